@@ -1,0 +1,1 @@
+"""Real-time electromagnetic tracking with online compensation of metal distortion."""

@@ -1,0 +1,48 @@
+"""Every error that this package raises on purpose: one root, one child a kind of cause.
+
+A message is one clear line that names the rule and what was found instead.
+"""
+
+
+class AnserError(Exception):
+    """Root of all errors raised on purpose."""
+
+
+class SetupError(AnserError):
+    """A setup document breaks a rule of its schema."""
+
+
+class FrameError(AnserError):
+    """Bytes on the control unit's port that are no valid frame."""
+
+
+class PortError(AnserError):
+    """The serial port can't be opened, read or written."""
+
+
+class LayoutError(AnserError):
+    """A point cloud whose fields or bytes don't fit the layout that it should have."""
+
+
+class BagError(AnserError):
+    """A bag that can't be read, or that lacks what was asked of it."""
+
+
+class ModelFileError(AnserError):
+    """A model file that is none, or that doesn't fit the session."""
+
+
+class FitError(AnserError):
+    """Data that can't determine the model that was asked for."""
+
+
+class TrackingError(AnserError):
+    """The tracker was given what it can't track with."""
+
+
+class ParameterError(AnserError):
+    """A parameter is unknown, of the wrong type or out of its range."""
+
+
+class DiagnosisError(AnserError):
+    """A session that can't be diagnosed."""
