@@ -1,0 +1,357 @@
+"""Reads MCAP bags without ROS: raw messages for replay, and whole sessions as arrays.
+
+A bag that is complete is read through its index, in the order of its log times. A bag that was cut
+(a crash, a full disk) has no index: it is read chunk by chunk as far as it goes, every chunk that is
+whole is kept, and `Bag.lost` says in words what is gone.
+"""
+
+import io
+import os
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import zstandard
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, DataEnd, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap_ros2.decoder import DecoderFactory
+from numpy.typing import NDArray
+
+from anser_ros.errors import BagError, LayoutError, SetupError
+from anser_ros.wire.points import STALE, FluxPoints, decode_flux
+from anser_ros.wire.setup import Setup, parse_setup
+
+_BROKEN = (
+    McapError, ValueError, struct.error, EOFError, IndexError, KeyError, MemoryError, OverflowError,
+    zstandard.ZstdError, RuntimeError,
+)  # fmt: skip
+_RECORD_LIMIT = 256 * 2**20
+
+FLUX_TYPE = 'sensor_msgs/msg/PointCloud2'
+POSE_TYPE = 'geometry_msgs/msg/PoseStamped'
+
+
+class RawMessage(NamedTuple):
+    """One message as it lies in the bag: serialised (CDR), with its schema for decoding."""
+
+    topic: str
+    type_name: str
+    log_time_ns: int
+    data: bytes
+    channel: Channel
+    schema: Schema
+
+
+@dataclass
+class Salvage:
+    """What a reader had to leave behind; filled while the messages are iterated."""
+
+    lost: str = ''
+    bad_chunks: int = 0
+
+
+@dataclass(frozen=True)
+class FluxStream:
+    """Fluxes of one topic.
+
+    Attributes
+    ----------
+    stamp_ns : ndarray, shape (F,)
+        Header stamps, ascending.
+    channel : ndarray, shape (S,)
+    flags : ndarray, shape (F, S)
+    flux : ndarray, shape (F, S, K), complex
+        T; NaN (with the flag `STALE`) where a frame lacks the channel.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    channel: NDArray[np.int64]
+    flags: NDArray[np.int64]
+    flux: NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class PoseStream:
+    """Poses of one topic: stamps (M,), positions (M, 3) in m, quaternions x y z w (M, 4)."""
+
+    stamp_ns: NDArray[np.int64]
+    position: NDArray[np.float64]
+    quaternion: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Bag:
+    """A recorded session: its setup, its fluxes, the optical poses, and what was refused or lost."""
+
+    path: str
+    setup: Setup
+    setup_text: str
+    tool: FluxStream | None
+    reference: FluxStream | None
+    optical: dict[str, PoseStream]
+    refused: dict[str, int] = field(default_factory=dict)
+    lost: str = ''
+
+
+def bag_file(path: str | os.PathLike[str]) -> str:
+    """Path of the MCAP file that ``path`` names: the file itself, or the one in a bag's folder.
+
+    Raises
+    ------
+    BagError
+        When there is none, or a folder holds several.
+    """
+    name = os.fspath(path)
+    if os.path.isdir(name):
+        files = sorted(f for f in os.listdir(name) if f.endswith('.mcap'))
+        if len(files) != 1:
+            raise BagError(f'{name}: a bag folder holds one .mcap file, found {len(files)}')
+        name = os.path.join(name, files[0])
+    if not os.path.isfile(name):
+        raise BagError(f'{name}: no such bag')
+    return name
+
+
+def _indexed(stream: io.BufferedReader) -> Iterator[RawMessage] | None:
+    """The messages of a complete bag in log time order, or None where the index is missing."""
+    reader = make_reader(stream, validate_crcs=True)
+    try:
+        summary = reader.get_summary()
+    except _BROKEN:
+        return None
+    if summary is None or not summary.chunk_indexes:
+        return None
+    return (
+        RawMessage(channel.topic, schema.name, message.log_time, message.data, channel, schema)
+        for schema, channel, message in reader.iter_messages(log_time_order=True)
+        if schema is not None
+    )
+
+
+def _records(stream: io.BufferedReader, salvage: Salvage, size: int) -> Iterator[Any]:
+    """Records of a bag without index, chunk by chunk, as far as it reads."""
+    reader = StreamReader(stream, emit_chunks=True, record_size_limit=_RECORD_LIMIT)
+    whole = 0
+    try:
+        for record in reader.records:
+            whole = stream.tell()
+            if isinstance(record, DataEnd):
+                break
+            if not isinstance(record, Chunk):
+                yield record
+                continue
+            try:
+                inner = breakup_chunk(record, validate_crc=True)
+            except _BROKEN:
+                salvage.bad_chunks += 1
+                continue
+            yield from inner
+    except _BROKEN as error:
+        salvage.lost = (
+            f'the bag breaks off after {whole} of {size} bytes '
+            f'({type(error).__name__}: {" ".join(str(error).split())[:120]})'
+        )
+    if salvage.bad_chunks:
+        text = f'{salvage.bad_chunks} chunks with a bad checksum left out'
+        salvage.lost = f'{salvage.lost}; {text}' if salvage.lost else text
+
+
+def _streamed(stream: io.BufferedReader, salvage: Salvage, size: int) -> list[RawMessage]:
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    messages = []
+    for record in _records(stream, salvage, size):
+        if isinstance(record, Schema):
+            schemas[record.id] = record
+        elif isinstance(record, Channel):
+            channels[record.id] = record
+        elif isinstance(record, Message) and record.channel_id in channels:
+            channel = channels[record.channel_id]
+            schema = schemas.get(channel.schema_id)
+            if schema is not None:
+                messages.append(
+                    RawMessage(
+                        channel.topic, schema.name, record.log_time, record.data, channel, schema
+                    )
+                )
+    messages.sort(key=lambda message: message.log_time_ns)
+    return messages
+
+
+def iter_messages(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[RawMessage]:
+    """Messages of a bag by ascending log time.
+
+    Parameters
+    ----------
+    path : path of the ``.mcap`` file or of the bag's folder
+    salvage : Salvage
+        Filled with what could not be read.
+
+    Raises
+    ------
+    BagError
+        When there is no such file, it is no MCAP file, or not one message can be read.
+    """
+    name = bag_file(path)
+    with open(name, 'rb') as stream:
+        if stream.read(8) != b'\x89MCAP0\r\n':
+            raise BagError(f'{name}: not an MCAP file')
+        stream.seek(0)
+        count = 0
+        messages = _indexed(stream)
+        if messages is not None:
+            try:
+                for message in messages:
+                    count += 1
+                    yield message
+                return
+            except _BROKEN as error:
+                salvage.lost = f'{type(error).__name__}: {error}'
+                last = message.log_time_ns if count else -1
+                stream.seek(0)
+                rest = _streamed(stream, salvage, os.path.getsize(name))
+                rest = [message for message in rest if message.log_time_ns > last]
+                yield from rest
+                return
+        stream.seek(0)
+        for message in _streamed(stream, salvage, os.path.getsize(name)):
+            count += 1
+            yield message
+        if count == 0:
+            raise BagError(f'{name}: not one message can be read ({salvage.lost or "empty bag"})')
+
+
+class MessageDecoder:
+    """Turns raw messages into objects with the message's attributes, without ROS."""
+
+    def __init__(self) -> None:
+        self._factory = DecoderFactory()
+        self._decoders: dict[int, Any] = {}
+
+    def decode(self, message: RawMessage) -> Any:
+        """Decode one message; raises `BagError` when its bytes don't fit its schema."""
+        decoder = self._decoders.get(message.schema.id)
+        try:
+            if decoder is None:
+                decoder = self._factory.decoder_for(message.channel.message_encoding, message.schema)
+                self._decoders[message.schema.id] = decoder
+            if decoder is None:
+                raise BagError(f'{message.topic}: no decoder for {message.type_name}')
+            return decoder(message.data)
+        except (*_BROKEN, TypeError, AttributeError) as error:
+            raise BagError(f'{message.topic}: {message.type_name} does not decode: {error}') from error
+
+
+def stamp_ns(message: Any) -> int:
+    """Header stamp of a decoded message, ns."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+class _Collector:
+    """Gathers what a session needs from the messages of a bag."""
+
+    def __init__(self) -> None:
+        self.decoder = MessageDecoder()
+        self.setups: list[str] = []
+        self.flux: dict[str, list[tuple[int, FluxPoints]]] = {'tool': [], 'reference': []}
+        self.poses: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
+        self.refused: Counter[str] = Counter()
+
+    def add(self, raw: RawMessage) -> None:
+        try:
+            if raw.topic.endswith('/setup') and raw.type_name == 'std_msgs/msg/String':
+                self.setups.append(str(self.decoder.decode(raw).data))
+            elif raw.topic.endswith(('/tool/flux', '/reference/flux')):
+                self._add_flux(raw)
+            elif raw.topic.startswith('/optical/') and raw.type_name == POSE_TYPE:
+                self._add_pose(raw)
+        except (BagError, LayoutError) as error:
+            self.refused[f'{raw.topic}: {error}'] += 1
+
+    def _add_flux(self, raw: RawMessage) -> None:
+        if raw.type_name != FLUX_TYPE:
+            raise LayoutError(f'type {raw.type_name} where {FLUX_TYPE} belongs')
+        cloud = self.decoder.decode(raw)
+        fields = [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields]
+        width = int(cloud.width) * int(cloud.height)
+        points = decode_flux(fields, cloud.point_step, width, bytes(cloud.data), cloud.is_bigendian)
+        stamp = stamp_ns(cloud)
+        if stamp == 0:
+            raise LayoutError('stamp zero')
+        self.flux[raw.topic.split('/')[-2]].append((stamp, points))
+
+    def _add_pose(self, raw: RawMessage) -> None:
+        message = self.decoder.decode(raw)
+        p, q = message.pose.position, message.pose.orientation
+        values = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+        norm = float(np.linalg.norm(values[3:]))
+        if not np.isfinite(values).all() or abs(norm - 1.0) > 1e-2:
+            raise LayoutError('a pose with values not finite or a quaternion not of unit length')
+        body = raw.topic[len('/optical/') : -len('/pose')]
+        self.poses.setdefault(body, []).append((stamp_ns(message), values))
+
+    def flux_stream(self, which: str) -> FluxStream | None:
+        frames: dict[int, FluxPoints] = {}
+        n_emitters = Counter(points.flux.shape[1] for _, points in self.flux[which])
+        for stamp, points in self.flux[which]:
+            if points.flux.shape[1] != n_emitters.most_common(1)[0][0]:
+                self.refused[f'{which}/flux: another number of emitters'] += 1
+            elif stamp in frames:
+                self.refused[f'{which}/flux: the same stamp twice'] += 1
+            else:
+                frames[stamp] = points
+        if not frames:
+            return None
+        channels = np.unique(np.concatenate([points.channel for points in frames.values()]))
+        stamps = np.array(sorted(frames), dtype=np.int64)
+        shape = (stamps.size, channels.size)
+        flux = np.full((*shape, n_emitters.most_common(1)[0][0]), np.nan, dtype=np.complex128)
+        flags = np.full(shape, STALE, dtype=np.int64)
+        for f, stamp in enumerate(stamps.tolist()):
+            points = frames[stamp]
+            rows = np.searchsorted(channels, points.channel)
+            flux[f, rows], flags[f, rows] = points.flux, points.flags
+        return FluxStream(stamps, channels, flags, flux)
+
+    def pose_streams(self) -> dict[str, PoseStream]:
+        streams = {}
+        for body, rows in self.poses.items():
+            unique = dict(rows)
+            stamps = np.array(sorted(unique), dtype=np.int64)
+            values = np.array([unique[stamp] for stamp in stamps.tolist()])
+            quaternion = values[:, 3:] / np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
+            streams[body] = PoseStream(stamps, values[:, :3], quaternion)
+        return streams
+
+
+def read_bag(path: str | os.PathLike[str]) -> Bag:
+    """Read a recorded session.
+
+    Raises
+    ------
+    BagError
+        When the file can't be read, has no setup, or has no flux topic at all.
+    """
+    salvage, collector = Salvage(), _Collector()
+    for raw in iter_messages(path, salvage):
+        collector.add(raw)
+    if not collector.setups:
+        raise BagError(f'{os.fspath(path)}: the bag has no setup')
+    try:
+        setup = parse_setup(collector.setups[0])
+    except SetupError as error:
+        raise BagError(f'{os.fspath(path)}: {error}') from error
+    tool, reference = collector.flux_stream('tool'), collector.flux_stream('reference')
+    if tool is None and reference is None:
+        reasons = ''.join(f'; {text}' for text in list(collector.refused)[:1])
+        raise BagError(f'{os.fspath(path)}: the bag has no flux that reads{reasons}')
+    return Bag(
+        os.fspath(path), setup, collector.setups[0], tool, reference, collector.pose_streams(),
+        dict(collector.refused), salvage.lost,
+    )  # fmt: skip

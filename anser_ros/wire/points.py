@@ -1,0 +1,195 @@
+"""The byte layouts of the two point clouds, flux and field model, without any ROS message.
+
+Fields are read by name and offset, never by position, so a cloud with other fields in between, or in
+another order, is read right. A field is the tuple ``(name, offset, datatype, count)`` with the datatype
+codes of ``sensor_msgs/PointField``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import LayoutError
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+PointFieldTuple = tuple[str, int, int, int]
+
+SATURATED = 1
+STALE = 2
+DROPPED = 4
+
+UINT16, FLOAT32, FLOAT64 = 4, 7, 8
+_CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
+
+
+@dataclass(frozen=True)
+class FluxPoints:
+    """One demodulation window: a row a sensor.
+
+    Attributes
+    ----------
+    channel, flags : ndarray, shape (S,)
+        Channel number and flag bits (`SATURATED`, `STALE`, `DROPPED`).
+    flux : ndarray, shape (S, K), complex
+        T, a column an emitter.
+    position, axis : ndarray, shape (S, 3)
+        m and unit vector, frame fg; NaN for sensors that move.
+    """
+
+    channel: NDArray[np.int64]
+    flags: NDArray[np.int64]
+    flux: ComplexArray
+    position: Array
+    axis: Array
+
+
+@dataclass(frozen=True)
+class DipolePoints:
+    """A field model as dipoles: positions (N, 3) m, directions (N, 3), moments (N, K) A m^2."""
+
+    positions: Array
+    directions: Array
+    moments: ComplexArray
+
+
+def _record_type(
+    fields: Sequence[PointFieldTuple], point_step: int, big_endian: bool
+) -> np.dtype[np.void]:
+    names, formats, offsets = [], [], []
+    order = '>' if big_endian else '<'
+    for name, offset, datatype, count in fields:
+        if datatype not in _CODES:
+            raise LayoutError(f'field {name!r} has the unknown datatype {datatype}')
+        if count != 1:
+            continue
+        if name in names:
+            raise LayoutError(f'field {name!r} appears twice')
+        kind = np.dtype(order + _CODES[datatype])
+        if offset < 0 or offset + kind.itemsize > point_step:
+            raise LayoutError(f'field {name!r} at {offset} leaves the point of {point_step} bytes')
+        names.append(name)
+        formats.append(kind)
+        offsets.append(offset)
+    return np.dtype(
+        {'names': names, 'formats': formats, 'offsets': offsets, 'itemsize': point_step}
+    )
+
+
+def _records(
+    fields: Sequence[PointFieldTuple],
+    point_step: int,
+    width: int,
+    data: bytes | bytearray | memoryview,
+    big_endian: bool,
+) -> NDArray[np.void]:
+    if point_step <= 0 or width < 0:
+        raise LayoutError(f'point_step {point_step} and width {width} make no cloud')
+    size = memoryview(data).nbytes
+    if size != point_step * width:
+        raise LayoutError(f'{width} points of {point_step} bytes need {point_step * width} bytes, got {size}')
+    return np.frombuffer(data, dtype=_record_type(fields, point_step, big_endian), count=width)
+
+
+def _columns(records: NDArray[np.void], names: Sequence[str]) -> Array:
+    present = records.dtype.names or ()
+    missing = [name for name in names if name not in present]
+    if missing:
+        raise LayoutError(f'the cloud lacks the field {missing[0]!r}')
+    out = np.empty((records.shape[0], len(names)))
+    for i, name in enumerate(names):
+        out[:, i] = records[name]
+    return out
+
+
+def _phasors(records: NDArray[np.void], stem: str) -> ComplexArray:
+    present = set(records.dtype.names or ())
+    count = 0
+    while f'{stem}{count}_re' in present or f'{stem}{count}_im' in present:
+        count += 1
+    if count == 0:
+        raise LayoutError(f'the cloud lacks the field {f"{stem}0_re"!r}')
+    real = _columns(records, [f'{stem}{k}_re' for k in range(count)])
+    imag = _columns(records, [f'{stem}{k}_im' for k in range(count)])
+    return np.asarray(real + 1j * imag)
+
+
+def decode_flux(
+    fields: Sequence[PointFieldTuple],
+    point_step: int,
+    width: int,
+    data: bytes | bytearray | memoryview,
+    is_bigendian: bool = False,
+) -> FluxPoints:
+    """Read a flux cloud.
+
+    Raises
+    ------
+    LayoutError
+        When a field is missing, doubled, of an unknown type or outside the point, when the number of
+        bytes is not ``width * point_step``, or when a channel appears twice.
+    """
+    records = _records(fields, point_step, width, data, is_bigendian)
+    geometry = _columns(records, ('x', 'y', 'z', 'nx', 'ny', 'nz'))
+    channel = _columns(records, ('channel',))[:, 0].astype(np.int64)
+    if len(set(channel.tolist())) != channel.size:
+        raise LayoutError('a channel appears twice in the cloud')
+    return FluxPoints(
+        channel=channel,
+        flags=_columns(records, ('flags',))[:, 0].astype(np.int64),
+        flux=_phasors(records, 'coil'),
+        position=geometry[:, :3],
+        axis=geometry[:, 3:],
+    )
+
+
+def flux_fields(n_emitters: int) -> tuple[list[PointFieldTuple], int]:
+    """Fields and point_step of the packed flux layout (92 bytes with eight emitters)."""
+    fields = [(name, 4 * i, FLOAT32, 1) for i, name in enumerate(('x', 'y', 'z', 'nx', 'ny', 'nz'))]
+    fields += [('channel', 24, UINT16, 1), ('flags', 26, UINT16, 1)]
+    for k in range(n_emitters):
+        fields.append((f'coil{k}_re', 28 + 8 * k, FLOAT32, 1))
+        fields.append((f'coil{k}_im', 32 + 8 * k, FLOAT32, 1))
+    return fields, 28 + 8 * n_emitters
+
+
+def encode_flux(points: FluxPoints) -> tuple[list[PointFieldTuple], int, bytes]:
+    """Pack a flux cloud: fields, point_step and bytes."""
+    count, n_emitters = points.flux.shape
+    fields, step = flux_fields(n_emitters)
+    head = np.dtype([('g', '<f4', 6), ('c', '<u2'), ('f', '<u2'), ('v', '<f4', 2 * n_emitters)])
+    out = np.zeros(count, dtype=head)
+    out['g'][:, :3], out['g'][:, 3:] = points.position, points.axis
+    out['c'], out['f'] = points.channel, points.flags
+    out['v'][:, 0::2], out['v'][:, 1::2] = points.flux.real, points.flux.imag
+    return fields, step, out.tobytes()
+
+
+def decode_field_model(
+    fields: Sequence[PointFieldTuple],
+    point_step: int,
+    width: int,
+    data: bytes | bytearray | memoryview,
+    is_bigendian: bool = False,
+) -> DipolePoints:
+    """Read a field model cloud; raises `LayoutError` as `decode_flux`, and on values not finite."""
+    records = _records(fields, point_step, width, data, is_bigendian)
+    geometry = _columns(records, ('x', 'y', 'z', 'ux', 'uy', 'uz'))
+    moments = _phasors(records, 'm')
+    if not (np.isfinite(geometry).all() and np.isfinite(moments).all()):
+        raise LayoutError('the field model holds values that are not finite')
+    return DipolePoints(geometry[:, :3], geometry[:, 3:], moments)
+
+
+def encode_field_model(points: DipolePoints) -> tuple[list[PointFieldTuple], int, bytes]:
+    """Pack a field model cloud: fields, point_step and bytes."""
+    count, n_emitters = points.moments.shape
+    names = ['x', 'y', 'z', 'ux', 'uy', 'uz']
+    names += [f'm{k}_{part}' for k in range(n_emitters) for part in ('re', 'im')]
+    values = np.empty((count, len(names)), dtype='<f8')
+    values[:, :3], values[:, 3:6] = points.positions, points.directions
+    values[:, 6::2], values[:, 7::2] = points.moments.real, points.moments.imag
+    fields = [(name, 8 * i, FLOAT64, 1) for i, name in enumerate(names)]
+    return fields, 8 * len(names), values.tobytes()

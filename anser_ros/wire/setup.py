@@ -1,0 +1,277 @@
+"""The setup document (`anser_setup/1`): which emitters drive, which sensors listen, and where they are.
+
+The YAML text travels in every bag and on the latched topic ``setup``. Sensor positions and axes are
+given in the frame of the sensor's body; the body ``fg`` is the field generator itself.
+"""
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import yaml
+
+from anser_ros.errors import SetupError
+
+SCHEMA = 'anser_setup/1'
+FIELD_GENERATOR = 'fg'
+AXIS_TOLERANCE = 1e-3
+
+_NAME = re.compile(r'^[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*$')
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Coil:
+    """One emitter coil: centre (m, frame fg), turn about z (degrees) and drive frequency (Hz)."""
+
+    name: str
+    centre_m: Vector
+    rotation_deg: float
+    frequency_hz: float
+
+
+@dataclass(frozen=True)
+class Emitter:
+    """The field generator: its kind, the geometry that all coils share, and the coils.
+
+    ``geometry`` holds the document's remaining keys (``turns``, ``side_m``, ``pitch_m``, ``layers``,
+    ``thickness_m``, ``current_a`` for ``square_spiral_pcb``), as given.
+    """
+
+    kind: str
+    geometry: Mapping[str, Any]
+    coils: tuple[Coil, ...]
+
+
+@dataclass(frozen=True)
+class SensorSpec:
+    """One coil: its channel, name, body, and position (m) and unit axis in the body's frame."""
+
+    channel: int
+    name: str
+    body: str
+    position_m: Vector
+    axis: Vector
+    length_m: float
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A validated setup document."""
+
+    frame_id: str
+    flux_rate_hz: float
+    emitter: Emitter
+    sensors: tuple[SensorSpec, ...]
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def tool_sensors(self) -> tuple[SensorSpec, ...]:
+        """Sensors on bodies that move."""
+        return tuple(s for s in self.sensors if s.body != FIELD_GENERATOR)
+
+    @property
+    def reference_sensors(self) -> tuple[SensorSpec, ...]:
+        """Sensors fixed in fg."""
+        return tuple(s for s in self.sensors if s.body == FIELD_GENERATOR)
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """Names of the bodies that move, in the order of their first sensor."""
+        return tuple(dict.fromkeys(s.body for s in self.tool_sensors))
+
+    @property
+    def emitter_names(self) -> tuple[str, ...]:
+        """Names of the emitters, in the order of the flux fields."""
+        return tuple(coil.name for coil in self.emitter.coils)
+
+    @property
+    def frequencies_hz(self) -> tuple[float, ...]:
+        """Drive frequencies, Hz, in the order of the flux fields."""
+        return tuple(coil.frequency_hz for coil in self.emitter.coils)
+
+
+def topic_of(name: str) -> str:
+    """Relative ROS topic stem of a sensor's or body's name.
+
+    A token that begins with a digit is not legal in a ROS 2 name, so it is joined to the token
+    before it: ``tool_a/0/x`` becomes ``tool_a_0/x``; a leading digit gets ``sensor_`` in front.
+    """
+    tokens: list[str] = []
+    for token in name.split('/'):
+        if token[:1].isdigit():
+            token = f'{tokens.pop()}_{token}' if tokens else f'sensor_{token}'
+        tokens.append(token)
+    return '/'.join(tokens)
+
+
+def _number(value: Any, where: str, low: float = -math.inf, high: float = math.inf) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise SetupError(f'setup: {where} must be a number, got {value!r}')
+    number = float(value)
+    if not math.isfinite(number) or not low <= number <= high:
+        raise SetupError(f'setup: {where} must be finite and in [{low:g}, {high:g}], got {value!r}')
+    return number
+
+
+def _vector(value: Any, where: str) -> Vector:
+    if not isinstance(value, list) or len(value) != 3:
+        raise SetupError(f'setup: {where} must be a list of three numbers, got {value!r}')
+    x, y, z = (_number(v, f'{where}[{i}]', -100.0, 100.0) for i, v in enumerate(value))
+    return x, y, z
+
+
+def _axis(value: Any, where: str) -> Vector:
+    vector = np.asarray(_vector(value, where))
+    norm = float(np.linalg.norm(vector))
+    if abs(norm - 1.0) > AXIS_TOLERANCE:
+        raise SetupError(f'setup: {where} must be a unit vector, its length is {norm:.6g}')
+    if abs(norm - 1.0) > 1e-12:
+        vector = vector / norm
+    x, y, z = (float(v) for v in vector)
+    return x, y, z
+
+
+def _mapping(value: Any, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise SetupError(f'setup: {where} must be a mapping, got {type(value).__name__}')
+    return value
+
+
+def _take(document: dict[str, Any], key: str, where: str) -> Any:
+    if key not in document:
+        raise SetupError(f'setup: {where} lacks the key {key!r}')
+    return document[key]
+
+
+def _name(value: Any, where: str) -> str:
+    if not isinstance(value, str) or not _NAME.match(value):
+        raise SetupError(f'setup: {where} must be words joined by /, got {value!r}')
+    return value
+
+
+def _unique(values: list[Any], what: str) -> None:
+    seen: set[Any] = set()
+    for value in values:
+        if value in seen:
+            raise SetupError(f'setup: {what} {value!r} appears twice')
+        seen.add(value)
+
+
+def _parse_coil(item: Any, where: str) -> Coil:
+    coil = _mapping(item, where)
+    return Coil(
+        name=_name(_take(coil, 'name', where), f'{where}.name'),
+        centre_m=_vector(_take(coil, 'centre_m', where), f'{where}.centre_m'),
+        rotation_deg=_number(coil.get('rotation_deg', 0.0), f'{where}.rotation_deg'),
+        frequency_hz=_number(_take(coil, 'frequency_hz', where), f'{where}.frequency_hz', 1e-3, 1e9),
+    )
+
+
+def _parse_emitter(item: Any) -> Emitter:
+    emitter = _mapping(item, 'emitter')
+    coils = _take(emitter, 'coils', 'emitter')
+    if not isinstance(coils, list) or not coils:
+        raise SetupError('setup: emitter.coils must be a list of at least one coil')
+    parsed = tuple(_parse_coil(coil, f'emitter.coils[{i}]') for i, coil in enumerate(coils))
+    _unique([coil.name for coil in parsed], 'coil')
+    geometry = {k: v for k, v in emitter.items() if k not in ('kind', 'coils')}
+    kind = _take(emitter, 'kind', 'emitter')
+    return Emitter(_name(kind, 'emitter.kind'), geometry, parsed)
+
+
+def _parse_sensor(item: Any, where: str) -> SensorSpec:
+    sensor = _mapping(item, where)
+    channel = _take(sensor, 'channel', where)
+    if isinstance(channel, bool) or not isinstance(channel, int) or not 0 <= channel <= 0xFFFF:
+        raise SetupError(f'setup: {where}.channel must be an integer in [0, 65535], got {channel!r}')
+    return SensorSpec(
+        channel=channel,
+        name=_name(_take(sensor, 'name', where), f'{where}.name'),
+        body=_name(_take(sensor, 'body', where), f'{where}.body'),
+        position_m=_vector(_take(sensor, 'position_m', where), f'{where}.position_m'),
+        axis=_axis(_take(sensor, 'axis', where), f'{where}.axis'),
+        length_m=_number(sensor.get('length_m', 0.0), f'{where}.length_m', 0.0, 1.0),
+    )
+
+
+def parse_setup(text: str) -> Setup:
+    """Read and check a setup document.
+
+    Parameters
+    ----------
+    text : str
+        YAML, schema ``anser_setup/1``.
+
+    Returns
+    -------
+    Setup
+
+    Raises
+    ------
+    SetupError
+        With the rule that is broken and the key where it is.
+    """
+    try:
+        document = yaml.load(text, Loader=getattr(yaml, 'CSafeLoader', yaml.SafeLoader))
+    except (yaml.YAMLError, UnicodeError, ValueError) as error:
+        raise SetupError(f'setup: not YAML: {" ".join(str(error).split())}') from error
+    root = _mapping(document, 'the document')
+    if root.get('schema') != SCHEMA:
+        raise SetupError(f'setup: schema must be {SCHEMA!r}, got {root.get("schema")!r}')
+    if root.get('flux_unit', 'T') != 'T':
+        raise SetupError(f'setup: flux_unit must be T, got {root.get("flux_unit")!r}')
+    sensors = _take(root, 'sensors', 'the document')
+    if not isinstance(sensors, list) or not sensors:
+        raise SetupError('setup: sensors must be a list of at least one sensor')
+    parsed = tuple(_parse_sensor(sensor, f'sensors[{i}]') for i, sensor in enumerate(sensors))
+    _unique([sensor.channel for sensor in parsed], 'channel')
+    _unique([sensor.name for sensor in parsed], 'sensor')
+    tools = [sensor for sensor in parsed if sensor.body != FIELD_GENERATOR]
+    bodies = list(dict.fromkeys(sensor.body for sensor in tools))
+    _unique([topic_of(name) for name in [s.name for s in tools] + bodies], 'topic of sensor or body')
+    known = ('schema', 'frame_id', 'flux_rate_hz', 'flux_unit', 'emitter', 'sensors')
+    return Setup(
+        frame_id=_name(root.get('frame_id', FIELD_GENERATOR), 'frame_id'),
+        flux_rate_hz=_number(_take(root, 'flux_rate_hz', 'the document'), 'flux_rate_hz', 1e-3, 1e6),
+        emitter=_parse_emitter(_take(root, 'emitter', 'the document')),
+        sensors=parsed,
+        extra={k: v for k, v in root.items() if k not in known},
+    )
+
+
+def dump_setup(setup: Setup) -> str:
+    """Write a setup as the YAML document that `parse_setup` reads back unchanged."""
+    coils = [
+        {
+            'name': coil.name,
+            'centre_m': list(coil.centre_m),
+            'rotation_deg': coil.rotation_deg,
+            'frequency_hz': coil.frequency_hz,
+        }
+        for coil in setup.emitter.coils
+    ]
+    sensors = [
+        {
+            'channel': s.channel,
+            'name': s.name,
+            'body': s.body,
+            'position_m': list(s.position_m),
+            'axis': list(s.axis),
+            'length_m': s.length_m,
+        }
+        for s in setup.sensors
+    ]
+    document = {
+        'schema': SCHEMA,
+        'frame_id': setup.frame_id,
+        'flux_rate_hz': setup.flux_rate_hz,
+        'flux_unit': 'T',
+        'emitter': {'kind': setup.emitter.kind, **setup.emitter.geometry, 'coils': coils},
+        'sensors': sensors,
+        **setup.extra,
+    }
+    return yaml.safe_dump(document, sort_keys=False)
