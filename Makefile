@@ -1,0 +1,56 @@
+# Every target makes its environment first: .venv with pinned packages, once.
+VENV ?= .venv
+VENV_OLDEST ?= .venv-oldest
+ANSER = $(VENV)/bin/anser
+READY = $(VENV)/.installed-newest
+READY_OLDEST = $(VENV_OLDEST)/.installed-oldest
+# One thread each: two cores are shared with the processes under test.
+ENVIRONMENT = OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1
+ARGS ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test test-oldest lint format types bench paper loop measured clean
+
+help:
+	@echo 'make demo [DURATION=30]  watch a simulated tool being tracked'
+	@echo 'make test                lint, types, tests'
+	@echo 'make test-oldest         tests with the oldest dependencies (needs Python 3.12)'
+	@echo 'make bench               speed and accuracy beside rivals, writes bench.json'
+	@echo 'make paper|loop|measured the studies; options with ARGS=...'
+
+$(READY): .ci/requirements-newest.txt .ci/requirements-oldest.txt .ci/bootstrap setup.py
+	@.ci/bootstrap $(VENV) newest
+	@touch $@
+
+$(READY_OLDEST): .ci/requirements-oldest.txt .ci/bootstrap setup.py
+	@.ci/bootstrap $(VENV_OLDEST) oldest
+	@touch $@
+
+demo: $(READY)
+	@$(ANSER) demo $(if $(DURATION),--duration $(DURATION)) $(ARGS)
+
+lint: $(READY)
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+
+format: $(READY)
+	$(VENV)/bin/ruff check --fix .
+	$(VENV)/bin/ruff format .
+
+types: $(READY)
+	$(VENV)/bin/mypy
+
+test: lint types
+	$(ENVIRONMENT) $(VENV)/bin/python -m pytest $(ARGS)
+
+test-oldest: $(READY_OLDEST)
+	$(ENVIRONMENT) $(VENV_OLDEST)/bin/python -m pytest $(ARGS)
+
+bench: $(READY)
+	@$(ENVIRONMENT) $(VENV)/bin/python test/bench/run.py $(ARGS)
+
+paper loop measured: $(READY)
+	@$(ENVIRONMENT) $(ANSER) $@ $(ARGS)
+
+clean:
+	rm -rf build install log out *.egg-info .pytest_cache .mypy_cache .ruff_cache

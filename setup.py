@@ -1,0 +1,55 @@
+"""Build of the ROS package: every node and every offline tool is one executable."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'anser_ros'
+HERE = Path(__file__).parent
+
+
+def commands(folder, mark):
+    """Return the names of a folder's modules that are commands: those that have the mark."""
+    modules = sorted((HERE / PACKAGE / folder).glob('*.py'))
+    return [path.stem for path in modules if mark in path.read_text(encoding='utf-8')]
+
+
+def shared(folder):
+    """Return the data_files entry of a folder that is installed under share/."""
+    files = sorted(path for path in (HERE / folder).glob('*') if path.is_file())
+    return f'share/{PACKAGE}/{folder}', [str(path.relative_to(HERE)) for path in files]
+
+
+names = commands('nodes', "\nif __name__ == '__main__':") + commands('cli', '\ndef add_arguments(')
+scripts = [f'{name} = {PACKAGE}.cli.main:run_executable' for name in names]
+
+setup(
+    name=PACKAGE,
+    version='0.1.0',
+    packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
+        (f'share/{PACKAGE}', ['package.xml']),
+        *(shared(folder) for folder in ('config', 'launch', 'bags')),
+    ],
+    install_requires=[
+        'setuptools',
+        'numpy>=1.26',
+        'scipy>=1.11',
+        'numba>=0.59',
+        'PyYAML>=6',
+        'pyserial>=3.5',
+        'mcap>=1.1',
+        'mcap-ros2-support>=0.5.5',
+        'rich>=13',
+        'matplotlib>=3.8',
+        'pyigtl>=0.3.1',
+    ],
+    python_requires='>=3.11',
+    zip_safe=True,
+    maintainer='anser_ros maintainers',
+    maintainer_email='maintainers@anser-ros.invalid',
+    description='Electromagnetic tracking with the Anser field generator on ROS 2',
+    license='Apache-2.0',
+    entry_points={'console_scripts': [f'anser = {PACKAGE}.cli.main:main', *scripts]},
+)
