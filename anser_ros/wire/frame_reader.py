@@ -1,0 +1,133 @@
+"""Finds records in a byte stream, and finds them again after garbage."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, fields
+
+from anser_ros.errors import FrameError
+from anser_ros.wire.frames import (
+    CRC,
+    HEADER,
+    MAGIC,
+    MAX_PAYLOAD,
+    OVERHEAD,
+    VERSION,
+    Record,
+    decode_payload,
+    header_check,
+    knows,
+)
+
+
+@dataclass
+class FrameCounters:
+    """What the reader has met so far, in records unless the name says otherwise."""
+
+    records: int = 0
+    bad_header: int = 0
+    bad_crc: int = 0
+    bad_payload: int = 0
+    wrong_version: int = 0
+    unknown_type: int = 0
+    skipped_bytes: int = 0
+
+    def as_dict(self) -> dict[str, int]:
+        """Names and values, in the order of declaration."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+class FrameReader:
+    """Turns received bytes into records; everything else is counted and skipped.
+
+    After a header or CRC that is wrong the search goes on one byte behind that record's magic, so
+    a good record inside or right behind a damaged one is never lost. Bytes are copied only while a
+    record is incomplete; sample blocks are views into the received bytes.
+
+    Parameters
+    ----------
+    max_payload : longest payload to wait for, bytes; lower it once the hello told the block size,
+        so that a forged length cannot hold back the records behind it
+    """
+
+    def __init__(self, max_payload: int = MAX_PAYLOAD) -> None:
+        self.max_payload = max_payload
+        self.counters = FrameCounters()
+        self.last_refusal = ''
+        self._pending = b''
+
+    @property
+    def pending(self) -> int:
+        """Bytes that wait for the rest of their record."""
+        return len(self._pending)
+
+    def reset(self) -> None:
+        """Forget a half-received record, after the port was closed."""
+        self._pending = b''
+
+    def feed(self, data: bytes) -> list[Record]:
+        """Take bytes as they come and return the records that they complete."""
+        buffer = self._pending + data if self._pending else bytes(data)
+        view = memoryview(buffer)
+        records: list[Record] = []
+        counters = self.counters
+        position = 0
+        while True:
+            start = buffer.find(MAGIC, position)
+            if start < 0:
+                keep = _magic_prefix(buffer, position)
+                counters.skipped_bytes += len(buffer) - keep - position
+                position = len(buffer) - keep
+                break
+            counters.skipped_bytes += start - position
+            position = start
+            if len(buffer) - start < HEADER.size:
+                break
+            _, version, number, length, tag, check = HEADER.unpack_from(buffer, start)
+            if check != header_check(view[start : start + 10]) or length > self.max_payload:
+                counters.bad_header += 1
+                position = self._skip(start)
+                continue
+            end = start + OVERHEAD + length
+            if len(buffer) < end:
+                break
+            body_end = end - CRC.size
+            if zlib.crc32(view[start:body_end]) != CRC.unpack_from(buffer, body_end)[0]:
+                counters.bad_crc += 1
+                position = self._skip(start)
+                continue
+            position = end
+            record = self._decode(version, number, tag, view[start + HEADER.size : body_end])
+            if record is not None:
+                records.append(record)
+        self._pending = buffer[position:]
+        return records
+
+    def _skip(self, start: int) -> int:
+        self.counters.skipped_bytes += 1
+        return start + 1
+
+    def _decode(self, version: int, number: int, tag: int, body: memoryview) -> Record | None:
+        if version != VERSION:
+            self.counters.wrong_version += 1
+            self.last_refusal = f'protocol version {version}, this is version {VERSION}'
+            return None
+        if not knows(number):
+            self.counters.unknown_type += 1
+            return None
+        try:
+            payload = decode_payload(number, body)
+        except FrameError as error:
+            self.counters.bad_payload += 1
+            self.last_refusal = str(error)
+            return None
+        self.counters.records += 1
+        return Record(payload, tag)
+
+
+def _magic_prefix(buffer: bytes, position: int) -> int:
+    """How many bytes at the end of the buffer may be the begin of a magic."""
+    for length in range(min(len(MAGIC) - 1, len(buffer) - position), 0, -1):
+        if buffer.endswith(MAGIC[:length]):
+            return length
+    return 0

@@ -1,0 +1,389 @@
+"""Records of the control unit's serial protocol, version 1: encode and decode one of them.
+
+The protocol is written down in `docs/cu_protocol.md`; the two must agree. Everything is little
+endian. `frame_reader` finds records in a stream; this module knows what is inside one.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+from math import isfinite
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import FrameError
+
+MAGIC = b'\xa5\x41\x4e\xda'
+VERSION = 1
+HEADER = struct.Struct('<4sBBHHH')
+CRC = struct.Struct('<I')
+OVERHEAD = HEADER.size + CRC.size
+MAX_PAYLOAD = 0xFFFF
+FULL_SCALE_CODE = 32768
+
+_HELLO = struct.Struct('<HddHHHB')
+_CHANNEL = struct.Struct('<HBBf')
+_COIL = struct.Struct('<df')
+_SAMPLES = struct.Struct('<IQHHHH')
+_STATUS = struct.Struct('<BBHQIIf')
+_REPLY = struct.Struct('<BB')
+
+
+class ChannelKind(IntEnum):
+    """What an ADC channel measures: a sensor coil, or the sum of the emitter coils' currents."""
+
+    SENSE = 0
+    CURRENT = 1
+
+
+class State(IntEnum):
+    """What the control unit is doing."""
+
+    IDLE = 0
+    STREAMING = 1
+    FAULT = 2
+
+
+class StatusFlag(IntFlag):
+    """Conditions that the control unit reports about itself."""
+
+    SYNTHESISER_UNLOCKED = 1
+    DRIVER_OVERHEATED = 2
+    COIL_OPEN = 4
+    ADC_CLOCK_LOST = 8
+    OVERRUN = 16
+
+
+class SamplesFlag(IntFlag):
+    """Conditions of one block of samples."""
+
+    LOST_BEFORE = 1
+
+
+class ReplyCode(IntEnum):
+    """The control unit's answer to a command."""
+
+    OK = 0
+    UNKNOWN_COMMAND = 1
+    BAD_ARGUMENT = 2
+    WRONG_STATE = 3
+    BROKEN = 4
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One column of the sample blocks.
+
+    Attributes
+    ----------
+    number : the channel number of the setup document (the current channel's is its own)
+    kind : what it measures
+    full_scale : volts (sense) or amperes (current) at code 32768
+    """
+
+    number: int
+    kind: ChannelKind
+    full_scale: float
+
+
+@dataclass(frozen=True)
+class Hello:
+    """What the control unit is and how it samples; sent once a second and after each change.
+
+    Attributes
+    ----------
+    device : name and serial number, UTF-8
+    sample_rate_hz, tick_hz : sampling rate a channel, rate of the device's timestamp counter
+    block_samples : sampling instants in every block
+    channels : columns of a block, in their order
+    frequencies_hz, currents_a : drive tone and nominal peak current of each emitter coil
+    minor : minor version of the protocol
+    """
+
+    device: str
+    sample_rate_hz: float
+    tick_hz: float
+    block_samples: int
+    channels: tuple[Channel, ...]
+    frequencies_hz: tuple[float, ...]
+    currents_a: tuple[float, ...]
+    minor: int = 0
+
+    def samples_size(self) -> int:
+        """Payload bytes of one block of samples."""
+        return _SAMPLES.size + 2 * self.block_samples * len(self.channels)
+
+
+@dataclass(frozen=True)
+class SampleBlock:
+    """Consecutive samples of all channels.
+
+    Attributes
+    ----------
+    sequence : number of the block since START, modulo 2^32
+    timestamp_ticks : device time of the first sample
+    codes : ndarray, shape (n, C), int16, ADC codes, read-only view into the received bytes
+    flags : conditions of this block
+    """
+
+    sequence: int
+    timestamp_ticks: int
+    codes: NDArray[np.int16]
+    flags: SamplesFlag = SamplesFlag(0)
+
+
+@dataclass(frozen=True)
+class Status:
+    """Health of the control unit, sent once a second and when it changes."""
+
+    state: State
+    flags: StatusFlag
+    uptime_ticks: int
+    dropped_blocks: int
+    refused_records: int
+    temperature_deg_c: float
+
+
+@dataclass(frozen=True)
+class Reply:
+    """Answer to the command that carried the same tag."""
+
+    command: int
+    code: ReplyCode
+    text: str = ''
+
+
+@dataclass(frozen=True)
+class Identify:
+    """Command: send a hello now."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """Command: stream sample blocks, from sequence number 0."""
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Command: stop streaming."""
+
+
+@dataclass(frozen=True)
+class SetFrequencies:
+    """Command: drive the coils at these tones; answered, then followed by a new hello."""
+
+    frequencies_hz: tuple[float, ...]
+
+
+Payload = Hello | SampleBlock | Status | Reply | Identify | Start | Stop | SetFrequencies
+
+
+@dataclass(frozen=True)
+class Record:
+    """One record of the stream: its payload, and the tag that ties a reply to its command."""
+
+    payload: Payload
+    tag: int = 0
+
+
+def _text(raw: memoryview) -> str:
+    try:
+        return bytes(raw).decode('utf-8')
+    except UnicodeDecodeError as error:
+        raise FrameError(f'text is not UTF-8: {error.reason}') from error
+
+
+def _encode_hello(hello: Hello) -> bytes:
+    device = hello.device.encode('utf-8')[:255]
+    parts = [
+        _HELLO.pack(
+            hello.minor,
+            hello.sample_rate_hz,
+            hello.tick_hz,
+            hello.block_samples,
+            len(hello.channels),
+            len(hello.frequencies_hz),
+            len(device),
+        ),
+        device,
+    ]
+    parts += [_CHANNEL.pack(c.number, c.kind, 0, c.full_scale) for c in hello.channels]
+    parts += [
+        _COIL.pack(frequency, current)
+        for frequency, current in zip(hello.frequencies_hz, hello.currents_a, strict=True)
+    ]
+    return b''.join(parts)
+
+
+def _decode_hello(raw: memoryview) -> Hello:
+    minor, rate, tick, block, n_channels, n_coils, n_text = _HELLO.unpack_from(raw)
+    start = _HELLO.size + n_text
+    coil_start = start + n_channels * _CHANNEL.size
+    end = coil_start + n_coils * _COIL.size
+    if len(raw) < end:
+        raise FrameError(f'hello of {len(raw)} bytes announces {end}')
+    channels = [
+        Channel(number, ChannelKind(kind), full_scale)
+        for number, kind, _, full_scale in _CHANNEL.iter_unpack(raw[start:coil_start])
+    ]
+    coils = list(_COIL.iter_unpack(raw[coil_start:end]))
+    hello = Hello(
+        _text(raw[_HELLO.size : start]),
+        rate,
+        tick,
+        block,
+        tuple(channels),
+        tuple(frequency for frequency, _ in coils),
+        tuple(current for _, current in coils),
+        minor,
+    )
+    check_hello(hello)
+    return hello
+
+
+def check_hello(hello: Hello) -> None:
+    """Refuse a hello that no receiver could use.
+
+    Raises
+    ------
+    FrameError
+        When a rate, scale or tone is not finite and positive, a tone is not below half the sample
+        rate, a channel number appears twice, there is not exactly one current channel, or a block
+        does not fit one record.
+    """
+    scales = [channel.full_scale for channel in hello.channels]
+    positive = [hello.sample_rate_hz, hello.tick_hz, *scales, *hello.frequencies_hz]
+    if not all(isfinite(value) and value > 0 for value in [*positive, *hello.currents_a]):
+        raise FrameError('hello holds a rate, full scale, tone or current that is not positive')
+    if any(2 * tone >= hello.sample_rate_hz for tone in hello.frequencies_hz):
+        raise FrameError(f'hello holds a tone above half of {hello.sample_rate_hz:g} S/s')
+    numbers = [channel.number for channel in hello.channels]
+    if len(set(numbers)) != len(numbers):
+        raise FrameError('hello names a channel twice')
+    if sum(channel.kind is ChannelKind.CURRENT for channel in hello.channels) != 1:
+        raise FrameError('hello must name exactly one current channel')
+    if not hello.frequencies_hz:
+        raise FrameError('hello names no emitter coil')
+    if not 0 < hello.samples_size() <= MAX_PAYLOAD or hello.block_samples < 1:
+        raise FrameError(f'a block of {hello.block_samples} samples does not fit one record')
+
+
+def _encode_samples(block: SampleBlock) -> bytes:
+    n, columns = block.codes.shape
+    head = _SAMPLES.pack(
+        block.sequence, block.timestamp_ticks, n, columns, int(block.flags), 0
+    )
+    return head + np.ascontiguousarray(block.codes, dtype='<i2').tobytes()
+
+
+def _decode_samples(raw: memoryview) -> SampleBlock:
+    sequence, ticks, n, columns, flags, _ = _SAMPLES.unpack_from(raw)
+    if n * columns == 0 or len(raw) != _SAMPLES.size + 2 * n * columns:
+        raise FrameError(f'block of {n} x {columns} samples in {len(raw)} bytes')
+    codes = np.frombuffer(raw, '<i2', n * columns, _SAMPLES.size).reshape(n, columns)
+    return SampleBlock(sequence, ticks, codes, SamplesFlag(flags & 1))
+
+
+def _encode_status(status: Status) -> bytes:
+    return _STATUS.pack(
+        status.state,
+        0,
+        int(status.flags),
+        status.uptime_ticks,
+        status.dropped_blocks,
+        status.refused_records,
+        status.temperature_deg_c,
+    )
+
+
+def _decode_status(raw: memoryview) -> Status:
+    state, _, flags, uptime, dropped, refused, temperature = _STATUS.unpack_from(raw)
+    return Status(State(state), StatusFlag(flags & 31), uptime, dropped, refused, temperature)
+
+
+def _encode_reply(reply: Reply) -> bytes:
+    return _REPLY.pack(reply.command, reply.code) + reply.text.encode('utf-8')
+
+
+def _decode_reply(raw: memoryview) -> Reply:
+    command, code = _REPLY.unpack_from(raw)
+    return Reply(command, ReplyCode(code), _text(raw[_REPLY.size :]))
+
+
+def _encode_frequencies(command: SetFrequencies) -> bytes:
+    return struct.pack(f'<{len(command.frequencies_hz)}d', *command.frequencies_hz)
+
+
+def _decode_frequencies(raw: memoryview) -> SetFrequencies:
+    if len(raw) == 0 or len(raw) % 8:
+        raise FrameError(f'frequencies in {len(raw)} bytes, not a multiple of 8')
+    tones = struct.unpack(f'<{len(raw) // 8}d', raw)
+    if not all(isfinite(tone) and tone > 0 for tone in tones):
+        raise FrameError('a frequency is not finite and positive')
+    return SetFrequencies(tones)
+
+
+def _nothing(_: object) -> bytes:
+    return b''
+
+
+_LAYOUTS: dict[int, tuple[type, Callable[..., bytes], Callable[[memoryview], Payload]]] = {
+    0x01: (Hello, _encode_hello, _decode_hello),
+    0x02: (SampleBlock, _encode_samples, _decode_samples),
+    0x03: (Status, _encode_status, _decode_status),
+    0x04: (Reply, _encode_reply, _decode_reply),
+    0x81: (Identify, _nothing, lambda raw: Identify()),
+    0x82: (Start, _nothing, lambda raw: Start()),
+    0x83: (Stop, _nothing, lambda raw: Stop()),
+    0x84: (SetFrequencies, _encode_frequencies, _decode_frequencies),
+}
+TYPE_OF = {layout[0]: number for number, layout in _LAYOUTS.items()}
+
+
+def knows(number: int) -> bool:
+    """Whether this version of the protocol defines record type `number`."""
+    return number in _LAYOUTS
+
+
+def encode(payload: Payload, tag: int = 0) -> bytes:
+    """Encode one record, header and CRC included.
+
+    Raises
+    ------
+    FrameError
+        When the payload does not fit one record.
+    """
+    number = TYPE_OF[type(payload)]
+    body = _LAYOUTS[number][1](payload)
+    if len(body) > MAX_PAYLOAD:
+        raise FrameError(f'payload of {len(body)} bytes does not fit one record')
+    bare = HEADER.pack(MAGIC, VERSION, number, len(body), tag, 0)
+    head = bare[:10] + struct.pack('<H', header_check(bare))
+    raw = head + body
+    return raw + CRC.pack(zlib.crc32(raw))
+
+
+def header_check(head: bytes | memoryview) -> int:
+    """Check value of a header: the low half of the CRC-32 of its first ten bytes."""
+    return zlib.crc32(head[:10]) & 0xFFFF
+
+
+def decode_payload(number: int, raw: memoryview) -> Payload:
+    """Decode the payload of a record whose CRC was right.
+
+    Raises
+    ------
+    FrameError
+        When its content breaks the layout of its type, or its type is unknown.
+    """
+    if number not in _LAYOUTS:
+        raise FrameError(f'unknown record type {number:#04x}')
+    try:
+        return _LAYOUTS[number][2](raw)
+    except (struct.error, ValueError) as error:
+        raise FrameError(f'record type {number:#04x}: {error}') from error
