@@ -238,13 +238,17 @@ class MessageDecoder:
         decoder = self._decoders.get(message.schema.id)
         try:
             if decoder is None:
-                decoder = self._factory.decoder_for(message.channel.message_encoding, message.schema)
+                decoder = self._factory.decoder_for(
+                    message.channel.message_encoding, message.schema
+                )
                 self._decoders[message.schema.id] = decoder
             if decoder is None:
                 raise BagError(f'{message.topic}: no decoder for {message.type_name}')
             return decoder(message.data)
         except (*_BROKEN, TypeError, AttributeError) as error:
-            raise BagError(f'{message.topic}: {message.type_name} does not decode: {error}') from error
+            raise BagError(
+                f'{message.topic}: {message.type_name} does not decode: {error}'
+            ) from error
 
 
 def stamp_ns(message: Any) -> int:
@@ -280,7 +284,9 @@ class _Collector:
         cloud = self.decoder.decode(raw)
         fields = [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields]
         width = int(cloud.width) * int(cloud.height)
-        points = decode_flux(fields, cloud.point_step, width, bytes(cloud.data), cloud.is_bigendian)
+        points = decode_flux(
+            fields, cloud.point_step, width, bytes(cloud.data), cloud.is_bigendian
+        )
         stamp = stamp_ns(cloud)
         if stamp == 0:
             raise LayoutError('stamp zero')

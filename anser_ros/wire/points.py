@@ -89,7 +89,9 @@ def _records(
         raise LayoutError(f'point_step {point_step} and width {width} make no cloud')
     size = memoryview(data).nbytes
     if size != point_step * width:
-        raise LayoutError(f'{width} points of {point_step} bytes need {point_step * width} bytes, got {size}')
+        raise LayoutError(
+            f'{width} points of {point_step} bytes need {point_step * width} bytes, got {size}'
+        )
     return np.frombuffer(data, dtype=_record_type(fields, point_step, big_endian), count=width)
 
 
@@ -147,7 +149,9 @@ def decode_flux(
 
 def flux_fields(n_emitters: int) -> tuple[list[PointFieldTuple], int]:
     """Fields and point_step of the packed flux layout (92 bytes with eight emitters)."""
-    fields = [(name, 4 * i, FLOAT32, 1) for i, name in enumerate(('x', 'y', 'z', 'nx', 'ny', 'nz'))]
+    fields = [
+        (name, 4 * i, FLOAT32, 1) for i, name in enumerate(('x', 'y', 'z', 'nx', 'ny', 'nz'))
+    ]
     fields += [('channel', 24, UINT16, 1), ('flags', 26, UINT16, 1)]
     for k in range(n_emitters):
         fields.append((f'coil{k}_re', 28 + 8 * k, FLOAT32, 1))

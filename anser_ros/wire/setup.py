@@ -113,7 +113,9 @@ def _number(value: Any, where: str, low: float = -math.inf, high: float = math.i
         raise SetupError(f'setup: {where} must be a number, got {value!r}')
     number = float(value)
     if not math.isfinite(number) or not low <= number <= high:
-        raise SetupError(f'setup: {where} must be finite and in [{low:g}, {high:g}], got {value!r}')
+        raise SetupError(
+            f'setup: {where} must be finite and in [{low:g}, {high:g}], got {value!r}'
+        )
     return number
 
 
@@ -167,7 +169,9 @@ def _parse_coil(item: Any, where: str) -> Coil:
         name=_name(_take(coil, 'name', where), f'{where}.name'),
         centre_m=_vector(_take(coil, 'centre_m', where), f'{where}.centre_m'),
         rotation_deg=_number(coil.get('rotation_deg', 0.0), f'{where}.rotation_deg'),
-        frequency_hz=_number(_take(coil, 'frequency_hz', where), f'{where}.frequency_hz', 1e-3, 1e9),
+        frequency_hz=_number(
+            _take(coil, 'frequency_hz', where), f'{where}.frequency_hz', 1e-3, 1e9
+        ),
     )
 
 
@@ -187,7 +191,9 @@ def _parse_sensor(item: Any, where: str) -> SensorSpec:
     sensor = _mapping(item, where)
     channel = _take(sensor, 'channel', where)
     if isinstance(channel, bool) or not isinstance(channel, int) or not 0 <= channel <= 0xFFFF:
-        raise SetupError(f'setup: {where}.channel must be an integer in [0, 65535], got {channel!r}')
+        raise SetupError(
+            f'setup: {where}.channel must be an integer in [0, 65535], got {channel!r}'
+        )
     return SensorSpec(
         channel=channel,
         name=_name(_take(sensor, 'name', where), f'{where}.name'),
@@ -232,11 +238,15 @@ def parse_setup(text: str) -> Setup:
     _unique([sensor.name for sensor in parsed], 'sensor')
     tools = [sensor for sensor in parsed if sensor.body != FIELD_GENERATOR]
     bodies = list(dict.fromkeys(sensor.body for sensor in tools))
-    _unique([topic_of(name) for name in [s.name for s in tools] + bodies], 'topic of sensor or body')
+    _unique(
+        [topic_of(name) for name in [s.name for s in tools] + bodies], 'topic of sensor or body'
+    )
     known = ('schema', 'frame_id', 'flux_rate_hz', 'flux_unit', 'emitter', 'sensors')
     return Setup(
         frame_id=_name(root.get('frame_id', FIELD_GENERATOR), 'frame_id'),
-        flux_rate_hz=_number(_take(root, 'flux_rate_hz', 'the document'), 'flux_rate_hz', 1e-3, 1e6),
+        flux_rate_hz=_number(
+            _take(root, 'flux_rate_hz', 'the document'), 'flux_rate_hz', 1e-3, 1e6
+        ),
         emitter=_parse_emitter(_take(root, 'emitter', 'the document')),
         sensors=parsed,
         extra={k: v for k, v in root.items() if k not in known},

@@ -1,0 +1,76 @@
+"""Measured fluxes of the sensors on one body, with the pose that another instrument gave it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.physics.pose_track import PoseTrack
+from anser_ros.physics.sensor import SensorTable
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """F frames of the S sensors on one body, K emitters.
+
+    Attributes
+    ----------
+    body : str
+        ``fg`` for reference sensors; their pose is the identity.
+    sensors : SensorTable
+    time : ndarray, shape (F,)
+        s since the session's first stamp, on the flux clock.
+    flux : ndarray, shape (F, S, K), complex
+        T; finite only where ``valid``.
+    valid : ndarray of bool, shape (F, S)
+        False where the value is missing, not finite or flagged.
+    position : ndarray, shape (F, 3)
+        m, frame fg; NaN where ``has_pose`` is False.
+    rotation : ndarray, shape (F, 3, 3)
+    has_pose : ndarray of bool, shape (F,)
+    track : PoseTrack or None
+        The pose stream itself, on the same time axis, for effects that shift the clocks.
+    """
+
+    body: str
+    sensors: SensorTable
+    time: Array
+    flux: ComplexArray
+    valid: NDArray[np.bool_]
+    position: Array
+    rotation: Array
+    has_pose: NDArray[np.bool_]
+    track: PoseTrack | None = None
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Mask (F, S) of the values that have a pose and are valid."""
+        return np.asarray(self.valid & self.has_pose[:, None])
+
+    def frames(self, rows: NDArray[np.generic]) -> 'Measurements':
+        """The frames named by index or mask."""
+        return replace(
+            self,
+            time=self.time[rows],
+            flux=self.flux[rows],
+            valid=self.valid[rows],
+            position=self.position[rows],
+            rotation=self.rotation[rows],
+            has_pose=self.has_pose[rows],
+        )
+
+    def sensors_only(self, rows: NDArray[np.generic]) -> 'Measurements':
+        """The sensors named by index or mask."""
+        return replace(
+            self,
+            sensors=self.sensors.select(rows),
+            flux=self.flux[:, rows],
+            valid=self.valid[:, rows],
+        )
+
+    def placed(self) -> tuple[Array, Array]:
+        """Sensor centres and axes in fg, each of shape (F, S, 3)."""
+        return self.sensors.placed(self.position, self.rotation)

@@ -1,0 +1,209 @@
+"""The field model that everything shares: virtual dipoles, a column of moments for each emitter."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import ModelFileError
+from anser_ros.physics.dipole import flux_basis
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+SCHEMA = 'anser_model/1'
+
+
+@dataclass(frozen=True)
+class EffectRecord:
+    """One effect that a model corrects: its name (interfaces, section 6) and parameters in SI units."""
+
+    name: str
+    parameters: Mapping[str, Any]
+    uncertainty: Mapping[str, Any] = field(default_factory=dict)
+    evidence: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FieldModel:
+    """Dipoles that stand for the field generator and everything that bends its field.
+
+    Attributes
+    ----------
+    positions, directions : ndarray, shape (N, 3)
+        m and unit vectors, frame fg. A dipole with three free components takes three rows.
+    moments : ndarray, shape (N, K), complex
+        A m^2 at each emitter's nominal current.
+    emitters : tuple of str, length K
+    frequencies_hz : tuple of float, length K
+    flux_error_t : float
+        Standard deviation, T a phasor component, of what the model itself leaves unexplained in the
+        volume that it was fitted in (held-out, with noise and pose jitter taken off).
+    modes : ndarray, shape (R, N, K), complex, or None
+        Low-rank factor of the moments' covariance: the field's uncertainty is the sum of the squares
+        of the R fields that these moments make (real and imaginary part of a mode vary together).
+    effects : tuple of EffectRecord
+        Corrections of measured fluxes, sensors or the optical frame that belong to this model.
+        Effects on the field itself are already in the dipoles.
+    provenance : mapping
+        Where the model comes from, with its held-out error.
+    """
+
+    positions: Array
+    directions: Array
+    moments: ComplexArray
+    emitters: tuple[str, ...]
+    frequencies_hz: tuple[float, ...]
+    flux_error_t: float = 0.0
+    modes: ComplexArray | None = None
+    effects: tuple[EffectRecord, ...] = ()
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n, k = self.positions.shape[0], len(self.emitters)
+        if self.positions.shape != (n, 3) or self.directions.shape != (n, 3) or n == 0:
+            raise ModelFileError(
+                f'model: positions {self.positions.shape} and directions {self.directions.shape} '
+                'must both be (N, 3) with N of at least 1'
+            )
+        if self.moments.shape != (n, k) or len(self.frequencies_hz) != k:
+            raise ModelFileError(
+                f'model: moments {self.moments.shape} and {len(self.frequencies_hz)} frequencies '
+                f'must fit {n} dipoles and {k} emitters'
+            )
+        if self.modes is not None and self.modes.shape[1:] != (n, k):
+            raise ModelFileError(f'model: modes {self.modes.shape} must be (R, {n}, {k})')
+
+    def flux(self, points: Array, axes: Array, lengths: Array | None = None) -> ComplexArray:
+        """Flux of each sensor and emitter, T: sensors of shape (..., 3) give (..., K)."""
+        flat = points.reshape(-1, 3)
+        spans = None if lengths is None else np.broadcast_to(lengths, points.shape[:-1]).ravel()
+        basis = flux_basis(flat, axes.reshape(-1, 3), spans, self.positions, self.directions)
+        return np.asarray((basis @ self.moments).reshape(*points.shape[:-1], -1))
+
+    def with_dipoles(
+        self, positions: Array, directions: Array, moments: ComplexArray
+    ) -> 'FieldModel':
+        """This model with further dipoles added (metal, for example); uncertainty modes keep."""
+        modes = self.modes
+        if modes is not None:
+            pad = np.zeros((modes.shape[0], positions.shape[0], modes.shape[2]), dtype=complex)
+            modes = np.concatenate([modes, pad], axis=1)
+        return replace(
+            self,
+            positions=np.concatenate([self.positions, positions]),
+            directions=np.concatenate([self.directions, directions]),
+            moments=np.concatenate([self.moments, moments]),
+            modes=modes,
+        )
+
+
+def to_document(model: FieldModel) -> dict[str, Any]:
+    """The model as plain data, ready for a text file."""
+    table = np.concatenate(
+        [
+            model.positions,
+            model.directions,
+            np.stack([model.moments.real, model.moments.imag], axis=2).reshape(
+                len(model.moments), -1
+            ),
+        ],
+        axis=1,
+    )
+    document: dict[str, Any] = {
+        'schema': SCHEMA,
+        'frame_id': 'fg',
+        'units': {
+            'position': 'm',
+            'direction': '1',
+            'moment': 'A m^2',
+            'frequency': 'Hz',
+            'flux': 'T',
+        },
+        'emitters': [
+            {'name': name, 'frequency_hz': frequency}
+            for name, frequency in zip(model.emitters, model.frequencies_hz, strict=True)
+        ],
+        'provenance': dict(model.provenance),
+        'flux_error_t': model.flux_error_t,
+        'effects': [
+            {
+                'name': effect.name,
+                'parameters': dict(effect.parameters),
+                'uncertainty': dict(effect.uncertainty),
+                'evidence': dict(effect.evidence),
+            }
+            for effect in model.effects
+        ],
+        'columns': ['x', 'y', 'z', 'ux', 'uy', 'uz']
+        + [f'm{k}_{part}' for k in range(len(model.emitters)) for part in ('re', 'im')],
+        'dipoles': table.tolist(),
+    }
+    if model.modes is not None:
+        parts = np.stack([model.modes.real, model.modes.imag], axis=3)
+        document['modes'] = parts.reshape(*model.modes.shape[:2], -1).tolist()
+    return document
+
+
+def _table(value: Any, width: int, what: str) -> Array:
+    try:
+        table = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ModelFileError(f'model: {what} is no table of numbers') from error
+    if table.ndim != 2 or table.shape[1] != width or table.shape[0] == 0:
+        raise ModelFileError(f'model: {what} must be rows of {width} numbers, got {table.shape}')
+    if not np.isfinite(table).all():
+        raise ModelFileError(f'model: {what} holds values that are not finite')
+    return table
+
+
+def _effect(item: Any) -> EffectRecord:
+    if not isinstance(item, dict) or not isinstance(item.get('name'), str):
+        raise ModelFileError(f'model: an effect needs a name, got {item!r}')
+    parts = [item.get(key) or {} for key in ('parameters', 'uncertainty', 'evidence')]
+    if not all(isinstance(part, dict) for part in parts):
+        raise ModelFileError(f'model: effect {item["name"]!r} needs mappings of parameters')
+    return EffectRecord(item['name'], *parts)
+
+
+def from_document(document: Any) -> FieldModel:
+    """The model in a document; raises `ModelFileError` naming the rule that is broken."""
+    if not isinstance(document, dict) or document.get('schema') != SCHEMA:
+        got = document.get('schema') if isinstance(document, dict) else type(document).__name__
+        raise ModelFileError(f'model: schema must be {SCHEMA!r}, got {got!r}')
+    emitters = document.get('emitters')
+    if not isinstance(emitters, list) or not emitters:
+        raise ModelFileError('model: emitters must be a list of at least one')
+    try:
+        names = tuple(str(item['name']) for item in emitters)
+        frequencies = tuple(float(item['frequency_hz']) for item in emitters)
+        flux_error = float(document.get('flux_error_t', 0.0))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ModelFileError(f'model: an emitter or flux_error_t is malformed: {error}') from error
+    k = len(names)
+    table = _table(document.get('dipoles'), 6 + 2 * k, 'dipoles')
+    norms = np.linalg.norm(table[:, 3:6], axis=1)
+    if np.abs(norms - 1.0).max() > 1e-6:
+        raise ModelFileError('model: a dipole direction is no unit vector')
+    modes = None
+    if document.get('modes'):
+        parts = [_table(mode, 2 * k, 'modes') for mode in document['modes']]
+        if any(part.shape[0] != table.shape[0] for part in parts):
+            raise ModelFileError('model: every mode needs one row a dipole')
+        modes = np.array([part[:, 0::2] + 1j * part[:, 1::2] for part in parts])
+    effects = document.get('effects') or []
+    if not isinstance(effects, list):
+        raise ModelFileError('model: effects must be a list')
+    return FieldModel(
+        positions=table[:, :3].copy(),
+        directions=table[:, 3:6].copy(),
+        moments=np.ascontiguousarray(table[:, 6::2] + 1j * table[:, 7::2]),
+        emitters=names,
+        frequencies_hz=frequencies,
+        flux_error_t=flux_error,
+        modes=modes,
+        effects=tuple(_effect(item) for item in effects),
+        provenance=document.get('provenance') or {},
+    )

@@ -1,0 +1,131 @@
+"""A recorded session as arrays: a bag's documents turned into measurements on one time axis."""
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import BagError
+from anser_ros.fitting.measurements import Measurements
+from anser_ros.physics.pose_track import PoseTrack
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.wire.bag import Bag, FluxStream, PoseStream, read_bag
+from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
+
+NANO = 1e-9
+LONGEST_OPTICAL_GAP_S = 0.25
+"""An optical tracker at 60 Hz that misses more than a quarter of a second has no pose between."""
+
+
+@dataclass(frozen=True)
+class Session:
+    """One recording.
+
+    Attributes
+    ----------
+    path : str
+    setup : Setup
+    start_ns : int
+        The stamp at time 0 of all measurements.
+    tools : tuple of Measurements
+        One a body that moves, in the order of the setup.
+    reference : Measurements or None
+    lost : str
+        What could not be read, in words; empty when nothing is missing.
+    """
+
+    path: str
+    setup: Setup
+    start_ns: int
+    tools: tuple[Measurements, ...]
+    reference: Measurements | None
+    lost: str = ''
+
+
+def sensor_table(specs: tuple[SensorSpec, ...]) -> SensorTable:
+    """The setup's sensors as arrays."""
+    return SensorTable(
+        channel=np.array([s.channel for s in specs], dtype=np.int64),
+        name=tuple(s.name for s in specs),
+        body=tuple(s.body for s in specs),
+        position=np.array([s.position_m for s in specs], dtype=np.float64).reshape(-1, 3),
+        axis=np.array([s.axis for s in specs], dtype=np.float64).reshape(-1, 3),
+        length=np.array([s.length_m for s in specs], dtype=np.float64),
+    )
+
+
+def pose_track(stream: PoseStream, start_ns: int) -> PoseTrack:
+    """A pose stream on the session's time axis."""
+    time = (stream.stamp_ns - start_ns) * NANO
+    return PoseTrack(np.asarray(time, dtype=np.float64), stream.position, stream.quaternion)
+
+
+def _columns(
+    stream: FluxStream, sensors: SensorTable
+) -> tuple[NDArray[np.complex128], NDArray[np.bool_]]:
+    """Flux (F, S, K) and validity (F, S) in the order of the sensor table."""
+    flux = np.full((stream.stamp_ns.size, len(sensors), stream.flux.shape[2]), np.nan, complex)
+    valid = np.zeros(flux.shape[:2], dtype=bool)
+    place = {int(channel): i for i, channel in enumerate(stream.channel)}
+    for column, channel in enumerate(sensors.channel.tolist()):
+        if channel in place:
+            flux[:, column] = stream.flux[:, place[channel]]
+            finite = np.isfinite(flux[:, column]).all(axis=1)
+            valid[:, column] = (stream.flags[:, place[channel]] == 0) & finite
+    return flux, valid
+
+
+def _tool(
+    stream: FluxStream, sensors: SensorTable, body: str, bag: Bag, start: int
+) -> Measurements:
+    flux, valid = _columns(stream, sensors)
+    time = np.asarray((stream.stamp_ns - start) * NANO, dtype=np.float64)
+    count = time.size
+    position, rotation = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
+    has_pose, track = np.zeros(count, dtype=bool), None
+    if body in bag.optical:
+        track = pose_track(bag.optical[body], start)
+        position, rotation, has_pose = track.at(time, LONGEST_OPTICAL_GAP_S)
+    return Measurements(body, sensors, time, flux, valid, position, rotation, has_pose, track)
+
+
+def _reference(stream: FluxStream, sensors: SensorTable, start: int) -> Measurements:
+    flux, valid = _columns(stream, sensors)
+    time = np.asarray((stream.stamp_ns - start) * NANO, dtype=np.float64)
+    count = time.size
+    return Measurements(
+        FIELD_GENERATOR, sensors, time, flux, valid, np.zeros((count, 3)),
+        np.broadcast_to(np.eye(3), (count, 3, 3)), np.ones(count, dtype=bool),
+    )  # fmt: skip
+
+
+def session_of(bag: Bag) -> Session:
+    """Turn a bag into arrays.
+
+    Raises
+    ------
+    BagError
+        When the fluxes' number of emitters is not the setup's.
+    """
+    streams = [stream for stream in (bag.tool, bag.reference) if stream is not None]
+    n_emitters = len(bag.setup.emitter.coils)
+    for stream in streams:
+        if stream.flux.shape[2] != n_emitters:
+            raise BagError(
+                f'{bag.path}: the setup has {n_emitters} emitters, the fluxes {stream.flux.shape[2]}'
+            )
+    start = min(int(stream.stamp_ns[0]) for stream in streams)
+    tools, reference = [], None
+    table = sensor_table(bag.setup.tool_sensors)
+    if bag.tool is not None:
+        for body in bag.setup.bodies:
+            tools.append(_tool(bag.tool, table.of_body(body), body, bag, start))
+    if bag.reference is not None and bag.setup.reference_sensors:
+        reference = _reference(bag.reference, sensor_table(bag.setup.reference_sensors), start)
+    return Session(bag.path, bag.setup, start, tuple(tools), reference, bag.lost)
+
+
+def load_session(path: str | os.PathLike[str]) -> Session:
+    """Read a bag as a session; raises `BagError`."""
+    return session_of(read_bag(path))

@@ -1,0 +1,39 @@
+"""Model files: YAML text, read and written as plain data (what it means is the field model's)."""
+
+import os
+import tempfile
+from typing import Any
+
+import yaml
+
+from anser_ros.errors import ModelFileError
+
+_LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+_DUMPER = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
+
+
+def read_document(path: str | os.PathLike[str]) -> Any:
+    """Parse a model file; raises `ModelFileError` when it can't be read or is no YAML."""
+    name = os.fspath(path)
+    try:
+        with open(name, encoding='utf-8') as stream:
+            return yaml.load(stream, Loader=_LOADER)
+    except (OSError, UnicodeError) as error:
+        raise ModelFileError(f'{name}: {error}') from error
+    except (yaml.YAMLError, ValueError) as error:
+        raise ModelFileError(f'{name}: not YAML: {" ".join(str(error).split())}') from error
+
+
+def write_document(path: str | os.PathLike[str], document: Any) -> None:
+    """Write a model file whole or not at all; raises `ModelFileError` when it can't be written."""
+    name = os.fspath(path)
+    try:
+        folder = os.path.dirname(os.path.abspath(name))
+        os.makedirs(folder, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=folder, suffix='.tmp')
+        with os.fdopen(handle, 'w', encoding='utf-8') as stream:
+            yaml.dump(document, stream, Dumper=_DUMPER, sort_keys=False, width=4000)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, name)
+    except OSError as error:
+        raise ModelFileError(f'{name}: {error}') from error
