@@ -128,13 +128,13 @@ class SampleBlock:
     sequence : number of the block since START, modulo 2^32
     timestamp_ticks : device time of the first sample
     codes : ndarray, shape (n, C), int16, ADC codes, read-only view into the received bytes
-    flags : conditions of this block
+    flags : bits of `SamplesFlag`
     """
 
     sequence: int
     timestamp_ticks: int
     codes: NDArray[np.int16]
-    flags: SamplesFlag = SamplesFlag(0)
+    flags: int = 0
 
 
 @dataclass(frozen=True)
@@ -275,9 +275,7 @@ def check_hello(hello: Hello) -> None:
 
 def _encode_samples(block: SampleBlock) -> bytes:
     n, columns = block.codes.shape
-    head = _SAMPLES.pack(
-        block.sequence, block.timestamp_ticks, n, columns, int(block.flags), 0
-    )
+    head = _SAMPLES.pack(block.sequence, block.timestamp_ticks, n, columns, block.flags, 0)
     return head + np.ascontiguousarray(block.codes, dtype='<i2').tobytes()
 
 
@@ -286,7 +284,7 @@ def _decode_samples(raw: memoryview) -> SampleBlock:
     if n * columns == 0 or len(raw) != _SAMPLES.size + 2 * n * columns:
         raise FrameError(f'block of {n} x {columns} samples in {len(raw)} bytes')
     codes = np.frombuffer(raw, '<i2', n * columns, _SAMPLES.size).reshape(n, columns)
-    return SampleBlock(sequence, ticks, codes, SamplesFlag(flags & 1))
+    return SampleBlock(sequence, ticks, codes, flags)
 
 
 def _encode_status(status: Status) -> bytes:

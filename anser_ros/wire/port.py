@@ -1,0 +1,303 @@
+"""The control unit's serial port: a reader thread that survives cables, and names every fault.
+
+The thread reads, finds records and queues them; it never waits for the receiver. A receiver that
+is too slow loses whole blocks, counted as `overrun_blocks`. The port is reopened with growing
+pauses after an unplugged cable.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from enum import Enum
+
+import serial
+from serial.tools import list_ports
+
+from anser_ros.errors import PortError
+from anser_ros.wire.frame_reader import FrameReader
+from anser_ros.wire.frames import (
+    MAX_PAYLOAD,
+    Hello,
+    Payload,
+    Record,
+    SampleBlock,
+    encode,
+)
+
+DEFAULT_BAUD = 12_000_000
+_READ_TIMEOUT_S = 0.05
+_WRITE_TIMEOUT_S = 0.2
+_SHORTEST_PAYLOAD = 4096
+_GARBAGE_BYTES = 256
+
+
+class PortState(Enum):
+    """What the port is doing now; the value is the words for an operator."""
+
+    CLOSED = 'closed'
+    ABSENT = 'cannot open the port'
+    WAITING = 'open, nothing received yet'
+    RECEIVING = 'receiving records'
+    WRONG_BAUD = 'bytes arrive but no records: check the baud rate'
+    SILENT = 'nothing arrives'
+
+
+@dataclass
+class PortCounters:
+    """Faults since the port was started; each is an event unless the name says otherwise."""
+
+    gap_blocks: int = 0
+    wrong_baud: int = 0
+    silence: int = 0
+    unplug: int = 0
+    overrun_blocks: int = 0
+    open_failures: int = 0
+    opens: int = 0
+    received_bytes: int = 0
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Records that one read completed.
+
+    Attributes
+    ----------
+    arrival_ns : monotonic host time right after the read
+    records : in the order of the stream; empty when the connection began or ended
+    connected : False tells that the connection ended
+    """
+
+    arrival_ns: int
+    records: tuple[Record, ...]
+    connected: bool = True
+
+
+class ControlUnitPort:
+    """Reads the control unit in a thread of its own.
+
+    Parameters
+    ----------
+    device : device path, or any pyserial URL
+    baud : line speed; without meaning on USB and pseudo-terminals
+    silence_s : no byte for so long is a fault; a hello comes once a second even when idle
+    queue_batches : reads that may wait for the receiver
+    pause_s, longest_pause_s : first and longest pause between attempts to open, doubled each time
+    """
+
+    def __init__(
+        self,
+        device: str,
+        *,
+        baud: int = DEFAULT_BAUD,
+        silence_s: float = 1.5,
+        queue_batches: int = 512,
+        pause_s: float = 0.1,
+        longest_pause_s: float = 2.0,
+    ) -> None:
+        self.device = device
+        self.counters = PortCounters()
+        self.state = PortState.CLOSED
+        self.reason = ''
+        self._baud = baud
+        self._silence_s = silence_s
+        self._queue_batches = queue_batches
+        self._pauses = (pause_s, longest_pause_s)
+        self._reader = FrameReader()
+        self._queue: queue.SimpleQueue[Batch] = queue.SimpleQueue()
+        self._commands: deque[bytes] = deque(maxlen=64)
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._next_sequence: int | None = None
+        self._tag = 0
+
+    def start(self) -> None:
+        """Start the reader thread; the port may appear later.
+
+        Raises
+        ------
+        PortError
+            When it was started before.
+        """
+        if self._thread is not None:
+            raise PortError(f'the port {self.device} was started before')
+        self._thread = threading.Thread(target=self._run, name='control_unit_port', daemon=True)
+        self._thread.start()
+
+    def stop(self, timeout_s: float = 1.0) -> None:
+        """End the reader thread and close the port."""
+        self._stopping.set()
+        if self._thread is not None:
+            self._thread.join(timeout_s)
+
+    def get(self, timeout_s: float) -> Batch | None:
+        """Wait for the next batch; None when none came in time."""
+        try:
+            return self._queue.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+
+    def send(self, command: Payload) -> int:
+        """Queue a command for the reader thread to write; returns its tag.
+
+        It is lost when the port closes before; whoever sends it watches for the reply.
+        """
+        self._tag = self._tag % 0xFFFF + 1
+        self._commands.append(encode(command, self._tag))
+        return self._tag
+
+    def fault_counters(self) -> dict[str, int]:
+        """All counters by name, the frame reader's included."""
+        ours = {field.name: getattr(self.counters, field.name) for field in fields(self.counters)}
+        return ours | self._reader.counters.as_dict()
+
+    @property
+    def last_refusal(self) -> str:
+        """Why the last refused record was refused."""
+        return self._reader.last_refusal
+
+    def _run(self) -> None:
+        pause, longest = self._pauses
+        wait = pause
+        while not self._stopping.is_set():
+            try:
+                port = _open(self.device, self._baud)
+            except PortError as error:
+                self.counters.open_failures += 1
+                self.state, self.reason = PortState.ABSENT, str(error)
+                self._stopping.wait(wait)
+                wait = min(2 * wait, longest)
+                continue
+            opened = time.monotonic()
+            self.counters.opens += 1
+            self.state, self.reason = PortState.WAITING, ''
+            self._reader.reset()
+            self._reader.max_payload = MAX_PAYLOAD
+            self._next_sequence = None
+            self._commands.clear()
+            self._queue.put(Batch(time.monotonic_ns(), ()))
+            try:
+                self._read(port)
+            except (serial.SerialException, OSError, TypeError) as error:
+                # pyserial raises TypeError when the descriptor vanishes between two of its calls
+                if not self._stopping.is_set():
+                    self.counters.unplug += 1
+                    self.state, self.reason = PortState.ABSENT, f'unplugged: {error}'
+            finally:
+                _close(port)
+                self._queue.put(Batch(time.monotonic_ns(), (), connected=False))
+            wait = pause if time.monotonic() - opened > longest else min(2 * wait, longest)
+            self._stopping.wait(wait)
+        self.state = PortState.CLOSED
+
+    def _read(self, port: serial.SerialBase) -> None:
+        last_byte = period_start = time.monotonic()
+        period_bytes = 0
+        reader = self._reader
+        period_records = reader.counters.records
+        while not self._stopping.is_set():
+            while self._commands:
+                port.write(self._commands.popleft())
+            data = port.read(port.in_waiting or 1)
+            now = time.monotonic()
+            if data:
+                last_byte = now
+                period_bytes += len(data)
+                self.counters.received_bytes += len(data)
+                records = reader.feed(data)
+                if records:
+                    self.state = PortState.RECEIVING
+                    self._take(records)
+            elif now - last_byte > self._silence_s:
+                self.counters.silence += 1
+                self.state = PortState.SILENT
+                last_byte = now
+            if now - period_start > 1.0:
+                if period_bytes > _GARBAGE_BYTES and reader.counters.records == period_records:
+                    self.counters.wrong_baud += 1
+                    self.state = PortState.WRONG_BAUD
+                period_start, period_bytes = now, 0
+                period_records = reader.counters.records
+
+    def _take(self, records: list[Record]) -> None:
+        arrival_ns = time.monotonic_ns()
+        blocks = 0
+        for record in records:
+            payload = record.payload
+            if isinstance(payload, SampleBlock):
+                blocks += 1
+                self._count_gap(payload.sequence)
+            elif isinstance(payload, Hello):
+                self._reader.max_payload = max(_SHORTEST_PAYLOAD, payload.samples_size())
+        if self._queue.qsize() >= self._queue_batches:
+            self.counters.overrun_blocks += blocks
+            records = [r for r in records if not isinstance(r.payload, SampleBlock)]
+            if not records or self._queue.qsize() >= 2 * self._queue_batches:
+                return
+        self._queue.put(Batch(arrival_ns, tuple(records)))
+
+    def _count_gap(self, sequence: int) -> None:
+        if self._next_sequence is not None and sequence:
+            missing = (sequence - self._next_sequence) % 2**32
+            if missing < 2**31:
+                self.counters.gap_blocks += missing
+        self._next_sequence = (sequence + 1) % 2**32
+
+
+def _open(device: str, baud: int) -> serial.SerialBase:
+    try:
+        return serial.serial_for_url(
+            device,
+            baudrate=baud,
+            timeout=_READ_TIMEOUT_S,
+            write_timeout=_WRITE_TIMEOUT_S,
+            exclusive=True,
+        )
+    except (serial.SerialException, OSError, ValueError) as error:
+        raise PortError(f'cannot open {device}: {error}') from error
+
+
+def _close(port: serial.SerialBase) -> None:
+    with contextlib.suppress(serial.SerialException, OSError):
+        port.close()
+
+
+def find_port(
+    candidates: Iterable[str] | None = None, *, baud: int = DEFAULT_BAUD, listen_s: float = 1.5
+) -> str:
+    """Find the control unit's port by listening for its hello; nothing is written to any device.
+
+    Parameters
+    ----------
+    candidates : device paths to try; all serial ports of the computer by default
+    baud : line speed
+    listen_s : how long to listen to each; a hello comes once a second
+
+    Raises
+    ------
+    PortError
+        When no port carries a hello.
+    """
+    devices: list[str] = list(candidates or (port.device for port in list_ports.comports()))
+    for device in devices:
+        try:
+            port = _open(device, baud)
+        except PortError:
+            continue
+        reader = FrameReader()
+        end = time.monotonic() + listen_s
+        try:
+            while time.monotonic() < end:
+                records = reader.feed(port.read(port.in_waiting or 1))
+                if any(isinstance(record.payload, Hello) for record in records):
+                    return device
+        except (serial.SerialException, OSError):
+            continue
+        finally:
+            _close(port)
+    raise PortError(f'no control unit speaks on any of {len(devices)} serial ports')

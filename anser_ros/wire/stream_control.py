@@ -1,0 +1,100 @@
+"""Which command the control unit needs next, so that it streams what the host wants."""
+
+from __future__ import annotations
+
+from anser_ros.wire.frames import (
+    TYPE_OF,
+    Hello,
+    Identify,
+    Payload,
+    Record,
+    Reply,
+    ReplyCode,
+    SampleBlock,
+    SetFrequencies,
+    Start,
+)
+
+_REPEAT_NS = 500_000_000
+_TONE_TOLERANCE_HZ = 1.0
+
+
+class StreamControl:
+    """Follows the records of one connection and says what to send.
+
+    The order is: hello, right tones, samples. Each command is repeated every half second until the
+    control unit does what it asks; a refusal is kept as text and not repeated.
+
+    Parameters
+    ----------
+    frequencies_hz : drive tones that the setup document asks for
+    set_frequencies : whether the host may change the control unit's tones
+    """
+
+    def __init__(self, frequencies_hz: tuple[float, ...], *, set_frequencies: bool = True) -> None:
+        self._wanted = frequencies_hz
+        self._may_set = set_frequencies
+        self.hello: Hello | None = None
+        self.refusal = ''
+        self._refused = False
+        self._last_block_ns = 0
+        self._last_sent: dict[type, int] = {}
+
+    def reset(self) -> None:
+        """Begin a new connection."""
+        self.hello = None
+        self.refusal = ''
+        self._refused = False
+        self._last_block_ns = 0
+        self._last_sent.clear()
+
+    @property
+    def tones_agree(self) -> bool:
+        """Whether the control unit drives the tones of the setup document."""
+        return self.hello is not None and self._agree(self.hello)
+
+    def take(self, record: Record, arrival_ns: int) -> None:
+        """Note what a received record says."""
+        payload = record.payload
+        if isinstance(payload, SampleBlock):
+            self._last_block_ns = arrival_ns
+        elif isinstance(payload, Hello):
+            self.hello = payload
+            if self._agree(payload):
+                self.refusal = ''
+            elif not self._may_set or self._refused:
+                self.refusal = self.refusal or _disagreement(self._wanted, payload)
+        elif isinstance(payload, Reply) and payload.code is not ReplyCode.OK:
+            self.refusal = f'the control unit refused: {payload.code.name.lower()} {payload.text}'
+            if payload.command == TYPE_OF[SetFrequencies]:
+                self._refused = True
+
+    def due(self, now_ns: int) -> Payload | None:
+        """Return the command to send now, None when nothing is due."""
+        command: Payload
+        if self.hello is None:
+            command = Identify()
+        elif not self._agree(self.hello):
+            if not self._may_set or self._refused:
+                return None
+            command = SetFrequencies(self._wanted)
+        elif now_ns - self._last_block_ns > _REPEAT_NS:
+            command = Start()
+        else:
+            return None
+        if now_ns - self._last_sent.get(type(command), -_REPEAT_NS) < _REPEAT_NS:
+            return None
+        self._last_sent[type(command)] = now_ns
+        return command
+
+    def _agree(self, hello: Hello) -> bool:
+        return len(hello.frequencies_hz) == len(self._wanted) and all(
+            abs(have - want) <= _TONE_TOLERANCE_HZ
+            for have, want in zip(hello.frequencies_hz, self._wanted, strict=True)
+        )
+
+
+def _disagreement(wanted: tuple[float, ...], hello: Hello) -> str:
+    have = ', '.join(f'{tone:g}' for tone in hello.frequencies_hz)
+    want = ', '.join(f'{tone:g}' for tone in wanted)
+    return f'the control unit drives {have} Hz, the setup asks for {want} Hz'

@@ -1,0 +1,291 @@
+"""The port over real pseudo-terminals: every fault is survived, counted and named."""
+
+import contextlib
+import os
+import threading
+import time
+import tty
+
+import numpy as np
+import pytest
+
+from anser_ros.errors import PortError
+from anser_ros.wire.frame_reader import FrameReader
+from anser_ros.wire.frames import (
+    Channel,
+    ChannelKind,
+    Hello,
+    Identify,
+    Record,
+    Reply,
+    ReplyCode,
+    SampleBlock,
+    SetFrequencies,
+    Start,
+    encode,
+)
+from anser_ros.wire.port import ControlUnitPort, PortState, find_port
+from anser_ros.wire.stream_control import StreamControl
+
+TONES = (6000.0, 6170.0)
+HELLO = Hello(
+    'test unit',
+    40e3,
+    1e6,
+    40,
+    (Channel(0, ChannelKind.SENSE, 5.0), Channel(1, ChannelKind.CURRENT, 1.0)),
+    TONES,
+    (0.25, 0.25),
+)
+
+
+def block(sequence: int) -> bytes:
+    return encode(SampleBlock(sequence, sequence, np.full((40, 2), 7, np.int16)))
+
+
+class Wire:
+    """The far end of a cable: a pseudo-terminal behind a link that keeps its name."""
+
+    def __init__(self, link):
+        self.link = link
+        self.fds = ()
+        self.plug()
+
+    def plug(self):
+        self.master, slave = os.openpty()
+        tty.setraw(slave)
+        os.set_blocking(self.master, False)
+        self.fds = (self.master, slave)
+        with contextlib.suppress(FileNotFoundError):
+            self.link.unlink()
+        self.link.symlink_to(os.ttyname(slave))
+
+    def unplug(self):
+        for fd in self.fds:
+            os.close(fd)
+        self.fds = ()
+        self.link.unlink()
+
+    def write(self, data: bytes):
+        end = time.monotonic() + 2
+        while data and time.monotonic() < end:
+            try:
+                data = data[os.write(self.master, data) :]
+            except BlockingIOError:
+                time.sleep(0.001)
+        assert not data
+
+    def read(self, seconds: float = 1.0) -> bytes:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            try:
+                return os.read(self.master, 4096)
+            except BlockingIOError:
+                time.sleep(0.005)
+        return b''
+
+
+@pytest.fixture
+def wire(tmp_path):
+    cable = Wire(tmp_path / 'cu')
+    yield cable
+    if cable.fds:
+        cable.unplug()
+
+
+@pytest.fixture
+def port(wire):
+    reader = ControlUnitPort(str(wire.link), silence_s=0.2, pause_s=0.02, longest_pause_s=0.1)
+    reader.start()
+    assert wait(lambda: reader.state is PortState.WAITING)
+    yield reader
+    reader.stop()
+    assert reader.state is PortState.CLOSED
+
+
+def wait(condition, seconds: float = 3.0) -> bool:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if condition():
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def receive(port, count: int) -> list:
+    payloads = []
+    end = time.monotonic() + 3
+    while len(payloads) < count and time.monotonic() < end:
+        batch = port.get(0.1)
+        payloads += [record.payload for record in batch.records] if batch else []
+    return payloads
+
+
+def test_records_arrive_in_order(wire, port):
+    wire.write(encode(HELLO) + b''.join(block(k) for k in range(20)))
+    payloads = receive(port, 21)
+    assert payloads[0] == HELLO
+    assert [p.sequence for p in payloads[1:]] == list(range(20))
+    assert port.state is PortState.RECEIVING
+    assert port.fault_counters()['gap_blocks'] == 0
+
+
+def test_commands_reach_the_wire_with_their_tag(wire, port):
+    tag = port.send(SetFrequencies(TONES))
+    (record,) = FrameReader().feed(wire.read())
+    assert record == Record(SetFrequencies(TONES), tag)
+
+
+def test_unplugged_cable_is_counted_and_the_port_comes_back(wire, port):
+    wire.write(encode(HELLO))
+    assert receive(port, 1) == [HELLO]
+    wire.unplug()
+    assert wait(lambda: port.state is PortState.ABSENT)
+    assert port.counters.unplug == 1
+    assert wait(lambda: port.counters.open_failures > 1)
+    assert 'cannot open' in port.reason
+    wire.plug()
+    assert wait(lambda: port.counters.opens == 2)
+    wire.write(encode(HELLO))
+    assert receive(port, 1) == [HELLO]
+    assert port.state is PortState.RECEIVING
+
+
+def test_receiver_hears_of_the_connection_ending(wire, port):
+    wire.unplug()
+    ended = []
+    wait(lambda: ended.append(port.get(0.1)) or (ended[-1] and not ended[-1].connected))
+    assert not ended[-1].connected
+
+
+def test_gap_in_the_sequence_is_counted_in_blocks(wire, port):
+    wire.write(block(4) + block(5) + block(9))
+    assert len(receive(port, 3)) == 3
+    assert port.counters.gap_blocks == 3
+    wire.write(block(0) + block(1))
+    assert len(receive(port, 2)) == 2
+    assert port.counters.gap_blocks == 3, 'a restarted stream is no gap'
+
+
+def test_bad_crc_is_counted(wire, port):
+    raw = bytearray(block(0))
+    raw[40] ^= 1
+    wire.write(bytes(raw) + block(1))
+    assert [p.sequence for p in receive(port, 1)] == [1]
+    assert port.fault_counters()['bad_crc'] == 1
+
+
+def test_bytes_without_records_are_called_a_wrong_baud_rate(wire, port):
+    rng = np.random.default_rng(1)
+    end = time.monotonic() + 2.5
+    while port.counters.wrong_baud == 0 and time.monotonic() < end:
+        wire.write(bytes(rng.integers(0, 256, 500, dtype=np.uint8)))
+        time.sleep(0.05)
+    assert port.counters.wrong_baud == 1
+    assert port.state is PortState.WRONG_BAUD
+    assert 'baud' in port.state.value
+
+
+def test_silence_is_counted_and_ends_with_the_next_record(wire, port):
+    wire.write(encode(HELLO))
+    assert wait(lambda: port.counters.silence >= 2)
+    assert port.state is PortState.SILENT
+    wire.write(encode(HELLO))
+    assert wait(lambda: port.state is PortState.RECEIVING)
+
+
+def test_slow_receiver_loses_blocks_but_no_hello_and_stops_nobody(wire):
+    port = ControlUnitPort(str(wire.link), queue_batches=3)
+    port.start()
+    assert wait(lambda: port.state is PortState.WAITING)
+    try:
+        for sequence in range(30):
+            wire.write(block(sequence))
+            assert wait(lambda n=sequence: port.fault_counters()['records'] == n + 1)
+        wire.write(encode(HELLO))
+        assert wait(lambda: port.fault_counters()['records'] == 31)
+        assert port.counters.overrun_blocks >= 26
+        batches = iter(lambda: port.get(0.05), None)
+        assert HELLO in [record.payload for batch in batches for record in batch.records]
+    finally:
+        port.stop()
+
+
+def test_port_can_be_started_once(port):
+    with pytest.raises(PortError, match='started before'):
+        port.start()
+
+
+def test_device_that_does_not_exist_is_tried_again_and_named(tmp_path):
+    port = ControlUnitPort(str(tmp_path / 'nothing'), pause_s=0.01, longest_pause_s=0.02)
+    port.start()
+    assert wait(lambda: port.counters.open_failures >= 3)
+    assert port.state is PortState.ABSENT
+    assert 'nothing' in port.reason
+    port.stop()
+
+
+def test_the_right_port_is_found_by_listening_only(wire, tmp_path):
+    other = Wire(tmp_path / 'gps')
+    try:
+        other.write(b'$GPGGA,123519,4807.038,N*47\r\n')
+        wire.write(encode(HELLO))
+        # pyserial empties the buffer when it opens a port, so the hello must come again
+        found = []
+
+        def search():
+            found.append(find_port([str(other.link), str(wire.link)], listen_s=0.5))
+
+        thread = threading.Thread(target=search)
+        thread.start()
+        while thread.is_alive():
+            wire.write(encode(HELLO))
+            time.sleep(0.05)
+        assert found == [str(wire.link)]
+        assert wire.read(0.05) == b'' and other.read(0.05) == b''
+    finally:
+        other.unplug()
+
+
+def test_no_port_speaks(wire, tmp_path):
+    with pytest.raises(PortError, match='on any of 2'):
+        find_port([str(wire.link), str(tmp_path / 'absent')], listen_s=0.1)
+
+
+SECOND = 1_000_000_000
+
+
+def test_control_asks_for_hello_then_tones_then_samples():
+    control = StreamControl((6000.0, 6200.0))
+    now = SECOND
+    assert control.due(now) == Identify()
+    assert control.due(now + SECOND // 10) is None, 'not repeated at once'
+    assert control.due(now + SECOND) == Identify()
+    control.take(Record(HELLO), now)
+    assert not control.tones_agree
+    assert control.due(now) == SetFrequencies((6000.0, 6200.0))
+    right = Hello(**{**HELLO.__dict__, 'frequencies_hz': (6000.0, 6199.99)})
+    control.take(Record(right), now)
+    assert control.tones_agree
+    assert control.due(now) == Start()
+    control.take(Record(SampleBlock(0, 0, np.zeros((1, 2), np.int16))), now)
+    assert control.due(now + SECOND // 4) is None
+    assert control.due(now + 2 * SECOND) == Start(), 'a stream that stopped is started again'
+    control.reset()
+    assert control.due(now + 3 * SECOND) == Identify()
+
+
+def test_control_keeps_a_refusal_and_does_not_insist():
+    control = StreamControl((6000.0,))
+    control.take(Record(HELLO), 0)
+    assert control.due(SECOND) == SetFrequencies((6000.0,))
+    control.take(Record(Reply(0x84, ReplyCode.BAD_ARGUMENT, 'two coils')), SECOND)
+    assert 'two coils' in control.refusal
+    assert control.due(3 * SECOND) is None
+
+
+def test_control_that_may_not_set_tones_says_what_differs():
+    control = StreamControl((6000.0, 7000.0), set_frequencies=False)
+    control.take(Record(HELLO), 0)
+    assert control.due(SECOND) is None
+    assert '6170' in control.refusal and '7000' in control.refusal
