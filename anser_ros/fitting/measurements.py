@@ -27,6 +27,8 @@ class Measurements:
         T; finite only where ``valid``.
     valid : ndarray of bool, shape (F, S)
         False where the value is missing, not finite or flagged.
+    flags : ndarray of int, shape (F, S)
+        The flux messages' flag bits (saturated 1, stale 2, dropped samples 4).
     position : ndarray, shape (F, 3)
         m, frame fg; NaN where ``has_pose`` is False.
     rotation : ndarray, shape (F, 3, 3)
@@ -40,6 +42,7 @@ class Measurements:
     time: Array
     flux: ComplexArray
     valid: NDArray[np.bool_]
+    flags: NDArray[np.int64]
     position: Array
     rotation: Array
     has_pose: NDArray[np.bool_]
@@ -57,6 +60,7 @@ class Measurements:
             time=self.time[rows],
             flux=self.flux[rows],
             valid=self.valid[rows],
+            flags=self.flags[rows],
             position=self.position[rows],
             rotation=self.rotation[rows],
             has_pose=self.has_pose[rows],
@@ -69,6 +73,7 @@ class Measurements:
             sensors=self.sensors.select(rows),
             flux=self.flux[:, rows],
             valid=self.valid[:, rows],
+            flags=self.flags[:, rows],
         )
 
     def placed(self) -> tuple[Array, Array]:

@@ -11,6 +11,7 @@ from anser_ros.fitting.measurements import Measurements
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.wire.bag import Bag, FluxStream, PoseStream, read_bag
+from anser_ros.wire.points import STALE
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
 
 NANO = 1e-9
@@ -63,23 +64,25 @@ def pose_track(stream: PoseStream, start_ns: int) -> PoseTrack:
 
 def _columns(
     stream: FluxStream, sensors: SensorTable
-) -> tuple[NDArray[np.complex128], NDArray[np.bool_]]:
-    """Flux (F, S, K) and validity (F, S) in the order of the sensor table."""
+) -> tuple[NDArray[np.complex128], NDArray[np.bool_], NDArray[np.int64]]:
+    """Flux (F, S, K), validity and flags (F, S) in the order of the sensor table."""
     flux = np.full((stream.stamp_ns.size, len(sensors), stream.flux.shape[2]), np.nan, complex)
     valid = np.zeros(flux.shape[:2], dtype=bool)
+    flags = np.full(flux.shape[:2], STALE, dtype=np.int64)
     place = {int(channel): i for i, channel in enumerate(stream.channel)}
     for column, channel in enumerate(sensors.channel.tolist()):
         if channel in place:
             flux[:, column] = stream.flux[:, place[channel]]
             finite = np.isfinite(flux[:, column]).all(axis=1)
-            valid[:, column] = (stream.flags[:, place[channel]] == 0) & finite
-    return flux, valid
+            flags[:, column] = stream.flags[:, place[channel]]
+            valid[:, column] = (flags[:, column] == 0) & finite
+    return flux, valid, flags
 
 
 def _tool(
     stream: FluxStream, sensors: SensorTable, body: str, bag: Bag, start: int
 ) -> Measurements:
-    flux, valid = _columns(stream, sensors)
+    flux, valid, flags = _columns(stream, sensors)
     time = np.asarray((stream.stamp_ns - start) * NANO, dtype=np.float64)
     count = time.size
     position, rotation = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
@@ -87,15 +90,17 @@ def _tool(
     if body in bag.optical:
         track = pose_track(bag.optical[body], start)
         position, rotation, has_pose = track.at(time, LONGEST_OPTICAL_GAP_S)
-    return Measurements(body, sensors, time, flux, valid, position, rotation, has_pose, track)
+    return Measurements(
+        body, sensors, time, flux, valid, flags, position, rotation, has_pose, track
+    )
 
 
 def _reference(stream: FluxStream, sensors: SensorTable, start: int) -> Measurements:
-    flux, valid = _columns(stream, sensors)
+    flux, valid, flags = _columns(stream, sensors)
     time = np.asarray((stream.stamp_ns - start) * NANO, dtype=np.float64)
     count = time.size
     return Measurements(
-        FIELD_GENERATOR, sensors, time, flux, valid, np.zeros((count, 3)),
+        FIELD_GENERATOR, sensors, time, flux, valid, flags, np.zeros((count, 3)),
         np.broadcast_to(np.eye(3), (count, 3, 3)), np.ones(count, dtype=bool),
     )  # fmt: skip
 
