@@ -1,0 +1,99 @@
+"""What a node says of itself: statuses, counters, and warnings that do not flood."""
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+
+HARDWARE_ID = 'anser'
+
+
+class Level(IntEnum):
+    """Levels of diagnostic_msgs."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
+@dataclass(frozen=True)
+class Status:
+    """One line of ``/diagnostics``.
+
+    Attributes
+    ----------
+    name : str
+        What it is about, such as ``tool_a/0/x``; empty for the node itself.
+    level : Level
+    message : str
+        The state or the reason, one line.
+    values : mapping
+        Figures by name; the unit stands in the name.
+    """
+
+    name: str
+    level: Level
+    message: str
+    values: Mapping[str, object] = field(default_factory=dict)
+
+
+def text_of(value: object) -> str:
+    """Return a figure as an operator reads it."""
+    if isinstance(value, float):
+        return f'{value:.6g}' if math.isfinite(value) else str(value)
+    return str(value)
+
+
+def diagnostic_array(node: str, statuses: Iterable[Status], stamp: Time) -> DiagnosticArray:
+    """Return the message of a node's statuses; each is named ``node`` or ``node: part``."""
+    message = DiagnosticArray()
+    message.header.stamp = stamp
+    for status in statuses:
+        one = DiagnosticStatus()
+        one.level = bytes([int(status.level)])
+        one.name = f'{node}: {status.name}' if status.name else node
+        one.message = status.message
+        one.hardware_id = HARDWARE_ID
+        one.values = [KeyValue(key=key, value=text_of(v)) for key, v in status.values.items()]
+        message.status.append(one)
+    return message
+
+
+class Throttle:
+    """Lets the first warning of a kind through whole, and the rest at most once a period.
+
+    Parameters
+    ----------
+    period_s : float
+        Least time between two warnings of one kind.
+    """
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self._last_s: dict[str, float] = {}
+        self._held_back: Counter[str] = Counter()
+
+    def admit(self, kind: str, text: str, now_s: float) -> str | None:
+        """Return the text to log now, or None when this one is held back.
+
+        Parameters
+        ----------
+        kind : str
+            Warnings of one kind are throttled together.
+        text : str
+            The whole warning.
+        now_s : float
+            Monotonic time.
+        """
+        last_s = self._last_s.get(kind)
+        if last_s is not None and now_s - last_s < self._period_s:
+            self._held_back[kind] += 1
+            return None
+        held = self._held_back.pop(kind, 0)
+        self._last_s[kind] = now_s
+        return f'{text} ({held} more like it held back)' if held else text

@@ -1,0 +1,320 @@
+"""The base of every node: parameters, diagnostics, guarded callbacks, start and end.
+
+A node is a class with a name and a parameter table::
+
+    class Tracker(AnserNode):
+        NAME = 'tracker'
+        PARAMETERS = TrackerParameters
+
+        def __init__(self, **options):
+            super().__init__(**options)
+            self.create_subscription(PointCloud2, 'tool/flux', self._on_flux, qos.STREAM)
+
+    if __name__ == '__main__':
+        sys.exit(main(Tracker))
+
+Callbacks given to ``create_subscription``, ``create_timer`` and ``create_service`` are guarded:
+an error is logged, counted and shown in ``/diagnostics``, and the node lives on.
+"""
+
+import argparse
+import functools
+import signal
+import sys
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
+from rclpy.clock import Clock, ClockType
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+from anser_ros.errors import AnserError, ParameterError
+from anser_ros.nodes import parameters, qos
+from anser_ros.nodes.diagnostics import Level, Status, Throttle, diagnostic_array
+
+NAMESPACE = 'anser'
+DIAGNOSTICS_PERIOD_S = 1.0
+WARNING_PERIOD_S = 10.0
+# How long a signal may go unnoticed by an idle node.
+SPIN_SLICE_S = 0.1
+# Parameters that rclpy itself declares or reads.
+FOREIGN_PARAMETERS = ('use_sim_time', 'start_type_description_service')
+FOREIGN_PREFIXES = ('qos_overrides.',)
+
+
+@dataclass(frozen=True)
+class NoParameters:
+    """The table of a node without parameters."""
+
+
+class AnserNode(Node):
+    """Base of the nodes.
+
+    Attributes
+    ----------
+    parameters : instance of ``PARAMETERS``
+        The values in force, frozen; a change that is allowed swaps the whole instance.
+    counters : collections.Counter
+        Events by name; all of them are shown in ``/diagnostics``.
+    exit_code : int or None
+        What the process ends with once :meth:`stop` was called.
+    """
+
+    NAME: ClassVar[str]
+    PARAMETERS: ClassVar[type] = NoParameters
+
+    def __init__(self, **options: Any) -> None:
+        # The base class already creates services, so what guards them must be there first.
+        self.counters: Counter[str] = Counter()
+        self.exit_code: int | None = None
+        self._throttle = Throttle(WARNING_PERIOD_S)
+        self._fault: str | None = None
+        self._faults_reported = 0
+        self.started_s = time.monotonic()
+        options.setdefault('namespace', NAMESPACE)
+        super().__init__(self.NAME, **options)
+        self.parameters = self._declare_table()
+        self.add_on_set_parameters_callback(self._on_set_parameters)
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.EVENTS)
+        self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(DIAGNOSTICS_PERIOD_S, self.publish_diagnostics, clock=self.steady_clock)
+
+    # What a node may override -------------------------------------------------------------
+
+    @classmethod
+    def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
+        """Add the node's own command line; each argument goes to ``__init__`` by name."""
+
+    def status(self) -> Status:
+        """Return the state of the node itself."""
+        return Status('', Level.OK, 'running')
+
+    def part_statuses(self) -> Sequence[Status]:
+        """Return the states of what the node looks after: sensors, emitters, a port."""
+        return ()
+
+    def on_parameters(self, old: Any, new: Any) -> None:
+        """Act on changed parameters; ``self.parameters`` already holds the new ones."""
+
+    def close(self) -> None:
+        """Release what the node holds; called once at the end, signals already ignored."""
+
+    # What a node uses ---------------------------------------------------------------------
+
+    def count(self, name: str, by: int = 1) -> None:
+        """Count an event for ``/diagnostics``."""
+        self.counters[name] += by
+
+    def warn(self, kind: str, text: str) -> None:
+        """Count an event and log it: the first of a kind whole, then one in ten seconds."""
+        self.counters[kind] += 1
+        admitted = self._throttle.admit(kind, text, time.monotonic())
+        if admitted is not None:
+            self.get_logger().warning(admitted)
+
+    def stop(self, code: int = 0) -> None:
+        """End the process after the running callback."""
+        self.exit_code = code
+
+    def publish_diagnostics(self) -> None:
+        """Publish all statuses now."""
+        own = self.status()
+        level, message = own.level, own.message
+        if self.counters['callback_faults'] > self._faults_reported:
+            self._faults_reported = self.counters['callback_faults']
+            level, message = Level.ERROR, f'callback failed: {self._fault}'
+        values = {**own.values, **self.counters, 'uptime_s': time.monotonic() - self.started_s}
+        statuses = [Status(own.name, level, message, values), *self.part_statuses()]
+        name = self.get_fully_qualified_name().strip('/')
+        stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(diagnostic_array(name, statuses, stamp))
+
+    # Guarded callbacks --------------------------------------------------------------------
+
+    def create_subscription(self, msg_type, topic, callback, qos_profile, **options):
+        """Subscribe as rclpy does, with the callback guarded."""
+        guarded = self._guard(callback)
+        return super().create_subscription(msg_type, topic, guarded, qos_profile, **options)
+
+    def create_timer(self, timer_period_sec, callback, *args, **options):
+        """Make a timer as rclpy does, with the callback guarded."""
+        return super().create_timer(timer_period_sec, self._guard(callback), *args, **options)
+
+    def create_service(self, srv_type, srv_name, callback, **options):
+        """Serve as rclpy does; an error becomes ``success = False`` with its message."""
+        guarded = self._guard(callback, is_service=True)
+        return super().create_service(srv_type, srv_name, guarded, **options)
+
+    def _guard(self, callback: Callable, is_service: bool = False) -> Callable:
+        @functools.wraps(callback)
+        def guarded(*args):
+            reason = ''
+            try:
+                return callback(*args)
+            except AnserError as error:
+                reason = ' '.join(str(error).split())
+                self.warn(f'refused_{type(error).__name__}', reason)
+            except Exception as error:  # noqa: BLE001 - the node must outlive any callback
+                if self.context.ok():
+                    reason = f'{type(error).__name__}: {error}'
+                    self._report_fault(reason)
+            if is_service:
+                return _failed(args[1], reason)
+            return None
+
+        return guarded
+
+    def _report_fault(self, reason: str) -> None:
+        self._fault = reason
+        self.counters['callback_faults'] += 1
+        text = f'callback failed\n{traceback.format_exc()}'
+        admitted = self._throttle.admit(f'fault {reason}', text, time.monotonic())
+        if admitted is not None:
+            self.get_logger().error(admitted)
+
+    # Parameters ---------------------------------------------------------------------------
+
+    def _declare_table(self) -> Any:
+        table = self.PARAMETERS
+        kinds, values = parameters.types(table), {}
+        # rclpy drops overrides that nobody declares; a misspelt name must not pass silently.
+        unknown = [name for name in self._parameter_overrides if not _is_known(name, kinds)]
+        if unknown:
+            parameters.build(table, dict.fromkeys(sorted(unknown)))
+        for name, rule in parameters.rules(table).items():
+            default = getattr(table, name)
+            descriptor = ParameterDescriptor(
+                description=rule.description,
+                additional_constraints=', '.join(rule.choices),
+                read_only=not rule.live,
+                dynamic_typing=True,  # so that a whole number will do for a float
+            )
+            given = self.declare_parameter(name, _as_ros(default), descriptor).value
+            values[name] = default if given is None else given
+        return parameters.build(table, values)
+
+    def _on_set_parameters(self, changed: Sequence[Parameter]) -> SetParametersResult:
+        own = {p.name: p.value for p in changed if not _is_foreign(p.name)}
+        if not own:
+            return SetParametersResult(successful=True)
+        old = self.parameters
+        try:
+            new = parameters.build(self.PARAMETERS, {**vars(old), **own})
+            self.parameters = new
+            self.on_parameters(old, new)
+        except AnserError as error:
+            self.parameters = old
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+
+def _is_foreign(name: str) -> bool:
+    return name in FOREIGN_PARAMETERS or name.startswith(FOREIGN_PREFIXES)
+
+
+def _is_known(name: str, kinds: dict[str, Any]) -> bool:
+    return name in kinds or _is_foreign(name)
+
+
+def _as_ros(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _failed(response: Any, reason: str) -> Any:
+    if hasattr(response, 'success'):
+        response.success, response.message = False, reason
+    return response
+
+
+def main(node_class: type[AnserNode], argv: Sequence[str] | None = None) -> int:
+    """Run one node until it ends, or until SIGINT or SIGTERM.
+
+    Returns
+    -------
+    int
+        0 ended as asked; 2 a wrong argument or parameter, said in one line; 1 a defect.
+    """
+    arguments = list(sys.argv if argv is None else argv)
+    try:
+        own = _parse(node_class, _without_ros(arguments))
+        stopping = _stop_on_signals()
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        return _run(node_class, own, stopping)
+    except AnserError as error:
+        print(f'{node_class.NAME}: {" ".join(str(error).split())}', file=sys.stderr)
+        return 2
+    except rclpy.exceptions.ROSInterruptException:
+        return 0
+    except Exception:  # noqa: BLE001 - the outermost place: whatever is left is a defect
+        traceback.print_exc()
+        return 1
+    finally:
+        rclpy.try_shutdown()
+
+
+def _without_ros(arguments: Sequence[str]) -> list[str]:
+    """Return the node's own arguments, the program's name left out."""
+    try:
+        return list(remove_ros_args(arguments)[1:])
+    except (RCLError, UnknownROSArgsError) as error:  # such as a params file that is none
+        raise ParameterError(f'ROS arguments: {error}') from error
+
+
+def _parse(node_class: type[AnserNode], arguments: Sequence[str]) -> dict[str, Any]:
+    summary = (sys.modules[node_class.__module__].__doc__ or '').strip().split('\n')[0]
+    table = parameters.describe(node_class.PARAMETERS)
+    parser = argparse.ArgumentParser(
+        prog=f'anser {node_class.NAME}',
+        description=summary,
+        epilog=f'parameters (--ros-args -p NAME:=VALUE, or --params-file):\n{table}',
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    node_class.add_arguments(parser)
+    return vars(parser.parse_args(arguments))
+
+
+def _stop_on_signals() -> list[int]:
+    """Catch SIGINT and SIGTERM, and return the list that fills with them.
+
+    rclpy's own handlers end the context at once, so that a node could neither close its files
+    in order nor say its last word in ``/diagnostics``.
+    """
+    caught: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda received, _frame: caught.append(received))
+    return caught
+
+
+def _run(node_class: type[AnserNode], own: dict[str, Any], stopping: list[int]) -> int:
+    node, code = None, 0
+    executor = SingleThreadedExecutor()
+    try:
+        node = node_class(**own)
+        executor.add_node(node)
+        while not stopping and node.exit_code is None:
+            executor.spin_once(timeout_sec=SPIN_SLICE_S)
+        code = node.exit_code or 0
+    finally:
+        # A second Ctrl-C must not cut the closing of files short.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
+        if node is not None:
+            node.close()
+            node.publish_diagnostics()
+            executor.shutdown(timeout_sec=1.0)
+            node.destroy_node()
+    return code
+
+
+__all__ = ['AnserNode', 'Level', 'Status', 'main']

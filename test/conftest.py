@@ -1,0 +1,130 @@
+"""A ROS graph of its own for every test, and nothing left running after it."""
+
+import contextlib
+import importlib.util
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+# All of this must stand in the environment before the first ROS module is imported.
+os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
+os.environ.setdefault('ROS_LOG_DIR', tempfile.mkdtemp(prefix='anser_ros_log_'))
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+os.environ.setdefault('NUMBA_NUM_THREADS', '1')
+if 'AMENT_PREFIX_PATH' not in os.environ and importlib.util.find_spec('ros_wheels_bootstrapper'):
+    os.environ['AMENT_PREFIX_PATH'] = sys.prefix
+
+import pytest
+
+REPO = Path(__file__).resolve().parents[1]
+SHARED = Path(os.environ.get('ANSER_SHARED', REPO.parent / 'shared'))
+STOP_TIMEOUT_S = 5.0
+# Domains up to 101 leave all of Linux's ephemeral ports alone. Parallel runs begin apart.
+DOMAINS = itertools.cycle(range(1, 101))
+for _ in range(os.getpid() % 100):
+    next(DOMAINS)
+
+
+@pytest.fixture
+def domain(monkeypatch: pytest.MonkeyPatch) -> int:
+    """Give the test a ROS domain that no other test of the run has."""
+    number = next(DOMAINS)
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(number))
+    return number
+
+
+@pytest.fixture
+def ros(domain: int) -> Iterator[Any]:
+    """Give the test an initialised rclpy in its own domain; yields the rclpy module."""
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
+    rclpy.init(domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    yield rclpy
+    rclpy.try_shutdown()
+
+
+class Process:
+    """A process of the test, in a process group of its own, with its output in a file."""
+
+    def __init__(self, arguments: list[str], log: Path, **options: Any) -> None:
+        self.log = log
+        with log.open('wb') as stream:
+            self.popen = subprocess.Popen(
+                arguments,
+                stdout=stream,
+                stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL,
+                start_new_session=True,
+                **options,
+            )
+
+    @property
+    def output(self) -> str:
+        """Return all that it has written so far."""
+        return self.log.read_text(errors='replace')
+
+    def interrupt(self, number: int = signal.SIGINT, timeout_s: float = STOP_TIMEOUT_S) -> int:
+        """Send a signal and return the exit code."""
+        if self.popen.poll() is None:
+            self.popen.send_signal(number)
+        return self.popen.wait(timeout_s)
+
+    def wait_for(self, text: str, timeout_s: float = 20.0) -> None:
+        """Wait until its output contains a text."""
+        end = time.monotonic() + timeout_s
+        while text not in self.output:
+            assert self.popen.poll() is None, f'ended early:\n{self.output}'
+            assert time.monotonic() < end, f'never said {text!r}:\n{self.output}'
+            time.sleep(0.02)
+
+    def kill_group(self) -> None:
+        """Kill whatever is left of its process group."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.popen.pid, signal.SIGKILL)
+        self.popen.wait(STOP_TIMEOUT_S)
+
+
+@pytest.fixture
+def start(domain: int, tmp_path: Path) -> Iterator[Callable[..., Process]]:
+    """Start processes in the test's domain; ``start('tracker', ...)`` is ``anser tracker ...``."""
+    started: list[Process] = []
+
+    def run(*arguments: str, **options: Any) -> Process:
+        command = [sys.executable, '-m', 'anser_ros.cli.main', *map(str, arguments)]
+        log = tmp_path / f'{arguments[0]}_{len(started)}.log'
+        options.setdefault('cwd', REPO)
+        started.append(Process(command, log, **options))
+        return started[-1]
+
+    yield run
+    for process in started:
+        process.kill_group()
+
+
+def spin_until(node: Any, condition: Callable[[], bool], timeout_s: float = 10.0) -> bool:
+    """Spin a node until a condition holds; return whether it does."""
+    import rclpy
+
+    end = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        rclpy.spin_once(node, timeout_sec=0.05)
+    return True
+
+
+@pytest.fixture
+def shared() -> Path:
+    """Return the folder of the recorded sessions, or skip where it is not there."""
+    if not SHARED.is_dir():
+        pytest.skip('the folder of recorded sessions is not beside the repository')
+    return SHARED

@@ -1,0 +1,238 @@
+"""The base of the nodes: parameter tables, diagnostics, guarded callbacks, start and end."""
+
+import signal
+import sys
+import time
+from dataclasses import dataclass
+
+import pytest
+from conftest import Process, spin_until
+
+from anser_ros.errors import ParameterError, SetupError
+from anser_ros.nodes import parameters
+from anser_ros.nodes.diagnostics import Throttle, text_of
+from anser_ros.nodes.parameters import parameter
+
+
+@dataclass(frozen=True)
+class Table:
+    rate_hz: float = parameter(25.0, 'rate', minimum=1.0, maximum=100.0, live=True)
+    depth: int = parameter(3, 'depth', minimum=0)
+    mode: str = parameter('fast', 'mode', choices=('fast', 'slow'))
+    names: tuple[str, ...] = parameter((), 'names')
+    centre_m: tuple[float, ...] = parameter((0.0, 0.0, 0.2), 'centre', minimum=-1.0)
+    loud: bool = parameter(False, 'loud')
+
+
+class TestParameterTable:
+    def test_defaults_and_given_values(self):
+        built = parameters.build(Table, {'rate_hz': 50, 'centre_m': [0, 0, 1], 'names': ['a']})
+        assert built == Table(rate_hz=50.0, centre_m=(0.0, 0.0, 1.0), names=('a',))
+        assert isinstance(built.rate_hz, float)
+
+    @pytest.mark.parametrize(
+        ('values', 'said'),
+        [
+            ({'rate': 1.0}, 'no parameter rate; there are: rate_hz'),
+            ({'rate_hz': 0.5}, 'below 1.0'),
+            ({'rate_hz': 200.0}, 'above 100.0'),
+            ({'rate_hz': float('nan')}, 'not a number'),
+            ({'rate_hz': 'ten'}, "'ten' is not a float"),
+            ({'rate_hz': True}, 'True is not a float'),
+            ({'depth': 1.5}, '1.5 is not a int'),
+            ({'depth': True}, 'True is not a int'),
+            ({'loud': 1}, '1 is not a bool'),
+            ({'mode': 'other'}, "none of 'fast', 'slow'"),
+            ({'names': 'abc'}, 'is not a list'),
+            ({'names': 3}, 'is not a list'),
+            ({'centre_m': [0.0, -2.0]}, 'below -1.0'),
+        ],
+    )
+    def test_refusals(self, values, said):
+        with pytest.raises(ParameterError, match=said):
+            parameters.build(Table, values)
+
+    def test_a_table_may_hold_only_what_ros_can_carry(self):
+        @dataclass(frozen=True)
+        class Wrong:
+            where: dict = parameter(None, 'a dictionary')
+
+        with pytest.raises(ParameterError, match='no parameter can be'):
+            parameters.types(Wrong)
+
+    def test_description_lists_everything(self):
+        text = parameters.describe(Table)
+        assert 'rate_hz = 25.0 [1 to 100] (may change while it runs)' in text
+        assert "mode = 'fast' [fast | slow]" in text
+
+
+class TestThrottle:
+    def test_first_of_a_kind_is_whole_and_the_rest_is_counted(self):
+        throttle = Throttle(10.0)
+        assert throttle.admit('gap', 'gap of 3', 100.0) == 'gap of 3'
+        assert throttle.admit('gap', 'gap of 4', 101.0) is None
+        assert throttle.admit('crc', 'bad crc', 101.0) == 'bad crc'
+        assert throttle.admit('gap', 'gap of 5', 110.0) == 'gap of 5 (1 more like it held back)'
+        assert throttle.admit('gap', 'gap of 6', 121.0) == 'gap of 6'
+
+
+def test_figures_are_short():
+    assert text_of(1.23456789e-7) == '1.23457e-07'
+    assert text_of(float('nan')) == 'nan'
+    assert text_of(3) == '3'
+
+
+NODE = '''
+"""A node of the tests."""
+import sys
+from dataclasses import dataclass
+from std_srvs.srv import Trigger
+from anser_ros.nodes.node import AnserNode, main
+from anser_ros.nodes.parameters import parameter
+
+@dataclass(frozen=True)
+class Table:
+    rate_hz: float = parameter(25.0, 'rate', minimum=1.0)
+
+class Sample(AnserNode):
+    NAME = 'sample'
+    PARAMETERS = Table
+
+    @classmethod
+    def add_arguments(cls, parser):
+        parser.add_argument('--end', type=int)
+
+    def __init__(self, end=None, **options):
+        super().__init__(**options)
+        print('rate', self.parameters.rate_hz, flush=True)
+        if end is not None:
+            self.stop(end)
+
+    def close(self):
+        print('closed', flush=True)
+
+sys.exit(main(Sample))
+'''
+
+
+class TestProcess:
+    @pytest.fixture
+    def run(self, domain, tmp_path):
+        script = tmp_path / 'sample.py'
+        script.write_text(NODE)
+        started = []
+
+        def start(*arguments):
+            log = tmp_path / f'{len(started)}.log'
+            started.append(Process([sys.executable, str(script), *arguments], log))
+            return started[-1]
+
+        yield start
+        for process in started:
+            process.kill_group()
+
+    @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+    def test_a_signal_ends_it_in_order(self, run, number):
+        process = run('--ros-args', '-p', 'rate_hz:=50')
+        process.wait_for('rate 50.0')
+        began = time.monotonic()
+        assert process.interrupt(number) == 0
+        assert time.monotonic() - began < 2.0
+        assert process.output.endswith('closed\n')
+
+    def test_it_can_end_itself(self, run):
+        assert run('--end', '0').popen.wait(20) == 0
+
+    @pytest.mark.parametrize(
+        ('arguments', 'said'),
+        [
+            (['--ros-args', '-p', 'rate:=50'], 'no parameter rate; there are: rate_hz'),
+            (['--ros-args', '-p', 'rate_hz:=0.1'], 'below 1.0'),
+            (['--ros-args', '--params-file', '/nowhere.yaml'], 'params file'),
+            (['--bogus'], 'unrecognized arguments'),
+        ],
+    )
+    def test_a_wrong_argument_is_one_clear_line(self, run, arguments, said):
+        process = run(*arguments)
+        assert process.popen.wait(20) == 2
+        assert said in process.output
+        assert 'Traceback' not in process.output
+
+    def test_help_prints_the_table(self, run):
+        process = run('--help')
+        assert process.popen.wait(20) == 0
+        assert 'rate_hz = 25.0 [1 to inf]' in process.output
+
+
+class TestGraph:
+    @pytest.fixture
+    def node(self, ros):
+        from anser_ros.nodes.node import AnserNode, Level, Status
+
+        class Sample(AnserNode):
+            NAME = 'sample'
+            PARAMETERS = Table
+
+            def status(self):
+                return Status('', Level.WARN, 'waiting', {'noise_t': 6e-11})
+
+            def part_statuses(self):
+                return [Status('tool_a/0/x', Level.OK, 'ok')]
+
+        node = Sample()
+        yield node
+        node.destroy_node()
+
+    def test_diagnostics_hold_state_counters_and_parts(self, ros, node):
+        from diagnostic_msgs.msg import DiagnosticArray
+
+        got = []
+        node.count('windows', 5)
+        listener = ros.create_node('listener')
+        listener.create_subscription(DiagnosticArray, '/diagnostics', got.append, 10)
+        executor = ros.executors.SingleThreadedExecutor()
+        executor.add_node(node)
+        executor.add_node(listener)
+        end = time.monotonic() + 10
+        while not got and time.monotonic() < end:
+            executor.spin_once(timeout_sec=0.1)
+        executor.shutdown()
+        own, part = got[0].status
+        assert (own.name, own.level, own.message) == ('anser/sample', b'\x01', 'waiting')
+        values = {pair.key: pair.value for pair in own.values}
+        assert values['windows'] == '5' and values['noise_t'] == '6e-11'
+        assert part.name == 'anser/sample: tool_a/0/x'
+
+    def test_a_failing_callback_is_counted_and_survived(self, ros, node):
+        from std_msgs.msg import String
+        from std_srvs.srv import Trigger
+
+        def fail(_message):
+            raise ZeroDivisionError('on purpose')
+
+        def refuse(_request, _response):
+            raise SetupError('no such board')
+
+        node.create_subscription(String, 'in', fail, 10)
+        node.create_service(Trigger, 'ask', refuse)
+        out = node.create_publisher(String, 'in', 10)
+        client = node.create_client(Trigger, 'ask')
+        assert client.wait_for_service(10)
+        future = client.call_async(Trigger.Request())
+        assert spin_until(node, future.done)
+        assert (future.result().success, future.result().message) == (False, 'no such board')
+        assert node.counters['refused_SetupError'] == 1
+        out.publish(String(data='x'))
+        assert spin_until(node, lambda: node.counters['callback_faults'] == 1)
+
+    def test_parameters_change_only_within_the_table(self, node):
+        from rclpy.parameter import Parameter
+
+        before = node.parameters
+        (done,) = node.set_parameters([Parameter('rate_hz', value=50)])
+        assert done.successful and node.parameters.rate_hz == 50.0 and before.rate_hz == 25.0
+        (done,) = node.set_parameters([Parameter('rate_hz', value=1000.0)])
+        assert not done.successful and 'above 100.0' in done.reason
+        (done,) = node.set_parameters([Parameter('depth', value=5)])
+        assert not done.successful
+        assert node.parameters.rate_hz == 50.0 and node.parameters.depth == 3
