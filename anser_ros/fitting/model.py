@@ -1,4 +1,4 @@
-"""The field model that everything shares: virtual dipoles, a column of moments for each emitter."""
+"""The field model that everything shares: virtual dipoles with moments for each emitter."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -18,7 +18,7 @@ SCHEMA = 'anser_model/1'
 
 @dataclass(frozen=True)
 class EffectRecord:
-    """One effect that a model corrects: its name (interfaces, section 6) and parameters in SI units."""
+    """One effect that a model corrects: its name and its parameters in SI units."""
 
     name: str
     parameters: Mapping[str, Any]
@@ -39,11 +39,11 @@ class FieldModel:
     emitters : tuple of str, length K
     frequencies_hz : tuple of float, length K
     flux_error_t : float
-        Standard deviation, T a phasor component, of what the model itself leaves unexplained in the
-        volume that it was fitted in (held-out, with noise and pose jitter taken off).
+        Standard deviation, T a phasor component, of what the model itself leaves unexplained
+        in the volume that it was fitted in (held-out, with noise and pose jitter taken off).
     modes : ndarray, shape (R, N, K), complex, or None
-        Low-rank factor of the moments' covariance: the field's uncertainty is the sum of the squares
-        of the R fields that these moments make (real and imaginary part of a mode vary together).
+        Low-rank factor of the moments' covariance: the field's uncertainty is the sum of the
+        squares of the R fields that these moments make (both parts of a mode vary together).
     effects : tuple of EffectRecord
         Corrections of measured fluxes, sensors or the optical frame that belong to this model.
         Effects on the field itself are already in the dipoles.

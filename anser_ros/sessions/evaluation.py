@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.correction import Correction
-from anser_ros.errors import BagError, ModelFileError
+from anser_ros.errors import BagError
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.refit import LiveRefit
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, NANO, Session
+from anser_ros.sessions.starting_model import check_fits
 from anser_ros.tracking.tracker import PoseEstimate, Tracker, TrackerSettings
 
 Array = NDArray[np.float64]
@@ -27,9 +28,9 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class PoseSeries:
-    """Every estimate of one sensor or body, with the optical truth beside it where there is one.
+    """Every estimate of one sensor or body, with its error where the truth is known.
 
-    ``position_error`` (m) and ``orientation_error`` (rad) are NaN where a pose or the truth is missing.
+    ``position_error`` (m) and ``orientation_error`` (rad) are NaN where either is missing.
     """
 
     name: str
@@ -45,26 +46,11 @@ class PoseSeries:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What tracking a session gave: a series a sensor and a body, and the wall time a frame took."""
+    """What tracking gave: a series a sensor and a body, and the wall time a frame took."""
 
     sensors: dict[str, PoseSeries]
     bodies: dict[str, PoseSeries]
     seconds_per_frame: float
-
-
-def check_fits(model: FieldModel, session: Session) -> None:
-    """Raise `ModelFileError` when the model's emitters are not the session's."""
-    names = session.setup.emitter_names
-    if model.emitters != names:
-        raise ModelFileError(
-            f'the model has the emitters {", ".join(model.emitters)}; '
-            f'the session {session.path} has {", ".join(names)}'
-        )
-    if not np.allclose(model.frequencies_hz, session.setup.frequencies_hz, rtol=1e-3):
-        raise ModelFileError(
-            f'the model drives at {list(model.frequencies_hz)} Hz; '
-            f'the session {session.path} at {list(session.setup.frequencies_hz)} Hz'
-        )
 
 
 def baseline_flux(baseline: Session, sensors: SensorTable) -> NDArray[np.complex128]:
@@ -132,7 +118,7 @@ def track_session(
     baseline : Session, optional
         Distortion-free recording of the same board, whose reference readings are the clean ones.
     refit : bool
-        Whether the model follows the session's reference sensors, as `nodes/field_model` does live.
+        Whether the model follows the session's reference sensors, as the node does live.
     in_phase : bool
         Whether only in-phase fluxes and moments are used (the article's way).
     progress : callable, optional
@@ -207,7 +193,7 @@ def _follower(session: Session, model: FieldModel, baseline: Session | None) -> 
 def _truth(
     tool: Measurements, correction: Correction
 ) -> tuple[Array, Array, NDArray[np.bool_], SensorTable]:
-    """Optical pose of the body at the flux stamps, with the model's corrections of clock and frame."""
+    """Optical pose at the flux stamps, with the model's corrections of clock and frame."""
     sensors = correction.sensors(tool.sensors)
     if tool.track is None:
         return tool.position, tool.rotation, tool.has_pose, sensors

@@ -118,7 +118,8 @@ def session_of(bag: Bag) -> Session:
     for stream in streams:
         if stream.flux.shape[2] != n_emitters:
             raise BagError(
-                f'{bag.path}: the setup has {n_emitters} emitters, the fluxes {stream.flux.shape[2]}'
+                f'{bag.path}: the setup has {n_emitters} emitters, '
+                f'the fluxes {stream.flux.shape[2]}'
             )
     start = min(int(stream.stamp_ns[0]) for stream in streams)
     tools, reference = [], None

@@ -1,0 +1,144 @@
+"""Track a recorded session and compare its poses with the optical ones."""
+
+import argparse
+import csv
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from anser_ros.sessions.evaluation import Evaluation, PoseSeries, metrics, track_session
+from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import model_for
+
+SCHEMA = 'anser_evaluation/1'
+POSE_COLUMNS = (
+    'stamp_ns', 'sensor', 'x_m', 'y_m', 'z_m', 'ax', 'ay', 'az', 'sigma_position_m', 'residual_t',
+    'status',
+)  # fmt: skip
+BODY_COLUMNS = (
+    'stamp_ns', 'body', 'x_m', 'y_m', 'z_m', 'qx', 'qy', 'qz', 'qw', 'sigma_position_m',
+    'residual_t', 'status',
+)  # fmt: skip
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument('session', help='bag to track (.mcap file or bag folder)')
+    parser.add_argument(
+        '--model', required=True, help="model file, or 'nominal' for the setup's own geometry"
+    )
+    parser.add_argument('--out', required=True, type=Path, help='folder for the results')
+    parser.add_argument('--baseline', help='distortion-free recording of the same board')
+    parser.add_argument(
+        '--refit', action='store_true', help='let the model follow the reference sensors'
+    )
+    parser.add_argument(
+        '--in-phase', action='store_true', help="use in-phase fluxes only, the article's way"
+    )
+    parser.add_argument('--json', action='store_true', help='print evaluation.json on stdout')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; the exit code."""
+    session = load_session(args.session)
+    model = model_for(args.model, session)
+    baseline = load_session(args.baseline) if args.baseline else None
+    console = Console(stderr=True)
+    columns = (TextColumn('tracking'), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task('', total=1.0)
+        evaluation = track_session(
+            session,
+            model,
+            baseline=baseline,
+            refit=args.refit,
+            in_phase=args.in_phase,
+            progress=lambda share: bar.update(task, completed=share),
+        )
+    document = to_document(evaluation)
+    args.out.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(document, indent=1)
+    (args.out / 'evaluation.json').write_text(text + '\n', encoding='utf-8')
+    write_poses(args.out / 'poses.csv', evaluation)
+    write_body_poses(args.out / 'bodies.csv', evaluation)
+    if session.lost:
+        console.print(f'{args.session}: {session.lost}', style='yellow', highlight=False)
+    if args.json:
+        print(text)
+    else:
+        Console().print(_table(document))
+    return 0
+
+
+def to_document(evaluation: Evaluation) -> dict[str, Any]:
+    """The contract's evaluation document."""
+    return {
+        'schema': SCHEMA,
+        'sensors': {name: metrics(series) for name, series in evaluation.sensors.items()},
+        'bodies': {name: metrics(series) for name, series in evaluation.bodies.items()},
+    }
+
+
+def _rows(series: PoseSeries) -> list[list[Any]]:
+    rows = []
+    for pose in series.estimates:
+        head = [pose.stamp_ns, series.name]
+        if pose.state == 'ok':
+            values = [*pose.position, *pose.axis, pose.sigma_position_m, pose.residual_t]
+            rows.append([*head, *(f'{float(v):.9g}' for v in values), 'ok'])
+        else:
+            rows.append([*head, *[''] * 8, pose.state])
+    return rows
+
+
+def write_poses(path: Path, evaluation: Evaluation) -> None:
+    """Write every sensor's pose, or why there is none, by stamp."""
+    rows = [row for series in evaluation.sensors.values() for row in _rows(series)]
+    rows.sort(key=lambda row: row[0])
+    with path.open('w', newline='', encoding='utf-8') as stream:
+        writer = csv.writer(stream)
+        writer.writerow(POSE_COLUMNS)
+        writer.writerows(rows)
+
+
+def write_body_poses(path: Path, evaluation: Evaluation) -> None:
+    """Write every rigid tool's 6-DoF pose, or why there is none, by stamp."""
+    with path.open('w', newline='', encoding='utf-8') as stream:
+        writer = csv.writer(stream)
+        writer.writerow(BODY_COLUMNS)
+        for name, series in evaluation.bodies.items():
+            for pose in series.estimates:
+                if pose.state != 'ok' or pose.rotation is None:
+                    writer.writerow([pose.stamp_ns, name, *[''] * 9, pose.state])
+                    continue
+                quaternion = Rotation.from_matrix(pose.rotation).as_quat()
+                values = [*pose.position, *quaternion, pose.sigma_position_m, pose.residual_t]
+                row = [f'{float(value):.9g}' for value in values]
+                writer.writerow([pose.stamp_ns, name, *row, 'ok'])
+
+
+def _table(document: dict[str, Any]) -> Table:
+    table = Table('sensor', 'frames', 'tracked', 'RMSE mm', 'PRC95 mm', 'RMSE deg', 'PRC95 deg')
+    for group in ('sensors', 'bodies'):
+        for name, row in document[group].items():
+            cells = [
+                _cell(row[key], scale)
+                for key, scale in (
+                    ('position_rmse_m', 1e3),
+                    ('position_prc95_m', 1e3),
+                    ('orientation_rmse_rad', 57.29578),
+                    ('orientation_prc95_rad', 57.29578),
+                )
+            ]
+            table.add_row(name, str(row['n']), f'{row["tracked_fraction"]:.1%}', *cells)
+    return table
+
+
+def _cell(value: float | None, scale: float) -> str:
+    return '-' if value is None else f'{value * scale:.3f}'

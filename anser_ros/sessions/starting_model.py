@@ -1,0 +1,61 @@
+"""The field model that a command starts from: a file, or the nominal one of the setup."""
+
+import numpy as np
+
+from anser_ros.errors import ModelFileError, SetupError
+from anser_ros.fitting.model import FieldModel
+from anser_ros.fitting.nominal import nominal_model
+from anser_ros.physics.board import Board
+from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.session import Session
+from anser_ros.wire.setup import Setup
+
+NOMINAL = 'nominal'
+
+
+def board_of(setup: Setup) -> Board:
+    """The emitter's geometry; raises `SetupError` when its kind is unknown or a key is missing."""
+    emitter = setup.emitter
+    try:
+        return Board.of(
+            kind=emitter.kind,
+            geometry=dict(emitter.geometry),
+            names=setup.emitter_names,
+            centres=np.array([coil.centre_m for coil in emitter.coils]),
+            rotations_deg=np.array([coil.rotation_deg for coil in emitter.coils]),
+            frequencies_hz=np.array(setup.frequencies_hz),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise SetupError(f'setup: emitter of kind {emitter.kind!r}: {error}') from error
+
+
+def model_for(name: str, session: Session) -> FieldModel:
+    """The model that ``name`` stands for: a file's path, or ``nominal``.
+
+    Raises
+    ------
+    ModelFileError
+        When the file is no model, or its emitters are not the session's.
+    SetupError
+        When the nominal model is asked for and the setup's geometry makes none.
+    """
+    if name == NOMINAL:
+        return nominal_model(board_of(session.setup))
+    model = load_model(name)
+    check_fits(model, session)
+    return model
+
+
+def check_fits(model: FieldModel, session: Session) -> None:
+    """Raise `ModelFileError` when the model's emitters are not the session's."""
+    names = session.setup.emitter_names
+    if model.emitters != names:
+        raise ModelFileError(
+            f'the model has the emitters {", ".join(model.emitters)}; '
+            f'the session {session.path} has {", ".join(names)}'
+        )
+    if not np.allclose(model.frequencies_hz, session.setup.frequencies_hz, rtol=1e-3):
+        raise ModelFileError(
+            f'the model drives at {list(model.frequencies_hz)} Hz; '
+            f'the session {session.path} at {list(session.setup.frequencies_hz)} Hz'
+        )

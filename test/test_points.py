@@ -1,0 +1,131 @@
+"""The point layouts: packed as the contract says, read by name and offset, refused when broken."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from anser_ros.errors import LayoutError
+from anser_ros.wire.points import (
+    DipolePoints,
+    FluxPoints,
+    decode_field_model,
+    decode_flux,
+    encode_field_model,
+    encode_flux,
+)
+
+
+def flux_points(sensors: int = 4, emitters: int = 8) -> FluxPoints:
+    rng = np.random.default_rng(3)
+    flux = rng.normal(size=(sensors, emitters, 2)).astype(np.float32).astype(float)
+    geometry = rng.normal(size=(sensors, 6)).astype(np.float32).astype(float)
+    geometry[0] = np.nan
+    return FluxPoints(
+        channel=np.arange(sensors) * 3,
+        flags=np.arange(sensors) % 8,
+        flux=flux[..., 0] + 1j * flux[..., 1],
+        position=geometry[:, :3],
+        axis=geometry[:, 3:],
+    )
+
+
+def assert_same(a: FluxPoints, b: FluxPoints) -> None:
+    for name in ('channel', 'flags', 'flux', 'position', 'axis'):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_flux_layout_is_the_contracts():
+    points = flux_points()
+    fields, step, data = encode_flux(points)
+    assert step == 92
+    assert [f[0] for f in fields][:8] == ['x', 'y', 'z', 'nx', 'ny', 'nz', 'channel', 'flags']
+    assert fields[8] == ('coil0_re', 28, 7, 1)
+    assert fields[-1] == ('coil7_im', 88, 7, 1)
+    assert_same(decode_flux(fields, step, 4, data), points)
+
+
+def test_any_number_of_emitters():
+    points = flux_points(emitters=3)
+    fields, step, data = encode_flux(points)
+    assert step == 52
+    assert_same(decode_flux(fields, step, 4, data), points)
+
+
+def test_fields_are_read_by_name_and_offset():
+    points = flux_points()
+    fields, step, data = encode_flux(points)
+    padded = b''.join(b'\xff' * 6 + data[i * step : (i + 1) * step] for i in range(4))
+    moved = [(n, o + 6, t, c) for n, o, t, c in reversed(fields)] + [('rgb', 0, 2, 1)]
+    assert_same(decode_flux(moved, step + 6, 4, padded), points)
+
+
+def test_big_endian_clouds_are_read():
+    points = flux_points()
+    fields, step, data = encode_flux(points)
+    kinds = {4: '<u2', 7: '<f4'}
+    record = np.dtype({'names': [f[0] for f in fields], 'offsets': [f[1] for f in fields],
+                       'formats': [kinds[f[2]] for f in fields], 'itemsize': step})  # fmt: skip
+    swapped = np.frombuffer(data, record).astype(record.newbyteorder('>'))
+    assert_same(decode_flux(fields, step, 4, swapped.tobytes(), True), points)
+
+
+def test_field_model_layout():
+    rng = np.random.default_rng(0)
+    model = DipolePoints(
+        rng.normal(size=(5, 3)), rng.normal(size=(5, 3)),
+        rng.normal(size=(5, 8)) + 1j * rng.normal(size=(5, 8)),
+    )  # fmt: skip
+    fields, step, data = encode_field_model(model)
+    assert step == 8 * 22
+    assert [f[0] for f in fields][:8] == ['x', 'y', 'z', 'ux', 'uy', 'uz', 'm0_re', 'm0_im']
+    back = decode_field_model(fields, step, 5, data)
+    np.testing.assert_array_equal(back.moments, model.moments)
+    np.testing.assert_array_equal(back.positions, model.positions)
+
+
+def test_a_field_model_with_nan_is_refused():
+    model = DipolePoints(np.full((2, 3), np.nan), np.ones((2, 3)), np.ones((2, 1), complex))
+    with pytest.raises(LayoutError, match='not finite'):
+        decode_field_model(*shuffle(encode_field_model(model), 2))
+
+
+def shuffle(encoded, width):
+    fields, step, data = encoded
+    return fields, step, width, data
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        (lambda f, s, w, d: ([x for x in f if x[0] != 'channel'], s, w, d), "'channel'"),
+        (lambda f, s, w, d: ([x for x in f if x[0] != 'coil3_im'], s, w, d), "'coil3_im'"),
+        (lambda f, s, w, d: ([x for x in f if 'coil' not in x[0]], s, w, d), "'coil0_re'"),
+        (lambda f, s, w, d: (f, s, w, d[:-1]), 'need 368 bytes, got 367'),
+        (lambda f, s, w, d: (f, s, w + 1, d), 'bytes'),
+        (lambda f, s, w, d: (f, 0, w, d), 'make no cloud'),
+        (lambda f, s, w, d: (f + [('x', 0, 7, 1)], s, w, d), 'twice'),
+        (lambda f, s, w, d: (f + [('y2', 90, 7, 1)], s, w, d), 'leaves the point'),
+        (lambda f, s, w, d: (f + [('y2', 0, 77, 1)], s, w, d), 'datatype 77'),
+        (lambda f, s, w, d: (f, s, w, d[:92] * 4), 'channel appears twice'),
+    ],
+)
+def test_a_broken_cloud_is_refused(change, message):
+    with pytest.raises(LayoutError, match=message):
+        decode_flux(*change(*shuffle(encode_flux(flux_points()), 4)))
+
+
+FIELD = st.tuples(
+    st.sampled_from(['x', 'y', 'z', 'nx', 'channel', 'flags', 'coil0_re', 'coil0_im', '']),
+    st.integers(-4, 200), st.integers(0, 12), st.integers(0, 3),
+)  # fmt: skip
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(FIELD, max_size=12), st.integers(-1, 200), st.integers(-1, 5), st.binary(max_size=400)
+)
+def test_hostile_clouds_raise_only_layout_errors(fields, step, width, data):
+    for decode in (decode_flux, decode_field_model):
+        with pytest.raises(LayoutError):
+            decode(fields, step, width, data)

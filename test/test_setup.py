@@ -1,0 +1,103 @@
+"""The setup document: what is read, and what is refused with the rule named."""
+
+import pytest
+import yaml
+
+from anser_ros.errors import SetupError
+from anser_ros.wire.setup import dump_setup, parse_setup, topic_of
+
+
+def document() -> dict:
+    return {
+        'schema': 'anser_setup/1',
+        'frame_id': 'fg',
+        'flux_rate_hz': 50.0,
+        'flux_unit': 'T',
+        'emitter': {
+            'kind': 'square_spiral_pcb',
+            'turns': 25,
+            'coils': [
+                {'name': f'coil{k}', 'centre_m': [0.1 * k, 0, 0], 'frequency_hz': 6000.0 + 200 * k}
+                for k in range(3)
+            ],
+        },
+        'sensors': [
+            {
+                'channel': 0, 'name': 'tool_a/0/x', 'body': 'tool_a',
+                'position_m': [0, 0, 0.01], 'axis': [1.0, 0, 0], 'length_m': 0.008,
+            },
+            {
+                'channel': 16, 'name': 'ref/0', 'body': 'fg',
+                'position_m': [0.1, 0.1, 0.02], 'axis': [0.6, 0.0, 0.8],
+            },
+        ],
+    }  # fmt: skip
+
+
+def test_a_setup_survives_being_written_and_read():
+    setup = parse_setup(yaml.safe_dump(document()))
+    assert parse_setup(dump_setup(setup)) == setup
+    assert setup.emitter.geometry == {'turns': 25}
+    assert [s.name for s in setup.tool_sensors] == ['tool_a/0/x']
+    assert [s.name for s in setup.reference_sensors] == ['ref/0']
+    assert setup.bodies == ('tool_a',)
+    assert setup.frequencies_hz == (6000.0, 6200.0, 6400.0)
+
+
+def edited(path: tuple, value: object) -> str:
+    root = document()
+    place = root
+    for key in path[:-1]:
+        place = place[key]
+    if value is None:
+        del place[path[-1]]
+    else:
+        place[path[-1]] = value
+    return yaml.safe_dump(root)
+
+
+@pytest.mark.parametrize(
+    ('path', 'value', 'message'),
+    [
+        (('schema',), 'anser_setup/9', 'schema must be'),
+        (('flux_unit',), 'uT', 'flux_unit must be T'),
+        (('flux_rate_hz',), None, 'lacks the key'),
+        (('flux_rate_hz',), float('nan'), 'must be finite'),
+        (('flux_rate_hz',), 'fast', 'must be a number'),
+        (('emitter', 'coils'), [], 'at least one coil'),
+        (('emitter', 'coils', 0, 'frequency_hz'), -5.0, 'must be finite and in'),
+        (('emitter', 'coils', 1, 'name'), 'coil0', 'appears twice'),
+        (('emitter', 'coils', 0, 'centre_m'), [1, 2], 'three numbers'),
+        (('sensors',), [], 'at least one sensor'),
+        (('sensors', 0, 'channel'), 70000, 'integer in'),
+        (('sensors', 1, 'channel'), 0, 'appears twice'),
+        (('sensors', 1, 'name'), 'tool_a/0/x', 'appears twice'),
+        (('sensors', 0, 'name'), 'tool a', 'words joined by /'),
+        (('sensors', 0, 'axis'), [0, 0, 2.0], 'unit vector'),
+        (('sensors', 0, 'length_m'), -1.0, 'must be finite and in'),
+        (('sensors', 0), 'coil', 'must be a mapping'),
+    ],
+)
+def test_a_broken_rule_is_named(path, value, message):
+    with pytest.raises(SetupError, match=message) as caught:
+        parse_setup(edited(path, value))
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('text', ['', '[', '\x00', '- 1', 'schema: [', 'just words', '&a [*a]'])
+def test_garbage_is_no_setup(text):
+    with pytest.raises(SetupError):
+        parse_setup(text)
+
+
+def test_topics_are_legal_ros_names():
+    assert topic_of('tool_b/y') == 'tool_b/y'
+    assert topic_of('tool_a/0/x') == 'tool_a_0/x'
+    assert topic_of('3') == 'sensor_3'
+
+
+def test_names_that_share_a_topic_are_refused():
+    root = document()
+    root['sensors'].append({**root['sensors'][0], 'channel': 5, 'name': 'tool_a_0/x'})
+    with pytest.raises(SetupError, match='topic'):
+        parse_setup(yaml.safe_dump(root))
