@@ -1,0 +1,1 @@
+"""From samples to phasors: windows, least-squares demodulation, fluxes and device time."""

@@ -1,0 +1,50 @@
+"""Maps the device's clock to the host's by the earliest arrivals."""
+
+from __future__ import annotations
+
+_TOLERANCE = 2e-4
+_JUMP_NS = 1_000_000_000
+
+
+class DeviceClock:
+    """Host time of device timestamps.
+
+    Every arrival is late by an unknown delay that is never negative, so the smallest difference
+    seen between arrival and device time is the best estimate of the offset. The estimate may rise
+    by 200 ppm, more than two quartz clocks drift apart, so that it follows a slow device clock and
+    forgets an early outlier.
+
+    Parameters
+    ----------
+    tick_hz : rate of the device's timestamp counter
+    """
+
+    def __init__(self, tick_hz: float) -> None:
+        self._ns_per_tick = 1e9 / tick_hz
+        self._offset_ns: float | None = None
+        self._last_device_ns = 0.0
+        self.jumps = 0
+
+    def observe(self, ticks: float, arrival_ns: int) -> None:
+        """Note that device time `ticks` was already past at host time `arrival_ns`.
+
+        Device time that runs backwards, or leaps by more than a second against the host's, starts
+        the estimate anew.
+        """
+        device_ns = ticks * self._ns_per_tick
+        offset = arrival_ns - device_ns
+        if self._offset_ns is not None:
+            elapsed = device_ns - self._last_device_ns
+            risen = self._offset_ns + _TOLERANCE * max(elapsed, 0.0)
+            if elapsed < 0 or abs(offset - risen) > _JUMP_NS:
+                self.jumps += 1
+            else:
+                offset = min(offset, risen)
+        self._offset_ns = offset
+        self._last_device_ns = device_ns
+
+    def host_ns(self, ticks: float) -> int:
+        """Host time at device time `ticks`, in the clock of the arrivals; 0 before the first."""
+        if self._offset_ns is None:
+            return 0
+        return round(ticks * self._ns_per_tick + self._offset_ns)

@@ -1,0 +1,212 @@
+"""Least-squares demodulation of all drive tones of all channels at once.
+
+A window of samples x(t) of one channel is modelled as
+
+    x(t) = sum_k Re[(P_k + Q_k t) exp(+j w_k t)] + c_0 + c_1 t (+ mains harmonics) + white noise
+
+with t = 0 in the middle of the window. P_k is the phasor wanted, Q_k its rate of change: a coil
+that moves changes all its amplitudes within the window, and a fit without Q_k takes that change
+for other tones. The model is linear, so its pseudo-inverse is computed once and a window costs one
+matrix product (Kay, Fundamentals of Statistical Signal Processing I, section 4.3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import FitError, ParameterError
+
+SHORTEST_WINDOW_S = 0.005
+LONGEST_WINDOW_S = 0.05
+_RANK_TOLERANCE = 1e-6
+_WORST_VARIANCE_RATIO = 30.0
+_MOTION_NEEDS_CYCLES = 2.0
+
+
+@dataclass(frozen=True)
+class ToneFit:
+    """Phasors of one window, in the unit of the samples.
+
+    Attributes
+    ----------
+    phasors : ndarray, shape (C, K), complex, peak amplitude and phase in the middle of the window
+    sigma : ndarray, shape (C, K), standard deviation of the real and of the imaginary part
+    noise : ndarray, shape (C,), root mean square of what the model leaves, per sample
+    rates : ndarray, shape (C, K), complex, change of the phasors per second; zero where not fitted
+    """
+
+    phasors: NDArray[np.complex128]
+    sigma: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    rates: NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """A solved design: orthonormal basis, map to coefficients, and their variance factors."""
+
+    basis: NDArray[np.float64]
+    to_coefficients: NDArray[np.float64]
+    variance: NDArray[np.float64]
+
+
+class Demodulator:
+    """Demodulates windows of a fixed length.
+
+    Parameters
+    ----------
+    sample_rate_hz : samples a second and channel
+    frequencies_hz : K drive tones
+    window_samples : samples in a window, 5 to 50 ms of them
+    mains_hz : fundamental of the mains whose harmonics are fitted as well; None for none
+    mains_harmonics : how many harmonics; one that falls on a tone is left out
+    follow_motion : fit the phasors' rates of change too; None does so where the window separates
+        the tones well enough (two cycles of the smallest difference of tones)
+
+    Raises
+    ------
+    ParameterError
+        When the window is not 5 to 50 ms long, or too short to tell two tones apart.
+    """
+
+    def __init__(
+        self,
+        sample_rate_hz: float,
+        frequencies_hz: NDArray[np.float64],
+        window_samples: int,
+        *,
+        mains_hz: float | None = None,
+        mains_harmonics: int = 5,
+        follow_motion: bool | None = None,
+    ) -> None:
+        tones = np.asarray(frequencies_hz, float)
+        length_s = window_samples / sample_rate_hz
+        half_sample = 0.5 / sample_rate_hz
+        if not SHORTEST_WINDOW_S - half_sample <= length_s <= LONGEST_WINDOW_S + half_sample:
+            raise ParameterError(f'a window of {1e3 * length_s:.3g} ms is not 5 to 50 ms long')
+        spacing = _smallest_spacing(tones)
+        if follow_motion is None:
+            follow_motion = spacing * length_s >= _MOTION_NEEDS_CYCLES
+        self.frequencies_hz = tones
+        self.window_samples = window_samples
+        self.window_s = length_s
+        self.follows_motion = follow_motion
+        self._half_s = length_s / 2
+        self._design = _design_matrix(
+            sample_rate_hz,
+            window_samples,
+            tones,
+            _kept_harmonics(mains_hz, mains_harmonics, tones, sample_rate_hz, length_s),
+            follow_motion,
+        )
+        try:
+            self._solution = _solve(self._design, 2 * tones.size)
+        except FitError as error:
+            raise ParameterError(
+                f'a window of {1e3 * length_s:.3g} ms cannot separate tones {spacing:.4g} Hz apart'
+            ) from error
+
+    def demodulate(
+        self, samples: NDArray[np.generic], present: NDArray[np.bool_] | None = None
+    ) -> ToneFit:
+        """Fit all tones of all channels.
+
+        Parameters
+        ----------
+        samples : ndarray, shape (N, C), any real type
+        present : ndarray, shape (N,), False where a sample was lost; its rows are not looked at
+
+        Raises
+        ------
+        FitError
+            When the samples that are left do not determine the tones.
+        """
+        solution = self._solution
+        values = samples.astype(np.float64)
+        if present is not None and not present.all():
+            solution = _solve(self._design[present], 2 * self.frequencies_hz.size)
+            values = values[present]
+        projected = solution.basis.T @ values
+        coefficients = solution.to_coefficients @ projected
+        energy = np.einsum('nc,nc->c', values, values) - np.einsum(
+            'rc,rc->c', projected, projected
+        )
+        freedom = max(values.shape[0] - solution.basis.shape[1], 1)
+        noise = np.sqrt(np.maximum(energy, 0.0) / freedom)
+        count = self.frequencies_hz.size
+        phasors = (coefficients[:count] + 1j * coefficients[count : 2 * count]).T
+        if self.follows_motion:
+            change = coefficients[2 * count : 3 * count] + 1j * coefficients[3 * count : 4 * count]
+            rates = np.asarray(change.T / self._half_s, complex)
+        else:
+            rates = np.zeros_like(phasors)
+        variance = (solution.variance[:count] + solution.variance[count : 2 * count]) / 2
+        return ToneFit(phasors, noise[:, None] * np.sqrt(variance), noise, rates)
+
+
+def _smallest_spacing(tones: NDArray[np.float64]) -> float:
+    if tones.size < 2:
+        return float('inf')
+    return float(np.diff(np.sort(tones)).min())
+
+
+def _kept_harmonics(
+    mains_hz: float | None,
+    count: int,
+    tones: NDArray[np.float64],
+    sample_rate_hz: float,
+    length_s: float,
+) -> NDArray[np.float64]:
+    if mains_hz is None:
+        return np.empty(0)
+    harmonics = mains_hz * np.arange(1, count + 1)
+    apart = np.abs(harmonics[:, None] - tones).min(axis=1) > 1 / length_s
+    kept: NDArray[np.float64] = harmonics[apart & (harmonics < sample_rate_hz / 2)]
+    return kept
+
+
+def _design_matrix(
+    sample_rate_hz: float,
+    window_samples: int,
+    tones: NDArray[np.float64],
+    harmonics: NDArray[np.float64],
+    follow_motion: bool,
+) -> NDArray[np.float64]:
+    """Columns: cos and -sin of the tones, the same times t, offset and slope, mains."""
+    time = (np.arange(window_samples) - (window_samples - 1) / 2) / sample_rate_hz
+    unit = time / (window_samples / sample_rate_hz / 2)
+    angle = 2 * np.pi * time[:, None] * tones
+    waves = np.hstack([np.cos(angle), -np.sin(angle)])
+    columns = [waves]
+    if follow_motion:
+        columns.append(unit[:, None] * waves)
+    columns += [np.ones_like(unit)[:, None], unit[:, None]]
+    mains = 2 * np.pi * time[:, None] * harmonics
+    columns += [np.cos(mains), np.sin(mains)]
+    return np.hstack(columns)
+
+
+def _solve(design: NDArray[np.float64], wanted: int) -> _Solution:
+    """Solve the design by SVD; its first `wanted` coefficients must be determined.
+
+    Raises
+    ------
+    FitError
+        When they are not, or only with a variance far above that of tones alone.
+    """
+    samples, columns = design.shape
+    if samples < columns + 1:
+        raise FitError(f'{columns} unknowns need more than {samples} samples')
+    scale = np.linalg.norm(design, axis=0)
+    left, values, right = np.linalg.svd(design / scale, full_matrices=False)
+    kept = values > _RANK_TOLERANCE * values[0]
+    to_coefficients = (right[kept].T / values[kept]) / scale[:, None]
+    variance = np.einsum('pr,pr->p', to_coefficients, to_coefficients)
+    lost = np.abs(right[~kept][:, :wanted]).max(initial=0.0)
+    worst = variance[:wanted].max() * samples / 2
+    if lost > 1e-3 or worst > _WORST_VARIANCE_RATIO:
+        raise FitError(f'tones not separable: variance {worst:.3g} times that of one tone alone')
+    return _Solution(np.ascontiguousarray(left[:, kept]), to_coefficients, variance)

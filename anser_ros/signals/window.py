@@ -1,0 +1,188 @@
+"""Cuts a stream of sample blocks into overlapping windows, and knows what is missing in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import ParameterError
+
+_SEQUENCES = 2**32
+_FULL_SCALE = (-32768, 32767)
+
+
+@dataclass(frozen=True)
+class Window:
+    """One window of samples.
+
+    Attributes
+    ----------
+    codes : ndarray, shape (N, C), int16
+    present : ndarray, shape (N,), False where a sample was lost
+    middle_ticks : device time of the middle of the window
+    saturated : ndarray, shape (C,), whether a sample lies at an end of the converter's range
+    stuck : ndarray, shape (C,), whether all samples are the same
+    dropped : whether samples are missing
+    """
+
+    codes: NDArray[np.int16]
+    present: NDArray[np.bool_]
+    middle_ticks: float
+    saturated: NDArray[np.bool_]
+    stuck: NDArray[np.bool_]
+
+    @property
+    def dropped(self) -> bool:
+        """Whether samples are missing inside the window."""
+        return not bool(self.present.all())
+
+
+@dataclass
+class CutterCounters:
+    """What happened to the stream, in the unit of the name."""
+
+    windows: int = 0
+    windows_lost: int = 0
+    windows_dropped_samples: int = 0
+    missing_samples: int = 0
+    duplicate_blocks: int = 0
+    restarts: int = 0
+
+
+class WindowCutter:
+    """Collects blocks and hands out a window every `hop_samples`.
+
+    Lost blocks leave a hole of the right length, so the windows keep their grid; a window with
+    less than half of its samples is counted as lost. A sequence that starts again at 0 is a new
+    stream.
+
+    Parameters
+    ----------
+    window_samples, hop_samples : length of a window, and from one window to the next
+    columns : channels
+    samples_per_tick : sample rate over tick rate of the device
+
+    Raises
+    ------
+    ParameterError
+        When the hop is not between one sample and the window length.
+    """
+
+    def __init__(
+        self, window_samples: int, hop_samples: int, columns: int, samples_per_tick: float
+    ) -> None:
+        if not 1 <= hop_samples <= window_samples:
+            raise ParameterError(
+                f'a hop of {hop_samples} samples is not within 1 to {window_samples}, the window'
+            )
+        self.counters = CutterCounters()
+        self._window = window_samples
+        self._hop = hop_samples
+        self._samples_per_tick = samples_per_tick
+        self._codes = np.zeros((max(4 * window_samples, 8192), columns), np.int16)
+        self._present = np.zeros(len(self._codes), bool)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the samples; the next block begins a new grid of windows."""
+        self._filled = 0
+        self._until_next = self._window
+        self._expected: int | None = None
+
+    def push(self, sequence: int, timestamp_ticks: int, codes: NDArray[np.int16]) -> list[Window]:
+        """Add a block and return the windows that it completes.
+
+        Parameters
+        ----------
+        sequence : number of the block, modulo 2^32
+        timestamp_ticks : device time of its first sample
+        codes : ndarray, shape (n, C), int16
+
+        Raises
+        ------
+        ParameterError
+            When the block has another number of channels.
+        """
+        if codes.shape[1] != self._codes.shape[1]:
+            raise ParameterError(
+                f'a block of {codes.shape[1]} channels in a stream of {self._codes.shape[1]}'
+            )
+        missing = self._missing_blocks(sequence) * len(codes)
+        if missing < 0:
+            self.counters.duplicate_blocks += 1
+            return []
+        self._expected = (sequence + 1) % _SEQUENCES
+        windows: list[Window] = []
+        if missing:
+            self.counters.missing_samples += missing
+            hole_ticks = timestamp_ticks - missing / self._samples_per_tick
+            missing -= self._skip_whole_windows(missing)
+            windows += self._advance(None, missing, hole_ticks)
+        return windows + self._advance(codes, len(codes), timestamp_ticks)
+
+    def _missing_blocks(self, sequence: int) -> int:
+        """Blocks lost before this one; -1 for one that came before."""
+        if self._expected is None or sequence == self._expected:
+            return 0
+        if sequence == 0:
+            self.counters.restarts += 1
+            self.reset()
+            return 0
+        ahead = (sequence - self._expected) % _SEQUENCES
+        return ahead if ahead < _SEQUENCES // 2 else -1
+
+    def _skip_whole_windows(self, missing: int) -> int:
+        """Jump over the windows that lie inside a long hole; returns the samples jumped over."""
+        hops = (missing - 2 * self._window) // self._hop
+        if hops <= 0:
+            return 0
+        self.counters.windows_lost += hops
+        return hops * self._hop
+
+    def _advance(
+        self, codes: NDArray[np.int16] | None, count: int, first_ticks: float
+    ) -> list[Window]:
+        """Append samples, or a hole where `codes` is None, and cut the windows they complete."""
+        windows: list[Window] = []
+        done = 0
+        while done < count:
+            step = min(self._until_next, count - done)
+            self._append(None if codes is None else codes[done : done + step], step)
+            done += step
+            self._until_next -= step
+            if self._until_next == 0:
+                self._until_next = self._hop
+                windows += self._cut(first_ticks + done / self._samples_per_tick)
+        return windows
+
+    def _append(self, codes: NDArray[np.int16] | None, count: int) -> None:
+        if self._filled + count > len(self._codes):
+            keep = min(self._filled, self._window)
+            tail = slice(self._filled - keep, self._filled)
+            self._codes[:keep] = self._codes[tail].copy()
+            self._present[:keep] = self._present[tail].copy()
+            self._filled = keep
+        place = slice(self._filled, self._filled + count)
+        self._present[place] = codes is not None
+        if codes is not None:
+            self._codes[place] = codes
+        self._filled += count
+
+    def _cut(self, end_ticks: float) -> list[Window]:
+        """Return the window that ends with the newest sample, unless too little of it arrived."""
+        place = slice(self._filled - self._window, self._filled)
+        codes, present = self._codes[place].copy(), self._present[place].copy()
+        arrived = int(np.count_nonzero(present))
+        if 2 * arrived < self._window:
+            self.counters.windows_lost += 1
+            return []
+        self.counters.windows += 1
+        seen = codes if arrived == self._window else codes[present]
+        if arrived < self._window:
+            self.counters.windows_dropped_samples += 1
+        low, high = seen.min(axis=0), seen.max(axis=0)
+        saturated = (low <= _FULL_SCALE[0]) | (high >= _FULL_SCALE[1])
+        middle = end_ticks - self._window / 2 / self._samples_per_tick
+        return [Window(codes, present, middle, saturated, low == high)]

@@ -1,0 +1,308 @@
+"""Samples to fluxes: what comes out is what was put in, and its stated noise is honest."""
+
+import time
+
+import numpy as np
+import pytest
+
+from anser_ros.errors import FitError, ParameterError
+from anser_ros.signals.clock import DeviceClock
+from anser_ros.signals.demodulation import Demodulator
+from anser_ros.signals.flux import FluxConverter
+from anser_ros.signals.window import WindowCutter
+
+RATE = 40e3
+TONES = np.array([6000.0, 6170.0, 6340.0, 6510.0, 6690.0, 6860.0, 7030.0, 7200.0])
+
+
+def phasors(channels: int = 5, seed: int = 0, tones: int = 8) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return rng.normal(0, 2000, (channels, tones)) + 1j * rng.normal(0, 2000, (channels, tones))
+
+
+def waves(values: np.ndarray, samples: int, tones: np.ndarray = TONES) -> np.ndarray:
+    """Samples (N, C) of Re[P exp(jwt)], t = 0 in the middle."""
+    time_s = (np.arange(samples) - (samples - 1) / 2) / RATE
+    return (np.exp(2j * np.pi * time_s[:, None] * tones) @ values.T).real
+
+
+@pytest.mark.parametrize('milliseconds', [5, 8, 20, 33.3, 50])
+def test_exact_for_the_signal_that_it_models(milliseconds):
+    samples = round(RATE * milliseconds / 1e3)
+    truth = phasors()
+    fit = Demodulator(RATE, TONES, samples).demodulate(waves(truth, samples) + 1234.5)
+    assert np.abs(fit.phasors - truth).max() < 1e-7
+    assert fit.noise.max() < 1e-3, 'energies cancel to a thousandth of a code'
+
+
+def test_phase_convention_is_exp_plus_jwt():
+    time_s = (np.arange(801) - 400) / RATE
+    fit = Demodulator(RATE, TONES[:1], 801).demodulate(
+        np.cos(2 * np.pi * 6000 * time_s + 0.3)[:, None]
+    )
+    assert np.angle(fit.phasors[0, 0]) == pytest.approx(0.3, abs=1e-12)
+
+
+@pytest.mark.parametrize(('milliseconds', 'motion'), [(5, False), (20, True), (20, False)])
+def test_stated_noise_is_the_noise(milliseconds, motion):
+    samples = round(RATE * milliseconds / 1e3)
+    demodulator = Demodulator(RATE, TONES, samples, follow_motion=motion)
+    truth = phasors(200, 1)
+    noise = 3.0 * np.random.default_rng(2).standard_normal((samples, 200))
+    fit = demodulator.demodulate(waves(truth, samples) + noise)
+    error = fit.phasors - truth
+    ratio = np.concatenate([error.real.ravel(), error.imag.ravel()]) / np.tile(
+        fit.sigma.ravel(), 2
+    )
+    assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1, abs=0.05)
+    assert fit.noise.mean() == pytest.approx(3.0, rel=0.02)
+    if milliseconds == 20:
+        assert fit.sigma.mean() == pytest.approx(3.0 * np.sqrt(2 / samples), rel=0.1)
+
+
+def test_a_moving_coil_does_not_leak_into_other_tones():
+    samples = 800
+    truth = np.zeros((1, 8), complex)
+    truth[0, 3] = 10000
+    ramp = 1 + 0.04 * np.linspace(-0.5, 0.5, samples)[:, None]
+    moving = waves(truth, samples) * ramp
+    followed = Demodulator(RATE, TONES, samples).demodulate(moving)
+    plain = Demodulator(RATE, TONES, samples, follow_motion=False).demodulate(moving)
+    assert np.abs(followed.phasors - truth).max() < 1e-3
+    assert np.abs(plain.phasors - truth).max() > 5, 'or the column would not be needed'
+    assert followed.rates[0, 3] == pytest.approx(10000 * 0.04 / 0.02, rel=0.01)
+
+
+def test_mains_is_fitted_when_asked():
+    samples = 800
+    truth = phasors(2)
+    time_s = np.arange(samples) / RATE
+    hum = sum(3000 / h * np.cos(2 * np.pi * 50 * h * time_s + h) for h in range(1, 6))
+    noisy = waves(truth, samples) + hum[:, None]
+    with_mains = Demodulator(RATE, TONES, samples, mains_hz=50.0).demodulate(noisy)
+    without = Demodulator(RATE, TONES, samples).demodulate(noisy)
+    assert np.abs(with_mains.phasors - truth).max() < 1e-6
+    assert np.abs(without.phasors - truth).max() > 0.1
+
+
+def test_a_mains_harmonic_on_a_tone_is_left_to_the_tone():
+    fit = Demodulator(RATE, TONES, 800, mains_hz=50.0, mains_harmonics=200)
+    truth = phasors()
+    assert np.abs(fit.demodulate(waves(truth, 800)).phasors - truth).max() < 1e-6
+
+
+def test_lost_samples_are_left_out_of_the_fit():
+    truth = phasors()
+    samples = waves(truth, 800)
+    present = np.ones(800, bool)
+    present[300:420] = False
+    samples[~present] = 30000
+    fit = Demodulator(RATE, TONES, 800).demodulate(samples, present)
+    assert np.abs(fit.phasors - truth).max() < 1e-6
+
+
+def test_too_few_samples_left():
+    present = np.zeros(800, bool)
+    present[:30] = True
+    with pytest.raises(FitError, match='unknowns need more than 30'):
+        Demodulator(RATE, TONES, 800).demodulate(np.zeros((800, 1)), present)
+    present[:60] = True
+    with pytest.raises(FitError, match='not separable'):
+        Demodulator(RATE, TONES, 800).demodulate(np.zeros((800, 1)), present)
+
+
+@pytest.mark.parametrize('samples', [199, 2001])
+def test_window_length_is_5_to_50_ms(samples):
+    with pytest.raises(ParameterError, match='5 to 50 ms'):
+        Demodulator(RATE, TONES, samples)
+
+
+def test_tones_too_close_for_the_window():
+    with pytest.raises(ParameterError, match='cannot separate'):
+        Demodulator(RATE, np.array([6000.0, 6010.0]), 200)
+
+
+def test_48_channels_take_less_than_a_millisecond():
+    demodulator = Demodulator(RATE, TONES, 800)
+    codes = np.random.default_rng(0).integers(-20000, 20000, (800, 48)).astype(np.int16)
+    spent = []
+    for _ in range(50):
+        start = time.perf_counter()
+        demodulator.demodulate(codes)
+        spent.append(time.perf_counter() - start)
+    assert np.median(spent) < 1e-3
+
+
+class TestFlux:
+    AREA = np.array([2.0, -1.5])
+    DELAY = np.array([3e-6, 0.0])
+    NOMINAL = np.full(8, 0.25)
+
+    def converter(self, **changes):
+        arguments = {
+            'current_column': 2,
+            'amperes_per_code': 1e-4,
+            'nominal_currents_a': self.NOMINAL,
+            'current_delay_s': 1e-6,
+        } | changes
+        return FluxConverter(
+            TONES, np.array([0, 1]), np.full(2, 1.5e-4), self.AREA, self.DELAY, **arguments
+        )
+
+    def codes(self, flux, current, samples=800):
+        """What the ADC sees of a flux at nominal current when `current` flows."""
+        omega = 2 * np.pi * TONES
+        field = flux * current / self.NOMINAL
+        volts = 1j * omega * self.AREA[:, None] * field * np.exp(-1j * omega * self.DELAY[:, None])
+        amperes = current * np.exp(-1j * omega * 1e-6)
+        return waves(np.vstack([volts / 1.5e-4, amperes / 1e-4]), samples)
+
+    def test_flux_is_recovered_whatever_the_current_does(self):
+        flux = phasors(2, 3) * 1e-10
+        demodulator, converter = Demodulator(RATE, TONES, 800), self.converter()
+        for seed in range(3):
+            rng = np.random.default_rng(seed)
+            current = 0.25 * rng.uniform(0.7, 1.2, 8) * np.exp(1j * rng.uniform(-3, 3, 8))
+            window = converter.convert(demodulator.demodulate(self.codes(flux, current)))
+            assert np.abs(window.flux - flux).max() < 1e-15
+            assert np.abs(window.current) == pytest.approx(np.abs(current))
+            assert window.driven.all()
+
+    def test_stated_noise_is_the_noise(self):
+        flux = phasors(2, 3) * 1e-10
+        current = np.full(8, 0.2 + 0.1j)
+        demodulator, converter = Demodulator(RATE, TONES, 800), self.converter()
+        rng = np.random.default_rng(0)
+        clean = self.codes(flux, current)
+        ratios = []
+        for _ in range(200):
+            noisy = clean + rng.standard_normal(clean.shape) * [1.0, 2.0, 3.0]
+            window = converter.convert(demodulator.demodulate(noisy))
+            ratios.append((window.flux - flux) / window.sigma)
+        assert np.sqrt(np.mean(np.abs(ratios) ** 2) / 2) == pytest.approx(1, abs=0.05)
+
+    def test_an_emitter_without_current_has_no_flux(self):
+        current = np.full(8, 0.25 + 0j)
+        current[5] = 0.001
+        fit = Demodulator(RATE, TONES, 800).demodulate(self.codes(phasors(2) * 1e-10, current))
+        window = self.converter().convert(fit)
+        assert np.isnan(window.flux[:, 5]).all()
+        assert np.isfinite(np.delete(window.flux, 5, axis=1)).all()
+        assert not window.driven[5] and window.driven.sum() == 7
+
+    def test_refusals(self):
+        with pytest.raises(ParameterError, match='effective area'):
+            FluxConverter(
+                TONES,
+                np.array([0]),
+                np.ones(1),
+                np.zeros(1),
+                np.zeros(1),
+                current_column=1,
+                amperes_per_code=1.0,
+                nominal_currents_a=self.NOMINAL,
+            )
+        with pytest.raises(ParameterError, match='nominal current'):
+            self.converter(nominal_currents_a=np.zeros(8))
+
+
+class TestWindows:
+    def stream(self, blocks: int, columns: int = 2) -> np.ndarray:
+        return np.random.default_rng(0).integers(-99, 99, (40 * blocks, columns)).astype('i2')
+
+    def feed(self, cutter, samples, skip=(), start=0):
+        windows = []
+        for k in range(len(samples) // 40):
+            if k not in skip:
+                part = samples[40 * k : 40 * k + 40]
+                windows += cutter.push((start + k) % 2**32, 1000 * k, part)
+        return windows
+
+    @pytest.mark.parametrize(('window', 'hop'), [(200, 200), (800, 200), (333, 7), (2000, 801)])
+    def test_every_window_is_the_right_part_of_the_stream(self, window, hop):
+        samples = self.stream(400)
+        cutter = WindowCutter(window, hop, 2, 0.04)
+        windows = self.feed(cutter, samples)
+        assert len(windows) == (len(samples) - window) // hop + 1
+        for k, one in enumerate(windows):
+            assert np.array_equal(one.codes, samples[k * hop : k * hop + window])
+            assert not one.dropped and one.present.all()
+            assert one.middle_ticks == pytest.approx((k * hop + window / 2) / 0.04)
+
+    def test_sequence_wraps_around(self):
+        windows = self.feed(WindowCutter(200, 200, 2, 0.04), self.stream(20), start=2**32 - 7)
+        assert len(windows) == 4 and not any(w.dropped for w in windows)
+
+    def test_a_hole_keeps_the_grid_and_is_flagged(self):
+        samples = self.stream(100)
+        cutter = WindowCutter(400, 400, 2, 0.04)
+        windows = self.feed(cutter, samples, skip={14, 15, 25})
+        assert [w.dropped for w in windows] == [False, True, True] + [False] * 7
+        for k, one in enumerate(windows):
+            expected = samples[400 * k : 400 * k + 400]
+            assert np.array_equal(one.codes[one.present], expected[one.present])
+            assert one.middle_ticks == pytest.approx((400 * k + 200) / 0.04)
+        assert (~windows[1].present).sum() == 80
+        assert cutter.counters.missing_samples == 120
+        assert cutter.counters.windows_dropped_samples == 2
+
+    @pytest.mark.parametrize('hole', [8, 30, 61, 95])
+    def test_a_long_hole_loses_windows_and_the_grid_stays(self, hole):
+        samples = self.stream(120)
+        cutter = WindowCutter(400, 200, 2, 0.04)
+        windows = self.feed(cutter, samples, skip=set(range(11, 11 + hole)))
+        assert len(windows) + cutter.counters.windows_lost == (len(samples) - 400) // 200 + 1
+        last = windows[-1]
+        assert np.array_equal(last.codes[last.present], samples[-400:][last.present])
+        assert last.middle_ticks == pytest.approx((len(samples) - 200) / 0.04)
+
+    def test_duplicates_are_dropped_and_a_restart_begins_anew(self):
+        samples = self.stream(12)
+        cutter = WindowCutter(200, 200, 2, 0.04)
+        cutter.push(0, 0, samples[:40])
+        cutter.push(1, 1000, samples[40:80])
+        assert cutter.push(1, 1000, samples[40:80]) == []
+        assert cutter.counters.duplicate_blocks == 1
+        windows = self.feed(cutter, samples)
+        assert cutter.counters.restarts == 1
+        assert np.array_equal(windows[0].codes, samples[:200])
+
+    def test_saturated_and_stuck_channels(self):
+        samples = self.stream(5, 4)
+        samples[17, 1] = 32767
+        samples[90, 2] = -32768
+        samples[:, 3] = 5
+        (window,) = self.feed(WindowCutter(200, 200, 4, 0.04), samples)
+        assert window.saturated.tolist() == [False, True, True, False]
+        assert window.stuck.tolist() == [False, False, False, True]
+
+    def test_refusals(self):
+        with pytest.raises(ParameterError, match='hop of 300'):
+            WindowCutter(200, 300, 2, 0.04)
+        with pytest.raises(ParameterError, match='block of 3 channels'):
+            WindowCutter(200, 200, 2, 0.04).push(0, 0, np.zeros((40, 3), np.int16))
+
+
+class TestClock:
+    def test_latency_that_varies_does_not_move_the_stamps(self):
+        rng = np.random.default_rng(0)
+        clock = DeviceClock(1e6)
+        errors = []
+        for k in range(20000):
+            true_ns = 10**15 + k * 1_000_000
+            device = (k * 1_000_000) * (1 - 50e-6) / 1e3
+            clock.observe(device, int(true_ns + 200_000 + rng.exponential(300_000)))
+            errors.append(clock.host_ns(device) - true_ns)
+        settled = np.array(errors[100:])
+        assert np.abs(settled - 200_000).max() < 30_000
+
+    def test_before_the_first_arrival_there_is_no_time(self):
+        assert DeviceClock(1e6).host_ns(5.0) == 0
+
+    @pytest.mark.parametrize('ticks', [0.0, 60e6])
+    def test_a_device_clock_that_jumps_is_followed(self, ticks):
+        clock = DeviceClock(1e6)
+        clock.observe(5e6, 10**12)
+        clock.observe(ticks, 10**12 + 1_000_000)
+        assert clock.jumps == 1
+        assert clock.host_ns(ticks) == 10**12 + 1_000_000
