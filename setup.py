@@ -39,7 +39,7 @@ setup(
         'numba>=0.59',
         'PyYAML>=6',
         'pyserial>=3.5',
-        'mcap>=1.1',
+        'mcap>=1.5',
         'mcap-ros2-support>=0.5.5',
         'rich>=13',
         'matplotlib>=3.8',

@@ -1,0 +1,117 @@
+"""The account of a bag: its topics, counts and times, and rosbag2's ``metadata.yaml`` of it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+METADATA_VERSION = 9
+# What rosbag2 calls "for ever".
+FOREVER = {'sec': 9223372036, 'nsec': 854775807}
+
+
+def qos_profile(
+    *, reliable: bool = True, latched: bool = False, depth: int = 1, keep_all: bool = False
+) -> dict[str, Any]:
+    """Return an offered quality of service as rosbag2 (version 9) writes it."""
+    return {
+        'history': 'keep_all' if keep_all else 'keep_last',
+        'depth': depth,
+        'reliability': 'reliable' if reliable else 'best_effort',
+        'durability': 'transient_local' if latched else 'volatile',
+        'deadline': FOREVER,
+        'lifespan': FOREVER,
+        'liveliness': 'automatic',
+        'liveliness_lease_duration': FOREVER,
+        'avoid_ros_namespace_conventions': False,
+    }
+
+
+@dataclass
+class TopicRecord:
+    """A topic of a bag and how much of it was written."""
+
+    name: str
+    type_name: str
+    type_hash: str
+    qos: Sequence[Mapping[str, Any]]
+    messages: int = 0
+
+
+@dataclass
+class BagRecord:
+    """What a bag holds so far; times are log times in ns."""
+
+    topics: dict[int, TopicRecord] = field(default_factory=dict)
+    messages: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+
+    @property
+    def duration_s(self) -> float:
+        """Time between the first and the last message."""
+        return (self.last_ns - self.first_ns) * 1e-9
+
+
+def write_metadata(path: Path, record: BagRecord, ros_distro: str, is_closed: bool = True) -> None:
+    """Write ``metadata.yaml`` of the folder that holds one MCAP file, in place of an older one.
+
+    Parameters
+    ----------
+    path : Path
+        The MCAP file.
+    record : BagRecord
+        What it holds.
+    ros_distro : str
+        Name of the ROS distribution.
+    is_closed : bool
+        False while the bag is still being written.
+    """
+    times = {
+        'duration': {'nanoseconds': record.last_ns - record.first_ns},
+        'starting_time': {'nanoseconds_since_epoch': record.first_ns},
+        'message_count': record.messages,
+    }
+    document = {
+        'rosbag2_bagfile_information': {
+            'version': METADATA_VERSION,
+            'storage_identifier': 'mcap',
+            **times,
+            'topics_with_message_count': [_topic(topic) for topic in record.topics.values()],
+            'compression_format': '',
+            'compression_mode': '',
+            'relative_file_paths': [path.name],
+            'files': [{'path': path.name, **times}],
+            'custom_data': {'closed': 'true' if is_closed else 'false'},
+            'ros_distro': ros_distro,
+        }
+    }
+    target = path.with_name('metadata.yaml')
+    draft = path.with_name('.metadata.yaml.new')
+    draft.write_text(plain_yaml(document), encoding='utf-8')
+    draft.replace(target)
+
+
+def plain_yaml(document: Any) -> str:
+    """Return a document as YAML without anchors, which not every reader follows."""
+    return yaml.dump(document, Dumper=_Dumper, sort_keys=False)
+
+
+class _Dumper(yaml.SafeDumper):
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _topic(topic: TopicRecord) -> dict[str, Any]:
+    return {
+        'topic_metadata': {
+            'name': topic.name,
+            'type': topic.type_name,
+            'serialization_format': 'cdr',
+            'offered_qos_profiles': [dict(profile) for profile in topic.qos],
+            'type_description_hash': topic.type_hash,
+        },
+        'message_count': topic.messages,
+    }

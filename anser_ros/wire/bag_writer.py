@@ -1,0 +1,279 @@
+"""Writes MCAP bags that survive a crash and a full disk, with or without ROS.
+
+What was written up to the last flush stays whole whatever happens: a flush ends a chunk and hands
+all of it to the system in one go, and a write that fails is taken back. So that even a full disk
+leaves a bag with an index, a file without a name keeps the space for it.
+"""
+
+import contextlib
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO, Self
+
+from mcap.well_known import Profile, SchemaEncoding
+from mcap.writer import CompressionType, Writer
+
+from anser_ros.errors import BagError
+from anser_ros.wire import cdr
+from anser_ros.wire.bag_metadata import BagRecord, TopicRecord, plain_yaml, qos_profile
+from anser_ros.wire.points import PointFieldTuple
+
+CHUNK_BYTES = 256 * 1024
+RESERVE_BYTES = 1024 * 1024
+LIBRARY = 'anser_ros'
+
+
+class _Segments:
+    """The stream under the MCAP writer: collects, and writes a whole segment at each flush."""
+
+    def __init__(self, raw: BinaryIO) -> None:
+        self._raw = raw
+        self._waiting = bytearray()
+        self._written = 0
+
+    def write(self, data: bytes) -> int:
+        self._waiting += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self._written + len(self._waiting)
+
+    def flush(self) -> None:
+        """Write what is waiting; when that fails, the file has none of it and all still waits."""
+        view = memoryview(bytes(self._waiting))
+        try:
+            done = 0
+            while done < len(view):
+                done += self._raw.write(view[done:])
+            self._raw.flush()
+        except OSError:
+            with contextlib.suppress(OSError):
+                self._raw.seek(self._written)
+                self._raw.truncate()
+            raise
+        self._written += len(view)
+        self._waiting.clear()
+
+
+class BagWriter:
+    """One MCAP file being written.
+
+    Parameters
+    ----------
+    path : str or Path
+        The ``.mcap`` file; it must not exist yet, its folder is made.
+    raw : unbuffered binary stream, optional
+        Written to instead of a file at ``path``.
+
+    Raises
+    ------
+    BagError
+        The file exists already, or cannot be made.
+    """
+
+    def __init__(self, path: str | Path, raw: BinaryIO | None = None) -> None:
+        self.path = Path(path)
+        self.record = BagRecord()
+        self._reserve: int | None = None
+        try:
+            if raw is None:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                raw = open(self.path, 'xb', buffering=0)  # type: ignore[assignment]  # noqa: SIM115
+                self._reserve = self._keep_space(raw)
+        except FileExistsError as error:
+            raise BagError(f'{self.path}: is there already') from error
+        except OSError as error:
+            raise BagError(f'{self.path}: {error.strerror}') from error
+        assert raw is not None
+        self._raw = raw
+        self._segments = _Segments(raw)
+        self._writer = Writer(
+            self._segments,  # type: ignore[arg-type]
+            chunk_size=CHUNK_BYTES,
+            compression=CompressionType.ZSTD,
+        )
+        self._schemas: dict[str, int] = {}
+        self._writer.start(profile=Profile.ROS2, library=LIBRARY)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether messages can still be written."""
+        return not self._raw.closed
+
+    def add_topic(
+        self,
+        name: str,
+        type_name: str,
+        definition: str,
+        qos: Sequence[Mapping[str, Any]] = (),
+        type_hash: str = '',
+    ) -> int:
+        """Announce a topic and return its channel.
+
+        Parameters
+        ----------
+        name : str
+            Absolute topic name.
+        type_name : str
+            Such as ``sensor_msgs/msg/PointCloud2``.
+        definition : str
+            The text of its definition, followed by those of all types that it contains.
+        qos : sequence of mapping
+            What its publishers offer (:func:`qos_profile`).
+        type_hash : str
+            REP 2011's hash, empty when it is not known.
+        """
+        if type_name not in self._schemas:
+            self._schemas[type_name] = self._writer.register_schema(
+                type_name, SchemaEncoding.ROS2, definition.encode()
+            )
+        channel: int = self._writer.register_channel(
+            name,
+            'cdr',
+            self._schemas[type_name],
+            {
+                'offered_qos_profiles': plain_yaml([dict(profile) for profile in qos]),
+                'topic_type_hash': type_hash,
+            },
+        )
+        self.record.topics[channel] = TopicRecord(name, type_name, type_hash, tuple(qos))
+        return channel
+
+    def write(
+        self, channel: int, log_time_ns: int, data: bytes, publish_time_ns: int | None = None
+    ) -> None:
+        """Add a message to the running chunk; nothing reaches the disk before :meth:`flush`."""
+        published_ns = log_time_ns if publish_time_ns is None else publish_time_ns
+        self._writer.add_message(channel, log_time_ns, data, published_ns)
+        record = self.record
+        record.first_ns = min(record.first_ns, log_time_ns) if record.messages else log_time_ns
+        record.last_ns = max(record.last_ns, log_time_ns)
+        record.messages += 1
+        record.topics[channel].messages += 1
+
+    def flush(self) -> None:
+        """End the running chunk and hand it to the system; raises OSError on a full disk."""
+        self._writer.flush()
+
+    def close(self) -> None:
+        """Write the index and close; raises OSError when even the kept space does not do.
+
+        Also the way out after a :meth:`flush` that failed. The file holds whole chunks only,
+        with the index where there was room for it.
+        """
+        if not self.is_open:
+            return
+        self._free_space()
+        try:
+            self._writer.finish()
+            self._segments.flush()
+        finally:
+            self._raw.close()
+
+    def _keep_space(self, raw: BinaryIO) -> int:
+        """Return the descriptor of a file without a name that keeps the last space free."""
+        name = self.path.with_name(f'.{self.path.name}.reserve')
+        descriptor = os.open(name, os.O_CREAT | os.O_WRONLY, 0o600)
+        name.unlink()
+        try:
+            os.posix_fallocate(descriptor, 0, RESERVE_BYTES)
+        except OSError:
+            os.close(descriptor)
+            raw.close()
+            self.path.unlink()
+            raise
+        return descriptor
+
+    def _free_space(self) -> None:
+        if self._reserve is not None:
+            os.close(self._reserve)
+            self._reserve = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class SessionWriter:
+    """Writes a session without ROS: setup, fluxes and poses, log time = stamp.
+
+    Parameters
+    ----------
+    path : str or Path
+        The ``.mcap`` file; it must not exist yet.
+    frame_id : str
+        Frame of the fluxes and poses.
+
+    Raises
+    ------
+    BagError
+        The file exists already, or cannot be made.
+    """
+
+    def __init__(self, path: str | Path, frame_id: str = 'fg') -> None:
+        self._bag = BagWriter(path)
+        self._frame_id = frame_id
+        self._channels: dict[str, int] = {}
+
+    def write_setup(self, text: str, stamp_ns: int, topic: str = '/anser/setup') -> None:
+        """Write the setup document."""
+        channel = self._channel(topic, 'std_msgs/msg/String', latched=True)
+        self._bag.write(channel, stamp_ns, cdr.string_bytes(text))
+
+    def write_flux(
+        self,
+        topic: str,
+        stamp_ns: int,
+        fields: Sequence[PointFieldTuple],
+        point_step: int,
+        width: int,
+        data: bytes,
+    ) -> None:
+        """Write one window's cloud, as `anser_ros.wire.points.encode_flux` packs it."""
+        channel = self._channel(topic, 'sensor_msgs/msg/PointCloud2')
+        frame = self._frame_id
+        message = cdr.cloud_bytes(stamp_ns, frame, fields, point_step, width, data)
+        self._bag.write(channel, stamp_ns, message)
+
+    def write_pose(
+        self,
+        topic: str,
+        stamp_ns: int,
+        position: Sequence[float],
+        quaternion_xyzw: Sequence[float],
+    ) -> None:
+        """Write one pose: position in m, unit quaternion."""
+        channel = self._channel(topic, 'geometry_msgs/msg/PoseStamped')
+        message = cdr.pose_bytes(stamp_ns, self._frame_id, position, quaternion_xyzw)
+        self._bag.write(channel, stamp_ns, message)
+
+    def close(self) -> None:
+        """Write the index and close the file."""
+        self._bag.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _channel(self, topic: str, type_name: str, latched: bool = False) -> int:
+        if topic not in self._channels:
+            qos = [qos_profile(latched=latched, depth=1 if latched else 100)]
+            definition = cdr.DEFINITIONS[type_name]
+            self._channels[topic] = self._bag.add_topic(topic, type_name, definition, qos)
+        return self._channels[topic]

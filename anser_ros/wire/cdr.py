@@ -1,0 +1,137 @@
+"""Serialised bytes of the three message types that a session is made of, without ROS.
+
+Plain CDR, little endian: a value lies at a multiple of its own size, counted from the byte after
+the four-byte header; a string or a sequence is its length as uint32 and then its items.
+Source: OMG Common Data Representation, as DDS-XTypes 1.3 (section 7.4.1) takes it over.
+"""
+
+import struct
+from collections.abc import Sequence
+
+from anser_ros.wire.points import PointFieldTuple
+
+HEADER = b'\x00\x01\x00\x00'
+NS = 1_000_000_000
+
+_TIME = """
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+_HEADER = f"""
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+{_TIME}"""
+# Field lists of the three types, in the form in which MCAP carries definitions (`ros2msg`).
+DEFINITIONS = {
+    'std_msgs/msg/String': 'string data\n',
+    'sensor_msgs/msg/PointCloud2': f"""std_msgs/Header header
+uint32 height
+uint32 width
+PointField[] fields
+bool is_bigendian
+uint32 point_step
+uint32 row_step
+uint8[] data
+bool is_dense
+
+================================================================================
+MSG: sensor_msgs/PointField
+string name
+uint32 offset
+uint8 datatype
+uint32 count
+{_HEADER}""",
+    'geometry_msgs/msg/PoseStamped': f"""std_msgs/Header header
+Pose pose
+
+================================================================================
+MSG: geometry_msgs/Pose
+Point position
+Quaternion orientation
+
+================================================================================
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+
+================================================================================
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+{_HEADER}""",
+}
+
+
+class _Bytes:
+    """Appends aligned values."""
+
+    def __init__(self) -> None:
+        self.body = bytearray()
+
+    def add(self, code: str, *values: float) -> None:
+        size = struct.calcsize(f'<{code}')
+        self.body += bytes(-len(self.body) % size)
+        self.body += struct.pack(f'<{len(values)}{code}', *values)
+
+    def text(self, value: str) -> None:
+        encoded = value.encode() + b'\0'
+        self.add('I', len(encoded))
+        self.body += encoded
+
+    def header(self, stamp_ns: int, frame_id: str) -> None:
+        self.add('i', stamp_ns // NS)
+        self.add('I', stamp_ns % NS)
+        self.text(frame_id)
+
+    def done(self) -> bytes:
+        return HEADER + bytes(self.body)
+
+
+def string_bytes(text: str) -> bytes:
+    """Serialise a ``std_msgs/String``."""
+    out = _Bytes()
+    out.text(text)
+    return out.done()
+
+
+def pose_bytes(
+    stamp_ns: int, frame_id: str, position: Sequence[float], quaternion_xyzw: Sequence[float]
+) -> bytes:
+    """Serialise a ``geometry_msgs/PoseStamped``; the position in m."""
+    out = _Bytes()
+    out.header(stamp_ns, frame_id)
+    x, y, z = position
+    qx, qy, qz, qw = quaternion_xyzw
+    out.add('d', x, y, z, qx, qy, qz, qw)
+    return out.done()
+
+
+def cloud_bytes(
+    stamp_ns: int,
+    frame_id: str,
+    fields: Sequence[PointFieldTuple],
+    point_step: int,
+    width: int,
+    data: bytes,
+) -> bytes:
+    """Serialise a ``sensor_msgs/PointCloud2`` of height 1."""
+    out = _Bytes()
+    out.header(stamp_ns, frame_id)
+    out.add('I', 1, width, len(fields))
+    for name, offset, datatype, count in fields:
+        out.text(name)
+        out.add('I', offset)
+        out.add('B', datatype)
+        out.add('I', count)
+    out.add('B', 0)
+    out.add('I', point_step, point_step * width, len(data))
+    out.body += data
+    out.add('B', 0)  # not dense: the position of a tool sensor is NaN
+    return out.done()
