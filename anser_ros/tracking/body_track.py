@@ -1,0 +1,199 @@
+"""One rigid tool through time: all of its usable coils together, coils that disagree left out."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.tracking import estimate as states
+from anser_ros.tracking.coil_track import NANO, RARE, CoilResult
+from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings, no_pose
+from anser_ros.tracking.rigid import (
+    BodyCoils,
+    BodySolution,
+    common_factor,
+    solve_body,
+    start_from_coils,
+    start_from_grid,
+)
+from anser_ros.tracking.scene import Scene
+from anser_ros.tracking.uncertainty import bounded_inverse, chi2_limit
+
+Array = NDArray[np.float64]
+Start = tuple[Array, Array]
+
+DISAGREES = 4.0
+"""A coil is left out when its share of the misfit is so many times the mean of the others'."""
+
+
+@dataclass
+class BodyTrack:
+    """Memory of one body: its last good pose and its noise scale."""
+
+    good: BodySolution | None = None
+    good_ns: int = 0
+    noise: NoiseScale = field(default_factory=NoiseScale)
+
+    def forget(self) -> None:
+        """Drop the warm start."""
+        self.good = None
+
+
+@dataclass(frozen=True)
+class _Fit:
+    solution: BodySolution
+    used: NDArray[np.int64]
+    freedom: int
+
+    @property
+    def ratio(self) -> float:
+        return self.solution.chi2 / self.freedom
+
+
+def _solve(
+    scene: Scene, coils: BodyCoils, flux: Array, used: NDArray[np.int64], start: Start
+) -> _Fit:
+    part = coils.subset(used)
+    position, rotation = start
+    points = part.offsets @ rotation.T + position
+    modes = scene.error_modes(points, part.axes @ rotation.T, part.lengths)
+    inverse_sigma = np.tile(1.0 / scene.sigma, (len(used), 1))
+    if modes is None:
+        modes = np.zeros((0, *inverse_sigma.shape))
+    reach = float(np.linalg.norm(part.offsets, axis=1).max())
+    solution = solve_body(
+        scene.field, part, np.ascontiguousarray(flux[used]), inverse_sigma,
+        common_factor(modes, inverse_sigma), position, rotation, scene.low - reach,
+        scene.high + reach,
+    )  # fmt: skip
+    return _Fit(solution, used, max(inverse_sigma.size - 6, 1))
+
+
+def _without_disagreeing(
+    fit: _Fit, scene: Scene, coils: BodyCoils, flux: Array, gate: float
+) -> _Fit:
+    """Leave out, one by one, up to a third of the coils while one of them spoils the fit."""
+    for _ in range(len(fit.used) // 3):
+        if fit.ratio <= gate**2:
+            break
+        misfit = fit.solution.coil_chi2
+        worst = int(np.argmax(misfit))
+        others = np.delete(misfit, worst)
+        rest = np.delete(fit.used, worst)
+        if len(rest) < 2 or not coils.subset(rest).observable:
+            break
+        if misfit[worst] < DISAGREES * others.mean():
+            break
+        fit = _solve(scene, coils, flux, rest, (fit.solution.position, fit.solution.rotation))
+    return fit
+
+
+def _cold_starts(
+    scene: Scene, coils: BodyCoils, flux: Array, used: NDArray[np.int64], single: list[CoilResult]
+) -> list[Start]:
+    for wanted in (states.OK, states.RESIDUAL):
+        rows = [i for i in used if single[i].estimate.state == wanted]
+        solutions = [single[i].solution for i in rows]
+        known = [s for s in solutions if s is not None]
+        if known:
+            start = start_from_coils(
+                coils.subset(np.array(rows)),
+                np.array([s.position for s in known]),
+                np.array([s.axis for s in known]),
+                np.array([1.0 / single[i].estimate.sigma_position_m ** 2 for i in rows]),
+            )
+            if start is not None:
+                return [start]
+    if any(single[i].estimate.state == states.RESIDUAL for i in used):
+        return []
+    return start_from_grid(scene.grid, scene.field, coils.subset(used), flux[used])
+
+
+def track_body(
+    track: BodyTrack,
+    name: str,
+    coils: BodyCoils,
+    stamp_ns: int,
+    flux: Array,
+    usable: NDArray[np.bool_],
+    single: list[CoilResult],
+    scene: Scene,
+    settings: TrackerSettings,
+) -> PoseEstimate:
+    """Estimate a body's pose from the fluxes, shape (S, 2K), of its usable coils."""
+    used = np.flatnonzero(usable)
+    if len(used) < 2 or not coils.subset(used).observable:
+        reason = f'{len(used)} of {len(usable)} coils usable, two that are not parallel needed'
+        worst = next(
+            (s.estimate.state for i, s in enumerate(single) if not usable[i]), states.STALE
+        )
+        return no_pose(name, stamp_ns, worst, scene.model_id, reason)
+    fit = None
+    if track.good is not None and (stamp_ns - track.good_ns) * NANO <= settings.warm_age_s:
+        fit = _solve(scene, coils, flux, used, (track.good.position, track.good.rotation))
+        if fit.ratio > settings.gate**2:
+            fit = None
+    if fit is None:
+        fits = [
+            _solve(scene, coils, flux, used, start)
+            for start in _cold_starts(scene, coils, flux, used, single)
+        ]
+        if not fits:
+            reason = 'no coil of this body has a pose to start from'
+            return no_pose(name, stamp_ns, states.RESIDUAL, scene.model_id, reason)
+        fits.sort(key=lambda candidate: candidate.ratio)
+        fit = _without_disagreeing(fits[0], scene, coils, flux, settings.gate)
+    else:
+        fits = [fit]
+    result = _judge(track, name, stamp_ns, fit, fits[1:], coils, scene, settings)
+    if result.state == states.OK:
+        track.good, track.good_ns = fit.solution, stamp_ns
+        track.noise.add(fit.ratio)
+    return result
+
+
+def _judge(
+    track: BodyTrack,
+    name: str,
+    stamp_ns: int,
+    fit: _Fit,
+    rivals: list[_Fit],
+    coils: BodyCoils,
+    scene: Scene,
+    settings: TrackerSettings,
+) -> PoseEstimate:
+    solution = fit.solution
+    scale = 1.0
+    if settings.adaptive:
+        scale = track.noise.of_frame(fit.ratio, chi2_limit(fit.freedom, RARE) / fit.freedom)
+    covariance = scale * bounded_inverse(solution.information)
+    sigma = math.sqrt(float(np.trace(covariance[:3, :3])))
+    centre = solution.position + solution.rotation @ coils.subset(fit.used).offsets.mean(axis=0)
+    residual = float(np.sqrt(np.mean(solution.residual**2)))
+    state = states.OK
+    left_out = len(coils.offsets) - len(fit.used)
+    reason = f'{left_out} of {len(coils.offsets)} coils left out' if left_out else ''
+    if not fit.ratio <= settings.gate**2:
+        state = states.RESIDUAL
+        reason = f'residual {residual:.3g} T is {math.sqrt(fit.ratio):.3g} times the expected one'
+    elif not settings.volume.contains(centre):
+        state = states.OUTSIDE_VOLUME
+        reason = 'at ' + ', '.join(f'{1e3 * v:.1f}' for v in centre) + ' mm'
+    elif not solution.converged or sigma > settings.max_sigma_m:
+        state, reason = states.AMBIGUOUS, f'position uncertain by {1e3 * sigma:.3g} mm'
+    else:
+        margin = 2.0 * math.log(settings.odds) * max(1.0, fit.ratio)
+        for rival in rivals:
+            apart = np.linalg.norm(rival.solution.position - solution.position) > 2e-3
+            apart |= np.linalg.norm(rival.solution.rotation - solution.rotation) > 0.1
+            if (
+                apart
+                and rival.solution.converged
+                and (rival.solution.chi2 < solution.chi2 + margin)
+            ):
+                state, reason = states.AMBIGUOUS, 'another pose would explain the fluxes too'
+    return PoseEstimate(
+        name, stamp_ns, state, solution.position, solution.rotation[:, 2].copy(),
+        solution.rotation, covariance, sigma, residual, fit.ratio, scene.model_id, reason,
+    )  # fmt: skip

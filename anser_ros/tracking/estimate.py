@@ -1,0 +1,162 @@
+"""What tracking reports, and what it is told: states, pose estimates, settings."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import TrackingError
+from anser_ros.tracking.seed import Volume
+from anser_ros.tracking.uncertainty import ROLL_VARIANCE
+
+Array = NDArray[np.float64]
+
+OK = 'ok'
+NO_MODEL = 'no_model'
+NO_SIGNAL = 'no_signal'
+RESIDUAL = 'residual'
+OUTSIDE_VOLUME = 'outside_volume'
+AMBIGUOUS = 'ambiguous'
+STALE = 'stale'
+SATURATED = 'saturated'
+DROPPED = 'dropped'
+STATES = (
+    OK, NO_MODEL, NO_SIGNAL, RESIDUAL, OUTSIDE_VOLUME, AMBIGUOUS, STALE, SATURATED, DROPPED,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """What the tracker may assume.
+
+    Attributes
+    ----------
+    flux_noise_t : float
+        Standard deviation of each phasor component, T, before anything has been tracked.
+    adaptive : bool
+        Whether each sensor's noise scale follows the residuals of its recent good frames.
+    volume : Volume
+        Where tools may be.
+    grid_spacing_m : float
+        Spacing of the cold start's grid at 0.1 m height.
+    gate : float
+        A pose whose residual is more than so many times the expected one is refused.
+    odds : float
+        A second pose that is more likely than one to so many makes the first ambiguous.
+    max_sigma_m : float
+        Poses less certain than this are refused as ambiguous, m.
+    min_signal : float
+        Fluxes whose rms is below so many noise sigmas are no signal.
+    warm_age_s : float
+        How old a good pose may be to start from.
+    roll_variance : float
+        Variance given to the roll about a single coil's axis, rad^2.
+    """
+
+    flux_noise_t: float = 60e-12
+    adaptive: bool = True
+    volume: Volume = field(default_factory=Volume)
+    grid_spacing_m: float = 0.035
+    gate: float = 6.0
+    odds: float = 1000.0
+    max_sigma_m: float = 5e-3
+    min_signal: float = 4.0
+    warm_age_s: float = 1.0
+    roll_variance: float = ROLL_VARIANCE
+
+    def __post_init__(self) -> None:
+        for name in (
+            'flux_noise_t', 'grid_spacing_m', 'gate', 'max_sigma_m', 'warm_age_s', 'roll_variance',
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0) and not (name == 'gate' and value > 0):
+                raise TrackingError(f'setting {name} must be positive and finite, got {value}')
+        if not self.odds >= 1 or not self.min_signal >= 0:
+            raise TrackingError('settings: odds must be at least 1, min_signal at least 0')
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """One sensor's or body's pose in one frame, or why there is none.
+
+    Attributes
+    ----------
+    name : str
+        Of the sensor or body.
+    stamp_ns : int
+        The flux message's stamp.
+    state : str
+        One of `STATES`; the pose may only be used when it is ``ok``.
+    position : ndarray, shape (3,)
+        m, frame fg; NaN where nothing was solved.
+    axis : ndarray, shape (3,)
+        Sensitive axis of a sensor, +z of a body; unit vector, frame fg.
+    rotation : ndarray, shape (3, 3), or None
+        Body axes in fg (columns); None for a single coil, whose roll is not observable.
+    covariance : ndarray, shape (6, 6)
+        Position (m^2) and rotation vector (rad^2), both in fg; the model's uncertainty included.
+    sigma_position_m : float
+        Square root of the trace of the position covariance.
+    residual_t : float
+        Root mean square of measured minus modelled flux components, T.
+    chi2 : float
+        Residual power per degree of freedom in units of the expected one.
+    model_id : str
+        Which field model made it.
+    reason : str
+        Why the state is not ``ok``, in words with figures.
+    """
+
+    name: str
+    stamp_ns: int
+    state: str
+    position: Array
+    axis: Array
+    rotation: Array | None
+    covariance: Array
+    sigma_position_m: float
+    residual_t: float
+    chi2: float
+    model_id: str
+    reason: str = ''
+
+
+def no_pose(name: str, stamp_ns: int, state: str, model_id: str, reason: str) -> PoseEstimate:
+    """An estimate without a pose: all figures NaN."""
+    nothing = np.full(3, np.nan)
+    return PoseEstimate(
+        name, stamp_ns, state, nothing, nothing, None, np.full((6, 6), np.nan), math.nan,
+        math.nan, math.nan, model_id, reason,
+    )  # fmt: skip
+
+
+class NoiseScale:
+    """Running estimate of residual power over its expectation: 1 when the noise is as told.
+
+    An exponential mean over the good frames of about ``memory``, that starts as if ``prior`` frames
+    had been as expected.
+    """
+
+    def __init__(self, memory: float = 100.0, prior: float = 8.0) -> None:
+        self._memory = memory
+        self._weight = prior
+        self._sum = prior
+
+    @property
+    def value(self) -> float:
+        """Variance scale."""
+        return self._sum / self._weight
+
+    def add(self, ratio: float) -> None:
+        """Take in the residual power per degree of freedom of one more good frame."""
+        keep = 1.0 - 1.0 / self._memory
+        self._weight = keep * self._weight + 1.0
+        self._sum = keep * self._sum + min(ratio, 4.0 * self.value + 1.0)
+
+    def of_frame(self, ratio: float, usual: float) -> float:
+        """Scale for one frame: the running one, or more when this frame's residual says so.
+
+        ``usual`` is the ratio that noise alone rarely exceeds.
+        """
+        return max(self.value, ratio / usual)

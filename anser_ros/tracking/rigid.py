@@ -1,0 +1,316 @@
+"""6-DoF pose of a rigid tool from all of its coils at once.
+
+The rotation moves by a rotation vector in fg, R <- exp([w]) R, so no attitude is singular. Model
+errors are common to all coils; they enter as a low-rank part of the residuals' covariance
+(Woodbury's identity), so coils that share an error don't count as independent.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import TrackingError
+from anser_ros.physics.dipole import flux_jacobian
+from anser_ros.tracking.rotations import nearest_rotation, rotation_of_vector
+from anser_ros.tracking.seed import SeedGrid
+from anser_ros.tracking.solve import Array, RealField, fill_coil
+
+MAX_EVALUATIONS = 30
+LARGEST_MOVE_M = 0.04
+LARGEST_TURN = 0.6
+CONVERGED_CHI2 = 1e-6
+PARALLEL = 0.05
+"""Sine of the angle between axes below which all coils of a tool count as parallel."""
+
+
+@dataclass(frozen=True)
+class BodyCoils:
+    """Coils of a rigid tool in its own frame: offsets (S, 3) m, unit axes (S, 3), lengths (S,) m."""
+
+    offsets: Array
+    axes: Array
+    lengths: Array
+
+    @property
+    def observable(self) -> bool:
+        """Whether two coils are not parallel, so that all six degrees of freedom are seen."""
+        return len(self.axes) > 1 and bool(
+            np.linalg.svd(self.axes, compute_uv=False)[1] > PARALLEL
+        )
+
+    def subset(self, keep: NDArray[np.generic]) -> 'BodyCoils':
+        """The coils of a mask or index array."""
+        return BodyCoils(
+            np.ascontiguousarray(self.offsets[keep]),
+            np.ascontiguousarray(self.axes[keep]),
+            np.ascontiguousarray(self.lengths[keep]),
+        )
+
+
+@dataclass(frozen=True)
+class BodySolution:
+    """Where a rigid tool's solve ended.
+
+    Attributes
+    ----------
+    position : ndarray, shape (3,)
+        Body origin, m, frame fg.
+    rotation : ndarray, shape (3, 3)
+        Takes body vectors to fg.
+    chi2 : float
+        Squared residual in units of its covariance.
+    information : ndarray, shape (6, 6)
+        Inverse covariance of (position, rotation vector), both in fg.
+    residual : ndarray, shape (S, 2K)
+        Measured minus modelled flux, T.
+    coil_chi2 : ndarray, shape (S,)
+        Each coil's squared residual in units of its own noise.
+    evaluations : int
+    converged : bool
+    """
+
+    position: Array
+    rotation: Array
+    chi2: float
+    information: Array
+    residual: Array
+    coil_chi2: Array
+    evaluations: int
+    converged: bool
+
+
+@numba.njit(cache=True, error_model='numpy')
+def _fill_body(  # type: ignore[no-untyped-def]
+    position, rotation, offsets, axes, lengths, flux, inverse_sigma, positions, directions, moments,
+    residual, white, jacobian,
+):  # fmt: skip
+    """Whitened residual (S 2K) and its model derivatives (S 2K, 6) by translation and turn."""
+    width = flux.shape[1]
+    basis = np.empty((9, positions.shape[0]))
+    model, slopes = np.empty(width), np.empty((6, width))
+    arm, point, axis = np.empty(3), np.empty(3), np.empty(3)
+    for s in range(offsets.shape[0]):
+        for i in range(3):
+            arm[i] = 0.0
+            axis[i] = 0.0
+            for j in range(3):
+                arm[i] += rotation[i, j] * offsets[s, j]
+                axis[i] += rotation[i, j] * axes[s, j]
+            point[i] = position[i] + arm[i]
+        fill_coil(point, axis, lengths[s], positions, directions, moments, basis, model, slopes)
+        for k in range(width):
+            w = inverse_sigma[s, k]
+            row = s * width + k
+            residual[s, k] = flux[s, k] - model[k]
+            white[row] = w * residual[s, k]
+            for i in range(3):
+                jacobian[row, i] = w * slopes[i, k]
+            for i in range(3):
+                j, m = (i + 1) % 3, (i + 2) % 3
+                turn = arm[j] * slopes[m, k] - arm[m] * slopes[j, k]
+                turn += axis[j] * slopes[3 + m, k] - axis[m] * slopes[3 + j, k]
+                jacobian[row, 3 + i] = w * turn
+
+
+@numba.njit(cache=True, error_model='numpy')
+def _inner(a, b, common):  # type: ignore[no-untyped-def]
+    """``a^T C^-1 b`` for white ``a``, ``b`` and the covariance I + D^T D, common = H^-1 D."""
+    plain = np.dot(a.T, b)
+    if common.shape[0] > 0:
+        plain -= np.dot(np.dot(common, a).T, np.dot(common, b))
+    return plain
+
+
+def common_factor(modes: Array, inverse_sigma: Array) -> Array:
+    """Factor E with ``(I + D^T D)^-1 = I - E^T E`` for whitened modes D.
+
+    Parameters
+    ----------
+    modes : ndarray, shape (R, S, 2K)
+        Flux errors of one standard deviation each that several coils share, T.
+    inverse_sigma : ndarray, shape (S, 2K)
+        1/T.
+
+    Returns
+    -------
+    ndarray, shape (R, S 2K)
+
+    Raises
+    ------
+    TrackingError
+        When the modes are not finite.
+    """
+    white = (modes * inverse_sigma).reshape(len(modes), inverse_sigma.size)
+    if not np.isfinite(white).all():
+        raise TrackingError('the model covariance must be finite')
+    if len(white) == 0:
+        return white
+    factor = np.linalg.cholesky(np.eye(len(white)) + white @ white.T)
+    return np.ascontiguousarray(np.linalg.solve(factor, white))
+
+
+def solve_body(
+    field: RealField,
+    coils: BodyCoils,
+    flux: Array,
+    inverse_sigma: Array,
+    common: Array,
+    position: NDArray[np.generic],
+    rotation: NDArray[np.generic],
+    low: Array,
+    high: Array,
+    budget: int = MAX_EVALUATIONS,
+) -> BodySolution:
+    """Fit a rigid tool's pose from a start near it.
+
+    Parameters
+    ----------
+    field : RealField
+    coils : BodyCoils
+    flux : ndarray, shape (S, 2K)
+        T; real and imaginary part by turns.
+    inverse_sigma : ndarray, shape (S, 2K)
+        1/T.
+    common : ndarray, shape (R, S 2K)
+        From `common_factor`; R = 0 for a model without uncertainty.
+    position, rotation : ndarray, shapes (3,), (3, 3)
+        Start.
+    low, high : ndarray, shape (3,)
+        Box that the body's origin must not leave, m.
+    budget : int
+        Most evaluations of all coils.
+
+    Returns
+    -------
+    BodySolution
+
+    Raises
+    ------
+    TrackingError
+        When shapes don't fit.
+    """
+    count, width = len(coils.offsets), field.moments.shape[1]
+    if flux.shape != (count, width) or inverse_sigma.shape != flux.shape:
+        raise TrackingError(f'{count} coils and {width} components, got flux {flux.shape}')
+
+    def evaluate(r: Array, turn: Array) -> tuple[Array, Array, Array, float]:
+        residual = np.empty((count, width))
+        white, jacobian = np.empty((count * width, 1)), np.empty((count * width, 6))
+        _fill_body(
+            r, turn, coils.offsets, coils.axes, coils.lengths, flux, inverse_sigma,
+            field.positions, field.directions, field.moments, residual, white[:, 0], jacobian,
+        )  # fmt: skip
+        return residual, white, jacobian, float(_inner(white, white, common)[0, 0])
+
+    r, turn = np.array(position, dtype=np.float64), np.array(rotation, dtype=np.float64)
+    residual, white, jacobian, chi2 = evaluate(r, turn)
+    used, damping, converged = 1, 1e-4, False
+    normal, gradient = _inner(jacobian, jacobian, common), _inner(jacobian, white, common)[:, 0]
+    while used < budget and not converged and damping < 1e10:
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-300), gradient)
+        move, angle = math.sqrt(step[:3] @ step[:3]), math.sqrt(step[3:] @ step[3:])
+        step *= min(1.0, LARGEST_MOVE_M / (move + 1e-30), LARGEST_TURN / (angle + 1e-30))
+        promised = float(step @ (2.0 * gradient - normal @ step))
+        new_r = np.minimum(np.maximum(r + step[:3], low), high)
+        new_turn = rotation_of_vector(step[3:]) @ turn
+        trial = evaluate(new_r, new_turn)
+        used += 1
+        negligible = promised < CONVERGED_CHI2 + 1e-9 * chi2
+        if trial[3] <= chi2:
+            fall = chi2 - trial[3]
+            converged = negligible or fall < CONVERGED_CHI2 + 1e-9 * chi2
+            damping *= 0.1 if fall > 0.5 * promised else 0.5
+            r, turn, (residual, white, jacobian, chi2) = new_r, new_turn, trial
+            normal = _inner(jacobian, jacobian, common)
+            gradient = _inner(jacobian, white, common)[:, 0]
+        else:
+            converged = negligible
+            damping = max(5.0 * damping, 1e-6)
+    coil_chi2 = (white.reshape(count, width) ** 2).sum(axis=1)
+    turn = nearest_rotation(turn)
+    return BodySolution(r, turn, chi2, normal, residual, coil_chi2, used, converged)
+
+
+def start_from_coils(
+    coils: BodyCoils, positions: Array, axes: Array, weights: Array
+) -> tuple[Array, Array] | None:
+    """Pose of a body from its coils' own 5-DoF poses (Wahba's problem).
+
+    Parameters
+    ----------
+    coils : BodyCoils
+        The coils that have a pose.
+    positions, axes : ndarray, shape (S, 3)
+        Their poses, m and unit vectors, frame fg.
+    weights : ndarray, shape (S,)
+        How much each is trusted.
+
+    Returns
+    -------
+    position, rotation : ndarrays, shapes (3,), (3, 3), or None
+        None when these coils don't fix the rotation.
+    """
+    if len(axes) == 0:
+        return None
+    share = weights / weights.sum()
+    here, there = share @ coils.offsets, share @ positions
+    matrix = (axes * share[:, None]).T @ coils.axes
+    # A lever arm of 3 cm known to 1 mm tells directions about as well as an axis does.
+    matrix += ((positions - there) * share[:, None]).T @ (coils.offsets - here) / 0.03**2
+    if np.linalg.svd(matrix, compute_uv=False)[1] < 1e-3:
+        return None
+    rotation = nearest_rotation(matrix)
+    return there - rotation @ here, rotation
+
+
+def start_from_grid(
+    grid: SeedGrid, field: RealField, coils: BodyCoils, flux: Array, count: int = 12
+) -> list[tuple[Array, Array]]:
+    """Starts for a body whose single coils have no pose of their own (few emitters, many axes).
+
+    At every grid point the emitters' fields are turned to fit all coils at once, the lever arms
+    neglected; the poses with the least misfit come first.
+
+    Parameters
+    ----------
+    grid : SeedGrid
+        Gives the positions.
+    field : RealField
+    coils : BodyCoils
+    flux : ndarray, shape (S, 2K)
+        T.
+    count : int
+        Most starts wanted.
+
+    Returns
+    -------
+    list of (position, rotation)
+    """
+    unit = np.eye(3)
+    total = len(grid.points)
+    complex_moments = field.moments.view(np.complex128)
+    points, axes = np.repeat(grid.points, 3, axis=0), np.tile(unit, (total, 1))
+    model, _, _ = flux_jacobian(
+        points, axes, None, field.positions, field.directions, complex_moments
+    )
+    fields = model.view(np.float64).reshape(total, 3, -1)
+    measured = coils.axes.T @ flux
+    u, _, vt = np.linalg.svd(np.einsum('gik,jk->gij', fields, measured))
+    sign = np.sign(np.linalg.det(u @ vt))
+    u[:, :, 2] *= sign[:, None]
+    rotations = u @ vt
+    predicted = np.einsum('sj,gij,gik->gsk', coils.axes, rotations, fields, optimize=True)
+    misfit = ((flux - predicted) ** 2).sum(axis=(1, 2))
+    order: Sequence[int] = np.argsort(misfit, kind='stable')[: 8 * count].tolist()
+    chosen: list[int] = []
+    for index in order:
+        apart = [np.linalg.norm(grid.points[index] - grid.points[c]) for c in chosen]
+        if len(chosen) < count and all(distance > grid.spacing_m for distance in apart):
+            chosen.append(index)
+    return [
+        (grid.points[i] - rotations[i] @ coils.offsets.mean(axis=0), rotations[i]) for i in chosen
+    ]

@@ -1,0 +1,96 @@
+"""Rotations: matrices, rotation vectors, and the roll rule of a pose that has only an axis."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def rotation_of_vector(vector: NDArray[np.generic]) -> Array:
+    """Matrix, shape (3, 3), of a rotation vector, shape (3,), rad (Rodrigues' formula)."""
+    v = np.asarray(vector, dtype=np.float64)
+    angle = math.sqrt(float(v @ v))
+    cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    if angle < 1e-8:
+        return np.eye(3) + cross
+    a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+    return np.asarray(np.eye(3) + a * cross + b * (cross @ cross))
+
+
+def rotation_between(first: Array, second: Array) -> Array:
+    """Rotation vector, shape (3,), rad, that takes the matrix ``first`` to ``second``, in fg."""
+    matrix = second @ first.T
+    vector = 0.5 * np.array(
+        [matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]
+    )
+    sine = math.sqrt(float(vector @ vector))
+    angle = math.atan2(sine, 0.5 * (float(np.trace(matrix)) - 1.0))
+    if sine > 1e-6:
+        return np.asarray(vector * (angle / sine))
+    if angle < 1.0:
+        return vector
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    return np.asarray(vectors[:, int(np.argmax(values))] * angle)
+
+
+def quaternion_of_axis(axis: NDArray[np.generic]) -> tuple[float, float, float, float]:
+    """Unit quaternion (x, y, z, w) of the shortest rotation that takes +z to a unit axis.
+
+    This is the written roll rule of a 5-DoF pose; about +x for the axis -z, where it is not unique.
+    """
+    nx, ny, nz = (float(v) for v in axis)
+    w = math.sqrt(max(0.0, 0.5 * (1.0 + nz)))
+    if w < 1e-9:
+        return 1.0, 0.0, 0.0, 0.0
+    x, y = -0.5 * ny / w, 0.5 * nx / w
+    norm = math.sqrt(x * x + y * y + w * w)
+    return x / norm, y / norm, 0.0, w / norm
+
+
+def quaternion_of_rotation(matrix: NDArray[np.generic]) -> tuple[float, float, float, float]:
+    """Unit quaternion (x, y, z, w), w >= 0, of a rotation matrix (Shepperd's method)."""
+    m = np.asarray(matrix, dtype=np.float64)
+    trace = float(np.trace(m))
+    squares = [1.0 + 2.0 * float(m[i, i]) - trace for i in range(3)] + [1.0 + trace]
+    best = int(np.argmax(squares))
+    q = np.zeros(4)
+    root = math.sqrt(squares[best])
+    q[best] = 0.5 * root
+    half = 0.5 / root
+    if best == 3:
+        q[0], q[1], q[2] = (
+            half * (m[2, 1] - m[1, 2]),
+            half * (m[0, 2] - m[2, 0]),
+            half * (m[1, 0] - m[0, 1]),
+        )
+    else:
+        j, k = (best + 1) % 3, (best + 2) % 3
+        q[j] = half * (m[j, best] + m[best, j])
+        q[k] = half * (m[k, best] + m[best, k])
+        q[3] = half * (m[k, j] - m[j, k])
+    if q[3] < 0:
+        q = -q
+    q /= math.sqrt(float(q @ q))
+    return float(q[0]), float(q[1]), float(q[2]), float(q[3])
+
+
+def rotation_of_quaternion(quaternion: NDArray[np.generic]) -> Array:
+    """Matrix, shape (3, 3), of a quaternion (x, y, z, w) of any length but zero."""
+    q = np.asarray(quaternion, dtype=np.float64)
+    x, y, z, w = q / math.sqrt(float(q @ q))
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def nearest_rotation(matrix: NDArray[np.generic]) -> Array:
+    """Proper rotation nearest to a matrix (Kabsch): ``U diag(1, 1, det) V^T`` of its SVD."""
+    u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
+    sign = 1.0 if np.linalg.det(u @ vt) > 0 else -1.0
+    return np.asarray(u @ np.diag([1.0, 1.0, sign]) @ vt)

@@ -1,0 +1,325 @@
+"""A coil's pose without any guess: a scan of a precomputed grid, then polish of the best few.
+
+For a given position the fluxes are linear in the axis, ``y = B^T n`` with the emitters' fields as
+columns of B. With ``B B^T = L L^T`` the unexplained power at a grid point is ``|y|^2 - |c|^2``,
+``c = L^-1 B y``, and the axis is ``L^-T c``: one small product a point. That a true axis has length
+one is a constraint that tells positions apart; its price is added to second order.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import TrackingError
+from anser_ros.physics.dipole import fill_field_and_gradient
+from anser_ros.tracking.solve import Array, CoilSolution, RealField, solve_coil
+
+SAME_PLACE_M = 2e-3
+SAME_AXIS = 0.05
+"""Two solutions closer than this (m; chord of the unit axes) are one."""
+
+LAST_RESORT = 5
+"""How many times more starts are tried when none of the first ones leads below the gate."""
+
+
+@dataclass(frozen=True)
+class Volume:
+    """Box where tools may be, m, frame fg."""
+
+    low: tuple[float, float, float] = (-0.2, -0.2, 0.05)
+    high: tuple[float, float, float] = (0.2, 0.2, 0.35)
+
+    def __post_init__(self) -> None:
+        box = np.array([self.low, self.high], dtype=np.float64)
+        if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[1] > box[0]).all():
+            raise TrackingError(
+                f'a volume needs low < high in x, y, z, got {self.low}, {self.high}'
+            )
+
+    def contains(self, position: Array) -> bool:
+        """Whether a position (m) lies in the box."""
+        return bool(np.all(position >= self.low) and np.all(position <= self.high))
+
+    def grown(self, margin_m: float) -> tuple[Array, Array]:
+        """Corners of the box with a margin around it; the floor stays above half its height.
+
+        The field of a flat board is mirrored at its plane, so a solver must not cross it.
+        """
+        low, high = np.array(self.low) - margin_m, np.array(self.high) + margin_m
+        if self.low[2] > 0:
+            low[2] = max(low[2], 0.5 * self.low[2])
+        return low, high
+
+
+@dataclass(frozen=True)
+class SeedGrid:
+    """Positions (G, 3) of the grid and, for each, what turns fluxes into an axis.
+
+    Attributes
+    ----------
+    points : ndarray, shape (G, 3)
+        m, frame fg.
+    projectors : ndarray, shape (G, 3, 2K)
+        ``L^-1 B``, whitened.
+    triangles : ndarray, shape (G, 3, 3)
+        ``L^-1``.
+    sigma : ndarray, shape (2K,)
+        Standard deviations that the grid was whitened with, T.
+    spacing_m : float
+        Distance between neighbours in the board's plane at the volume's floor.
+    """
+
+    points: Array
+    projectors: Array
+    triangles: Array
+    sigma: Array
+    spacing_m: float
+
+
+@numba.njit(cache=True, error_model='numpy')
+def _fill_grid(points, positions, directions, moments, inverse_sigma, projectors, triangles):  # type: ignore[no-untyped-def]
+    basis = np.empty((9, positions.shape[0]))
+    width = moments.shape[1]
+    for g in range(points.shape[0]):
+        fill_field_and_gradient(points[g], positions, directions, basis)
+        field = np.dot(basis[:3], moments)
+        for i in range(3):
+            for k in range(width):
+                field[i, k] *= inverse_sigma[k]
+        gram = np.zeros((3, 3))
+        for i in range(3):
+            for j in range(3):
+                for k in range(width):
+                    gram[i, j] += field[i, k] * field[j, k]
+        ridge = 1e-12 * (gram[0, 0] + gram[1, 1] + gram[2, 2]) + 1e-300
+        l00 = math.sqrt(gram[0, 0] + ridge)
+        l10, l20 = gram[1, 0] / l00, gram[2, 0] / l00
+        l11 = math.sqrt(max(gram[1, 1] - l10 * l10, 0.0) + ridge)
+        l21 = (gram[2, 1] - l20 * l10) / l11
+        l22 = math.sqrt(max(gram[2, 2] - l20 * l20 - l21 * l21, 0.0) + ridge)
+        t = triangles[g]
+        t[:] = 0.0
+        t[0, 0], t[1, 1], t[2, 2] = 1.0 / l00, 1.0 / l11, 1.0 / l22
+        t[1, 0] = -l10 * t[0, 0] / l11
+        t[2, 1] = -l21 * t[1, 1] / l22
+        t[2, 0] = -(l20 * t[0, 0] + l21 * t[1, 0]) / l22
+        for i in range(3):
+            for k in range(width):
+                total = 0.0
+                for j in range(i + 1):
+                    total += t[i, j] * field[j, k]
+                projectors[g, i, k] = total
+
+
+@numba.njit(cache=True, error_model='numpy')
+def _score(linear, triangles, power, cost, axes):  # type: ignore[no-untyped-def]
+    """Cost of a unit axis at every grid point, and that axis."""
+    for g in range(linear.shape[0]):
+        c0, c1, c2 = linear[g, 0], linear[g, 1], linear[g, 2]
+        t = triangles[g]
+        n0 = t[0, 0] * c0 + t[1, 0] * c1 + t[2, 0] * c2
+        n1 = t[1, 1] * c1 + t[2, 1] * c2
+        n2 = t[2, 2] * c2
+        length = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2) + 1e-300
+        n0, n1, n2 = n0 / length, n1 / length, n2 / length
+        axes[g, 0], axes[g, 1], axes[g, 2] = n0, n1, n2
+        # variance of the axis' length: n^T (B B^T)^-1 n = |L^-1 n|^2
+        v0 = t[0, 0] * n0
+        v1 = t[1, 0] * n0 + t[1, 1] * n1
+        v2 = t[2, 0] * n0 + t[2, 1] * n1 + t[2, 2] * n2
+        variance = v0 * v0 + v1 * v1 + v2 * v2
+        cost[g] = power - (c0 * c0 + c1 * c1 + c2 * c2) + (length - 1.0) ** 2 / variance
+
+
+@numba.njit(cache=True, error_model='numpy')
+def _pick(points, cost, axes, apart, count):  # type: ignore[no-untyped-def]
+    """Indices of the cheapest points that are apart from each other in place or axis."""
+    chosen = np.empty(count, np.int64)
+    found = 0
+    alive = np.ones(points.shape[0], np.bool_)
+    while found < count:
+        best = -1
+        for g in range(points.shape[0]):
+            if alive[g] and (best < 0 or cost[g] < cost[best]):
+                best = g
+        if best < 0:
+            break
+        chosen[found] = best
+        found += 1
+        for g in range(points.shape[0]):
+            dx = points[g, 0] - points[best, 0]
+            dy = points[g, 1] - points[best, 1]
+            dz = points[g, 2] - points[best, 2]
+            dot = (
+                axes[g, 0] * axes[best, 0]
+                + axes[g, 1] * axes[best, 1]
+                + axes[g, 2] * axes[best, 2]
+            )
+            if dx * dx + dy * dy + dz * dz < apart * apart and dot > 0.5:
+                alive[g] = False
+    return chosen[:found]
+
+
+def grid_points(volume: Volume, spacing_m: float) -> Array:
+    """Points of a grid that covers a volume, shape (G, 3), m.
+
+    The field changes over a length that grows with the height, so does the spacing: ``spacing_m``
+    holds at 0.1 m height and grows in proportion above it.
+
+    Raises
+    ------
+    TrackingError
+        When the spacing is not positive, or the grid would have more than 100,000 points.
+    """
+    if not (math.isfinite(spacing_m) and spacing_m > 0):
+        raise TrackingError(f'grid spacing must be positive, got {spacing_m}')
+    low, high = np.array(volume.low), np.array(volume.high)
+    layers, z, total = [], float(low[2]), 0
+    while True:
+        step = spacing_m * max(abs(z), 0.05) / 0.1
+        sides = [
+            np.linspace(low[i], high[i], max(2, math.ceil((high[i] - low[i]) / step) + 1))
+            for i in range(2)
+        ]
+        total += sides[0].size * sides[1].size
+        if total > 100_000:
+            raise TrackingError(f'a grid spacing of {spacing_m} m is too fine for the volume')
+        x, y = np.meshgrid(*sides, indexing='ij')
+        layers.append(np.stack([x.ravel(), y.ravel(), np.full(x.size, z)], axis=1))
+        if z >= high[2]:
+            return np.ascontiguousarray(np.concatenate(layers))
+        z = min(z + step, float(high[2]))
+
+
+def build_grid(
+    field: RealField, sigma: Array, volume: Volume, spacing_m: float = 0.025
+) -> SeedGrid:
+    """Precompute the scan of a volume.
+
+    Parameters
+    ----------
+    field : RealField
+    sigma : ndarray, shape (2K,)
+        Standard deviation of each flux component, T.
+    volume : Volume
+    spacing_m : float
+        See `grid_points`.
+
+    Returns
+    -------
+    SeedGrid
+
+    Raises
+    ------
+    TrackingError
+        When the spacing doesn't suit the volume.
+    """
+    points = grid_points(volume, spacing_m)
+    projectors = np.empty((len(points), 3, field.moments.shape[1]))
+    triangles = np.empty((len(points), 3, 3))
+    _fill_grid(
+        points,
+        field.positions,
+        field.directions,
+        field.moments,
+        1.0 / sigma,
+        projectors,
+        triangles,
+    )
+    return SeedGrid(points, projectors, triangles, np.array(sigma), spacing_m)
+
+
+def scan(grid: SeedGrid, flux: Array, count: int) -> tuple[NDArray[np.int64], Array, Array]:
+    """Cheapest distinct grid points.
+
+    Parameters
+    ----------
+    grid : SeedGrid
+    flux : ndarray, shape (2K,)
+        T; real and imaginary part by turns.
+    count : int
+        Most candidates wanted.
+
+    Returns
+    -------
+    chosen : ndarray, shape (C,)
+        Indices into ``grid.points``, best first.
+    axes : ndarray, shape (G, 3)
+        Best unit axis at every grid point.
+    cost : ndarray, shape (G,)
+        Whitened squared misfit with that axis.
+    """
+    white = flux / grid.sigma
+    total = len(grid.points)
+    linear = (grid.projectors.reshape(3 * total, -1) @ white).reshape(total, 3)
+    cost, axes = np.empty(total), np.empty((total, 3))
+    _score(linear, grid.triangles, float(white @ white), cost, axes)
+    chosen = _pick(grid.points, cost, axes, 1.5 * grid.spacing_m, count)
+    return chosen, axes, cost
+
+
+def _same(a: CoilSolution, b: CoilSolution) -> bool:
+    return bool(
+        np.linalg.norm(a.position - b.position) < SAME_PLACE_M
+        and np.linalg.norm(a.axis - b.axis) < SAME_AXIS
+    )
+
+
+def solve_cold(
+    field: RealField,
+    grid: SeedGrid,
+    flux: Array,
+    whitening: Array,
+    low: Array,
+    high: Array,
+    length_m: float = 0.0,
+    gate: float = math.inf,
+    candidates: int = 6,
+) -> list[CoilSolution]:
+    """Every distinct pose that the best grid points lead to, least chi-square first.
+
+    Parameters
+    ----------
+    field : RealField
+    grid : SeedGrid
+    flux, whitening, low, high, length_m
+        As for `solve_coil`.
+    gate : float
+        Chi-square that an acceptable pose stays below; starts whose misfit remains far above it
+        are given up early.
+    candidates : int
+        Most starts that are polished.
+
+    Returns
+    -------
+    list of CoilSolution
+        At least one.
+    """
+    found: list[CoilSolution] = []
+    tried = 0
+    for count, budget in ((candidates, 24), (LAST_RESORT * candidates, 60)):
+        chosen, axes, _ = scan(grid, flux, count)
+        for index in chosen[tried:]:
+            solution = solve_coil(
+                field,
+                flux,
+                whitening,
+                grid.points[index],
+                axes[index],
+                low,
+                high,
+                length_m,
+                budget,
+            )
+            if not any(_same(solution, other) for other in found):
+                found.append(solution)
+            if tried and solution.chi2 <= gate:
+                break
+        found.sort(key=lambda solution: solution.chi2)
+        tried = len(chosen)
+        if found[0].chi2 <= gate:
+            break
+    return found

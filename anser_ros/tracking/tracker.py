@@ -1,0 +1,235 @@
+"""From fluxes to poses with a state each: what the live node and the offline evaluation share.
+
+A frame gives one estimate for every tool sensor (5-DoF) and for every body whose coils fix all six
+degrees of freedom. A pose is good only when its state is ``ok``; only good poses start the next
+frame's solve, and a warm solve that misses the gate is repeated without any guess.
+"""
+
+from collections import Counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import TrackingError
+from anser_ros.fitting.model import FieldModel
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.tracking import estimate as states
+from anser_ros.tracking.body_track import BodyTrack, track_body
+from anser_ros.tracking.coil_track import CoilResult, CoilTrack, track_coil
+from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
+from anser_ros.tracking.rigid import BodyCoils
+from anser_ros.tracking.scene import Scene, build_scene
+
+Array = NDArray[np.float64]
+
+FLAGS = ((1, states.SATURATED), (2, states.STALE), (4, states.DROPPED))
+"""Flag bits of a flux point (interfaces, section 3) and the states that they cause."""
+
+__all__ = ['PoseEstimate', 'Tracker', 'TrackerSettings']
+
+
+class Tracker:
+    """Tracks all tool sensors and rigid bodies of a setup.
+
+    Parameters
+    ----------
+    model : FieldModel or None
+        None until one is known; every state is then ``no_model``.
+    sensors : SensorTable
+        The tool sensors, positions and axes in their body's frame.
+    settings : TrackerSettings, optional
+    model_id : str, optional
+        Name of the model in the estimates; by default a digest of its arrays.
+
+    Attributes
+    ----------
+    counters : collections.Counter
+        ``frames``, ``cold_starts``, ``duplicates``, ``time_jumps``.
+
+    Raises
+    ------
+    TrackingError
+        When there is no sensor, a channel or name appears twice, or the model can't be used.
+    """
+
+    def __init__(
+        self,
+        model: FieldModel | None,
+        sensors: SensorTable,
+        settings: TrackerSettings | None = None,
+        model_id: str | None = None,
+    ) -> None:
+        if len(sensors) == 0:
+            raise TrackingError('there is no tool sensor to track')
+        if len(set(sensors.channel.tolist())) != len(sensors):
+            raise TrackingError('a channel appears twice in the sensors')
+        if len(set(sensors.name)) != len(sensors):
+            raise TrackingError('a name appears twice in the sensors')
+        self.settings = settings or TrackerSettings()
+        self.sensors = sensors
+        self.counters: Counter[str] = Counter()
+        self._coil_tracks = {name: CoilTrack() for name in sensors.name}
+        self._body_tracks = {name: BodyTrack() for name in dict.fromkeys(sensors.body)}
+        self._last_ns = [0]
+        self._scene: Scene | None = None
+        self._use(model, model_id)
+
+    def _use(self, model: FieldModel | None, model_id: str | None) -> None:
+        self._model = model
+        table = self.sensors
+        if model is not None:
+            self._scene = build_scene(model, self.settings, self._scene, model_id)
+        self._table = table
+        self._bodies: dict[str, tuple[NDArray[np.int64], BodyCoils]] = {}
+        for body in self._body_tracks:
+            rows = np.array([i for i, name in enumerate(table.body) if name == body])
+            coils = BodyCoils(table.position[rows], table.axis[rows], table.length[rows])
+            if coils.observable:
+                self._bodies[body] = (rows, coils)
+
+    @property
+    def model(self) -> FieldModel | None:
+        """The field model in force."""
+        return self._model
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """Bodies that get a 6-DoF pose."""
+        return tuple(self._bodies)
+
+    def with_model(self, model: FieldModel, model_id: str | None = None) -> 'Tracker':
+        """The same tracker with another field model; warm starts and counters go on.
+
+        Raises
+        ------
+        TrackingError
+            When the model can't be used; this tracker is as it was.
+        """
+        other = Tracker.__new__(Tracker)
+        other.__dict__.update(self.__dict__)
+        other._use(model, model_id)
+        return other
+
+    def reset(self) -> None:
+        """Forget all warm starts."""
+        for track in (*self._coil_tracks.values(), *self._body_tracks.values()):
+            track.forget()
+
+    def update(
+        self,
+        stamp_ns: int,
+        channels: NDArray[np.generic],
+        flux: NDArray[np.generic],
+        flags: NDArray[np.generic] | None = None,
+    ) -> list[PoseEstimate]:
+        """Estimate all poses from one frame.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Middle of the demodulation window; must be positive.
+        channels : ndarray, shape (S,)
+            Channel of each row, in any order; unknown ones are passed over.
+        flux : ndarray, shape (S, K), complex
+            T.
+        flags : ndarray, shape (S,), optional
+            Flag bits: 1 saturated, 2 stale, 4 dropped samples.
+
+        Returns
+        -------
+        list of PoseEstimate
+            A row a sensor, then one a rigid body. Empty for a frame that was already seen.
+
+        Raises
+        ------
+        TrackingError
+            When the stamp is not positive, shapes don't fit, a channel appears twice, or the number
+            of emitters is not the model's.
+        """
+        rows, values, bits = self._checked(stamp_ns, channels, flux, flags)
+        if stamp_ns == self._last_ns[0]:
+            self.counters['duplicates'] += 1
+            return []
+        if stamp_ns < self._last_ns[0]:
+            self.counters['time_jumps'] += 1
+            self.reset()
+        self._last_ns[0] = stamp_ns
+        self.counters['frames'] += 1
+        scene, table = self._scene, self._table
+        if scene is None:
+            names = (*table.name, *self._bodies)
+            return [no_pose(n, stamp_ns, states.NO_MODEL, '', 'no field model yet') for n in names]
+        results = []
+        for i, name in enumerate(table.name):
+            refusal = _refusal(rows[i], values[i], int(bits[i]))
+            if refusal is not None:
+                bad = no_pose(name, stamp_ns, refusal[0], scene.model_id, refusal[1])
+                results.append(CoilResult(bad, None))
+                continue
+            result = track_coil(
+                self._coil_tracks[name], name, float(table.length[i]), stamp_ns, values[i], scene,
+                self.settings,
+            )  # fmt: skip
+            self.counters['cold_starts'] += result.cold
+            results.append(result)
+        estimates = [result.estimate for result in results]
+        for body, (members, coils) in self._bodies.items():
+            usable = np.array([results[i].solution is not None for i in members])
+            estimates.append(
+                track_body(
+                    self._body_tracks[body],
+                    body,
+                    coils,
+                    stamp_ns,
+                    values[members],
+                    usable,
+                    [results[i] for i in members],
+                    scene,
+                    self.settings,
+                )  # fmt: skip
+            )
+        return estimates
+
+    def _checked(
+        self,
+        stamp_ns: int,
+        channels: NDArray[np.generic],
+        flux: NDArray[np.generic],
+        flags: NDArray[np.generic] | None,
+    ) -> tuple[NDArray[np.int64], Array, NDArray[np.int64]]:
+        """Rows of the message (-1 where missing), fluxes (S, 2K) and flags in the table's order."""
+        if stamp_ns <= 0:
+            raise TrackingError(f'a flux frame needs a positive stamp, got {stamp_ns} ns')
+        given = np.asarray(flux)
+        number = np.asarray(channels, dtype=np.int64)
+        marks = np.zeros(number.shape, np.int64) if flags is None else np.asarray(flags)
+        if given.ndim != 2 or number.shape != given.shape[:1] or marks.shape != number.shape:
+            raise TrackingError(
+                f'fluxes (s, k) need s channels and s flags, got {given.shape}, {number.shape} '
+                f'and {marks.shape}'
+            )
+        if self._scene is not None and given.shape[1] != self._scene.field.emitters:
+            raise TrackingError(
+                f'the model has {self._scene.field.emitters} emitters, the fluxes {given.shape[1]}'
+            )
+        place = {channel: i for i, channel in enumerate(number.tolist())}
+        if len(place) != number.size:
+            raise TrackingError('a channel appears twice in the frame')
+        rows = np.array([place.get(c, -1) for c in self.sensors.channel.tolist()], dtype=np.int64)
+        values = np.full((len(rows), given.shape[1]), np.nan, dtype=np.complex128)
+        bits = np.zeros(len(rows), dtype=np.int64)
+        here = rows >= 0
+        values[here], bits[here] = given[rows[here]], marks[rows[here]]
+        return rows, values.view(np.float64), bits
+
+
+def _refusal(row: int, values: Array, bits: int) -> tuple[str, str] | None:
+    """State and reason of a sensor whose fluxes must not be used."""
+    if row < 0:
+        return states.STALE, 'its channel is not in the frame'
+    for bit, state in FLAGS:
+        if bits & bit:
+            return state, f'flagged {state} by the acquisition'
+    if not np.isfinite(values).all():
+        return states.NO_SIGNAL, 'the fluxes are not finite'
+    return None
