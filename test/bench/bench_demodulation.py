@@ -1,4 +1,4 @@
-"""Demodulation of 48 channels, 20 ms at 40 kS/s: all tones by least squares, rival one FFT each."""
+"""Demodulation of 48 channels, 20 ms at 40 kS/s: one least-squares fit, rival one FFT each."""
 
 from __future__ import annotations
 

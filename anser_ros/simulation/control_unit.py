@@ -1,0 +1,226 @@
+"""A whole control unit without its plug: takes command bytes, gives record bytes.
+
+It keeps no clock of its own: whoever owns it says how many samples have gone by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from anser_ros.simulation.raw_effects import RawEffect
+from anser_ros.simulation.sampling import FrontEnd, Sampler
+from anser_ros.simulation.world import World
+from anser_ros.wire.channel_calibration import ChannelCalibration
+from anser_ros.wire.frame_reader import FrameReader
+from anser_ros.wire.frames import (
+    TYPE_OF,
+    Channel,
+    ChannelKind,
+    Hello,
+    Identify,
+    Payload,
+    Record,
+    Reply,
+    ReplyCode,
+    SampleBlock,
+    SamplesFlag,
+    SetFrequencies,
+    Start,
+    State,
+    Status,
+    StatusFlag,
+    Stop,
+    encode,
+)
+
+TICK_HZ = 1e6
+_COMMANDS = (Identify, Start, Stop, SetFrequencies)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Bytes of one record, with what an observer of the wire may want to know.
+
+    Attributes
+    ----------
+    data : the record
+    is_block : whether it carries samples; such a record may be dropped when the pipe is full
+    """
+
+    data: bytes
+    is_block: bool = False
+
+
+class ControlUnit:
+    """Speaks the protocol of `docs/cu_protocol.md`.
+
+    Parameters
+    ----------
+    world, calibration : what it is connected to
+    front_end : converter and noise
+    block_samples : samples a block
+    effects : changes of the signals
+    seed : of the noise
+    name : the device's name
+    """
+
+    def __init__(
+        self,
+        world: World,
+        calibration: ChannelCalibration,
+        front_end: FrontEnd | None = None,
+        *,
+        block_samples: int = 40,
+        effects: Sequence[RawEffect] = (),
+        seed: int = 0,
+        name: str = 'anser_ros simulated control unit',
+    ) -> None:
+        front = front_end or FrontEnd()
+        nominal_a = float(world.setup.emitter.geometry.get('current_a', 0.25))
+        self._effects = tuple(effects)
+        self._sampler = Sampler(
+            world, calibration, front, nominal_a, effects=self._effects, seed=seed
+        )
+        self._hello = _hello(world, front, block_samples, nominal_a, name)
+        self._reader = FrameReader()
+        self._sample = 0
+        self._stream_begin = 0
+        self._sequence = 0
+        self._state = State.IDLE
+        self._dropped = 0
+        self._lost_before = False
+        self._next_hello = 0
+
+    @property
+    def sample_rate_hz(self) -> float:
+        """Samples a second and channel."""
+        return self._hello.sample_rate_hz
+
+    @property
+    def samples(self) -> int:
+        """Samples since power-up."""
+        return self._sample
+
+    @property
+    def streaming(self) -> bool:
+        """Whether it sends samples."""
+        return self._state is State.STREAMING
+
+    def receive(self, data: bytes) -> list[Piece]:
+        """Take bytes from the host and return the records that answer."""
+        answers: list[Piece] = []
+        for record in self._reader.feed(data):
+            answers += self._obey(record)
+        return answers
+
+    def drop(self) -> None:
+        """Note that the pipe was too full for a block."""
+        self._dropped += 1
+        self._lost_before = True
+
+    def advance(self, samples: int) -> list[Piece]:
+        """Let time go by and return the records of that time, in order.
+
+        Parameters
+        ----------
+        samples : sampling instants; blocks are sent when their last sample is taken
+        """
+        pieces: list[Piece] = []
+        if self._sample >= self._next_hello:
+            self._next_hello = self._sample + int(self.sample_rate_hz)
+            pieces += [self._piece(self._hello), self._piece(self._status())]
+        if self.streaming:
+            pieces += self._blocks(samples)
+        self._sample += samples
+        return pieces
+
+    def _blocks(self, samples: int) -> list[Piece]:
+        block = self._hello.block_samples
+        begin = self._stream_begin + self._sequence * block
+        count = (self._sample + samples - begin) // block
+        if count <= 0:
+            return []
+        codes = self._sampler.codes(begin, count * block)
+        pieces = []
+        for rank in range(count):
+            part = SampleBlock(
+                self._sequence % 2**32,
+                self._ticks(begin + rank * block),
+                codes[rank * block : (rank + 1) * block],
+                int(SamplesFlag.LOST_BEFORE) if self._lost_before else 0,
+            )
+            self._lost_before = False
+            self._sequence += 1
+            pieces.append(Piece(encode(part), is_block=True))
+        return pieces
+
+    def _obey(self, record: Record) -> list[Piece]:
+        command = record.payload
+        if not isinstance(command, _COMMANDS):
+            return []
+        code, text, more = ReplyCode.OK, '', []
+        if isinstance(command, Start):
+            self._state = State.STREAMING
+            self._stream_begin, self._sequence = self._sample, 0
+            self._dropped, self._lost_before = 0, False
+        elif isinstance(command, Stop):
+            self._state = State.IDLE
+        elif isinstance(command, Identify):
+            more = [self._piece(self._hello)]
+        else:
+            code, text = self._set_frequencies(command)
+            more = [self._piece(self._hello)] if code is ReplyCode.OK else []
+        reply = encode(Reply(TYPE_OF[type(command)], code, text), record.tag)
+        return [Piece(reply), *more]
+
+    def _set_frequencies(self, command: SetFrequencies) -> tuple[ReplyCode, str]:
+        tones = command.frequencies_hz
+        count = len(self._hello.frequencies_hz)
+        if len(tones) != count:
+            return ReplyCode.BAD_ARGUMENT, f'{count} coils, {len(tones)} frequencies'
+        if max(tones) >= self.sample_rate_hz / 2:
+            return ReplyCode.BAD_ARGUMENT, 'a frequency above half the sample rate'
+        self._hello = replace(self._hello, frequencies_hz=tones)
+        self._sampler.set_frequencies(np.array(tones))
+        return ReplyCode.OK, ''
+
+    def _status(self) -> Status:
+        refused = self._reader.counters
+        return Status(
+            self._state,
+            StatusFlag.OVERRUN if self._dropped else StatusFlag(0),
+            self._ticks(self._sample),
+            self._dropped,
+            refused.bad_header + refused.bad_crc + refused.bad_payload + refused.unknown_type,
+            31.5,
+        )
+
+    def _ticks(self, sample: int) -> int:
+        time_s = sample / self.sample_rate_hz
+        for effect in self._effects:
+            time_s = effect.device_time(time_s)
+        return round(time_s * TICK_HZ)
+
+    def _piece(self, payload: Payload) -> Piece:
+        return Piece(encode(payload))
+
+
+def _hello(
+    world: World, front: FrontEnd, block_samples: int, nominal_a: float, name: str
+) -> Hello:
+    numbers = [sensor.channel for sensor in world.sensors]
+    channels = [Channel(n, ChannelKind.SENSE, front.full_scale_v) for n in numbers]
+    current = Channel(max(numbers) + 1, ChannelKind.CURRENT, front.full_scale_a)
+    tones = world.setup.frequencies_hz
+    return Hello(
+        name,
+        front.sample_rate_hz,
+        TICK_HZ,
+        block_samples,
+        (*channels, current),
+        tones,
+        (nominal_a,) * len(tones),
+    )

@@ -1,0 +1,82 @@
+"""Metal bodies as clouds of spheres that every emitter drives with the same polarisability."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.physics.constants import MU_0
+from anser_ros.simulation.motion import Approach, Path
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+def sphere_polarisability(
+    radius_m: float, conductivity_s_per_m: float, relative_permeability: float, omega: Array
+) -> ComplexArray:
+    """Magnetic moment of a sphere per tesla of a uniform field exp(+j w t), A m^2 / T.
+
+    J. R. Wait, Geophysics 16 (1951) 666, the induced dipole of a conducting permeable sphere; its
+    limits are -2 pi a^3 / mu_0 for a perfect conductor and
+    4 pi a^3 / mu_0 (mu_r - 1) / (mu_r + 2) for a permeable insulator.
+
+    Parameters
+    ----------
+    omega : ndarray, shape (K,), rad/s
+
+    Returns
+    -------
+    ndarray, shape (K,), complex
+    """
+    mu = relative_permeability
+    x = radius_m * np.sqrt(1j * omega * conductivity_s_per_m * mu * MU_0)
+    tanh = np.tanh(np.where(np.abs(x) > 300, 300.0, x))
+    numerator = (1 + x**2 + 2 * mu) * tanh - (1 + 2 * mu) * x
+    denominator = (1 + x**2 - mu) * tanh - (1 - mu) * x
+    return np.asarray(-2 * np.pi * radius_m**3 / MU_0 * numerator / denominator)
+
+
+@dataclass(frozen=True)
+class MetalBody:
+    """A rigid cloud of equal spheres on a path; their fields on each other are left out.
+
+    Attributes
+    ----------
+    offsets : ndarray, shape (M, 3), m, sphere centres in the body's frame
+    radius_m, conductivity_s_per_m, relative_permeability : of each sphere
+    path : pose of the body at a time
+    """
+
+    offsets: Array
+    radius_m: float
+    conductivity_s_per_m: float
+    relative_permeability: float
+    path: Path
+
+    def centres(self, time_s: float) -> Array:
+        """Sphere centres (M, 3), m, frame fg."""
+        position, rotation = self.path(time_s)
+        return np.asarray(position + self.offsets @ rotation.T)
+
+    def polarisability(self, frequencies_hz: Array) -> ComplexArray:
+        """Polarisability of one sphere at each drive tone, shape (K,)."""
+        return sphere_polarisability(
+            self.radius_m,
+            self.conductivity_s_per_m,
+            self.relative_permeability,
+            2 * np.pi * frequencies_hz,
+        )
+
+
+def steel_disc(path: Path | None = None, *, radius_m: float = 0.06, rings: int = 3) -> MetalBody:
+    """A disc of touching steel balls, like the foot of an instrument stand or an X-ray head."""
+    ball = radius_m / (2 * rings + 1)
+    centres = [np.zeros(3)]
+    for ring in range(1, rings + 1):
+        angles = 2 * np.pi * np.arange(6 * ring) / (6 * ring)
+        circle = 2 * ball * ring * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+        centres += list(circle)
+    return MetalBody(np.array(centres), ball, 5e6, 200.0, path or Approach())

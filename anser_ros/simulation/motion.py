@@ -1,0 +1,75 @@
+"""Where things are at a time: a tool on a smooth closed path, and metal that comes and goes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+Pose = tuple[Array, Array]
+"""Position (3,), m, and rotation matrix (3, 3), frame fg."""
+
+Path = Callable[[float], Pose]
+"""A pose for every time in seconds."""
+
+
+@dataclass(frozen=True)
+class Lissajous:
+    """Sums of sines in each coordinate and in each component of the rotation vector.
+
+    Attributes
+    ----------
+    centre_m, amplitude_m, period_s : three values each, x y z
+    turn_rad, turn_period_s : amplitude and period of the rotation vector's components
+    phase_rad : start phase, so that two bodies need not move alike
+    """
+
+    centre_m: tuple[float, float, float] = (0.0, 0.0, 0.15)
+    amplitude_m: tuple[float, float, float] = (0.08, 0.08, 0.03)
+    period_s: tuple[float, float, float] = (9.0, 12.5, 7.0)
+    turn_rad: tuple[float, float, float] = (0.5, 0.4, 0.8)
+    turn_period_s: tuple[float, float, float] = (11.0, 8.0, 17.0)
+    phase_rad: float = 0.0
+
+    def __call__(self, time_s: float) -> Pose:
+        """Pose at a time."""
+        angle = 2 * np.pi * time_s / np.array(self.period_s) + self.phase_rad
+        position = np.array(self.centre_m) + np.array(self.amplitude_m) * np.sin(angle)
+        turn = 2 * np.pi * time_s / np.array(self.turn_period_s) + self.phase_rad
+        rotation = Rotation.from_rotvec(np.array(self.turn_rad) * np.sin(turn))
+        return position, np.asarray(rotation.as_matrix())
+
+
+@dataclass(frozen=True)
+class Approach:
+    """A visit from afar: far, then near, then far again, each way along a smooth ramp.
+
+    Attributes
+    ----------
+    far_m, near_m : positions between which it moves
+    start_s, travel_s, stay_s : begin, time for one way, time near
+    period_s : the visit repeats after this long; 0 for once
+    """
+
+    far_m: tuple[float, float, float] = (0.05, -0.03, -0.6)
+    near_m: tuple[float, float, float] = (0.05, -0.03, -0.08)
+    start_s: float = 8.0
+    travel_s: float = 5.0
+    stay_s: float = 6.0
+    period_s: float = 0.0
+
+    def __call__(self, time_s: float) -> Pose:
+        """Pose at a time; the orientation stays."""
+        local = time_s - self.start_s
+        if self.period_s > 0 and local > 0:
+            local %= self.period_s
+        inward = local / self.travel_s
+        outward = (2 * self.travel_s + self.stay_s - local) / self.travel_s
+        share = float(np.clip(min(inward, outward), 0.0, 1.0))
+        smooth = share * share * (3 - 2 * share)
+        far, near = np.array(self.far_m), np.array(self.near_m)
+        return far + smooth * (near - far), np.eye(3)

@@ -1,0 +1,273 @@
+"""The simulated control unit: bytes in, bytes out, and fluxes that come back as they went in."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from anser_ros.errors import SetupError
+from anser_ros.physics.constants import MU_0
+from anser_ros.physics.dipole import field_basis
+from anser_ros.signals.demodulation import Demodulator
+from anser_ros.signals.flux import FluxConverter
+from anser_ros.signals.window import WindowCutter
+from anser_ros.simulation import raw_effects
+from anser_ros.simulation.control_unit import ControlUnit
+from anser_ros.simulation.metal import sphere_polarisability, steel_disc
+from anser_ros.simulation.motion import Approach, Lissajous
+from anser_ros.simulation.sampling import FrontEnd
+from anser_ros.simulation.world import World
+from anser_ros.wire.channel_calibration import parse_channels
+from anser_ros.wire.config_folder import config_path, read_config
+from anser_ros.wire.frame_reader import FrameReader
+from anser_ros.wire.frames import (
+    Hello,
+    Identify,
+    Reply,
+    ReplyCode,
+    SampleBlock,
+    SamplesFlag,
+    SetFrequencies,
+    Start,
+    State,
+    Status,
+    Stop,
+    encode,
+)
+from anser_ros.wire.setup import parse_setup
+
+SETUP = parse_setup(read_config('demo_setup.yaml'))
+CHANNELS = parse_channels(read_config('demo_channels.yaml'))
+TONES = np.array(SETUP.frequencies_hz)
+
+
+def dipoles(points):
+    """One vertical dipole an emitter, as strong as 25 turns of 62 mm at 0.25 A."""
+    centres = np.array([coil.centre_m for coil in SETUP.emitter.coils])
+    up = np.broadcast_to([0.0, 0.0, 1.0], centres.shape)
+    return 0.024 * field_basis(points, centres, up).transpose(0, 2, 1).astype(complex)
+
+
+def world(**options):
+    return World(SETUP, dipoles, **options)
+
+
+def decode(pieces):
+    return [record.payload for record in FrameReader().feed(b''.join(p.data for p in pieces))]
+
+
+def fluxes(unit, seconds=0.1, window=800):
+    """Fluxes (windows, S, K), their sigmas and the mid times, as acquisition makes them."""
+    unit.receive(encode(Start()))
+    begin = unit.samples / unit.sample_rate_hz
+    (hello,) = [p for p in decode(unit.receive(encode(Identify()))) if isinstance(p, Hello)]
+    columns = len(hello.channels) - 1
+    scales = np.array([c.full_scale / 32768 for c in hello.channels])
+    numbers = [c.number for c in hello.channels[:-1]]
+    demodulator = Demodulator(hello.sample_rate_hz, np.array(hello.frequencies_hz), window)
+    converter = FluxConverter(
+        np.array(hello.frequencies_hz),
+        np.arange(columns),
+        scales[:-1],
+        CHANNELS.areas_m2(numbers),
+        CHANNELS.delays_s(numbers),
+        current_column=columns,
+        amperes_per_code=scales[-1],
+        nominal_currents_a=np.array(hello.currents_a),
+        current_delay_s=CHANNELS.current_delay_s,
+    )
+    cutter = WindowCutter(window, window, columns + 1, 0.04)
+    found = []
+    for _ in range(round(seconds / 0.005)):
+        for block in decode(unit.advance(200)):
+            if isinstance(block, SampleBlock):
+                found += cutter.push(block.sequence, block.timestamp_ticks, block.codes)
+    converted = [converter.convert(demodulator.demodulate(one.codes)) for one in found]
+    times = begin + (np.arange(len(found)) + 0.5) * window / hello.sample_rate_hz
+    return np.array([c.flux for c in converted]), np.array([c.sigma for c in converted]), times
+
+
+class TestProtocol:
+    def test_says_hello_and_status_once_a_second_even_when_idle(self):
+        unit = ControlUnit(world(), CHANNELS)
+        payloads = [p for _ in range(300) for p in decode(unit.advance(400))]
+        assert [type(p) for p in payloads] == [Hello, Status] * 3
+        assert payloads[1].state is State.IDLE
+
+    def test_streams_between_start_and_stop(self):
+        unit = ControlUnit(world(), CHANNELS)
+        unit.advance(400)
+        (reply,) = decode(unit.receive(encode(Start(), 7)))
+        assert reply == Reply(0x82, ReplyCode.OK)
+        blocks = [p for _ in range(4) for p in decode(unit.advance(100))]
+        assert [b.sequence for b in blocks] == list(range(10))
+        assert [b.timestamp_ticks for b in blocks] == [10_000 + 1000 * k for k in range(10)]
+        assert blocks[0].codes.shape == (40, 42)
+        unit.receive(encode(Stop()))
+        assert decode(unit.advance(100)) == []
+
+    def test_sets_tones_and_refuses_wrong_ones(self):
+        unit = ControlUnit(world(), CHANNELS)
+        reply, hello = decode(unit.receive(encode(SetFrequencies(tuple(TONES + 1000)))))
+        assert reply.code is ReplyCode.OK
+        assert hello.frequencies_hz == tuple(TONES + 1000)
+        for wrong in ((6000.0,), (30000.0,) * 8):
+            (reply,) = decode(unit.receive(encode(SetFrequencies(wrong))))
+            assert reply.code is ReplyCode.BAD_ARGUMENT and reply.text
+
+    def test_counts_what_it_refused_and_what_it_dropped(self):
+        unit = ControlUnit(world(), CHANNELS)
+        damaged = bytearray(encode(Start()))
+        damaged[-1] ^= 1
+        assert unit.receive(bytes(damaged)) == []
+        assert unit.receive(encode(Reply(1, ReplyCode.OK))) == []
+        unit.receive(encode(Start()))
+        unit.drop()
+        payloads = decode(unit.advance(40))
+        assert payloads[1].refused_records == 1 and payloads[1].dropped_blocks == 1
+        assert payloads[2].flags == SamplesFlag.LOST_BEFORE
+
+
+class TestSignals:
+    def test_flux_comes_back_as_it_went_in(self):
+        truth = world()
+        got, sigma, times = fluxes(ControlUnit(truth, CHANNELS), 0.2)
+        expected = np.array([truth.flux(t) for t in times])
+        ratio = np.abs(got - expected) / sigma
+        assert len(got) == 10
+        assert np.sqrt((ratio**2).mean() / 2) == pytest.approx(1.0, abs=0.1)
+        assert 20e-12 < np.median(sigma) < 200e-12
+
+    def test_drifting_current_moves_no_flux(self):
+        truth = world()
+        drift = raw_effects.CurrentDrift(coil=2, amount=-0.3, tau_s=0.05)
+        unit = ControlUnit(truth, CHANNELS, effects=[drift])
+        got, sigma, times = fluxes(unit, 0.2)
+        expected = np.array([truth.flux(t) for t in times])
+        assert (np.abs(got - expected) / sigma).max() < 7
+
+    def test_other_tones_give_the_same_flux(self):
+        unit = ControlUnit(world(), CHANNELS)
+        unit.receive(encode(SetFrequencies(tuple(TONES - 2000))))
+        got, sigma, times = fluxes(unit, 0.1)
+        assert (np.abs(got - [world().flux(t) for t in times]) / sigma).max() < 7
+
+    def test_converter_clips(self):
+        unit = ControlUnit(world(), CHANNELS, FrontEnd(full_scale_v=0.02))
+        unit.receive(encode(Start()))
+        blocks = [p for p in decode(unit.advance(400)) if isinstance(p, SampleBlock)]
+        codes = np.concatenate([b.codes for b in blocks])
+        assert codes.min() == -32768 and codes.max() == 32767
+
+    def test_same_seed_same_bytes(self):
+        streams = []
+        for _ in range(2):
+            unit = ControlUnit(world(metal=[steel_disc()]), CHANNELS, seed=3)
+            unit.receive(encode(Start()))
+            streams.append(b''.join(p.data for p in unit.advance(200)))
+        assert streams[0] == streams[1]
+
+
+class TestEffects:
+    def codes(self, *effects):
+        unit = ControlUnit(world(), CHANNELS, FrontEnd(noise_codes=0.0), effects=effects)
+        unit.receive(encode(Start()))
+        blocks = [p for p in decode(unit.advance(4000)) if isinstance(p, SampleBlock)]
+        return np.concatenate([b.codes for b in blocks]).astype(float), blocks
+
+    def test_crosstalk(self):
+        clean, _ = self.codes()
+        leaky, _ = self.codes(raw_effects.ChannelCrosstalk(3, 5, 0.1))
+        assert np.abs(leaky[:, 3] - clean[:, 3] - 0.1 * clean[:, 5]).max() <= 1
+        assert np.array_equal(np.delete(leaky, 3, 1), np.delete(clean, 3, 1))
+
+    def test_compression(self):
+        clean, _ = self.codes()
+        limit = 10.0 * np.abs(clean[:, 20]).max() / 32768
+        bent, _ = self.codes(raw_effects.CompressingAmplifier(20, limit))
+        ratio = np.abs(bent[:, 20]).max() / np.abs(clean[:, 20]).max()
+        assert ratio == pytest.approx(np.tanh(1.0), abs=1e-3)
+
+    def test_loose_contact(self):
+        clean, _ = self.codes()
+        loose, _ = self.codes(raw_effects.LooseSensor(20, share=0.5, period_s=0.02, rest=0.0))
+        assert np.abs(loose[:400, 20]).max() == 0
+        assert np.array_equal(loose[400:800], clean[400:800])
+
+    def test_slow_clock(self):
+        _, blocks = self.codes(raw_effects.SlowClock(-1000.0))
+        assert blocks[50].timestamp_ticks == round(50_000 * 0.999)
+
+    def test_base_changes_nothing(self):
+        clean, _ = self.codes()
+        same, _ = self.codes(raw_effects.RawEffect())
+        assert np.array_equal(clean, same)
+        assert raw_effects.RawEffect().setup(SETUP) is SETUP
+
+
+class TestMetal:
+    OMEGA = 2 * np.pi * np.array([100.0, 6000.0, 1e7])
+
+    def test_perfect_conductor_and_permeable_insulator(self):
+        volume = 4 * np.pi * 0.02**3 / MU_0
+        perfect = sphere_polarisability(0.02, 1e12, 1.0, self.OMEGA)
+        assert perfect[2] == pytest.approx(-volume / 2, rel=1e-3)
+        insulator = sphere_polarisability(0.02, 1e-6, 50.0, self.OMEGA)
+        assert insulator == pytest.approx(np.full(3, volume * 49 / 52), rel=1e-4)
+
+    def test_weak_conductor_lags_by_90_degrees(self):
+        omega = np.array([100.0])
+        weak = sphere_polarisability(0.02, 1e3, 1.0, omega)
+        eddy = -2 * np.pi * 0.02**5 * 1j * omega * 1e3 / 15
+        assert weak == pytest.approx(eddy, rel=1e-3)
+
+    def test_metal_comes_and_goes(self):
+        bare, with_metal = world(), world(metal=[steel_disc()])
+        change = [np.abs(with_metal.flux(t) - bare.flux(t)).max() for t in (0.0, 14.0, 30.0)]
+        assert change[1] > 5e-9 and change[1] > 50 * max(change[0], change[2])
+
+    def test_approach_repeats_when_it_has_a_period(self):
+        path = replace(Approach(), period_s=20.0)
+        assert path(34.0)[0] == pytest.approx(path(14.0)[0])
+        assert path(14.0)[0] == pytest.approx(path.near_m)
+
+
+def test_tool_moves_smoothly_inside_the_volume():
+    path = Lissajous()
+    positions = np.array([path(t)[0] for t in np.arange(0, 60, 0.01)])
+    assert np.linalg.norm(np.diff(positions, axis=0), axis=1).max() / 0.01 < 0.15
+    assert positions[:, 2].min() > 0.08 and np.abs(positions[:, :2]).max() < 0.125
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('[', 'not YAML'),
+        ('schema: other', 'schema must be'),
+        ('schema: anser_channels/1', 'default must be a mapping'),
+        ('schema: anser_channels/1\ndefault: {}', 'area_m2 must be a finite'),
+        ('schema: anser_channels/1\ndefault: {area_m2: 0}', 'not be zero'),
+        ('schema: anser_channels/1\ndefault: {area_m2: 1, delay_s: 1}', '10 ms'),
+        ('schema: anser_channels/1\ndefault: {area_m2: 1, gain: 1}', 'unknown key gain'),
+        ('schema: anser_channels/1\ndefault: {area_m2: 1}\nchannels: 3', 'must be a list'),
+        ('schema: anser_channels/1\ndefault: {area_m2: 1}\nchannels: [{}]', 'channel number'),
+        (
+            'schema: anser_channels/1\ndefault: {area_m2: 1}\n'
+            'channels: [{channel: 1}, {channel: 1}]',
+            'appears twice',
+        ),
+    ],
+)
+def test_channel_documents_that_are_refused(text, message):
+    with pytest.raises(SetupError, match=message):
+        parse_channels(text)
+
+
+def test_config_files_are_found_or_named(tmp_path):
+    assert config_path('demo_setup.yaml').is_file()
+    with pytest.raises(SetupError, match='no file nothing'):
+        config_path('nothing.yaml')
+    binary = tmp_path / 'binary.yaml'
+    binary.write_bytes(b'\xff\xfe')
+    with pytest.raises(SetupError, match='cannot read'):
+        read_config(str(binary))
