@@ -1,8 +1,8 @@
 """Magnetic dipoles: their field, its gradient, and the flux that a finite pick-up coil links.
 
 The field of a dipole m at the offset d is the article's equation (1),
-``B = mu0/(4 pi) (3 (m . d) d / |d|^5 - m / |d|^3)``; its gradient follows by differentiation and is
-symmetric and traceless outside the source. A coil of length L along its axis n sees the mean of
+``B = mu0/(4 pi) (3 (m . d) d / |d|^5 - m / |d|^3)``; its gradient follows by differentiation and
+is symmetric and traceless outside the source. A coil of length L along its axis n sees the mean of
 ``n . B`` over its length; two-point Gauss-Legendre at +-L/(2 sqrt 3) has an error of order L^4.
 """
 
@@ -49,7 +49,7 @@ def _fill_flux_basis(points, axes, lengths, positions, directions, out):  # type
 def fill_field_and_gradient(point, positions, directions, basis):  # type: ignore[no-untyped-def]
     """Write each unit dipole's field and gradient at one point (m) into ``basis``, shape (9, N).
 
-    Rows 0 to 2 hold B_x, B_y, B_z (T); rows 3 to 8 hold the gradient's xx, xy, xz, yy, yz, zz (T/m).
+    Rows 0 to 2 hold B_x, B_y, B_z (T); rows 3 to 8 the gradient's xx, xy, xz, yy, yz, zz (T/m).
     """
     for j in range(positions.shape[0]):
         dx = point[0] - positions[j, 0]
@@ -159,7 +159,7 @@ def flux_basis(
 def field_basis(
     points: NDArray[np.generic], positions: NDArray[np.generic], directions: NDArray[np.generic]
 ) -> Array:
-    """Field of each unit dipole at each point, shape (P, N, 3), T / (A m^2); shapes as `flux_basis`."""
+    """Field of each unit dipole at each point, shape (P, N, 3), T / (A m^2)."""
     r = _rows(points, 3, 'points')
     unit = np.eye(3)
     columns = [

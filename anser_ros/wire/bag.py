@@ -1,8 +1,8 @@
 """Reads MCAP bags without ROS: raw messages for replay, and whole sessions as arrays.
 
 A bag that is complete is read through its index, in the order of its log times. A bag that was cut
-(a crash, a full disk) has no index: it is read chunk by chunk as far as it goes, every chunk that is
-whole is kept, and `Bag.lost` says in words what is gone.
+(a crash, a full disk) has no index: it is read chunk by chunk as far as it goes, every chunk
+that is whole is kept, and `Bag.lost` says in words what is gone.
 """
 
 import io
@@ -27,8 +27,8 @@ from anser_ros.wire.points import STALE, FluxPoints, decode_flux
 from anser_ros.wire.setup import Setup, parse_setup
 
 _BROKEN = (
-    McapError, ValueError, struct.error, EOFError, IndexError, KeyError, MemoryError, OverflowError,
-    zstandard.ZstdError, RuntimeError,
+    McapError, ValueError, struct.error, EOFError, IndexError, KeyError, MemoryError,
+    OverflowError, zstandard.ZstdError, RuntimeError,
 )  # fmt: skip
 _RECORD_LIMIT = 256 * 2**20
 
@@ -86,7 +86,7 @@ class PoseStream:
 
 @dataclass(frozen=True)
 class Bag:
-    """A recorded session: its setup, its fluxes, the optical poses, and what was refused or lost."""
+    """A recorded session: setup, fluxes, optical poses, and what was refused or lost."""
 
     path: str
     setup: Setup

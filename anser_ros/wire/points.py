@@ -1,8 +1,8 @@
 """The byte layouts of the two point clouds, flux and field model, without any ROS message.
 
-Fields are read by name and offset, never by position, so a cloud with other fields in between, or in
-another order, is read right. A field is the tuple ``(name, offset, datatype, count)`` with the datatype
-codes of ``sensor_msgs/PointField``.
+Fields are read by name and offset, never by position, so a cloud with other fields in between,
+or in another order, is read right. A field is the tuple ``(name, offset, datatype, count)`` with
+the datatype codes of ``sensor_msgs/PointField``.
 """
 
 from collections.abc import Sequence
@@ -130,8 +130,8 @@ def decode_flux(
     Raises
     ------
     LayoutError
-        When a field is missing, doubled, of an unknown type or outside the point, when the number of
-        bytes is not ``width * point_step``, or when a channel appears twice.
+        When a field is missing, doubled, of an unknown type or outside the point, when the number
+        of bytes is not ``width * point_step``, or when a channel appears twice.
     """
     records = _records(fields, point_step, width, data, is_bigendian)
     geometry = _columns(records, ('x', 'y', 'z', 'nx', 'ny', 'nz'))
@@ -178,7 +178,7 @@ def decode_field_model(
     data: bytes | bytearray | memoryview,
     is_bigendian: bool = False,
 ) -> DipolePoints:
-    """Read a field model cloud; raises `LayoutError` as `decode_flux`, and on values not finite."""
+    """Read a field model cloud; `LayoutError` as `decode_flux`, and on values not finite."""
     records = _records(fields, point_step, width, data, is_bigendian)
     geometry = _columns(records, ('x', 'y', 'z', 'ux', 'uy', 'uz'))
     moments = _phasors(records, 'm')

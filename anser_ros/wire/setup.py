@@ -1,7 +1,7 @@
-"""The setup document (`anser_setup/1`): which emitters drive, which sensors listen, and where they are.
+"""The setup document (`anser_setup/1`): which coils drive, which listen, and where they are.
 
-The YAML text travels in every bag and on the latched topic ``setup``. Sensor positions and axes are
-given in the frame of the sensor's body; the body ``fg`` is the field generator itself.
+The YAML text travels in every bag and on the latched topic ``setup``. Sensor positions and axes
+are given in the frame of the sensor's body; the body ``fg`` is the field generator itself.
 """
 
 import math
@@ -37,8 +37,8 @@ class Coil:
 class Emitter:
     """The field generator: its kind, the geometry that all coils share, and the coils.
 
-    ``geometry`` holds the document's remaining keys (``turns``, ``side_m``, ``pitch_m``, ``layers``,
-    ``thickness_m``, ``current_a`` for ``square_spiral_pcb``), as given.
+    ``geometry`` holds the document's remaining keys (``turns``, ``side_m``, ``pitch_m``,
+    ``layers``, ``thickness_m``, ``current_a`` for ``square_spiral_pcb``), as given.
     """
 
     kind: str
