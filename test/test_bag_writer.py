@@ -68,7 +68,7 @@ class TestCdr:
         from std_msgs.msg import String
 
         def agree(ours, message):
-            # Padding is whatever lay in ROS's memory, so the lengths and the contents are compared.
+            # Padding is whatever lay in ROS's memory, so lengths and contents are compared.
             assert len(ours) == len(serialize_message(message))
             assert deserialize_message(ours, type(message)) == message
 

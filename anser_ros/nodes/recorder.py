@@ -1,0 +1,262 @@
+"""Records the topics into an MCAP bag that a crash or a full disk can't spoil."""
+
+import os
+import struct
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from std_srvs.srv import Trigger
+
+from anser_ros.errors import AnserError
+from anser_ros.nodes.definitions import definition, message_class, type_hash
+from anser_ros.nodes.node import AnserNode, Level, Status, main
+from anser_ros.nodes.parameters import parameter
+from anser_ros.nodes.recording_log import TopicLog, report
+from anser_ros.wire.bag_metadata import qos_profile, write_metadata
+from anser_ros.wire.bag_writer import BagWriter
+
+DISCOVERY_PERIOD_S = 0.25
+# Deep enough for a pause of seconds on a slow disk.
+DEPTH = 2000
+COMMON_TOPICS = ('/diagnostics', '/tf', '/tf_static')
+COMMON_PREFIXES = ('/optical/',)
+STAMPED = (
+    'sensor_msgs/msg/PointCloud2',
+    'geometry_msgs/msg/PoseStamped',
+    'geometry_msgs/msg/PoseWithCovarianceStamped',
+)
+
+
+@dataclass(frozen=True)
+class RecorderParameters:
+    """Parameters of the recorder."""
+
+    directory: str = parameter('recordings', 'folder that gets one folder a bag')
+    name: str = parameter('', "the bag's folder; empty for one with date and time")
+    autostart: bool = parameter(True, 'record from the start on')
+    flush_period_s: float = parameter(
+        0.25, 'most that a crash may cost, s', minimum=0.05, maximum=1.0
+    )
+    topics: tuple[str, ...] = parameter((), 'topics to record besides those of the contract')
+
+
+class Recorder(AnserNode):
+    """Subscribes to all topics of the contract as they appear, and writes their raw bytes."""
+
+    NAME = 'recorder'
+    PARAMETERS = RecorderParameters
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._bag: BagWriter | None = None
+        self._logs: dict[str, TopicLog] = {}
+        self._topic_subscriptions: dict[str, Any] = {}
+        self._error = ''
+        self._last_report = ''
+        self.create_service(Trigger, 'recorder/start', self._on_start)
+        self.create_service(Trigger, 'recorder/stop', self._on_stop)
+        clock = self.steady_clock
+        self.create_timer(DISCOVERY_PERIOD_S, self._discover, clock=clock)
+        self.create_timer(self.parameters.flush_period_s, self._flush, clock=clock)
+        if self.parameters.autostart:
+            self.start()
+
+    def status(self) -> Status:
+        """Return whether it records, how much, and what went wrong."""
+        if self._bag is None:
+            if self._error:
+                return Status('', Level.ERROR, f'recording stopped: {self._error}')
+            return Status('', Level.OK, 'not recording', {'last': self._last_report})
+        record = self._bag.record
+        values = {
+            'bag': str(self._bag.path.parent),
+            'messages': record.messages,
+            'topics': len(record.topics),
+            'duration_s': record.duration_s,
+            'lost_messages': sum(log.lost for log in self._logs.values()),
+        }
+        return Status('', Level.OK, 'recording', values)
+
+    def start(self) -> Path:
+        """Begin a bag and return its folder.
+
+        Raises
+        ------
+        BagError
+            The bag is there already, or cannot be made.
+        """
+        folder = self._new_folder()
+        self._error = ''
+        self._bag = BagWriter(folder / f'{folder.name}_0.mcap')
+        self.get_logger().info(f'recording to {folder}')
+        self._discover()
+        return folder
+
+    def stop_recording(self) -> str:
+        """End the bag and return the report of its counts and gaps."""
+        bag, self._bag = self._bag, None
+        if bag is None:
+            return 'not recording'
+        for subscription in filter(None, self._topic_subscriptions.values()):
+            self.destroy_subscription(subscription)
+        self._topic_subscriptions.clear()
+        try:
+            bag.close()
+            write_metadata(bag.path, bag.record, _ros_distro())
+        except OSError as error:
+            self._error = self._error or _reason(error)
+        logs, self._logs = self._logs, {}
+        self._last_report = report(bag.path.parent, bag.record, logs)
+        self.get_logger().info(self._last_report)
+        return self._last_report
+
+    def close(self) -> None:
+        """End the bag in order when the node ends."""
+        self.stop_recording()
+
+    # Callbacks ----------------------------------------------------------------------------
+
+    def _on_start(self, _request: Any, response: Any) -> Any:
+        if self._bag is not None:
+            response.success, response.message = False, 'records already'
+            return response
+        response.message = str(self.start())
+        response.success = True
+        return response
+
+    def _on_stop(self, _request: Any, response: Any) -> Any:
+        response.success = self._bag is not None
+        response.message = self.stop_recording()
+        if self._error:
+            response.success = False
+            response.message = f'{self._error}; {response.message}'
+        return response
+
+    def _flush(self) -> None:
+        if self._bag is None:
+            return
+        try:
+            self._bag.flush()
+        except OSError as error:
+            self._error = _reason(error)
+            self.count('write_errors')
+            self.get_logger().error(f'recording stopped: {self._error}')
+            self.stop_recording()
+            self.publish_diagnostics()
+
+    def _discover(self) -> None:
+        """Subscribe to what has appeared since the last time."""
+        if self._bag is None:
+            return
+        added = False
+        for topic, type_names in self.get_topic_names_and_types():
+            if topic in self._topic_subscriptions:
+                self._logs[topic].publishers(self.count_publishers(topic))
+            elif self._wanted(topic) and len(type_names) == 1:
+                added = self._add(topic, type_names[0]) or added
+        if added:
+            try:
+                write_metadata(self._bag.path, self._bag.record, _ros_distro(), is_closed=False)
+            except OSError as error:  # the next flush will stop the recording
+                self.warn('metadata_errors', _reason(error))
+
+    def _wanted(self, topic: str) -> bool:
+        own = self.get_namespace().rstrip('/') + '/'
+        return (
+            topic.startswith((own, *COMMON_PREFIXES))
+            or topic in COMMON_TOPICS
+            or topic in self.parameters.topics
+        )
+
+    def _add(self, topic: str, type_name: str) -> bool:
+        """Subscribe to one topic; return whether it is recorded from now on."""
+        offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
+        if not offered or self._bag is None:
+            return False  # only somebody who listens
+        try:
+            message, text = message_class(type_name), definition(type_name)
+        except AnserError as error:
+            self.warn('topics_without_definition', f'{topic}: {error}')
+            self._logs[topic] = TopicLog()
+            self._topic_subscriptions[topic] = None
+            return False
+        profiles = [_described(profile) for profile in offered]
+        channel = self._bag.add_topic(topic, type_name, text, profiles, type_hash(type_name))
+        log = self._logs[topic] = TopicLog(len(offered))
+        callback = self._writer_of(channel, log, type_name in STAMPED)
+        self._topic_subscriptions[topic] = self.create_subscription(
+            message, topic, callback, _matching(offered), raw=True
+        )
+        return True
+
+    def _writer_of(
+        self, channel: int, log: TopicLog, is_stamped: bool
+    ) -> Callable[[bytes, dict[str, int]], None]:
+        """Return the callback that writes one topic's messages."""
+
+        def write(data: bytes, info: dict[str, int]) -> None:
+            if self._bag is None:
+                return
+            received_ns = info.get('received_timestamp') or time.time_ns()
+            self._bag.write(channel, received_ns, data, info.get('source_timestamp') or None)
+            log.add(
+                info.get('publication_sequence_number'), _stamp_ns(data) if is_stamped else None
+            )
+
+        return write
+
+    def _new_folder(self) -> Path:
+        parent = Path(self.parameters.directory).expanduser()
+        if self.parameters.name:
+            return parent / self.parameters.name
+        name = time.strftime('anser_%Y%m%d_%H%M%S')
+        folder, number = parent / name, 1
+        while folder.exists():
+            number += 1
+            folder = parent / f'{name}_{number}'
+        return folder
+
+
+def _matching(offered: list[QoSProfile]) -> QoSProfile:
+    """Return a profile that matches all publishers and asks for all that they have."""
+    latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in offered)
+    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in offered)
+    return QoSProfile(
+        depth=DEPTH,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+    )
+
+
+def _described(profile: QoSProfile) -> dict[str, Any]:
+    return qos_profile(
+        reliable=profile.reliability == ReliabilityPolicy.RELIABLE,
+        latched=profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+        depth=max(profile.depth, 1),  # the graph does not tell the depth
+    )
+
+
+def _stamp_ns(data: bytes) -> int | None:
+    """Return the stamp of a serialised message that begins with a header."""
+    if len(data) < 12:
+        return None
+    order = '<' if data[1] & 1 else '>'
+    sec, nanosec = struct.unpack_from(f'{order}iI', data, 4)
+    return int(sec) * 1_000_000_000 + int(nanosec)
+
+
+def _ros_distro() -> str:
+    return os.environ.get('ROS_DISTRO', 'jazzy')
+
+
+def _reason(error: OSError) -> str:
+    return error.strerror or type(error).__name__
+
+
+if __name__ == '__main__':
+    sys.exit(main(Recorder))

@@ -1,0 +1,239 @@
+"""The recorder as a process: what it writes, what a crash and a full disk cost."""
+
+import os
+import signal
+import time
+
+import pytest
+import yaml
+from conftest import spin_until
+from mcap.reader import make_reader
+
+from anser_ros.errors import BagError
+from anser_ros.nodes.recording_log import TopicLog, report
+from anser_ros.wire.bag import Salvage, iter_messages
+from anser_ros.wire.bag_metadata import BagRecord
+
+
+@pytest.fixture
+def source(ros):
+    """A node that publishes what the recorder is to record."""
+    from geometry_msgs.msg import PoseStamped
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from std_msgs.msg import String
+
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    node = ros.create_node('source')
+    node.setup = node.create_publisher(String, '/anser/setup', latched)
+    node.pose = node.create_publisher(PoseStamped, '/optical/tool_a/pose', 100)
+    node.other = node.create_publisher(String, '/elsewhere', 10)
+    node.sent = 0
+
+    def send(padding=''):
+        message = PoseStamped()
+        node.sent += 1
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(node.sent * 10**7, 10**9)
+        message.header.frame_id = 'fg' + padding
+        node.pose.publish(message)
+
+    node.send = send
+    yield node
+    node.destroy_node()
+
+
+def begin(start, source, tmp_path, *options):
+    """Start a recorder and wait until it listens."""
+    from std_msgs.msg import String
+
+    source.setup.publish(String(data='schema: anser_setup/1'))
+    arguments = [f'directory:={tmp_path}', 'name:=bag', *options]
+    pairs = [word for argument in arguments for word in ('-p', argument)]
+    process = start('recorder', '--ros-args', *pairs)
+    assert spin_until(source, lambda: source.pose.get_subscription_count() == 1, 20), (
+        process.output
+    )
+    return process
+
+
+def call(node, name):
+    from std_srvs.srv import Trigger
+
+    client = node.create_client(Trigger, name)
+    assert client.wait_for_service(10)
+    future = client.call_async(Trigger.Request())
+    assert spin_until(node, future.done)
+    return future.result()
+
+
+def test_a_bag_is_complete_and_described(start, source, tmp_path):
+    process = begin(start, source, tmp_path)
+    for _ in range(50):
+        source.send()
+        time.sleep(0.01)
+    source.sent += 30
+    source.send()
+    time.sleep(0.3)
+    assert process.interrupt(signal.SIGTERM) == 0
+    assert '/optical/tool_a/pose 1 gaps up to 0.31 s' in process.output
+    bag = tmp_path / 'bag' / 'bag_0.mcap'
+    with bag.open('rb') as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == 'ros2'
+        summary = reader.get_summary()
+        assert {index.compression for index in summary.chunk_indexes} == {'zstd'}
+        topics = {channel.topic: channel for channel in summary.channels.values()}
+        counts = {
+            c.topic: summary.statistics.channel_message_counts[i]
+            for i, c in summary.channels.items()
+        }
+        schema = summary.schemas[topics['/optical/tool_a/pose'].schema_id]
+    assert counts['/optical/tool_a/pose'] == 51 and counts['/anser/setup'] == 1
+    assert '/elsewhere' not in topics and '/diagnostics' in topics
+    assert 'MSG: geometry_msgs/Quaternion' in schema.data.decode()
+    assert schema.data.decode().count('MSG: builtin_interfaces/Time') == 1
+    metadata = topics['/anser/setup'].metadata
+    (offered,) = yaml.safe_load(metadata['offered_qos_profiles'])
+    assert offered['durability'] == 'transient_local'
+    assert metadata['topic_type_hash'].startswith('RIHS01_')
+    info = yaml.safe_load((bag.parent / 'metadata.yaml').read_text())
+    info = info['rosbag2_bagfile_information']
+    assert info['message_count'] == sum(counts.values())
+    assert info['custom_data'] == {'closed': 'true'}
+
+
+def test_a_kill_costs_less_than_a_second(start, source, tmp_path):
+    process = begin(start, source, tmp_path)
+    end = time.monotonic() + 2.0
+    while time.monotonic() < end:
+        source.send()
+        time.sleep(0.02)
+    last_s = time.time()
+    process.interrupt(signal.SIGKILL)
+    salvage = Salvage()
+    messages = list(iter_messages(tmp_path / 'bag', salvage))
+    poses = [m for m in messages if m.topic == '/optical/tool_a/pose']
+    assert salvage.lost
+    assert last_s - max(m.log_time_ns for m in poses) * 1e-9 <= 1.0
+    assert len(poses) > 40
+    info = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
+    assert info['rosbag2_bagfile_information']['relative_file_paths'] == ['bag_0.mcap']
+
+
+def test_services_start_and_stop(start, source, tmp_path):
+    process = start('recorder', '--ros-args', '-p', f'directory:={tmp_path}')
+    began = call(source, '/anser/recorder/start')
+    assert (began.success, began.message) == (False, 'records already')
+    ended = call(source, '/anser/recorder/stop')
+    assert ended.success and 'no gaps' in ended.message
+    again = call(source, '/anser/recorder/stop')
+    assert (again.success, again.message) == (False, 'not recording')
+    assert call(source, '/anser/recorder/start').success
+    assert process.interrupt() == 0
+    assert len(list(tmp_path.glob('anser_*/*.mcap'))) == 2
+
+
+def test_a_bag_is_never_written_over(start, tmp_path):
+    (tmp_path / 'bag').mkdir()
+    (tmp_path / 'bag' / 'bag_0.mcap').write_bytes(b'precious')
+    process = start('recorder', '--ros-args', '-p', f'directory:={tmp_path}', '-p', 'name:=bag')
+    assert process.popen.wait(20) == 2
+    assert 'is there already' in process.output and 'Traceback' not in process.output
+    assert (tmp_path / 'bag' / 'bag_0.mcap').read_bytes() == b'precious'
+
+
+def test_a_full_disk_ends_only_the_recording(start, source, small_disk):
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    errors = []
+
+    def listen(message):
+        errors.extend(s.message for s in message.status if s.level == b'\x02')
+
+    source.create_subscription(DiagnosticArray, '/diagnostics', listen, 10)
+    process = begin(start, source, small_disk)
+    end = time.monotonic() + 20
+    while not errors and time.monotonic() < end:
+        source.send(os.urandom(40_000).hex())  # that much noise can't be compressed away
+        spin_until(source, lambda: False, 0.01)
+    assert errors[0] == 'recording stopped: No space left on device'
+    assert process.popen.poll() is None
+    answer = call(source, '/anser/recorder/stop')
+    assert not answer.success
+    assert process.interrupt() == 0
+    assert 'Traceback' not in process.output
+    salvage = Salvage()
+    messages = list(iter_messages(small_disk / 'bag', salvage))
+    assert len(messages) > 10
+    assert not salvage.lost
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A disk of 3 MB."""
+    import subprocess
+
+    folder = tmp_path / 'disk'
+    folder.mkdir()
+    command = ['mount', '-t', 'tmpfs', '-o', 'size=3m', 'tmpfs', str(folder)]
+    mounted = subprocess.run(command, capture_output=True, text=True, check=False)
+    if mounted.returncode:
+        pytest.skip(f'no small disk can be mounted here: {mounted.stderr.strip()}')
+    yield folder
+    subprocess.run(['umount', '-l', str(folder)], check=False)
+
+
+class TestLog:
+    def test_counts_what_the_publisher_numbered(self):
+        log = TopicLog()
+        for sequence in (1, 2, 5, 6, 1, 2):  # started again after the sixth
+            log.add(sequence, None)
+        assert log.lost == 2
+
+    def test_numbers_of_several_publishers_say_nothing(self):
+        log = TopicLog(n_publishers=2)
+        for sequence in (1, 10, 2, 11):
+            log.add(sequence, None)
+        assert log.lost == 0
+
+    def test_finds_gaps_by_the_usual_period(self, tmp_path):
+        log = TopicLog()
+        stamps = [n * 20_000_000 for n in range(100) if n not in (5, 60, 61)] + [1]
+        for stamp_ns in stamps:
+            log.add(None, stamp_ns)
+        assert (log.gaps, log.jumps_back) == (2, 1)
+        assert log.longest_gap_s == pytest.approx(0.06)
+        text = report(tmp_path, BagRecord({}, 98, 0, 2 * 10**9), {'/a': log, '/b': TopicLog()})
+        assert text.endswith('98 messages of 0 topics in 2.0 s; '
+                             '/a 2 gaps up to 0.06 s, 1 jumps back in time')  # fmt: skip
+
+
+class TestDefinitions:
+    def test_unknown_types_are_refused(self):
+        from anser_ros.nodes.definitions import definition, message_class, type_hash
+
+        for name in ('no_msgs/msg/None', 'std_msgs/msg/Nothing', 'String'):
+            with pytest.raises(BagError):
+                message_class(name)
+            with pytest.raises(BagError):
+                definition(name)
+            assert type_hash(name) == ''
+
+    def test_the_embedded_texts_agree_with_the_installed_ones(self):
+        """Comments aside, and in any order."""
+        from anser_ros.nodes.definitions import definition
+        from anser_ros.wire.cdr import DEFINITIONS
+
+        def essence(text):
+            lines = (line.split('#')[0].split() for line in text.splitlines())
+            lines = [line for line in lines if line and '=' not in ''.join(line)]
+            sections, current = {}, ()
+            for line in lines:
+                if line[0] == 'MSG:':
+                    current = tuple(line)
+                else:
+                    # Default values (a quaternion's w of 1) don't change the layout.
+                    sections.setdefault(current, []).append(tuple(line[:2]))
+            return sections
+
+        for type_name, text in DEFINITIONS.items():
+            assert essence(text) == essence(definition(type_name))
