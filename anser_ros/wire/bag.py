@@ -28,7 +28,7 @@ from anser_ros.wire.setup import Setup, parse_setup
 
 _BROKEN = (
     McapError, ValueError, struct.error, EOFError, IndexError, KeyError, MemoryError,
-    OverflowError, zstandard.ZstdError, RuntimeError,
+    OverflowError, OSError, zstandard.ZstdError, RuntimeError,
 )  # fmt: skip
 _RECORD_LIMIT = 256 * 2**20
 
@@ -275,7 +275,7 @@ class _Collector:
                 self._add_flux(raw)
             elif raw.topic.startswith('/optical/') and raw.type_name == POSE_TYPE:
                 self._add_pose(raw)
-        except (BagError, LayoutError) as error:
+        except (BagError, LayoutError, AttributeError, TypeError, ValueError) as error:
             self.refused[f'{raw.topic}: {error}'] += 1
 
     def _add_flux(self, raw: RawMessage) -> None:
