@@ -1,0 +1,90 @@
+"""Tells when the nodes that listen have caught up, for a replay without a clock of its own.
+
+DDS confirms what a listener's queue has taken, not what its callbacks have worked off. But every
+node answers parameter requests from the same executor that runs its callbacks, and runs those
+first: an answer to a request that was sent after a message says that the message was handled.
+"""
+
+import threading
+import time
+from typing import Any
+
+from rcl_interfaces.srv import GetParameterTypes
+from rclpy.node import Node
+
+REPLY_TIMEOUT_S = 2.0
+ATTEMPTS = 5
+POLL_S = 0.1
+# How often the graph is asked for new listeners, in messages.
+REFRESH_EVERY = 50
+
+
+class Consumers:
+    """The nodes that subscribe to a topic.
+
+    Parameters
+    ----------
+    node : Node
+        Asks them; its executor must be spinning in another thread.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._clients: dict[str, Any] = {}
+        self._listeners: dict[str, set[str]] = {}
+        self._silent: set[str] = set()
+        self._calls = 0
+        self._given_up = threading.Event()
+
+    def wait(self, topic: str) -> None:
+        """Wait until all listeners of a topic have handled what was published."""
+        if self._calls % REFRESH_EVERY == 0:
+            self._listeners.clear()
+        self._calls += 1
+        if topic not in self._listeners:
+            self._listeners[topic] = self._find(topic)
+        waiting = {name: self._ask(name) for name in self._listeners[topic]}
+        for name, answered in waiting.items():
+            if not self._answers(name, answered):
+                self._silent.add(name)
+                self._listeners[topic].discard(name)
+
+    def give_up(self) -> None:
+        """End every wait."""
+        self._given_up.set()
+
+    def _find(self, topic: str) -> set[str]:
+        """Return the listeners that can be asked."""
+        own = self._node.get_fully_qualified_name()
+        found = set()
+        for info in self._node.get_subscriptions_info_by_topic(topic):
+            name = f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+            if name == own or name in self._silent:
+                continue
+            if name not in self._clients:
+                service = f'{name}/get_parameter_types'
+                self._clients[name] = self._node.create_client(GetParameterTypes, service)
+            if self._clients[name].wait_for_service(REPLY_TIMEOUT_S):
+                found.add(name)
+            else:  # a listener without parameters can't be asked
+                self._silent.add(name)
+        return found
+
+    def _ask(self, name: str) -> threading.Event:
+        answered = threading.Event()
+        future = self._clients[name].call_async(GetParameterTypes.Request())
+        future.add_done_callback(lambda _future: answered.set())
+        return answered
+
+    def _answers(self, name: str, answered: threading.Event) -> bool:
+        """Wait for a listener's answer; it is asked again, for an answer can miss a new client."""
+        for _ in range(ATTEMPTS):
+            end_s = time.monotonic() + REPLY_TIMEOUT_S
+            while time.monotonic() < end_s:
+                if answered.wait(POLL_S):
+                    return True
+                if self._given_up.is_set() or not self._clients[name].service_is_ready():
+                    return False
+            answered = self._ask(name)
+        self._node.get_logger().warning(f'{name} does not answer; going on without it')
+        return False

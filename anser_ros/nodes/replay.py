@@ -1,0 +1,243 @@
+"""Publishes a bag again with its own stamps, as far as it reads."""
+
+import argparse
+import sys
+import threading
+import time
+import traceback
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import yaml
+from rclpy.duration import Duration
+from rclpy.serialization import deserialize_message
+from rosgraph_msgs.msg import Clock
+
+from anser_ros.errors import AnserError, ParameterError
+from anser_ros.nodes import qos
+from anser_ros.nodes.consumers import Consumers
+from anser_ros.nodes.definitions import message_class
+from anser_ros.nodes.node import AnserNode, Level, Status, main
+from anser_ros.wire.bag import RawMessage, Salvage, iter_messages
+
+BAG_NAMESPACE = '/anser/'
+FLUX_ENDINGS = ('/tool/flux', '/reference/flux')
+# What the nodes that listen will publish themselves.
+OUTPUT_ENDINGS = ('/pose', '/pose_with_covariance', '/field_model')
+OUTPUT_TOPICS = ('/diagnostics', '/tf', '/tf_static', '/clock')
+MATCH_TIMEOUT_S = 10.0
+# The listeners count as complete when none has joined for so long.
+SETTLE_S = 0.5
+POLL_S = 0.02
+CLOCK_PERIOD_NS = 10_000_000
+LAST_ACK_S = 5.0
+
+
+class Replay(AnserNode):
+    """Plays one bag in a thread of its own; the executor stays free for parameters and replies.
+
+    Parameters
+    ----------
+    bag : str
+        The ``.mcap`` file or the folder that holds one.
+    rate : float
+        Speed relative to the recording; 0 for as fast as the listeners take it.
+    loop : bool
+        Whether to begin again at the end.
+    all_topics : bool
+        Whether topics that running nodes publish themselves (poses, model, diagnostics) are
+        played too.
+
+    Raises
+    ------
+    ParameterError
+        The rate is negative.
+    BagError
+        There is no such bag, or nothing of it can be read.
+    """
+
+    NAME = 'replay'
+
+    @classmethod
+    def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
+        """Add the bag and how to play it."""
+        parser.add_argument('bag', help='the .mcap file, or the folder that holds it')
+        parser.add_argument('--rate', type=float, default=1.0, help='speed; 0: as fast as taken')
+        parser.add_argument('--loop', action='store_true', help='begin again at the end')
+        parser.add_argument(
+            '--all', dest='all_topics', action='store_true', help='poses and diagnostics as well'
+        )
+
+    def __init__(
+        self,
+        bag: str,
+        rate: float = 1.0,
+        loop: bool = False,
+        all_topics: bool = False,
+        **options: Any,
+    ) -> None:
+        if not 0.0 <= rate < float('inf'):
+            raise ParameterError(f'rate {rate} is neither 0 nor a positive number')
+        super().__init__(**options)
+        self._bag, self._rate, self._loop, self._all_topics = bag, rate, loop, all_topics
+        self._types: dict[str, type] = {}
+        self._outlets: dict[str, Any] = {}
+        self._total = 0
+        self._lost = ''
+        self._done = 0
+        self._rounds = 0
+        self._ending = threading.Event()
+        self._scan()
+        self._ticks = self.create_publisher(Clock, '/clock', qos.STREAM)
+        self._consumers = Consumers(self)
+        self._thread = threading.Thread(target=self._play_guarded, name='replay', daemon=True)
+        self._thread.start()
+
+    def status(self) -> Status:
+        """Return how far it is, and what of the bag is lost."""
+        values = {'published': self._done, 'messages': self._total, 'rounds': self._rounds}
+        if self._lost:
+            return Status('', Level.WARN, f'replaying a damaged bag: {self._lost}', values)
+        return Status('', Level.OK, 'replaying', values)
+
+    def close(self) -> None:
+        """Stop the thread."""
+        self._ending.set()
+        self._consumers.give_up()
+        self._thread.join(LAST_ACK_S)
+
+    # Before playing -----------------------------------------------------------------------
+
+    def _scan(self) -> None:
+        """Read the bag once for its topics, so that all are announced before the first message."""
+        salvage, counts = Salvage(), Counter[str]()
+        for message in iter_messages(self._bag, salvage):
+            if self._is_played(message.topic):
+                counts[message.topic] += 1
+                if counts[message.topic] == 1:
+                    self._announce(message)
+        self._total = sum(counts[topic] for topic in self._outlets)
+        self._lost = salvage.lost
+        if self._lost:
+            self.get_logger().warning(f'the bag is damaged: {self._lost}')
+        self.get_logger().info(f'{self._total} messages of {len(self._outlets)} topics')
+
+    def _is_played(self, topic: str) -> bool:
+        if self._all_topics or topic.startswith('/optical/'):
+            return topic != '/clock'
+        return topic not in OUTPUT_TOPICS and not topic.endswith(OUTPUT_ENDINGS)
+
+    def _announce(self, message: RawMessage) -> None:
+        try:
+            kind = message_class(message.type_name)
+        except AnserError as error:
+            self.warn('topics_left_out', f'{message.topic}: {error}')
+            return
+        name = message.topic
+        if name.startswith(BAG_NAMESPACE):
+            name = name.removeprefix(BAG_NAMESPACE)  # into the namespace of this node
+        profile = qos.LATCHED if _is_latched(message) else qos.STREAM
+        self._types[message.topic] = kind
+        self._outlets[message.topic] = self.create_publisher(kind, name, profile)
+
+    def _wait_for_listeners(self) -> None:
+        """Wait until somebody takes the fluxes and no more join, at most ten seconds."""
+        main_outlets = [o for t, o in self._outlets.items() if t.endswith(FLUX_ENDINGS)]
+        main_outlets = main_outlets or list(self._outlets.values())
+        end_s = time.monotonic() + MATCH_TIMEOUT_S
+        seen, since_s = -1, time.monotonic()
+        while not self._ending.wait(POLL_S):
+            now_s = time.monotonic()
+            matched = sum(o.get_subscription_count() for o in self._outlets.values())
+            if matched != seen:
+                seen, since_s = matched, now_s
+            wanted = any(outlet.get_subscription_count() for outlet in main_outlets)
+            if wanted and now_s - since_s >= SETTLE_S:
+                return
+            if now_s > end_s:
+                self.warn('no_listeners', f'nobody has listened for {MATCH_TIMEOUT_S:g} s')
+                return
+
+    # Playing ------------------------------------------------------------------------------
+
+    def _play_guarded(self) -> None:
+        try:
+            self._wait_for_listeners()
+            while not self._ending.is_set():
+                self._play_once()
+                self._rounds += 1
+                if not self._loop:
+                    break
+            self._finish()
+        except AnserError as error:
+            self.get_logger().error(str(error))
+            self.stop(2)
+        except Exception:  # noqa: BLE001 - the outermost place of this thread
+            if self.context.ok() and not self._ending.is_set():
+                self.get_logger().error(f'replay failed\n{traceback.format_exc()}')
+                self.stop(1)
+
+    def _play_once(self) -> None:
+        first_ns, began_s, clock_ns = None, time.monotonic(), 0
+        for message in self._messages():
+            now_ns = message.log_time_ns
+            first_ns = now_ns if first_ns is None else first_ns
+            if self._rate > 0.0:
+                due_s = began_s + (now_ns - first_ns) * 1e-9 / self._rate
+                # Waiting also ends when the node does.
+                if self._ending.wait(max(due_s - time.monotonic(), 0.0)):
+                    return
+            if now_ns - clock_ns >= CLOCK_PERIOD_NS or now_ns < clock_ns:
+                clock_ns = now_ns
+                self._publish_clock(now_ns)
+            self._outlets[message.topic].publish(message.data)
+            self._done += 1
+            if self._rate == 0.0 and message.topic.endswith(FLUX_ENDINGS):
+                self._consumers.wait(self._outlets[message.topic].topic_name)
+
+    def _messages(self) -> Iterator[RawMessage]:
+        """Yield what can be published; bytes that are no message of their type are left out."""
+        for message in iter_messages(self._bag, Salvage()):
+            if self._ending.is_set():
+                return
+            kind = self._types.get(message.topic)
+            if kind is None:
+                continue
+            try:
+                deserialize_message(message.data, kind)
+            except Exception as error:  # noqa: BLE001 - rclpy names none that is narrower
+                self.warn('messages_left_out', f'{message.topic}: {error}')
+                continue
+            yield message
+
+    def _publish_clock(self, stamp_ns: int) -> None:
+        tick = Clock()
+        tick.clock.sec, tick.clock.nanosec = divmod(stamp_ns, 1_000_000_000)
+        self._ticks.publish(tick)
+
+    def _finish(self) -> None:
+        """Wait until all is received, and end the process."""
+        for outlet in self._outlets.values():
+            if not self._ending.is_set():
+                outlet.wait_for_all_acked(Duration(seconds=LAST_ACK_S))
+        left_out = self.counters['messages_left_out']
+        lost = f'; lost: {self._lost}' if self._lost else ''
+        lost += f'; {left_out} messages that do not decode left out' if left_out else ''
+        self.get_logger().info(f'published {self._done} of {self._total} messages{lost}')
+        self.stop(0)
+
+
+def _is_latched(message: RawMessage) -> bool:
+    """Return whether a topic was latched when it was recorded, or must be by the contract."""
+    if message.topic.endswith(('/setup', '/field_model')):
+        return True
+    try:
+        offered = yaml.safe_load(message.channel.metadata.get('offered_qos_profiles', ''))
+        return any(profile['durability'] in ('transient_local', 1) for profile in offered)
+    except (yaml.YAMLError, TypeError, KeyError):
+        return False
+
+
+if __name__ == '__main__':
+    sys.exit(main(Replay))

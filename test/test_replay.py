@@ -1,0 +1,177 @@
+"""The replay as a process: what arrives, in what order and when, and what of a bad bag is left."""
+
+import signal
+import time
+
+import numpy as np
+import pytest
+from conftest import spin_until
+
+from anser_ros.wire import cdr
+from anser_ros.wire.bag_writer import BagWriter, SessionWriter
+from anser_ros.wire.points import FluxPoints, encode_flux
+
+START_NS = 1_750_000_000 * 10**9
+PERIOD_NS = 20_000_000
+
+
+def flux_cloud(n):
+    rng = np.random.default_rng(n)
+    flux = 1e-6 * (rng.normal(size=(3, 8)) + 1j * rng.normal(size=(3, 8)))
+    nothing = np.full((3, 3), np.nan)
+    points = FluxPoints(np.arange(1, 4), np.zeros(3, int), flux, nothing, nothing)
+    fields, step, data = encode_flux(points)
+    return fields, step, 3, data
+
+
+def make_session(path, count):
+    with SessionWriter(path) as session:
+        session.write_setup('schema: anser_setup/1\n', START_NS)
+        for n in range(count):
+            stamp_ns = START_NS + n * PERIOD_NS
+            session.write_flux('/anser/tool/flux', stamp_ns, *flux_cloud(n))
+            session.write_pose('/optical/tool_a/pose', stamp_ns, (0.0, 0.0, 0.1), (0, 0, 0, 1))
+            session.write_pose('/anser/tool_a/pose', stamp_ns, (0.0, 0.0, 0.1), (0, 0, 0, 1))
+    return path
+
+
+@pytest.fixture
+def listener(ros):
+    """A node that takes what is replayed; ``delay_s`` makes it slow."""
+    from geometry_msgs.msg import PoseStamped
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+    from rosgraph_msgs.msg import Clock
+    from sensor_msgs.msg import PointCloud2
+    from std_msgs.msg import String
+
+    node = ros.create_node('listener')
+    node.stamps, node.arrivals, node.got, node.delay_s = [], [], [], 0.0
+
+    def on_flux(message):
+        time.sleep(node.delay_s)
+        node.arrivals.append(time.monotonic())
+        node.stamps.append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+        node.data = bytes(message.data)
+
+    def take(name):
+        return lambda message: node.got.append((name, message))
+
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    node.create_subscription(PointCloud2, '/anser/tool/flux', on_flux, 5)
+    node.create_subscription(PointCloud2, '/other/tool/flux', on_flux, 5)
+    node.create_subscription(String, '/anser/setup', take('setup'), latched)
+    node.create_subscription(PoseStamped, '/optical/tool_a/pose', take('optical'), 1000)
+    node.create_subscription(PoseStamped, '/anser/tool_a/pose', take('pose'), 1000)
+    node.create_subscription(Clock, '/clock', take('clock'), 1000)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+
+    def run(condition, timeout_s=20.0):
+        end = time.monotonic() + timeout_s
+        while not condition():
+            if time.monotonic() > end:
+                return False
+            executor.spin_once(timeout_sec=0.05)
+        return True
+
+    node.run = run
+    node.count = lambda name: sum(topic == name for topic, _ in node.got)
+    yield node
+    executor.shutdown()
+    node.destroy_node()
+
+
+def test_everything_arrives_with_its_stamps_at_its_pace(start, listener, tmp_path):
+    bag = make_session(tmp_path / 'a.mcap', 100)
+    process = start('replay', bag, '--rate', '2')
+    assert listener.run(lambda: len(listener.stamps) == 100), process.output
+    assert listener.stamps == [START_NS + n * PERIOD_NS for n in range(100)]
+    assert listener.data == flux_cloud(99)[3]
+    assert listener.arrivals[-1] - listener.arrivals[0] == pytest.approx(0.99, abs=0.3)
+    assert listener.run(lambda: process.popen.poll() is not None)
+    assert process.popen.returncode == 0
+    assert 'published 201 of 201 messages' in process.output
+    assert (listener.count('setup'), listener.count('optical')) == (1, 100)
+    assert listener.count('pose') == 0  # the tracker's own
+    clocks = [m.clock.sec * 10**9 + m.clock.nanosec for name, m in listener.got if name == 'clock']
+    assert clocks[0] == START_NS and clocks == sorted(clocks) and len(clocks) == 100
+
+
+def test_as_fast_as_taken_loses_nothing(start, listener, tmp_path):
+    """The listener's queue holds five, and it needs longer than the bag's publisher."""
+    listener.delay_s = 0.002
+    bag = make_session(tmp_path / 'a.mcap', 300)
+    process = start('replay', bag, '--rate', '0', '--all')
+    assert listener.run(lambda: process.popen.poll() is not None)
+    assert listener.stamps == [START_NS + n * PERIOD_NS for n in range(300)]
+    assert listener.run(lambda: listener.count('pose') == 300)
+    assert listener.arrivals[-1] - listener.arrivals[0] < 6.0 * 0.9
+
+
+def test_loop_in_another_namespace_ends_at_a_signal(start, listener, tmp_path):
+    bag = make_session(tmp_path / 'a.mcap', 10)
+    command = ('replay', bag, '--loop', '--rate', '5', '--ros-args', '-r', '__ns:=/other')
+    process = start(*command)
+    assert listener.run(lambda: len(listener.stamps) > 25), process.output
+    began = time.monotonic()
+    assert process.interrupt(signal.SIGINT) == 0
+    assert time.monotonic() - began < 2.0
+
+
+def test_a_cut_bag_is_played_as_far_as_it_reads(start, listener, tmp_path):
+    whole = make_session(tmp_path / 'a.mcap', 1500).read_bytes()
+    bag = tmp_path / 'cut.mcap'
+    bag.write_bytes(whole[: len(whole) // 2])
+    process = start('replay', bag, '--rate', '0')
+    assert listener.run(lambda: process.popen.poll() is not None)
+    assert process.popen.returncode == 0
+    assert 'the bag breaks off after' in process.output
+    assert listener.stamps == [START_NS + n * PERIOD_NS for n in range(len(listener.stamps))]
+    assert 200 < len(listener.stamps) < 1200
+
+
+def test_what_does_not_decode_is_left_out(start, listener, tmp_path):
+    bag = BagWriter(tmp_path / 'bad.mcap')
+    cloud, text = 'sensor_msgs/msg/PointCloud2', cdr.DEFINITIONS['sensor_msgs/msg/PointCloud2']
+    flux = bag.add_topic('/anser/tool/flux', cloud, text)
+    stranger = bag.add_topic('/anser/strange', 'no_msgs/msg/None', 'uint8 x\n')
+    good = cdr.cloud_bytes(START_NS, 'fg', *flux_cloud(0))
+    bag.write(stranger, START_NS, b'\0\1\0\0\7')
+    for n, data in enumerate((good, good[:40], b'', b'\xff' * 60, good)):
+        bag.write(flux, START_NS + n, data)
+    bag.close()
+    process = start('replay', tmp_path / 'bad.mcap', '--rate', '0')
+    assert listener.run(lambda: process.popen.poll() is not None)
+    assert process.popen.returncode == 0
+    assert '/anser/strange: type no_msgs/msg/None is not installed' in process.output
+    assert '3 messages that do not decode left out' in process.output
+    assert listener.run(lambda: len(listener.stamps) == 2)
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'said'),
+    [
+        (['nowhere.mcap'], 'no such bag'),
+        (['pyproject.toml'], 'not an MCAP file'),
+        (['nowhere.mcap', '--rate', '-1'], 'rate -1.0 is neither 0 nor a positive number'),
+        (['nowhere.mcap', '--rate', 'fast'], "invalid float value: 'fast'"),
+        ([], 'arguments are required: bag'),
+    ],
+)
+def test_bad_usage_is_one_clear_line(start, arguments, said):
+    process = start('replay', *arguments)
+    assert process.popen.wait(20) == 2
+    assert said in process.output and 'Traceback' not in process.output
+
+
+def test_nobody_listens(ros, domain, start, tmp_path, monkeypatch):
+    """It waits for listeners, and plays for the record when none comes."""
+    from anser_ros.nodes import replay
+
+    monkeypatch.setattr(replay, 'MATCH_TIMEOUT_S', 0.2)
+    node = replay.Replay(str(make_session(tmp_path / 'a.mcap', 3)), rate=100.0)
+    assert spin_until(node, lambda: node.exit_code is not None)
+    assert node.exit_code == 0 and node.counters['no_listeners'] == 1
+    node.close()
+    node.destroy_node()
