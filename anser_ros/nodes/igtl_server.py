@@ -1,0 +1,193 @@
+"""A TCP server that sends every client the same OpenIGTLink messages.
+
+Messages are packed by pyigtl. Its own server is not used: it takes the process's signals, serves
+one client, and does not notice one that has left.
+"""
+
+import contextlib
+import math
+import select
+import socket
+import threading
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+import pyigtl
+
+from anser_ros.errors import PortError
+
+# A client that takes nothing for so long is dropped.
+SEND_TIMEOUT_S = 2.0
+POLL_S = 0.1
+QUEUE_LENGTH = 256
+DEVICE_NAME_LENGTH = 20
+MM_PER_M = 1e3
+
+
+def device_name(name: str, ending: str = '') -> str:
+    """Return a name that fits the protocol's 20 characters; a longer one loses its beginning."""
+    return (name + ending)[-DEVICE_NAME_LENGTH:]
+
+
+def transform_bytes(
+    name: str, stamp_s: float, position_m: Sequence[float], quaternion_xyzw: Sequence[float]
+) -> bytes:
+    """Pack a TRANSFORM message; OpenIGTLink and 3D Slicer work in millimetres."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = _rotation(quaternion_xyzw)
+    matrix[:3, 3] = MM_PER_M * np.asarray(position_m)
+    message = pyigtl.TransformMessage(matrix, timestamp=stamp_s, device_name=device_name(name))
+    packed: bytes = message.pack()
+    return packed
+
+
+def state_bytes(name: str, stamp_s: float, state: str) -> bytes:
+    """Pack a STRING message with the state of a sensor that has no pose."""
+    text = state.encode('ascii', 'replace').decode()
+    message = pyigtl.StringMessage(
+        text, timestamp=stamp_s, device_name=device_name(name, '/state')
+    )
+    packed: bytes = message.pack()
+    return packed
+
+
+def _rotation(quaternion_xyzw: Sequence[float]) -> np.ndarray:
+    """Return the rotation matrix of a quaternion, shape (3, 3)."""
+    x, y, z, w = quaternion_xyzw
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    x, y, z, w = x / norm, y / norm, z / norm, w / norm
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+class _Client:
+    """One connection with its queue and its thread."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self._queue: deque[bytes] = deque(maxlen=QUEUE_LENGTH)
+        self._filled = threading.Condition()
+        self._ending = False
+        self.dropped = 0
+        self._thread = threading.Thread(target=self._serve, name='igtl client', daemon=True)
+        self._thread.start()
+
+    @property
+    def is_connected(self) -> bool:
+        return self._thread.is_alive()
+
+    def put(self, data: bytes) -> None:
+        with self._filled:
+            self.dropped += len(self._queue) == QUEUE_LENGTH  # the oldest makes room
+            self._queue.append(data)
+            self._filled.notify()
+
+    def end(self) -> None:
+        with self._filled:
+            self._ending = True
+            self._filled.notify()
+        self._thread.join(2 * SEND_TIMEOUT_S)
+
+    def _serve(self) -> None:
+        with self._connection, contextlib.suppress(OSError):
+            self._connection.settimeout(SEND_TIMEOUT_S)
+            while not self._has_left():
+                with self._filled:
+                    if not self._queue and not self._ending:
+                        self._filled.wait(POLL_S)
+                    if self._ending:
+                        return
+                    waiting = b''.join(self._queue)
+                    self._queue.clear()
+                self._connection.sendall(waiting)
+
+    def _has_left(self) -> bool:
+        """Read what the client says, all of which is ignored, until it has nothing more to say."""
+        while select.select([self._connection], [], [], 0.0)[0]:
+            if not self._connection.recv(4096):
+                return True
+        return False
+
+
+class IgtlServer:
+    """Listens on one address and sends to all who connect.
+
+    Parameters
+    ----------
+    host : str
+        Address to listen on.
+    port : int
+        TCP port; 0 for a free one.
+
+    Raises
+    ------
+    PortError
+        The address can't be listened on.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        try:
+            self._listener = socket.create_server((host, port))
+        except OSError as error:
+            raise PortError(f'can not listen on {host}:{port}: {error.strerror}') from error
+        self.port: int = self._listener.getsockname()[1]
+        self._listener.settimeout(POLL_S)
+        self._clients: list[_Client] = []
+        self._lock = threading.Lock()
+        self._ending = threading.Event()
+        self._dropped_before = 0
+        self._thread = threading.Thread(target=self._accept, name='igtl server', daemon=True)
+        self._thread.start()
+
+    @property
+    def n_clients(self) -> int:
+        """Number of connected clients."""
+        self._forget_the_gone()
+        return len(self._clients)
+
+    @property
+    def dropped(self) -> int:
+        """Messages that slow clients have missed."""
+        with self._lock:
+            return self._dropped_before + sum(client.dropped for client in self._clients)
+
+    def send(self, data: bytes) -> None:
+        """Queue a packed message for every client; never blocks."""
+        with self._lock:
+            for client in self._clients:
+                client.put(data)
+
+    def close(self) -> None:
+        """End all connections."""
+        self._ending.set()
+        self._thread.join()
+        self._listener.close()
+        with self._lock:
+            for client in self._clients:
+                client.end()
+            self._clients.clear()
+
+    def _accept(self) -> None:
+        while not self._ending.is_set():
+            try:
+                connection, _ = self._listener.accept()
+            except TimeoutError:
+                continue
+            except OSError:  # the client was gone before it was accepted
+                continue
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._forget_the_gone()
+            with self._lock:
+                self._clients.append(_Client(connection))
+
+    def _forget_the_gone(self) -> None:
+        with self._lock:
+            gone = [client for client in self._clients if not client.is_connected]
+            self._dropped_before += sum(client.dropped for client in gone)
+            self._clients = [client for client in self._clients if client.is_connected]
