@@ -245,7 +245,9 @@ class MessageDecoder:
             if decoder is None:
                 raise BagError(f'{message.topic}: no decoder for {message.type_name}')
             return decoder(message.data)
-        except (*_BROKEN, TypeError, AttributeError) as error:
+        except BagError:
+            raise
+        except Exception as error:  # noqa: BLE001 - the decoder's errors have no root of their own
             raise BagError(
                 f'{message.topic}: {message.type_name} does not decode: {error}'
             ) from error
