@@ -247,7 +247,7 @@ class MessageDecoder:
             return decoder(message.data)
         except BagError:
             raise
-        except Exception as error:  # noqa: BLE001 - the decoder's errors have no root of their own
+        except Exception as error:  # the decoder's errors have no root of their own
             raise BagError(
                 f'{message.topic}: {message.type_name} does not decode: {error}'
             ) from error
