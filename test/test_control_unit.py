@@ -183,7 +183,7 @@ class TestEffects:
 
     def test_compression(self):
         clean, _ = self.codes()
-        limit = 10.0 * np.abs(clean[:, 20]).max() / 32768
+        limit = 5.0 * np.abs(clean[:, 20]).max() / 32768
         bent, _ = self.codes(raw_effects.CompressingAmplifier(20, limit))
         ratio = np.abs(bent[:, 20]).max() / np.abs(clean[:, 20]).max()
         assert ratio == pytest.approx(np.tanh(1.0), abs=1e-3)

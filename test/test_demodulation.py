@@ -218,7 +218,7 @@ class TestWindows:
                 windows += cutter.push((start + k) % 2**32, 1000 * k, part)
         return windows
 
-    @pytest.mark.parametrize(('window', 'hop'), [(200, 200), (800, 200), (333, 7), (2000, 801)])
+    @pytest.mark.parametrize(('window', 'hop'), [(200, 200), (800, 200), (333, 7), (2000, 801), (200, 500)])
     def test_every_window_is_the_right_part_of_the_stream(self, window, hop):
         samples = self.stream(400)
         cutter = WindowCutter(window, hop, 2, 0.04)
@@ -263,9 +263,26 @@ class TestWindows:
         cutter.push(1, 1000, samples[40:80])
         assert cutter.push(1, 1000, samples[40:80]) == []
         assert cutter.counters.duplicate_blocks == 1
-        windows = self.feed(cutter, samples)
+        windows = []
+        for k in range(5):
+            part = samples[40 * k : 40 * k + 40]
+            windows += cutter.push(k, 9000 + 1000 * k, part)
         assert cutter.counters.restarts == 1
         assert np.array_equal(windows[0].codes, samples[:200])
+
+    @pytest.mark.parametrize('sequence', [3, 70])
+    def test_a_restart_whose_begin_was_lost_is_no_hole(self, sequence):
+        """A hole of the wrong length would join pieces whose phases do not fit."""
+        samples = self.stream(30)
+        cutter = WindowCutter(400, 400, 2, 0.04)
+        self.feed(cutter, samples[:920])
+        windows = []
+        for k in range(10):
+            part = samples[40 * k : 40 * k + 40]
+            windows += cutter.push(sequence + k, 500_000 + 1000 * k, part)
+        assert cutter.counters.restarts == 1 and cutter.counters.missing_samples == 0
+        (window,) = windows
+        assert np.array_equal(window.codes, samples[:400]) and not window.dropped
 
     def test_saturated_and_stuck_channels(self):
         samples = self.stream(5, 4)
@@ -277,8 +294,8 @@ class TestWindows:
         assert window.stuck.tolist() == [False, False, False, True]
 
     def test_refusals(self):
-        with pytest.raises(ParameterError, match='hop of 300'):
-            WindowCutter(200, 300, 2, 0.04)
+        with pytest.raises(ParameterError, match='hop of 0'):
+            WindowCutter(200, 0, 2, 0.04)
         with pytest.raises(ParameterError, match='block of 3 channels'):
             WindowCutter(200, 200, 2, 0.04).push(0, 0, np.zeros((40, 3), np.int16))
 

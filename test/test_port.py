@@ -268,6 +268,9 @@ def test_control_asks_for_hello_then_tones_then_samples():
     control.take(Record(right), now)
     assert control.tones_agree
     assert control.due(now) == Start()
+    assert not control.started
+    control.take(Record(Reply(0x82, ReplyCode.OK)), now)
+    assert control.started
     control.take(Record(SampleBlock(0, 0, np.zeros((1, 2), np.int16))), now)
     assert control.due(now + SECOND // 4) is None
     assert control.due(now + 2 * SECOND) == Start(), 'a stream that stopped is started again'

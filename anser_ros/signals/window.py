@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from anser_ros.errors import ParameterError
 
 _SEQUENCES = 2**32
+_CLOCK_TOLERANCE = 0.01
 _FULL_SCALE = (-32768, 32767)
 
 
@@ -55,29 +56,31 @@ class WindowCutter:
     """Collects blocks and hands out a window every `hop_samples`.
 
     Lost blocks leave a hole of the right length, so the windows keep their grid; a window with
-    less than half of its samples is counted as lost. A sequence that starts again at 0 is a new
-    stream.
+    less than half of its samples is counted as lost. A sequence that does not fit the device time
+    is a new stream.
 
     Parameters
     ----------
-    window_samples, hop_samples : length of a window, and from one window to the next
+    window_samples, hop_samples : length of a window, and from one window to the next; a longer
+        hop leaves samples out
     columns : channels
     samples_per_tick : sample rate over tick rate of the device
 
     Raises
     ------
     ParameterError
-        When the hop is not between one sample and the window length.
+        When a length is less than one sample.
     """
 
     def __init__(
         self, window_samples: int, hop_samples: int, columns: int, samples_per_tick: float
     ) -> None:
-        if not 1 <= hop_samples <= window_samples:
+        if min(hop_samples, window_samples) < 1:
             raise ParameterError(
-                f'a hop of {hop_samples} samples is not within 1 to {window_samples}, the window'
+                f'a window of {window_samples} and a hop of {hop_samples} samples: both need one'
             )
         self.counters = CutterCounters()
+        self.columns = columns
         self._window = window_samples
         self._hop = hop_samples
         self._samples_per_tick = samples_per_tick
@@ -90,6 +93,7 @@ class WindowCutter:
         self._filled = 0
         self._until_next = self._window
         self._expected: int | None = None
+        self._last_ticks = 0
 
     def push(self, sequence: int, timestamp_ticks: int, codes: NDArray[np.int16]) -> list[Window]:
         """Add a block and return the windows that it completes.
@@ -109,11 +113,12 @@ class WindowCutter:
             raise ParameterError(
                 f'a block of {codes.shape[1]} channels in a stream of {self._codes.shape[1]}'
             )
-        missing = self._missing_blocks(sequence) * len(codes)
+        missing = self._missing_blocks(sequence, timestamp_ticks, len(codes)) * len(codes)
         if missing < 0:
             self.counters.duplicate_blocks += 1
             return []
         self._expected = (sequence + 1) % _SEQUENCES
+        self._last_ticks = timestamp_ticks
         windows: list[Window] = []
         if missing:
             self.counters.missing_samples += missing
@@ -122,16 +127,24 @@ class WindowCutter:
             windows += self._advance(None, missing, hole_ticks)
         return windows + self._advance(codes, len(codes), timestamp_ticks)
 
-    def _missing_blocks(self, sequence: int) -> int:
-        """Blocks lost before this one; -1 for one that came before."""
+    def _missing_blocks(self, sequence: int, ticks: int, block: int) -> int:
+        """Blocks lost before this one; -1 for one that came before.
+
+        Sequence and device time must agree on the size of a hole; else the device has started a
+        new stream, whose start was lost on the way.
+        """
         if self._expected is None or sequence == self._expected:
             return 0
-        if sequence == 0:
-            self.counters.restarts += 1
-            self.reset()
-            return 0
         ahead = (sequence - self._expected) % _SEQUENCES
-        return ahead if ahead < _SEQUENCES // 2 else -1
+        elapsed = (ticks - self._last_ticks) * self._samples_per_tick
+        if ahead >= _SEQUENCES // 2 and elapsed <= 0:
+            return -1
+        span = (ahead + 1) * block
+        if abs(elapsed - span) <= 1 + _CLOCK_TOLERANCE * span:
+            return ahead
+        self.counters.restarts += 1
+        self.reset()
+        return 0
 
     def _skip_whole_windows(self, missing: int) -> int:
         """Jump over the windows that lie inside a long hole; returns the samples jumped over."""

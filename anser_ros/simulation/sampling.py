@@ -31,9 +31,9 @@ class FrontEnd:
     """
 
     sample_rate_hz: float = 40e3
-    full_scale_v: float = 10.0
-    full_scale_a: float = 4.0
-    noise_codes: float = 1.0
+    full_scale_v: float = 5.0
+    full_scale_a: float = 2.5
+    noise_codes: float = 2.4
     current_noise_codes: float = 0.5
     current_drift: float = 0.02
     warm_up_s: float = 60.0

@@ -22,8 +22,9 @@ _TONE_TOLERANCE_HZ = 1.0
 class StreamControl:
     """Follows the records of one connection and says what to send.
 
-    The order is: hello, right tones, samples. Each command is repeated every half second until the
-    control unit does what it asks; a refusal is kept as text and not repeated.
+    The order is: hello, right tones, start, samples. Each command is repeated every half second
+    until the control unit does what it asks; a refusal is kept as text and not repeated. Samples
+    that come before the reply to the start were left over in some buffer.
 
     Parameters
     ----------
@@ -36,6 +37,7 @@ class StreamControl:
         self._may_set = set_frequencies
         self.hello: Hello | None = None
         self.refusal = ''
+        self.started = False
         self._refused = False
         self._last_block_ns = 0
         self._last_sent: dict[type, int] = {}
@@ -44,6 +46,7 @@ class StreamControl:
         """Begin a new connection."""
         self.hello = None
         self.refusal = ''
+        self.started = False
         self._refused = False
         self._last_block_ns = 0
         self._last_sent.clear()
@@ -64,7 +67,11 @@ class StreamControl:
                 self.refusal = ''
             elif not self._may_set or self._refused:
                 self.refusal = self.refusal or _disagreement(self._wanted, payload)
-        elif isinstance(payload, Reply) and payload.code is not ReplyCode.OK:
+        elif isinstance(payload, Reply) and payload.code is ReplyCode.OK:
+            if payload.command == TYPE_OF[Start]:
+                self.started = True
+                self._last_block_ns = arrival_ns
+        elif isinstance(payload, Reply):
             self.refusal = f'the control unit refused: {payload.code.name.lower()} {payload.text}'
             if payload.command == TYPE_OF[SetFrequencies]:
                 self._refused = True
@@ -78,7 +85,7 @@ class StreamControl:
             if not self._may_set or self._refused:
                 return None
             command = SetFrequencies(self._wanted)
-        elif now_ns - self._last_block_ns > _REPEAT_NS:
+        elif not self.started or now_ns - self._last_block_ns > _REPEAT_NS:
             command = Start()
         else:
             return None

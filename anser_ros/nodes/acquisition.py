@@ -1,0 +1,362 @@
+"""Samples of a control unit's serial port to fluxes.
+
+Three threads, and none waits for another: the port's reads and queues, this node's worker
+demodulates and publishes, the executor serves parameters and diagnostics.
+"""
+
+import sys
+import threading
+import time
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
+
+from anser_ros.errors import AnserError, PortError
+from anser_ros.nodes import qos
+from anser_ros.nodes.clouds import FluxCloud
+from anser_ros.nodes.flux_stream import FluxFrame, FluxStream, StreamOptions
+from anser_ros.nodes.node import AnserNode, Level, Status, main
+from anser_ros.nodes.parameters import parameter
+from anser_ros.wire.channel_calibration import parse_channels
+from anser_ros.wire.config_folder import read_config
+from anser_ros.wire.frames import Hello, Record, SampleBlock, Stop
+from anser_ros.wire.frames import Status as DeviceStatus
+from anser_ros.wire.points import DROPPED, SATURATED, STALE
+from anser_ros.wire.port import DEFAULT_BAUD, Batch, ControlUnitPort, PortState, find_port
+from anser_ros.wire.setup import Setup, dump_setup, parse_setup
+from anser_ros.wire.stream_control import StreamControl
+
+AUTO = 'auto'
+WAIT_S = 0.1
+GOODBYE_S = 0.1
+
+
+@dataclass(frozen=True)
+class AcquisitionParameters:
+    """Parameters of the acquisition."""
+
+    device: str = parameter(
+        '/dev/ttyACM0', "the control unit's port, or auto: listen on all ports for its hello"
+    )
+    baud: int = parameter(
+        DEFAULT_BAUD, 'line speed; without meaning over USB', minimum=9600, maximum=50_000_000
+    )
+    setup_file: str = parameter('demo_setup.yaml', 'setup document: a path, or a file of config/')
+    channels_file: str = parameter(
+        'demo_channels.yaml', 'channel calibration: a path, or a file of config/'
+    )
+    window_s: float = parameter(
+        0.02, 'length of a demodulation window, s', minimum=0.005, maximum=0.05, live=True
+    )
+    rate_hz: float = parameter(
+        0.0,
+        'windows a second, may overlap; 0 for the rate of the setup document',
+        minimum=0.0,
+        maximum=1000.0,
+        live=True,
+    )
+    mains_hz: float = parameter(
+        0.0,
+        'mains whose harmonics are fitted too; 0 for none',
+        minimum=0.0,
+        maximum=400.0,
+        live=True,
+    )
+    set_frequencies: bool = parameter(
+        True, 'whether the control unit is told to drive the tones of the setup document'
+    )
+    silence_s: float = parameter(
+        1.5, 'time without a byte that counts as a fault, s', minimum=0.1, maximum=60.0
+    )
+
+
+@dataclass
+class Interval:
+    """What happened since the last diagnostics."""
+
+    begin_s: float
+    frames: int = 0
+    delay_sum_s: float = 0.0
+    delay_max_s: float = 0.0
+    flags: np.ndarray | None = None
+
+    def add(self, frame: FluxFrame, delay_s: float) -> None:
+        """Note a published frame."""
+        self.frames += 1
+        self.delay_sum_s += delay_s
+        self.delay_max_s = max(self.delay_max_s, delay_s)
+        known = self.flags is not None and self.flags.shape == frame.flags.shape
+        self.flags = self.flags | frame.flags if known else frame.flags
+
+
+class Acquisition(AnserNode):
+    """Publishes ``setup``, ``tool/flux`` and ``reference/flux``."""
+
+    NAME = 'acquisition'
+    PARAMETERS = AcquisitionParameters
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        table = self.parameters
+        self._setup = parse_setup(read_config(table.setup_file))
+        self._calibration = parse_channels(read_config(table.channels_file))
+        self._setup_publisher = self.create_publisher(String, 'setup', qos.LATCHED)
+        self._tool_publisher = self.create_publisher(PointCloud2, 'tool/flux', qos.STREAM)
+        self._reference_publisher = self.create_publisher(
+            PointCloud2, 'reference/flux', qos.STREAM
+        )
+        self._cloud = FluxCloud(self._setup.frame_id)
+        self._control = StreamControl(
+            self._setup.frequencies_hz, set_frequencies=table.set_frequencies
+        )
+        self._hello: Hello | None = None
+        self._device: DeviceStatus | None = None
+        self._stream: FluxStream | None = None
+        self._refusal = ''
+        self._rebuild = False
+        self._frame: FluxFrame | None = None
+        self._interval = Interval(time.monotonic())
+        self._sensor_flags: np.ndarray | None = None
+        self._past: Counter[str] = Counter()
+        self._published_setup = ''
+        self._publish_setup(self._setup)
+        self._port: ControlUnitPort | None = None
+        self._closing = threading.Event()
+        step = self._guard(self._step)
+        self._worker = threading.Thread(target=self._work, args=(step,), name='demodulation')
+        self._worker.start()
+
+    # Worker thread ------------------------------------------------------------------------
+
+    def _work(self, step: Any) -> None:
+        while not self._closing.is_set():
+            step()
+        if self._port is not None:
+            self._port.send(Stop())
+            time.sleep(GOODBYE_S)
+            self._port.stop()
+
+    def _step(self) -> None:
+        """Take one batch from the port, or find the port first."""
+        if self._port is None:
+            self._open()
+            return
+        batch = self._port.get(WAIT_S)
+        if batch is not None:
+            self._take(batch)
+        command = self._control.due(time.monotonic_ns())
+        if command is not None and self._port.state not in (PortState.ABSENT, PortState.CLOSED):
+            self._port.send(command)
+
+    def _open(self) -> None:
+        table = self.parameters
+        device = table.device
+        if device == AUTO:
+            try:
+                device = find_port(baud=table.baud)
+            except PortError as error:
+                self._refusal = str(error)
+                self._closing.wait(1.0)
+                return
+            self._refusal = ''
+        port = ControlUnitPort(device, baud=table.baud, silence_s=table.silence_s)
+        port.start()
+        self._port = port
+
+    def _take(self, batch: Batch) -> None:
+        if not batch.records:
+            self._control.reset()
+            self._drop_stream()
+            return
+        for record in batch.records:
+            self._control.take(record, batch.arrival_ns)
+            self._dispatch(record, batch.arrival_ns)
+
+    def _dispatch(self, record: Record, arrival_ns: int) -> None:
+        payload = record.payload
+        if isinstance(payload, SampleBlock):
+            if not self._control.started:
+                return  # left over in a buffer from before the connection
+            if self._rebuild:
+                self._drop_stream()
+            if self._stream is None and not self._refusal:
+                self._make_stream()
+            if self._stream is not None:
+                for frame in self._stream.push(payload, arrival_ns):
+                    self._publish(frame, arrival_ns)
+        elif isinstance(payload, Hello):
+            if payload != self._hello:
+                self._drop_stream()
+            self._hello = payload
+        elif isinstance(payload, DeviceStatus):
+            self._device = payload
+
+    def _drop_stream(self) -> None:
+        """Forget windows and refusal; the next block makes a new stream."""
+        if self._stream is not None:
+            self._past.update(self._stream_counters(self._stream))
+        self._stream, self._refusal, self._rebuild = None, '', False
+
+    @staticmethod
+    def _stream_counters(stream: FluxStream) -> dict[str, int]:
+        return {**vars(stream.counters), 'clock_jumps': stream.clock.jumps}
+
+    def _make_stream(self) -> None:
+        if self._hello is None or not self._control.tones_agree:
+            return
+        table = self.parameters
+        options = StreamOptions(
+            table.window_s, table.rate_hz or self._setup.flux_rate_hz, table.mains_hz
+        )
+        try:
+            self._stream = FluxStream(self._hello, self._setup, self._calibration, options)
+        except AnserError as error:
+            self._refusal = str(error)
+            raise
+        self._publish_setup(replace(self._setup, flux_rate_hz=self._stream.rate_hz))
+
+    def _publish_setup(self, setup: Setup) -> None:
+        text = dump_setup(setup)
+        if text != self._published_setup:
+            self._published_setup = text
+            self._setup_publisher.publish(String(data=text))
+
+    def _publish(self, frame: FluxFrame, arrival_ns: int) -> None:
+        # The system's clock may be set while we run; the offset is taken anew for every stamp.
+        stamp_ns = frame.host_ns + time.time_ns() - time.monotonic_ns()
+        if len(frame.tool.channel):
+            self._tool_publisher.publish(self._cloud.message(frame.tool, stamp_ns))
+        if len(frame.reference.channel):
+            self._reference_publisher.publish(self._cloud.message(frame.reference, stamp_ns))
+        self._frame = frame
+        self._interval.add(frame, (time.monotonic_ns() - arrival_ns) / 1e9)
+
+    # Executor thread ----------------------------------------------------------------------
+
+    def on_parameters(self, old: Any, new: Any) -> None:
+        """Demodulate the new way from the next block on; what cannot be done is refused."""
+        if self._hello is not None and self._stream is not None:
+            options = StreamOptions(
+                new.window_s, new.rate_hz or self._setup.flux_rate_hz, new.mains_hz
+            )
+            FluxStream(self._hello, self._setup, self._calibration, options)
+        self._rebuild = True
+
+    def close(self) -> None:
+        """Tell the control unit to stop, and end both threads."""
+        self._closing.set()
+        self._worker.join(2.0)
+
+    def status(self) -> Status:
+        """State of the port and the stream."""
+        interval, self._interval = self._interval, Interval(time.monotonic())
+        elapsed = max(self._interval.begin_s - interval.begin_s, 1e-3)
+        values: dict[str, object] = {
+            'rate_hz': interval.frames / elapsed,
+            'processing_ms_mean': 1e3 * interval.delay_sum_s / max(interval.frames, 1),
+            'processing_ms_max': 1e3 * interval.delay_max_s,
+        }
+        self._sensor_flags = interval.flags
+        port, stream, device = self._port, self._stream, self._device
+        if port is not None:
+            values |= {'device': port.device, 'port': port.state.value, **port.fault_counters()}
+        if stream is not None:
+            live = self._stream_counters(stream)
+            values |= {name: value + self._past[name] for name, value in live.items()}
+        if device is not None:
+            values |= {
+                'device_state': device.state.name.lower(),
+                'device_flags': int(device.flags),
+                'device_dropped_blocks': device.dropped_blocks,
+                'device_temperature_deg_c': device.temperature_deg_c,
+            }
+        level, message = self._verdict(interval.frames)
+        return Status('', level, message, values)
+
+    def _verdict(self, frames: int) -> tuple[Level, str]:
+        port = self._port
+        if self._refusal or self._control.refusal:
+            return Level.ERROR, self._refusal or self._control.refusal
+        if port is None:
+            return Level.WARN, 'looking for the control unit'
+        if port.state is not PortState.RECEIVING:
+            reason = f': {port.reason}' if port.reason else ''
+            return Level.ERROR, f'{port.state.value}{reason}'
+        if frames == 0:
+            return Level.WARN, 'no windows yet'
+        if self._stream is not None and self._stream.missing:
+            names = ', '.join(s.name for s in self._stream.missing[:4])
+            return Level.WARN, f'the control unit has no channel for {names}'
+        if self._device is not None and self._device.flags:
+            return Level.WARN, f'control unit: {self._device.flags!r}'
+        return Level.OK, 'streaming'
+
+    def part_statuses(self) -> list[Status]:
+        """Amplitude, noise and current of each emitter; state and noise of each sensor."""
+        stream, frame = self._stream, self._frame
+        if stream is None or frame is None or len(frame.flags) != len(stream.sensors):
+            return []
+        return [*self._emitter_statuses(stream, frame), *self._sensor_statuses(stream, frame)]
+
+    def _emitter_statuses(self, stream: FluxStream, frame: FluxFrame) -> list[Status]:
+        window = frame.window
+        statuses = []
+        for k, coil in enumerate(self._setup.emitter.coils):
+            driven = bool(window.driven[k])
+            statuses.append(
+                Status(
+                    f'emitter {coil.name}',
+                    Level.OK if driven else Level.ERROR,
+                    'driven' if driven else 'no current',
+                    {
+                        'frequency_hz': float(stream.tones_hz[k]),
+                        'current_a': float(abs(window.current[k])),
+                        'nominal_current_a': float(stream.nominal_a[k]),
+                        'current_noise_a': float(window.current_sigma[k]),
+                        'flux_rms_t': _rms(window.flux[:, k]),
+                        'flux_noise_t': _rms(window.sigma[:, k]),
+                    },
+                )
+            )
+        return statuses
+
+    def _sensor_statuses(self, stream: FluxStream, frame: FluxFrame) -> list[Status]:
+        seen = self._sensor_flags
+        if seen is None or len(seen) != len(frame.flags):
+            seen = frame.flags
+        statuses = []
+        for row, sensor in enumerate(stream.sensors):
+            level, message = _sensor_state(int(seen[row]))
+            values = {
+                'channel': sensor.channel,
+                'flux_rms_t': _rms(frame.window.flux[row]),
+                'flux_noise_t': _rms(frame.window.sigma[row]),
+            }
+            statuses.append(Status(sensor.name, level, message, values))
+        return statuses
+
+
+def _sensor_state(flags: int) -> tuple[Level, str]:
+    if flags & STALE:
+        return Level.ERROR, 'stuck: all samples of a window are the same'
+    if flags & SATURATED:
+        return Level.WARN, 'saturated'
+    if flags & DROPPED:
+        return Level.WARN, 'samples lost'
+    return Level.OK, 'ok'
+
+
+def _rms(values: np.ndarray) -> float:
+    """Root mean square of what is finite; 0 when nothing is."""
+    finite = np.abs(values[np.isfinite(values)])
+    return float(np.sqrt(np.mean(finite**2))) if finite.size else 0.0
+
+
+if __name__ == '__main__':
+    # Threads take turns every millisecond, not every five.
+    sys.setswitchinterval(1e-3)
+    sys.exit(main(Acquisition))

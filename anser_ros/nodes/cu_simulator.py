@@ -1,0 +1,212 @@
+"""A control unit behind a pseudo-terminal, with the optical truth beside it."""
+
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from scipy.spatial.transform import Rotation
+
+from anser_ros.errors import ParameterError
+from anser_ros.nodes import qos
+from anser_ros.nodes.node import AnserNode, Level, Status, main
+from anser_ros.nodes.parameters import parameter
+from anser_ros.simulation.board_source import board_source
+from anser_ros.simulation.control_unit import ControlUnit, Piece
+from anser_ros.simulation.faults import FAULTS, NONE, UNPLUG, FaultInjector
+from anser_ros.simulation.metal import MetalBody, steel_disc
+from anser_ros.simulation.motion import Approach
+from anser_ros.simulation.pseudo_port import PseudoPort
+from anser_ros.simulation.raw_effects import RawEffect
+from anser_ros.simulation.sampling import FrontEnd
+from anser_ros.simulation.world import World
+from anser_ros.wire.channel_calibration import parse_channels
+from anser_ros.wire.config_folder import read_config
+from anser_ros.wire.setup import parse_setup, topic_of
+
+STRETCH_S = 0.005
+LONGEST_LAG_S = 1.0
+
+
+@dataclass(frozen=True)
+class CuSimulatorParameters:
+    """Parameters of the simulated control unit."""
+
+    link: str = parameter('/tmp/anser_cu', 'path under which the port can be opened')
+    setup_file: str = parameter('demo_setup.yaml', 'setup document: a path, or a file of config/')
+    channels_file: str = parameter(
+        'demo_channels.yaml', 'channel calibration: a path, or a file of config/'
+    )
+    block_samples: int = parameter(40, 'sampling instants a block', minimum=1, maximum=600)
+    noise_codes: float = parameter(
+        2.4, 'white noise before the converter, codes rms', minimum=0.0, maximum=1000.0
+    )
+    current_drift: float = parameter(
+        0.02, 'share by which the coil currents fall as they warm up', minimum=0.0, maximum=0.5
+    )
+    metal: bool = parameter(True, 'whether a steel disc comes and goes')
+    metal_near_m: tuple[float, ...] = parameter(
+        (0.05, -0.03, -0.08), 'nearest position of the disc in fg, m', minimum=-2.0, maximum=2.0
+    )
+    metal_start_s: float = parameter(8.0, 'when the disc sets out, s', minimum=0.0)
+    metal_travel_s: float = parameter(5.0, 'time of its way in, and out, s', minimum=0.1)
+    metal_stay_s: float = parameter(6.0, 'time that it stays near, s', minimum=0.0)
+    metal_period_s: float = parameter(30.0, 'its visit repeats; 0 for once, s', minimum=0.0)
+    optical_rate_hz: float = parameter(
+        60.0, 'poses a second of the optical truth', minimum=1.0, maximum=200.0
+    )
+    optical_noise_m: float = parameter(
+        0.0, 'jitter of the optical position, m rms an axis', minimum=0.0, maximum=0.01
+    )
+    fault: str = parameter(NONE, 'fault of the line', choices=FAULTS, live=True)
+    fault_period_s: float = parameter(
+        5.0, 'from one fault to the next, s', minimum=0.1, maximum=3600.0, live=True
+    )
+    seed: int = parameter(0, 'of noise and faults', minimum=0)
+
+
+class CuSimulator(AnserNode):
+    """Runs the control unit in a thread in real time, and publishes ``/optical/<body>/pose``."""
+
+    NAME = 'cu_simulator'
+    PARAMETERS = CuSimulatorParameters
+
+    def __init__(self, effects: tuple[RawEffect, ...] = (), **options: Any) -> None:
+        super().__init__(**options)
+        table = self.parameters
+        setup = parse_setup(read_config(table.setup_file))
+        channels = parse_channels(read_config(table.channels_file))
+        real = setup
+        for effect in effects:
+            real = effect.setup(real)
+        self._world = World(real, board_source(real), metal=_metal(table))
+        front = FrontEnd(noise_codes=table.noise_codes, current_drift=table.current_drift)
+        self._unit = ControlUnit(
+            self._world,
+            channels,
+            front,
+            block_samples=table.block_samples,
+            effects=effects,
+            seed=table.seed,
+        )
+        self._rng = np.random.default_rng(table.seed + 1)
+        self._injector = FaultInjector(table.fault, table.fault_period_s, table.seed)
+        self._port = PseudoPort(Path(table.link))
+        self._publishers_of = {
+            body: self.create_publisher(PoseStamped, f'/optical/{topic_of(body)}/pose', qos.STREAM)
+            for body in setup.bodies
+        }
+        self._frame_id = setup.frame_id
+        self._begin_ns = time.monotonic_ns()
+        self._closing = threading.Event()
+        step = self._guard(self._step)
+        self._thread = threading.Thread(target=self._run, args=(step,), name='control_unit')
+        self._thread.start()
+        self.create_timer(1 / table.optical_rate_hz, self._publish_truth, clock=self.steady_clock)
+        self.get_logger().info(f'control unit at {table.link}')
+
+    # Device thread ------------------------------------------------------------------------
+
+    def _run(self, step: Any) -> None:
+        while not self._closing.is_set():
+            step()
+            due_s = self._unit.samples / self._unit.sample_rate_hz + STRETCH_S
+            self._port.wait(max(due_s - self._elapsed_s(), 1e-4))
+
+    def _elapsed_s(self) -> float:
+        return (time.monotonic_ns() - self._begin_ns) / 1e9
+
+    def _step(self) -> None:
+        """Catch up with the clock, one stretch of samples after the other."""
+        unit, rate = self._unit, self._unit.sample_rate_hz
+        now_s = self._elapsed_s()
+        self._plug(now_s)
+        lag = int((now_s - LONGEST_LAG_S) * rate) - unit.samples
+        if lag > 0:
+            # A machine that was asleep: the samples of that time are lost, and say so.
+            self.count('lagged')
+            self._begin_ns += int(lag / rate * 1e9)
+        answers = unit.receive(self._port.read())
+        self._send(answers, now_s)
+        stretch = round(STRETCH_S * rate)
+        while (now_s * rate - unit.samples) >= stretch and not self._closing.is_set():
+            self._send(unit.advance(stretch), now_s)
+            now_s = min(now_s, self._elapsed_s())
+
+    def _send(self, pieces: list[Piece], now_s: float) -> None:
+        arriving = self._injector.apply(pieces, now_s)
+        for _ in range(self._port.write(arriving)):
+            self._unit.drop()
+            self.count('dropped_blocks')
+
+    def _plug(self, now_s: float) -> None:
+        out = self._injector.lasts(now_s, UNPLUG)
+        if out and self._port.plugged:
+            self.count('unplugged')
+            self._port.unplug()
+        elif not out and not self._port.plugged:
+            self._port.plug()
+
+    # Executor thread ----------------------------------------------------------------------
+
+    def _publish_truth(self) -> None:
+        now_ns = time.time_ns()
+        time_s = self._elapsed_s()
+        for body, publisher in self._publishers_of.items():
+            position, rotation = self._world.pose(body, time_s)
+            if self.parameters.optical_noise_m:
+                position = position + self.parameters.optical_noise_m * self._rng.standard_normal(
+                    3
+                )
+            publisher.publish(_pose(self._frame_id, now_ns, position, rotation))
+
+    def on_parameters(self, old: Any, new: Any) -> None:
+        """Switch to another fault."""
+        self._injector = FaultInjector(new.fault, new.fault_period_s, new.seed)
+
+    def status(self) -> Status:
+        """State of the control unit."""
+        state = 'streaming' if self._unit.streaming else 'idle, waits for a start'
+        values = {'link': self.parameters.link, 'fault': self._injector.kind}
+        return Status('', Level.OK, state, values)
+
+    def close(self) -> None:
+        """End the thread and remove the port."""
+        self._closing.set()
+        self._thread.join(2.0)
+        self._port.unplug()
+
+
+def _metal(table: CuSimulatorParameters) -> list[MetalBody]:
+    if not table.metal:
+        return []
+    if len(table.metal_near_m) != 3:
+        raise ParameterError(f'metal_near_m needs 3 numbers, got {len(table.metal_near_m)}')
+    x, y, z = table.metal_near_m
+    path = Approach(
+        far_m=(x, y, z - 0.52),
+        near_m=(x, y, z),
+        start_s=table.metal_start_s,
+        travel_s=table.metal_travel_s,
+        stay_s=table.metal_stay_s,
+        period_s=table.metal_period_s,
+    )
+    return [steel_disc(path)]
+
+
+def _pose(frame_id: str, stamp_ns: int, position: np.ndarray, rotation: np.ndarray) -> PoseStamped:
+    message = PoseStamped()
+    message.header.frame_id = frame_id
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+    place, turn = message.pose.position, message.pose.orientation
+    place.x, place.y, place.z = (float(v) for v in position)
+    turn.x, turn.y, turn.z, turn.w = (float(v) for v in Rotation.from_matrix(rotation).as_quat())
+    return message
+
+
+if __name__ == '__main__':
+    sys.exit(main(CuSimulator))

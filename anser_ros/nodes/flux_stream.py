@@ -1,0 +1,195 @@
+"""One connection's samples to fluxes: windows, demodulation, tesla, flags and stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import FitError, SetupError
+from anser_ros.signals.clock import DeviceClock
+from anser_ros.signals.demodulation import Demodulator
+from anser_ros.signals.flux import FluxConverter, FluxWindow
+from anser_ros.signals.window import Window, WindowCutter
+from anser_ros.wire.channel_calibration import ChannelCalibration
+from anser_ros.wire.frames import ChannelKind, Hello, SampleBlock
+from anser_ros.wire.points import DROPPED, SATURATED, STALE, FluxPoints
+from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
+
+
+@dataclass(frozen=True)
+class StreamOptions:
+    """How to demodulate: window and rate, and what to fit besides the tones."""
+
+    window_s: float
+    rate_hz: float
+    mains_hz: float = 0.0
+
+
+@dataclass(frozen=True)
+class FluxFrame:
+    """The fluxes of one window.
+
+    Attributes
+    ----------
+    tool, reference : points of the two topics
+    host_ns : middle of the window in the clock of the arrivals
+    window : conversion with noise and currents, sensors in the order of `FluxStream.sensors`
+    flags : flag bits of these sensors
+    """
+
+    tool: FluxPoints
+    reference: FluxPoints
+    host_ns: int
+    window: FluxWindow
+    flags: NDArray[np.int64]
+
+
+class FluxStream:
+    """Made anew for every hello that differs from the one before.
+
+    Parameters
+    ----------
+    hello : what the control unit says that it sends
+    setup : which sensors are wanted
+    calibration : response of the channels
+    options : window and rate
+
+    Attributes
+    ----------
+    sensors : those of the setup that the control unit has a channel for, tools first
+    missing : those that it has none for
+    rate_hz : windows a second, a whole number of samples apart
+
+    Raises
+    ------
+    SetupError
+        When the control unit has none of the channels, or other emitters than the setup.
+    ParameterError
+        When the window cannot be demodulated.
+    """
+
+    def __init__(
+        self, hello: Hello, setup: Setup, calibration: ChannelCalibration, options: StreamOptions
+    ) -> None:
+        if len(hello.frequencies_hz) != len(setup.emitter.coils):
+            raise SetupError(
+                f'the control unit drives {len(hello.frequencies_hz)} coils, '
+                f'the setup has {len(setup.emitter.coils)}'
+            )
+        columns = {
+            channel.number: column
+            for column, channel in enumerate(hello.channels)
+            if channel.kind is ChannelKind.SENSE
+        }
+        wanted = (*setup.tool_sensors, *setup.reference_sensors)
+        self.sensors = tuple(s for s in wanted if s.channel in columns)
+        self.missing = tuple(s for s in wanted if s.channel not in columns)
+        if not self.sensors:
+            raise SetupError('the control unit has none of the channels of the setup')
+        self.tones_hz = np.array(hello.frequencies_hz)
+        self.nominal_a = _nominal_currents(setup, hello)
+        rate = hello.sample_rate_hz
+        window = round(options.window_s * rate)
+        hop = max(1, round(rate / options.rate_hz))
+        self.rate_hz = rate / hop
+        self._tick_hz, self._sample_rate_hz = hello.tick_hz, rate
+        self._demodulator = Demodulator(
+            rate, self.tones_hz, window, mains_hz=options.mains_hz or None
+        )
+        self._converter = _converter(hello, self, columns, calibration)
+        self._cutter = WindowCutter(window, hop, len(hello.channels), rate / hello.tick_hz)
+        self.counters = self._cutter.counters
+        self.clock = DeviceClock(hello.tick_hz)
+        self._columns = np.array([columns[s.channel] for s in self.sensors])
+        self._split = sum(s.body != FIELD_GENERATOR for s in self.sensors)
+        self._tool = _geometry(self.sensors[: self._split])
+        self._reference = _geometry(self.sensors[self._split :])
+
+    def push(self, block: SampleBlock, arrival_ns: int) -> list[FluxFrame]:
+        """Take a block and return the frames that it completes."""
+        if block.codes.shape[1] != self._cutter.columns:
+            return []
+        end_ticks = block.timestamp_ticks + len(block.codes) * self._tick_hz / self._sample_rate_hz
+        self.clock.observe(end_ticks, arrival_ns)
+        windows = self._cutter.push(block.sequence, block.timestamp_ticks, block.codes)
+        frames = []
+        for window in windows:
+            try:
+                frames.append(self._frame(window))
+            except FitError:
+                self.counters.windows -= 1
+                self.counters.windows_lost += 1
+        return frames
+
+    def _frame(self, window: Window) -> FluxFrame:
+        fit = self._demodulator.demodulate(window.codes, window.present)
+        converted = self._converter.convert(fit)
+        flags = np.where(window.saturated[self._columns], SATURATED, 0)
+        flags |= np.where(window.stuck[self._columns], STALE, 0)
+        if window.dropped:
+            flags |= DROPPED
+        split = self._split
+        return FluxFrame(
+            _points(self._tool, converted.flux[:split], flags[:split]),
+            _points(self._reference, converted.flux[split:], flags[split:]),
+            self.clock.host_ns(window.middle_ticks),
+            converted,
+            flags,
+        )
+
+
+@dataclass(frozen=True)
+class _Geometry:
+    channel: NDArray[np.int64]
+    position: NDArray[np.float64]
+    axis: NDArray[np.float64]
+
+
+def _geometry(sensors: Sequence[SensorSpec]) -> _Geometry:
+    """Channels, and positions and axes in fg: NaN for what moves."""
+    fixed = np.array([s.body == FIELD_GENERATOR for s in sensors], bool)[:, None]
+    position = np.array([s.position_m for s in sensors]).reshape(-1, 3)
+    axis = np.array([s.axis for s in sensors]).reshape(-1, 3)
+    return _Geometry(
+        np.array([s.channel for s in sensors], np.int64),
+        np.where(fixed, position, np.nan),
+        np.where(fixed, axis, np.nan),
+    )
+
+
+def _points(
+    geometry: _Geometry, flux: NDArray[np.complex128], flags: NDArray[np.int64]
+) -> FluxPoints:
+    return FluxPoints(geometry.channel, flags, flux, geometry.position, geometry.axis)
+
+
+def _nominal_currents(setup: Setup, hello: Hello) -> NDArray[np.float64]:
+    """Currents that the setup's field is given for; the control unit's where it says nothing."""
+    current = setup.emitter.geometry.get('current_a')
+    if isinstance(current, (int, float)) and current > 0:
+        return np.full(len(hello.currents_a), float(current))
+    return np.array(hello.currents_a)
+
+
+def _converter(
+    hello: Hello, stream: FluxStream, columns: dict[int, int], calibration: ChannelCalibration
+) -> FluxConverter:
+    per_code = np.array([channel.full_scale / 32768 for channel in hello.channels])
+    kinds = [channel.kind for channel in hello.channels]
+    current = kinds.index(ChannelKind.CURRENT)
+    numbers = [sensor.channel for sensor in stream.sensors]
+    chosen = np.array([columns[number] for number in numbers])
+    return FluxConverter(
+        stream.tones_hz,
+        chosen,
+        per_code[chosen],
+        calibration.areas_m2(numbers),
+        calibration.delays_s(numbers),
+        current_column=current,
+        amperes_per_code=float(per_code[current]),
+        nominal_currents_a=stream.nominal_a,
+        current_delay_s=calibration.current_delay_s,
+    )

@@ -1,0 +1,127 @@
+"""A serial port made of a pseudo-terminal, behind a link that keeps its name when replugged."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import time
+import tty
+from collections.abc import Sequence
+from pathlib import Path
+
+from anser_ros.errors import PortError
+from anser_ros.simulation.control_unit import Piece
+
+_PENDING_LIMIT_BYTES = 1 << 19
+
+
+class PseudoPort:
+    """The device's end of the line; never blocks.
+
+    Parameters
+    ----------
+    link : path under which the host opens the port
+
+    Raises
+    ------
+    PortError
+        When something else than a link has that path, or it cannot be made.
+    """
+
+    def __init__(self, link: Path) -> None:
+        self.link = link
+        self._fds: tuple[int, int] | None = None
+        self._pending = b''
+        self.plug()
+
+    @property
+    def plugged(self) -> bool:
+        """Whether the cable is in."""
+        return self._fds is not None
+
+    def plug(self) -> None:
+        """Put the cable in: a fresh terminal behind the same link."""
+        if self.link.exists() and not self.link.is_symlink():
+            raise PortError(f'{self.link} exists and is no link')
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        os.set_blocking(master, False)
+        temporary = self.link.with_name(f'{self.link.name}.{os.getpid()}')
+        try:
+            temporary.symlink_to(os.ttyname(slave))
+            temporary.replace(self.link)
+        except OSError as error:
+            os.close(master)
+            os.close(slave)
+            raise PortError(f'cannot make the link {self.link}: {error.strerror}') from error
+        self._fds = (master, slave)
+
+    def unplug(self) -> None:
+        """Pull the cable out."""
+        if self._fds is None:
+            return
+        self._remove_own_link()
+        for descriptor in self._fds:
+            os.close(descriptor)
+        self._fds, self._pending = None, b''
+
+    def write(self, pieces: Sequence[Piece]) -> int:
+        """Send records; returns how many blocks found the line full and were dropped."""
+        if self._fds is None:
+            return sum(piece.is_block for piece in pieces)
+        dropped = 0
+        parts = [self._pending]
+        size = len(self._pending)
+        for piece in pieces:
+            if size + len(piece.data) > _PENDING_LIMIT_BYTES:
+                dropped += piece.is_block
+                continue
+            parts.append(piece.data)
+            size += len(piece.data)
+        self._pending = b''.join(parts)
+        self._flush()
+        return dropped
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait until the host sends something or time is over; what is pending goes out meanwhile.
+
+        The system takes a few kilobytes at a time, so a port that nobody waits on is a slow one.
+        """
+        end = time.monotonic() + timeout_s
+        while (left := end - time.monotonic()) > 0:
+            if self._fds is None:
+                time.sleep(left)
+                return
+            master = self._fds[0]
+            readable, writable, _ = select.select(
+                [master], [master] if self._pending else [], [], left
+            )
+            if writable:
+                self._flush()
+            if readable:
+                return
+
+    def _flush(self) -> None:
+        if self._fds is None:
+            return
+        with contextlib.suppress(BlockingIOError):
+            while self._pending:
+                self._pending = self._pending[os.write(self._fds[0], self._pending) :]
+
+    def read(self) -> bytes:
+        """Return what the host has sent; empty when nothing."""
+        if self._fds is None:
+            return b''
+        try:
+            return os.read(self._fds[0], 4096)
+        except BlockingIOError:
+            return b''
+
+    def _remove_own_link(self) -> None:
+        """Remove the link, unless another simulator has taken it over."""
+        if self._fds is None:
+            return
+        with contextlib.suppress(OSError):
+            if os.readlink(self.link) == os.ttyname(self._fds[1]):
+                self.link.unlink()

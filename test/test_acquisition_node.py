@@ -1,0 +1,269 @@
+"""Acquisition and the simulated control unit as processes, joined by a pseudo-terminal and DDS."""
+
+import time
+
+import numpy as np
+import pytest
+from conftest import spin_until
+
+from anser_ros.errors import PortError, SetupError
+from anser_ros.nodes.flux_stream import FluxStream, StreamOptions
+from anser_ros.simulation.control_unit import Piece
+from anser_ros.simulation.faults import FaultInjector
+from anser_ros.simulation.pseudo_port import PseudoPort
+from anser_ros.wire.channel_calibration import parse_channels
+from anser_ros.wire.config_folder import read_config
+from anser_ros.wire.frames import Channel, ChannelKind, Hello, SampleBlock
+from anser_ros.wire.points import DROPPED, SATURATED, STALE, decode_flux
+from anser_ros.wire.setup import parse_setup
+
+SETUP = parse_setup(read_config('demo_setup.yaml'))
+CHANNELS = parse_channels(read_config('demo_channels.yaml'))
+NUMBERS = [sensor.channel for sensor in SETUP.sensors]
+OPTIONS = StreamOptions(0.02, 50.0)
+
+
+def hello(numbers=NUMBERS, tones=SETUP.frequencies_hz):
+    channels = [Channel(n, ChannelKind.SENSE, 5.0) for n in numbers]
+    current = Channel(99, ChannelKind.CURRENT, 2.5)
+    return Hello('t', 40e3, 1e6, 40, (*channels, current), tones, (0.25,) * len(tones))
+
+
+class Listener:
+    """Collects what acquisition says."""
+
+    def __init__(self, ros, namespace='/anser'):
+        from diagnostic_msgs.msg import DiagnosticArray
+        from geometry_msgs.msg import PoseStamped
+        from sensor_msgs.msg import PointCloud2
+        from std_msgs.msg import String
+
+        from anser_ros.nodes import qos
+
+        self.node = ros.create_node('listener')
+        self.tool, self.reference, self.setups, self.optical = [], [], [], []
+        self.states, self.seen = {}, set()
+        subscribe = self.node.create_subscription
+        subscribe(PointCloud2, f'{namespace}/tool/flux', self._on_tool, qos.STREAM)
+        subscribe(PointCloud2, f'{namespace}/reference/flux', self.reference.append, qos.STREAM)
+        subscribe(String, f'{namespace}/setup', self.setups.append, qos.LATCHED)
+        subscribe(DiagnosticArray, '/diagnostics', self._on_diagnostics, qos.EVENTS)
+        subscribe(PoseStamped, '/optical/tool_a/pose', self.optical.append, qos.STREAM)
+
+    def _on_tool(self, message):
+        self.tool.append((message, time.time()))
+
+    def _on_diagnostics(self, message):
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            self.states[status.name] = (status.level, status.message, values)
+            self.seen.add(f'{status.name}: {status.message}')
+
+    def until(self, condition, seconds=15.0):
+        assert spin_until(self.node, condition, seconds), self.states.get('anser/acquisition')
+
+    def set(self, name, parameter, value):
+        """Change a live parameter of a node."""
+        from rcl_interfaces.srv import SetParameters
+        from rclpy.parameter import Parameter
+
+        client = self.node.create_client(SetParameters, f'/anser/{name}/set_parameters')
+        assert client.wait_for_service(10)
+        request = SetParameters.Request()
+        request.parameters = [Parameter(parameter, value=value).to_parameter_msg()]
+        future = client.call_async(request)
+        assert spin_until(self.node, future.done)
+        assert future.result().results[0].successful, future.result().results[0].reason
+
+    def value(self, key, node='anser/acquisition'):
+        return float(self.states.get(node, (0, '', {}))[2].get(key, 'nan'))
+
+
+def points(message):
+    fields = [(f.name, f.offset, f.datatype, f.count) for f in message.fields]
+    return decode_flux(fields, message.point_step, message.width, bytes(message.data))
+
+
+def stamp(message):
+    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+
+
+@pytest.fixture
+def chain(ros, start, tmp_path):
+    """Simulator and acquisition, started with parameters; returns a listener and the processes."""
+
+    def run(simulator=(), acquisition=()):
+        link = tmp_path / 'cu'
+        listener = Listener(ros)
+        first = start('cu_simulator', '--ros-args', *_set(link=link), *_set(**dict(simulator)))
+        second = start('acquisition', '--ros-args', *_set(device=link), *_set(**dict(acquisition)))
+        return listener, first, second
+
+    return run
+
+
+def _set(**parameters):
+    return [word for k, v in parameters.items() for word in ('-p', f'{k}:={v}')]
+
+
+def test_fluxes_arrive_with_layout_stamps_and_health(chain):
+    listener, simulator, acquisition = chain({'metal': 'false'})
+    listener.until(lambda: len(listener.tool) > 80 and len(listener.optical) > 50)
+    messages, arrivals = zip(*listener.tool, strict=True)
+    first = messages[0]
+    assert (first.point_step, first.width, first.height) == (92, 9, 1)
+    assert first.header.frame_id == 'fg' and not first.is_bigendian
+    assert [f.name for f in first.fields[:10]] == [
+        *('x', 'y', 'z', 'nx', 'ny', 'nz', 'channel', 'flags', 'coil0_re', 'coil0_im')
+    ]
+    tool, reference = points(messages[60]), points(listener.reference[60])
+    assert tool.channel.tolist() == list(range(9)) and np.isnan(tool.position).all()
+    assert reference.channel.tolist() == list(range(16, 48))
+    spec = SETUP.reference_sensors[5]
+    assert reference.position[5] == pytest.approx(spec.position_m, abs=1e-7)
+    assert reference.axis[5] == pytest.approx(spec.axis, abs=1e-6)
+    assert 1e-8 < np.abs(tool.flux).max() < 1e-4
+    # a board without metal has no quadrature
+    assert np.abs(reference.flux.imag).max() < 1e-3 * np.abs(reference.flux).max()
+    times = np.array([stamp(m) for m in messages[20:]])
+    assert np.median(np.diff(times)) == pytest.approx(0.02, abs=1e-4)
+    # a window's middle lies half a window behind its end; the rest is transport
+    latency = np.array(arrivals[20:]) - times
+    assert 0.009 < np.percentile(latency, 5) < 0.03
+    assert parse_setup(listener.setups[-1].data) == SETUP
+    listener.until(lambda: 'anser/acquisition: emitter coil7' in listener.states)
+    level, message, values = listener.states['anser/acquisition: emitter coil3']
+    assert (level, message) == (b'\x00', 'driven')
+    assert float(values['current_a']) == pytest.approx(0.25, rel=0.03)
+    assert 1e-11 < float(values['flux_noise_t']) < 3e-10
+    assert 'anser/acquisition: ref/15/1' in listener.states
+    listener.set('acquisition', 'rate_hz', 200.0)
+    count = len(listener.setups)
+    listener.until(lambda: len(listener.setups) > count)
+    assert parse_setup(listener.setups[-1].data).flux_rate_hz == 200.0
+    fast = len(listener.tool) + 20
+    listener.until(lambda: len(listener.tool) > fast + 100)
+    times = np.array([stamp(m) for m, _ in listener.tool[fast:]])
+    assert np.median(np.diff(times)) == pytest.approx(0.005, abs=1e-4)
+    for process in (acquisition, simulator):
+        begin = time.monotonic()
+        assert process.interrupt() == 0, process.output
+        assert time.monotonic() - begin < 2.0
+
+
+def test_every_fault_of_the_line_is_survived_counted_and_named(chain):
+    listener, _, acquisition = chain({'metal': 'false', 'fault_period_s': 0.3})
+    listener.until(lambda: len(listener.tool) > 10)
+    listener.set('cu_simulator', 'fault', 'bad_crc')
+    listener.until(lambda: listener.value('bad_crc') >= 1)
+    listener.set('cu_simulator', 'fault', 'gap')
+    listener.until(lambda: listener.value('gap_blocks') >= 3)
+    listener.until(lambda: any(points(m).flags[0] & DROPPED for m, _ in listener.tool))
+    listener.set('cu_simulator', 'fault', 'garbage')
+    listener.until(lambda: listener.value('skipped_bytes') >= 1)
+    listener.set('cu_simulator', 'fault_period_s', 5.0)
+    listener.set('cu_simulator', 'fault', 'wrong_baud')
+    listener.until(lambda: listener.value('wrong_baud') >= 1)
+    listener.set('cu_simulator', 'fault', 'none')
+    before = len(listener.tool)
+    listener.until(lambda: len(listener.tool) > before + 10)
+    listener.set('cu_simulator', 'fault_period_s', 2.2)
+    listener.set('cu_simulator', 'fault', 'unplug')
+    listener.until(lambda: listener.value('unplug') >= 1 and listener.value('opens') >= 2)
+    listener.set('cu_simulator', 'fault', 'none')
+    before = len(listener.tool)
+    listener.until(lambda: len(listener.tool) > before + 30)
+    assert acquisition.popen.poll() is None
+
+
+def test_a_port_that_is_not_there_and_a_setup_that_is_none(start, tmp_path, ros):
+    listener = Listener(ros)
+    start('acquisition', '--ros-args', *_set(device=tmp_path / 'absent'))
+    listener.until(lambda: listener.value('open_failures') >= 2)
+    assert listener.states['anser/acquisition'][0] == b'\x02'
+    broken = tmp_path / 'broken.yaml'
+    broken.write_text('schema: something else')
+    process = start('acquisition', '--ros-args', *_set(setup_file=broken))
+    assert process.popen.wait(15) == 2
+    assert 'schema must be' in process.output and 'Traceback' not in process.output
+
+
+class TestStream:
+    """The part between port and topics, without processes."""
+
+    def codes(self, seed=0, samples=40, columns=42):
+        rng = np.random.default_rng(seed)
+        return rng.integers(-500, 500, (samples, columns)).astype(np.int16)
+
+    def frames(self, stream, blocks, edit=lambda codes: None, skip=()):
+        found = []
+        for k in range(blocks):
+            codes = self.codes(k)
+            edit(codes)
+            if k not in skip:
+                found += stream.push(SampleBlock(k, 1000 * k, codes), 10**12 + 10**6 * (k + 1))
+        return found
+
+    def test_flags(self):
+        def edit(codes):
+            codes[5, 2] = 32767
+            codes[:, 4] = 17
+
+        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        first, second = self.frames(stream, 40, edit, skip={25})
+        assert first.tool.flags.tolist() == [0, 0, SATURATED, 0, STALE, 0, 0, 0, 0]
+        assert (second.flags & DROPPED).all()
+        assert first.host_ns == 10**12 + 10**7
+
+    def test_emitter_without_current_gives_nan_and_other_emitters_go_on(self):
+        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        (frame,) = self.frames(stream, 20)
+        assert np.isnan(frame.tool.flux).any()
+
+    def test_missing_channels_are_named(self):
+        stream = FluxStream(hello(NUMBERS[:-3]), SETUP, CHANNELS, OPTIONS)
+        assert [s.name for s in stream.missing] == ['ref/14/1', 'ref/15/0', 'ref/15/1']
+        assert len(stream.sensors) == 38
+
+    def test_blocks_of_another_width_are_left_alone(self):
+        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        assert stream.push(SampleBlock(0, 0, self.codes(columns=5)), 1) == []
+
+    def test_refusals(self):
+        with pytest.raises(SetupError, match='none of the channels'):
+            FluxStream(hello([500]), SETUP, CHANNELS, OPTIONS)
+        with pytest.raises(SetupError, match='drives 2 coils'):
+            FluxStream(hello(tones=(6000.0, 7000.0)), SETUP, CHANNELS, OPTIONS)
+
+
+def test_pseudo_port_leaves_foreign_files_alone(tmp_path):
+    taken = tmp_path / 'file'
+    taken.write_text('mine')
+    with pytest.raises(PortError, match='is no link'):
+        PseudoPort(taken)
+    with pytest.raises(PortError, match='cannot make the link'):
+        PseudoPort(tmp_path / 'no' / 'folder')
+    assert taken.read_text() == 'mine'
+
+
+def test_pseudo_port_drops_what_nobody_reads_and_removes_only_its_own_link(tmp_path):
+    link = tmp_path / 'cu'
+    port = PseudoPort(link)
+    piece = Piece(bytes(4000), is_block=True)
+    assert port.write([piece] * 300) > 100
+    other = PseudoPort(link)
+    port.unplug()
+    assert link.is_symlink() and not port.plugged
+    assert port.write([piece]) == 1 and port.read() == b''
+    other.unplug()
+    assert not link.is_symlink()
+
+
+def test_faults_damage_what_they_say():
+    pieces = [Piece(bytes([k]) * 50, is_block=True) for k in range(4)]
+    for kind, count in (('none', 4), ('gap', 3), ('garbage', 5), ('bad_crc', 4), ('silence', 0)):
+        assert len(FaultInjector(kind, 5.0).apply(pieces, 0.1)) == count
+    assert FaultInjector('gap', 5.0).apply(pieces, 7.0) == pieces[1:]
+    garbled = FaultInjector('wrong_baud', 8.0).apply(pieces, 0.1)
+    assert all(a.data not in b.data for a, b in zip(garbled, pieces, strict=True))
+    assert FaultInjector('silence', 5.0).apply(pieces, 3.0) == pieces
