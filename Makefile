@@ -9,7 +9,7 @@ ENVIRONMENT = OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-oldest lint format types bench paper loop measured clean
+.PHONY: help demo test test-oldest lint format types parameters bench paper loop measured clean
 
 help:
 	@echo 'make demo [DURATION=30]  watch a simulated tool being tracked'
@@ -39,6 +39,9 @@ format: $(READY)
 
 types: $(READY)
 	$(VENV)/bin/mypy
+
+parameters: $(READY)
+	@$(VENV)/bin/python .ci/write_parameters.py
 
 test: lint types
 	$(ENVIRONMENT) $(VENV)/bin/python -m pytest $(ARGS)

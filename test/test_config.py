@@ -1,0 +1,111 @@
+"""What lies in config/ is what the code knows: nothing that rclpy would drop silently."""
+
+import importlib
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from anser_ros.cli.main import NODES, node_names
+from anser_ros.errors import ParameterError
+from anser_ros.nodes import parameters
+from anser_ros.nodes.node import AnserNode
+from anser_ros.wire.setup import parse_setup, topic_of
+
+CONFIG = Path(__file__).resolve().parents[1] / 'config'
+DOCUMENTS = sorted(CONFIG.glob('*.yaml'))
+
+
+def is_parameter_file(document):
+    return isinstance(document, dict) and any(
+        isinstance(value, dict) and 'ros__parameters' in value for value in document.values()
+    )
+
+
+def node_class(name):
+    module = importlib.import_module(f'anser_ros.nodes.{name}')
+    (found,) = (
+        value
+        for value in vars(module).values()
+        if isinstance(value, type)
+        and issubclass(value, AnserNode)
+        and value.__module__ == module.__name__
+    )
+    return found
+
+
+def check_parameter_file(document):
+    """Raise ParameterError on a node or a key that no table knows, or a value out of range."""
+    for key, section in document.items():
+        name = key.rsplit('/', 1)[-1]
+        if name not in node_names():
+            raise ParameterError(f'no node {key}')
+        if set(section) != {'ros__parameters'}:
+            raise ParameterError(f'{key} may hold ros__parameters only')
+        parameters.build(node_class(name).PARAMETERS, section['ros__parameters'])
+
+
+@pytest.mark.parametrize('path', DOCUMENTS, ids=lambda path: path.name)
+def test_every_node_and_key_is_known(path):
+    document = yaml.safe_load(path.read_text())
+    if is_parameter_file(document):
+        check_parameter_file(document)
+
+
+@pytest.mark.parametrize(
+    ('document', 'said'),
+    [
+        ({'/anser/trakcer': {'ros__parameters': {}}}, 'no node /anser/trakcer'),
+        ({'/anser/recorder': {'ros__parameters': {'nmae': 'x'}}}, 'no parameter nmae'),
+        ({'/anser/recorder': {'ros__parameters': {'flush_period_s': 9}}}, 'above 1'),
+        ({'/anser/recorder': {'ros_parameters': {}}}, 'may hold ros__parameters only'),
+    ],
+)
+def test_what_rclpy_would_drop_is_found(document, said):
+    with pytest.raises(ParameterError, match=said):
+        check_parameter_file(document)
+
+
+def test_the_main_file_names_every_parameter_of_every_node():
+    document = yaml.safe_load((CONFIG / 'anser.yaml').read_text())
+    for name in node_names():
+        section = document[f'/anser/{name}']['ros__parameters']
+        assert set(section) == set(parameters.types(node_class(name).PARAMETERS)), name
+
+
+def test_every_node_has_the_name_of_its_module():
+    assert set(node_names()) <= set(NODES)
+    for name in node_names():
+        assert name == node_class(name).NAME
+
+
+@pytest.mark.parametrize('path', DOCUMENTS, ids=lambda path: path.name)
+def test_setup_documents_are_valid(path):
+    text = path.read_text()
+    if str(yaml.safe_load(text).get('schema', '')).startswith('anser_setup'):
+        parse_setup(text)
+
+
+def test_the_demo_has_eight_coils_a_tool_and_32_references():
+    setup = parse_setup((CONFIG / 'demo_setup.yaml').read_text())
+    assert len(setup.emitter.coils) == 8
+    assert len(setup.tool_sensors) == 9 and setup.bodies == ('tool_a',)
+    assert len(setup.reference_sensors) == 32
+
+
+def test_views_show_topics_that_exist():
+    setup = parse_setup((CONFIG / 'demo_setup.yaml').read_text())
+    names = [sensor.name for sensor in setup.tool_sensors] + list(setup.bodies)
+    poses = {f'/anser/{topic_of(name)}/pose' for name in names}
+    poses |= {f'{pose}_with_covariance' for pose in poses} | {'/optical/tool_a/pose'}
+    rviz = yaml.safe_load((CONFIG / 'anser.rviz').read_text())
+    displays = rviz['Visualization Manager']['Displays']
+    shown = {d['Topic']['Value'] for d in displays if 'Topic' in d}
+    layout = json.loads((CONFIG / 'foxglove_layout.json').read_text())
+    panels = layout['configById'].values()
+    shown |= {topic for panel in panels for topic in panel.get('topics', {})}
+    plotted = {path['value'] for panel in panels for path in panel.get('paths', [])}
+    shown |= {value.split('.', 1)[0] for value in plotted}
+    known = poses | {'/anser/field_model', '/anser/reference/flux', '/diagnostics', '/tf'}
+    assert shown and shown <= known

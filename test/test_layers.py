@@ -1,0 +1,112 @@
+"""Imports point inwards only, and each foreign library stays in its room.
+
+Every file's syntax tree is walked, imports inside functions included.
+"""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
+FILES = sorted(PACKAGE.rglob('*.py'))
+CORE = {'physics', 'signals', 'wire', 'fitting', 'effects', 'tracking', 'diagnosis', 'sessions'}
+# What each layer may import of ours, itself and the errors aside.
+ALLOWED = {
+    'physics': set(),
+    'signals': set(),
+    'wire': set(),
+    'fitting': {'physics'},
+    'effects': {'fitting', 'physics'},
+    'tracking': {'effects', 'fitting', 'physics'},
+    'diagnosis': {'effects', 'fitting', 'physics'},
+    'sessions': {'wire', 'tracking', 'fitting', 'effects', 'physics'},
+    'simulation': {'sessions', 'effects', 'fitting', 'physics', 'signals', 'wire'},
+    'measured': CORE,
+    'cli': {*CORE, 'simulation', 'measured'},
+    'nodes': {*CORE, 'simulation'},
+}
+# Libraries that only some places may know.
+ROOMS = {
+    'rclpy': ('nodes/',),
+    'ament_index_python': ('nodes/',),
+    'std_srvs': ('nodes/',),
+    'serial': ('wire/port.py',),
+    'mcap': ('wire/bag.py', 'wire/bag_writer.py'),
+    'mcap_ros2': ('wire/bag.py', 'wire/bag_writer.py'),
+    'pyigtl': ('nodes/igtl_server.py',),
+    'rich': ('nodes/', 'cli/'),
+    'matplotlib': ('diagnosis/', 'cli/'),
+    'magpylib': (),
+}
+
+
+def place(path):
+    return path.relative_to(PACKAGE).as_posix()
+
+
+def imports(path):
+    """Yield the full names that a file imports."""
+    module = ('anser_ros', *path.relative_to(PACKAGE).with_suffix('').parts)
+    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = '.'.join(module[: -node.level]) if node.level else ''
+            source = '.'.join(part for part in (base, node.module) if part)
+            yield source
+            yield from (f'{source}.{alias.name}' for alias in node.names)
+
+
+def is_ros(name):
+    return name.endswith('_msgs') or name in ('rclpy', 'std_srvs')
+
+
+@pytest.mark.parametrize('path', FILES, ids=place)
+def test_imports_of_ours_point_inwards(path):
+    layer = path.relative_to(PACKAGE).parts[0]
+    if layer.endswith('.py'):  # errors.py and __init__.py know nothing
+        allowed, layer = set(), ''
+    else:
+        assert layer in ALLOWED, f'{layer} is no layer'
+        allowed = ALLOWED[layer]
+    modules = {path.stem for path in PACKAGE.glob('*.py')}
+    for name in imports(path):
+        parts = name.split('.')
+        if parts[0] == 'anser_ros' and len(parts) > 1 and parts[1] not in modules:
+            assert parts[1] == layer or parts[1] in allowed, f'{place(path)} imports {name}'
+
+
+@pytest.mark.parametrize('path', FILES, ids=place)
+def test_libraries_stay_in_their_rooms(path):
+    for name in imports(path):
+        library = name.split('.')[0]
+        rooms = ('nodes/',) if is_ros(library) else ROOMS.get(library)
+        if rooms is not None:
+            assert place(path).startswith(rooms), f'{place(path)} imports {name}'
+
+
+def test_the_walk_sees_imports_everywhere(tmp_path):
+    """A guard on the guard: relative, aliased and local imports are all found."""
+    text = 'import a.b as c\ndef f():\n    from ..x import y\nfrom . import z\n'
+    path = PACKAGE / 'wire' / 'unwritten.py'
+
+    class Text(type(path)):
+        def read_text(self, encoding=None):
+            return text
+
+    found = set(imports(Text(path)))
+    assert {'a.b', 'anser_ros.x', 'anser_ros.x.y', 'anser_ros.wire.z'} <= found
+
+
+def test_broad_excepts_are_the_outermost():
+    """`except Exception` stands only where a callback, a thread or the process ends."""
+    allowed = {'cli/main.py', 'nodes/node.py', 'nodes/replay.py'}
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            if isinstance(node, ast.ExceptHandler):
+                broad = node.type is None or ast.unparse(node.type) in (
+                    'Exception',
+                    'BaseException',
+                )
+                assert not broad or place(path) in allowed, f'{place(path)}:{node.lineno}'
