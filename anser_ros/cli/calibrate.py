@@ -1,0 +1,175 @@
+"""Fit a field model to recorded sessions."""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from anser_ros.errors import AnserError, FitError, ParameterError
+from anser_ros.fitting.calibration import Calibration, Options, calibrate, to_document
+from anser_ros.fitting.layouts import Generator, Layout
+from anser_ros.fitting.model import FieldModel
+from anser_ros.fitting.moments import Uncertainty
+from anser_ros.sessions.model_file import save_model
+from anser_ros.sessions.session import Session, load_session
+from anser_ros.wire.setup import Setup
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument('sessions', nargs='+', metavar='SESSION', help='bags to learn from')
+    parser.add_argument('--out', required=True, type=Path, help='model file to write')
+    parser.add_argument('--report', type=Path, help='folder for calibration.json and the figures')
+    parser.add_argument('--json', action='store_true', help='print calibration.json on stdout')
+    parser.add_argument(
+        '--force', action='store_true',
+        help="write the model even when its held-out error is worse than the nominal model's",
+    )  # fmt: skip
+    parser.add_argument(
+        '--dipoles', type=_layer, metavar='NxN',
+        help='layer of N x N z-dipoles on the board instead of the choice by held-out error',
+    )  # fmt: skip
+    parser.add_argument('--damping', type=float, help='damping instead of the choice')
+    parser.add_argument('--flux-noise', type=float, default=60e-12, help='T a component')
+    parser.add_argument('--pose-jitter-mm', type=float, default=0.07, help='optical, per axis')
+    parser.add_argument('--pose-jitter-mrad', type=float, default=0.4, help='optical, per axis')
+
+
+def _layer(text: str) -> Layout:
+    first, _, second = text.partition('x')
+    if not first.isdigit() or second not in ('', first) or not 1 <= int(first) <= 64:
+        raise argparse.ArgumentTypeError(f'must be NxN with N in 1..64, got {text!r}')
+    return Layout('layer', int(first), 1.0, 0.0)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; the exit code."""
+    sessions = [load_session(path) for path in args.sessions]
+    check_same_board(sessions)
+    with progress_bar() as progress:
+        calibration = calibrate_sessions(sessions, _options(args), progress)
+    document = to_document(calibration)
+    text = json.dumps(document, indent=1)
+    if args.report is not None:
+        args.report.mkdir(parents=True, exist_ok=True)
+        (args.report / 'calibration.json').write_text(text + '\n', encoding='utf-8')
+    if not calibration.better_than_nominal and not args.force:
+        raise FitError(
+            f'no model written: its held-out error {document["heldout_flux_rmse_t"]:.3g} T is '
+            f"worse than the nominal model's {calibration.nominal_rmse_t:.3g} T (--force writes it)"
+        )
+    save_model(args.out, calibration.model)
+    if args.json:
+        print(text)
+    else:
+        Console().print(_table(calibration, document))
+    return 0
+
+
+def _options(args: argparse.Namespace) -> Options:
+    values = (args.flux_noise, args.pose_jitter_mm, args.pose_jitter_mrad, args.damping or 0.0)
+    if not np.isfinite(values).all() or min(values) < 0.0 or args.flux_noise == 0.0:
+        raise ParameterError(
+            'flux noise must be positive; jitter and damping must not be negative, '
+            f'got {", ".join(f"{v:g}" for v in values)}'
+        )
+    uncertainty = Uncertainty(
+        args.flux_noise, 1e-3 * args.pose_jitter_mm, 1e-3 * args.pose_jitter_mrad
+    )
+    return Options(uncertainty, args.dipoles, args.damping)
+
+
+def check_same_board(sessions: list[Session]) -> None:
+    """Raise `FitError` when two sessions' setups have different emitters."""
+    first = sessions[0]
+    for other in sessions[1:]:
+        if other.setup.emitter != first.setup.emitter:
+            raise FitError(
+                f'all sessions must be of one board: {first.path} and {other.path} differ in '
+                f'{_difference(first.setup, other.setup)}'
+            )
+
+
+def _difference(one: Setup, other: Setup) -> str:
+    if len(one.emitter.coils) != len(other.emitter.coils):
+        return f'the number of coils, {len(one.emitter.coils)} and {len(other.emitter.coils)}'
+    for mine, theirs in zip(one.emitter.coils, other.emitter.coils, strict=True):
+        if mine != theirs:
+            return f'coil {mine.name}: {mine} and {theirs}'
+    return 'the geometry of the coils'
+
+
+def generator_of(setup: Setup) -> Generator:
+    """Where the setup's coils are; their side from the geometry, or from their spacing."""
+    centres = np.array([coil.centre_m for coil in setup.emitter.coils])
+    turns = np.array([coil.rotation_deg for coil in setup.emitter.coils])
+    side = setup.emitter.geometry.get('side_m')
+    if not isinstance(side, int | float) or not side > 0:
+        gaps = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+        gaps = gaps[gaps > 0.0]
+        side = float(gaps.min()) if gaps.size else 0.1
+    return Generator(centres, turns, float(side))
+
+
+def nominal_of(session: Session) -> FieldModel | None:
+    """The nominal model, or None where the setup's geometry makes none."""
+    try:
+        from anser_ros.sessions.starting_model import NOMINAL, model_for
+
+        return model_for(NOMINAL, session)
+    except (AnserError, ImportError):
+        return None
+
+
+def calibrate_sessions(
+    sessions: list[Session],
+    options: Options,
+    progress: Callable[[str, float], None] | None = None,
+) -> Calibration:
+    """Calibrate on all tool sensors of the sessions.
+
+    Reference sensors are left out: their survey is less accurate than the field model becomes.
+    """
+    setup = sessions[0].setup
+    measurements = [tool for session in sessions for tool in session.tools]
+    names = [Path(session.path).name for session in sessions for _ in session.tools]
+    return calibrate(
+        measurements, names, generator_of(setup), setup.emitter_names, setup.frequencies_hz,
+        options, nominal_of(sessions[0]), progress,
+    )  # fmt: skip
+
+
+@contextmanager
+def progress_bar() -> Iterator[Callable[[str, float], None]]:
+    """A bar on stderr where that is a terminal."""
+    columns = (TextColumn('{task.description}'), BarColumn(), TimeElapsedColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task('calibrating', total=1.0)
+        yield lambda stage, share: bar.update(task, description=stage, completed=share)
+
+
+def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
+    table = Table(title='calibration', show_header=False)
+    held_out = calibration.held_out
+    rows = (
+        ('readings an emitter', f'{document["n_measurements"]}'),
+        ('dipoles', calibration.layout.describe()),
+        ('damping', f'{calibration.damping:g}'),
+        ('residual, T rms', f'{document["flux_rmse_t"]:.4g}'),
+        ('held out, T rms', f'{document["heldout_flux_rmse_t"]:.4g}'),
+        ('held out, % of the range', f'{document["heldout_n_rmse_percent"]:.4f}'),
+        ("the field model's own error, T", f'{held_out.flux_error_t:.3g}'),
+        ('noise, T a component', f'{calibration.fit.noise_t:.3g}'),
+    )
+    for name, value in rows:
+        table.add_row(name, value)
+    return table

@@ -1,0 +1,194 @@
+"""Held-out error: what a model that never saw a block of space predicts for it.
+
+Two figures for every block. As in the article, the residual at the measured pose, in which the
+pose's own jitter times the field's gradient is the largest part. And the residual with the pose
+marginalised: with the covariance C = sigma^2 I + J S J^T of a frame's readings (J the flux's
+derivatives by the pose, S the pose's jitter), ``r^T C^-1 r`` is the frame's predictive chi-square,
+and ``sigma^2 C^-1 r`` what no pose explains.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.fitting.measurements import Measurements
+from anser_ros.fitting.moments import (
+    ComplexArray,
+    Dipoles,
+    MomentFitter,
+    PoseTerms,
+    Uncertainty,
+    as_real,
+    frame_blocks,
+    pose_terms,
+    usable_weights,
+    with_pose,
+)
+
+Array = NDArray[np.float64]
+
+
+class PoseWhitener:
+    """The frames' covariance C, factored once for many residuals.
+
+    Parameters
+    ----------
+    slope : ndarray, shape (F, S, 2K, 6)
+        Derivatives of the fluxes by the pose.
+    weights : ndarray, shape (F, S)
+    noise_t : float
+    precision : ndarray, shape (6,)
+        Inverse variances of the pose.
+    """
+
+    def __init__(self, slope: Array, weights: Array, noise_t: float, precision: Array) -> None:
+        frames, _, parts, _ = slope.shape
+        self.noise_t = noise_t
+        self.root = np.repeat(np.sqrt(weights), parts, axis=1)
+        flat = slope.reshape(frames, -1, 6) * (self.root / noise_t)[:, :, None]
+        normal = np.einsum('fri,frj->fij', flat, flat, optimize=True)
+        self.inverse = np.linalg.inv(normal + np.diag(precision))
+        self.slope = flat
+        self.share = np.asarray(self.inverse @ normal)
+        self.readings = self.root.astype(bool).sum(axis=1)
+
+    def chi_square(self, residual: Array) -> Array:
+        """Predictive chi-square of every frame, shape (F,), of residuals (F, S, 2K)."""
+        white = residual.reshape(self.root.shape) * self.root / self.noise_t
+        along = np.einsum('fri,fr->fi', self.slope, white)
+        explained = np.einsum('fi,fij,fj->f', along, self.inverse, along)
+        return np.asarray((white**2).sum(axis=1) - explained)
+
+    def left_over(self, residual: Array) -> Array:
+        """What no pose explains, T, shape (F, S, 2K), of residuals at the measured pose."""
+        white = residual.reshape(self.root.shape) * self.root / self.noise_t
+        along = np.einsum('fri,fr->fi', self.slope, white)
+        step = np.einsum('fij,fj->fi', self.inverse, along)
+        left = white - np.einsum('fri,fi->fr', self.slope, step)
+        return np.asarray((left * self.noise_t).reshape(residual.shape))
+
+    def noise_share(self) -> tuple[float, float]:
+        """Traces of ``sigma^2 C^-1`` and of its square, summed over the frames.
+
+        White noise of variance v leaves the power v times the second trace; noise and jitter as
+        assumed leave sigma^2 times the first.
+        """
+        # The eigenvalues of sigma^2 C^-1 are 1 - those of the share of each pose parameter.
+        first = self.readings.sum() - np.trace(self.share, axis1=1, axis2=2).sum()
+        square = np.einsum('fij,fji->f', self.share, self.share).sum()
+        second = self.readings.sum() - 2.0 * (self.readings.sum() - first) + square
+        return float(first), float(second)
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Residuals of blocks that took no part in the fit that predicts them.
+
+    Attributes
+    ----------
+    error : ndarray, shape (P, K), complex
+        Measured minus predicted flux of every usable reading at the measured pose, T.
+    left_over : ndarray, shape (P, K), complex
+        The part that no pose explains, T.
+    chi_square : float
+        Mean predictive chi-square a phasor component.
+    noise_t : float
+        The noise that the chi-square was divided by.
+    flux_error_t : float
+        Standard deviation of the field model's own error a phasor component, noise taken off.
+    """
+
+    error: ComplexArray
+    left_over: ComplexArray
+    chi_square: float
+    noise_t: float
+    flux_error_t: float
+
+
+def _complex_rows(values: Array, used: NDArray[np.bool_]) -> ComplexArray:
+    return np.ascontiguousarray(values[used]).view(np.complex128)
+
+
+def predict_held_out(
+    measurements: Sequence[Measurements],
+    folds: Sequence[NDArray[np.int64]],
+    dipoles: Dipoles,
+    damping: float,
+    uncertainty: Uncertainty,
+    prior: ComplexArray | None = None,
+    alternations: int = 3,
+    noise_t: float | None = None,
+) -> HeldOut:
+    """Fit without each fold in turn, from the start, and predict it.
+
+    Parameters
+    ----------
+    measurements : sequence of Measurements
+    folds : sequence of ndarray, shape (F,)
+        Fold of each frame, an array a measurement set.
+    dipoles, damping, uncertainty, prior
+        As for `MomentFitter`.
+    alternations : int
+    noise_t : float or None
+        Noise of a phasor component, T, for weighing noise against jitter and to be taken off;
+        when not given, the smallest that any fold's fit left.
+    """
+    fits = []
+    for fold in np.unique(np.concatenate(list(folds))):
+        train = [m.frames(f != fold) for m, f in zip(measurements, folds, strict=True)]
+        fitter = MomentFitter(train, dipoles, damping, uncertainty, prior)
+        fits.append((int(fold), fitter.fit(alternations, exact=False)))
+    noise = min(fit.noise_t for _, fit in fits) if noise_t is None else noise_t
+    tally = _Tally(noise, uncertainty)
+    for fold, fit in fits:
+        for m, f in zip(measurements, folds, strict=True):
+            test = with_pose(m.frames(f == fold))
+            for block in frame_blocks(len(test.time), len(test.sensors)):
+                part = test.frames(block)  # type: ignore[arg-type]
+                tally.add(pose_terms(part, dipoles, fit.moments), usable_weights(part))
+    return tally.result()
+
+
+class _Tally:
+    """Gathers held-out residuals."""
+
+    def __init__(self, noise_t: float, uncertainty: Uncertainty) -> None:
+        self.noise_t, self.precision = noise_t, uncertainty.pose_precision
+        self.error: list[ComplexArray] = []
+        self.left: list[ComplexArray] = []
+        self.chi: list[Array] = []
+        self.first = self.second = 0.0
+
+    def add(self, terms: PoseTerms, weights: Array) -> None:
+        if terms.residual.shape[0] == 0:
+            return
+        white = PoseWhitener(terms.slope, weights, self.noise_t, self.precision)
+        used = weights > 0.0
+        self.error.append(_complex_rows(terms.residual, used))
+        self.left.append(_complex_rows(white.left_over(terms.residual), used))
+        self.chi.append(white.chi_square(terms.residual))
+        first, second = white.noise_share()
+        self.first, self.second = self.first + first, self.second + second
+
+    def result(self) -> HeldOut:
+        error, left = np.concatenate(self.error), np.concatenate(self.left)
+        components = 2 * error.size
+        # Robust: a few outlier readings are not the model's error.
+        power = _typical_power(left) * components
+        excess = (power - self.noise_t**2 * self.first) / max(self.second, 1.0)
+        return HeldOut(
+            error=error,
+            left_over=left,
+            chi_square=float(np.concatenate(self.chi).sum()) / components,
+            noise_t=self.noise_t,
+            flux_error_t=float(np.sqrt(max(excess, 0.0))),
+        )
+
+
+def _typical_power(left: ComplexArray) -> float:
+    """Mean square of a component without the readings beyond six times the median size."""
+    size = np.sqrt((as_real(left) ** 2).mean(axis=1))
+    kept = size <= 6.0 * max(float(np.median(size)), 1e-300)
+    return float((size[kept] ** 2).mean())
