@@ -26,18 +26,24 @@ Start = tuple[Array, Array]
 DISAGREES = 4.0
 """A coil is left out when its share of the misfit is so many times the mean of the others'."""
 
+LEFT_OUT_S = 1.0
+"""How long a coil that disagreed stays out before it is tried again."""
+
 
 @dataclass
 class BodyTrack:
-    """Memory of one body: its last good pose and its noise scale."""
+    """Memory of one body: its last good pose, its noise scale, the coils that disagreed."""
 
     good: BodySolution | None = None
     good_ns: int = 0
+    left_out: frozenset[int] = frozenset()
+    again_ns: int = 0
     noise: NoiseScale = field(default_factory=NoiseScale)
 
     def forget(self) -> None:
         """Drop the warm start."""
         self.good = None
+        self.left_out = frozenset()
 
 
 @dataclass(frozen=True)
@@ -129,28 +135,49 @@ def track_body(
             (s.estimate.state for i, s in enumerate(single) if not usable[i]), states.STALE
         )
         return no_pose(name, stamp_ns, worst, scene.model_id, reason)
-    fit = None
-    if track.good is not None and (stamp_ns - track.good_ns) * NANO <= settings.warm_age_s:
-        fit = _solve(scene, coils, flux, used, (track.good.position, track.good.rotation))
-        if fit.ratio > settings.gate**2:
-            fit = None
-    if fit is None:
-        fits = [
-            _solve(scene, coils, flux, used, start)
-            for start in _cold_starts(scene, coils, flux, used, single)
-        ]
-        if not fits:
-            reason = 'no coil of this body has a pose to start from'
-            return no_pose(name, stamp_ns, states.RESIDUAL, scene.model_id, reason)
+    fits = _from_good(track, coils, stamp_ns, flux, used, scene, settings)
+    if not fits:
+        starts = _cold_starts(scene, coils, flux, used, single)
+        fits = [_solve(scene, coils, flux, used, start) for start in starts]
         fits.sort(key=lambda candidate: candidate.ratio)
-        fit = _without_disagreeing(fits[0], scene, coils, flux, settings.gate)
-    else:
-        fits = [fit]
+        fits[:1] = [_without_disagreeing(f, scene, coils, flux, settings.gate) for f in fits[:1]]
+    if not fits:
+        reason = 'no coil of this body has a pose to start from'
+        return no_pose(name, stamp_ns, states.RESIDUAL, scene.model_id, reason)
+    fit = fits[0]
     result = _judge(track, name, stamp_ns, fit, fits[1:], coils, scene, settings)
     if result.state == states.OK:
         track.good, track.good_ns = fit.solution, stamp_ns
         track.noise.add(fit.ratio)
+        left_out = frozenset(used.tolist()) - frozenset(fit.used.tolist())
+        if left_out != track.left_out:
+            track.left_out, track.again_ns = left_out, stamp_ns + round(LEFT_OUT_S / NANO)
     return result
+
+
+def _from_good(
+    track: BodyTrack,
+    coils: BodyCoils,
+    stamp_ns: int,
+    flux: Array,
+    used: NDArray[np.int64],
+    scene: Scene,
+    settings: TrackerSettings,
+) -> list[_Fit]:
+    """The fit near the last good pose, when there is one that passes the gate."""
+    if track.good is None or (stamp_ns - track.good_ns) * NANO > settings.warm_age_s:
+        return []
+    start = (track.good.position, track.good.rotation)
+    if track.left_out and stamp_ns < track.again_ns:
+        kept = np.array([i for i in used if int(i) not in track.left_out], dtype=np.int64)
+        if len(kept) > 1 and coils.subset(kept).observable:
+            fit = _solve(scene, coils, flux, kept, start)
+            if fit.ratio <= settings.gate**2:
+                return [fit]
+    track.again_ns = stamp_ns + round(LEFT_OUT_S / NANO)
+    fit = _solve(scene, coils, flux, used, start)
+    fit = _without_disagreeing(fit, scene, coils, flux, settings.gate)
+    return [fit] if fit.ratio <= settings.gate**2 else []
 
 
 def _judge(
@@ -168,7 +195,7 @@ def _judge(
     if settings.adaptive:
         scale = track.noise.of_frame(fit.ratio, chi2_limit(fit.freedom, RARE) / fit.freedom)
     covariance = scale * bounded_inverse(solution.information)
-    sigma = math.sqrt(float(np.trace(covariance[:3, :3])))
+    sigma = math.sqrt(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
     centre = solution.position + solution.rotation @ coils.subset(fit.used).offsets.mean(axis=0)
     residual = float(np.sqrt(np.mean(solution.residual**2)))
     state = states.OK

@@ -19,6 +19,8 @@ NANO = 1e-9
 RARE = 0.01
 """Probability of a residual that counts as more than this frame's share of noise."""
 SUSPICIOUS_JUMP_M = 0.02
+FIRST_RETRY_S = 0.05
+LAST_RETRY_S = 1.0
 WHITENING_REACH_M = 3e-3
 WHITENING_REACH = 0.05
 """Move (m) and turn (chord of the axes) up to which the model's error at a pose is reused."""
@@ -26,17 +28,47 @@ WHITENING_REACH = 0.05
 
 @dataclass
 class CoilTrack:
-    """Memory of one sensor: its last good pose, its noise scale, the model error near it."""
+    """Memory of one sensor: its last good pose, its noise scale, the model error near it.
+
+    While no pose is good, ``suspect`` is the best bad one. It tells whether anything has changed, so
+    that the costly scan need not run in every frame of a long distortion; it never becomes a pose
+    without a scan that confirms it.
+    """
 
     good: CoilSolution | None = None
     good_ns: int = 0
+    suspect: CoilSolution | None = None
+    failures: int = 0
+    retry_ns: int = 0
     noise: NoiseScale = field(default_factory=NoiseScale)
     whitening: Array | None = None
     whitening_at: tuple[Scene, Array, Array] | None = None
 
     def forget(self) -> None:
         """Drop the warm start."""
-        self.good = None
+        self.good = self.suspect = None
+        self.failures = 0
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """One sensor's fluxes (2K,) in one frame, and what they are tracked with."""
+
+    name: str
+    length: float
+    stamp_ns: int
+    flux: Array
+    scene: Scene
+    settings: TrackerSettings
+
+    @property
+    def freedom(self) -> int:
+        return max(self.flux.size - 5, 1)
+
+    @property
+    def limit(self) -> float:
+        """Chi-square up to which a pose is accepted."""
+        return self.settings.gate**2 * self.freedom
 
 
 @dataclass(frozen=True)
@@ -72,37 +104,26 @@ def _whitening(
     return track.whitening
 
 
-def _cold(
-    track: CoilTrack, scene: Scene, flux: Array, length: float, limit: float
-) -> list[CoilSolution]:
+def _cold(track: CoilTrack, frame: _Frame) -> list[CoilSolution]:
     """All distinct poses in order of chi-square, with the model's error at each in the weights."""
+    scene = frame.scene
     # Far from the truth only the size of the model's error counts, not its pattern.
-    extra = scene.relative_error**2 * float(np.mean((flux / scene.sigma) ** 2))
-    scale = 1.0 + extra
-    plain = whitening_of(scene.sigma)
+    power = float(np.mean((frame.flux / scene.sigma) ** 2))
+    limit = frame.limit * (1.0 + scene.relative_error**2 * power)
     found = solve_cold(
-        scene.field, scene.grid, flux, plain, scene.low, scene.high, length, limit * scale
+        scene.field,
+        scene.grid,
+        frame.flux,
+        whitening_of(scene.sigma),
+        scene.low,
+        scene.high,
+        frame.length,
+        limit,
     )
     if scene.modes is None:
         return found
-    refined = []
-    for solution in found:
-        if solution.chi2 <= 100.0 * limit * scale or solution is found[0]:
-            weights = _whitening(track, scene, solution.position, solution.axis, length)
-            refined.append(
-                solve_coil(
-                    scene.field,
-                    flux,
-                    weights,
-                    solution.position,
-                    solution.axis,
-                    scene.low,
-                    scene.high,
-                    length,
-                )  # fmt: skip
-            )
-    refined.sort(key=lambda solution: solution.chi2)
-    return refined
+    near = [s for s in found if s.chi2 <= 100.0 * limit or s is found[0]]
+    return sorted((_descend(track, frame, s) for s in near), key=lambda solution: solution.chi2)
 
 
 def track_coil(
@@ -119,40 +140,70 @@ def track_coil(
     if signal < settings.min_signal:
         reason = f'flux is {signal:.2g} times the noise'
         return CoilResult(no_pose(name, stamp_ns, states.NO_SIGNAL, scene.model_id, reason), None)
-    freedom = max(flux.size - 5, 1)
-    limit = settings.gate**2 * freedom
-    recent = (stamp_ns - track.good_ns) * NANO <= settings.warm_age_s
-    solution, rivals, cold = None, [], False
-    if track.good is not None and recent:
-        start = track.good
-        weights = _whitening(track, scene, start.position, start.axis, length)
-        solution = solve_coil(
-            scene.field, flux, weights, start.position, start.axis, scene.low, scene.high, length
-        )
-        jump = float(np.linalg.norm(solution.position - start.position))
-        if solution.chi2 > limit or not solution.converged or jump > SUSPICIOUS_JUMP_M:
-            solution = None
-    if solution is None:
-        cold = True
-        solution, *rivals = _cold(track, scene, flux, length, limit)
-    result = _judge(track, name, stamp_ns, solution, rivals, limit, freedom, scene, settings)
-    if result.state == states.OK:
-        track.good, track.good_ns = solution, stamp_ns
-        track.noise.add(solution.chi2 / freedom)
-    return CoilResult(result, solution, cold)
+    frame = _Frame(name, length, stamp_ns, flux, scene, settings)
+    solution = _from_good(track, frame)
+    if solution is not None:
+        return _finish(track, frame, solution, [], False)
+    if track.suspect is not None and stamp_ns < track.retry_ns:
+        solution = _descend(track, frame, track.suspect)
+        verdict = _judge(track, frame, solution, [])
+        if verdict.state != states.OK:
+            return CoilResult(verdict, solution)
+    solution, *rivals = _cold(track, frame)
+    return _finish(track, frame, solution, rivals, True)
+
+
+def _finish(
+    track: CoilTrack,
+    frame: _Frame,
+    solution: CoilSolution,
+    rivals: list[CoilSolution],
+    cold: bool,
+) -> CoilResult:
+    """Judge a solution and remember it as good or suspect."""
+    verdict = _judge(track, frame, solution, rivals)
+    if verdict.state == states.OK:
+        track.good, track.good_ns = solution, frame.stamp_ns
+        track.suspect, track.failures = None, 0
+        track.noise.add(verdict.chi2)
+    elif cold:
+        wait_s = min(FIRST_RETRY_S * 2.0**track.failures, LAST_RETRY_S)
+        track.suspect, track.failures = solution, track.failures + 1
+        track.retry_ns = frame.stamp_ns + round(wait_s / NANO)
+    return CoilResult(verdict, solution, cold)
+
+
+def _descend(track: CoilTrack, frame: _Frame, start: CoilSolution) -> CoilSolution:
+    scene = frame.scene
+    weights = _whitening(track, scene, start.position, start.axis, frame.length)
+    return solve_coil(
+        scene.field,
+        frame.flux,
+        weights,
+        start.position,
+        start.axis,
+        scene.low,
+        scene.high,
+        frame.length,
+    )
+
+
+def _from_good(track: CoilTrack, frame: _Frame) -> CoilSolution | None:
+    """Solution near the last good pose; None when there is none that a scan need not confirm."""
+    start = track.good
+    if start is None or (frame.stamp_ns - track.good_ns) * NANO > frame.settings.warm_age_s:
+        return None
+    solution = _descend(track, frame, start)
+    jump = math.dist(solution.position, start.position)
+    if solution.chi2 > frame.limit or not solution.converged or jump > SUSPICIOUS_JUMP_M:
+        return None
+    return solution
 
 
 def _judge(
-    track: CoilTrack,
-    name: str,
-    stamp_ns: int,
-    solution: CoilSolution,
-    rivals: list[CoilSolution],
-    limit: float,
-    freedom: int,
-    scene: Scene,
-    settings: TrackerSettings,
+    track: CoilTrack, frame: _Frame, solution: CoilSolution, rivals: list[CoilSolution]
 ) -> PoseEstimate:
+    freedom, settings = frame.freedom, frame.settings
     ratio = solution.chi2 / freedom
     scale = 1.0
     if settings.adaptive:
@@ -160,10 +211,10 @@ def _judge(
     covariance = scale * coil_covariance(
         solution.normal, solution.axis, settings.roll_variance / scale
     )
-    sigma = math.sqrt(float(np.trace(covariance[:3, :3])))
+    sigma = math.sqrt(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
     residual = float(np.sqrt(np.mean(solution.residual**2)))
     state, reason = states.OK, ''
-    if not solution.chi2 <= limit:
+    if not solution.chi2 <= frame.limit:
         state = states.RESIDUAL
         reason = f'residual {residual:.3g} T is {math.sqrt(ratio):.3g} times the expected one'
     elif not settings.volume.contains(solution.position):
@@ -180,8 +231,8 @@ def _judge(
                 state = states.AMBIGUOUS
                 reason = f'{_millimetres(rival.position)} mm would explain the fluxes too'
     return PoseEstimate(
-        name, stamp_ns, state, solution.position, solution.axis, None, covariance, sigma,
-        residual, ratio, scene.model_id, reason,
+        frame.name, frame.stamp_ns, state, solution.position, solution.axis, None, covariance, sigma,
+        residual, ratio, frame.scene.model_id, reason,
     )  # fmt: skip
 
 

@@ -29,7 +29,7 @@ PARALLEL = 0.05
 
 @dataclass(frozen=True)
 class BodyCoils:
-    """Coils of a rigid tool in its own frame: offsets (S, 3) m, unit axes (S, 3), lengths (S,) m."""
+    """Coils of a tool in its own frame: offsets (S, 3) m, unit axes (S, 3), lengths (S,) m."""
 
     offsets: Array
     axes: Array
@@ -85,8 +85,8 @@ class BodySolution:
 
 @numba.njit(cache=True, error_model='numpy')
 def _fill_body(  # type: ignore[no-untyped-def]
-    position, rotation, offsets, axes, lengths, flux, inverse_sigma, positions, directions, moments,
-    residual, white, jacobian,
+    position, rotation, offsets, axes, lengths, flux, inverse_sigma, positions, directions,
+    moments, residual, white, jacobian,
 ):  # fmt: skip
     """Whitened residual (S 2K) and its model derivatives (S 2K, 6) by translation and turn."""
     width = flux.shape[1]

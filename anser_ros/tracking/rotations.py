@@ -14,7 +14,7 @@ def rotation_of_vector(vector: NDArray[np.generic]) -> Array:
     angle = math.sqrt(float(v @ v))
     cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
     if angle < 1e-8:
-        return np.eye(3) + cross
+        return np.asarray(np.eye(3) + cross)
     a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
     return np.asarray(np.eye(3) + a * cross + b * (cross @ cross))
 
@@ -38,7 +38,7 @@ def rotation_between(first: Array, second: Array) -> Array:
 def quaternion_of_axis(axis: NDArray[np.generic]) -> tuple[float, float, float, float]:
     """Unit quaternion (x, y, z, w) of the shortest rotation that takes +z to a unit axis.
 
-    This is the written roll rule of a 5-DoF pose; about +x for the axis -z, where it is not unique.
+    The written roll rule of a 5-DoF pose; about +x for the axis -z, where it is not unique.
     """
     nx, ny, nz = (float(v) for v in axis)
     w = math.sqrt(max(0.0, 0.5 * (1.0 + nz)))

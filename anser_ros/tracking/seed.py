@@ -2,8 +2,8 @@
 
 For a given position the fluxes are linear in the axis, ``y = B^T n`` with the emitters' fields as
 columns of B. With ``B B^T = L L^T`` the unexplained power at a grid point is ``|y|^2 - |c|^2``,
-``c = L^-1 B y``, and the axis is ``L^-T c``: one small product a point. That a true axis has length
-one is a constraint that tells positions apart; its price is added to second order.
+``c = L^-1 B y``, and the axis is ``L^-T c``: one small product a point. That a true axis has
+length one is a constraint that tells positions apart; its price is added to second order.
 """
 
 import math
@@ -41,7 +41,8 @@ class Volume:
 
     def contains(self, position: Array) -> bool:
         """Whether a position (m) lies in the box."""
-        return bool(np.all(position >= self.low) and np.all(position <= self.high))
+        inside = zip(self.low, position.tolist(), self.high, strict=True)
+        return all(low <= value <= high for low, value, high in inside)
 
     def grown(self, margin_m: float) -> tuple[Array, Array]:
         """Corners of the box with a margin around it; the floor stays above half its height.

@@ -182,7 +182,7 @@ def _whiten(flux, model, jacobian, whitening, residual, white):  # type: ignore[
 
 @numba.njit(cache=True, error_model='numpy')
 def _normal_equations(white, tangent, full, normal, gradient):  # type: ignore[no-untyped-def]
-    """``full`` (6, 6) by position and free axis; ``normal`` (5, 5), ``gradient`` (5) in the tangent."""
+    """``full`` (6, 6) by position and free axis; ``normal``, ``gradient`` in the tangent plane."""
     g = np.zeros(6)
     for i in range(6):
         for j in range(i, 6):

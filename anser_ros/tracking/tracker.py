@@ -112,8 +112,10 @@ class Tracker:
 
     def reset(self) -> None:
         """Forget all warm starts."""
-        for track in (*self._coil_tracks.values(), *self._body_tracks.values()):
-            track.forget()
+        for coil in self._coil_tracks.values():
+            coil.forget()
+        for body in self._body_tracks.values():
+            body.forget()
 
     def update(
         self,
@@ -143,8 +145,8 @@ class Tracker:
         Raises
         ------
         TrackingError
-            When the stamp is not positive, shapes don't fit, a channel appears twice, or the number
-            of emitters is not the model's.
+            When the stamp is not positive, shapes don't fit, a channel appears twice, or the
+            emitters are not as many as the model's.
         """
         rows, values, bits = self._checked(stamp_ns, channels, flux, flags)
         if stamp_ns == self._last_ns[0]:
@@ -186,7 +188,7 @@ class Tracker:
                     [results[i] for i in members],
                     scene,
                     self.settings,
-                )  # fmt: skip
+                )
             )
         return estimates
 
@@ -197,7 +199,7 @@ class Tracker:
         flux: NDArray[np.generic],
         flags: NDArray[np.generic] | None,
     ) -> tuple[NDArray[np.int64], Array, NDArray[np.int64]]:
-        """Rows of the message (-1 where missing), fluxes (S, 2K) and flags in the table's order."""
+        """Rows of the frame (-1: missing), fluxes (S, 2K) and flags in the table's order."""
         if stamp_ns <= 0:
             raise TrackingError(f'a flux frame needs a positive stamp, got {stamp_ns} ns')
         given = np.asarray(flux)

@@ -7,11 +7,12 @@ is not observable: the rotation covariance is that of the tilt plus ``roll_varia
 
 import math
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from anser_ros.physics.dipole import flux_basis
+from anser_ros.tracking.solve import fill_tangent
 
 Array = NDArray[np.float64]
 
@@ -27,64 +28,30 @@ def chi2_limit(degrees_of_freedom: int, probability: float) -> float:
     return float(chdtri(max(degrees_of_freedom, 1), probability))
 
 
-def model_error_modes(
-    modes: NDArray[np.complex128],
-    positions: Array,
-    directions: Array,
-    points: Array,
-    axes: Array,
-    lengths: Array,
-) -> Array:
-    """Flux errors that the moments' uncertainty causes at given sensors.
+@numba.njit(cache=True, error_model='numpy')
+def bounded_inverse(information):  # type: ignore[no-untyped-def]
+    """Covariance of a symmetric, positive semidefinite information matrix.
 
-    Parameters
-    ----------
-    modes : ndarray, shape (R, N, K), complex
-        Low-rank factor of the moments' covariance: the moments are wrong by
-        ``sum_r xi_r modes[r]`` with independent unit normal ``xi``, A m^2.
-    positions, directions : ndarray, shape (N, 3)
-        Dipoles.
-    points, axes : ndarray, shape (S, 3)
-        Sensors, m and unit vectors, frame fg.
-    lengths : ndarray, shape (S,)
-        Coil lengths, m.
-
-    Returns
-    -------
-    ndarray, shape (R, S, 2K)
-        T; real and imaginary part by turns.
+    Directions that it says next to nothing of are held to `UNKNOWN_VARIANCE`.
     """
-    basis = flux_basis(points, axes, lengths, positions, directions)
-    flux = np.ascontiguousarray(np.einsum('sn,rnk->rsk', basis, modes, optimize=True))
-    return flux.view(np.float64)
+    n = information.shape[0]
+    scale = np.empty(n)
+    for i in range(n):
+        scale[i] = 1.0 / math.sqrt(max(information[i, i], 1e-30))
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    for i in range(n):
+        values[i] = 1.0 / max(values[i], 1e-14)
+    covariance = np.dot(vectors * values, vectors.T) * np.outer(scale, scale)
+    for i in range(n):
+        if covariance[i, i] > UNKNOWN_VARIANCE:
+            shrink = math.sqrt(UNKNOWN_VARIANCE / covariance[i, i])
+            covariance[i, :] *= shrink
+            covariance[:, i] *= shrink
+    return covariance
 
 
-def bounded_inverse(information: Array) -> Array:
-    """Inverse of an information matrix whose weak directions are held to `UNKNOWN_VARIANCE`.
-
-    Parameters
-    ----------
-    information : ndarray, shape (n, n)
-        Symmetric, positive semidefinite.
-
-    Returns
-    -------
-    ndarray, shape (n, n)
-        Covariance.
-    """
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-30))
-    scaled = information / np.outer(scale, scale)
-    values, vectors = np.linalg.eigh(scaled)
-    weights = 1.0 / np.maximum(values, 1e-14)
-    covariance = (vectors * weights) @ vectors.T / np.outer(scale, scale)
-    variance = np.diag(covariance)
-    if (variance > UNKNOWN_VARIANCE).any():
-        shrink = np.minimum(1.0, np.sqrt(UNKNOWN_VARIANCE / variance))
-        covariance = covariance * np.outer(shrink, shrink)
-    return np.asarray(covariance)
-
-
-def coil_covariance(normal: Array, axis: Array, roll_variance: float = ROLL_VARIANCE) -> Array:
+@numba.njit(cache=True, error_model='numpy')
+def coil_covariance(normal, axis, roll_variance):  # type: ignore[no-untyped-def]
     """Covariance of a single coil's pose.
 
     Parameters
@@ -101,17 +68,18 @@ def coil_covariance(normal: Array, axis: Array, roll_variance: float = ROLL_VARI
     ndarray, shape (6, 6)
         m^2, m rad, rad^2: position, then rotation vector, both in fg.
     """
-    helper = np.zeros(3)
-    helper[int(np.argmin(np.abs(axis)))] = 1.0
-    first = np.cross(axis, helper)
-    first /= math.sqrt(float(first @ first))
-    second = np.cross(axis, first)
-    # A turn w moves the axis by w x n: about `first` by -second, about `second` by +first.
+    t = np.empty((2, 3))
+    fill_tangent(axis, t)
+    # A turn w moves the axis by w x n: about t[0] by -t[1], about t[1] by t[0].
     reduced, back = np.zeros((5, 6)), np.zeros((6, 5))
-    reduced[:3, :3] = back[:3, :3] = np.eye(3)
-    reduced[3, 3:], reduced[4, 3:] = -second, first
-    back[3:, 3], back[3:, 4] = first, second
-    inner = bounded_inverse(reduced @ normal @ reduced.T)
-    covariance = back @ inner @ back.T
-    covariance[3:, 3:] += roll_variance * np.outer(axis, axis)
-    return np.asarray(covariance)
+    for i in range(3):
+        reduced[i, i] = 1.0
+        back[i, i] = 1.0
+        reduced[3, 3 + i], reduced[4, 3 + i] = -t[1, i], t[0, i]
+        back[3 + i, 3], back[3 + i, 4] = t[0, i], t[1, i]
+    inner = bounded_inverse(np.dot(np.dot(reduced, normal), reduced.T))
+    covariance = np.dot(np.dot(back, inner), back.T)
+    for i in range(3):
+        for j in range(3):
+            covariance[3 + i, 3 + j] += roll_variance * axis[i] * axis[j]
+    return covariance
