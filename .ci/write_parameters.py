@@ -27,7 +27,7 @@ def table_of(name):
 
 def section(name):
     fields = dataclasses.fields(table_of(name))
-    lines = [f'/anser/{name}:', f'  ros__parameters:{"" if fields else " {}"}']
+    lines = [f'/**/{name}:', f'  ros__parameters:{"" if fields else " {}"}']
     for field in fields:
         rule = field.metadata['rule']
         value = list(field.default) if isinstance(field.default, tuple) else field.default
