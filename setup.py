@@ -14,10 +14,12 @@ def commands(folder, mark):
     return [path.stem for path in modules if mark in path.read_text(encoding='utf-8')]
 
 
-def shared(folder):
-    """Return the data_files entry of a folder that is installed under share/."""
-    files = sorted(path for path in (HERE / folder).glob('*') if path.is_file())
-    return f'share/{PACKAGE}/{folder}', [str(path.relative_to(HERE)) for path in files]
+def shared(*folders):
+    """Yield the data_files entries of the folders that are installed under share/."""
+    for folder in folders:
+        files = sorted(path for path in (HERE / folder).glob('*') if path.is_file())
+        if files:
+            yield f'share/{PACKAGE}/{folder}', [str(path.relative_to(HERE)) for path in files]
 
 
 names = commands('nodes', "\nif __name__ == '__main__':") + commands('cli', '\ndef add_arguments(')
@@ -30,7 +32,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
-        *(shared(folder) for folder in ('config', 'launch', 'bags')),
+        *shared('config', 'launch', 'bags'),
     ],
     install_requires=[
         'setuptools',

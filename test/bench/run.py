@@ -1,0 +1,101 @@
+"""Runs every benchmark here, prints their table and writes bench.json.
+
+A benchmark is a module ``bench_*.py`` with ``rows() -> list[dict]``. A row has ``name``, ``value``
+and ``unit``, and where there are such: ``rival``, ``rival_value``, ``ratio`` (the rival's value
+over ours), ``target`` (a number, with ``target_is`` 'most' or 'least') and ``met``. Everything
+runs on one thread, ours and the rival in the same process one after the other.
+"""
+
+import argparse
+import importlib.util
+import json
+import os
+import sys
+import time
+import traceback
+from pathlib import Path
+from typing import Any
+
+THREADS = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'NUMBA_NUM_THREADS')
+for variable in THREADS:  # before a benchmark imports numpy
+    os.environ[variable] = '1'
+
+HERE = Path(__file__).resolve().parent
+REPO = HERE.parents[1]
+KEYS = ('name', 'value', 'unit', 'rival', 'rival_value', 'ratio', 'target', 'met')
+
+
+def load(path: Path) -> Any:
+    """Import one benchmark by its path."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def complete(row: dict[str, Any]) -> dict[str, Any]:
+    """Return a row with all keys of bench.json, those that were left out worked out or None."""
+    unknown = set(row) - {*KEYS, 'target_is'}
+    if unknown:
+        raise ValueError(f'row {row.get("name")!r} has unknown keys {sorted(unknown)}')
+    value, rival, target = row['value'], row.get('rival_value'), row.get('target')
+    if row.get('ratio') is None and rival is not None and value:
+        row['ratio'] = rival / value
+    if row.get('met') is None and isinstance(target, int | float):
+        at_least = row.get('target_is', 'most') == 'least'
+        row['met'] = bool(value >= target if at_least else value <= target)
+    return {key: row.get(key) for key in KEYS}
+
+
+def text(value: Any) -> str:
+    """Return a cell of the table."""
+    if value is None:
+        return ''
+    if isinstance(value, bool):
+        return 'yes' if value else 'NO'
+    return f'{value:.4g}' if isinstance(value, float) else str(value)
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Return the rows as aligned text."""
+    cells = [list(KEYS), *([text(row[key]) for key in KEYS] for row in rows)]
+    widths = [max(len(line[i]) for line in cells) for i in range(len(KEYS))]
+    lines = ['  '.join(c.ljust(w) for c, w in zip(line, widths, strict=True)) for line in cells]
+    lines.insert(1, '  '.join('-' * width for width in widths))
+    return '\n'.join(line.rstrip() for line in lines)
+
+
+def main() -> int:
+    """Run the benchmarks; 1 when one of them broke, whatever the figures."""
+    parser = argparse.ArgumentParser(description='benchmarks beside their rivals, on one thread')
+    parser.add_argument('names', nargs='*', help='run only these: demodulation, solve, ...')
+    parser.add_argument('--out', type=Path, default=REPO / 'bench.json', help='file to write')
+    args = parser.parse_args()
+    paths = sorted(HERE.glob('bench_*.py'))
+    known = {path.stem.removeprefix('bench_'): path for path in paths}
+    unknown = set(args.names) - set(known)
+    if unknown:
+        print(f'bench: no {", ".join(sorted(unknown))}; there are: {", ".join(known)}')
+        return 2
+    rows, broken = [], []
+    for name, path in known.items():
+        if args.names and name not in args.names:
+            continue
+        began_s = time.monotonic()
+        try:
+            rows += [complete(row) for row in load(path).rows()]
+        except Exception:  # noqa: BLE001 - the others are still worth their figures
+            traceback.print_exc()
+            broken.append(name)
+        print(f'{name}: {time.monotonic() - began_s:.1f} s', file=sys.stderr, flush=True)
+    print(table(rows))
+    args.out.write_text(json.dumps(rows, indent=1) + '\n', encoding='utf-8')
+    if broken:
+        print(f'bench: broken: {", ".join(broken)}', file=sys.stderr)
+    return 1 if broken else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

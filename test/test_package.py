@@ -1,0 +1,171 @@
+"""The package as colcon builds it, and the console script."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import REPO, Process
+
+from anser_ros.cli import main as cli
+from anser_ros.cli.main import node_names, verb_names
+from anser_ros.errors import BagError
+
+COLCON = shutil.which('colcon', path=f'{Path(sys.executable).parent}:{os.environ["PATH"]}')
+LEFT_OUT = shutil.ignore_patterns('.*', 'build', 'install', 'log', 'out', '*.egg-info', 'test')
+
+
+@pytest.fixture(scope='module')
+def installed(tmp_path_factory):
+    """Build the package with colcon in a workspace of its own; return its prefix."""
+    if COLCON is None:
+        pytest.skip('colcon is not installed')
+    workspace = tmp_path_factory.mktemp('workspace')
+    shutil.copytree(REPO, workspace / 'src' / 'anser_ros', ignore=LEFT_OUT)
+    command = [COLCON, 'build', '--event-handlers', 'console_direct+']
+    # The Python of the tests must be the one that colcon builds for.
+    path = f'{Path(sys.executable).parent}{os.pathsep}{os.environ["PATH"]}'
+    built = subprocess.run(
+        command,
+        cwd=workspace,
+        env={**os.environ, 'PATH': path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert built.returncode == 0, built.stdout + built.stderr
+    return workspace / 'install' / 'anser_ros'
+
+
+@pytest.fixture
+def overlay(installed, domain):
+    """Return the environment of a sourced workspace."""
+    (library,) = installed.glob('lib/python3*/site-packages')
+    prefixes = [str(installed), os.environ.get('AMENT_PREFIX_PATH', '')]
+    return {
+        **os.environ,
+        'PYTHONPATH': str(library),
+        'AMENT_PREFIX_PATH': os.pathsep.join(filter(None, prefixes)),
+    }
+
+
+def test_the_ament_index_knows_the_package(installed, monkeypatch):
+    from ament_index_python.packages import get_package_prefix, get_package_share_directory
+
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(installed))
+    assert Path(get_package_prefix('anser_ros')) == installed
+    share = Path(get_package_share_directory('anser_ros'))
+    assert (share / 'package.xml').is_file()
+    for folder in ('config', 'launch', 'bags'):
+        files = {path.name for path in (REPO / folder).glob('*') if path.is_file()}
+        found = share / folder
+        assert files == {path.name for path in found.glob('*')} if files else not found.exists()
+
+
+def test_every_command_is_an_executable(installed):
+    executables = {path.name for path in (installed / 'lib' / 'anser_ros').iterdir()}
+    assert executables == {'anser', *node_names(), *verb_names()}
+    needed = {'acquisition', 'field_model', 'tracker', 'recorder', 'replay', 'cu_simulator'}
+    needed |= {'openigtlink', 'calibrate', 'evaluate', 'diagnose', 'demo'}
+    assert needed <= executables
+
+
+def test_an_installed_node_runs(installed, overlay, tmp_path):
+    """As `ros2 run anser_ros tracker` starts it: by its executable, from anywhere."""
+    command = [sys.executable, str(installed / 'lib' / 'anser_ros' / 'tracker')]
+    asked = Process([*command, '--help'], tmp_path / 'help.log', env=overlay, cwd=tmp_path)
+    assert asked.popen.wait(30) == 0, asked.output
+    assert 'parameters' in asked.output
+    process = Process(command, tmp_path / 'tracker.log', env=overlay, cwd=tmp_path)
+    try:
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.popen.wait(2.5)
+        assert process.interrupt() == 0, process.output
+    finally:
+        process.kill_group()
+
+
+def test_an_installed_offline_command_runs(installed, overlay, tmp_path):
+    command = [sys.executable, str(installed / 'lib' / 'anser_ros' / 'evaluate'), 'nowhere.mcap']
+    arguments = ['--model', 'nominal', '--out', str(tmp_path / 'out')]
+    done = subprocess.run(
+        [*command, *arguments], env=overlay, cwd=tmp_path, capture_output=True, check=False
+    )
+    assert done.returncode == 2
+    assert len(done.stderr.decode().strip().splitlines()) == 1
+    assert b'nowhere.mcap' in done.stderr and done.stdout == b''
+
+
+class TestConsole:
+    """Exit 0 done, 2 one clear line, 1 a defect with its traceback."""
+
+    @pytest.fixture
+    def verb(self, monkeypatch):
+        """Put a command in place that does what it is told."""
+
+        class Module:
+            __doc__ = 'A command of the tests.'
+
+            @staticmethod
+            def add_arguments(parser):
+                parser.add_argument('--json', action='store_true')
+
+        def place(run):
+            Module.run = staticmethod(run)
+            monkeypatch.setattr(cli, 'verb_names', lambda: ['sample'])
+            monkeypatch.setattr(cli.importlib, 'import_module', lambda name: Module)
+
+        return place
+
+    def test_success_and_its_output(self, verb, capsys):
+        verb(lambda args: print('{}') or 0 if args.json else 1)
+        assert cli.main(['sample', '--json']) == 0
+        assert capsys.readouterr().out == '{}\n'
+
+    @pytest.mark.parametrize(
+        ('error', 'said'),
+        [
+            (BagError('a bag\nthat is none'), 'anser sample: a bag that is none'),
+            (FileNotFoundError(2, 'No such file', 'x.yaml'), 'anser sample: x.yaml: No such file'),
+            (KeyboardInterrupt(), 'anser sample: interrupted'),
+        ],
+    )
+    def test_bad_input_is_one_line(self, verb, capsys, error, said):
+        def run(_args):
+            raise error
+
+        verb(run)
+        assert cli.main(['sample']) == 2
+        assert capsys.readouterr().err == f'{said}\n'
+
+    @pytest.mark.parametrize('error', [ZeroDivisionError('defect'), OSError('no file in it')])
+    def test_a_defect_shows_its_traceback(self, verb, capsys, error):
+        def run(_args):
+            raise error
+
+        verb(run)
+        assert cli.main(['sample']) == 1
+        assert 'Traceback' in capsys.readouterr().err
+
+    def test_bad_usage(self, verb, capsys):
+        verb(lambda args: 0)
+        assert cli.main(['sample', '--bogus']) == 2
+        assert 'unrecognized arguments: --bogus' in capsys.readouterr().err
+        assert cli.main(['smaple']) == 2
+        assert "no command 'smaple'; there are:" in capsys.readouterr().err
+
+    def test_help(self, verb, capsys):
+        verb(lambda args: 0)
+        assert cli.main(['sample', '--help']) == 0
+        assert 'A command of the tests.' in capsys.readouterr().out
+
+    def test_usage_lists_every_command_without_importing_any(self, capsys):
+        assert cli.main(['--help']) == 0
+        usage = capsys.readouterr().out
+        for name in node_names() + verb_names():
+            assert f'  {name}' in usage
+        assert cli.main([]) == 2
+        assert cli.main(['--version']) == 0
+        assert 'anser_ros' in capsys.readouterr().out
