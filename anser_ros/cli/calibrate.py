@@ -64,7 +64,8 @@ def run(args: argparse.Namespace) -> int:
     if not calibration.better_than_nominal and not args.force:
         raise FitError(
             f'no model written: its held-out error {document["heldout_flux_rmse_t"]:.3g} T is '
-            f"worse than the nominal model's {calibration.nominal_rmse_t:.3g} T (--force writes it)"
+            f"worse than the nominal model's {calibration.nominal_rmse_t:.3g} T; "
+            '--force writes it'
         )
     save_model(args.out, calibration.model)
     if args.json:

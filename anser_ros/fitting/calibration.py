@@ -30,7 +30,7 @@ FEWEST_FRAMES = 10
 FLATTEST = 0.002
 """Thickness (rms) of the cloud of sensors that the fit needs, as a part of its extent."""
 DISAGREEMENT = 10.0
-"""Sessions whose common fit leaves this many times what each leaves alone are of different boards."""
+"""Sessions whose common fit leaves this many times what each leaves alone differ in their board."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Calibration:
 
     @property
     def better_than_nominal(self) -> bool:
-        """Whether the held-out error is below the nominal model's (or there is none to compare)."""
+        """Whether the held-out error is below the nominal model's, where there is one."""
         return self.nominal_rmse_t is None or rms(self.held_out.error) < self.nominal_rmse_t
 
 

@@ -5,7 +5,7 @@ emitters see that error together, along six known directions. So the fit alterna
 most probable pose of every frame, from all its readings and the pose's prior, and (b) damped least
 squares of the moments at those poses: the article's equation (6) with one matrix and a right-hand
 side for every phasor component. Both steps lower the same sum of squares (block coordinate descent
-on the joint posterior); readings that no pose explains lose weight (Huber, Robust Statistics, 1981).
+on the joint posterior); readings that no pose explains lose weight (Huber, Robust Statistics).
 The matrix is only kept as the triangular factor of its rows so far (Golub and Van Loan, section
 5.3), so millions of rows take no more memory than one block.
 """
@@ -114,7 +114,8 @@ class TriangularFactor:
         """Take in rows (P, N) with their right-hand sides (P, M)."""
         self.rows += matrix.shape[0]
         block = np.concatenate([matrix, right], axis=1)
-        self.triangle = np.linalg.qr(np.concatenate([self.triangle, block]), mode='r')
+        stack = np.concatenate([self.triangle, block])
+        self.triangle = np.asarray(np.linalg.qr(stack, mode='r'))
 
     def spectrum(self) -> 'Spectrum':
         """Column-scaled singular value decomposition."""
@@ -230,7 +231,7 @@ def usable_weights(measurements: Measurements) -> Array:
 
 def with_pose(measurements: Measurements) -> Measurements:
     """The frames that have a pose and at least one valid reading, unusable fluxes set to zero."""
-    kept = measurements.frames(measurements.usable.any(axis=1))
+    kept = measurements.frames(np.asarray(measurements.usable.any(axis=1)))
     flux = np.where(kept.usable[:, :, None], kept.flux, 0.0)
     return replace(kept, flux=flux)
 

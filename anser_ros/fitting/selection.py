@@ -1,11 +1,12 @@
 """Which dipoles, and how much damping: chosen by the predictive error of held-out blocks.
 
 All candidates are compared at the same poses (corrected once with a rich layer) and on the same
-blocks of space. A candidate costs one matrix: each fold's rows are summed to a Gram matrix, those of
-the other folds are added up, and the eigenvectors of the sum give every damping at once. (Squaring
-the condition is harmless here, where the smallest damping is far above its rounding; what is kept
-is fitted by QR.) The score is the predictive chi-square of the held-out frames with their pose marginalised,
-so that the pose's jitter, much larger than the flux noise, does not drown the differences.
+blocks of space. A candidate costs one matrix: each fold's rows are summed to a Gram matrix, those
+of the other folds are added up, and the eigenvectors of the sum give every damping at once.
+(Squaring the condition is harmless here, where the smallest damping is far above its rounding; what
+is kept is fitted by QR.) The score is the predictive chi-square of the held-out frames with their
+pose marginalised, so that the pose's jitter, much larger than the flux noise, does not drown the
+differences.
 """
 
 from collections.abc import Callable, Sequence
