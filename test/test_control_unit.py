@@ -140,7 +140,7 @@ class TestSignals:
 
     def test_drifting_current_moves_no_flux(self):
         truth = world()
-        drift = raw_effects.CurrentDrift(coil=2, amount=-0.3, tau_s=0.05)
+        drift = raw_effects.CurrentDrift(coil=2, amount=-0.3, tau_s=0.5)
         unit = ControlUnit(truth, CHANNELS, effects=[drift])
         got, sigma, times = fluxes(unit, 0.2)
         expected = np.array([truth.flux(t) for t in times])

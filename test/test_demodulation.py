@@ -218,7 +218,9 @@ class TestWindows:
                 windows += cutter.push((start + k) % 2**32, 1000 * k, part)
         return windows
 
-    @pytest.mark.parametrize(('window', 'hop'), [(200, 200), (800, 200), (333, 7), (2000, 801), (200, 500)])
+    @pytest.mark.parametrize(
+        ('window', 'hop'), [(200, 200), (800, 200), (333, 7), (2000, 801), (200, 500)]
+    )
     def test_every_window_is_the_right_part_of_the_stream(self, window, hop):
         samples = self.stream(400)
         cutter = WindowCutter(window, hop, 2, 0.04)

@@ -83,7 +83,8 @@ class CuSimulator(AnserNode):
         real = setup
         for effect in effects:
             real = effect.setup(real)
-        self._world = World(real, board_source(real), metal=_metal(table))
+        self._metal = _metal(table)
+        self._world = World(real, board_source(real), metal=self._metal)
         front = FrontEnd(noise_codes=table.noise_codes, current_drift=table.current_drift)
         self._unit = ControlUnit(
             self._world,
@@ -171,7 +172,10 @@ class CuSimulator(AnserNode):
     def status(self) -> Status:
         """State of the control unit."""
         state = 'streaming' if self._unit.streaming else 'idle, waits for a start'
-        values = {'link': self.parameters.link, 'fault': self._injector.kind}
+        values: dict[str, object] = {'link': self.parameters.link, 'fault': self._injector.kind}
+        if self._metal:
+            position, _ = self._metal[0].path(self._elapsed_s())
+            values['metal_distance_m'] = float(abs(position[2]))
         return Status('', Level.OK, state, values)
 
     def close(self) -> None:

@@ -1,0 +1,162 @@
+"""Watch a simulated tool being tracked: all nodes as processes, a live table, a bag, a picture.
+
+Two chains of field model and tracker run side by side: one refits its model to the reference
+coils, the other keeps the model as calibrated. A steel disc comes from below and leaves again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from anser_ros.cli.demo_report import draw, load, summarise
+from anser_ros.cli.supervisor import Supervisor, tail
+from anser_ros.errors import ParameterError
+
+FROZEN = 'frozen'
+PATIENCE_S = 60.0
+POLL_S = 0.05
+SHARED_TOPICS = ('setup', 'tool/flux', 'reference/flux')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command line of the demo."""
+    parser.add_argument(
+        '--duration', type=float, default=30.0, metavar='S', help='time from the first pose on'
+    )
+    parser.add_argument(
+        '--out', type=Path, default=Path('recordings'), metavar='DIR',
+        help='folder that gets a folder with bag, picture and logs',
+    )  # fmt: skip
+    parser.add_argument('--rate', type=float, default=50.0, metavar='HZ', help='poses a second')
+    parser.add_argument('--no-metal', action='store_true', help='leave the steel disc away')
+    parser.add_argument('--no-picture', action='store_true', help='draw nothing at the end')
+    parser.add_argument('--json', action='store_true', help='print only the summary, as JSON')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the demo.
+
+    Raises
+    ------
+    ParameterError
+        When the duration or the rate is out of range.
+    """
+    if not 1.0 <= args.duration <= 3600.0:
+        raise ParameterError(f'--duration must be 1 to 3600 s, got {args.duration:g}')
+    if not 1.0 <= args.rate <= 200.0:
+        raise ParameterError(f'--rate must be 1 to 200 Hz, got {args.rate:g}')
+    stopped: list[int] = []
+    before = {
+        number: signal.signal(number, lambda got, _: stopped.append(got))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    folder = args.out / time.strftime('demo_%Y%m%d_%H%M%S')
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        return _run_in(folder, args, stopped)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _run_in(folder: Path, args: argparse.Namespace, stopped: list[int]) -> int:
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    for threads in ('OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
+        os.environ.setdefault(threads, '1')
+    ports = Path(tempfile.mkdtemp(prefix='anser_demo_'))
+    data = folder / 'demo.npz'
+    failed = ''
+    try:
+        with Supervisor(folder / 'logs') as supervisor:
+            for name, command in _commands(folder, ports / 'cu', args):
+                supervisor.start(name, command)
+            monitor = supervisor.start('monitor', _monitor(data, args), on_terminal=not args.json)
+            while not stopped:
+                ended = supervisor.ended()
+                if ended is not None:
+                    if ended is not monitor or monitor.process.returncode:
+                        failed = f'{ended.name} ended with {ended.process.returncode}'
+                        failed += f'\n{tail(ended)}'
+                    break
+                time.sleep(POLL_S)
+    finally:
+        shutil.rmtree(ports, ignore_errors=True)
+    if failed:
+        print(f'anser demo: {failed}\nlogs: {folder / "logs"}', file=sys.stderr)
+        return 1
+    return _report(folder, data, args, interrupted=bool(stopped))
+
+
+def _report(folder: Path, data: Path, args: argparse.Namespace, *, interrupted: bool) -> int:
+    summary: dict[str, object] = {'bag': str(folder / 'bag'), 'interrupted': interrupted}
+    results = load(data) if data.is_file() else None
+    if results is not None:
+        summary |= summarise(results)
+        if not (interrupted or args.no_picture):
+            draw(results, folder / 'demo.png')
+            summary['picture'] = str(folder / 'demo.png')
+    if args.json:
+        print(json.dumps(summary, indent=1))
+    else:
+        _print(summary)
+    return 0
+
+
+def _print(summary: dict[str, object]) -> None:
+    chains = summary.get('chains')
+    if isinstance(chains, dict):
+        for chain, figures in chains.items():
+            print(
+                f'{chain:>7}: {figures["poses"]} poses at {figures["rate_hz"]:.1f} Hz, '
+                f'error RMSE {1e3 * figures["position_rmse_m"]:.2f} mm, '
+                f'95 % below {1e3 * figures["position_prc95_m"]:.2f} mm, '
+                f'worst {1e3 * figures["position_max_m"]:.2f} mm; '
+                f'latency {1e3 * figures["latency_prc50_s"]:.1f} ms from the middle of a window'
+            )
+    for key in ('bag', 'picture'):
+        if key in summary:
+            print(f'{key:>7}: {summary[key]}')
+    if summary['interrupted']:
+        print('interrupted: no picture')
+
+
+def _node(name: str, /, *words: str, **parameters: object) -> list[str]:
+    """Command of a node; `words` are further ROS arguments."""
+    command = [sys.executable, '-P', '-m', f'anser_ros.nodes.{name}', '--ros-args', *words]
+    for key, value in parameters.items():
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        command += ['-p', f'{key}:={text}']
+    return command
+
+
+def _commands(folder: Path, port: Path, args: argparse.Namespace) -> list[tuple[str, list[str]]]:
+    apart = ['-r', f'__ns:=/anser/{FROZEN}']
+    for topic in SHARED_TOPICS:
+        apart += ['-r', f'{topic}:=/anser/{topic}']
+    return [
+        ('cu_simulator', _node('cu_simulator', link=port, metal=not args.no_metal)),
+        ('acquisition', _node('acquisition', device=port, rate_hz=float(args.rate))),
+        ('field_model', _node('field_model')),
+        ('tracker', _node('tracker')),
+        ('field_model_frozen', _node('field_model', *apart)),
+        ('tracker_frozen', _node('tracker', *apart)),
+        ('recorder', _node('recorder', directory=folder, name='bag')),
+    ]
+
+
+def _monitor(data: Path, args: argparse.Namespace) -> list[str]:
+    return _node(
+        'monitor',
+        duration_s=float(args.duration),
+        patience_s=PATIENCE_S,
+        compare=FROZEN,
+        output=data,
+    )

@@ -1,0 +1,122 @@
+"""Starts processes, watches them, and leaves none behind: a launch without `launch`."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+_PR_SET_PDEATHSIG = 1
+_INTERRUPT_S = 1.2
+_TERMINATE_S = 0.2
+_TAIL_LINES = 8
+
+
+@dataclass(frozen=True)
+class Child:
+    """A process that was started.
+
+    Attributes
+    ----------
+    name : what it is called in messages
+    process : the process, leader of a group of its own
+    log : where its output goes; None for the terminal
+    """
+
+    name: str
+    process: subprocess.Popen[bytes]
+    log: Path | None
+
+
+class Supervisor:
+    """Processes that live and end together; used as a context.
+
+    Each is a group of its own, so Ctrl-C reaches only the supervisor, which ends them in order.
+    When the supervisor itself is killed the system ends them (Linux).
+
+    Parameters
+    ----------
+    logs : folder for their output
+    """
+
+    def __init__(self, logs: Path) -> None:
+        self._logs = logs
+        self._children: list[Child] = []
+
+    def __enter__(self) -> Supervisor:
+        self._logs.mkdir(parents=True, exist_ok=True)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def start(self, name: str, command: Sequence[str], *, on_terminal: bool = False) -> Child:
+        """Start a process."""
+        log = None if on_terminal else self._logs / f'{name}.log'
+        stream = None if log is None else log.open('wb')
+        try:
+            process = subprocess.Popen(
+                list(command),
+                stdin=subprocess.DEVNULL,
+                stdout=stream,
+                stderr=None if stream is None else subprocess.STDOUT,
+                start_new_session=True,
+                preexec_fn=_prepare,
+            )
+        finally:
+            if stream is not None:
+                stream.close()
+        self._children.append(Child(name, process, log))
+        return self._children[-1]
+
+    def ended(self) -> Child | None:
+        """Return a process that has ended by itself, None while all run."""
+        return next((c for c in self._children if c.process.poll() is not None), None)
+
+    def end(self) -> None:
+        """End all: interrupt, then terminate, then kill what does not heed."""
+        for number, patience_s in (
+            (signal.SIGINT, _INTERRUPT_S),
+            (signal.SIGTERM, _TERMINATE_S),
+            (signal.SIGKILL, 1.0),
+        ):
+            running = [c for c in self._children if c.process.poll() is None]
+            for child in running:
+                _signal_group(child, number)
+            end = time.monotonic() + patience_s
+            for child in running:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    child.process.wait(max(0.0, end - time.monotonic()))
+        for child in self._children:
+            _signal_group(child, signal.SIGKILL)
+
+
+def tail(child: Child) -> str:
+    """Return the last lines of a process's log."""
+    if child.log is None:
+        return ''
+    lines = child.log.read_text(encoding='utf-8', errors='replace').splitlines()
+    return '\n'.join(f'    {line}' for line in lines[-_TAIL_LINES:])
+
+
+def _signal_group(child: Child, number: int) -> None:
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(child.process.pid, number)
+
+
+def _prepare() -> None:
+    """Run in the child: the system kills it when its parent is gone (Linux).
+
+    An interrupt while Python still starts would end in a traceback; it is ignored until the
+    program has a handler of its own.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if sys.platform.startswith('linux'):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -1,0 +1,291 @@
+"""A live table of sensors, rates and latencies."""
+
+import sys
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from std_msgs.msg import String
+
+from anser_ros.nodes import qos
+from anser_ros.nodes.node import AnserNode, Level, Status, main
+from anser_ros.nodes.parameters import parameter
+from anser_ros.nodes.traces import OpticalTrace, Row, Traces, targets_of
+from anser_ros.wire.setup import Setup, parse_setup, topic_of
+
+LINE_PERIOD_S = 1.0
+LEVELS = {0: 'green', 1: 'yellow', 2: 'red', 3: 'red'}
+
+
+@dataclass(frozen=True)
+class MonitorParameters:
+    """Parameters of the monitor."""
+
+    duration_s: float = parameter(
+        0.0, 'ends by itself so long after the first pose; 0 for never, s', minimum=0.0
+    )
+    patience_s: float = parameter(
+        0.0, 'gives up when no pose came in so long; 0 for never, s', minimum=0.0
+    )
+    compare: str = parameter('', 'namespace of a second tracker to show beside; empty for none')
+    output: str = parameter('', 'file (.npz) that gets all poses and errors at the end')
+    period_s: float = parameter(
+        0.25,
+        'from one table to the next; without a terminal a line a second, s',
+        minimum=0.05,
+        maximum=10.0,
+    )
+
+
+class Monitor(AnserNode):
+    """Shows state, pose, sigma, true error, rate and latency of every sensor and body."""
+
+    NAME = 'monitor'
+    PARAMETERS = MonitorParameters
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        table = self.parameters
+        self._console = Console()
+        self._live: Live | None = None
+        if self._console.is_terminal:
+            self._live = Live(console=self._console, auto_refresh=False)
+            self._live.start()
+        self._setup: Setup | None = None
+        self._chains: dict[str, Traces] = {}
+        self._optical: dict[str, OpticalTrace] = {}
+        self._states: dict[str, tuple[int, str]] = {}
+        self._note = ''
+        self._metal: list[tuple[float, float]] = []
+        self._pose_subscriptions: list[Any] = []
+        self._first_s: float | None = None
+        self._last_s = time.monotonic()
+        self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, qos.EVENTS)
+        period_s = table.period_s if self._live else LINE_PERIOD_S
+        self.create_timer(period_s, self._show, clock=self.steady_clock)
+
+    def _on_setup(self, message: String) -> None:
+        setup = parse_setup(message.data)
+        known = self._setup
+        self._setup = setup
+        if known is not None and known.sensors == setup.sensors:
+            return
+        for subscription in self._pose_subscriptions:
+            self.destroy_subscription(subscription)
+        self._pose_subscriptions = []
+        names = [''] + ([self.parameters.compare] if self.parameters.compare else [])
+        self._chains = {name: Traces(targets_of(setup)) for name in names}
+        self._optical = {body: OpticalTrace() for body in setup.bodies}
+        for chain, traces in self._chains.items():
+            prefix = f'{chain}/' if chain else ''
+            for name, trace in traces.of.items():
+                self._subscribe(
+                    PoseWithCovarianceStamped,
+                    f'{prefix}{topic_of(name)}/pose_with_covariance',
+                    partial(self._on_pose, trace),
+                )
+        for body, trace in self._optical.items():
+            topic = f'/optical/{topic_of(body)}/pose'
+            self._subscribe(PoseStamped, topic, partial(self._on_optical, trace))
+
+    def _subscribe(self, kind: type, topic: str, callback: Any) -> None:
+        # rclpy wants a function, not a partial
+        def received(message: Any) -> None:
+            callback(message)
+
+        self._pose_subscriptions.append(
+            self.create_subscription(kind, topic, received, qos.STREAM)
+        )
+
+    def _on_pose(self, trace: Any, message: PoseWithCovarianceStamped) -> None:
+        now_s = time.time()
+        if self._first_s is None:
+            self._first_s = time.monotonic()
+        pose, variance = message.pose.pose, message.pose.covariance
+        stamp_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        q = pose.orientation
+        trace.stamp_s.append(stamp_s)
+        trace.position.append((pose.position.x, pose.position.y, pose.position.z))
+        trace.axis.append(_z_axis(q))
+        trace.sigma_m.append(float(np.sqrt(variance[0] + variance[7] + variance[14])))
+        trace.latency_s.append(now_s - stamp_s)
+
+    def _on_optical(self, trace: OpticalTrace, message: PoseStamped) -> None:
+        stamp_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        p, q = message.pose.position, message.pose.orientation
+        trace.add(stamp_s, (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self._states[status.name] = (status.level[0], status.message)
+            if status.name.endswith('cu_simulator'):
+                values = {pair.key: pair.value for pair in status.values}
+                if 'metal_distance_m' in values:
+                    self._metal.append((time.time(), float(values['metal_distance_m'])))
+
+    def _show(self) -> None:
+        now_s = time.monotonic()
+        elapsed_s, self._last_s = now_s - self._last_s, now_s
+        rows = {
+            chain: traces.rows(self._optical, elapsed_s) for chain, traces in self._chains.items()
+        }
+        if self._live is not None:
+            self._live.update(self._table(rows), refresh=True)
+        else:
+            print(self._line(rows), flush=True)
+        self._check_end(now_s)
+
+    def _check_end(self, now_s: float) -> None:
+        table = self.parameters
+        if self._first_s is None:
+            if table.patience_s and now_s - self.started_s > table.patience_s:
+                self._note = f'no pose within {table.patience_s:g} s'
+                print(f'monitor: {self._note}; {self._problems()}', file=sys.stderr)
+                self.stop(1)
+        elif table.duration_s and now_s - self._first_s >= table.duration_s:
+            self.stop(0)
+
+    def _problems(self) -> str:
+        """What the other nodes complain of."""
+        found = [f'{name}: {text}' for name, (level, text) in self._states.items() if level]
+        return '; '.join(found[:4]) or 'no node complains'
+
+    def _state(self, chain: str, name: str) -> tuple[int, str]:
+        namespace = self.get_namespace().strip('/')
+        prefix = f'{namespace}/{chain}' if chain else namespace
+        return self._states.get(f'{prefix}/tracker: {name}', (1, 'waiting'))
+
+    def _table(self, rows: dict[str, list[Row]]) -> Table:
+        second = self.parameters.compare
+        title = self._title()
+        table = Table(title=title, title_justify='left', caption=self._caption())
+        table.add_column('sensor')
+        table.add_column('state')
+        for heading in ('x mm', 'y mm', 'z mm', 'sigma mm', 'error mm'):
+            table.add_column(heading, justify='right')
+        if second:
+            table.add_column(f'{second}: error mm', justify='right')
+            table.add_column('state')
+        for heading in ('rate Hz', 'latency ms'):
+            table.add_column(heading, justify='right')
+        others = {row.name: row for row in rows.get(second, [])} if second else {}
+        for row in rows.get('', []):
+            level, state = self._state('', row.name)
+            cells = [row.name, f'[{LEVELS.get(level, "red")}]{state}']
+            cells += [_mm(v, 1) for v in row.position_m]
+            cells += [_mm(row.sigma_m), _mm(row.error_m)]
+            if second:
+                level, state = self._state(second, row.name)
+                cells += [_mm(others[row.name].error_m), f'[{LEVELS.get(level, "red")}]{state}']
+            cells += [f'{row.rate_hz:.0f}', _number(1e3 * row.latency_s, 1)]
+            table.add_row(*cells)
+        return table
+
+    def _title(self) -> str:
+        if self._first_s is None:
+            return 'waiting for the first pose'
+        end_s = self.parameters.duration_s
+        ran_s = time.monotonic() - self._first_s
+        return f'{ran_s:.0f} s' + (f' of {end_s:.0f} s' if end_s else '')
+
+    def _caption(self) -> str:
+        words = ['latency from the middle of the window']
+        if self._metal:
+            words.insert(0, f'metal {100 * self._metal[-1][1]:.0f} cm from the board')
+        return '; '.join(words)
+
+    def _line(self, rows: dict[str, list[Row]]) -> str:
+        """One line with the medians over all sensors."""
+        if self._first_s is None:
+            return f'{self._title()}; {self._problems()}'
+        parts = [self._title()]
+        for chain, found in rows.items():
+            good = sum(row.rate_hz > 0 for row in found)
+            error = _middle([row.error_m for row in found])
+            sigma = _middle([row.sigma_m for row in found])
+            parts.append(
+                f'{chain or "live"}: {good}/{len(found)} tracked, '
+                f'error {_mm(error)} mm, sigma {_mm(sigma)} mm'
+            )
+        live = rows.get('', [])
+        parts.append(f'{_middle([row.rate_hz for row in live]):.0f} Hz')
+        parts.append(f'{_number(1e3 * _middle([row.latency_s for row in live]), 1)} ms')
+        if self._metal:
+            parts.append(f'metal {100 * self._metal[-1][1]:.0f} cm')
+        return '  '.join(parts)
+
+    def status(self) -> Status:
+        """How many poses came."""
+        poses = {
+            f'poses_{chain or "live"}': sum(len(t.stamp_s) for t in traces.of.values())
+            for chain, traces in self._chains.items()
+        }
+        return Status('', Level.OK, self._note or 'watching', poses)
+
+    def close(self) -> None:
+        """Leave the terminal in order and write the output file."""
+        if self._live is not None:
+            self._live.stop()
+        if self.parameters.output:
+            self._write(Path(self.parameters.output))
+
+    def _write(self, path: Path) -> None:
+        arrays: dict[str, Any] = {
+            'chains': np.array(list(self._chains), dtype=str),
+            'metal': np.array(self._metal, float).reshape(-1, 2),
+        }
+        names = list(self._chains[''].of) if self._chains else []
+        arrays['names'] = np.array(names, dtype=str)
+        for rank, traces in enumerate(self._chains.values()):
+            for index, trace in enumerate(traces.of.values()):
+                optical = self._optical[trace.target.body].track()
+                key = f'{rank}_{index}'
+                away, angle = trace.errors(optical) if optical else (np.zeros(0), np.zeros(0))
+                arrays[f'stamp_{key}'] = np.array(trace.stamp_s)
+                arrays[f'position_{key}'] = np.array(trace.position, float).reshape(-1, 3)
+                arrays[f'sigma_{key}'] = np.array(trace.sigma_m)
+                arrays[f'latency_{key}'] = np.array(trace.latency_s)
+                arrays[f'error_{key}'] = away
+                arrays[f'angle_{key}'] = angle
+        for body, trace in self._optical.items():
+            arrays[f'optical_{body}'] = np.column_stack(
+                [np.array(trace.stamp_s), np.array(trace.position, float).reshape(-1, 3)]
+            )
+        temporary = path.with_suffix('.part.npz')
+        np.savez_compressed(temporary, **arrays)
+        temporary.replace(path)
+
+
+def _z_axis(q: Any) -> tuple[float, ...]:
+    """Axis of a pose: +z, by the contract, for sensors as for bodies."""
+    return (
+        2 * (q.x * q.z + q.w * q.y),
+        2 * (q.y * q.z - q.w * q.x),
+        1 - 2 * (q.x * q.x + q.y * q.y),
+    )
+
+
+def _middle(values: list[float]) -> float:
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.median(finite)) if finite else float('nan')
+
+
+def _mm(value_m: float, digits: int = 2) -> str:
+    return _number(1e3 * value_m, digits)
+
+
+def _number(value: float, digits: int) -> str:
+    return f'{value:.{digits}f}' if np.isfinite(value) else '-'
+
+
+if __name__ == '__main__':
+    sys.exit(main(Monitor))

@@ -1,0 +1,166 @@
+"""What came in for every sensor and body, and how far it is from the optical truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.physics.pose_track import PoseTrack
+from anser_ros.wire.setup import Setup
+
+Array = NDArray[np.float64]
+LONGEST_GAP_S = 0.1
+RECENT = 200
+
+
+@dataclass(frozen=True)
+class Target:
+    """A sensor or a body that is tracked.
+
+    Attributes
+    ----------
+    name, body : its own name and that of the body that it sits on
+    position_m, axis : in the body's frame; a body's own axis is its z
+    """
+
+    name: str
+    body: str
+    position_m: tuple[float, float, float]
+    axis: tuple[float, float, float]
+
+
+def targets_of(setup: Setup) -> list[Target]:
+    """All tool sensors of a setup, and the bodies that carry more than one."""
+    sensors = [Target(s.name, s.body, s.position_m, s.axis) for s in setup.tool_sensors]
+    carried = [sensor.body for sensor in sensors]
+    bodies = [
+        Target(body, body, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+        for body in setup.bodies
+        if carried.count(body) > 1
+    ]
+    return sensors + bodies
+
+
+@dataclass
+class OpticalTrace:
+    """Poses of one body by an optical tracker, or the simulator's truth."""
+
+    stamp_s: list[float] = field(default_factory=list)
+    position: list[tuple[float, ...]] = field(default_factory=list)
+    quaternion: list[tuple[float, ...]] = field(default_factory=list)
+
+    def add(self, stamp_s: float, position: tuple[float, ...], turn: tuple[float, ...]) -> None:
+        """Note a pose; one that is not later than the last is left out."""
+        if not self.stamp_s or stamp_s > self.stamp_s[-1]:
+            self.stamp_s.append(stamp_s)
+            self.position.append(position)
+            self.quaternion.append(turn)
+
+    def track(self, since: int = 0) -> PoseTrack | None:
+        """The poses from number `since` on, None when there are less than two."""
+        if len(self.stamp_s) - since < 2:
+            return None
+        return PoseTrack(
+            np.array(self.stamp_s[since:]),
+            np.array(self.position[since:]),
+            np.array(self.quaternion[since:]),
+        )
+
+
+@dataclass
+class PoseTrace:
+    """Poses of one target by one tracker.
+
+    Attributes
+    ----------
+    stamp_s, sigma_m, latency_s : a value a pose; latency from the middle of the window
+    position, axis : three values a pose
+    """
+
+    target: Target
+    stamp_s: list[float] = field(default_factory=list)
+    position: list[tuple[float, ...]] = field(default_factory=list)
+    axis: list[tuple[float, ...]] = field(default_factory=list)
+    sigma_m: list[float] = field(default_factory=list)
+    latency_s: list[float] = field(default_factory=list)
+
+    def errors(self, optical: PoseTrack, since: int = 0) -> tuple[Array, Array]:
+        """Distance (m) and angle (rad) to the truth of the poses from number `since` on.
+
+        NaN where the optical track does not reach.
+        """
+        stamps = np.array(self.stamp_s[since:])
+        if not stamps.size:
+            return np.zeros(0), np.zeros(0)
+        position, rotation, _ = optical.at(stamps, LONGEST_GAP_S)
+        true_position = position + rotation @ np.array(self.target.position_m)
+        true_axis = rotation @ np.array(self.target.axis)
+        away = np.linalg.norm(np.array(self.position[since:]) - true_position, axis=1)
+        axes = np.array(self.axis[since:])
+        angle = np.arctan2(
+            np.linalg.norm(np.cross(axes, true_axis), axis=1),
+            np.einsum('ni,ni->n', axes, true_axis),
+        )
+        return away, angle
+
+
+@dataclass(frozen=True)
+class Row:
+    """The newest of one target, for a table.
+
+    Attributes
+    ----------
+    position_m : NaN when nothing came lately
+    error_m, latency_s, sigma_m : medians of the poses of the interval, NaN without any
+    rate_hz : poses a second of the interval
+    """
+
+    name: str
+    position_m: tuple[float, ...]
+    sigma_m: float
+    error_m: float
+    rate_hz: float
+    latency_s: float
+
+
+class Traces:
+    """All targets of one chain of nodes."""
+
+    def __init__(self, targets: list[Target]) -> None:
+        self.of = {target.name: PoseTrace(target) for target in targets}
+        self._seen = dict.fromkeys(self.of, 0)
+
+    def rows(self, optical: Mapping[str, OpticalTrace], elapsed_s: float) -> list[Row]:
+        """What came since the last call."""
+        recent = {
+            body: trace.track(max(0, len(trace.stamp_s) - 200)) for body, trace in optical.items()
+        }
+        rows = []
+        for name, trace in self.of.items():
+            since, self._seen[name] = self._seen[name], len(trace.stamp_s)
+            count = len(trace.stamp_s) - since
+            track = recent.get(trace.target.body)
+            error = float('nan')
+            if count and track is not None:
+                # the last poses may be newer than the last optical one
+                away = trace.errors(track, max(0, since - 5))[0]
+                known = away[np.isfinite(away)]
+                error = float(np.median(known)) if known.size else error
+            rows.append(
+                Row(
+                    name,
+                    trace.position[-1] if count else (float('nan'),) * 3,
+                    _median(trace.sigma_m[since:]),
+                    error,
+                    count / elapsed_s,
+                    _median(trace.latency_s[since:]),
+                )
+            )
+        return rows
+
+
+def _median(values: list[float]) -> float:
+    return float(np.median(values)) if values else float('nan')

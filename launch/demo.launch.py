@@ -1,0 +1,78 @@
+"""The demo on an installation with `launch`: simulated control unit, two trackers, live table.
+
+One tracker follows a field model that is refitted live, the other one keeps the model as
+calibrated. Without `launch`, `anser demo` starts the same processes.
+
+ros2 launch anser_ros demo.launch.py duration:=30
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, EmitEvent, GroupAction, RegisterEventHandler
+from launch.event_handlers import OnProcessExit
+from launch.events import Shutdown
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node, PushRosNamespace
+
+PACKAGE = 'anser_ros'
+PORT = '/tmp/anser_cu'
+SHARED_TOPICS = ('setup', 'tool/flux', 'reference/flux')
+ARGUMENTS = {
+    'duration': ('30.0', 'time from the first pose on, s; 0 for no end'),
+    'directory': ('recordings', 'folder of the bag'),
+    'metal': ('true', 'whether a steel disc comes and goes'),
+}
+
+
+def node(name, remappings=(), output='log', **parameters):
+    """Return one node with its parameters."""
+    return Node(
+        package=PACKAGE,
+        executable=name,
+        name=name,
+        parameters=[parameters],
+        remappings=list(remappings),
+        output=output,
+        emulate_tty=output == 'screen',
+        sigterm_timeout='5',
+    )
+
+
+def generate_launch_description():
+    """Return the nodes, and the rule that the monitor's end is everybody's end."""
+    value = LaunchConfiguration
+    monitor = node(
+        'monitor',
+        output='screen',
+        duration_s=value('duration'),
+        compare='frozen',
+    )
+    shared = [(topic, f'/anser/{topic}') for topic in SHARED_TOPICS]
+    return LaunchDescription(
+        [
+            *(
+                DeclareLaunchArgument(name, default_value=default, description=text)
+                for name, (default, text) in ARGUMENTS.items()
+            ),
+            GroupAction(
+                [
+                    PushRosNamespace('anser'),
+                    node('cu_simulator', link=PORT, metal=value('metal')),
+                    node('acquisition', device=PORT),
+                    node('field_model'),
+                    node('tracker'),
+                    node('recorder', directory=value('directory')),
+                    GroupAction(
+                        [
+                            PushRosNamespace('frozen'),
+                            node('field_model', shared),
+                            node('tracker', shared),
+                        ]
+                    ),
+                    monitor,
+                ]
+            ),
+            RegisterEventHandler(
+                OnProcessExit(target_action=monitor, on_exit=[EmitEvent(event=Shutdown())])
+            ),
+        ]
+    )

@@ -1,0 +1,202 @@
+"""The demo: its supervisor leaves nothing behind, its monitor measures, and the whole runs."""
+
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import spin_until
+
+from anser_ros.cli.demo_report import draw, load, summarise
+from anser_ros.cli.main import main
+from anser_ros.cli.supervisor import Supervisor, tail
+from anser_ros.nodes.traces import OpticalTrace, PoseTrace, Traces, targets_of
+from anser_ros.wire.config_folder import read_config
+from anser_ros.wire.setup import parse_setup, topic_of
+
+SETUP_TEXT = read_config('demo_setup.yaml')
+SETUP = parse_setup(SETUP_TEXT)
+STUBBORN = 'import signal, time; signal.signal(signal.SIGTERM, lambda *_: 0); time.sleep(60)'
+
+
+def running(mark):
+    """Command lines of living processes that contain a mark."""
+    found = []
+    for folder in Path('/proc').glob('[0-9]*'):
+        try:
+            line = (folder / 'cmdline').read_bytes().replace(b'\0', b' ').decode()
+            state = (folder / 'stat').read_text().rsplit(')', 1)[1].split()[0]
+        except OSError:
+            continue
+        if mark in line and state != 'Z' and folder.name != str(os.getpid()):
+            found.append(line)
+    return found
+
+
+class TestSupervisor:
+    def test_ends_all_in_time_even_the_stubborn_and_their_children(self, tmp_path):
+        mark = f'mark_{os.getpid()}'
+        grandchild = (
+            f'import subprocess, sys, time; '
+            f'subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60) # {mark}"]); '
+            f'time.sleep(60)'
+        )
+        with Supervisor(tmp_path) as supervisor:
+            supervisor.start('stubborn', [sys.executable, '-c', f'{STUBBORN} # {mark}'])
+            supervisor.start('parent', [sys.executable, '-c', grandchild])
+            end = time.monotonic() + 5
+            while len(running(mark)) < 3 and time.monotonic() < end:
+                time.sleep(0.05)
+            assert len(running(mark)) == 3
+            assert supervisor.ended() is None
+            begin = time.monotonic()
+        assert time.monotonic() - begin < 2.0
+        time.sleep(0.1)
+        assert running(mark) == []
+
+    def test_tells_who_ended_and_shows_its_last_words(self, tmp_path):
+        with Supervisor(tmp_path) as supervisor:
+            child = supervisor.start('brief', [sys.executable, '-c', 'print("last words")'])
+            child.process.wait(10)
+            assert supervisor.ended() is child
+            assert tail(child) == '    last words'
+
+    def test_its_own_end_takes_the_others_along(self, tmp_path, start):
+        mark = f'orphan_{os.getpid()}'
+        script = (
+            'import sys, time; from pathlib import Path; '
+            'from anser_ros.cli.supervisor import Supervisor\n'
+            f'child = [sys.executable, "-c", "import time; time.sleep(60) # {mark}"]\n'
+            f'with Supervisor(Path({str(tmp_path)!r})) as s:\n'
+            '    s.start("child", child)\n'
+            '    time.sleep(60)\n'
+        )
+        import subprocess
+
+        parent = subprocess.Popen([sys.executable, '-c', script])
+        end = time.monotonic() + 10
+        while len(running(f'# {mark}')) < 2 and time.monotonic() < end:
+            time.sleep(0.05)
+        parent.kill()
+        parent.wait(5)
+        end = time.monotonic() + 3
+        while running(mark) and time.monotonic() < end:
+            time.sleep(0.05)
+        assert running(mark) == []
+
+
+class TestTraces:
+    def test_error_is_the_distance_to_the_interpolated_truth(self):
+        optical = OpticalTrace()
+        for k in range(50):
+            # moves along x at 1 m/s, turned by 90 degrees about z
+            optical.add(0.02 * k, (0.02 * k, 0.0, 0.15), (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)))
+        optical.add(0.5, (9.0, 9.0, 9.0), (0.0, 0.0, 0.0, 1.0))
+        target = targets_of(SETUP)[0]
+        assert (target.name, target.position_m) == ('tool_a/0/x', (0.0, 0.0, -0.03))
+        trace = PoseTrace(target)
+        trace.stamp_s += [0.55, 7.0]
+        trace.position += [(0.55, 0.003, 0.12), (0.0, 0.0, 0.0)]
+        trace.axis += [(0.0, 1.0, 0.0), (0.0, 1.0, 0.0)]
+        away, angle = trace.errors(optical.track())
+        assert away[0] == pytest.approx(0.003) and np.isnan(away[1])
+        assert angle[0] == pytest.approx(0.0, abs=1e-6)
+
+    def test_bodies_with_several_coils_are_targets_too(self):
+        names = [target.name for target in targets_of(SETUP)]
+        assert names[-1] == 'tool_a' and len(names) == 10
+
+    def test_rows_without_poses_say_so(self):
+        rows = Traces(targets_of(SETUP)).rows({'tool_a': OpticalTrace()}, 1.0)
+        assert len(rows) == 10
+        assert all(row.rate_hz == 0 and np.isnan(row.error_m) for row in rows)
+
+
+def test_monitor_measures_error_rate_and_latency(ros, start, tmp_path):
+    from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+    from std_msgs.msg import String
+
+    from anser_ros.nodes import qos
+
+    node = ros.create_node('fake')
+    output = tmp_path / 'demo.npz'
+    setup = node.create_publisher(String, '/anser/setup', qos.LATCHED)
+    setup.publish(String(data=SETUP_TEXT))
+    poses = {
+        chain: node.create_publisher(
+            PoseWithCovarianceStamped,
+            f'/anser/{chain}{topic_of("tool_a/1/z")}/pose_with_covariance',
+            qos.STREAM,
+        )
+        for chain in ('', 'frozen/')
+    }
+    truth = node.create_publisher(PoseStamped, '/optical/tool_a/pose', qos.STREAM)
+    monitor = start(
+        'monitor', '--ros-args', '-p', 'duration_s:=2.5', '-p', 'compare:=frozen',
+        '-p', f'output:={output}',
+    )  # fmt: skip
+
+    def publish():
+        now = node.get_clock().now().to_msg()
+        exact = PoseStamped()
+        exact.header.stamp = now
+        exact.pose.position.z = 0.15
+        truth.publish(exact)
+        for chain, error_m in (('', 0.001), ('frozen/', 0.02)):
+            tracked = PoseWithCovarianceStamped()
+            tracked.header.stamp = now
+            tracked.pose.pose.position.x = error_m
+            tracked.pose.pose.position.z = 0.15
+            tracked.pose.covariance[0] = 4e-8
+            poses[chain].publish(tracked)
+
+    node.create_timer(0.02, publish)
+    assert spin_until(node, lambda: monitor.popen.poll() is not None, 25.0), monitor.output
+    assert monitor.popen.returncode == 0, monitor.output
+    assert '1/10 tracked, error 1.00 mm, sigma 0.20 mm' in monitor.output
+    assert 'frozen: 1/10 tracked, error 20.00 mm' in monitor.output
+    summary = summarise(load(output))['chains']
+    assert summary['live']['position_rmse_m'] == pytest.approx(0.001)
+    assert summary['frozen']['position_rmse_m'] == pytest.approx(0.02)
+    assert summary['live']['rate_hz'] == pytest.approx(50, rel=0.2)
+    assert 0 <= summary['live']['latency_prc50_s'] < 0.1
+    draw(load(output), tmp_path / 'demo.png')
+    assert (tmp_path / 'demo.png').read_bytes()[:8] == b'\x89PNG\r\n\x1a\n'
+
+
+def test_monitor_gives_up_with_the_reason(ros, start):
+    monitor = start('monitor', '--ros-args', '-p', 'patience_s:=1.0')
+    assert monitor.popen.wait(20) == 1
+    assert 'no pose within 1 s' in monitor.output
+
+
+@pytest.mark.parametrize('words', [['--duration', '0'], ['--rate', '1000']])
+def test_bad_usage_is_one_clear_line(words, capsys, tmp_path):
+    assert main(['demo', '--out', str(tmp_path), *words]) == 2
+    assert 'must be' in capsys.readouterr().err
+
+
+def test_demo_runs_and_reports(start, tmp_path):
+    demo = start('demo', '--duration', '5', '--out', tmp_path, '--json')
+    assert demo.popen.wait(90) == 0, demo.output
+    summary = json.loads(demo.output)
+    live = summary['chains']['live']
+    assert live['poses'] > 5 * 40 * 9
+    assert live['position_prc95_m'] < 2e-3
+    assert Path(summary['picture']).stat().st_size > 10_000
+    assert list(Path(summary['bag']).glob('*.mcap'))
+    assert running('anser_demo_') == []
+
+
+def test_ctrl_c_ends_the_demo_in_two_seconds(start, tmp_path):
+    demo = start('demo', '--out', tmp_path)
+    demo.wait_for('tracked', 60)
+    begin = time.monotonic()
+    assert demo.interrupt(signal.SIGINT) == 0, demo.output
+    assert time.monotonic() - begin < 2.0
+    assert 'bag:' in demo.output and 'Traceback' not in demo.output
+    assert running('anser_demo_') == []
