@@ -1,0 +1,67 @@
+"""The optical tracker's clock runs at another rate than the fluxes'."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+    sigmas,
+)  # fmt: skip
+from anser_ros.effects.time_offset import flux_rate
+from anser_ros.fitting.model import EffectRecord
+from anser_ros.physics.pose_track import PoseTrack
+
+
+class ClockRate(Effect):
+    """theta: offset at time 0 (s) and rate (s a second): optical t' counts as t' + a + b t'."""
+
+    name = 'clock_rate'
+    summary = "one of the two clocks runs slow, so that the stamps' offset grows"
+    units = {'offset_s': 's', 'rate_ppm': '1e-6'}
+    plausible = {'offset_s': (-0.5, 0.5), 'rate_ppm': (-2e4, 2e4)}
+    remedy = Remedy.OPTICAL
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """One clock for all bodies."""
+        return [Term(self, {}, np.zeros(2))] if scene.tools else []
+
+    def prior(self, term: Term) -> Array:
+        """A tenth of a second, a few thousand parts per million."""
+        return np.array([0.1, 3e-3])
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Minus the flux's rate of change, constant and growing with time."""
+        if view.is_reference:
+            return None
+        rate = -flux_rate(view)
+        return np.stack([rate, rate * view.time[:, None, None]], axis=-1)
+
+    def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
+        """The track on the fluxes' clock."""
+        return replace(track, time=track.time * (1 + term.theta[1]) + term.theta[0])
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Offset and rate."""
+        sigma = sigmas(covariance)
+        return EffectRecord(
+            self.name,
+            {'offset_s': float(term.theta[0]), 'rate_ppm': 1e6 * float(term.theta[1])},
+            {'offset_s': float(sigma[0]), 'rate_ppm': 1e6 * float(sigma[1])},
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From offset and rate."""
+        rate = 1e-6 * float(needed(record, 'rate_ppm'))
+        return Term(self, {}, np.array([float(needed(record, 'offset_s')), rate]))
+
+
+EFFECTS = (ClockRate(),)

@@ -1,0 +1,97 @@
+"""One emitter's tone leaks into another's."""
+
+from collections.abc import Sequence
+from itertools import combinations, permutations
+
+import numpy as np
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+    sigmas,
+    unit_matrix,
+)  # fmt: skip
+from anser_ros.fitting.model import EffectRecord
+
+
+class CoilCrosstalk(Effect):
+    """theta: one-way leak, real and imaginary share; mutual leak, one real share both ways.
+
+    The tone of the second coil is read with a share of the first one's field.
+    """
+
+    name = 'coil_crosstalk'
+    summary = "one emitter's tone leaks into another's"
+    units = {'coils': '1', 'eps': '1', 'eps_quadrature': '1', 'mutual': '1'}
+    plausible = {'eps': (-0.5, 0.5)}
+    remedy = Remedy.FLUX
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """Every ordered pair, and every pair both ways."""
+        coils = range(scene.emitters)
+        one_way = [Term(self, {'coils': p}, np.zeros(2)) for p in permutations(coils, 2)]
+        both = [
+            Term(self, {'coils': p, 'mutual': True}, np.zeros(1)) for p in combinations(coils, 2)
+        ]
+        return one_way + both
+
+    def prior(self, term: Term) -> Array:
+        """Some percent."""
+        return np.full(term.theta.size, 0.1)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """The source's flux in the other tone."""
+        source, target = term.site['coils']
+        own = np.einsum(
+            'ab,fsb->fsa', np.linalg.inv(self._matrix(term, view.omega.size)), view.linear
+        )
+        out = view.columns(term.theta.size)
+        out[:, :, target, 0] = own[:, :, source]
+        if term.site.get('mutual'):
+            out[:, :, source, 0] = own[:, :, target]
+        else:
+            out[:, :, target, 1] = 1j * own[:, :, source]
+        return out
+
+    def _matrix(self, term: Term, emitters: int) -> ComplexArray:
+        source, target = term.site['coils']
+        matrix = unit_matrix(emitters)
+        if term.site.get('mutual'):
+            matrix[target, source] = matrix[source, target] = term.theta[0]
+        else:
+            matrix[target, source] = complex(*term.theta)
+        return matrix
+
+    def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
+        """One entry, or two."""
+        return self._matrix(term, omega.size)[None]
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Source, target and share."""
+        sigma = sigmas(covariance)
+        parameters = {'coils': list(term.site['coils']), 'eps': float(term.theta[0])}
+        uncertainty = {'eps': float(sigma[0])}
+        if term.site.get('mutual'):
+            parameters['mutual'] = True
+        else:
+            parameters['eps_quadrature'] = float(term.theta[1])
+            uncertainty['eps_quadrature'] = float(sigma[1])
+        return EffectRecord(self.name, parameters, uncertainty)
+
+    def term(self, record: EffectRecord) -> Term:
+        """From source, target and share."""
+        coils = tuple(int(c) for c in needed(record, 'coils'))
+        eps = float(needed(record, 'eps'))
+        if record.parameters.get('mutual'):
+            return Term(self, {'coils': coils, 'mutual': True}, np.array([eps]))
+        across = float(record.parameters.get('eps_quadrature', 0.0))
+        return Term(self, {'coils': coils}, np.array([eps, across]))
+
+
+EFFECTS = (CoilCrosstalk(),)

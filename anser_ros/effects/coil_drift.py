@@ -1,0 +1,117 @@
+"""An emitter's strength changes with time, as its copper or its driver warms up."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+    sigmas,
+    unit_matrix,
+)  # fmt: skip
+from anser_ros.fitting.model import EffectRecord
+
+PROBED_SHARES = (0.1, 0.5, 2.5)
+"""Time constants of the probe, as shares of the session."""
+
+
+def _shape(time: Array, tau: float) -> Array:
+    return np.asarray(1 - np.exp(-np.maximum(time, 0.0) / tau))
+
+
+class CoilDrift(Effect):
+    """theta: amount (final relative change) and log(tau / s): 1 + amount (1 - exp(-t/tau))."""
+
+    name = 'coil_drift'
+    summary = "an emitter's strength changes with time"
+    units = {'coil': '1', 'amount': '1', 'tau_s': 's'}
+    plausible = {'amount': (-0.5, 0.5), 'tau_s': (0.5, 1000.0)}
+    remedy = Remedy.FLUX
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """Every emitter."""
+        tau = 0.5 * max(scene.duration, 1.0)
+        return [
+            Term(self, {'coil': k, '_duration': scene.duration}, np.array([0.0, np.log(tau)]))
+            for k in range(scene.emitters)
+        ]
+
+    def prior(self, term: Term) -> Array:
+        """Some percent; a time constant known to a factor of five."""
+        return np.array([0.1, 1.6])
+
+    def _own(self, term: Term, view: View) -> ComplexArray:
+        coil, (amount, log_tau) = term.site['coil'], term.theta
+        factor = 1 + amount * _shape(view.time, float(np.exp(log_tau)))
+        return np.asarray(view.linear[:, :, coil] / factor[:, None])
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """The emitter's flux times the derivatives of the curve."""
+        amount, log_tau = term.theta
+        tau = float(np.exp(log_tau))
+        own, late = self._own(term, view), np.maximum(view.time, 0.0) / tau
+        out = view.columns(2)
+        out[:, :, term.site['coil'], 0] = own * _shape(view.time, tau)[:, None]
+        out[:, :, term.site['coil'], 1] = own * (-amount * late * np.exp(-late))[:, None]
+        return out
+
+    def probe(self, term: Term, view: View) -> ComplexArray | None:
+        """Curves of three time constants."""
+        own = self._own(term, view)
+        out = view.columns(len(PROBED_SHARES))
+        for i, share in enumerate(PROBED_SHARES):
+            curve = _shape(view.time, share * max(term.site['_duration'], 1.0))
+            out[:, :, term.site['coil'], i] = own * curve[:, None]
+        return out
+
+    def started(self, term: Term, solution: Array) -> Sequence[Term]:
+        """The time constant whose curve comes nearest to the probe's sum."""
+        duration = max(term.site['_duration'], 1.0)
+        time = np.linspace(0.0, duration, 60)
+        curves = [_shape(time, share * duration) for share in PROBED_SHARES]
+        wanted = sum(a * c for a, c in zip(solution, curves, strict=True))
+        best: tuple[float, Array] | None = None
+        for tau in duration * np.geomspace(0.03, 5.0, 25):
+            curve = _shape(time, float(tau))
+            amount = float(curve @ wanted / (curve @ curve))
+            misfit = float(np.sum((wanted - amount * curve) ** 2))
+            if best is None or misfit < best[0]:
+                best = (misfit, np.array([amount, np.log(tau)]))
+        return (term.with_theta(best[1] if best else term.theta),)
+
+    def bounded(self, term: Term) -> Term:
+        """Time constants from half a second to a quarter of an hour."""
+        amount, log_tau = term.theta
+        return term.with_theta(np.array([amount, np.clip(log_tau, np.log(0.3), np.log(1500.0))]))
+
+    def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
+        """Diagonal, by time."""
+        amount, log_tau = term.theta
+        matrix = np.repeat(unit_matrix(omega.size)[None], time.size, axis=0)
+        coil = term.site['coil']
+        matrix[:, coil, coil] = 1 + amount * _shape(time, float(np.exp(log_tau)))
+        return matrix
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Amount and time constant."""
+        sigma, tau = sigmas(covariance), float(np.exp(term.theta[1]))
+        return EffectRecord(
+            self.name,
+            {'coil': term.site['coil'], 'amount': float(term.theta[0]), 'tau_s': tau},
+            {'amount': float(sigma[0]), 'tau_s': tau * float(sigma[1])},
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From amount and time constant."""
+        theta = np.array([float(needed(record, 'amount')), np.log(float(needed(record, 'tau_s')))])
+        return Term(self, {'coil': int(needed(record, 'coil')), '_duration': 40.0}, theta)
+
+
+EFFECTS = (CoilDrift(),)

@@ -1,0 +1,78 @@
+"""An emitter is stronger or weaker than the model has it, all the time."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+    unit_matrix,
+)  # fmt: skip
+from anser_ros.fitting.model import EffectRecord
+
+
+class CoilGain(Effect):
+    """theta: real and imaginary part of (gain - 1)."""
+
+    name = 'coil_gain'
+    summary = "an emitter's strength is not the calibrated one"
+    units = {'coil': '1', 'gain': '1', 'phase_deg': 'deg'}
+    plausible = {'gain': (0.2, 3.0), 'phase_deg': (-60.0, 60.0)}
+    remedy = Remedy.FLUX
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """Every emitter."""
+        return [Term(self, {'coil': k}, np.zeros(2)) for k in range(scene.emitters)]
+
+    def prior(self, term: Term) -> Array:
+        """Some ten percent."""
+        return np.full(2, 0.3)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """The emitter's own flux."""
+        own = view.linear[:, :, term.site['coil']] / (1 + complex(*term.theta))
+        out = view.columns(2)
+        out[:, :, term.site['coil'], 0], out[:, :, term.site['coil'], 1] = own, 1j * own
+        return out
+
+    def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
+        """Diagonal."""
+        matrix = unit_matrix(omega.size)
+        matrix[term.site['coil'], term.site['coil']] = 1 + complex(*term.theta)
+        return matrix[None]
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Gain and phase."""
+        gain = 1 + complex(*term.theta)
+        turn = np.array([gain.real, gain.imag]) / abs(gain)
+        across = np.array([-turn[1], turn[0]]) / abs(gain)
+        return EffectRecord(
+            self.name,
+            {
+                'coil': term.site['coil'],
+                'gain': abs(gain),
+                'phase_deg': float(np.degrees(np.angle(gain))),
+            },
+            {
+                'gain': float(np.sqrt(turn @ covariance @ turn)),
+                'phase_deg': float(np.degrees(np.sqrt(across @ covariance @ across))),
+            },
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From gain and phase."""
+        gain = float(needed(record, 'gain')) * np.exp(
+            1j * np.radians(float(record.parameters.get('phase_deg', 0.0)))
+        )
+        theta = np.array([gain.real - 1, gain.imag])
+        return Term(self, {'coil': int(needed(record, 'coil'))}, theta)
+
+
+EFFECTS = (CoilGain(),)

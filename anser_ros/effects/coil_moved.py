@@ -1,0 +1,72 @@
+"""An emitter is not where the model has it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from anser_ros.effects.dipoles import Dipoles
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+    sigmas,
+)  # fmt: skip
+from anser_ros.fitting.model import EffectRecord
+
+
+class CoilMoved(Effect):
+    """theta: shift of one emitter, m, frame fg."""
+
+    name = 'coil_moved'
+    summary = 'an emitter is not where the model has it'
+    units = {'coil': '1', 'shift_m': 'm'}
+    plausible = {'shift_m': (-0.03, 0.03)}
+    remedy = Remedy.FIELD
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """Every emitter."""
+        return [Term(self, {'coil': k}, np.zeros(3)) for k in range(scene.emitters)]
+
+    def prior(self, term: Term) -> Array:
+        """Some millimetres."""
+        return np.full(3, 3e-3)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Moving the source is moving the sensor the other way."""
+        coil = term.site['coil']
+        out = view.columns(3)
+        out[:, :, coil] = -np.moveaxis(view.d_position[..., coil], 2, -1)
+        return out
+
+    def sources(
+        self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
+    ) -> Dipoles | None:
+        """The emitter at its new place, less the one at the old."""
+        only = np.zeros_like(base.moments)
+        only[:, term.site['coil']] = base.moments[:, term.site['coil']]
+        used = np.flatnonzero(np.abs(only).any(axis=1))
+        place, direction, moment = base.positions[used], base.directions[used], only[used]
+        return Dipoles(place + term.theta, direction, moment).joined(
+            Dipoles(place, direction, -moment)
+        )
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """The shift."""
+        return EffectRecord(
+            self.name,
+            {'coil': term.site['coil'], 'shift_m': term.theta.tolist()},
+            {'shift_m': sigmas(covariance).tolist()},
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From the shift."""
+        shift = np.asarray(needed(record, 'shift_m'), dtype=np.float64)
+        return Term(self, {'coil': int(needed(record, 'coil'))}, shift)
+
+
+EFFECTS = (CoilMoved(),)

@@ -1,0 +1,73 @@
+"""Eddy currents of a thin square sheet, on a mesh of square loops.
+
+Loop i of a mesh of edge h obeys ``sum_j (R_ij + j w M_ij) I_j = -j w Phi_i``: M from Neumann's
+formula for parallel filaments (the mean distance of a strip of width h from itself is 0.2235 h,
+Grover, Inductance Calculations, 1946, ch. 3), R from the sheet resistance, one square an edge.
+"""
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.dipoles import Dipoles
+from anser_ros.physics.constants import MU_0
+
+Array = NDArray[np.float64]
+
+STRIP = 0.2235
+
+
+def _parallel(ahead: Array, aside: Array) -> Array:
+    """Mutual inductance over mu0/(4 pi) of two unit filaments, offset ahead and aside."""
+    distance = np.where(aside == 0, STRIP, np.abs(aside))
+
+    def part(u: Array) -> Array:
+        return np.asarray(u * np.arcsinh(u / distance) - np.sqrt(u**2 + distance**2))
+
+    return np.asarray(part(ahead + 1) + part(ahead - 1) - 2 * part(ahead))
+
+
+@cache
+def unit_mesh(count: int) -> tuple[Array, Array]:
+    """Inductance (H at an edge of 1 m) and resistance (at 1 ohm a square) of a count^2 mesh."""
+    i, j = np.meshgrid(np.arange(count * 1.0), np.arange(count * 1.0), indexing='ij')
+    table = sum(
+        2 * _parallel(a, b) - _parallel(a, b + 1) - _parallel(a, b - 1)
+        for a, b in ((i, j), (j, i))
+    )
+    row, column = np.divmod(np.arange(count * count), count)
+    di, dj = np.abs(row[:, None] - row), np.abs(column[:, None] - column)
+    inductance = MU_0 / (4 * np.pi) * np.asarray(table)[di, dj]
+    resistance = 4.0 * (di + dj == 0) - 1.0 * (di + dj == 1)
+    return inductance, resistance
+
+
+def sheet_sources(
+    centre: Array, edges: Array, sheet_ohm: float, count: int, illumination: Dipoles, omega: Array
+) -> Dipoles:
+    """Loops of a sheet parallel to the board, as dipoles along z.
+
+    Parameters
+    ----------
+    centre : ndarray, shape (3,)
+        m.
+    edges : ndarray, shape (2,)
+        Along x and y, m; the mesh is scaled with their geometric mean.
+    sheet_ohm : float
+        Resistance of a square.
+    count : int
+        Loops along an edge.
+    """
+    inductance, resistance = unit_mesh(count)
+    steps = (np.arange(count) + 0.5) / count - 0.5
+    x, y = np.meshgrid(steps * edges[0], steps * edges[1], indexing='ij')
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1) + centre
+    area = float(edges[0] * edges[1]) / count**2
+    flux = illumination.field(points)[:, 2] * area
+    current = np.empty_like(flux)
+    for k, w in enumerate(omega):
+        system = inductance * np.sqrt(area) + resistance * (sheet_ohm / (1j * w))
+        current[:, k] = -np.linalg.solve(system, flux[:, k])
+    up = np.tile([0.0, 0.0, 1.0], (points.shape[0], 1))
+    return Dipoles(points, up, current * area)

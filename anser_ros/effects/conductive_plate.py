@@ -1,0 +1,125 @@
+"""A metal sheet parallel to the board."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from anser_ros.effects.conducting_sheet import sheet_sources
+from anser_ros.effects.dipoles import Dipoles
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+    sigmas,
+)  # fmt: skip
+from anser_ros.fitting.model import EffectRecord
+
+MESH = 12
+STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])
+TYPICAL_OHM = 3e-5
+"""A millimetre of aluminium."""
+
+
+class ConductivePlate(Effect):
+    """theta: height z, edge, centre x and y (m), log of the sheet resistance (ohm)."""
+
+    name = 'conductive_plate'
+    summary = 'a metal sheet lies parallel to the board'
+    units = {'z_m': 'm', 'edge_m': 'm', 'centre_m': 'm', 'sheet_ohm': 'ohm'}
+    plausible = {'z_m': (-1.0, 1.0), 'edge_m': (0.02, 2.0), 'sheet_ohm': (1e-7, 1.0)}
+    remedy = Remedy.FIELD
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """Heights below the board and above the volume, two sizes."""
+        size = float(np.max(scene.board[1, :2] - scene.board[0, :2]))
+        middle = scene.board.mean(axis=0)
+        below = scene.board[0, 2] - size * np.array([0.08, 0.16, 0.26, 0.4, 0.6])
+        above = scene.working_volume[1, 2] + size * np.array([0.25, 0.5])
+        return [
+            Term(
+                self,
+                {'z': float(z), 'edge': float(edge)},
+                np.array([z, edge, middle[0], middle[1], np.log(TYPICAL_OHM)]),
+            )
+            for z in (*below, *above)
+            for edge in (0.6 * size, size, 1.8 * size)
+        ]
+
+    def prior(self, term: Term) -> Array:
+        """Anywhere near the board; sheet resistances over decades."""
+        return np.array([0.1, 0.2, 0.1, 0.1, 3.0])
+
+    def bounded(self, term: Term) -> Term:
+        """Edges and resistances that exist."""
+        theta = term.theta.copy()
+        theta[1] = np.clip(theta[1], 0.02, 2.0)
+        theta[4] = np.clip(theta[4], np.log(1e-7), 0.0)
+        return term.with_theta(theta)
+
+    def sources(
+        self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
+    ) -> Dipoles | None:
+        """The loops of the sheet; none where no amount has been set yet."""
+        z, edge, x, y, log_ohm = term.theta
+        centre, edges = np.array([x, y, z]), np.array([edge, edge])
+        return sheet_sources(centre, edges, float(np.exp(log_ohm)), MESH, illumination, omega)
+
+    def _flux(self, theta: Array, view: View) -> ComplexArray:
+        added = self.sources(Term(self, {}, theta), view.dipoles, view.illumination, view.omega)
+        assert added is not None
+        return view.along(added.flux(*view.flat))
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """By differences."""
+        parts = [
+            (self._flux(term.theta + step, view) - self._flux(term.theta - step, view))
+            / (2 * STEPS[i])
+            for i, step in enumerate(np.diag(STEPS))
+        ]
+        return np.stack(parts, axis=-1)
+
+    def probe(self, term: Term, view: View) -> ComplexArray | None:
+        """A sheet of this height and size, any strength and phase."""
+        unit = self._flux(term.theta, view)
+        return np.stack([unit, 1j * unit], axis=-1)
+
+    def started(self, term: Term, solution: Array) -> Sequence[Term]:
+        """The sheet as probed."""
+        return (term,)
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Height, size, centre and resistance."""
+        z, edge, x, y, log_ohm = (float(v) for v in term.theta)
+        sigma, ohm = sigmas(covariance), float(np.exp(log_ohm))
+        return EffectRecord(
+            self.name,
+            {'z_m': z, 'edge_m': edge, 'centre_m': [x, y], 'sheet_ohm': ohm},
+            {
+                'z_m': float(sigma[0]),
+                'edge_m': float(sigma[1]),
+                'centre_m': sigma[2:4].tolist(),
+                'sheet_ohm': ohm * float(sigma[4]),
+            },
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From height, size, centre and resistance."""
+        x, y = needed(record, 'centre_m')
+        theta = np.array(
+            [
+                float(needed(record, 'z_m')),
+                float(needed(record, 'edge_m')),
+                float(x),
+                float(y),
+                np.log(float(needed(record, 'sheet_ohm'))),
+            ]
+        )
+        return Term(self, {}, theta)
+
+
+EFFECTS = (ConductivePlate(),)

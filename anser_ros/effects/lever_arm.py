@@ -1,0 +1,68 @@
+"""The sensors sit elsewhere in the body's frame than the setup says."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+    sigmas,
+)  # fmt: skip
+from anser_ros.fitting.model import EffectRecord
+from anser_ros.physics.sensor import SensorTable
+
+
+class LeverArm(Effect):
+    """theta: offset of all of a body's sensors in the body's frame, m."""
+
+    name = 'lever_arm'
+    summary = "the sensors sit elsewhere in the body's frame"
+    units = {'offset_m': 'm', 'body': '1'}
+    plausible = {'offset_m': (-0.03, 0.03)}
+    remedy = Remedy.SENSORS
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """Every body."""
+        return [
+            Term(self, {'body': table.body[0]}, np.zeros(3)) for table in scene.tools if len(table)
+        ]
+
+    def prior(self, term: Term) -> Array:
+        """Some millimetres."""
+        return np.full(3, 5e-3)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Derivative by the centres, along the body's axes."""
+        if view.is_reference or view.sensors.body[0] != term.site['body']:
+            return None
+        return np.asarray(np.einsum('fsik,fij->fskj', view.d_position, view.rotation))
+
+    def table(self, term: Term, sensors: SensorTable) -> SensorTable:
+        """Sensors moved in their body."""
+        rows = np.array([body == term.site['body'] for body in sensors.body])
+        return sensors.with_geometry(
+            position=sensors.position + rows[:, None] * term.theta[None, :]
+        )
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """The offset."""
+        return EffectRecord(
+            self.name,
+            {'offset_m': term.theta.tolist(), 'body': term.site['body']},
+            {'offset_m': sigmas(covariance).tolist()},
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From the offset."""
+        offset = np.asarray(needed(record, 'offset_m'), dtype=np.float64)
+        return Term(self, {'body': str(needed(record, 'body'))}, offset)
+
+
+EFFECTS = (LeverArm(),)

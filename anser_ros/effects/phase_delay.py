@@ -1,0 +1,61 @@
+"""A common acquisition delay turns all phasors, the faster the higher their frequency."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+)  # fmt: skip
+from anser_ros.fitting.model import EffectRecord
+
+UNIT = 1e-6
+"""theta counts microseconds."""
+
+
+class PhaseDelay(Effect):
+    """theta: delay, us: a phasor at w becomes exp(-j w delay) times itself."""
+
+    name = 'phase_delay'
+    summary = 'a common acquisition delay turns all phasors'
+    units = {'delay_s': 's'}
+    plausible = {'delay_s': (-5e-5, 5e-5)}
+    remedy = Remedy.FLUX
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """One delay for all channels."""
+        return [Term(self, {}, np.zeros(1))]
+
+    def prior(self, term: Term) -> Array:
+        """Some microseconds."""
+        return np.full(1, 5.0)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Minus j w times the flux."""
+        return np.asarray((-1j * UNIT * view.omega * view.linear)[..., None])
+
+    def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
+        """Diagonal."""
+        return np.diag(np.exp(-1j * omega * term.theta[0] * UNIT))[None]
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """The delay."""
+        return EffectRecord(
+            self.name,
+            {'delay_s': UNIT * float(term.theta[0])},
+            {'delay_s': UNIT * float(np.sqrt(covariance[0, 0]))},
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From the delay."""
+        return Term(self, {}, np.array([float(needed(record, 'delay_s')) / UNIT]))
+
+
+EFFECTS = (PhaseDelay(),)

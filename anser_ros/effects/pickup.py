@@ -1,0 +1,83 @@
+"""A constant phasor is added to a channel: cables, or drive that couples into sense."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+    sigmas,
+)  # fmt: skip
+from anser_ros.fitting.model import EffectRecord
+
+UNIT = 1e-9
+"""theta counts nanotesla."""
+
+
+class Pickup(Effect):
+    """theta: real, then imaginary parts of one channel's phasors, nT."""
+
+    name = 'pickup'
+    summary = 'a constant phasor is added to a channel'
+    units = {'channel': '1', 'phasor_t': 'T (re, im of every emitter)', 'rms_t': 'T'}
+    plausible = {'rms_t': (0.0, 1e-6)}
+    remedy = Remedy.FLUX
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """Every channel."""
+        return [Term(self, {'channel': c}, np.zeros(2 * scene.emitters)) for c in scene.channels]
+
+    def prior(self, term: Term) -> Array:
+        """Some tens of nanotesla."""
+        return np.full(term.theta.size, 30.0)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Ones, a column a part and emitter."""
+        row = view.row(term.site['channel'])
+        if row is None:
+            return None
+        emitters = view.omega.size
+        out = view.columns(2 * emitters)
+        for k in range(emitters):
+            out[:, row, k, k], out[:, row, k, emitters + k] = UNIT, 1j * UNIT
+        return out
+
+    def _phasor(self, term: Term) -> ComplexArray:
+        parts = term.theta.reshape(2, -1) * UNIT
+        return np.asarray(parts[0] + 1j * parts[1])
+
+    def offset(self, term: Term, channels: NDArray[np.int64], emitters: int) -> ComplexArray:
+        """The phasor in its row."""
+        out = np.zeros((channels.size, emitters), dtype=complex)
+        out[channels == term.site['channel']] = self._phasor(term)
+        return out
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Phasors and their size."""
+        phasor, sigma = self._phasor(term), sigmas(covariance).reshape(2, -1) * UNIT
+        rms = float(np.sqrt(np.mean(np.abs(phasor) ** 2)))
+        return EffectRecord(
+            self.name,
+            {
+                'channel': term.site['channel'],
+                'phasor_t': [[float(p.real), float(p.imag)] for p in phasor],
+                'rms_t': rms,
+            },
+            {'phasor_t': sigma.T.tolist(), 'rms_t': float(np.sqrt(np.mean(sigma**2)))},
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From the phasors."""
+        parts = np.asarray(needed(record, 'phasor_t'), dtype=np.float64)
+        return Term(self, {'channel': int(needed(record, 'channel'))}, parts.T.ravel() / UNIT)
+
+
+EFFECTS = (Pickup(),)

@@ -1,0 +1,180 @@
+"""What the sensors of a body should read, when a list of effects holds: the forward chain."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.dipoles import Dipoles
+from anser_ros.effects.effect import Term, View
+from anser_ros.fitting.measurements import Measurements
+from anser_ros.physics.dipole import flux_jacobian
+from anser_ros.physics.pose_track import PoseTrack
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+LONGEST_GAP_S = 0.25
+VELOCITY_STEP_S = 0.02
+
+
+@dataclass(frozen=True)
+class Fields:
+    """The fields that a prediction starts from.
+
+    Attributes
+    ----------
+    model : Dipoles
+        Good where tool sensors were calibrated.
+    illumination : Dipoles
+        Good beside and below the board: what metal and reference sensors see.
+    omega : ndarray, shape (K,)
+        rad/s.
+    """
+
+    model: Dipoles
+    illumination: Dipoles
+    omega: Array
+
+
+def tool_view(body: Measurements, terms: Sequence[Term], fields: Fields) -> View:
+    """Predict a tool's fluxes; frames without a pose get NaN poses and fluxes.
+
+    Raises
+    ------
+    FloatingPointError
+        Never on purpose: a frame without a pose must be left out by the caller.
+    """
+    position, rotation, velocity = _poses(body, terms)
+    sensors = body.sensors
+    for term in terms:
+        sensors = term.effect.table(term, sensors)
+    centres, axes = sensors.placed(position, rotation)
+    dipoles = _with_sources(fields.model, terms, fields)
+    lengths = np.tile(sensors.length, body.time.size)
+    flux, d_position, d_axis = flux_jacobian(
+        centres.reshape(-1, 3), axes.reshape(-1, 3), lengths,
+        dipoles.positions, dipoles.directions, dipoles.moments,
+    )  # fmt: skip
+    shape = (body.time.size, len(sensors))
+    view = View(
+        time=body.time, sensors=sensors, position=position, rotation=rotation, velocity=velocity,
+        centres=centres, axes=axes, linear=flux.reshape(*shape, -1),
+        flux=flux.reshape(*shape, -1), d_position=d_position.reshape(*shape, 3, -1),
+        d_axis=d_axis.reshape(*shape, 3, -1), dipoles=dipoles, illumination=fields.illumination,
+        omega=fields.omega, is_reference=False,
+    )  # fmt: skip
+    return _measured(_with_motion(view, terms), terms)
+
+
+def reference_view(
+    reference: Measurements, baseline: ComplexArray, terms: Sequence[Term], fields: Fields
+) -> View:
+    """Predict the reference sensors: their clean readings (S, K) and what the effects change."""
+    sensors, frames = reference.sensors, reference.time.size
+    base = fields.illumination
+    added = _with_sources(Dipoles.none(base.moments.shape[1]), terms, fields, base)
+    flux, d_position, d_axis = flux_jacobian(
+        sensors.position, sensors.axis, sensors.length,
+        base.positions, base.directions, base.moments,
+    )  # fmt: skip
+    change = (
+        added.flux(sensors.position, sensors.axis, sensors.length)
+        if added.positions.shape[0]
+        else np.zeros_like(flux)
+    )
+    shape = (frames, *change.shape)
+    eye = np.broadcast_to(np.eye(3), (frames, 3, 3))
+    linear = np.broadcast_to(baseline + change, shape)
+    view = View(
+        time=reference.time, sensors=sensors, position=np.zeros((frames, 3)), rotation=eye,
+        velocity=np.zeros((frames, 6)),
+        centres=np.broadcast_to(sensors.position, (frames, len(sensors), 3)),
+        axes=np.broadcast_to(sensors.axis, (frames, len(sensors), 3)),
+        linear=linear, flux=linear,
+        d_position=np.broadcast_to(d_position, (frames, *d_position.shape)),
+        d_axis=np.broadcast_to(d_axis, (frames, *d_axis.shape)),
+        dipoles=base.joined(added), illumination=base, omega=fields.omega, is_reference=True,
+    )  # fmt: skip
+    return _measured(_with_motion(view, terms), terms)
+
+
+def true_track(track: PoseTrack, terms: Sequence[Term]) -> PoseTrack:
+    """The optical track on the fluxes' clock and in fg."""
+    for term in terms:
+        track = term.effect.optical(term, track)
+    return track
+
+
+def _poses(body: Measurements, terms: Sequence[Term]) -> tuple[Array, Array, Array]:
+    """Position (F, 3), rotation (F, 3, 3) and velocity (F, 6) by the corrected track."""
+    if body.track is None:
+        return body.position, body.rotation, np.zeros((body.time.size, 6))
+    track = true_track(body.track, terms)
+    inside = np.clip(body.time, track.time[0], track.time[-1])
+    position, rotation, _ = track.at(inside, np.inf)
+    low = np.clip(inside - VELOCITY_STEP_S, track.time[0], track.time[-1])
+    high = np.clip(inside + VELOCITY_STEP_S, track.time[0], track.time[-1])
+    before, turned_before, _ = track.at(low, np.inf)
+    after, turned_after, _ = track.at(high, np.inf)
+    span = np.maximum(high - low, 1e-9)[:, None]
+    turn = turned_after @ turned_before.transpose(0, 2, 1)
+    spin = 0.5 * np.stack(
+        [
+            turn[:, 2, 1] - turn[:, 1, 2],
+            turn[:, 0, 2] - turn[:, 2, 0],
+            turn[:, 1, 0] - turn[:, 0, 1],
+        ],
+        axis=1,
+    )
+    return position, rotation, np.concatenate([after - before, spin], axis=1) / span
+
+
+def _with_sources(
+    start: Dipoles, terms: Sequence[Term], fields: Fields, base: Dipoles | None = None
+) -> Dipoles:
+    out = start
+    for term in terms:
+        added = term.effect.sources(term, base or fields.model, fields.illumination, fields.omega)
+        if added is not None:
+            out = out.joined(added)
+    return out
+
+
+def _with_motion(view: View, terms: Sequence[Term]) -> View:
+    """Add what moves in fg (its gradient is left out: it is a small part of the field's)."""
+    for term in terms:
+        if term.effect.moving:
+            linear = view.linear + term.effect.moving_flux(term, view)
+            view = replace(view, linear=linear, flux=linear)
+    return view
+
+
+def _measured(view: View, terms: Sequence[Term]) -> View:
+    """Emitters, channels, offsets and compression."""
+    linear, d_position, d_axis = view.linear, view.d_position, view.d_axis
+    channels = view.sensors.channel
+    for term in terms:
+        matrix = term.effect.emitter_matrix(term, view.time, view.omega)
+        if matrix is not None:
+            linear = np.einsum('fab,fsb->fsa', _frames(matrix, view), linear)
+            d_position = np.einsum('fab,fsib->fsia', _frames(matrix, view), d_position)
+            d_axis = np.einsum('fab,fsib->fsia', _frames(matrix, view), d_axis)
+    for term in terms:
+        mixing = term.effect.channel_matrix(term, channels)
+        if mixing is not None:
+            linear = np.einsum('st,ftk->fsk', mixing, linear)
+            d_position = np.einsum('st,ftik->fsik', mixing, d_position)
+            d_axis = np.einsum('st,ftik->fsik', mixing, d_axis)
+    flux = linear
+    for term in terms:
+        added = term.effect.offset(term, channels, view.omega.size)
+        flux = flux if added is None else flux + added
+    for term in terms:
+        flux = term.effect.compress(term, channels, flux)
+    return replace(view, linear=linear, flux=flux, d_position=d_position, d_axis=d_axis)
+
+
+def _frames(matrix: ComplexArray, view: View) -> ComplexArray:
+    return np.broadcast_to(matrix, (view.time.size, *matrix.shape[1:]))

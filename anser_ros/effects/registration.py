@@ -1,0 +1,84 @@
+"""The optical tracker's frame is not the field generator's."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+    sigmas,
+)  # fmt: skip
+from anser_ros.fitting.model import EffectRecord
+from anser_ros.physics.pose_track import PoseTrack
+
+
+class Registration(Effect):
+    """theta: rotation vector (rad) and translation (m): optical = R(theta) fg + t."""
+
+    name = 'registration'
+    summary = "the optical frame is not the field generator's"
+    units = {'rotation_deg': 'deg', 'translation_m': 'm'}
+    plausible = {'rotation_deg': (-10.0, 10.0), 'translation_m': (-0.05, 0.05)}
+    remedy = Remedy.OPTICAL
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """One frame for all bodies."""
+        return [Term(self, {}, np.zeros(6))] if scene.tools else []
+
+    def prior(self, term: Term) -> Array:
+        """About a degree, some millimetres."""
+        return np.repeat([0.02, 5e-3], 3)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """All sensors turned about fg's origin and moved, the other way round."""
+        if view.is_reference:
+            return None
+        back = Rotation.from_rotvec(term.theta[:3]).as_matrix().T
+        turn = np.cross(view.centres[..., :, None], view.d_position, axis=2)
+        turn = turn + np.cross(view.axes[..., :, None], view.d_axis, axis=2)
+        out = view.columns(6)
+        # To first order a further turn w of the optical frame turns the true pose by -R^T w.
+        out[..., :3] = -np.einsum('fsik,ij->fskj', turn, back)
+        out[..., 3:] = -np.einsum('fsik,ij->fskj', view.d_position, back)
+        return out
+
+    def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
+        """Poses in fg."""
+        back = Rotation.from_rotvec(term.theta[:3]).inv()
+        return PoseTrack(
+            track.time,
+            back.apply(track.position - term.theta[3:]),
+            (back * Rotation.from_quat(track.quaternion)).as_quat(),
+        )
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Rotation vector and translation."""
+        sigma = sigmas(covariance)
+        return EffectRecord(
+            self.name,
+            {
+                'rotation_deg': np.degrees(term.theta[:3]).tolist(),
+                'translation_m': term.theta[3:].tolist(),
+            },
+            {
+                'rotation_deg': np.degrees(sigma[:3]).tolist(),
+                'translation_m': sigma[3:].tolist(),
+            },
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From rotation and translation."""
+        turn = np.radians(np.asarray(needed(record, 'rotation_deg'), dtype=np.float64))
+        shift = np.asarray(needed(record, 'translation_m'), dtype=np.float64)
+        return Term(self, {}, np.concatenate([turn, shift]))
+
+
+EFFECTS = (Registration(),)

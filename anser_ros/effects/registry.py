@@ -1,0 +1,33 @@
+"""All effects, found by looking: a module in this package that defines `EFFECTS` is one.
+
+Adding an effect means adding its file; nothing else needs to know.
+"""
+
+import importlib
+import pkgutil
+from functools import cache
+
+import anser_ros.effects as package
+from anser_ros.effects.effect import Effect
+from anser_ros.errors import ModelFileError
+
+
+@cache
+def all_effects() -> dict[str, Effect]:
+    """Every effect by its name, in alphabetical order."""
+    found: dict[str, Effect] = {}
+    for info in pkgutil.iter_modules(package.__path__):
+        module = importlib.import_module(f'{package.__name__}.{info.name}')
+        for effect in getattr(module, 'EFFECTS', ()):
+            if effect.name in found:
+                raise ValueError(f'two effects are called {effect.name!r}')
+            found[effect.name] = effect
+    return dict(sorted(found.items()))
+
+
+def effect_named(name: str) -> Effect:
+    """The effect with a name; raises `ModelFileError` when there is none."""
+    try:
+        return all_effects()[name]
+    except KeyError:
+        raise ModelFileError(f'model: no effect is called {name!r}') from None

@@ -1,0 +1,114 @@
+"""A channel compresses large signals.
+
+The amplifier sees the sum of all tones, v(t), and gives fs tanh(v / fs). To third order this takes
+``(S / 2 - |V_k|^2 / 4) / fs^2`` of tone k away, where S is the sum of the squared amplitudes of all
+tones (trigonometric products of independent phases): the other tones count twice.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+)  # fmt: skip
+from anser_ros.fitting.model import EffectRecord
+
+UNIT = 1e12
+"""theta counts 1/fs^2 in units of 1/uT^2."""
+PHASES = 64
+
+
+def third_order(flux: ComplexArray) -> ComplexArray:
+    """What one unit of 1/fs^2 adds to fluxes (..., K), to third order."""
+    squared = np.abs(flux) ** 2
+    total = squared.sum(axis=-1, keepdims=True)
+    return np.asarray(-(0.5 * total - 0.25 * squared) * flux)
+
+
+def compressed(flux: ComplexArray, per_full_scale_squared: float) -> ComplexArray:
+    """Amplitudes (..., K) behind fs tanh(v / fs), averaged over the phases of the tones.
+
+    The third order is exact; what lies above it is an average over a fixed set of phases.
+    """
+    if per_full_scale_squared <= 0.0:
+        return np.asarray(flux + per_full_scale_squared * third_order(flux))
+    emitters = flux.shape[-1]
+    full_scale = 1 / np.sqrt(per_full_scale_squared)
+    phase = 2 * np.pi * qmc.Sobol(emitters, scramble=False).random(PHASES)
+    turn = np.exp(1j * phase)
+    x = np.einsum('...k,pk->...p', flux / full_scale, turn).real
+    rest = full_scale * (np.tanh(x) - x + x**3 / 3)
+    average = np.einsum('...p,pk->...k', rest, turn.conj()) * 2 / PHASES
+    return np.asarray(flux + per_full_scale_squared * third_order(flux) + average)
+
+
+class Saturation(Effect):
+    """theta: 1 / full_scale^2 in 1/uT^2."""
+
+    name = 'saturation'
+    summary = 'a channel compresses large signals'
+    units = {'channel': '1', 'full_scale_t': 'T'}
+    plausible = {'full_scale_t': (1e-8, 1e-3)}
+    remedy = Remedy.FLUX
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """Every channel of a tool; references don't see signals of different size."""
+        return [Term(self, {'channel': c}, np.zeros(1)) for c in scene.tool_channels]
+
+    def prior(self, term: Term) -> Array:
+        """Full scales down to the size of the signals."""
+        return np.full(1, 3.0)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """The third-order loss."""
+        row = view.row(term.site['channel'])
+        if row is None:
+            return None
+        out, own = view.columns(1), view.linear[:, row]
+        if term.theta[0] <= 0:
+            out[:, row, :, 0] = UNIT * third_order(own)
+        else:
+            step = 0.01 * term.theta[0]
+            more = compressed(own, UNIT * (term.theta[0] + step))
+            less = compressed(own, UNIT * (term.theta[0] - step))
+            out[:, row, :, 0] = (more - less) / (2 * step)
+        return out
+
+    def compress(
+        self, term: Term, channels: NDArray[np.int64], flux: ComplexArray
+    ) -> ComplexArray:
+        """The channel behind its amplifier."""
+        out = flux.copy()
+        for row in np.flatnonzero(channels == term.site['channel']):
+            out[:, row] = compressed(flux[:, row], UNIT * float(term.theta[0]))
+        return out
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Full scale."""
+        value = max(float(term.theta[0]), 1e-9)
+        full_scale = 1 / np.sqrt(UNIT * value)
+        relative = 0.5 * float(np.sqrt(covariance[0, 0])) / value
+        return EffectRecord(
+            self.name,
+            {'channel': term.site['channel'], 'full_scale_t': float(full_scale)},
+            {'full_scale_t': float(full_scale * relative)},
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From the full scale."""
+        full_scale = float(needed(record, 'full_scale_t'))
+        site = {'channel': int(needed(record, 'channel'))}
+        return Term(self, site, np.array([1 / (UNIT * full_scale**2)]))
+
+
+EFFECTS = (Saturation(),)

@@ -1,0 +1,131 @@
+"""A sensor's axis, or a whole triaxial cluster's frame, is not the surveyed one."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+    orthogonal_pair,
+    sigmas,
+)  # fmt: skip
+from anser_ros.errors import ModelFileError
+from anser_ros.fitting.model import EffectRecord
+from anser_ros.physics.sensor import SensorTable
+
+
+class SensorAxis(Effect):
+    """theta: one channel, two tangent steps (rad); a cluster, a rotation vector (rad, body)."""
+
+    name = 'sensor_axis'
+    summary = "a sensor's axis is not the surveyed one"
+    units = {'channel': '1', 'tilt_deg': 'deg', 'axis': '1', 'rotation_deg': 'deg'}
+    plausible = {'tilt_deg': (0.0, 30.0)}
+    remedy = Remedy.SENSORS
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """Every single tool sensor, and every cluster as a whole."""
+        axes = {
+            int(c): tuple(float(v) for v in a)
+            for table in scene.tools
+            for c, a in zip(table.channel, table.axis, strict=True)
+        }
+        terms = [
+            Term(self, {'channel': c, '_axis': axes[c]}, np.zeros(2)) for c in scene.tool_channels
+        ]
+        for cluster in scene.clusters():
+            if len(scene.tool_channels) > len(cluster) and len(cluster) > 1:
+                terms.append(Term(self, {'channels': cluster}, np.zeros(3)))
+        return terms
+
+    def prior(self, term: Term) -> Array:
+        """Some degrees."""
+        return np.full(term.theta.size, 0.1)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Derivative by the axis, along the tangents or across the cluster's turn."""
+        if view.is_reference:
+            return None
+        out = view.columns(term.theta.size)
+        if 'channel' in term.site:
+            row = view.row(term.site['channel'])
+            if row is None:
+                return None
+            pair = orthogonal_pair(np.array(term.site['_axis']))
+            steps = np.einsum('fij,tj->fti', view.rotation, pair)
+            out[:, row] = np.einsum('fik,fti->fkt', view.d_axis[:, row], steps)
+            return out
+        rows = [view.row(c) for c in term.site['channels']]
+        if any(row is None for row in rows):
+            return None
+        for row in rows:
+            axis = view.sensors.axis[row]
+            steps = np.einsum('fij,tj->fti', view.rotation, np.cross(np.eye(3), axis))
+            out[:, row] = np.einsum('fik,fti->fkt', view.d_axis[:, row], steps)
+        return out
+
+    def table(self, term: Term, sensors: SensorTable) -> SensorTable:
+        """Sensors with their true axes."""
+        axis = sensors.axis.copy()
+        if 'channel' in term.site:
+            for row in np.flatnonzero(sensors.channel == term.site['channel']):
+                axis[row] = self._tilted(term)
+        else:
+            turn = Rotation.from_rotvec(term.theta).as_matrix()
+            rows = np.isin(sensors.channel, term.site['channels'])
+            axis[rows] = axis[rows] @ turn.T
+        return sensors.with_geometry(axis=axis)
+
+    def _tilted(self, term: Term) -> Array:
+        surveyed = np.array(term.site['_axis'])
+        axis = surveyed + term.theta @ orthogonal_pair(surveyed)
+        return np.asarray(axis / np.linalg.norm(axis))
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Tilt and true axis, or the cluster's rotation."""
+        if 'channel' not in term.site:
+            return EffectRecord(
+                self.name,
+                {
+                    'channels': list(term.site['channels']),
+                    'rotation_deg': np.degrees(term.theta).tolist(),
+                },
+                {'rotation_deg': np.degrees(sigmas(covariance)).tolist()},
+            )
+        tilt = float(np.linalg.norm(term.theta))
+        unit = term.theta / max(tilt, 1e-12)
+        return EffectRecord(
+            self.name,
+            {
+                'channel': term.site['channel'],
+                'tilt_deg': float(np.degrees(np.arctan(tilt))),
+                'axis': self._tilted(term).tolist(),
+                'surveyed_axis': list(term.site['_axis']),
+            },
+            {'tilt_deg': float(np.degrees(np.sqrt(unit @ covariance @ unit)))},
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From the true axis or the rotation."""
+        if 'channels' in record.parameters:
+            theta = np.radians(np.asarray(needed(record, 'rotation_deg'), dtype=np.float64))
+            return Term(self, {'channels': tuple(record.parameters['channels'])}, theta)
+        surveyed = np.asarray(needed(record, 'surveyed_axis'), dtype=np.float64)
+        axis = np.asarray(needed(record, 'axis'), dtype=np.float64)
+        along = float(axis @ surveyed)
+        if along <= 0:
+            raise ModelFileError('model: sensor_axis turns an axis by a right angle or more')
+        theta = orthogonal_pair(surveyed) @ (axis / along)
+        site = {'channel': int(needed(record, 'channel')), '_axis': tuple(surveyed.tolist())}
+        return Term(self, site, theta)
+
+
+EFFECTS = (SensorAxis(),)

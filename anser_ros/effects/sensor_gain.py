@@ -1,0 +1,83 @@
+"""One sensor's complex gain is off."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+    unit_matrix,
+)  # fmt: skip
+from anser_ros.fitting.model import EffectRecord
+
+
+class SensorGain(Effect):
+    """theta: real and imaginary part of (gain - 1)."""
+
+    name = 'sensor_gain'
+    summary = "one sensor's gain is off"
+    units = {'channel': '1', 'gain': '1', 'phase_deg': 'deg'}
+    plausible = {'gain': (0.2, 3.0), 'phase_deg': (-60.0, 60.0)}
+    remedy = Remedy.FLUX
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """Every channel, references too."""
+        return [Term(self, {'channel': c}, np.zeros(2)) for c in scene.channels]
+
+    def prior(self, term: Term) -> Array:
+        """A gain is within some ten percent of one."""
+        return np.full(2, 0.3)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """The channel's own flux, in phase and turned by a quarter."""
+        row = view.row(term.site['channel'])
+        if row is None:
+            return None
+        out = view.columns(2)
+        gain = 1 + term.theta[0] + 1j * term.theta[1]
+        own = view.linear[:, row] / gain
+        out[:, row, :, 0], out[:, row, :, 1] = own, 1j * own
+        return out
+
+    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+        """Diagonal."""
+        matrix = unit_matrix(channels.size)
+        for row in np.flatnonzero(channels == term.site['channel']):
+            matrix[row, row] = 1 + term.theta[0] + 1j * term.theta[1]
+        return matrix
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Gain and phase."""
+        gain = complex(1 + term.theta[0], term.theta[1])
+        turn = np.array([gain.real, gain.imag]) / abs(gain)
+        sigma_gain = float(np.sqrt(turn @ covariance @ turn))
+        across = np.array([-turn[1], turn[0]]) / abs(gain)
+        sigma_phase = float(np.sqrt(across @ covariance @ across))
+        return EffectRecord(
+            self.name,
+            {
+                'channel': term.site['channel'],
+                'gain': abs(gain),
+                'phase_deg': float(np.degrees(np.angle(gain))),
+            },
+            {'gain': sigma_gain, 'phase_deg': float(np.degrees(sigma_phase))},
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From gain and phase."""
+        gain = float(needed(record, 'gain')) * np.exp(
+            1j * np.radians(float(record.parameters.get('phase_deg', 0.0)))
+        )
+        theta = np.array([gain.real - 1, gain.imag])
+        return Term(self, {'channel': int(needed(record, 'channel'))}, theta)
+
+
+EFFECTS = (SensorGain(),)

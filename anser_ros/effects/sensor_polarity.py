@@ -1,0 +1,33 @@
+"""Sensors that are wired the other way round."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term, needed
+from anser_ros.fitting.model import EffectRecord
+
+
+class SensorPolarity(Effect):
+    """No parameter: the channels' signs are turned round."""
+
+    name = 'sensor_polarity'
+    summary = 'a sensor is wired the other way round'
+    units = {'channels': '1'}
+    remedy = Remedy.FLUX
+
+    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+        """Diagonal of signs."""
+        signs = np.where(np.isin(channels, term.site['channels']), -1.0, 1.0)
+        return np.diag(signs).astype(complex)
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """The channels."""
+        return EffectRecord(self.name, {'channels': list(term.site['channels'])})
+
+    def term(self, record: EffectRecord) -> Term:
+        """From the channels."""
+        channels = tuple(int(c) for c in needed(record, 'channels'))
+        return Term(self, {'channels': channels})
+
+
+EFFECTS = (SensorPolarity(),)

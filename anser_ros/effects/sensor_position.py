@@ -1,0 +1,75 @@
+"""One sensor, or one cluster, sits elsewhere in the body than the others say."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+    sigmas,
+)  # fmt: skip
+from anser_ros.fitting.model import EffectRecord
+from anser_ros.physics.sensor import SensorTable
+
+
+class SensorPosition(Effect):
+    """theta: offset of some of a body's sensors in the body's frame, m."""
+
+    name = 'sensor_position'
+    summary = 'one sensor of a body sits elsewhere than surveyed'
+    units = {'channels': '1', 'offset_m': 'm'}
+    plausible = {'offset_m': (-0.03, 0.03)}
+    remedy = Remedy.SENSORS
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """Single sensors and clusters of bodies that carry more than those."""
+        groups: list[tuple[int, ...]] = []
+        for table in scene.tools:
+            if len(table) > 1:
+                groups += [(int(c),) for c in table.channel]
+                own = {int(c) for c in table.channel}
+                groups += [g for g in scene.clusters() if own > set(g)]
+        return [Term(self, {'channels': group}, np.zeros(3)) for group in groups]
+
+    def prior(self, term: Term) -> Array:
+        """Some millimetres."""
+        return np.full(3, 5e-3)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Derivative by the centres of those sensors, along the body's axes."""
+        rows = np.isin(view.sensors.channel, term.site['channels'])
+        if view.is_reference or not rows.any():
+            return None
+        out = view.columns(3)
+        out[:, rows] = np.einsum('fsik,fij->fskj', view.d_position[:, rows], view.rotation)
+        return out
+
+    def table(self, term: Term, sensors: SensorTable) -> SensorTable:
+        """Those sensors moved."""
+        rows = np.isin(sensors.channel, term.site['channels'])
+        return sensors.with_geometry(
+            position=sensors.position + rows[:, None] * term.theta[None, :]
+        )
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """The offset."""
+        return EffectRecord(
+            self.name,
+            {'channels': list(term.site['channels']), 'offset_m': term.theta.tolist()},
+            {'offset_m': sigmas(covariance).tolist()},
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From the offset."""
+        offset = np.asarray(needed(record, 'offset_m'), dtype=np.float64)
+        return Term(self, {'channels': tuple(needed(record, 'channels'))}, offset)
+
+
+EFFECTS = (SensorPosition(),)

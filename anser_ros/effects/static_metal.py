@@ -1,0 +1,132 @@
+"""A metal object near the volume, at rest."""
+
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+
+from anser_ros.effects.dipoles import Dipoles
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+    sigmas,
+)  # fmt: skip
+from anser_ros.effects.metal_body import UNIT, BodyShape, group_flux
+from anser_ros.fitting.model import EffectRecord
+
+BALL = BodyShape.ball()
+STEP = 1e-3
+CLOSEST = 0.02
+"""Metal that is searched keeps this distance (m) from where sensors were."""
+
+
+def places(scene: Scene) -> Array:
+    """Where metal is looked for: a grid about the board and the volume, shape (n, 3), m."""
+    low = np.minimum(scene.board[0], scene.working_volume[0])
+    high = np.maximum(scene.board[1], scene.working_volume[1])
+    size = float(np.max(high[:2] - low[:2]))
+    lateral = [np.linspace(low[i] - 0.2 * size, high[i] + 0.2 * size, 7) for i in (0, 1)]
+    below = scene.board[0, 2] - size * np.array([0.06, 0.14, 0.24, 0.38, 0.6])
+    above = scene.working_volume[1, 2] + size * np.array([0.2, 0.45])
+    beside = np.linspace(scene.board[1, 2], scene.working_volume[1, 2], 3)
+    grid = [(x, y, z) for z in (*below, *beside, *above) for x, y in product(*lateral)]
+    points = np.array(grid)
+    inside = np.all(
+        (points > scene.working_volume[0] - CLOSEST)
+        & (points < scene.working_volume[1] + CLOSEST),
+        axis=1,
+    )
+    on_board = np.all(
+        (points > scene.board[0] - [0, 0, 0.01]) & (points < scene.board[1] + [0, 0, 0.04]), axis=1
+    )
+    return points[~inside & ~on_board]
+
+
+class StaticMetal(Effect):
+    """theta: centre (m, 3), then real and imaginary parts of the groups' polarisabilities."""
+
+    name = 'static_metal'
+    summary = 'a metal object stands near the volume'
+    units = {'position_m': 'm', 'polarizability': 'm^3 (3x3, [re, im])'}
+    plausible = {'position_m': (-1.0, 1.0)}
+    remedy = Remedy.FIELD
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """A grid of places."""
+        return [
+            Term(
+                self,
+                {'place': tuple(float(v) for v in place)},
+                np.concatenate([place, np.zeros(2 * BALL.groups)]),
+            )
+            for place in places(scene)
+        ]
+
+    def prior(self, term: Term) -> Array:
+        """Anywhere; a few litres of metal at most."""
+        return np.concatenate([np.full(3, 0.1), np.full(2 * BALL.groups, 10.0)])
+
+    def _flux(self, centre: Array, alpha: Array, view: View) -> ComplexArray:
+        return BALL.sources(centre, alpha, view.illumination).flux(*view.flat)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """By place (differences) and by polarisability (exact)."""
+        centre, alpha = term.theta[:3], term.theta[3:]
+        out = view.columns(term.theta.size)
+        if np.any(alpha):
+            for i, step in enumerate(STEP * np.eye(3)):
+                more, less = (self._flux(centre + s, alpha, view) for s in (step, -step))
+                out[..., i] = view.along((more - less) / (2 * STEP))
+        points, moments = BALL.responses(centre, view.illumination)
+        unit = group_flux(points, moments, *view.flat).reshape(*view.flux.shape, -1)
+        groups = unit.shape[-1]
+        out[..., 3 : 3 + groups], out[..., 3 + groups :] = unit, 1j * unit
+        return out
+
+    def probe(self, term: Term, view: View) -> ComplexArray | None:
+        """One isotropic scatterer."""
+        points, moments = BodyShape.point().responses(term.theta[:3], view.illumination)
+        unit = group_flux(points, moments, *view.flat).reshape(*view.flux.shape, -1)
+        return np.concatenate([unit, 1j * unit], axis=-1)
+
+    def started(self, term: Term, solution: Array) -> Sequence[Term]:
+        """The scatterer at the centre, the shell and the tensors nothing yet."""
+        alpha = np.zeros((2, BALL.groups))
+        alpha[:, 0] = solution
+        return (term.with_theta(np.concatenate([term.theta[:3], alpha.ravel()])),)
+
+    def sources(
+        self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
+    ) -> Dipoles | None:
+        """Induced dipoles."""
+        if not np.any(term.theta[3:]):
+            return None
+        return BALL.sources(term.theta[:3], term.theta[3:], illumination)
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Place and whole polarisability."""
+        total = BALL.total(term.theta[3:])
+        return EffectRecord(
+            self.name,
+            {
+                'position_m': term.theta[:3].tolist(),
+                'polarizability': np.stack([total.real, total.imag], axis=-1).tolist(),
+                'groups': (UNIT * term.theta[3:]).tolist(),
+            },
+            {'position_m': sigmas(covariance)[:3].tolist()},
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From place and groups."""
+        place = np.asarray(needed(record, 'position_m'), dtype=np.float64)
+        alpha = np.asarray(needed(record, 'groups'), dtype=np.float64) / UNIT
+        return Term(self, {'place': tuple(place.tolist())}, np.concatenate([place, alpha]))
+
+
+EFFECTS = (StaticMetal(),)

@@ -1,0 +1,71 @@
+"""The optical tracker's clock is ahead of the fluxes', or behind."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+)  # fmt: skip
+from anser_ros.fitting.model import EffectRecord
+from anser_ros.physics.pose_track import PoseTrack
+
+
+def flux_rate(view: View) -> ComplexArray:
+    """Time derivative of the flux by the body's motion, (F, S, K), T/s."""
+    lever = view.centres - view.position[:, None, :]
+    moving = view.velocity[:, None, :3] + np.cross(view.velocity[:, None, 3:], lever)
+    turning = np.cross(view.velocity[:, None, 3:], view.axes)
+    return np.asarray(
+        np.einsum('fsik,fsi->fsk', view.d_position, moving)
+        + np.einsum('fsik,fsi->fsk', view.d_axis, turning)
+    )
+
+
+class TimeOffset(Effect):
+    """theta: at flux stamp t the optical pose stamped t - theta applies, s."""
+
+    name = 'time_offset'
+    summary = 'the optical stamps are early or late'
+    units = {'offset_s': 's'}
+    plausible = {'offset_s': (-0.5, 0.5)}
+    remedy = Remedy.OPTICAL
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """One offset for all bodies."""
+        return [Term(self, {}, np.zeros(1))] if scene.tools else []
+
+    def prior(self, term: Term) -> Array:
+        """A tenth of a second."""
+        return np.full(1, 0.1)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """Minus the flux's rate of change."""
+        return None if view.is_reference else -flux_rate(view)[..., None]
+
+    def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
+        """The track on the fluxes' clock."""
+        return replace(track, time=track.time + term.theta[0])
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """The offset."""
+        return EffectRecord(
+            self.name,
+            {'offset_s': float(term.theta[0])},
+            {'offset_s': float(np.sqrt(covariance[0, 0]))},
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From the offset."""
+        return Term(self, {}, np.array([float(needed(record, 'offset_s'))]))
+
+
+EFFECTS = (TimeOffset(),)
