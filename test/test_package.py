@@ -169,3 +169,14 @@ class TestConsole:
         assert cli.main([]) == 2
         assert cli.main(['--version']) == 0
         assert 'anser_ros' in capsys.readouterr().out
+
+    def test_a_reader_that_leaves_early_is_no_error(self):
+        """`anser --help | head -1` ends in peace."""
+        reading, writing = os.pipe()
+        os.close(reading)
+        command = [sys.executable, '-m', 'anser_ros.cli.main', '--help']
+        done = subprocess.run(
+            command, stdout=writing, stderr=subprocess.PIPE, cwd=REPO, check=False
+        )
+        os.close(writing)
+        assert (done.returncode, done.stderr) == (0, b'')

@@ -58,7 +58,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         0 done, 2 bad usage or bad input (one clear line on stderr), 1 a defect (a traceback).
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        code = _dispatch(list(sys.argv[1:] if argv is None else argv))
+        sys.stdout.flush()
+    except BrokenPipeError:  # whoever read the output has had enough
+        sys.stdout = open(os.devnull, 'w', encoding='utf-8')  # noqa: SIM115 - until the exit
+        return EXIT_OK
+    return code
+
+
+def _dispatch(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ('-h', '--help'):
         print(_usage())
         return EXIT_OK if arguments else EXIT_BAD_INPUT
@@ -104,9 +113,8 @@ def run_verb(name: str, arguments: Sequence[str]) -> int:
     except AnserError as error:
         print(f'anser {name}: {_one_line(error)}', file=sys.stderr)
         return EXIT_BAD_INPUT
-    except BrokenPipeError:  # whoever read our output has had enough
-        sys.stdout = open(os.devnull, 'w', encoding='utf-8')  # noqa: SIM115 - until exit
-        return EXIT_OK
+    except BrokenPipeError:
+        raise
     except OSError as error:
         # A file that is not there or can't be written is the caller's input, not a defect.
         if error.filename is None:
