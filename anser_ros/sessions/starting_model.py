@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from anser_ros.errors import ModelFileError, SetupError
+from anser_ros.errors import ModelFileError
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.nominal import nominal_model
-from anser_ros.physics.board import Board
+from anser_ros.physics.board import Board, build_board
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import Session
 from anser_ros.wire.setup import Setup
@@ -16,17 +16,14 @@ NOMINAL = 'nominal'
 def board_of(setup: Setup) -> Board:
     """The emitter's geometry; raises `SetupError` when its kind is unknown or a key is missing."""
     emitter = setup.emitter
-    try:
-        return Board.of(
-            kind=emitter.kind,
-            geometry=dict(emitter.geometry),
-            names=setup.emitter_names,
-            centres=np.array([coil.centre_m for coil in emitter.coils]),
-            rotations_deg=np.array([coil.rotation_deg for coil in emitter.coils]),
-            frequencies_hz=np.array(setup.frequencies_hz),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise SetupError(f'setup: emitter of kind {emitter.kind!r}: {error}') from error
+    return build_board(
+        emitter.kind,
+        emitter.geometry,
+        setup.emitter_names,
+        np.array([coil.centre_m for coil in emitter.coils]),
+        np.array([coil.rotation_deg for coil in emitter.coils]),
+        setup.frequencies_hz,
+    )
 
 
 def model_for(name: str, session: Session) -> FieldModel:
