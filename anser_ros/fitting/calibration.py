@@ -22,6 +22,7 @@ from anser_ros.fitting.moments import (
     as_real,
     with_pose,
 )
+from anser_ros.fitting.prior import DrawnBoard
 from anser_ros.fitting.selection import Candidate, choose_layout, thin_frames
 
 Array = NDArray[np.float64]
@@ -30,7 +31,7 @@ FEWEST_FRAMES = 10
 FLATTEST = 0.002
 """Thickness (rms) of the cloud of sensors that the fit needs, as a part of its extent."""
 DISAGREEMENT = 10.0
-"""Sessions whose common fit leaves this many times what each leaves alone differ in their board."""
+"""Sessions whose common fit leaves this many times what each alone leaves: different boards."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,8 @@ class Calibration:
     nominal_rmse_t : float or None
         Residual of the nominal model on the same readings, root mean square of the magnitude.
     candidates : tuple of Candidate
-        All that were compared; empty when layout and damping were given.
-    chosen : Candidate or None
+        All that were compared.
+    chosen : Candidate
     layout : Layout
     damping : float
     n_measurements : int
@@ -79,7 +80,7 @@ class Calibration:
     held_out: HeldOut
     nominal_rmse_t: float | None
     candidates: tuple[Candidate, ...]
-    chosen: Candidate | None
+    chosen: Candidate
     layout: Layout
     damping: float
     n_measurements: int
@@ -213,21 +214,22 @@ def calibrate(
     posed = [with_pose(m) for m in measurements]
     thin = thin_frames(posed)
     folds = fold_of_frames([m.position for m in thin])
+    drawn = None if nominal is None else DrawnBoard(nominal, thin)
     selection = choose_layout(
-        thin, folds, generator, options.uncertainty, progress, options.layout
+        thin, folds, generator, options.uncertainty, progress, options.layout, drawn
     )
     layout = selection.chosen.layout
     damping = selection.chosen.damping if options.damping is None else options.damping
-    dipoles = selection.chosen.dipoles
+    dipoles, prior = selection.chosen.dipoles, selection.chosen.prior
     uncertainty = options.uncertainty
 
     def fit_alone(part: list[Measurements]) -> MomentFit:
-        return MomentFitter(part, dipoles, damping, uncertainty).fit(3, exact=False)
+        return MomentFitter(part, dipoles, damping, uncertainty, prior).fit(3, exact=False)
 
-    fit = MomentFitter(posed, dipoles, damping, uncertainty).fit(progress=progress)
+    fit = MomentFitter(posed, dipoles, damping, uncertainty, prior).fit(progress=progress)
     check_agreement(posed, names, fit, fit_alone)
     held_out = predict_held_out(
-        thin, folds, dipoles, damping, uncertainty,
+        thin, folds, dipoles, damping, uncertainty, prior,
         noise_t=min(fit.noise_t, selection.reference.noise_t),
     )  # fmt: skip
     model = FieldModel(

@@ -20,7 +20,6 @@ from anser_ros.fitting.moments import (
     MomentFitter,
     PoseTerms,
     Uncertainty,
-    as_real,
     frame_blocks,
     pose_terms,
     usable_weights,
@@ -69,17 +68,20 @@ class PoseWhitener:
         left = white - np.einsum('fri,fi->fr', self.slope, step)
         return np.asarray((left * self.noise_t).reshape(residual.shape))
 
-    def noise_share(self) -> tuple[float, float]:
-        """Traces of ``sigma^2 C^-1`` and of its square, summed over the frames.
+    def excess_power(self, residual: Array) -> Array:
+        """Estimate of each frame's variance beyond noise and jitter, T^2 a component, shape (F,).
 
-        White noise of variance v leaves the power v times the second trace; noise and jitter as
-        assumed leave sigma^2 times the first.
+        White errors of variance v leave the power v tr(W^2), W = sigma^2 C^-1, in what no pose
+        explains; noise and jitter as assumed leave sigma^2 tr(W). The eigenvalues of W are one
+        minus those of the share of each pose parameter that the readings determine.
         """
-        # The eigenvalues of sigma^2 C^-1 are 1 - those of the share of each pose parameter.
-        first = self.readings.sum() - np.trace(self.share, axis1=1, axis2=2).sum()
-        square = np.einsum('fij,fji->f', self.share, self.share).sum()
-        second = self.readings.sum() - 2.0 * (self.readings.sum() - first) + square
-        return float(first), float(second)
+        left = self.left_over(residual).reshape(self.root.shape)
+        power = (left**2).sum(axis=1)
+        taken = np.trace(self.share, axis1=1, axis2=2)
+        square = np.einsum('fij,fji->f', self.share, self.share)
+        first = self.readings - taken
+        second = np.maximum(self.readings - 2.0 * taken + square, 1.0)
+        return np.asarray((power - self.noise_t**2 * first) / second)
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,8 @@ class HeldOut:
     noise_t : float
         The noise that the chi-square was divided by.
     flux_error_t : float
-        Standard deviation of the field model's own error a phasor component, noise taken off.
+        Standard deviation of the field model's own error a phasor component, noise taken off,
+        in the typical held-out frame.
     """
 
     error: ComplexArray
@@ -159,7 +162,7 @@ class _Tally:
         self.error: list[ComplexArray] = []
         self.left: list[ComplexArray] = []
         self.chi: list[Array] = []
-        self.first = self.second = 0.0
+        self.excess: list[Array] = []
 
     def add(self, terms: PoseTerms, weights: Array) -> None:
         if terms.residual.shape[0] == 0:
@@ -169,15 +172,13 @@ class _Tally:
         self.error.append(_complex_rows(terms.residual, used))
         self.left.append(_complex_rows(white.left_over(terms.residual), used))
         self.chi.append(white.chi_square(terms.residual))
-        first, second = white.noise_share()
-        self.first, self.second = self.first + first, self.second + second
+        self.excess.append(white.excess_power(terms.residual))
 
     def result(self) -> HeldOut:
         error, left = np.concatenate(self.error), np.concatenate(self.left)
         components = 2 * error.size
-        # Robust: a few outlier readings are not the model's error.
-        power = _typical_power(left) * components
-        excess = (power - self.noise_t**2 * self.first) / max(self.second, 1.0)
+        # The typical frame: those beyond the edge of what was fitted, and outliers, do not count.
+        excess = float(np.median(np.concatenate(self.excess)))
         return HeldOut(
             error=error,
             left_over=left,
@@ -185,10 +186,3 @@ class _Tally:
             noise_t=self.noise_t,
             flux_error_t=float(np.sqrt(max(excess, 0.0))),
         )
-
-
-def _typical_power(left: ComplexArray) -> float:
-    """Mean square of a component without the readings beyond six times the median size."""
-    size = np.sqrt((as_real(left) ** 2).mean(axis=1))
-    kept = size <= 6.0 * max(float(np.median(size)), 1e-300)
-    return float((size[kept] ** 2).mean())

@@ -64,21 +64,25 @@ class Layout:
         Size of the layer as a multiple of the field generator's own.
     depth_m : float
         How far below the coils the layer lies.
+    prior : {'none', 'nominal'}
+        What the damping pulls the moments towards: zero, or those of the drawn board.
     """
 
     kind: str
     count: int
     extension: float
     depth_m: float
+    prior: str = 'none'
 
     def describe(self) -> str:
         """One line for a report."""
+        drawn = ', pulled to the drawn board' if self.prior == 'nominal' else ''
         if self.kind == 'coils':
-            return f'{self.count}x{self.count} z-dipoles on every coil'
+            return f'{self.count}x{self.count} z-dipoles on every coil{drawn}'
         parts = 'z-dipoles' if self.kind == 'layer' else 'three-component dipoles'
         return (
             f"{self.count}x{self.count} {parts}, {self.extension:.2f} x the coils' extent, "
-            f'{1e3 * self.depth_m:.1f} mm below'
+            f'{1e3 * self.depth_m:.1f} mm below{drawn}'
         )
 
 

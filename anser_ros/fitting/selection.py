@@ -3,8 +3,8 @@
 All candidates are compared at the same poses (corrected once with a rich layer) and on the same
 blocks of space. A candidate costs one matrix: each fold's rows are summed to a Gram matrix, those
 of the other folds are added up, and the eigenvectors of the sum give every damping at once.
-(Squaring the condition is harmless here, where the smallest damping is far above its rounding; what
-is kept is fitted by QR.) The score is the predictive chi-square of the held-out frames with their
+Squaring the condition is harmless here, where the smallest damping is far above its rounding; what
+is kept is fitted by QR. The score is the predictive chi-square of the held-out frames with their
 pose marginalised, so that the pose's jitter, much larger than the flux noise, does not drown the
 differences.
 """
@@ -30,6 +30,7 @@ from anser_ros.fitting.moments import (
     pose_terms,
     with_pose,
 )
+from anser_ros.fitting.prior import DrawnBoard
 
 Array = NDArray[np.float64]
 
@@ -40,7 +41,7 @@ DEPTHS = (-0.15, 0.15, 0.3)
 """As a part of the lowest sensor's height over the coils."""
 MOST_ROWS = 12_000
 """Readings that the choice looks at; the final fit takes all."""
-WORTH = 0.01
+WORTH = 0.05
 """A richer layout must lower the predictive error by this part to be worth its dipoles."""
 
 
@@ -52,6 +53,8 @@ class Candidate:
     ----------
     layout : Layout
     dipoles : Dipoles
+    prior : ndarray, shape (N, K), complex, or None
+        Moments that the damping pulls towards.
     damping : float
     score : float
         Square root of the mean predictive chi-square a phasor component, times the noise: T.
@@ -61,6 +64,7 @@ class Candidate:
 
     layout: Layout
     dipoles: Dipoles
+    prior: ComplexArray | None
     damping: float
     score: float
     curve: tuple[tuple[float, float], ...]
@@ -175,7 +179,7 @@ class Selector:
         scores = self.noise_t * np.sqrt(chi / count)
         best = int(np.argmin(scores))
         curve = tuple(zip(map(float, dampings), map(float, scores), strict=True))
-        return Candidate(layout, dipoles, float(dampings[best]), float(scores[best]), curve)
+        return Candidate(layout, dipoles, prior, float(dampings[best]), float(scores[best]), curve)
 
     @property
     def _parts(self) -> int:
@@ -231,6 +235,7 @@ def choose_layout(
     uncertainty: Uncertainty,
     progress: Progress | None = None,
     asked: Layout | None = None,
+    drawn: DrawnBoard | None = None,
 ) -> Selection:
     """Walk through layouts from coarse to fine, then size, depth and kind, by held-out error.
 
@@ -242,28 +247,31 @@ def choose_layout(
         When there are fewer readings than the smallest layout has dipoles.
     """
     rows = sum(int(m.usable.sum()) for m in measurements)
-    affordable = [n for n in COUNTS if n * n <= rows]
-    if not affordable:
+    if rows < COUNTS[0] ** 2:
         raise FitError(
             f'the smallest layout has {COUNTS[0] ** 2} dipoles and needs as many readings, '
             f'got {rows}'
         )
+    # Damping makes more dipoles than readings harmless, and with a prior even useful.
+    affordable = [n for n in COUNTS if n * n <= max(4 * rows, 144)]
     height = lowest_height(measurements, generator)
+    prior = 'none' if drawn is None else 'nominal'
     rich = Layout('layer', min(16, affordable[-1]), EXTENSIONS[1], 0.0)
     selector = Selector(measurements, folds, place(rich, generator), uncertainty)
-    search = _Search(selector, generator, progress)
+    search = _Search(selector, generator, progress, drawn)
     if asked is not None:
         return Selection(search.score(asked), tuple(search.tried.values()), selector.reference)
-    start = Layout('layer', affordable[len(affordable) // 2], EXTENSIONS[1], 0.0)
+    start = Layout('layer', affordable[len(affordable) // 2], EXTENSIONS[1], 0.0, prior)
     best = search.climb(start, affordable)
     best = search.best_of(best, [replace(best.layout, extension=e) for e in EXTENSIONS])
     best = search.climb(best.layout, affordable)
     best = search.best_of(best, [replace(best.layout, depth_m=d * height) for d in DEPTHS])
     triple = max(4, round(best.layout.count / np.sqrt(3.0)))
     others = [replace(best.layout, kind='layer_xyz', count=triple)]
-    others += [Layout('coils', n, 1.0, 0.0) for n in (2, 3, 4)]
-    limit = min(rows, COUNTS[-1] ** 2 * 1.2)
-    others = [other for other in others if len(place(other, generator)) <= limit]
+    others += [Layout('coils', n, 1.0, 0.0, prior) for n in (2, 3, 4)]
+    if drawn is not None:
+        others.append(replace(best.layout, prior='none'))
+    others = [other for other in others if len(place(other, generator)) <= 1.2 * COUNTS[-1] ** 2]
     best = search.best_of(best, others)
     chosen = search.leanest(best)
     return Selection(chosen, tuple(search.tried.values()), selector.reference)
@@ -279,14 +287,23 @@ class _Search:
     """Candidates as they are tried, each once."""
 
     def __init__(
-        self, selector: Selector, generator: Generator, progress: Progress | None
+        self,
+        selector: Selector,
+        generator: Generator,
+        progress: Progress | None,
+        drawn: DrawnBoard | None,
     ) -> None:
         self.selector, self.generator, self.progress = selector, generator, progress
+        self.drawn = drawn
         self.tried: dict[Layout, Candidate] = {}
 
     def score(self, layout: Layout) -> Candidate:
         if layout not in self.tried:
-            self.tried[layout] = self.selector.score(layout, place(layout, self.generator))
+            dipoles = place(layout, self.generator)
+            prior = None
+            if layout.prior == 'nominal' and self.drawn is not None:
+                prior = self.drawn.moments(dipoles)
+            self.tried[layout] = self.selector.score(layout, dipoles, prior=prior)
             if self.progress is not None:
                 self.progress('layouts', 1.0 - 0.9 ** len(self.tried))
         return self.tried[layout]
