@@ -23,7 +23,7 @@ SHORTEST_WINDOW_S = 0.005
 LONGEST_WINDOW_S = 0.05
 _RANK_TOLERANCE = 1e-6
 _WORST_VARIANCE_RATIO = 30.0
-_MOTION_NEEDS_CYCLES = 2.0
+_AFFORDABLE_VARIANCE_RATIO = 2.0
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class Demodulator:
     window_samples : samples in a window, 5 to 50 ms of them
     mains_hz : fundamental of the mains whose harmonics are fitted as well; None for none
     mains_harmonics : how many harmonics; one that falls on a tone is left out
-    follow_motion : fit the phasors' rates of change too; None does so where the window separates
-        the tones well enough (two cycles of the smallest difference of tones)
+    follow_motion : fit the phasors' rates of change too; None does so where that does not double
+        the variance of the phasors (from 10 ms on with tones 170 Hz apart)
 
     Raises
     ------
@@ -87,26 +87,28 @@ class Demodulator:
         half_sample = 0.5 / sample_rate_hz
         if not SHORTEST_WINDOW_S - half_sample <= length_s <= LONGEST_WINDOW_S + half_sample:
             raise ParameterError(f'a window of {1e3 * length_s:.3g} ms is not 5 to 50 ms long')
-        spacing = _smallest_spacing(tones)
-        if follow_motion is None:
-            follow_motion = spacing * length_s >= _MOTION_NEEDS_CYCLES
         self.frequencies_hz = tones
         self.window_samples = window_samples
         self.window_s = length_s
-        self.follows_motion = follow_motion
-        self._half_s = length_s / 2
-        self._design = _design_matrix(
-            sample_rate_hz,
-            window_samples,
-            tones,
-            _kept_harmonics(mains_hz, mains_harmonics, tones, sample_rate_hz, length_s),
-            follow_motion,
-        )
+        harmonics = _kept_harmonics(mains_hz, mains_harmonics, tones, sample_rate_hz, length_s)
+
+        def prepare(motion: bool, worst: float) -> None:
+            self._design = _design_matrix(sample_rate_hz, window_samples, tones, harmonics, motion)
+            self._solution = _solve(self._design, 2 * tones.size, worst)
+            self.follows_motion = motion
+
         try:
-            self._solution = _solve(self._design, 2 * tones.size)
+            if follow_motion is None:
+                try:
+                    prepare(True, _AFFORDABLE_VARIANCE_RATIO)
+                except FitError:
+                    prepare(False, _WORST_VARIANCE_RATIO)
+            else:
+                prepare(follow_motion, _WORST_VARIANCE_RATIO)
         except FitError as error:
             raise ParameterError(
-                f'a window of {1e3 * length_s:.3g} ms cannot separate tones {spacing:.4g} Hz apart'
+                f'a window of {1e3 * length_s:.3g} ms cannot separate tones '
+                f'{_smallest_spacing(tones):.4g} Hz apart'
             ) from error
 
     def demodulate(
@@ -140,7 +142,7 @@ class Demodulator:
         phasors = (coefficients[:count] + 1j * coefficients[count : 2 * count]).T
         if self.follows_motion:
             change = coefficients[2 * count : 3 * count] + 1j * coefficients[3 * count : 4 * count]
-            rates = np.asarray(change.T / self._half_s, complex)
+            rates = np.asarray(change.T / (self.window_s / 2), complex)
         else:
             rates = np.zeros_like(phasors)
         variance = (solution.variance[:count] + solution.variance[count : 2 * count]) / 2
@@ -189,13 +191,15 @@ def _design_matrix(
     return np.hstack(columns)
 
 
-def _solve(design: NDArray[np.float64], wanted: int) -> _Solution:
+def _solve(
+    design: NDArray[np.float64], wanted: int, worst_ratio: float = _WORST_VARIANCE_RATIO
+) -> _Solution:
     """Solve the design by SVD; its first `wanted` coefficients must be determined.
 
     Raises
     ------
     FitError
-        When they are not, or only with a variance far above that of tones alone.
+        When they are not, or only with more than `worst_ratio` times one tone's own variance.
     """
     samples, columns = design.shape
     if samples < columns + 1:
@@ -207,6 +211,6 @@ def _solve(design: NDArray[np.float64], wanted: int) -> _Solution:
     variance = np.einsum('pr,pr->p', to_coefficients, to_coefficients)
     lost = np.abs(right[~kept][:, :wanted]).max(initial=0.0)
     worst = variance[:wanted].max() * samples / 2
-    if lost > 1e-3 or worst > _WORST_VARIANCE_RATIO:
+    if lost > 1e-3 or worst > worst_ratio:
         raise FitError(f'tones not separable: variance {worst:.3g} times that of one tone alone')
     return _Solution(np.ascontiguousarray(left[:, kept]), to_coefficients, variance)

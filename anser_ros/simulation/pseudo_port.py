@@ -83,6 +83,14 @@ class PseudoPort:
         self._flush()
         return dropped
 
+    def write_all(self, data: bytes) -> None:
+        """Send bytes, and wait until the line has taken the last one."""
+        self._pending += data
+        self._flush()
+        while self._pending and self._fds is not None:
+            select.select([], [self._fds[0]], [], 0.1)
+            self._flush()
+
     def wait(self, timeout_s: float) -> None:
         """Wait until the host sends something or time is over; what is pending goes out meanwhile.
 

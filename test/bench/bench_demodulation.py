@@ -34,9 +34,7 @@ def rows() -> list[dict]:
             'unit': 'ms',
             'rival': 'one FFT per channel',
             'rival_value': rival_ms,
-            'ratio': rival_ms / ours_ms,
-            'target': f'<= {TARGET_MS:g}',
-            'met': bool(ours_ms <= TARGET_MS),
+            'target': TARGET_MS,
         }
     ]
 
