@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from anser_ros.errors import SetupError
+from anser_ros.errors import ParameterError, SetupError
 from anser_ros.physics.constants import MU_0
 from anser_ros.physics.dipole import field_basis
 from anser_ros.signals.demodulation import Demodulator
@@ -13,6 +13,7 @@ from anser_ros.signals.flux import FluxConverter
 from anser_ros.signals.window import WindowCutter
 from anser_ros.simulation import raw_effects
 from anser_ros.simulation.control_unit import ControlUnit
+from anser_ros.simulation.effect_draw import CATALOGUE, draw
 from anser_ros.simulation.metal import sphere_polarisability, steel_disc
 from anser_ros.simulation.motion import Approach, Lissajous
 from anser_ros.simulation.sampling import FrontEnd
@@ -177,7 +178,7 @@ class TestEffects:
 
     def test_crosstalk(self):
         clean, _ = self.codes()
-        leaky, _ = self.codes(raw_effects.ChannelCrosstalk(3, 5, 0.1))
+        leaky, _ = self.codes(raw_effects.ChannelCrosstalk((3, 5), ((1.0, 0.1), (0.0, 1.0))))
         assert np.abs(leaky[:, 3] - clean[:, 3] - 0.1 * clean[:, 5]).max() <= 1
         assert np.array_equal(np.delete(leaky, 3, 1), np.delete(clean, 3, 1))
 
@@ -194,6 +195,25 @@ class TestEffects:
         assert np.abs(loose[:400, 20]).max() == 0
         assert np.array_equal(loose[400:800], clean[400:800])
 
+    def test_tilted_sensor_is_tilted_in_the_world_only(self):
+        real = raw_effects.TiltedSensor(2, (0.0, 0.6, 0.8)).setup(SETUP)
+        assert real.sensors[2].axis == (0.0, 0.6, 0.8)
+        assert real.sensors[3:] == SETUP.sensors[3:]
+
+    def test_gain_ripple_and_late_delivery(self):
+        clean, _ = self.codes()
+        swung, _ = self.codes(raw_effects.GainRipple(0.1, 0.4))
+        assert np.abs(swung[-1, 20] - 1.1 * clean[-1, 20]) <= 1
+        scaled, _ = self.codes(raw_effects.ChannelGain(20, 0.5))
+        assert np.abs(scaled[:, 20] - 0.5 * clean[:, 20]).max() <= 1
+        assert raw_effects.LateDelivery(0.03).delivery_delay_s() == 0.03
+
+    def test_coil_that_weakens_at_constant_current(self):
+        unit = ControlUnit(world(), CHANNELS, effects=[raw_effects.CoilWeakens(2, -0.1, 1e-4)])
+        got, _, times = fluxes(unit, 0.1)
+        ratio = got[:, 20] / [world().flux(t)[20] for t in times]
+        assert ratio[0].real == pytest.approx([1, 1, 0.9, 1, 1, 1, 1, 1], abs=2e-2)
+
     def test_slow_clock(self):
         _, blocks = self.codes(raw_effects.SlowClock(-1000.0))
         assert blocks[50].timestamp_ticks == round(50_000 * 0.999)
@@ -203,6 +223,35 @@ class TestEffects:
         same, _ = self.codes(raw_effects.RawEffect())
         assert np.array_equal(clean, same)
         assert raw_effects.RawEffect().setup(SETUP) is SETUP
+
+
+class TestDraw:
+    @pytest.mark.parametrize('name', sorted(CATALOGUE))
+    def test_every_effect_of_the_catalogue_changes_the_signals(self, name):
+        drawn = draw(name, SETUP, np.random.default_rng(1))
+        assert drawn.name == name and drawn.parameters
+        real = SETUP
+        for effect in drawn.effects:
+            real = effect.setup(real)
+        changed = World(real, dipoles, metal=drawn.metal)
+        quiet = FrontEnd(noise_codes=0.0, current_noise_codes=0.0)
+        streams = []
+        for unit in (
+            ControlUnit(changed, CHANNELS, quiet, effects=drawn.effects),
+            ControlUnit(world(), CHANNELS, quiet),
+        ):
+            unit.advance(40_000)
+            unit.receive(encode(Start()))
+            streams.append(b''.join(piece.data for piece in unit.advance(4000)))
+        late = sum(effect.delivery_delay_s() for effect in drawn.effects)
+        assert (streams[0] != streams[1]) or late > 0
+
+    def test_random_is_reproducible_and_none_is_nothing(self):
+        first, second = (draw('random', SETUP, np.random.default_rng(5)) for _ in range(2))
+        assert (first.name, first.parameters) == (second.name, second.parameters)
+        assert draw('none', SETUP, np.random.default_rng(0)).effects == ()
+        with pytest.raises(ParameterError, match='no effect'):
+            draw('gremlin', SETUP, np.random.default_rng(0))
 
 
 class TestMetal:

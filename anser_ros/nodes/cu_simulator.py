@@ -1,5 +1,6 @@
 """A control unit behind a pseudo-terminal, with the optical truth beside it."""
 
+import json
 import sys
 import threading
 import time
@@ -17,11 +18,12 @@ from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.control_unit import ControlUnit, Piece
+from anser_ros.simulation.effect_draw import NONE as NO_EFFECT
+from anser_ros.simulation.effect_draw import Drawn, draw
 from anser_ros.simulation.faults import FAULTS, NONE, UNPLUG, FaultInjector
 from anser_ros.simulation.metal import MetalBody, steel_disc
 from anser_ros.simulation.motion import Approach
 from anser_ros.simulation.pseudo_port import PseudoPort
-from anser_ros.simulation.raw_effects import RawEffect
 from anser_ros.simulation.sampling import FrontEnd
 from anser_ros.simulation.world import World
 from anser_ros.wire.channel_calibration import parse_channels
@@ -67,6 +69,11 @@ class CuSimulatorParameters:
         5.0, 'from one fault to the next, s', minimum=0.1, maximum=3600.0, live=True
     )
     seed: int = parameter(0, 'of noise and faults', minimum=0)
+    effect: str = parameter(
+        NO_EFFECT, 'effect in the raw signals: none, random, or one of its catalogue'
+    )
+    effect_seed: int = parameter(0, 'of the effect; 0 for another one every time', minimum=0)
+    effect_file: str = parameter('', 'file (.json) that gets the effect drawn; empty for none')
 
 
 class CuSimulator(AnserNode):
@@ -75,15 +82,20 @@ class CuSimulator(AnserNode):
     NAME = 'cu_simulator'
     PARAMETERS = CuSimulatorParameters
 
-    def __init__(self, effects: tuple[RawEffect, ...] = (), **options: Any) -> None:
+    def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         table = self.parameters
         setup = parse_setup(read_config(table.setup_file))
         channels = parse_channels(read_config(table.channels_file))
+        drawn = draw(table.effect, setup, np.random.default_rng(table.effect_seed or None))
+        if table.effect_file:
+            _write_effect(Path(table.effect_file), drawn)
+        effects = drawn.effects
         real = setup
         for effect in effects:
             real = effect.setup(real)
-        self._metal = _metal(table)
+        self._delay_s = sum(effect.delivery_delay_s() for effect in effects)
+        self._metal = [*_metal(table), *drawn.metal]
         self._world = World(real, board_source(real), metal=self._metal)
         front = FrontEnd(noise_codes=table.noise_codes, current_drift=table.current_drift)
         self._unit = ControlUnit(
@@ -115,7 +127,7 @@ class CuSimulator(AnserNode):
     def _run(self, step: Any) -> None:
         while not self._closing.is_set():
             step()
-            due_s = self._unit.samples / self._unit.sample_rate_hz + STRETCH_S
+            due_s = self._unit.samples / self._unit.sample_rate_hz + STRETCH_S + self._delay_s
             self._port.wait(max(due_s - self._elapsed_s(), 1e-4))
 
     def _elapsed_s(self) -> float:
@@ -134,9 +146,10 @@ class CuSimulator(AnserNode):
         answers = unit.receive(self._port.read())
         self._send(answers, now_s)
         stretch = round(STRETCH_S * rate)
-        while (now_s * rate - unit.samples) >= stretch and not self._closing.is_set():
+        while (now_s - self._delay_s) * rate - unit.samples >= stretch:
             self._send(unit.advance(stretch), now_s)
-            now_s = min(now_s, self._elapsed_s())
+            if self._closing.is_set():
+                return
 
     def _send(self, pieces: list[Piece], now_s: float) -> None:
         arriving = self._injector.apply(pieces, now_s)
@@ -173,7 +186,7 @@ class CuSimulator(AnserNode):
         """State of the control unit."""
         state = 'streaming' if self._unit.streaming else 'idle, waits for a start'
         values: dict[str, object] = {'link': self.parameters.link, 'fault': self._injector.kind}
-        if self._metal:
+        if self.parameters.metal:
             position, _ = self._metal[0].path(self._elapsed_s())
             values['metal_distance_m'] = float(abs(position[2]))
         return Status('', Level.OK, state, values)
@@ -183,6 +196,13 @@ class CuSimulator(AnserNode):
         self._closing.set()
         self._thread.join(2.0)
         self._port.unplug()
+
+
+def _write_effect(path: Path, drawn: Drawn) -> None:
+    try:
+        path.write_text(json.dumps({'name': drawn.name, 'parameters': drawn.parameters}))
+    except OSError as error:
+        raise ParameterError(f'cannot write {path}: {error.strerror}') from error
 
 
 def _metal(table: CuSimulatorParameters) -> list[MetalBody]:

@@ -8,7 +8,7 @@ device time. An effect must not know who looks at the result.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,20 +42,29 @@ class RawEffect:
         """What the device's clock says at a true time."""
         return time_s
 
+    def delivery_delay_s(self) -> float:
+        """How much later than usual the records reach the host."""
+        return 0.0
+
 
 @dataclass(frozen=True)
 class ChannelCrosstalk(RawEffect):
-    """Sensors of one cluster leak into each other: column `source` times `share` into `target`."""
+    """Sensors of one cluster leak into each other.
 
-    target: int
-    source: int
-    share: float
+    Attributes
+    ----------
+    columns : of the cluster's sensors, in the order of the setup
+    matrix : what each of them (row) sees of the others (column), ones on the diagonal
+    """
+
+    columns: tuple[int, ...]
+    matrix: tuple[tuple[float, ...], ...]
 
     def volts(self, time_s: Array, volts: Array) -> Array:
-        """Add the leak."""
-        leaked = volts.copy()
-        leaked[:, self.target] += self.share * volts[:, self.source]
-        return leaked
+        """Mix."""
+        mixed = volts.copy()
+        mixed[:, list(self.columns)] = volts[:, list(self.columns)] @ np.array(self.matrix).T
+        return mixed
 
 
 @dataclass(frozen=True)
@@ -98,6 +107,73 @@ class SlowClock(RawEffect):
     def device_time(self, time_s: float) -> float:
         """Time by the wrong clock."""
         return time_s * (1 + 1e-6 * self.error_ppm)
+
+
+@dataclass(frozen=True)
+class LateDelivery(RawEffect):
+    """A filter or buffer holds the records back."""
+
+    delay_s: float
+
+    def delivery_delay_s(self) -> float:
+        """Constant."""
+        return self.delay_s
+
+
+@dataclass(frozen=True)
+class TiltedSensor(RawEffect):
+    """A sensor has come loose: it points elsewhere than the setup document says."""
+
+    column: int
+    axis: tuple[float, float, float]
+
+    def setup(self, setup: Setup) -> Setup:
+        """Turn the one sensor."""
+        sensors = list(setup.sensors)
+        sensors[self.column] = replace(sensors[self.column], axis=self.axis)
+        return replace(setup, sensors=tuple(sensors))
+
+
+@dataclass(frozen=True)
+class ChannelGain(RawEffect):
+    """One channel's gain is off."""
+
+    column: int
+    gain: float
+
+    def volts(self, time_s: Array, volts: Array) -> Array:
+        """Scale."""
+        scaled = volts.copy()
+        scaled[:, self.column] *= self.gain
+        return scaled
+
+
+@dataclass(frozen=True)
+class GainRipple(RawEffect):
+    """The gain of all channels swings, as by a bad supply: no effect of any catalogue."""
+
+    depth: float
+    period_s: float
+
+    def volts(self, time_s: Array, volts: Array) -> Array:
+        """Swing."""
+        swing = 1 + self.depth * np.sin(2 * np.pi * time_s / self.period_s)
+        return np.asarray(volts * swing[:, None])
+
+
+@dataclass(frozen=True)
+class CoilWeakens(RawEffect):
+    """A coil's field changes though its current does not: a turn that heats up and shorts."""
+
+    coil: int
+    amount: float
+    tau_s: float
+
+    def flux(self, time_s: float, flux: ComplexArray) -> ComplexArray:
+        """Drift."""
+        drifted = flux.copy()
+        drifted[:, self.coil] *= 1 + self.amount * (1 - np.exp(-time_s / self.tau_s))
+        return drifted
 
 
 @dataclass(frozen=True)
