@@ -195,6 +195,9 @@ def test_hostile_payloads_are_refused_or_decoded_never_a_crash(number, body):
     [
         {'sample_rate_hz': 0.0},
         {'tick_hz': float('inf')},
+        {'tick_hz': 1e-300},
+        {'sample_rate_hz': 1e9},
+        {'channels': tuple(Channel(n, ChannelKind.CURRENT, 1.0) for n in range(2000))},
         {'block_samples': 0},
         {'block_samples': 65535},
         {'frequencies_hz': (), 'currents_a': ()},

@@ -24,6 +24,9 @@ HEADER = struct.Struct('<4sBBHHH')
 CRC = struct.Struct('<I')
 OVERHEAD = HEADER.size + CRC.size
 MAX_PAYLOAD = 0xFFFF
+MAX_CHANNELS = 1024
+FASTEST_SAMPLE_RATE_HZ = 4e5
+TICK_RATES_HZ = (1e3, 1e10)
 FULL_SCALE_CODE = 32768
 
 _HELLO = struct.Struct('<HddHHHB')
@@ -252,14 +255,21 @@ def check_hello(hello: Hello) -> None:
     Raises
     ------
     FrameError
-        When a rate, scale or tone is not finite and positive, a tone is not below half the sample
-        rate, a channel number appears twice, there is not exactly one current channel, or a block
-        does not fit one record.
+        When a rate, scale or tone is not finite and positive or absurdly large, a tone is not
+        below half the sample rate, a channel number appears twice, there is not exactly one
+        current channel, or a block does not fit one record.
     """
     scales = [channel.full_scale for channel in hello.channels]
     positive = [hello.sample_rate_hz, hello.tick_hz, *scales, *hello.frequencies_hz]
     if not all(isfinite(value) and value > 0 for value in [*positive, *hello.currents_a]):
         raise FrameError('hello holds a rate, full scale, tone or current that is not positive')
+    if hello.sample_rate_hz > FASTEST_SAMPLE_RATE_HZ or len(hello.channels) > MAX_CHANNELS:
+        raise FrameError(
+            f'hello of {len(hello.channels)} channels at {hello.sample_rate_hz:g} S/s is beyond '
+            f'{MAX_CHANNELS} at {FASTEST_SAMPLE_RATE_HZ:g}'
+        )
+    if not TICK_RATES_HZ[0] <= hello.tick_hz <= TICK_RATES_HZ[1]:
+        raise FrameError(f'hello of {hello.tick_hz:g} ticks a second, out of 1e3 to 1e10')
     if any(2 * tone >= hello.sample_rate_hz for tone in hello.frequencies_hz):
         raise FrameError(f'hello holds a tone above half of {hello.sample_rate_hz:g} S/s')
     numbers = [channel.number for channel in hello.channels]
