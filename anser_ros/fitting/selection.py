@@ -41,7 +41,7 @@ DEPTHS = (-0.15, 0.15, 0.3)
 """As a part of the lowest sensor's height over the coils."""
 MOST_ROWS = 12_000
 """Readings that the choice looks at; the final fit takes all."""
-WORTH = 0.05
+WORTH = 0.1
 """A richer layout must lower the predictive error by this part to be worth its dipoles."""
 
 
@@ -328,6 +328,16 @@ class _Search:
         return best
 
     def leanest(self, best: Candidate) -> Candidate:
-        """The candidate with the fewest dipoles that is as good as the best to within `WORTH`."""
-        good = [c for c in self.tried.values() if c.score <= best.score * (1.0 + WORTH)]
+        """The candidate with the fewest dipoles that is as good as the best to within `WORTH`.
+
+        Tracking takes time in proportion to the dipoles, and far below the noise nothing is won.
+        """
+        limit = best.score * (1.0 + WORTH)
+        place_now = EXTENSIONS.index(best.layout.extension)
+        for extension in EXTENSIONS[max(place_now - 1, 0) : place_now + 1]:
+            size = replace(best.layout, extension=extension)
+            for count in (n for n in reversed(COUNTS) if n < best.layout.count):
+                if self.score(replace(size, count=count)).score > limit:
+                    break
+        good = [c for c in self.tried.values() if c.score <= limit]
         return min(good, key=lambda c: (len(c.dipoles), c.score))
