@@ -4,6 +4,8 @@ import time
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.signals.clock import DeviceClock
@@ -285,6 +287,24 @@ class TestWindows:
         assert cutter.counters.restarts == 1 and cutter.counters.missing_samples == 0
         (window,) = windows
         assert np.array_equal(window.codes, samples[:400]) and not window.dropped
+
+    @settings(max_examples=100, deadline=None)
+    @given(
+        st.lists(
+            st.tuples(
+                st.one_of(st.integers(0, 30), st.integers(0, 2**32 - 1)),
+                st.one_of(st.integers(0, 30_000), st.integers(0, 2**64 - 1)),
+                st.integers(1, 60),
+            ),
+            max_size=40,
+        )
+    )
+    def test_no_order_of_blocks_breaks_it(self, blocks):
+        cutter = WindowCutter(200, 77, 2, 0.04)
+        for sequence, ticks, samples in blocks:
+            for window in cutter.push(sequence, ticks, np.ones((samples, 2), np.int16)):
+                assert window.codes.shape == (200, 2)
+                assert 2 * window.present.sum() >= 200
 
     def test_saturated_and_stuck_channels(self):
         samples = self.stream(5, 4)
