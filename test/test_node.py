@@ -11,6 +11,7 @@ from conftest import Process, spin_until
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.nodes import parameters
 from anser_ros.nodes.diagnostics import Throttle, text_of
+from anser_ros.nodes.parameter_files import complaints
 from anser_ros.nodes.parameters import parameter
 
 
@@ -66,6 +67,29 @@ class TestParameterTable:
         assert "mode = 'fast' [fast | slow]" in text
 
 
+class TestParameterFiles:
+    @pytest.mark.parametrize('key', ['sample', '/anser/sample', '/**/sample', '/**', '/anser/*'])
+    def test_a_section_that_reaches_the_node_is_fine(self, tmp_path, key):
+        file = tmp_path / 'a.yaml'
+        file.write_text(f'{key}:\n  ros__parameters: {{}}\n')
+        arguments = ['sample', '--ros-args', '--params-file', str(file)]
+        assert complaints(arguments, 'sample') == []
+
+    def test_sections_may_be_nested_by_namespace(self, tmp_path):
+        file = tmp_path / 'a.yaml'
+        file.write_text('anser:\n  sample:\n    ros__parameters: {}\n')
+        assert complaints(['--params-file', str(file)], 'sample') == []
+        (complaint,) = complaints(['--params-file', str(file)], 'other')
+        assert complaint == f'{file} has nothing for other; it has: anser/sample'
+
+    def test_what_rcl_refuses_itself_is_left_to_it(self, tmp_path):
+        file = tmp_path / 'a.yaml'
+        file.write_text('a: [1')
+        assert complaints(['--params-file', str(file)], 'sample') == []
+        assert complaints(['--params-file', '/nowhere'], 'sample') == []
+        assert complaints(['--params-file'], 'sample') == []
+
+
 class TestThrottle:
     def test_first_of_a_kind_is_whole_and_the_rest_is_counted(self):
         throttle = Throttle(10.0)
@@ -88,6 +112,7 @@ import sys
 from dataclasses import dataclass
 from std_srvs.srv import Trigger
 from anser_ros.nodes.node import AnserNode, main
+from anser_ros.nodes.parameter_files import complaints
 from anser_ros.nodes.parameters import parameter
 
 @dataclass(frozen=True)
@@ -157,6 +182,14 @@ class TestProcess:
         assert process.popen.wait(20) == 2
         assert said in process.output
         assert 'Traceback' not in process.output
+
+    def test_a_file_without_the_node_is_said(self, run, tmp_path):
+        """rclpy drops a section with a misspelt name without a word."""
+        file = tmp_path / 'parameters.yaml'
+        file.write_text('/anser/smaple:\n  ros__parameters:\n    rate_hz: 50.0\n')
+        process = run('--ros-args', '--params-file', str(file))
+        process.wait_for("nothing for sample; is '/anser/smaple' meant?")
+        process.wait_for('rate 25.0')
 
     def test_help_prints_the_table(self, run):
         process = run('--help')

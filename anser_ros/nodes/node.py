@@ -25,7 +25,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import rclpy
@@ -40,7 +40,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from anser_ros.errors import AnserError, ParameterError
-from anser_ros.nodes import parameters, qos
+from anser_ros.nodes import parameter_files, parameters, qos
 from anser_ros.nodes.diagnostics import Level, Status, Throttle, diagnostic_array
 
 NAMESPACE = 'anser'
@@ -129,13 +129,22 @@ class AnserNode(Node):
 
     def publish_diagnostics(self) -> None:
         """Publish all statuses now."""
+        self._publish(self._own_status(), *self.part_statuses())
+
+    def publish_end(self) -> None:
+        """Publish that the node has ended, so that its last state is not taken for a live one."""
+        self._publish(replace(self._own_status(), level=Level.STALE, message='ended'))
+
+    def _own_status(self) -> Status:
         own = self.status()
         level, message = own.level, own.message
         if self.counters['callback_faults'] > self._faults_reported:
             self._faults_reported = self.counters['callback_faults']
             level, message = Level.ERROR, f'callback failed: {self._fault}'
         values = {**own.values, **self.counters, 'uptime_s': time.monotonic() - self.started_s}
-        statuses = [Status(own.name, level, message, values), *self.part_statuses()]
+        return Status(own.name, level, message, values)
+
+    def _publish(self, *statuses: Status) -> None:
         name = self.get_fully_qualified_name().strip('/')
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostic_array(name, statuses, stamp))
@@ -250,7 +259,7 @@ def main(node_class: type[AnserNode], argv: Sequence[str] | None = None) -> int:
         own = _parse(node_class, _without_ros(arguments))
         stopping = _stop_on_signals()
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        return _run(node_class, own, stopping)
+        return _run(node_class, own, arguments, stopping)
     except AnserError as error:
         print(f'{node_class.NAME}: {" ".join(str(error).split())}', file=sys.stderr)
         return 2
@@ -296,11 +305,18 @@ def _stop_on_signals() -> list[int]:
     return caught
 
 
-def _run(node_class: type[AnserNode], own: dict[str, Any], stopping: list[int]) -> int:
+def _run(
+    node_class: type[AnserNode],
+    own: dict[str, Any],
+    arguments: Sequence[str],
+    stopping: list[int],
+) -> int:
     node, code = None, 0
     executor = SingleThreadedExecutor()
     try:
         node = node_class(**own)
+        for text in parameter_files.complaints(arguments, node.get_name()):
+            node.get_logger().warning(text)
         executor.add_node(node)
         while not stopping and node.exit_code is None:
             executor.spin_once(timeout_sec=SPIN_SLICE_S)
@@ -311,7 +327,7 @@ def _run(node_class: type[AnserNode], own: dict[str, Any], stopping: list[int]) 
             signal.signal(number, signal.SIG_IGN)
         if node is not None:
             node.close()
-            node.publish_diagnostics()
+            node.publish_end()
             executor.shutdown(timeout_sec=1.0)
             node.destroy_node()
     return code

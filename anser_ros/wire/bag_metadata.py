@@ -90,8 +90,11 @@ def write_metadata(path: Path, record: BagRecord, ros_distro: str, is_closed: bo
     }
     target = path.with_name('metadata.yaml')
     draft = path.with_name('.metadata.yaml.new')
-    draft.write_text(plain_yaml(document), encoding='utf-8')
-    draft.replace(target)
+    try:
+        draft.write_text(plain_yaml(document), encoding='utf-8')
+        draft.replace(target)
+    finally:
+        draft.unlink(missing_ok=True)
 
 
 def plain_yaml(document: Any) -> str:

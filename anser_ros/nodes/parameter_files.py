@@ -1,0 +1,59 @@
+"""Finds parameter files that say nothing to the node that was given them."""
+
+import difflib
+import itertools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+OPTION = '--params-file'
+LEAF = 'ros__parameters'
+WILDCARDS = ('*', '**')
+
+
+def complaints(arguments: Sequence[str], node: str) -> list[str]:
+    """Return one line for each parameter file without a section for a node.
+
+    rclpy drops such a file without a word, and the node runs with its defaults. A file that is
+    none is left to rclpy, which refuses it.
+
+    Parameters
+    ----------
+    arguments : sequence of str
+        The process's arguments.
+    node : str
+        The node's name.
+    """
+    found = []
+    for option, value in itertools.pairwise(arguments):
+        if option != OPTION:
+            continue
+        try:
+            document = yaml.safe_load(Path(value).read_text(encoding='utf-8'))
+        except (OSError, ValueError, yaml.YAMLError):
+            continue
+        keys = list(_sections(document))
+        names = [key.rsplit('/', 1)[-1] for key in keys]
+        if node in names or any(name in WILDCARDS for name in names):
+            continue
+        close = difflib.get_close_matches(node, names, n=1)
+        hint = f"is '{keys[names.index(close[0])]}' meant?" if close else f'it has: {_list(keys)}'
+        found.append(f'{value} has nothing for {node}; {hint}')
+    return found
+
+
+def _sections(document: Any, path: str = '') -> Iterator[str]:
+    """Yield the full name of every section that holds parameters."""
+    if not isinstance(document, dict):
+        return
+    if LEAF in document:
+        yield path
+    for key, value in document.items():
+        if key != LEAF:
+            yield from _sections(value, f'{path}/{key}' if path else str(key))
+
+
+def _list(keys: Sequence[str]) -> str:
+    return ', '.join(keys) or 'no section at all'
