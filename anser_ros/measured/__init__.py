@@ -1,0 +1,38 @@
+"""Importers of other people's measurements: each finds what its data contain and scores it.
+
+A module here has a ``NAME`` and a function ``run(shared, rng)`` that returns its `Row` list.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table that `anser measured` prints.
+
+    Attributes
+    ----------
+    dataset : str
+        Folder of the measurement.
+    figure : str
+        What is measured, in words.
+    before, after : float
+        The figure without and with the effects that were found; nan where there is none.
+    unit : str
+        Unit of `before`, `after` and `target`.
+    target : float or None
+        What `after` should not exceed (for a correlation: not fall below).
+    met : bool or None
+        Whether it does; None without a target.
+    chosen_on : str
+        What the effects were chosen and fitted on, and what the figure was scored on.
+    """
+
+    dataset: str
+    figure: str
+    before: float
+    after: float
+    unit: str
+    target: float | None
+    met: bool | None
+    chosen_on: str
