@@ -30,9 +30,9 @@ WHITENING_REACH = 0.05
 class CoilTrack:
     """Memory of one sensor: its last good pose, its noise scale, the model error near it.
 
-    While no pose is good, ``suspect`` is the best bad one. It tells whether anything has changed, so
-    that the costly scan need not run in every frame of a long distortion; it never becomes a pose
-    without a scan that confirms it.
+    While no pose is good, ``suspect`` is the best bad one. It tells whether anything has changed,
+    so that the costly scan need not run in every frame of a long distortion; it never becomes a
+    pose without a scan that confirms it.
     """
 
     good: CoilSolution | None = None
@@ -231,8 +231,8 @@ def _judge(
                 state = states.AMBIGUOUS
                 reason = f'{_millimetres(rival.position)} mm would explain the fluxes too'
     return PoseEstimate(
-        frame.name, frame.stamp_ns, state, solution.position, solution.axis, None, covariance, sigma,
-        residual, ratio, frame.scene.model_id, reason,
+        frame.name, frame.stamp_ns, state, solution.position, solution.axis, None, covariance,
+        sigma, residual, ratio, frame.scene.model_id, reason,
     )  # fmt: skip
 
 

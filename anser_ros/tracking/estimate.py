@@ -66,7 +66,7 @@ class TrackerSettings:
     grid_spacing_m: float = 0.035
     gate: float = 4.0
     odds: float = 1000.0
-    max_sigma_m: float = 5e-3
+    max_sigma_m: float = 0.02
     min_signal: float = 4.0
     warm_age_s: float = 1.0
     roll_variance: float = ROLL_VARIANCE
@@ -140,8 +140,8 @@ def no_pose(name: str, stamp_ns: int, state: str, model_id: str, reason: str) ->
 class NoiseScale:
     """Running estimate of residual power over its expectation: 1 when the noise is as told.
 
-    An exponential mean over about ``memory`` good frames; it starts as if ``prior`` frames had been
-    as expected.
+    An exponential mean over about ``memory`` good frames; it starts as if ``prior`` frames had
+    been as expected.
     """
 
     def __init__(self, memory: float = 100.0, prior: float = 8.0) -> None:
@@ -161,10 +161,11 @@ class NoiseScale:
         self._sum = keep * self._sum + min(ratio, 4.0 * self.value)
 
     def of_frame(self, ratio: float, usual: float) -> float:
-        """Variance scale of one frame: the running one, more when the frame's residual asks for it.
+        """Variance scale of one frame: the running one, more when the frame's residual asks for
+        it.
 
-        ``usual`` is the ratio that noise alone rarely exceeds. A residual above it comes from a bent
-        field, and a smooth distortion looks more like a pose than like anything else.
+        ``usual`` is the ratio that noise alone rarely exceeds. A residual above it comes from a
+        bent field, and a smooth distortion looks more like a pose than like anything else.
         """
         if ratio <= usual * max(self.value, 1.0):
             return self.value

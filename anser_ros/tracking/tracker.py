@@ -10,8 +10,9 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.effects.correction import Correction
 from anser_ros.errors import TrackingError
-from anser_ros.fitting.model import FieldModel
+from anser_ros.fitting.model import EffectRecord, FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.tracking import estimate as states
 from anser_ros.tracking.body_track import BodyTrack, track_body
@@ -50,6 +51,8 @@ class Tracker:
     ------
     TrackingError
         When there is no sensor, a channel or name appears twice, or the model can't be used.
+    ModelFileError
+        When an effect of the model is none that can be undone.
     """
 
     def __init__(
@@ -71,15 +74,22 @@ class Tracker:
         self._coil_tracks = {name: CoilTrack() for name in sensors.name}
         self._body_tracks = {name: BodyTrack() for name in dict.fromkeys(sensors.body)}
         self._last_ns = [0]
+        self._first_ns: list[int] = []
         self._scene: Scene | None = None
+        self._effects: tuple[EffectRecord, ...] = ()
+        self._correction: Correction | None = None
+        self._table = sensors
         self._use(model, model_id)
 
     def _use(self, model: FieldModel | None, model_id: str | None) -> None:
-        self._model = model
-        table = self.sensors
         if model is not None:
-            self._scene = build_scene(model, self.settings, self._scene, model_id)
-        self._table = table
+            scene = build_scene(model, self.settings, self._scene, model_id)
+            if model.effects is not self._effects or self._correction is None:
+                self._correction = Correction.of(model.effects, self.sensors, model.frequencies_hz)
+                self._table = self._correction.sensors()
+            self._scene, self._effects = scene, model.effects
+        self._model = model
+        table = self._table
         self._bodies: dict[str, tuple[NDArray[np.int64], BodyCoils]] = {}
         for body in self._body_tracks:
             rows = np.array([i for i, name in enumerate(table.body) if name == body])
@@ -156,6 +166,7 @@ class Tracker:
             self.counters['time_jumps'] += 1
             self.reset()
         self._last_ns[0] = stamp_ns
+        values = self._corrected(stamp_ns, values)
         self.counters['frames'] += 1
         scene, table = self._scene, self._table
         if scene is None:
@@ -191,6 +202,17 @@ class Tracker:
                 )
             )
         return estimates
+
+    def _corrected(self, stamp_ns: int, values: Array) -> Array:
+        """Fluxes (S, 2K) without what the model's effects did to them."""
+        if not self._first_ns:
+            self._first_ns.append(stamp_ns)
+        if self._correction is None or not self._correction.changes_flux:
+            return values
+        time = (stamp_ns - self._first_ns[0]) * 1e-9
+        flux = values.view(np.complex128)
+        sound = self._correction.flux(time, self.sensors.channel, flux)
+        return np.ascontiguousarray(sound, dtype=np.complex128).view(np.float64)
 
     def _checked(
         self,

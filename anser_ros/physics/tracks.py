@@ -1,0 +1,115 @@
+"""Field of straight current-carrying tracks: the Biot-Savart law, textbook sign.
+
+A segment from A to B with the current I flowing from A to B makes, at the offsets ``a = P - A``
+and ``b = P - B``, ``B = mu0 I/(4 pi) (a x b) (|a| + |b|) / (|a| |b| (|a| |b| + a . b))``, which is
+the integral of ``dl x r / r^3`` in closed form (Hanson and Hirshman, Phys. Plasmas 9, 2002). It
+has no cancellation near the segment's extension. Only closed paths have a curl-free field outside
+the copper; a dipole model can fit no other.
+"""
+
+from collections.abc import Sequence
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.physics.constants import DIPOLE_CONSTANT
+
+Array = NDArray[np.float64]
+
+
+@numba.njit(cache=True, error_model='numpy')
+def _add_segments(starts, ends, points, factor, out):  # type: ignore[no-untyped-def]
+    for p in range(points.shape[0]):
+        bx, by, bz = 0.0, 0.0, 0.0
+        for s in range(starts.shape[0]):
+            ax, ay, az = (
+                points[p, 0] - starts[s, 0],
+                points[p, 1] - starts[s, 1],
+                points[p, 2] - starts[s, 2],
+            )
+            cx, cy, cz = (
+                points[p, 0] - ends[s, 0],
+                points[p, 1] - ends[s, 1],
+                points[p, 2] - ends[s, 2],
+            )
+            a = np.sqrt(ax * ax + ay * ay + az * az)
+            c = np.sqrt(cx * cx + cy * cy + cz * cz)
+            product = a * c
+            weight = (a + c) / (product * (product + ax * cx + ay * cy + az * cz))
+            bx += weight * (ay * cz - az * cy)
+            by += weight * (az * cx - ax * cz)
+            bz += weight * (ax * cy - ay * cx)
+        out[p, 0] += factor * bx
+        out[p, 1] += factor * by
+        out[p, 2] += factor * bz
+
+
+def _points(values: NDArray[np.generic], what: str) -> Array:
+    array = np.ascontiguousarray(values, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f'{what} must have shape (n, 3), got {array.shape}')
+    return array
+
+
+def segment_field(
+    starts: NDArray[np.generic],
+    ends: NDArray[np.generic],
+    points: NDArray[np.generic],
+    current_a: float = 1.0,
+) -> Array:
+    """Field of straight segments that all carry the same current.
+
+    Parameters
+    ----------
+    starts, ends : ndarray, shape (M, 3)
+        m; the current flows from start to end.
+    points : ndarray, shape (P, 3)
+        m; not on a segment.
+    current_a : float
+        A.
+
+    Returns
+    -------
+    ndarray, shape (P, 3)
+        T.
+
+    Raises
+    ------
+    ValueError
+        When shapes don't fit.
+    """
+    first, last, at = _points(starts, 'starts'), _points(ends, 'ends'), _points(points, 'points')
+    if first.shape != last.shape:
+        raise ValueError(f'starts and ends must match, got {first.shape} and {last.shape}')
+    lengths = np.linalg.norm(last - first, axis=1)
+    first, last = first[lengths > 0], last[lengths > 0]
+    out = np.zeros_like(at)
+    _add_segments(first, last, at, DIPOLE_CONSTANT * float(current_a), out)
+    return out
+
+
+def loop_field(
+    corners: NDArray[np.generic], points: NDArray[np.generic], current_a: float = 1.0
+) -> Array:
+    """Field (T), shape (P, 3), of a closed path: from each corner (m), shape (M, 3), to the next,
+    and from the last to the first; `ValueError` when shapes don't fit."""
+    path = _points(corners, 'corners')
+    return segment_field(path, np.roll(path, -1, axis=0), points, current_a)
+
+
+def loop_moment(corners: NDArray[np.generic], current_a: float = 1.0) -> Array:
+    """Moment (A m^2), shape (3,), of a closed path: ``I/2`` times the sum of ``r x dr``."""
+    path = _points(corners, 'corners')
+    cross = np.cross(path, np.roll(path, -1, axis=0))
+    return np.asarray(0.5 * current_a * cross.sum(axis=0))
+
+
+def paths_field(
+    paths: Sequence[NDArray[np.generic]], points: NDArray[np.generic], currents_a: Array
+) -> Array:
+    """Fields (T), shape (P, K, 3), of K closed paths with their own currents, shape (K,), A."""
+    fields = [
+        loop_field(path, points, float(i)) for path, i in zip(paths, currents_a, strict=True)
+    ]
+    return np.stack(fields, axis=1)
