@@ -9,7 +9,7 @@ import numpy as np
 
 from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.metal import steel_disc
-from anser_ros.simulation.motion import Approach
+from anser_ros.simulation.motion import Approach, Lissajous
 from anser_ros.simulation.recording import Errors, GridScan, record
 from anser_ros.simulation.world import World
 from anser_ros.wire.bag import bag_file
@@ -58,12 +58,22 @@ def run(args: argparse.Namespace) -> int:
     scan = GridScan()
     scanned = World(setup, source, paths=dict.fromkeys(setup.bodies, scan))
     frames = int(SECONDS * RATE_HZ)
+    # Within the heights that the scan's three clusters cover: a model is no better outside them.
+    path = Lissajous(centre_m=(0.0, 0.0, 0.16), amplitude_m=(0.08, 0.08, 0.02))
+    paths = dict.fromkeys(setup.bodies, path)
     visit = steel_disc(Approach(near_m=(0.05, -0.03, -0.06), start_s=2.0, travel_s=3.0))
     static, live = Errors(flux_noise_t=STATIC_NOISE_T), Errors()
     for name, world, count, rate, optical_rate, errors in (
         ('factory', scanned, scan.frames, 1.0, None, static),
-        ('moving', World(setup, source), frames, RATE_HZ, OPTICAL_RATE_HZ, live),
-        ('metal', World(setup, source, metal=[visit]), frames, RATE_HZ, OPTICAL_RATE_HZ, live),
+        ('moving', World(setup, source, paths=paths), frames, RATE_HZ, OPTICAL_RATE_HZ, live),
+        (
+            'metal',
+            World(setup, source, paths=paths, metal=[visit]),
+            frames,
+            RATE_HZ,
+            OPTICAL_RATE_HZ,
+            live,
+        ),
     ):
         path = args.out / f'{name}.mcap'
         with contextlib.suppress(FileNotFoundError):

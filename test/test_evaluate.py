@@ -1,0 +1,118 @@
+"""`anser evaluate` on bags of our own simulator: accuracy, honest uncertainty, files, refusals."""
+
+import csv
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from anser_ros.cli.main import main
+from anser_ros.sessions.evaluation import track_session
+from anser_ros.sessions.model_file import load_model, save_model
+from anser_ros.sessions.session import load_session
+
+BAGS = Path(__file__).resolve().parents[1] / 'bags'
+OPTICAL_JITTER_M = 0.12e-3
+FIGURES = {
+    f'{what}_{statistic}_{unit}'
+    for what, unit in (('position', 'm'), ('orientation', 'rad'))
+    for statistic in ('rmse', 'me', 'prc50', 'prc95')
+} | {'n', 'tracked_fraction'}
+
+
+@pytest.fixture(scope='module')
+def model(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp('model') / 'model.yaml'
+    assert main(['calibrate', str(BAGS / 'factory.mcap'), '--out', str(path)]) == 0
+    return path
+
+
+@pytest.fixture(scope='module')
+def moving(model):
+    return track_session(load_session(BAGS / 'moving.mcap'), load_model(model))
+
+
+def test_every_frame_is_tracked_to_the_optical_jitter(moving):
+    assert len(moving.sensors) == 9
+    for series in moving.sensors.values():
+        assert series.ok.mean() >= 0.99
+        rmse = np.sqrt(np.nanmean(series.position_error**2))
+        assert rmse < 0.16e-3
+        assert np.sqrt(np.nanmean(series.orientation_error**2)) < np.radians(0.1)
+
+
+def test_the_uncertainty_is_honest(moving):
+    for series in moving.sensors.values():
+        sigma = np.array([estimate.sigma_position_m for estimate in series.estimates])
+        score = series.position_error / np.hypot(sigma, OPTICAL_JITTER_M)
+        assert 1.1 < np.nanpercentile(score, 95) < 2.3
+
+
+def test_a_pose_near_unmodelled_metal_is_withheld_not_wrong(model):
+    evaluation = track_session(load_session(BAGS / 'metal.mcap'), load_model(model))
+    for series in evaluation.sensors.values():
+        assert 0.2 < series.ok.mean() < 0.9
+        assert np.nanmax(series.position_error) < 2e-3
+
+
+def test_files_and_json_are_the_contracts(model, tmp_path, capsys):
+    arguments = ['evaluate', str(BAGS / 'moving.mcap'), '--model', str(model), '--json']
+    assert main([*arguments, '--out', str(tmp_path)]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document == json.loads((tmp_path / 'evaluation.json').read_text())
+    assert document['schema'] == 'anser_evaluation/1'
+    assert set(document['bodies']) == {'tool_a'}
+    for row in [*document['sensors'].values(), *document['bodies'].values()]:
+        assert set(row) == FIGURES
+    lines = (tmp_path / 'poses.csv').read_text().splitlines()
+    header = 'stamp_ns,sensor,x_m,y_m,z_m,ax,ay,az,sigma_position_m,residual_t,status'
+    assert lines[0] == header
+    rows = list(csv.DictReader(lines))
+    assert len(rows) == 9 * 200
+    assert {row['sensor'] for row in rows} == set(document['sensors'])
+    good = [row for row in rows if row['status'] == 'ok']
+    axes = np.array([[float(row[key]) for key in ('ax', 'ay', 'az')] for row in good])
+    np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1.0, atol=1e-6)
+    assert all(float(row['sigma_position_m']) > 0 for row in good)
+
+
+def test_in_phase_alone_tracks_where_there_is_no_metal(model, tmp_path):
+    arguments = ['evaluate', str(BAGS / 'moving.mcap'), '--model', str(model), '--in-phase']
+    assert main([*arguments, '--out', str(tmp_path)]) == 0
+    document = json.loads((tmp_path / 'evaluation.json').read_text())
+    assert all(row['position_rmse_m'] < 0.25e-3 for row in document['sensors'].values())
+
+
+def test_the_nominal_model_tracks_worse_than_the_calibrated(tmp_path):
+    arguments = ['evaluate', str(BAGS / 'moving.mcap'), '--model', 'nominal']
+    assert main([*arguments, '--out', str(tmp_path)]) == 0
+    document = json.loads((tmp_path / 'evaluation.json').read_text())
+    assert document['sensors']['tool_a/2/y']['position_rmse_m'] > 0.3e-3
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        (['--model', 'absent.yaml'], 'absent.yaml'),
+        (['--refit'], '--baseline'),
+        (['--refit', '--baseline', 'absent.mcap'], 'no such bag'),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_two(model, tmp_path, capsys, change, message):
+    arguments = ['evaluate', str(BAGS / 'moving.mcap'), '--model', str(model), *change]
+    assert main([*arguments, '--out', str(tmp_path)]) == 2
+    text = capsys.readouterr().err
+    assert message in text
+    assert len(text.strip().split('\n')) == 1
+
+
+def test_a_model_of_another_board_is_refused(model, tmp_path, capsys):
+    other = tmp_path / 'other.yaml'
+    good = load_model(model)
+    names = tuple(f'other{k}' for k in range(len(good.emitters)))
+    save_model(other, dataclasses.replace(good, emitters=names))
+    arguments = ['evaluate', str(BAGS / 'moving.mcap'), '--model', str(other)]
+    assert main([*arguments, '--out', str(tmp_path)]) == 2
+    assert 'other0' in capsys.readouterr().err
