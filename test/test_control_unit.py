@@ -281,6 +281,15 @@ class TestMetal:
         assert path(14.0)[0] == pytest.approx(path.near_m)
 
 
+@pytest.mark.parametrize('kept', ['tool_sensors', 'reference_sensors'])
+def test_a_world_of_only_tools_or_only_references(kept):
+    setup = replace(SETUP, sensors=getattr(SETUP, kept))
+    rows = [SETUP.sensors.index(sensor) for sensor in setup.sensors]
+    for metal in ((), (steel_disc(),)):
+        part, whole = World(setup, dipoles, metal=metal), world(metal=metal)
+        assert part.flux(14.0) == pytest.approx(whole.flux(14.0)[rows])
+
+
 def test_tool_moves_smoothly_inside_the_volume():
     path = Lissajous()
     positions = np.array([path(t)[0] for t in np.arange(0, 60, 0.01)])
