@@ -1,6 +1,6 @@
 """From measurements to a field model: refusals, choice by held-out error, fit, honest figures."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from anser_ros.errors import FitError
 from anser_ros.fitting.blocks import fold_of_frames
 from anser_ros.fitting.held_out import HeldOut, predict_held_out
+from anser_ros.fitting.layout_fit import LayoutFit, fit_layout
 from anser_ros.fitting.layouts import Generator, Layout, place
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.moments import (
     ComplexArray,
     MomentFit,
-    MomentFitter,
     Progress,
     Uncertainty,
     as_real,
@@ -143,8 +143,12 @@ def _check_thickness(measurements: Sequence[Measurements]) -> None:
         )
 
 
-def check_agreement(measurements: Sequence[Measurements], names: Sequence[str], joint: MomentFit,
-                    layout_fit: Any) -> None:  # fmt: skip
+def check_agreement(
+    measurements: Sequence[Measurements],
+    names: Sequence[str],
+    joint: MomentFit,
+    fit_part: Callable[[list[Measurements]], LayoutFit],
+) -> None:
     """Refuse sessions that one field can't explain.
 
     Parameters
@@ -153,8 +157,8 @@ def check_agreement(measurements: Sequence[Measurements], names: Sequence[str], 
         One session's name for each set of measurements.
     joint : MomentFit
         Fit of all together.
-    layout_fit : callable
-        Fits some of the measurements alone with the same dipoles.
+    fit_part : callable
+        Fits some of the measurements alone in the same way.
 
     Raises
     ------
@@ -165,10 +169,10 @@ def check_agreement(measurements: Sequence[Measurements], names: Sequence[str], 
     if len(sessions) < 2:
         return
     alone = [
-        layout_fit([m for m, name in zip(measurements, names, strict=True) if name == session])
+        fit_part([m for m, name in zip(measurements, names, strict=True) if name == session])
         for session in sessions
     ]
-    worst = max(fit.noise_t for fit in alone)
+    worst = max(part.fit.noise_t for part in alone)
     if joint.noise_t > DISAGREEMENT * worst:
         raise FitError(
             f'the sessions are of different boards: one field leaves {joint.noise_t:.3g} T, '
@@ -220,18 +224,18 @@ def calibrate(
     )
     layout = selection.chosen.layout
     damping = selection.chosen.damping if options.damping is None else options.damping
-    dipoles, prior = selection.chosen.dipoles, selection.chosen.prior
     uncertainty = options.uncertainty
 
-    def fit_alone(part: list[Measurements]) -> MomentFit:
-        return MomentFitter(part, dipoles, damping, uncertainty, prior).fit(3, exact=False)
+    def fit_part(part: list[Measurements]) -> LayoutFit:
+        return fit_layout(
+            part, layout, damping, generator, uncertainty, nominal, alternations=3, exact=False
+        )
 
-    fit = MomentFitter(posed, dipoles, damping, uncertainty, prior).fit(progress=progress)
-    check_agreement(posed, names, fit, fit_alone)
-    held_out = predict_held_out(
-        thin, folds, dipoles, damping, uncertainty, prior,
-        noise_t=min(fit.noise_t, selection.reference.noise_t),
-    )  # fmt: skip
+    whole = fit_layout(posed, layout, damping, generator, uncertainty, nominal, progress=progress)
+    dipoles, fit = whole.dipoles, whole.fit
+    check_agreement(posed, names, fit, fit_part)
+    noise = min(fit.noise_t, selection.reference.noise_t)
+    held_out = predict_held_out(thin, folds, fit_part, uncertainty, noise)
     model = FieldModel(
         positions=dipoles.positions,
         directions=dipoles.directions,

@@ -7,17 +7,16 @@ derivatives by the pose, S the pose's jitter), ``r^T C^-1 r`` is the frame's pre
 and ``sigma^2 C^-1 r`` what no pose explains.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.fitting.layout_fit import LayoutFit
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.moments import (
     ComplexArray,
-    Dipoles,
-    MomentFitter,
     PoseTerms,
     Uncertainty,
     frame_blocks,
@@ -117,11 +116,8 @@ def _complex_rows(values: Array, used: NDArray[np.bool_]) -> ComplexArray:
 def predict_held_out(
     measurements: Sequence[Measurements],
     folds: Sequence[NDArray[np.int64]],
-    dipoles: Dipoles,
-    damping: float,
+    fit: Callable[[list[Measurements]], LayoutFit],
     uncertainty: Uncertainty,
-    prior: ComplexArray | None = None,
-    alternations: int = 3,
     noise_t: float | None = None,
 ) -> HeldOut:
     """Fit without each fold in turn, from the start, and predict it.
@@ -131,9 +127,9 @@ def predict_held_out(
     measurements : sequence of Measurements
     folds : sequence of ndarray, shape (F,)
         Fold of each frame, an array a measurement set.
-    dipoles, damping, uncertainty, prior
-        As for `MomentFitter`.
-    alternations : int
+    fit : callable
+        Fits a model to measurements, from the start.
+    uncertainty : Uncertainty
     noise_t : float or None
         Noise of a phasor component, T, for weighing noise against jitter and to be taken off;
         when not given, the smallest that any fold's fit left.
@@ -141,16 +137,16 @@ def predict_held_out(
     fits = []
     for fold in np.unique(np.concatenate(list(folds))):
         train = [m.frames(f != fold) for m, f in zip(measurements, folds, strict=True)]
-        fitter = MomentFitter(train, dipoles, damping, uncertainty, prior)
-        fits.append((int(fold), fitter.fit(alternations, exact=False)))
-    noise = min(fit.noise_t for _, fit in fits) if noise_t is None else noise_t
+        fits.append((int(fold), fit(train)))
+    noise = min(part.fit.noise_t for _, part in fits) if noise_t is None else noise_t
     tally = _Tally(noise, uncertainty)
-    for fold, fit in fits:
+    for fold, fitted in fits:
         for m, f in zip(measurements, folds, strict=True):
             test = with_pose(m.frames(f == fold))
             for block in frame_blocks(len(test.time), len(test.sensors)):
                 part = test.frames(block)  # type: ignore[arg-type]
-                tally.add(pose_terms(part, dipoles, fit.moments), usable_weights(part))
+                terms = pose_terms(part, fitted.dipoles, fitted.fit.moments)
+                tally.add(terms, usable_weights(part))
     return tally.result()
 
 

@@ -66,6 +66,8 @@ class Layout:
         How far below the coils the layer lies.
     prior : {'none', 'nominal'}
         What the damping pulls the moments towards: zero, or those of the drawn board.
+    moved : bool
+        Whether the dipoles are moved from there to where they explain the data best.
     """
 
     kind: str
@@ -73,10 +75,12 @@ class Layout:
     extension: float
     depth_m: float
     prior: str = 'none'
+    moved: bool = False
 
     def describe(self) -> str:
         """One line for a report."""
         drawn = ', pulled to the drawn board' if self.prior == 'nominal' else ''
+        drawn += ', positions optimised' if self.moved else ''
         if self.kind == 'coils':
             return f'{self.count}x{self.count} z-dipoles on every coil{drawn}'
         parts = 'z-dipoles' if self.kind == 'layer' else 'three-component dipoles'

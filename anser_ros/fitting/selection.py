@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import FitError
 from anser_ros.fitting.held_out import PoseWhitener
+from anser_ros.fitting.layout_fit import optimise_positions, prior_of
 from anser_ros.fitting.layouts import Generator, Layout, place
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.moments import (
@@ -41,6 +42,14 @@ DEPTHS = (-0.15, 0.15, 0.3)
 """As a part of the lowest sensor's height over the coils."""
 MOST_ROWS = 12_000
 """Readings that the choice looks at; the final fit takes all."""
+MOVING = (
+    Layout('coils', 2, 1.0, 0.0),
+    Layout('coils', 3, 1.0, 0.0),
+    Layout('layer', 8, 1.25, 0.01),
+)
+"""Where dipoles start from that are moved."""
+MOVING_READINGS = 12
+"""Readings that a moved dipole must have at least: three coordinates and a moment, thrice."""
 WORTH = 0.1
 """A richer layout must lower the predictive error by this part to be worth its dipoles."""
 
@@ -53,8 +62,7 @@ class Candidate:
     ----------
     layout : Layout
     dipoles : Dipoles
-    prior : ndarray, shape (N, K), complex, or None
-        Moments that the damping pulls towards.
+        As placed (before they are moved, if they may).
     damping : float
     score : float
         Square root of the mean predictive chi-square a phasor component, times the noise: T.
@@ -64,7 +72,6 @@ class Candidate:
 
     layout: Layout
     dipoles: Dipoles
-    prior: ComplexArray | None
     damping: float
     score: float
     curve: tuple[tuple[float, float], ...]
@@ -159,18 +166,25 @@ class Selector:
         self,
         layout: Layout,
         dipoles: Dipoles,
+        drawn: DrawnBoard | None = None,
         dampings: Sequence[float] = DAMPINGS,
-        prior: ComplexArray | None = None,
     ) -> Candidate:
-        """Held-out score of a layout for every damping; the best damping is kept."""
-        matrices = [basis_rows(bench.corrected, dipoles) for bench in self._benches]
-        folds = [int(fold) for fold in self._folds]
-        grams = {fold: self._gram(fold, matrices) for fold in folds}
-        total = sum(grams.values())
+        """Held-out score of a layout for every damping; the best damping is kept.
+
+        Dipoles that may move are moved anew for each fold, by the other folds' data.
+        """
+        prior = prior_of(layout, dipoles, drawn)
         chi, count = np.zeros(len(dampings)), 0.0
-        start = None if prior is None else as_real(prior) / self.noise_t
-        for fold in folds:
-            moments = _ridge(total - grams[fold], len(dipoles), dampings, start)
+        same = None if layout.moved else self._tables(dipoles)
+        for fold in (int(fold) for fold in self._folds):
+            own, own_prior = dipoles, prior
+            if layout.moved:
+                own = self._moved_without(fold, dipoles, prior)
+                own_prior = prior_of(layout, own, drawn)
+            matrices, grams = same or self._tables(own)
+            start = None if own_prior is None else as_real(own_prior) / self.noise_t
+            total = sum(gram for other, gram in grams.items() if other != fold)
+            moments = _ridge(np.asarray(total), len(own), dampings, start)
             for bench, matrix in zip(self._benches, matrices, strict=True):
                 if fold not in bench.whiteners:
                     continue
@@ -179,7 +193,20 @@ class Selector:
         scores = self.noise_t * np.sqrt(chi / count)
         best = int(np.argmin(scores))
         curve = tuple(zip(map(float, dampings), map(float, scores), strict=True))
-        return Candidate(layout, dipoles, prior, float(dampings[best]), float(scores[best]), curve)
+        return Candidate(layout, dipoles, float(dampings[best]), float(scores[best]), curve)
+
+    def _tables(self, dipoles: Dipoles) -> tuple[list[Array], dict[int, Array]]:
+        matrices = [basis_rows(bench.corrected, dipoles) for bench in self._benches]
+        return matrices, {int(fold): self._gram(int(fold), matrices) for fold in self._folds}
+
+    def _moved_without(self, fold: int, dipoles: Dipoles, prior: ComplexArray | None) -> Dipoles:
+        kept = [bench.folds != fold for bench in self._benches]
+        return optimise_positions(
+            [bench.corrected.frames(k) for bench, k in zip(self._benches, kept, strict=True)],
+            [bench.weights[k] for bench, k in zip(self._benches, kept, strict=True)],
+            dipoles,
+            prior,
+        )
 
     @property
     def _parts(self) -> int:
@@ -273,6 +300,10 @@ def choose_layout(
         others.append(replace(best.layout, prior='none'))
     others = [other for other in others if len(place(other, generator)) <= 1.2 * COUNTS[-1] ** 2]
     best = search.best_of(best, others)
+    moving = [replace(layout, prior=prior, moved=True) for layout in MOVING]
+    best = search.best_of(
+        best, [m for m in moving if MOVING_READINGS * len(place(m, generator)) <= rows]
+    )
     chosen = search.leanest(best)
     return Selection(chosen, tuple(search.tried.values()), selector.reference)
 
@@ -300,10 +331,7 @@ class _Search:
     def score(self, layout: Layout) -> Candidate:
         if layout not in self.tried:
             dipoles = place(layout, self.generator)
-            prior = None
-            if layout.prior == 'nominal' and self.drawn is not None:
-                prior = self.drawn.moments(dipoles)
-            self.tried[layout] = self.selector.score(layout, dipoles, prior=prior)
+            self.tried[layout] = self.selector.score(layout, dipoles, self.drawn)
             if self.progress is not None:
                 self.progress('layouts', 1.0 - 0.9 ** len(self.tried))
         return self.tried[layout]
@@ -333,10 +361,11 @@ class _Search:
         Tracking takes time in proportion to the dipoles, and far below the noise nothing is won.
         """
         limit = best.score * (1.0 + WORTH)
-        place_now = EXTENSIONS.index(best.layout.extension)
+        fixed = min((c for c in self.tried.values() if not c.layout.moved), key=lambda c: c.score)
+        place_now = EXTENSIONS.index(fixed.layout.extension)
         for extension in EXTENSIONS[max(place_now - 1, 0) : place_now + 1]:
-            size = replace(best.layout, extension=extension)
-            for count in (n for n in reversed(COUNTS) if n < best.layout.count):
+            size = replace(fixed.layout, extension=extension)
+            for count in (n for n in reversed(COUNTS) if n < fixed.layout.count):
                 if self.score(replace(size, count=count)).score > limit:
                     break
         good = [c for c in self.tried.values() if c.score <= limit]
