@@ -109,6 +109,7 @@ def test_figures_are_short():
 NODE = '''
 """A node of the tests."""
 import sys
+import time
 from dataclasses import dataclass
 from std_srvs.srv import Trigger
 from anser_ros.nodes.node import AnserNode, main
@@ -130,6 +131,8 @@ class Sample(AnserNode):
     def __init__(self, end=None, **options):
         super().__init__(**options)
         print('rate', self.parameters.rate_hz, flush=True)
+        for _ in range(100 * (self.parameters.rate_hz == 99.0)):
+            time.sleep(0.1)  # as long as compiling takes
         if end is not None:
             self.stop(end)
 
@@ -164,6 +167,14 @@ class TestProcess:
         assert process.interrupt(number) == 0
         assert time.monotonic() - began < 2.0
         assert process.output.endswith('closed\n')
+
+    def test_a_signal_ends_it_while_it_is_still_being_made(self, run):
+        process = run('--ros-args', '-p', 'rate_hz:=99')
+        process.wait_for('rate 99.0')
+        began = time.monotonic()
+        assert process.interrupt() == 0
+        assert time.monotonic() - began < 2.0
+        assert process.output == 'rate 99.0\n'
 
     def test_it_can_end_itself(self, run):
         assert run('--end', '0').popen.wait(20) == 0

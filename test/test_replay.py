@@ -155,6 +155,7 @@ def test_what_does_not_decode_is_left_out(start, listener, tmp_path):
         (['nowhere.mcap'], 'no such bag'),
         (['pyproject.toml'], 'not an MCAP file'),
         (['nowhere.mcap', '--rate', '-1'], 'rate -1.0 is neither 0 nor a positive number'),
+        (['nowhere.mcap', '--wait', '-1'], 'wait -1.0 is negative'),
         (['nowhere.mcap', '--rate', 'fast'], "invalid float value: 'fast'"),
         ([], 'arguments are required: bag'),
     ],
@@ -165,12 +166,11 @@ def test_bad_usage_is_one_clear_line(start, arguments, said):
     assert said in process.output and 'Traceback' not in process.output
 
 
-def test_nobody_listens(ros, domain, start, tmp_path, monkeypatch):
+def test_nobody_listens(ros, tmp_path):
     """It waits for listeners, and plays for the record when none comes."""
     from anser_ros.nodes import replay
 
-    monkeypatch.setattr(replay, 'MATCH_TIMEOUT_S', 0.2)
-    node = replay.Replay(str(make_session(tmp_path / 'a.mcap', 3)), rate=100.0)
+    node = replay.Replay(str(make_session(tmp_path / 'a.mcap', 3)), rate=100.0, wait=0.2)
     assert spin_until(node, lambda: node.exit_code is not None)
     assert node.exit_code == 0 and node.counters['no_listeners'] == 1
     node.close()

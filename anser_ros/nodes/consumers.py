@@ -13,7 +13,8 @@ from rcl_interfaces.srv import GetParameterTypes
 from rclpy.node import Node
 
 REPLY_TIMEOUT_S = 2.0
-ATTEMPTS = 5
+# A listener may be compiling its kernels.
+ATTEMPTS = 30
 POLL_S = 0.1
 # How often the graph is asked for new listeners, in messages.
 REFRESH_EVERY = 50

@@ -257,13 +257,13 @@ def main(node_class: type[AnserNode], argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv if argv is None else argv)
     try:
         own = _parse(node_class, _without_ros(arguments))
-        stopping = _stop_on_signals()
+        signals = _Signals()
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        return _run(node_class, own, arguments, stopping)
+        return _run(node_class, own, arguments, signals)
     except AnserError as error:
         print(f'{node_class.NAME}: {" ".join(str(error).split())}', file=sys.stderr)
         return 2
-    except rclpy.exceptions.ROSInterruptException:
+    except (_Interrupted, rclpy.exceptions.ROSInterruptException):
         return 0
     except Exception:  # noqa: BLE001 - the outermost place: whatever is left is a defect
         traceback.print_exc()
@@ -293,23 +293,40 @@ def _parse(node_class: type[AnserNode], arguments: Sequence[str]) -> dict[str, A
     return vars(parser.parse_args(arguments))
 
 
-def _stop_on_signals() -> list[int]:
-    """Catch SIGINT and SIGTERM, and return the list that fills with them.
+class _Interrupted(BaseException):
+    """A signal came while the node was still being made."""
+
+
+class _Signals:
+    """Catches SIGINT and SIGTERM from now on.
 
     rclpy's own handlers end the context at once, so that a node could neither close its files
-    in order nor say its last word in ``/diagnostics``.
+    in order nor say its last word in ``/diagnostics``. A node that is still being made, its
+    kernels compiling perhaps, is given up on the spot.
     """
-    caught: list[int] = []
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda received, _frame: caught.append(received))
-    return caught
+
+    def __init__(self) -> None:
+        self.is_node_made = False
+        self.caught: list[int] = []
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._catch)
+
+    def _catch(self, number: int, _frame: Any) -> None:
+        self.caught.append(number)
+        if not self.is_node_made:
+            raise _Interrupted
+
+    def ignore(self) -> None:
+        """Ignore all further ones: a second Ctrl-C must not cut the closing of files short."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
 
 
 def _run(
     node_class: type[AnserNode],
     own: dict[str, Any],
     arguments: Sequence[str],
-    stopping: list[int],
+    signals: _Signals,
 ) -> int:
     node, code = None, 0
     executor = SingleThreadedExecutor()
@@ -318,13 +335,12 @@ def _run(
         for text in parameter_files.complaints(arguments, node.get_name()):
             node.get_logger().warning(text)
         executor.add_node(node)
-        while not stopping and node.exit_code is None:
+        signals.is_node_made = True
+        while not signals.caught and node.exit_code is None:
             executor.spin_once(timeout_sec=SPIN_SLICE_S)
         code = node.exit_code or 0
     finally:
-        # A second Ctrl-C must not cut the closing of files short.
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.SIG_IGN)
+        signals.ignore()
         if node is not None:
             node.close()
             node.publish_end()

@@ -26,7 +26,8 @@ FLUX_ENDINGS = ('/tool/flux', '/reference/flux')
 # What the nodes that listen will publish themselves.
 OUTPUT_ENDINGS = ('/pose', '/pose_with_covariance', '/field_model')
 OUTPUT_TOPICS = ('/diagnostics', '/tf', '/tf_static', '/clock')
-MATCH_TIMEOUT_S = 10.0
+# A tracker that compiles its kernels for the first time listens late.
+WAIT_S = 30.0
 # The listeners count as complete when none has joined for so long.
 SETTLE_S = 0.5
 POLL_S = 0.02
@@ -48,11 +49,13 @@ class Replay(AnserNode):
     all_topics : bool
         Whether topics that running nodes publish themselves (poses, model, diagnostics) are
         played too.
+    wait : float
+        Longest time to wait for somebody who takes the fluxes, s.
 
     Raises
     ------
     ParameterError
-        The rate is negative.
+        The rate or the wait is negative.
     BagError
         There is no such bag, or nothing of it can be read.
     """
@@ -68,6 +71,9 @@ class Replay(AnserNode):
         parser.add_argument(
             '--all', dest='all_topics', action='store_true', help='poses and diagnostics as well'
         )
+        parser.add_argument(
+            '--wait', type=float, default=WAIT_S, help='longest wait for listeners, s'
+        )
 
     def __init__(
         self,
@@ -75,12 +81,16 @@ class Replay(AnserNode):
         rate: float = 1.0,
         loop: bool = False,
         all_topics: bool = False,
+        wait: float = WAIT_S,
         **options: Any,
     ) -> None:
         if not 0.0 <= rate < float('inf'):
             raise ParameterError(f'rate {rate} is neither 0 nor a positive number')
+        if not wait >= 0.0:
+            raise ParameterError(f'wait {wait} is negative')
         super().__init__(**options)
         self._bag, self._rate, self._loop, self._all_topics = bag, rate, loop, all_topics
+        self._wait_s = wait
         self._types: dict[str, type] = {}
         self._outlets: dict[str, Any] = {}
         self._total = 0
@@ -142,10 +152,10 @@ class Replay(AnserNode):
         self._outlets[message.topic] = self.create_publisher(kind, name, profile)
 
     def _wait_for_listeners(self) -> None:
-        """Wait until somebody takes the fluxes and no more join, at most ten seconds."""
+        """Wait until somebody takes the fluxes and no more join."""
         main_outlets = [o for t, o in self._outlets.items() if t.endswith(FLUX_ENDINGS)]
         main_outlets = main_outlets or list(self._outlets.values())
-        end_s = time.monotonic() + MATCH_TIMEOUT_S
+        end_s = time.monotonic() + self._wait_s
         seen, since_s = -1, time.monotonic()
         while not self._ending.wait(POLL_S):
             now_s = time.monotonic()
@@ -156,7 +166,7 @@ class Replay(AnserNode):
             if wanted and now_s - since_s >= SETTLE_S:
                 return
             if now_s > end_s:
-                self.warn('no_listeners', f'nobody has listened for {MATCH_TIMEOUT_S:g} s')
+                self.warn('no_listeners', f'nobody has listened for {self._wait_s:g} s')
                 return
 
     # Playing ------------------------------------------------------------------------------
