@@ -101,12 +101,12 @@ def test_everything_arrives_with_its_stamps_at_its_pace(start, listener, tmp_pat
 def test_as_fast_as_taken_loses_nothing(start, listener, tmp_path):
     """The listener's queue holds five, and it needs longer than the bag's publisher."""
     listener.delay_s = 0.002
-    bag = make_session(tmp_path / 'a.mcap', 300)
+    bag = make_session(tmp_path / 'a.mcap', 150)
     process = start('replay', bag, '--rate', '0', '--all')
     assert listener.run(lambda: process.popen.poll() is not None)
-    assert listener.stamps == [START_NS + n * PERIOD_NS for n in range(300)]
-    assert listener.run(lambda: listener.count('pose') == 300)
-    assert listener.arrivals[-1] - listener.arrivals[0] < 6.0 * 0.9
+    assert listener.stamps == [START_NS + n * PERIOD_NS for n in range(150)]
+    assert listener.run(lambda: listener.count('pose') == 150)
+    assert listener.arrivals[-1] - listener.arrivals[0] < 3.0 * 0.9
 
 
 def test_loop_in_another_namespace_ends_at_a_signal(start, listener, tmp_path):
@@ -120,7 +120,7 @@ def test_loop_in_another_namespace_ends_at_a_signal(start, listener, tmp_path):
 
 
 def test_a_cut_bag_is_played_as_far_as_it_reads(start, listener, tmp_path):
-    whole = make_session(tmp_path / 'a.mcap', 1500).read_bytes()
+    whole = make_session(tmp_path / 'a.mcap', 800).read_bytes()
     bag = tmp_path / 'cut.mcap'
     bag.write_bytes(whole[: len(whole) // 2])
     process = start('replay', bag, '--rate', '0')
@@ -128,7 +128,7 @@ def test_a_cut_bag_is_played_as_far_as_it_reads(start, listener, tmp_path):
     assert process.popen.returncode == 0
     assert 'the bag breaks off after' in process.output
     assert listener.stamps == [START_NS + n * PERIOD_NS for n in range(len(listener.stamps))]
-    assert 200 < len(listener.stamps) < 1200
+    assert 100 < len(listener.stamps) < 600
 
 
 def test_what_does_not_decode_is_left_out(start, listener, tmp_path):

@@ -1,0 +1,126 @@
+"""The process of one node: its arguments, its signals, its executor and its exit code."""
+
+import argparse
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import rclpy
+from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+from anser_ros.errors import AnserError, ParameterError
+from anser_ros.nodes import parameter_files, parameters
+
+if TYPE_CHECKING:
+    from anser_ros.nodes.node import AnserNode
+
+# How long a signal may go unnoticed by an idle node.
+SPIN_SLICE_S = 0.1
+
+
+def main(node_class: 'type[AnserNode]', argv: Sequence[str] | None = None) -> int:
+    """Run one node until it ends, or until SIGINT or SIGTERM.
+
+    Returns
+    -------
+    int
+        0 ended as asked; 2 a wrong argument or parameter, said in one line; 1 a defect.
+    """
+    arguments = list(sys.argv if argv is None else argv)
+    try:
+        own = _parse(node_class, _without_ros(arguments))
+        signals = _Signals()
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        return _run(node_class, own, arguments, signals)
+    except AnserError as error:
+        print(f'{node_class.NAME}: {" ".join(str(error).split())}', file=sys.stderr)
+        return 2
+    except (_Interrupted, rclpy.exceptions.ROSInterruptException):
+        return 0
+    except Exception:  # noqa: BLE001 - the outermost place: whatever is left is a defect
+        traceback.print_exc()
+        return 1
+    finally:
+        rclpy.try_shutdown()
+
+
+def _without_ros(arguments: Sequence[str]) -> list[str]:
+    """Return the node's own arguments, the program's name left out."""
+    try:
+        return list(remove_ros_args(arguments)[1:])
+    except (RCLError, UnknownROSArgsError) as error:  # such as a params file that is none
+        raise ParameterError(f'ROS arguments: {error}') from error
+
+
+def _parse(node_class: 'type[AnserNode]', arguments: Sequence[str]) -> dict[str, Any]:
+    summary = (sys.modules[node_class.__module__].__doc__ or '').strip().split('\n')[0]
+    table = parameters.describe(node_class.PARAMETERS)
+    parser = argparse.ArgumentParser(
+        prog=f'anser {node_class.NAME}',
+        description=summary,
+        epilog=f'parameters (--ros-args -p NAME:=VALUE, or --params-file):\n{table}',
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    node_class.add_arguments(parser)
+    return vars(parser.parse_args(arguments))
+
+
+class _Interrupted(BaseException):
+    """A signal came while the node was still being made."""
+
+
+class _Signals:
+    """Catches SIGINT and SIGTERM from now on.
+
+    rclpy's own handlers end the context at once, so that a node could neither close its files
+    in order nor say its last word in ``/diagnostics``. A node that is still being made, its
+    kernels compiling perhaps, is given up on the spot.
+    """
+
+    def __init__(self) -> None:
+        self.is_node_made = False
+        self.caught: list[int] = []
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._catch)
+
+    def _catch(self, number: int, _frame: Any) -> None:
+        self.caught.append(number)
+        if not self.is_node_made:
+            raise _Interrupted
+
+    def ignore(self) -> None:
+        """Ignore all further ones: a second Ctrl-C must not cut the closing of files short."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
+
+
+def _run(
+    node_class: 'type[AnserNode]',
+    own: dict[str, Any],
+    arguments: Sequence[str],
+    signals: _Signals,
+) -> int:
+    node, code = None, 0
+    executor = SingleThreadedExecutor()
+    try:
+        node = node_class(**own)
+        for text in parameter_files.complaints(arguments, node.get_name()):
+            node.get_logger().warning(text)
+        executor.add_node(node)
+        signals.is_node_made = True
+        while not signals.caught and node.exit_code is None:
+            executor.spin_once(timeout_sec=SPIN_SLICE_S)
+        code = node.exit_code or 0
+    finally:
+        signals.ignore()
+        if node is not None:
+            node.close()
+            node.publish_end()
+            executor.shutdown(timeout_sec=1.0)
+            node.destroy_node()
+    return code
