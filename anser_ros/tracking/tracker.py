@@ -120,6 +120,16 @@ class Tracker:
         other._use(model, model_id)
         return other
 
+    def with_settings(self, settings: TrackerSettings) -> 'Tracker':
+        """The same tracker with other settings; warm starts and counters go on."""
+        other = Tracker.__new__(Tracker)
+        other.__dict__.update(self.__dict__)
+        other.settings = settings
+        if self._model is not None and self._scene is not None:
+            model_id, other._scene = self._scene.model_id, None
+            other._use(self._model, model_id)
+        return other
+
     def reset(self) -> None:
         """Forget all warm starts."""
         for coil in self._coil_tracks.values():

@@ -1,0 +1,99 @@
+"""Distortion-free readings of reference sensors, averaged over the last moments."""
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import FitError
+from anser_ros.physics.sensor import SensorTable
+
+ComplexArray = NDArray[np.complex128]
+
+FEWEST_FRAMES = 3
+MOST_FRAMES = 2000
+
+
+class ReadingWindow:
+    """The newest readings of a set of sensors.
+
+    Parameters
+    ----------
+    sensors : SensorTable
+    emitters : int
+    span_s : float
+        How far back readings are kept, s of their stamps.
+
+    Raises
+    ------
+    FitError
+        When the span is not positive.
+    """
+
+    def __init__(self, sensors: SensorTable, emitters: int, span_s: float) -> None:
+        if not span_s > 0:
+            raise FitError(f'the span of a baseline must be positive, got {span_s}')
+        self._place = {int(c): i for i, c in enumerate(sensors.channel.tolist())}
+        self._shape = (len(sensors), emitters)
+        self._span_ns = round(1e9 * span_s)
+        self._frames: deque[tuple[int, ComplexArray]] = deque(maxlen=MOST_FRAMES)
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    @property
+    def full(self) -> bool:
+        """Whether the readings reach back over (nearly) the whole span."""
+        if len(self._frames) < FEWEST_FRAMES:
+            return False
+        return self._frames[-1][0] - self._frames[0][0] >= 0.9 * self._span_ns
+
+    def add(
+        self,
+        stamp_ns: int,
+        channels: NDArray[np.generic],
+        flux: NDArray[np.generic],
+        flags: NDArray[np.generic],
+    ) -> None:
+        """Take in a frame: channels and flags (S,), fluxes (S, K), T; a jump back starts anew.
+
+        Raises
+        ------
+        FitError
+            When the number of emitters is another one.
+        """
+        if flux.ndim != 2 or flux.shape[1] != self._shape[1]:
+            raise FitError(f'readings of {self._shape[1]} emitters wanted, got {flux.shape}')
+        if self._frames and stamp_ns < self._frames[-1][0]:
+            self._frames.clear()
+        frame = np.full(self._shape, np.nan, dtype=np.complex128)
+        for row, (channel, bits) in enumerate(zip(channels.tolist(), flags.tolist(), strict=True)):
+            if channel in self._place and not bits and np.isfinite(flux[row]).all():
+                frame[self._place[channel]] = flux[row]
+        self._frames.append((stamp_ns, frame))
+        while stamp_ns - self._frames[0][0] > self._span_ns:
+            self._frames.popleft()
+
+    def mean(self) -> ComplexArray:
+        """Mean reading, shape (S, K), T; NaN for a sensor without a good one in half the frames.
+
+        Raises
+        ------
+        FitError
+            When there are too few frames, or no sensor has good readings.
+        """
+        if len(self._frames) < FEWEST_FRAMES:
+            raise FitError(
+                f'a baseline needs {FEWEST_FRAMES} frames of reference readings, '
+                f'there are {len(self._frames)}'
+            )
+        stack = np.stack([frame for _, frame in self._frames])
+        good = np.isfinite(stack).all(axis=2)
+        count = good.sum(axis=0)
+        total = np.where(good[:, :, None], stack, 0.0).sum(axis=0)
+        enough = np.asarray(2 * count >= len(stack))
+        if not enough.any():
+            raise FitError('no reference sensor has good readings')
+        mean = np.full(self._shape, np.nan, dtype=np.complex128)
+        mean[enough] = total[enough] / count[enough, None]
+        return mean

@@ -1,0 +1,288 @@
+"""Serves the field model: from a file or drawn from the setup, refitted live to references.
+
+``field_model`` carries the dipoles, ``field_model_error`` their uncertainty with the same stamp.
+"""
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+
+from anser_ros.errors import AnserError, FitError, ModelFileError, SetupError
+from anser_ros.fitting.baseline import ReadingWindow
+from anser_ros.fitting.model import FieldModel
+from anser_ros.fitting.nominal import nominal_model
+from anser_ros.fitting.refit import LiveRefit, RefitResult
+from anser_ros.nodes import qos
+from anser_ros.nodes.flux_reader import read_flux
+from anser_ros.nodes.model_clouds import ModelWriter
+from anser_ros.nodes.node import AnserNode, Level, Status, main
+from anser_ros.nodes.parameters import parameter
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.sessions.evaluation import baseline_flux
+from anser_ros.sessions.model_file import load_model, save_model
+from anser_ros.sessions.session import load_session, sensor_table
+from anser_ros.sessions.starting_model import NOMINAL, board_of
+from anser_ros.wire.setup import Setup, parse_setup
+
+
+@dataclass(frozen=True)
+class FieldModelParameters:
+    """Parameters of the field model's server."""
+
+    model_file: str = parameter(
+        NOMINAL, "model to start from: a file, or nominal for that of the setup's own geometry"
+    )
+    refit: bool = parameter(
+        True, 'whether the model follows the reference sensors once a baseline is set', live=True
+    )
+    baseline_file: str = parameter(
+        '', 'distortion-free recording of the same board; empty: wait for set_baseline'
+    )
+    baseline_at_start: bool = parameter(
+        False, 'whether the first readings are the distortion-free ones'
+    )
+    baseline_s: float = parameter(
+        1.0, 'time that a baseline is averaged over, s', minimum=0.05, maximum=60.0
+    )
+    refit_rate_hz: float = parameter(
+        50.0, 'most refits a second', minimum=0.1, maximum=1000.0, live=True
+    )
+    save_file: str = parameter(
+        'field_model.yaml', 'where the service save writes the model', live=True
+    )
+
+
+class FieldModelNode(AnserNode):
+    """Publishes ``field_model``, and answers ``field_model/reset`` and its like."""
+
+    NAME = 'field_model'
+    PARAMETERS = FieldModelParameters
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        table = self.parameters
+        self._file_model = None if table.model_file == NOMINAL else load_model(table.model_file)
+        self._baseline_bag = load_session(table.baseline_file) if table.baseline_file else None
+        self._setup_text = ''
+        self._setup: Setup | None = None
+        self._references: SensorTable | None = None
+        self._window: ReadingWindow | None = None
+        self._base: FieldModel | None = None
+        self._model: FieldModel | None = None
+        self._refit: LiveRefit | None = None
+        self._result: RefitResult | None = None
+        self._frozen = False
+        self._trouble = ''
+        self._stamp_ns = 0
+        self._refit_s = 0.0
+        self._next_refit_s = 0.0
+        self._writer = ModelWriter()
+        self._models = self.create_publisher(PointCloud2, 'field_model', qos.LATCHED)
+        self._errors = self.create_publisher(PointCloud2, 'field_model_error', qos.LATCHED)
+        self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
+        self.create_subscription(PointCloud2, 'reference/flux', self._on_flux, qos.STREAM)
+        self.create_service(Trigger, 'field_model/reset', self._on_reset)
+        self.create_service(Trigger, 'field_model/save', self._on_save)
+        self.create_service(SetBool, 'field_model/freeze', self._on_freeze)
+        self.create_service(Trigger, 'field_model/set_baseline', self._on_set_baseline)
+        if self._file_model is not None:
+            self._base = self._file_model
+            self._serve(self._file_model, self.get_clock().now().nanoseconds)
+
+    # What is subscribed to ----------------------------------------------------------------
+
+    def _on_setup(self, message: String) -> None:
+        if message.data == self._setup_text:
+            return
+        try:
+            setup = parse_setup(message.data)
+            base = self._starting_model(setup)
+        except AnserError as error:
+            self._trouble = str(error)
+            self.warn('setups_refused', str(error))
+            return
+        self._setup_text, self._setup, self._trouble = message.data, setup, ''
+        self._refit = self._result = None
+        self._references = sensor_table(setup.reference_sensors)
+        self._window = ReadingWindow(
+            self._references, len(base.emitters), self.parameters.baseline_s
+        )
+        if base is not self._model:
+            self._serve(base, self.get_clock().now().nanoseconds)
+        self._base = base
+        if self._baseline_bag is not None and len(self._references):
+            self._follow(baseline_flux(self._baseline_bag, self._references))
+
+    def _starting_model(self, setup: Setup) -> FieldModel:
+        if self._file_model is None:
+            return nominal_model(board_of(setup))
+        if self._file_model.emitters != setup.emitter_names:
+            raise ModelFileError(
+                f'the model has the emitters {", ".join(self._file_model.emitters)}; '
+                f'the setup {", ".join(setup.emitter_names)}'
+            )
+        return self._file_model
+
+    def _on_flux(self, message: PointCloud2) -> None:
+        window = self._window
+        if window is None:
+            self.count('readings_before_setup')
+            return
+        try:
+            stamp_ns, points = read_flux(message)
+            window.add(stamp_ns, points.channel, points.flux, points.flags)
+            self.count('readings')
+            if self._refit is None and self.parameters.baseline_at_start and window.full:
+                self._follow(window.mean())
+            if self._refit is not None and self.parameters.refit and not self._frozen:
+                self._update(self._refit, stamp_ns, points.channel, points.flux, points.flags)
+        except AnserError as error:
+            self._trouble = str(error)
+            self.warn('readings_refused', str(error))
+
+    def _update(
+        self,
+        refit: LiveRefit,
+        stamp_ns: int,
+        channels: NDArray[np.int64],
+        flux: NDArray[np.complex128],
+        flags: NDArray[np.int64],
+    ) -> None:
+        """Let the model follow the references, not more often than wanted."""
+        begin_s = time.monotonic()
+        if begin_s < self._next_refit_s:
+            self.count('readings_between_refits')
+            return
+        # A little early rather than every other frame when the rates are the same.
+        self._next_refit_s = begin_s + 0.8 / self.parameters.refit_rate_hz
+        self._result = refit.update(stamp_ns, channels, flux, flags)
+        self._refit_s = time.monotonic() - begin_s
+        self.count('refits')
+        if self._result.changed:
+            self._serve(self._result.model, stamp_ns)
+
+    # The model and its baseline -----------------------------------------------------------
+
+    def _serve(self, model: FieldModel, stamp_ns: int) -> None:
+        """Put a model in force; every one has a stamp of its own."""
+        self._stamp_ns = max(stamp_ns, self._stamp_ns + 1)
+        frame_id = self._setup.frame_id if self._setup is not None else 'fg'
+        # The uncertainty goes first, so that a receiver has both when the model comes.
+        self._errors.publish(self._writer.error(model, frame_id, self._stamp_ns))
+        self._models.publish(self._writer.dipoles(model, frame_id, self._stamp_ns))
+        self._model = model
+        self.count('models')
+
+    def _follow(self, baseline: NDArray[np.complex128]) -> None:
+        """Refit from now on to what differs from a baseline, shape (S, K), T."""
+        if self._base is None or self._references is None or self._setup is None:
+            raise FitError('no setup yet')
+        try:
+            drawing = board_of(self._setup).field
+        except SetupError:  # an emitter that can't be drawn: its own dipoles have to do
+            drawing = None
+        self._refit = LiveRefit(self._base, self._references, baseline, drawing=drawing)
+        self._result = None
+        self.count('baselines')
+
+    # Services -----------------------------------------------------------------------------
+
+    def _on_reset(self, _request: Any, response: Any) -> Any:
+        if self._base is None:
+            raise FitError('no model yet')
+        if self._refit is not None:
+            self._refit.reset()
+        self._result = None
+        self._serve(self._base, self.get_clock().now().nanoseconds)
+        response.success, response.message = True, 'the model is the one from the start'
+        return response
+
+    def _on_save(self, _request: Any, response: Any) -> Any:
+        if self._model is None:
+            raise FitError('no model yet')
+        path = Path(self.parameters.save_file).expanduser().resolve()
+        save_model(path, self._model)
+        response.success, response.message = True, str(path)
+        return response
+
+    def _on_freeze(self, request: Any, response: Any) -> Any:
+        self._frozen = bool(request.data)
+        response.success = True
+        response.message = 'the model stays as it is' if self._frozen else 'the model may change'
+        return response
+
+    def _on_set_baseline(self, _request: Any, response: Any) -> Any:
+        if self._window is None:
+            raise FitError('no setup yet')
+        baseline = self._window.mean()
+        self._follow(baseline)
+        good = int(np.isfinite(baseline).all(axis=1).sum())
+        response.success = True
+        response.message = f'baseline of {good} references over {len(self._window)} frames'
+        return response
+
+    # What is told -------------------------------------------------------------------------
+
+    def status(self) -> Status:
+        """Return which model is in force, where it comes from, and what the refit does."""
+        model = self._model
+        values: dict[str, object] = {'last_refusal': self._trouble}
+        if model is None:
+            return Status('', Level.WARN, self._trouble or 'no setup yet', values)
+        provenance = model.provenance
+        values |= {
+            'source': provenance.get('source', self.parameters.model_file),
+            'stamp_ns': self._stamp_ns,
+            'dipoles': len(model.positions),
+            'emitters': len(model.emitters),
+            'flux_error_t': float(model.flux_error_t),
+            'modes': 0 if model.modes is None else len(model.modes),
+            'frozen': self._frozen,
+            'refit_time_s': self._refit_s,
+        }
+        if self._trouble:
+            return Status('', Level.WARN, self._trouble, values)
+        return Status('', Level.OK, self._activity(values), values)
+
+    def _activity(self, values: dict[str, object]) -> str:
+        if self._frozen:
+            return 'frozen'
+        if self._refit is None or not self.parameters.refit:
+            return 'constant' if not self.parameters.refit else 'constant, no baseline yet'
+        result = self._result
+        if result is None:
+            return 'baseline set'
+        values |= {
+            'refit_state': result.state,
+            'refit_reason': result.reason,
+            'reference_noise_t': result.noise_t,
+            'change_log_odds': result.log_odds,
+            'references_left_out': ', '.join(result.left_out),
+        }
+        return result.state if not result.reason else f'{result.state}: {result.reason}'
+
+    def part_statuses(self) -> list[Status]:
+        """Return a line for every reference sensor that the refit looks at."""
+        if self._result is None:
+            return []
+        return [
+            Status(
+                health.name,
+                Level.OK if health.state == 'ok' else Level.WARN,
+                health.state,
+                {'residual_t': health.residual_t, 'distance': health.distance},
+            )
+            for health in self._result.references
+        ]
+
+
+if __name__ == '__main__':
+    sys.exit(main(FieldModelNode))

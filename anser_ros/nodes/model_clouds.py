@@ -1,0 +1,127 @@
+"""Field models as messages, and back: the dipoles, and beside them their uncertainty."""
+
+import array
+from collections.abc import Sequence
+
+import numpy as np
+from sensor_msgs.msg import PointCloud2, PointField
+
+from anser_ros.errors import LayoutError
+from anser_ros.fitting.model import FieldModel
+from anser_ros.wire.model_error import ModelError, decode_model_error, encode_model_error
+from anser_ros.wire.points import (
+    DipolePoints,
+    PointFieldTuple,
+    decode_field_model,
+    encode_field_model,
+)
+
+NANO = 1_000_000_000
+MOST_BYTES = 64_000_000
+
+
+class CloudMaker:
+    """Makes point clouds; the fields of each layout are built once."""
+
+    def __init__(self) -> None:
+        self._fields: dict[tuple[PointFieldTuple, ...], list[PointField]] = {}
+
+    def message(
+        self,
+        packed: tuple[Sequence[PointFieldTuple], int, bytes],
+        frame_id: str,
+        stamp_ns: int,
+    ) -> PointCloud2:
+        """Return the message of packed points (fields, point_step, bytes)."""
+        fields, step, data = packed
+        key = tuple(fields)
+        if key not in self._fields:
+            self._fields[key] = [
+                PointField(name=name, offset=offset, datatype=datatype, count=count)
+                for name, offset, datatype, count in fields
+            ]
+        message = PointCloud2()
+        message.header.frame_id = frame_id
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, NANO)
+        message.height, message.width = 1, len(data) // step
+        message.fields = self._fields[key]
+        message.point_step, message.row_step = step, len(data)
+        # An array is handed over in microseconds; bytes are checked one by one.
+        buffer = array.array('B')
+        buffer.frombytes(data)
+        message.data = buffer
+        message.is_dense = True
+        return message
+
+
+class ModelWriter:
+    """Makes the two messages of a model."""
+
+    def __init__(self) -> None:
+        self._maker = CloudMaker()
+
+    def dipoles(self, model: FieldModel, frame_id: str, stamp_ns: int) -> PointCloud2:
+        """Return the ``field_model`` message."""
+        points = DipolePoints(model.positions, model.directions, model.moments)
+        return self._maker.message(encode_field_model(points), frame_id, stamp_ns)
+
+    def error(self, model: FieldModel, frame_id: str, stamp_ns: int) -> PointCloud2:
+        """Return the ``field_model_error`` message."""
+        modes = model.modes
+        if modes is None:
+            modes = np.zeros((0, *model.moments.shape), dtype=complex)
+        packed = encode_model_error(ModelError(float(model.flux_error_t), modes))
+        return self._maker.message(packed, frame_id, stamp_ns)
+
+
+def stamp_of(message: PointCloud2) -> int:
+    """Stamp of a message, ns."""
+    return int(message.header.stamp.sec) * NANO + int(message.header.stamp.nanosec)
+
+
+def layout_of(message: PointCloud2) -> list[PointFieldTuple]:
+    """The fields of a cloud as plain tuples."""
+    return [(f.name, f.offset, f.datatype, f.count) for f in message.fields]
+
+
+def width_of(message: PointCloud2) -> int:
+    """Number of points of a cloud that has one row.
+
+    Raises
+    ------
+    LayoutError
+        When the cloud has more rows or is far too big.
+    """
+    if message.height != 1:
+        raise LayoutError(f'the cloud must have height 1, got {message.height}')
+    if len(message.data) > MOST_BYTES:
+        raise LayoutError(f'{len(message.data)} bytes are too many for a cloud')
+    return int(message.width)
+
+
+def read_dipoles(message: PointCloud2) -> DipolePoints:
+    """Read a ``field_model`` message.
+
+    Raises
+    ------
+    LayoutError
+        When it is none, has no dipole, or a direction is no unit vector.
+    """
+    points = decode_field_model(
+        layout_of(message), message.point_step, width_of(message), message.data,
+        bool(message.is_bigendian),
+    )  # fmt: skip
+    if len(points.positions) == 0:
+        raise LayoutError('the field model has no dipole')
+    norms = np.linalg.norm(points.directions, axis=1)
+    if np.abs(norms - 1.0).max() > 1e-3:
+        raise LayoutError('a dipole direction is no unit vector')
+    return points
+
+
+def read_error(message: PointCloud2, n_dipoles: int, n_emitters: int) -> ModelError:
+    """Read a ``field_model_error`` message for a model of that size; raises `LayoutError`."""
+    return decode_model_error(
+        layout_of(message), message.point_step, width_of(message), message.data, n_dipoles,
+        n_emitters,
+    )  # fmt: skip

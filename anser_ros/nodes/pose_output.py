@@ -1,0 +1,132 @@
+"""Poses as messages: one pair of topics a sensor or body, and /tf where it is installed."""
+
+import math
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+
+from anser_ros.nodes import qos
+from anser_ros.nodes.diagnostics import Level, Status
+from anser_ros.nodes.model_clouds import NANO
+from anser_ros.tracking.estimate import OK, STALE, PoseEstimate
+from anser_ros.tracking.rotations import quaternion_of_axis, quaternion_of_rotation
+from anser_ros.wire.setup import topic_of
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:  # the wheels don't have it
+    TFMessage = None
+
+LONGEST_LATENCY_S = 10.0
+
+
+@dataclass
+class Tally:
+    """What happened to one sensor or body since the last diagnostics."""
+
+    begin_s: float = field(default_factory=time.monotonic)
+    frames: int = 0
+    poses: int = 0
+    latency_s: float = math.nan
+    latest_s: float = -math.inf
+
+
+class PoseTopic:
+    """The two pose topics of one sensor or body; its messages are built once and filled anew."""
+
+    def __init__(self, node: Any, name: str, frame_id: str) -> None:
+        self.name = name
+        stem = topic_of(name)
+        self._pose = node.create_publisher(PoseStamped, f'{stem}/pose', qos.STREAM)
+        self._uncertain = node.create_publisher(
+            PoseWithCovarianceStamped, f'{stem}/pose_with_covariance', qos.STREAM
+        )
+        self._plain, self._full = PoseStamped(), PoseWithCovarianceStamped()
+        self._plain.header.frame_id = self._full.header.frame_id = frame_id
+        self.transform = TransformStamped()
+        self.transform.header.frame_id, self.transform.child_frame_id = frame_id, stem
+        self.estimate: PoseEstimate | None = None
+        self.states: Counter[str] = Counter()
+        self.tally = Tally()
+
+    def destroy(self, node: Any) -> None:
+        """Take the topics off the graph."""
+        node.destroy_publisher(self._pose)
+        node.destroy_publisher(self._uncertain)
+
+    def take(self, estimate: PoseEstimate, now_ns: int) -> bool:
+        """Publish an estimate that is good; return whether the state is another than before."""
+        changed = self.estimate is None or self.estimate.state != estimate.state
+        self.estimate = estimate
+        self.states[estimate.state] += 1
+        self.tally.frames += 1
+        self.tally.latest_s = time.monotonic()
+        if estimate.state == OK:
+            self._publish(estimate)
+            self.tally.poses += 1
+            latency_s = (now_ns - estimate.stamp_ns) / NANO
+            # A recorded bag's stamps are of another day.
+            if 0.0 <= latency_s < LONGEST_LATENCY_S:
+                self.tally.latency_s = latency_s
+        return changed
+
+    def _publish(self, estimate: PoseEstimate) -> None:
+        if estimate.rotation is None:
+            x, y, z, w = quaternion_of_axis(estimate.axis)
+        else:
+            x, y, z, w = quaternion_of_rotation(estimate.rotation)
+        px, py, pz = estimate.position.tolist()
+        sec, nanosec = divmod(estimate.stamp_ns, NANO)
+        for message, pose in ((self._plain, self._plain.pose), (self._full, self._full.pose.pose)):
+            message.header.stamp.sec, message.header.stamp.nanosec = sec, nanosec
+            pose.position.x, pose.position.y, pose.position.z = px, py, pz
+            turn = pose.orientation
+            turn.x, turn.y, turn.z, turn.w = x, y, z, w
+        self._full.pose.covariance = estimate.covariance.ravel()
+        self._pose.publish(self._plain)
+        self._uncertain.publish(self._full)
+        header, move = self.transform.header, self.transform.transform
+        header.stamp.sec, header.stamp.nanosec = sec, nanosec
+        move.translation.x, move.translation.y, move.translation.z = px, py, pz
+        move.rotation.x, move.rotation.y, move.rotation.z, move.rotation.w = x, y, z, w
+
+    def status(self, stale_after_s: float) -> Status:
+        """Return the line of ``/diagnostics`` and begin a new interval."""
+        tally, self.tally = self.tally, Tally(latest_s=self.tally.latest_s)
+        estimate = self.estimate
+        if estimate is None:
+            return Status(self.name, Level.STALE, STALE, {'reason': 'no fluxes yet'})
+        silent_s = time.monotonic() - tally.latest_s
+        state, reason = estimate.state, estimate.reason
+        if silent_s > stale_after_s:
+            state, reason = STALE, f'no fluxes for {silent_s:.1f} s'
+        seconds = max(time.monotonic() - tally.begin_s, 1e-3)
+        values: dict[str, object] = {
+            'state': state,
+            'reason': reason,
+            'rate_hz': tally.poses / seconds,
+            'frame_rate_hz': tally.frames / seconds,
+            'latency_s': tally.latency_s,
+            'sigma_position_m': estimate.sigma_position_m,
+            'residual_t': estimate.residual_t,
+            'chi2_per_freedom': estimate.chi2,
+            'model': estimate.model_id,
+        }
+        values.update({f'frames_{name}': count for name, count in sorted(self.states.items())})
+        level = Level.OK if state == OK else Level.STALE if state == STALE else Level.WARN
+        return Status(self.name, level, state, values)
+
+
+def transform_publisher(node: Any) -> Any:
+    """Publisher of /tf, or None where its message type is not installed."""
+    if TFMessage is None:
+        return None
+    return node.create_publisher(TFMessage, '/tf', qos.EVENTS)
+
+
+def transform_message(topics: list[PoseTopic]) -> Any:
+    """One /tf message with the transforms of these topics."""
+    return TFMessage(transforms=[topic.transform for topic in topics])

@@ -1,0 +1,260 @@
+"""Fluxes to poses: one for every tool sensor and rigid body, with covariance, state and reason.
+
+A pose is published only while its state is ``ok``; why there is none stands in ``/diagnostics``.
+"""
+
+import sys
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
+
+from anser_ros.errors import AnserError, LayoutError, ModelFileError, ParameterError
+from anser_ros.fitting.model import FieldModel
+from anser_ros.nodes import qos
+from anser_ros.nodes.flux_reader import read_flux
+from anser_ros.nodes.model_clouds import read_dipoles, read_error, stamp_of
+from anser_ros.nodes.node import AnserNode, Level, Status, main
+from anser_ros.nodes.parameters import parameter
+from anser_ros.nodes.pose_output import PoseTopic, transform_message, transform_publisher
+from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.session import sensor_table
+from anser_ros.tracking.estimate import OK, TrackerSettings
+from anser_ros.tracking.seed import Volume
+from anser_ros.tracking.tracker import Tracker
+from anser_ros.tracking.warm_up import warm_up
+from anser_ros.wire.points import DipolePoints
+from anser_ros.wire.setup import Setup, parse_setup
+
+EARLIEST_DIAGNOSTICS_S = 0.1
+
+
+@dataclass(frozen=True)
+class TrackerParameters:
+    """Parameters of the tracker."""
+
+    model_file: str = parameter(
+        '', 'model whose effects apply, and its field until field_model speaks; empty for none'
+    )
+    flux_noise_t: float = parameter(
+        60e-12, 'noise of a phasor component to start from, T', minimum=1e-15, maximum=1e-3
+    )
+    adaptive: bool = parameter(
+        True, 'whether the noise follows the residuals of good poses', live=True
+    )
+    gate: float = parameter(
+        4.0,
+        'largest residual of a pose, in units of the expected one',
+        minimum=1.0,
+        maximum=1e6,
+        live=True,
+    )
+    max_sigma_m: float = parameter(
+        0.02, 'largest uncertainty of a pose, m', minimum=1e-5, maximum=1.0, live=True
+    )
+    volume_low_m: tuple[float, ...] = parameter(
+        (-0.2, -0.2, 0.05), 'lower corner of the box where tools may be, m'
+    )
+    volume_high_m: tuple[float, ...] = parameter(
+        (0.2, 0.2, 0.35), 'upper corner of the box where tools may be, m'
+    )
+    grid_spacing_m: float = parameter(
+        0.035, 'spacing of the cold start at 0.1 m height, m', minimum=0.005, maximum=0.2
+    )
+    warm_age_s: float = parameter(
+        1.0, 'how old a good pose may be to start from, s', minimum=0.01, maximum=60.0, live=True
+    )
+    stale_after_s: float = parameter(
+        0.3, 'a sensor without fluxes for so long is stale, s', minimum=0.02, live=True
+    )
+    publish_tf: bool = parameter(True, 'whether /tf is published where tf2_msgs is installed')
+
+
+def settings_of(table: TrackerParameters) -> TrackerSettings:
+    """Settings of the core; raises `ParameterError` when a corner is not three numbers."""
+    for name in ('volume_low_m', 'volume_high_m'):
+        if len(getattr(table, name)) != 3:
+            raise ParameterError(f'parameter {name}: three numbers needed')
+    low, high = table.volume_low_m, table.volume_high_m
+    return TrackerSettings(
+        flux_noise_t=table.flux_noise_t,
+        adaptive=table.adaptive,
+        volume=Volume((low[0], low[1], low[2]), (high[0], high[1], high[2])),
+        grid_spacing_m=table.grid_spacing_m,
+        gate=table.gate,
+        max_sigma_m=table.max_sigma_m,
+        warm_age_s=table.warm_age_s,
+    )
+
+
+class TrackerNode(AnserNode):
+    """Subscribes to ``setup``, ``field_model`` and ``tool/flux``; publishes poses."""
+
+    NAME = 'tracker'
+    PARAMETERS = TrackerParameters
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        table = self.parameters
+        self._settings = settings_of(table)
+        self._file_model = load_model(table.model_file) if table.model_file else None
+        self._setup_text = ''
+        self._setup: Setup | None = None
+        self._tracker: Tracker | None = None
+        self._topics: dict[str, PoseTopic] = {}
+        self._dipoles: tuple[int, DipolePoints] | None = None
+        self._error: PointCloud2 | None = None
+        self._trouble = ''
+        self._solve_s = 0.0
+        self._told_s = 0.0
+        self._transforms = transform_publisher(self) if table.publish_tf else None
+        warm_up()
+        self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
+        self.create_subscription(PointCloud2, 'field_model', self._on_model, qos.LATCHED)
+        self.create_subscription(PointCloud2, 'field_model_error', self._on_error, qos.LATCHED)
+        self.create_subscription(PointCloud2, 'tool/flux', self._on_flux, qos.STREAM)
+
+    # What is subscribed to ----------------------------------------------------------------
+
+    def _on_setup(self, message: String) -> None:
+        if message.data == self._setup_text:
+            return
+        try:
+            setup = parse_setup(message.data)
+            sensors = sensor_table(setup.tool_sensors)
+            tracker = Tracker(None, sensors, self._settings)
+        except AnserError as error:
+            self._refuse('setups_refused', error)
+            return
+        self._setup_text, self._setup, self._tracker = message.data, setup, tracker
+        for topic in self._topics.values():
+            topic.destroy(self)
+        self._topics = {
+            name: PoseTopic(self, name, setup.frame_id)
+            for name in (*sensors.name, *tracker.bodies)
+        }
+        self._trouble = ''
+        self._use_model()
+
+    def _on_model(self, message: PointCloud2) -> None:
+        try:
+            if stamp_of(message) <= 0:
+                raise LayoutError('the field model has no stamp')
+            points = read_dipoles(message)
+        except AnserError as error:
+            self._refuse('models_refused', error)
+            return
+        self._dipoles = (stamp_of(message), points)
+        self._use_model()
+
+    def _on_error(self, message: PointCloud2) -> None:
+        self._error = message
+        if self._dipoles is not None and stamp_of(message) == self._dipoles[0]:
+            self._use_model()
+
+    def _use_model(self) -> None:
+        """Give the tracker the newest field model, once the setup is known too."""
+        if self._tracker is None or self._setup is None:
+            return
+        try:
+            model, model_id = self._model(self._setup)
+            if model is not None:
+                self._tracker = self._tracker.with_model(model, model_id)
+                self.count('models')
+        except AnserError as error:
+            self._refuse('models_refused', error)
+
+    def _model(self, setup: Setup) -> tuple[FieldModel | None, str]:
+        """The model in force and its name: the published one, or that of the file."""
+        given = self._file_model
+        names, frequencies = setup.emitter_names, setup.frequencies_hz
+        if given is not None and given.emitters != names:
+            raise ModelFileError(
+                f'the model file has the emitters {", ".join(given.emitters)}; '
+                f'the setup {", ".join(names)}'
+            )
+        if self._dipoles is None:
+            return given, self.parameters.model_file
+        stamp_ns, points = self._dipoles
+        if points.moments.shape[1] != len(names):
+            raise LayoutError(
+                f'the field model has {points.moments.shape[1]} emitters, the setup {len(names)}'
+            )
+        model = FieldModel(
+            points.positions, points.directions, points.moments, names, frequencies,
+            flux_error_t=0.0 if given is None else given.flux_error_t,
+            effects=() if given is None else given.effects,
+        )  # fmt: skip
+        if self._error is not None and stamp_of(self._error) == stamp_ns:
+            error = read_error(self._error, *points.moments.shape)
+            modes = error.modes if len(error.modes) else None
+            model = replace(model, flux_error_t=error.flux_error_t, modes=modes)
+        return model, str(stamp_ns)
+
+    def _on_flux(self, message: PointCloud2) -> None:
+        tracker = self._tracker
+        if tracker is None:
+            self.count('fluxes_before_setup')
+            return
+        begin_s = time.perf_counter()
+        try:
+            stamp_ns, points = read_flux(message)
+            estimates = tracker.update(stamp_ns, points.channel, points.flux, points.flags)
+        except AnserError as error:
+            self._refuse('fluxes_refused', error)
+            return
+        now_ns = self.get_clock().now().nanoseconds
+        changed = False
+        for estimate in estimates:
+            changed |= self._topics[estimate.name].take(estimate, now_ns)
+        if self._transforms is not None:
+            moved = [self._topics[e.name] for e in estimates if e.state == OK]
+            if moved:
+                self._transforms.publish(transform_message(moved))
+        self._solve_s = time.perf_counter() - begin_s
+        self.count('frames')
+        if changed and time.monotonic() - self._told_s > EARLIEST_DIAGNOSTICS_S:
+            self.publish_diagnostics()
+
+    # What is told -------------------------------------------------------------------------
+
+    def _refuse(self, counter: str, error: AnserError) -> None:
+        self._trouble = str(error)
+        self.warn(counter, str(error))
+
+    def on_parameters(self, old: TrackerParameters, new: TrackerParameters) -> None:
+        """Track on with the new settings, from where the tools were."""
+        self._settings = settings_of(new)
+        if self._tracker is not None:
+            self._tracker = self._tracker.with_settings(self._settings)
+
+    def status(self) -> Status:
+        """Return what the tracker lacks, if anything, and its counters."""
+        self._told_s = time.monotonic()
+        tracker = self._tracker
+        values: dict[str, object] = {'frame_time_s': self._solve_s, 'last_refusal': self._trouble}
+        if tracker is not None:
+            values |= {name: count for name, count in tracker.counters.items() if name != 'frames'}
+        if self._setup is None:
+            return Status('', Level.WARN, self._trouble or 'no setup yet', values)
+        if tracker is None or tracker.model is None:
+            return Status('', Level.WARN, self._trouble or 'no field model yet', values)
+        values |= {
+            'dipoles': len(tracker.model.positions),
+            'emitters': len(tracker.model.emitters),
+        }
+        good = sum(
+            t.estimate is not None and t.estimate.state == OK for t in self._topics.values()
+        )
+        values['tracked'] = good
+        return Status('', Level.OK, f'{good} of {len(self._topics)} tracked', values)
+
+    def part_statuses(self) -> list[Status]:
+        """Return a line for every sensor and body."""
+        return [topic.status(self.parameters.stale_after_s) for topic in self._topics.values()]
+
+
+if __name__ == '__main__':
+    sys.exit(main(TrackerNode))

@@ -1,0 +1,104 @@
+"""The byte layout of a field model's uncertainty, which travels beside the model.
+
+A point for every dipole that a mode moves: ``mode`` and ``dipole`` uint16, ``flux_error`` float32
+(T, the same in all points: what the model leaves unexplained), then ``m<k>_re``, ``m<k>_im``
+float32 (A m^2). The moments are wrong by the sum of all modes, each times an independent unit
+normal number. The message has the stamp of the ``field_model`` message that it belongs to; a
+receiver that does without it still has the field.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import LayoutError
+from anser_ros.wire.points import FLOAT32, UINT16, PointFieldTuple
+
+ComplexArray = NDArray[np.complex128]
+
+MOST_VALUES = 50_000_000
+_HEAD = [('mode', '<u2'), ('dipole', '<u2'), ('flux_error', '<f4')]
+
+
+@dataclass(frozen=True)
+class ModelError:
+    """Unexplained flux (T) and modes (R, N, K), complex, A m^2; R may be 0."""
+
+    flux_error_t: float
+    modes: ComplexArray
+
+
+def _layout(n_emitters: int) -> tuple[list[PointFieldTuple], 'np.dtype[np.void]']:
+    fields: list[PointFieldTuple] = [
+        ('mode', 0, UINT16, 1),
+        ('dipole', 2, UINT16, 1),
+        ('flux_error', 4, FLOAT32, 1),
+    ]
+    for k in range(n_emitters):
+        fields.append((f'm{k}_re', 8 + 8 * k, FLOAT32, 1))
+        fields.append((f'm{k}_im', 12 + 8 * k, FLOAT32, 1))
+    return fields, np.dtype([*_HEAD, ('m', '<f4', 2 * n_emitters)])
+
+
+def encode_model_error(error: ModelError) -> tuple[list[PointFieldTuple], int, bytes]:
+    """Pack a model's uncertainty: fields, point_step and bytes.
+
+    Raises
+    ------
+    LayoutError
+        When there are more modes or dipoles than the layout can count.
+    """
+    modes = np.asarray(error.modes, dtype=np.complex128)
+    if modes.ndim != 3 or max(modes.shape[:2]) > 0xFFFF:
+        raise LayoutError(f'modes must be (R, N, K) with R, N below 65536, got {modes.shape}')
+    fields, record = _layout(modes.shape[2])
+    mode, dipole = np.nonzero(np.abs(modes).max(axis=2, initial=0.0))
+    if mode.size == 0:
+        mode, dipole = np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.intp)
+    out = np.zeros(mode.size, dtype=record)
+    out['mode'], out['dipole'], out['flux_error'] = mode, dipole, error.flux_error_t
+    if modes.shape[0]:
+        chosen = modes[mode, dipole]
+        out['m'][:, 0::2], out['m'][:, 1::2] = chosen.real, chosen.imag
+    return fields, record.itemsize, out.tobytes()
+
+
+def decode_model_error(
+    fields: Sequence[PointFieldTuple],
+    point_step: int,
+    width: int,
+    data: bytes | bytearray | memoryview,
+    n_dipoles: int,
+    n_emitters: int,
+) -> ModelError:
+    """Read the uncertainty of a model with so many dipoles and emitters.
+
+    Raises
+    ------
+    LayoutError
+        When the cloud is not laid out as `encode_model_error` does, names a dipole that the model
+        doesn't have, or holds values that are not finite.
+    """
+    wanted, record = _layout(n_emitters)
+    if list(fields) != wanted or point_step != record.itemsize:
+        raise LayoutError(f'no model uncertainty for {n_emitters} emitters')
+    if width < 1 or memoryview(data).nbytes != point_step * width:
+        raise LayoutError(f'{width} points of {point_step} bytes do not fit the data')
+    points = np.frombuffer(data, dtype=record, count=width)
+    if int(points['dipole'].max()) >= n_dipoles:
+        raise LayoutError(f'an uncertainty of dipole {points["dipole"].max()} of {n_dipoles}')
+    if not (np.isfinite(points['m']).all() and np.isfinite(points['flux_error']).all()):
+        raise LayoutError('the model uncertainty holds values that are not finite')
+    flux_error = float(points['flux_error'][0])
+    if flux_error < 0.0:
+        raise LayoutError(f'the unexplained flux must not be negative, got {flux_error}')
+    moments = points['m'][:, 0::2] + 1j * points['m'][:, 1::2]
+    count = int(points['mode'].max()) + 1 if np.any(moments != 0.0) else 0
+    if count * n_dipoles * n_emitters > MOST_VALUES:
+        raise LayoutError(f'{count} modes of {n_dipoles} dipoles are too many')
+    modes = np.zeros((count, n_dipoles, n_emitters), dtype=np.complex128)
+    if count:
+        modes[points['mode'], points['dipole']] = moments
+    return ModelError(flux_error, modes)
