@@ -23,7 +23,13 @@ from anser_ros.fitting.moments import (
     with_pose,
 )
 from anser_ros.fitting.prior import DrawnBoard
-from anser_ros.fitting.selection import Candidate, choose_layout, thin_frames
+from anser_ros.fitting.selection import (
+    WORTH,
+    Candidate,
+    Selection,
+    choose_layout,
+    thin_frames,
+)
 
 Array = NDArray[np.float64]
 
@@ -222,20 +228,14 @@ def calibrate(
     selection = choose_layout(
         thin, folds, generator, options.uncertainty, progress, options.layout, drawn
     )
-    layout = selection.chosen.layout
-    damping = selection.chosen.damping if options.damping is None else options.damping
-    uncertainty = options.uncertainty
-
-    def fit_part(part: list[Measurements]) -> LayoutFit:
-        return fit_layout(
-            part, layout, damping, generator, uncertainty, nominal, alternations=3, exact=False
-        )
-
-    whole = fit_layout(posed, layout, damping, generator, uncertainty, nominal, progress=progress)
+    finals = [
+        _final(posed, thin, folds, candidate, generator, options, nominal, selection, progress)
+        for candidate in selection.finalists
+    ]
+    chosen, whole, held_out = _better(finals)
     dipoles, fit = whole.dipoles, whole.fit
-    check_agreement(posed, names, fit, fit_part)
-    noise = min(fit.noise_t, selection.reference.noise_t)
-    held_out = predict_held_out(thin, folds, fit_part, uncertainty, noise)
+    damping = chosen.damping if options.damping is None else options.damping
+    check_agreement(posed, names, fit, _fitter(chosen, generator, options, nominal))
     model = FieldModel(
         positions=dipoles.positions,
         directions=dipoles.directions,
@@ -247,9 +247,55 @@ def calibrate(
     error, flux = _residual(posed, model)
     calibration = Calibration(
         model, fit, held_out, _nominal_rms(posed, nominal), selection.candidates,
-        selection.chosen, layout, damping, readings, error, flux,
+        chosen, chosen.layout, damping, readings, error, flux,
     )  # fmt: skip
     return replace(calibration, model=replace(model, provenance=provenance(calibration, names)))
+
+
+Final = tuple[Candidate, LayoutFit, HeldOut]
+
+
+def _fitter(
+    candidate: Candidate, generator: Generator, options: Options, nominal: FieldModel | None
+) -> Callable[[list[Measurements]], LayoutFit]:
+    damping = candidate.damping if options.damping is None else options.damping
+
+    def fit(part: list[Measurements]) -> LayoutFit:
+        return fit_layout(
+            part, candidate.layout, damping, generator, options.uncertainty, nominal,
+            alternations=3, exact=False,
+        )  # fmt: skip
+
+    return fit
+
+
+def _final(
+    posed: Sequence[Measurements],
+    thin: Sequence[Measurements],
+    folds: Sequence[NDArray[np.int64]],
+    candidate: Candidate,
+    generator: Generator,
+    options: Options,
+    nominal: FieldModel | None,
+    selection: Selection,
+    progress: Progress | None,
+) -> Final:
+    """The candidate fitted to everything, and its held-out error, every fold from the start."""
+    damping = candidate.damping if options.damping is None else options.damping
+    whole = fit_layout(
+        posed, candidate.layout, damping, generator, options.uncertainty, nominal,
+        progress=progress,
+    )  # fmt: skip
+    noise = min(whole.fit.noise_t, selection.reference.noise_t)
+    fitter = _fitter(candidate, generator, options, nominal)
+    return candidate, whole, predict_held_out(thin, folds, fitter, options.uncertainty, noise)
+
+
+def _better(finals: Sequence[Final]) -> Final:
+    """The one with the fewest dipoles whose held-out error is the least to within `WORTH`."""
+    limit = min(final[2].score_t for final in finals) * (1.0 + WORTH)
+    good = [final for final in finals if final[2].score_t <= limit]
+    return min(good, key=lambda final: (len(final[1].dipoles), final[2].score_t))
 
 
 def _residual(

@@ -108,6 +108,11 @@ class HeldOut:
     noise_t: float
     flux_error_t: float
 
+    @property
+    def score_t(self) -> float:
+        """Root of the mean chi-square in flux: comparable between fits of other noise, T."""
+        return float(self.noise_t * np.sqrt(self.chi_square))
+
 
 def _complex_rows(values: Array, used: NDArray[np.bool_]) -> ComplexArray:
     return np.ascontiguousarray(values[used]).view(np.complex128)

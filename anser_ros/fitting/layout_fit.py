@@ -22,7 +22,7 @@ from anser_ros.fitting.prior import DrawnBoard
 
 Array = NDArray[np.float64]
 
-RICH = Layout('layer', 16, 1.5, 0.0)
+RICH = Layout('layer', 16, 1.8, 0.0)
 """The layout at which poses are corrected before positions are optimised."""
 RICH_DAMPING = 1e-5
 MOVING_DAMPING = 1e-4

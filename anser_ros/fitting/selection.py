@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import FitError
 from anser_ros.fitting.held_out import PoseWhitener
-from anser_ros.fitting.layout_fit import optimise_positions, prior_of
+from anser_ros.fitting.layout_fit import RICH, optimise_positions, prior_of
 from anser_ros.fitting.layouts import Generator, Layout, place
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.moments import (
@@ -50,7 +50,7 @@ MOVING = (
 """Where dipoles start from that are moved."""
 MOVING_READINGS = 12
 """Readings that a moved dipole must have at least: three coordinates and a moment, thrice."""
-WORTH = 0.1
+WORTH = 0.15
 """A richer layout must lower the predictive error by this part to be worth its dipoles."""
 
 
@@ -79,9 +79,9 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Selection:
-    """The chosen candidate, and all that were compared."""
+    """The finalists (a fit from the start tells the better), and all that were compared."""
 
-    chosen: Candidate
+    finalists: tuple[Candidate, ...]
     candidates: tuple[Candidate, ...]
     reference: MomentFit
 
@@ -283,11 +283,11 @@ def choose_layout(
     affordable = [n for n in COUNTS if n * n <= max(4 * rows, 144)]
     height = lowest_height(measurements, generator)
     prior = 'none' if drawn is None else 'nominal'
-    rich = Layout('layer', min(16, affordable[-1]), EXTENSIONS[1], 0.0)
+    rich = replace(RICH, count=min(RICH.count, affordable[-1]))
     selector = Selector(measurements, folds, place(rich, generator), uncertainty)
     search = _Search(selector, generator, progress, drawn)
     if asked is not None:
-        return Selection(search.score(asked), tuple(search.tried.values()), selector.reference)
+        return Selection((search.score(asked),), tuple(search.tried.values()), selector.reference)
     start = Layout('layer', affordable[len(affordable) // 2], EXTENSIONS[1], 0.0, prior)
     best = search.climb(start, affordable)
     best = search.best_of(best, [replace(best.layout, extension=e) for e in EXTENSIONS])
@@ -300,12 +300,12 @@ def choose_layout(
         others.append(replace(best.layout, prior='none'))
     others = [other for other in others if len(place(other, generator)) <= 1.2 * COUNTS[-1] ** 2]
     best = search.best_of(best, others)
+    finalists = [search.leanest(best)]
     moving = [replace(layout, prior=prior, moved=True) for layout in MOVING]
-    best = search.best_of(
-        best, [m for m in moving if MOVING_READINGS * len(place(m, generator)) <= rows]
-    )
-    chosen = search.leanest(best)
-    return Selection(chosen, tuple(search.tried.values()), selector.reference)
+    moving = [m for m in moving if MOVING_READINGS * len(place(m, generator)) <= rows]
+    if moving:
+        finalists.append(min(map(search.score, moving), key=lambda c: c.score))
+    return Selection(tuple(finalists), tuple(search.tried.values()), selector.reference)
 
 
 def lowest_height(measurements: Sequence[Measurements], generator: Generator) -> float:
@@ -361,11 +361,10 @@ class _Search:
         Tracking takes time in proportion to the dipoles, and far below the noise nothing is won.
         """
         limit = best.score * (1.0 + WORTH)
-        fixed = min((c for c in self.tried.values() if not c.layout.moved), key=lambda c: c.score)
-        place_now = EXTENSIONS.index(fixed.layout.extension)
+        place_now = EXTENSIONS.index(best.layout.extension)
         for extension in EXTENSIONS[max(place_now - 1, 0) : place_now + 1]:
-            size = replace(fixed.layout, extension=extension)
-            for count in (n for n in reversed(COUNTS) if n < fixed.layout.count):
+            size = replace(best.layout, extension=extension)
+            for count in (n for n in reversed(COUNTS) if n < best.layout.count):
                 if self.score(replace(size, count=count)).score > limit:
                     break
         good = [c for c in self.tried.values() if c.score <= limit]
