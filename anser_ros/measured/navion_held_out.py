@@ -15,9 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.measured.navion_fit import EFFECTS, PlateFit, Widths, fit_plates
+from anser_ros.measured.navion_fit import EFFECTS, PlateFit, fit_plates
 from anser_ros.measured.navion_plate import Plate, PlateData, predict_plane
 from anser_ros.measured.navion_sources import locate_magnets, magnet_cloud, scan_for_metal
+from anser_ros.measured.navion_system import Widths
 
 Array = NDArray[np.float64]
 
@@ -34,8 +35,6 @@ class Trial:
 
     Attributes
     ----------
-    height_m : float
-        The height that took no part.
     round : int
         How many effects the model had before.
     candidate : str
@@ -45,7 +44,6 @@ class Trial:
         Component RMSE at the held-out height with it, T.
     """
 
-    height_m: float
     round: int
     candidate: str
     gain: float
@@ -92,35 +90,64 @@ def rms(values: Array) -> float:
 
 
 def run_fold(data: PlateData, held: int, tell: Callable[[str], None] = lambda _: None) -> Fold:
-    """Choose effects one at a time on the other heights while each pays, then metal objects."""
+    """Choose on the other heights, predict the one."""
     known = others(data, held)
-    cloud = magnet_cloud(locate_magnets(known))
+    choice = choose_effects(known, lambda fit: rms(prediction_error(data, held, fit)))
     height = float(data.height_m[held])
+    tell(
+        f'height {height:+.4f} m: {", ".join(sorted(choice.fit.effects))}, '
+        f'metal: {metal_text(choice.fit)}'
+    )
+    dropped = _drop_each(data, held, choice.cloud, choice.fit)
+    return Fold(held, choice.plain, choice.fit, choice.trials, dropped)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What was chosen: the magnets' dipoles, the fits without and with effects, all trials."""
+
+    cloud: Array
+    plain: PlateFit
+    fit: PlateFit
+    trials: tuple[Trial, ...]
+
+
+def choose_effects(
+    known: PlateData, score: Callable[[PlateFit], float], max_metal: int = MAX_METAL
+) -> Choice:
+    """Add effects one at a time while each pays, then metal objects.
+
+    Parameters
+    ----------
+    known : PlateData
+        The heights to learn from; their log evidence alone chooses.
+    score : callable
+        Component RMSE (T) of a fit somewhere else; recorded with every trial, never used.
+    max_metal : int
+        Metal objects at most.
+    """
+    cloud = magnet_cloud(locate_magnets(known))
     plain = fit_plates(known, cloud, _NO_METAL, frozenset())
     best, trials = plain, []
-    while True:
+    while best.effects != frozenset(EFFECTS):
         tried = []
         for name in (effect for effect in EFFECTS if effect not in best.effects):
             fit = fit_plates(known, cloud, _NO_METAL, best.effects | {name})
-            gain = fit.log_evidence - best.log_evidence
-            error = rms(prediction_error(data, held, fit))
-            tried.append((gain, fit))
-            trials.append(Trial(height, len(best.effects), name, gain, error))
-        gain, fit = max(tried, key=lambda pair: pair[0], default=(0.0, best))
+            tried.append((fit.log_evidence - best.log_evidence, fit))
+            trials.append(Trial(len(best.effects), name, tried[-1][0], score(fit)))
+        gain, fit = max(tried, key=lambda pair: pair[0])
         if gain < PAYS:
             break
         best = fit
-    for _ in range(MAX_METAL):
+    for _ in range(max_metal):
         fit = add_metal(known, cloud, best)
         gain = fit.log_evidence - best.log_evidence
         count = len(best.effects) + best.sources.n_metal
-        error = rms(prediction_error(data, held, fit))
-        trials.append(Trial(height, count, 'static_metal', gain, error))
+        trials.append(Trial(count, 'static_metal', gain, score(fit)))
         if gain < PAYS:
             break
         best = fit
-    tell(f'height {height:+.4f} m: {", ".join(sorted(best.effects))}, metal: {metal_text(best)}')
-    return Fold(held, plain, best, tuple(trials), _drop_each(data, held, cloud, best))
+    return Choice(cloud, plain, best, tuple(trials))
 
 
 def fit_effects(data: PlateData, effects: frozenset[str], n_metal: int) -> PlateFit:

@@ -85,6 +85,12 @@ class Sources:
         flat = self.moment_am2.reshape(-1, self.moment_am2.shape[2])
         return np.asarray(np.einsum('pim,mk->pik', basis, flat))
 
+    @property
+    def magnets(self) -> Sources:
+        """The magnets alone."""
+        count = len(self.position_m) - self.n_metal
+        return Sources(self.position_m[:count], self.moment_am2[:count])
+
     def gradient(self, points: Array, only: slice = slice(None)) -> Array:
         """Gradient ``dB_i / dx_j`` of each coil: shape (P, 3, 3, K), T/m; `only` picks dipoles."""
         place, direction = vector_dipoles(self.position_m[only])
@@ -140,7 +146,7 @@ class Plate:
     @property
     def n_state(self) -> int:
         """Numbers that describe the plate at one height."""
-        return 6 + self.lift.shape[1]
+        return 6 + int(self.lift.shape[1])
 
     def place(self, height_m: float, state: Array, shift_m: Array) -> tuple[Array, Array]:
         """Positions (S, 3) and rotations (S, 3, 3) of the sensors at one height."""

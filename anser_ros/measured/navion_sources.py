@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from anser_ros.measured.navion_fit import PlateFit
-from anser_ros.measured.navion_plate import PlateData, vector_basis
+from anser_ros.measured.navion_plate import PlateData, Sources, vector_basis
 
 Array = NDArray[np.float64]
 
 CLOUD_RADIUS = 0.05
 """Radius (m) of a magnet's cloud: about a coil's own radius."""
 
-_SCAN_STEP = 0.05
+_SCAN_STEP = 0.06
 _CLEARANCE = 0.015
 _BATCH = 64
 
@@ -95,23 +95,38 @@ def scan_for_metal(data: PlateData, fit: PlateFit, metal_am2: float) -> tuple[Ar
     return grid[best], float(gain[best])
 
 
+def polarizability(sources: Sources, index: int) -> tuple[Array, float]:
+    """Polarisability (3, 3), m^3, of one metal object, and how far it is from symmetric.
+
+    The object's moments were free in every coil. One small object answers all coils with one
+    symmetric tensor, ``mu0 m_k = alpha B_k`` (reciprocity); large asymmetry, 0 to 1, says that the
+    dipole stands for something extended.
+    """
+    place = sources.position_m[len(sources.position_m) - sources.n_metal + index]
+    moment = sources.moment_am2[len(sources.position_m) - sources.n_metal + index]
+    field = sources.magnets.field(place[None])[0]
+    alpha = 4e-7 * np.pi * np.linalg.solve(field.T, moment.T).T
+    odd = np.linalg.norm(alpha - alpha.T) / 2.0
+    return alpha, float(odd / np.linalg.norm(alpha))
+
+
 def _gains(data: PlateData, fit: PlateFit, places: Array, metal_am2: float) -> Array:
     white = fit.whitened
     n_planes, n_sensors = white.position.shape[:2]
     n_coils = data.field_t.shape[1]
     basis = vector_basis(white.position.reshape(-1, 3), places)
-    reading = white.reading @ basis.reshape(n_planes, n_sensors, 3, -1)
+    reading = white.sensing @ basis.reshape(n_planes, n_sensors, 3, -1)
     reading = reading.transpose(1, 0, 2, 3).reshape(n_sensors, 3 * n_planes, -1)
     rows = white.inverse_root.shape[1]
     columns = np.zeros((n_coils, n_sensors, rows, reading.shape[2]))
     for k in range(n_coils):
         own = slice(k * 3 * n_planes, (k + 1) * 3 * n_planes)
         columns[k] = white.inverse_root[:, :, own] @ reading
-    flat = columns.reshape(n_coils, n_sensors * rows, len(places), 3)
-    free = flat.transpose(2, 0, 3, 1).reshape(len(places) * n_coils * 3, -1)
-    shadow = (free @ white.projector).reshape(len(places), n_coils * 3, -1)
-    pull = (free @ white.residual).reshape(len(places), -1)
-    free = free.reshape(len(places), n_coils * 3, -1)
+    by_place = columns.reshape(n_coils, n_sensors * rows, len(places), 3).transpose(2, 0, 3, 1)
+    flat = by_place.reshape(len(places) * n_coils * 3, -1)
+    shadow = (flat @ white.reach).reshape(len(places), n_coils * 3, -1)
+    pull = (flat @ white.residual).reshape(len(places), -1)
+    free = flat.reshape(len(places), n_coils * 3, -1)
     normal = free @ free.transpose(0, 2, 1) - shadow @ shadow.transpose(0, 2, 1)
     normal = normal + np.eye(n_coils * 3) / metal_am2**2
     step = np.linalg.solve(normal, pull[..., None])[..., 0]
