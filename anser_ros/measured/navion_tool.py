@@ -17,20 +17,22 @@ Array = NDArray[np.float64]
 
 _TABLE_STEP = 0.02
 _MAX_STEP = 0.02
+_STARTS = 3
+_START_SPACING = 0.04
 
 
 @dataclass(frozen=True)
 class ToolErrors:
-    """Distance (m) and angle (rad) of each tracked sensor from where it was put; NaN if lost."""
+    """Distance (m) and angle (rad) of each tracked sensor from where it was put."""
 
     position_m: Array
     angle_rad: Array
 
     def rmse(self) -> tuple[float, float]:
-        """Root mean squares over the tracked sensors, m and rad."""
+        """Root mean squares over all sensors, m and rad; none is left out."""
         return (
-            float(np.sqrt(np.nanmean(self.position_m**2))),
-            float(np.sqrt(np.nanmean(self.angle_rad**2))),
+            float(np.sqrt(np.mean(self.position_m**2))),
+            float(np.sqrt(np.mean(self.angle_rad**2))),
         )
 
 
@@ -58,9 +60,23 @@ def track_sensors(
         Sensor to frame.
     """
     seen = np.einsum('sij,ksj->sik', np.linalg.inv(matrix), reading_t)
-    position = _seed(seen, sources, low, high)
-    rotation = _align(sources.field(position), seen)
     reading = reading_t.transpose(1, 2, 0)
+    best = _refine(reading, matrix, sources, *_start(seen, sources, low, high, 0))
+    for rank in range(1, _STARTS):
+        other = _refine(reading, matrix, sources, *_start(seen, sources, low, high, rank))
+        better = other[2] < best[2]
+        best = (
+            np.where(better[:, None], other[0], best[0]),
+            np.where(better[:, None, None], other[1], best[1]),
+            np.where(better, other[2], best[2]),
+        )
+    return best[0], best[1]
+
+
+def _refine(
+    reading: Array, matrix: Array, sources: Sources, position: Array, rotation: Array
+) -> tuple[Array, Array, Array]:
+    """Levenberg-Marquardt for all sensors at once: position, rotation, sum of squares (S,)."""
     damping = np.full(len(position), 1e-3)
     cost, residual = _cost(reading, matrix, sources, position, rotation)
     for _ in range(30):
@@ -81,7 +97,7 @@ def track_sensors(
         residual = np.where(better[:, None, None], new_residual, residual)
         cost = np.where(better, new_cost, cost)
         damping = np.where(better, damping / 5.0, damping * 5.0)
-    return position, rotation
+    return position, rotation, cost
 
 
 def tool_errors(
@@ -109,11 +125,22 @@ def tool_errors(
     )
 
 
-def _seed(seen: Array, sources: Sources, low: Array, high: Array) -> Array:
+def _start(
+    seen: Array, sources: Sources, low: Array, high: Array, rank: int
+) -> tuple[Array, Array]:
+    """Start number `rank`: best table point that is well apart from the better starts."""
     axes = [np.arange(a, b + _TABLE_STEP / 2, _TABLE_STEP) for a, b in zip(low, high, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)
-    table, wanted = _signature(sources.field(points)), _signature(seen)
-    return np.array([points[np.argmin(((table - w) ** 2).sum(axis=1))] for w in wanted])
+    table = _signature(sources.field(points))
+    position = []
+    for wanted in _signature(seen):
+        distance = ((table - wanted) ** 2).sum(axis=1)
+        for _ in range(rank):
+            taken = points[np.argmin(distance)]
+            distance[np.linalg.norm(points - taken, axis=1) < _START_SPACING] = np.inf
+        position.append(points[np.argmin(distance)])
+    place = np.array(position)
+    return place, _align(sources.field(place), seen)
 
 
 def _signature(field: Array) -> Array:
