@@ -15,11 +15,16 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
 from anser_ros.physics.dipole import fill_field_and_gradient
+from anser_ros.tracking.projection import descend_projected
 from anser_ros.tracking.solve import Array, CoilSolution, RealField, solve_coil
 
 SAME_PLACE_M = 2e-3
 SAME_AXIS = 0.05
 """Two solutions closer than this (m; chord of the unit axes) are one."""
+
+PROJECTED_BUDGET = 25
+HOPELESS = 100.0
+"""Starts whose descent ends so many times above the gate and the best one are given up."""
 
 LAST_RESORT = 5
 """How many times more starts are tried when none of the first ones leads below the gate."""
@@ -269,6 +274,39 @@ def _same(a: CoilSolution, b: CoilSolution) -> bool:
     )
 
 
+def _polish(
+    field: RealField,
+    grid: SeedGrid,
+    flux: Array,
+    whitening: Array,
+    low: Array,
+    high: Array,
+    length_m: float,
+    gate: float,
+    starts: NDArray[np.int64],
+    axes: Array,
+) -> list[CoilSolution]:
+    """Distinct solutions that these grid points lead to."""
+    inverse_sigma = 1.0 / grid.sigma
+    reached = []
+    for index in starts:
+        position, axis = grid.points[index].copy(), axes[index].copy()
+        chi2, _ = descend_projected(
+            position, axis, flux, inverse_sigma, field.positions, field.directions,
+            field.moments, low, high, PROJECTED_BUDGET,
+        )  # fmt: skip
+        reached.append((chi2, position, axis))
+    reached.sort(key=lambda item: item[0])
+    found: list[CoilSolution] = []
+    for chi2, position, axis in reached:
+        if chi2 > max(HOPELESS * gate, HOPELESS * reached[0][0]):
+            break
+        solution = solve_coil(field, flux, whitening, position, axis, low, high, length_m)
+        if not any(_same(solution, other) for other in found):
+            found.append(solution)
+    return found
+
+
 def solve_cold(
     field: RealField,
     grid: SeedGrid,
@@ -289,10 +327,10 @@ def solve_cold(
     flux, whitening, low, high, length_m
         As for `solve_coil`.
     gate : float
-        Chi-square that an acceptable pose stays below; starts whose misfit remains far above it
-        are given up early.
+        Chi-square that an acceptable pose stays below; when none of the first starts leads there,
+        more are tried.
     candidates : int
-        Most starts that are polished.
+        Starts that are always tried.
 
     Returns
     -------
@@ -301,24 +339,12 @@ def solve_cold(
     """
     found: list[CoilSolution] = []
     tried = 0
-    for count, budget in ((candidates, 24), (LAST_RESORT * candidates, 60)):
+    for count in (candidates, LAST_RESORT * candidates):
         chosen, axes, _ = scan(grid, flux, count)
-        for index in chosen[tried:]:
-            solution = solve_coil(
-                field,
-                flux,
-                whitening,
-                grid.points[index],
-                axes[index],
-                low,
-                high,
-                length_m,
-                budget,
-            )
-            if not any(_same(solution, other) for other in found):
-                found.append(solution)
-            if tried and solution.chi2 <= gate:
-                break
+        more = _polish(
+            field, grid, flux, whitening, low, high, length_m, gate, chosen[tried:], axes
+        )
+        found += [new for new in more if not any(_same(new, old) for old in found)]
         found.sort(key=lambda solution: solution.chi2)
         tried = len(chosen)
         if found[0].chi2 <= gate:

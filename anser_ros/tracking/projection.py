@@ -1,0 +1,193 @@
+"""Descent by position alone: the axis is the best one at every position (variable projection).
+
+From far away the joint descent is slow and ends in false minima, because position and axis trade
+against each other. With the axis eliminated three unknowns remain, and the slopes are those that
+no turn of the axis can undo (Golub and Pereyra 1973, with Kaufman's simplification). The coil is
+taken for a point; the joint descent that follows knows its length.
+"""
+
+import math
+
+import numba
+import numpy as np
+
+from anser_ros.physics.dipole import fill_field_and_gradient
+from anser_ros.tracking.solve import fill_tangent
+
+LARGEST_MOVE_M = 0.05
+AXIS_STEPS = 3
+NEAR = 1e-4
+"""A relative fall of chi-square below this ends the descent: the joint one does the rest."""
+
+
+@numba.njit(cache=True, error_model='numpy')
+def _turn(field, flux, axis, tangent, plane, residual):  # type: ignore[no-untyped-def]
+    """Best small turn of the axis in a given whitened field (3, 2K); returns chi-square after it.
+
+    ``plane`` (2, 2K) is left with the orthonormal directions that turns of the axis reach.
+    """
+    width = flux.shape[0]
+    chi2 = 0.0
+    for step in range(AXIS_STEPS + 1):
+        chi2 = 0.0
+        for k in range(width):
+            residual[k] = flux[k] - (
+                axis[0] * field[0, k] + axis[1] * field[1, k] + axis[2] * field[2, k]
+            )
+            chi2 += residual[k] * residual[k]
+        fill_tangent(axis, tangent)
+        a00, a01, a11, g0, g1 = 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(width):
+            u = (
+                tangent[0, 0] * field[0, k]
+                + tangent[0, 1] * field[1, k]
+                + tangent[0, 2] * field[2, k]
+            )
+            v = (
+                tangent[1, 0] * field[0, k]
+                + tangent[1, 1] * field[1, k]
+                + tangent[1, 2] * field[2, k]
+            )
+            plane[0, k], plane[1, k] = u, v
+            a00 += u * u
+            a01 += u * v
+            a11 += v * v
+            g0 += u * residual[k]
+            g1 += v * residual[k]
+        if step == AXIS_STEPS:
+            break
+        determinant = max(a00 * a11 - a01 * a01, 1e-12 * a00 * a11 + 1e-300)
+        x, y = (a11 * g0 - a01 * g1) / determinant, (a00 * g1 - a01 * g0) / determinant
+        size = math.sqrt(x * x + y * y)
+        if size > 1.0:
+            x, y = x / size, y / size
+        norm = 0.0
+        for i in range(3):
+            axis[i] += x * tangent[0, i] + y * tangent[1, i]
+            norm += axis[i] * axis[i]
+        for i in range(3):
+            axis[i] /= math.sqrt(norm)
+    length = math.sqrt(max(a00, 1e-300))
+    dot = 0.0
+    for k in range(width):
+        plane[0, k] /= length
+        dot += plane[0, k] * plane[1, k]
+    length = 1e-300
+    for k in range(width):
+        plane[1, k] -= dot * plane[0, k]
+        length += plane[1, k] * plane[1, k]
+    for k in range(width):
+        plane[1, k] /= math.sqrt(length)
+    return chi2
+
+
+@numba.njit(cache=True, error_model='numpy')
+def _look(  # type: ignore[no-untyped-def]
+    position, axis, flux, inverse_sigma, positions, directions, moments, basis, field, tangent,
+    plane, residual, slopes,
+):  # fmt: skip
+    """Best axis at a position, chi-square with it, and its slopes (3, 2K) by the position."""
+    width = flux.shape[0]
+    fill_field_and_gradient(position, positions, directions, basis)
+    f = np.dot(basis, moments)
+    for k in range(width):
+        for i in range(9):
+            f[i, k] *= inverse_sigma[k]
+        for i in range(3):
+            field[i, k] = f[i, k]
+    chi2 = _turn(field, flux, axis, tangent, plane, residual)
+    n0, n1, n2 = axis[0], axis[1], axis[2]
+    for k in range(width):
+        slopes[0, k] = n0 * f[3, k] + n1 * f[4, k] + n2 * f[5, k]
+        slopes[1, k] = n0 * f[4, k] + n1 * f[6, k] + n2 * f[7, k]
+        slopes[2, k] = n0 * f[5, k] + n1 * f[7, k] + n2 * f[8, k]
+    for i in range(3):
+        for p in range(2):
+            dot = 0.0
+            for k in range(width):
+                dot += plane[p, k] * slopes[i, k]
+            for k in range(width):
+                slopes[i, k] -= dot * plane[p, k]
+    return chi2
+
+
+@numba.njit(cache=True, error_model='numpy')
+def _step(slopes, residual, damping, step):  # type: ignore[no-untyped-def]
+    """Damped step (3) by Cramer's rule, shortened to the largest move."""
+    a, g = np.empty((3, 3)), np.empty(3)
+    for i in range(3):
+        for j in range(i, 3):
+            a[i, j] = 0.0
+            for k in range(residual.shape[0]):
+                a[i, j] += slopes[i, k] * slopes[j, k]
+            a[j, i] = a[i, j]
+        g[i] = 0.0
+        for k in range(residual.shape[0]):
+            g[i] += slopes[i, k] * residual[k]
+    for i in range(3):
+        a[i, i] *= 1.0 + damping
+    c00 = a[1, 1] * a[2, 2] - a[1, 2] * a[2, 1]
+    c01 = a[1, 2] * a[2, 0] - a[1, 0] * a[2, 2]
+    c02 = a[1, 0] * a[2, 1] - a[1, 1] * a[2, 0]
+    c11 = a[0, 0] * a[2, 2] - a[0, 2] * a[2, 0]
+    c12 = a[0, 1] * a[2, 0] - a[0, 0] * a[2, 1]
+    c22 = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+    determinant = a[0, 0] * c00 + a[0, 1] * c01 + a[0, 2] * c02
+    scale = 1.0 / (determinant + 1e-300)
+    step[0] = scale * (c00 * g[0] + c01 * g[1] + c02 * g[2])
+    step[1] = scale * (c01 * g[0] + c11 * g[1] + c12 * g[2])
+    step[2] = scale * (c02 * g[0] + c12 * g[1] + c22 * g[2])
+    size = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+    if size > LARGEST_MOVE_M:
+        for i in range(3):
+            step[i] *= LARGEST_MOVE_M / size
+
+
+@numba.njit(cache=True, error_model='numpy')
+def descend_projected(  # type: ignore[no-untyped-def]
+    position, axis, flux, inverse_sigma, positions, directions, moments, low, high, budget,
+):  # fmt: skip
+    """Move ``position`` and ``axis`` (in place) towards a minimum.
+
+    ``flux`` is in tesla. Returns chi-square (of a point coil) and the evaluations used.
+    """
+    width = flux.shape[0]
+    white = flux * inverse_sigma
+    basis, field = np.empty((9, positions.shape[0])), np.empty((3, width))
+    tangent, plane, step = np.empty((2, 3)), np.empty((2, width)), np.empty(3)
+    residual, slopes = np.empty(width), np.empty((3, width))
+    new_residual, new_slopes = np.empty(width), np.empty((3, width))
+    new_position, new_axis = np.empty(3), np.empty(3)
+    chi2 = _look(
+        position, axis, white, inverse_sigma, positions, directions, moments, basis, field,
+        tangent, plane, residual, slopes,
+    )  # fmt: skip
+    used, damping = 1, 1e-3
+    while used < budget:
+        _step(slopes, residual, damping, step)
+        moved = 0.0
+        for i in range(3):
+            new_position[i] = min(max(position[i] + step[i], low[i]), high[i])
+            moved = max(moved, abs(new_position[i] - position[i]))
+            new_axis[i] = axis[i]
+        if moved < 1e-6:
+            break
+        trial = _look(
+            new_position, new_axis, white, inverse_sigma, positions, directions, moments, basis,
+            field, tangent, plane, new_residual, new_slopes,
+        )  # fmt: skip
+        used += 1
+        if trial < chi2:
+            done = chi2 - trial < NEAR * chi2
+            chi2 = trial
+            position[:], axis[:] = new_position, new_axis
+            residual, new_residual = new_residual, residual
+            slopes, new_slopes = new_slopes, slopes
+            damping *= 0.2
+            if done:
+                break
+        else:
+            damping = max(8.0 * damping, 1e-4)
+            if damping > 1e8:
+                break
+    return chi2, used
