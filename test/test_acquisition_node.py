@@ -250,7 +250,7 @@ def test_pseudo_port_drops_what_nobody_reads_and_removes_only_its_own_link(tmp_p
     link = tmp_path / 'cu'
     port = PseudoPort(link)
     piece = Piece(bytes(4000), is_block=True)
-    assert port.write([piece] * 300) > 100
+    assert port.write([piece] * 800) > 100
     other = PseudoPort(link)
     port.unplug()
     assert link.is_symlink() and not port.plugged

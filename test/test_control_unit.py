@@ -107,6 +107,17 @@ class TestProtocol:
         unit.receive(encode(Stop()))
         assert decode(unit.advance(100)) == []
 
+    def test_time_that_was_skipped_is_missing_from_the_sequence(self):
+        unit = ControlUnit(world(), CHANNELS)
+        unit.receive(encode(Start()))
+        unit.advance(90)
+        unit.skip(100)
+        blocks = [p for p in decode(unit.advance(50)) if isinstance(p, SampleBlock)]
+        assert [(b.sequence, b.timestamp_ticks, b.flags) for b in blocks] == [
+            (4, 4000, SamplesFlag.LOST_BEFORE),
+            (5, 5000, 0),
+        ]
+
     def test_sets_tones_and_refuses_wrong_ones(self):
         unit = ControlUnit(world(), CHANNELS)
         reply, hello = decode(unit.receive(encode(SetFrequencies(tuple(TONES + 1000)))))

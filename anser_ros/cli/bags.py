@@ -2,26 +2,23 @@
 
 import argparse
 import contextlib
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from anser_ros.simulation.board_source import board_source
+from anser_ros.simulation.manufacture import manufactured
 from anser_ros.simulation.metal import steel_disc
 from anser_ros.simulation.motion import Approach, Lissajous
 from anser_ros.simulation.recording import Errors, GridScan, record
 from anser_ros.simulation.world import World
 from anser_ros.wire.bag import bag_file
-from anser_ros.wire.setup import Setup, parse_setup
+from anser_ros.wire.setup import parse_setup
 
 RATE_HZ = 25.0
 OPTICAL_RATE_HZ = 60.0
 SECONDS = 8.0
 STATIC_NOISE_T = 30e-12
-SHIFT_M = 0.2e-3
-TURN_DEG = 0.1
-CURRENT_SHARE = 0.01
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,24 +26,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--setup', type=Path, default=Path('config/demo_setup.yaml'))
     parser.add_argument('--out', type=Path, default=Path('bags'), metavar='DIR')
     parser.add_argument('--seed', type=int, default=1)
-
-
-def manufactured(setup: Setup, rng: np.random.Generator) -> Setup:
-    """The setup as a workshop would build it: coils a little off, a current a little too strong.
-
-    The drawing that the bags carry does not know of it, so the nominal model is wrong for them.
-    """
-    coils = tuple(
-        replace(
-            coil,
-            centre_m=tuple(np.array(coil.centre_m) + rng.normal(scale=SHIFT_M, size=3)),
-            rotation_deg=coil.rotation_deg + float(rng.normal(scale=TURN_DEG)),
-        )
-        for coil in setup.emitter.coils
-    )
-    geometry = dict(setup.emitter.geometry)
-    geometry['current_a'] = float(geometry.get('current_a', 1.0)) * (1 + CURRENT_SHARE)
-    return replace(setup, emitter=replace(setup.emitter, coils=coils, geometry=geometry))
 
 
 def run(args: argparse.Namespace) -> int:

@@ -19,9 +19,18 @@ from pathlib import Path
 from anser_ros.cli.demo_report import draw, load, summarise
 from anser_ros.cli.supervisor import Supervisor, tail
 from anser_ros.errors import ParameterError
+from anser_ros.wire.config_folder import config_path
 
 FROZEN = 'frozen'
 PATIENCE_S = 60.0
+# The board of the bags in bags/, from which config/demo_model.yaml is calibrated:
+# anser calibrate bags/factory.mcap --out config/demo_model.yaml
+BOARD_SEED = 1
+# Half the usual rate: two cores carry it all and have room left.
+SAMPLE_RATE_HZ = 20e3
+METAL_RADIUS_M = 0.1
+# The frozen chain shows what a tracker without residual gate would say.
+NO_GATE = {'gate': 1e6, 'adaptive': False}
 POLL_S = 0.05
 SHARED_TOPICS = ('setup', 'tool/flux', 'reference/flux')
 
@@ -138,16 +147,27 @@ def _node(name: str, /, *words: str, **parameters: object) -> list[str]:
 
 
 def _commands(folder: Path, port: Path, args: argparse.Namespace) -> list[tuple[str, list[str]]]:
+    model = config_path('demo_model.yaml')
     apart = ['-r', f'__ns:=/anser/{FROZEN}']
     for topic in SHARED_TOPICS:
         apart += ['-r', f'{topic}:=/anser/{topic}']
     return [
-        ('cu_simulator', _node('cu_simulator', link=port, metal=not args.no_metal)),
+        (
+            'cu_simulator',
+            _node(
+                'cu_simulator',
+                link=port,
+                metal=not args.no_metal,
+                metal_radius_m=METAL_RADIUS_M,
+                board_seed=BOARD_SEED,
+                sample_rate_hz=SAMPLE_RATE_HZ,
+            ),
+        ),
         ('acquisition', _node('acquisition', device=port, rate_hz=float(args.rate))),
-        ('field_model', _node('field_model')),
+        ('field_model', _node('field_model', model_file=model, baseline_at_start=True)),
         ('tracker', _node('tracker')),
-        ('field_model_frozen', _node('field_model', *apart)),
-        ('tracker_frozen', _node('tracker', *apart)),
+        ('field_model_frozen', _node('field_model', *apart, model_file=model)),
+        ('tracker_frozen', _node('tracker', *apart, **NO_GATE)),
         ('recorder', _node('recorder', directory=folder, name='bag')),
     ]
 

@@ -187,7 +187,7 @@ class Acquisition(AnserNode):
                 self._make_stream()
             if self._stream is not None:
                 for frame in self._stream.push(payload, arrival_ns):
-                    self._publish(frame, arrival_ns)
+                    self._publish_frame(frame, arrival_ns)
         elif isinstance(payload, Hello):
             if payload != self._hello:
                 self._drop_stream()
@@ -225,7 +225,7 @@ class Acquisition(AnserNode):
             self._published_setup = text
             self._setup_publisher.publish(String(data=text))
 
-    def _publish(self, frame: FluxFrame, arrival_ns: int) -> None:
+    def _publish_frame(self, frame: FluxFrame, arrival_ns: int) -> None:
         # The system's clock may be set while we run; the offset is taken anew for every stamp.
         stamp_ns = frame.host_ns + time.time_ns() - time.monotonic_ns()
         if len(frame.tool.channel):

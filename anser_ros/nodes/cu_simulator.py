@@ -1,9 +1,11 @@
 """A control unit behind a pseudo-terminal, with the optical truth beside it."""
 
 import json
+import math
 import sys
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ from anser_ros.simulation.control_unit import ControlUnit, Piece
 from anser_ros.simulation.effect_draw import NONE as NO_EFFECT
 from anser_ros.simulation.effect_draw import Drawn, draw
 from anser_ros.simulation.faults import FAULTS, NONE, UNPLUG, FaultInjector
+from anser_ros.simulation.manufacture import manufactured
 from anser_ros.simulation.metal import MetalBody, steel_disc
 from anser_ros.simulation.motion import Approach
 from anser_ros.simulation.pseudo_port import PseudoPort
@@ -28,10 +31,10 @@ from anser_ros.simulation.sampling import FrontEnd
 from anser_ros.simulation.world import World
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.config_folder import read_config
-from anser_ros.wire.setup import parse_setup, topic_of
+from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
 STRETCH_S = 0.005
-LONGEST_LAG_S = 1.0
+LONGEST_LAG_S = 0.25
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,14 @@ class CuSimulatorParameters:
     channels_file: str = parameter(
         'demo_channels.yaml', 'channel calibration: a path, or a file of config/'
     )
+    board_seed: int = parameter(
+        0,
+        'of the board: 0 for one as drawn, else one with the tolerances of a workshop',
+        minimum=0,
+    )
+    sample_rate_hz: float = parameter(
+        40e3, 'samples a second and channel', minimum=16e3, maximum=100e3
+    )
     block_samples: int = parameter(40, 'sampling instants a block', minimum=1, maximum=600)
     noise_codes: float = parameter(
         2.4, 'white noise before the converter, codes rms', minimum=0.0, maximum=1000.0
@@ -51,11 +62,14 @@ class CuSimulatorParameters:
         0.02, 'share by which the coil currents fall as they warm up', minimum=0.0, maximum=0.5
     )
     metal: bool = parameter(True, 'whether a steel disc comes and goes')
+    metal_radius_m: float = parameter(0.06, 'of the disc, m', minimum=0.005, maximum=0.3)
     metal_near_m: tuple[float, ...] = parameter(
         (0.05, -0.03, -0.08), 'nearest position of the disc in fg, m', minimum=-2.0, maximum=2.0
     )
-    metal_start_s: float = parameter(8.0, 'when the disc sets out, s', minimum=0.0)
-    metal_travel_s: float = parameter(5.0, 'time of its way in, and out, s', minimum=0.1)
+    metal_start_s: float = parameter(
+        12.0, 'when the disc sets out, s after the first start of the stream', minimum=0.0
+    )
+    metal_travel_s: float = parameter(4.0, 'time of its way in, and out, s', minimum=0.1)
     metal_stay_s: float = parameter(6.0, 'time that it stays near, s', minimum=0.0)
     metal_period_s: float = parameter(30.0, 'its visit repeats; 0 for once, s', minimum=0.0)
     optical_rate_hz: float = parameter(
@@ -95,9 +109,15 @@ class CuSimulator(AnserNode):
         for effect in effects:
             real = effect.setup(real)
         self._delay_s = sum(effect.delivery_delay_s() for effect in effects)
-        self._metal = [*_metal(table), *drawn.metal]
-        self._world = World(real, board_source(real), metal=self._metal)
-        front = FrontEnd(noise_codes=table.noise_codes, current_drift=table.current_drift)
+        self._begin_ns = time.monotonic_ns()
+        self._stream_begin_s = math.inf
+        self._metal = [*_metal(table, lambda: self._stream_begin_s), *drawn.metal]
+        self._world = World(real, board_source(_board(table, real)), metal=self._metal)
+        front = FrontEnd(
+            table.sample_rate_hz,
+            noise_codes=table.noise_codes,
+            current_drift=table.current_drift,
+        )
         self._unit = ControlUnit(
             self._world,
             channels,
@@ -114,7 +134,7 @@ class CuSimulator(AnserNode):
             for body in setup.bodies
         }
         self._frame_id = setup.frame_id
-        self._begin_ns = time.monotonic_ns()
+        self._prepared: list[Piece] = []
         self._closing = threading.Event()
         step = self._guard(self._step)
         self._thread = threading.Thread(target=self._run, args=(step,), name='control_unit')
@@ -127,29 +147,33 @@ class CuSimulator(AnserNode):
     def _run(self, step: Any) -> None:
         while not self._closing.is_set():
             step()
-            due_s = self._unit.samples / self._unit.sample_rate_hz + STRETCH_S + self._delay_s
-            self._port.wait(max(due_s - self._elapsed_s(), 1e-4))
+            self._port.wait(max(self._due_s() - self._elapsed_s(), 1e-4))
 
     def _elapsed_s(self) -> float:
         return (time.monotonic_ns() - self._begin_ns) / 1e9
 
+    def _due_s(self) -> float:
+        """When the last sample of the prepared stretch is taken, and it can go out."""
+        return self._unit.samples / self._unit.sample_rate_hz + self._delay_s
+
     def _step(self) -> None:
-        """Catch up with the clock, one stretch of samples after the other."""
-        unit, rate = self._unit, self._unit.sample_rate_hz
+        """Send what is due. The next stretch is worked out before its time, so nothing is late."""
+        unit = self._unit
         now_s = self._elapsed_s()
         self._plug(now_s)
-        lag = int((now_s - LONGEST_LAG_S) * rate) - unit.samples
-        if lag > 0:
-            # A machine that was asleep: the samples of that time are lost, and say so.
-            self.count('lagged')
-            self._begin_ns += int(lag / rate * 1e9)
         answers = unit.receive(self._port.read())
+        if unit.streaming and self._stream_begin_s == math.inf:
+            self._stream_begin_s = now_s
         self._send(answers, now_s)
-        stretch = round(STRETCH_S * rate)
-        while (now_s - self._delay_s) * rate - unit.samples >= stretch:
-            self._send(unit.advance(stretch), now_s)
-            if self._closing.is_set():
-                return
+        stretch = round(STRETCH_S * unit.sample_rate_hz)
+        while now_s >= self._due_s() and not self._closing.is_set():
+            self._send(self._prepared, now_s)
+            late_s = now_s - self._due_s() - LONGEST_LAG_S
+            if late_s > 0:
+                # The machine was too busy: samples are lost, as in a device, but time goes on.
+                self.count('lags')
+                unit.skip(int(late_s * unit.sample_rate_hz))
+            self._prepared = unit.advance(stretch)
 
     def _send(self, pieces: list[Piece], now_s: float) -> None:
         arriving = self._injector.apply(pieces, now_s)
@@ -205,7 +229,15 @@ def _write_effect(path: Path, drawn: Drawn) -> None:
         raise ParameterError(f'cannot write {path}: {error.strerror}') from error
 
 
-def _metal(table: CuSimulatorParameters) -> list[MetalBody]:
+def _board(table: CuSimulatorParameters, setup: Setup) -> Setup:
+    """The setup whose geometry makes the field."""
+    if table.board_seed == 0:
+        return setup
+    return manufactured(setup, np.random.default_rng(table.board_seed))
+
+
+def _metal(table: CuSimulatorParameters, begin_s: Callable[[], float]) -> list[MetalBody]:
+    """The disc, on a path that begins when `begin_s` says."""
     if not table.metal:
         return []
     if len(table.metal_near_m) != 3:
@@ -219,7 +251,7 @@ def _metal(table: CuSimulatorParameters) -> list[MetalBody]:
         stay_s=table.metal_stay_s,
         period_s=table.metal_period_s,
     )
-    return [steel_disc(path)]
+    return [steel_disc(lambda time_s: path(time_s - begin_s()), radius_m=table.metal_radius_m)]
 
 
 def _pose(frame_id: str, stamp_ns: int, position: np.ndarray, rotation: np.ndarray) -> PoseStamped:

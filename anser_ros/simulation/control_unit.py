@@ -121,6 +121,17 @@ class ControlUnit:
         self._dropped += 1
         self._lost_before = True
 
+    def skip(self, samples: int) -> None:
+        """Let time go by in which the device could not send: whole blocks are lost, not time."""
+        block = self._hello.block_samples
+        if self.streaming:
+            end = self._sample + samples - self._stream_begin
+            lost = max(0, end // block - self._sequence)
+            self._sequence += lost
+            self._dropped += lost
+            self._lost_before = self._lost_before or lost > 0
+        self._sample += samples
+
     def advance(self, samples: int) -> list[Piece]:
         """Let time go by and return the records of that time, in order.
 

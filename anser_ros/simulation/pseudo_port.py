@@ -13,7 +13,7 @@ from pathlib import Path
 from anser_ros.errors import PortError
 from anser_ros.simulation.control_unit import Piece
 
-_PENDING_LIMIT_BYTES = 1 << 19
+_PENDING_LIMIT_BYTES = 1 << 21
 
 
 class PseudoPort:
