@@ -1,14 +1,17 @@
 """What lies in config/ is what the code knows: nothing that rclpy would drop silently."""
 
+import ast
 import importlib
 import json
 from pathlib import Path
 
 import pytest
+import rclpy.node
 import yaml
 
 from anser_ros.cli.main import NODES, node_names
 from anser_ros.errors import ParameterError
+from anser_ros.nodes import node as base
 from anser_ros.nodes import parameters
 from anser_ros.nodes.node import AnserNode
 from anser_ros.wire.setup import parse_setup, topic_of
@@ -109,3 +112,23 @@ def test_views_show_topics_that_exist():
     shown |= {value.split('.', 1)[0] for value in plotted}
     known = poses | {'/anser/field_model', '/anser/reference/flux', '/diagnostics', '/tf'}
     assert shown and shown <= known
+
+
+def private_names(path):
+    """Return the private methods and attributes that a file's classes give themselves."""
+    found = set()
+    for node in ast.walk(ast.parse(Path(path).read_text())):
+        if isinstance(node, ast.FunctionDef) and node.args.args[:1]:
+            found |= {node.name} if node.args.args[0].arg == 'self' else set()
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            found |= {node.attr} if ast.unparse(node.value) == 'self' else set()
+    return {name for name in found if name.startswith('_') and not name.startswith('__')}
+
+
+def test_no_node_takes_a_private_name_of_its_bases():
+    """rclpy's Node and our base have some that a node would think of too, such as `_clock`."""
+    taken = private_names(rclpy.node.__file__) | private_names(base.__file__)
+    assert '_clock' in taken
+    for name in node_names():
+        own = private_names(CONFIG.parent / 'anser_ros' / 'nodes' / f'{name}.py')
+        assert not own & taken, name

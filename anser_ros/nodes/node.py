@@ -121,13 +121,15 @@ class AnserNode(Node):
 
     def publish_diagnostics(self) -> None:
         """Publish all statuses now."""
-        self._publish(self._own_status(), *self.part_statuses())
+        self._send_statuses(self._status_with_counters(), *self.part_statuses())
 
     def publish_end(self) -> None:
         """Publish that the node has ended, so that its last state is not taken for a live one."""
-        self._publish(replace(self._own_status(), level=Level.STALE, message='ended'))
+        self._send_statuses(
+            replace(self._status_with_counters(), level=Level.STALE, message='ended')
+        )
 
-    def _own_status(self) -> Status:
+    def _status_with_counters(self) -> Status:
         own = self.status()
         level, message = own.level, own.message
         if self.counters['callback_faults'] > self._faults_reported:
@@ -136,7 +138,7 @@ class AnserNode(Node):
         values = {**own.values, **self.counters, 'uptime_s': time.monotonic() - self.started_s}
         return Status(own.name, level, message, values)
 
-    def _publish(self, *statuses: Status) -> None:
+    def _send_statuses(self, *statuses: Status) -> None:
         name = self.get_fully_qualified_name().strip('/')
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostic_array(name, statuses, stamp))

@@ -1,8 +1,11 @@
 """The process of one node: its arguments, its signals, its executor and its exit code."""
 
 import argparse
+import os
 import signal
+import socket
 import sys
+import threading
 import traceback
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -21,6 +24,9 @@ if TYPE_CHECKING:
 
 # How long a signal may go unnoticed by an idle node.
 SPIN_SLICE_S = 0.1
+ENDING = (signal.SIGINT, signal.SIGTERM)
+# How long a busy one may take to notice it.
+NOTICE_S = 1.5
 
 
 def main(node_class: 'type[AnserNode]', argv: Sequence[str] | None = None) -> int:
@@ -78,25 +84,40 @@ class _Signals:
     """Catches SIGINT and SIGTERM from now on.
 
     rclpy's own handlers end the context at once, so that a node could neither close its files
-    in order nor say its last word in ``/diagnostics``. A node that is still being made, its
-    kernels compiling perhaps, is given up on the spot.
+    in order nor say its last word in ``/diagnostics``. A node that is still being made is given
+    up on the spot; one whose main thread does not get round to noticing, for a kernel is being
+    compiled, is ended by a thread that does.
     """
 
     def __init__(self) -> None:
         self.is_node_made = False
         self.caught: list[int] = []
-        for number in (signal.SIGINT, signal.SIGTERM):
+        self._noticed = threading.Event()
+        for number in ENDING:
             signal.signal(number, self._catch)
+        # Python's handlers wait for the main thread; this channel does not.
+        self._reader, self._writer = socket.socketpair()
+        self._writer.setblocking(False)
+        signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
+        threading.Thread(target=self._watch, name='signals', daemon=True).start()
+
+    def ignore(self) -> None:
+        """Ignore all further ones: a second Ctrl-C must not cut the closing of files short."""
+        self._noticed.set()
+        for number in ENDING:
+            signal.signal(number, signal.SIG_IGN)
 
     def _catch(self, number: int, _frame: Any) -> None:
         self.caught.append(number)
         if not self.is_node_made:
             raise _Interrupted
 
-    def ignore(self) -> None:
-        """Ignore all further ones: a second Ctrl-C must not cut the closing of files short."""
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.SIG_IGN)
+    def _watch(self) -> None:
+        while self._reader.recv(1)[0] not in ENDING:
+            pass
+        if not self._noticed.wait(NOTICE_S):
+            sys.stderr.flush()
+            os._exit(0)
 
 
 def _run(
