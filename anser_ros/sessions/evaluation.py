@@ -19,7 +19,7 @@ from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.refit import LiveRefit
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, NANO, Session
-from anser_ros.sessions.starting_model import check_fits
+from anser_ros.sessions.starting_model import check_fits, drawing_of
 from anser_ros.tracking.tracker import PoseEstimate, Tracker, TrackerSettings
 
 Array = NDArray[np.float64]
@@ -187,7 +187,8 @@ def _follower(session: Session, model: FieldModel, baseline: Session | None) -> 
         raise BagError('a refit needs --baseline, a distortion-free recording of the same board')
     check_fits(model, baseline)
     sensors = session.reference.sensors
-    return LiveRefit(model, sensors, baseline_flux(baseline, sensors))
+    clean = baseline_flux(baseline, sensors)
+    return LiveRefit(model, sensors, clean, drawing=drawing_of(session.setup))
 
 
 def _truth(

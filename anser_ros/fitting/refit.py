@@ -1,0 +1,345 @@
+"""Live refit: reference coils make the field model follow metal that moves.
+
+The calibrated model is kept; what is refitted is the change since a distortion-free baseline. All
+emitters illuminate the same metal, so one polarisability a source explains all of them, and a few
+dozen readings determine the change of the whole field. `docs/refit.md` tells the method with its
+figures, and what was tried and left.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import FitError
+from anser_ros.fitting import refit_health as health
+from anser_ros.fitting.model import FieldModel
+from anser_ros.fitting.refit_assembly import Assembly
+from anser_ros.fitting.refit_change import Average, NoiseLevel
+from anser_ros.fitting.refit_excitation import FieldFunction
+from anser_ros.fitting.refit_health import ReferenceHealth, Watch
+from anser_ros.fitting.refit_posterior import Bank, Evaluation
+from anser_ros.fitting.refit_result import (
+    FEW_REFERENCES,
+    FROZEN,
+    POOR_FIT,
+    REFIT,
+    Metal,
+    RefitResult,
+    RefitSettings,
+)
+from anser_ros.fitting.refit_scene import build_scene
+from anser_ros.physics.sensor import SensorTable
+
+__all__ = ['LiveRefit', 'Metal', 'RefitResult', 'RefitSettings']
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+_READABLE = (health.MISSING, health.OK, health.FLAGGED, health.NOT_FINITE, health.NO_BASELINE)
+MOST_BANKS = 4
+NOTHING = 0.99
+"""Probability of no change from which on the calibrated model is in force."""
+DRIFT_SIGMAS = 5.0
+POOR = 4.0
+"""Typical left-out distance from which on the state is `POOR_FIT`."""
+
+
+class LiveRefit:
+    """Makes a field model follow what reference coils see.
+
+    Parameters
+    ----------
+    model : FieldModel
+        Calibrated without the metal.
+    references : SensorTable
+        The reference coils, places and axes in fg.
+    baseline : ndarray, shape (S, K), complex
+        Their readings without the metal, T; NaN for a coil that has none.
+    settings : RefitSettings, optional
+    drawing : callable, optional
+        Field of the board as drawn (`physics.board.Board.field`): points (P, 3) to (P, K, 3), T.
+        Without it the model's own dipoles drive the metal, which is much less accurate.
+
+    Raises
+    ------
+    FitError
+        When shapes don't fit, a channel appears twice, or there are no references.
+    """
+
+    def __init__(
+        self,
+        model: FieldModel,
+        references: SensorTable,
+        baseline: ComplexArray,
+        settings: RefitSettings | None = None,
+        drawing: FieldFunction | None = None,
+    ) -> None:
+        self.model = model
+        self.references = references
+        self.settings = settings or RefitSettings()
+        self.baseline = _checked_baseline(model, references, baseline)
+        self._scene = build_scene(model, references, self.settings, drawing)
+        k = len(model.emitters)
+        turned = self.baseline * self._scene.excitation.phase.conj()
+        scale = self.settings.drift / self.settings.flux_noise_t
+        self._drift = np.zeros((baseline.size, k))
+        for emitter in range(k):
+            self._drift[emitter::k, emitter] = np.nan_to_num(turned[:, emitter].real) * scale
+        self._banks: dict[bytes, Bank] = {}
+        self._has_baseline = np.isfinite(self.baseline).all(axis=1)
+        self._place = {int(c): i for i, c in enumerate(references.channel.tolist())}
+        self._names = ('nothing', *(prior.cloud.name for prior in self._scene.priors))
+        self._assembly = Assembly(model, self._scene.layers)
+        self.reset()
+
+    @property
+    def excitation_source(self) -> str:
+        """``board`` where the drawing drives the metal, ``model`` where the model itself does."""
+        return self._scene.excitation.source
+
+    def reset(self) -> None:
+        """Forget everything seen; the calibrated model is in force again."""
+        settings = self.settings
+        self._noise = NoiseLevel(settings.flux_noise_t)
+        self._average = Average(settings.average_frames)
+        self._watch = Watch(len(self.references), settings.hold_frames)
+        self._weights = _fresh_weights(len(self._names))
+        self._last_ns = 0
+        self._last_model = self.model
+
+    def update(
+        self,
+        stamp_ns: int,
+        channels: NDArray[np.generic],
+        flux: NDArray[np.generic],
+        flags: NDArray[np.generic] | None = None,
+    ) -> RefitResult:
+        """Take in one frame of reference fluxes.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Middle of the demodulation window.
+        channels : ndarray, shape (S,)
+            Channel of each row, in any order; unknown ones are passed over.
+        flux : ndarray, shape (S, K), complex
+            T.
+        flags : ndarray, shape (S,), optional
+            Flag bits; a flagged reading is not used.
+
+        Returns
+        -------
+        RefitResult
+
+        Raises
+        ------
+        FitError
+            When shapes don't fit or a channel appears twice.
+        """
+        ordered, readable, reasons = self._ordered(channels, flux, flags)
+        if stamp_ns < self._last_ns:
+            self._noise.forget()
+            self._average.forget()
+        self._last_ns = stamp_ns
+        self._watch.note(readable, reasons)
+        usable = np.where(readable[:, None], ordered, np.nan)
+        level = self._noise.update(usable)
+        if self._in_use().sum() < self.settings.min_references:
+            return self._too_few(stamp_ns, level)
+        used = np.where(self._watch.excluded[:, None], np.nan, ordered)
+        mean, frames = self._average.update(used, level * self.settings.flux_noise_t)
+        mean = np.where(np.isfinite(mean), mean, ordered)
+        noise = level / float(np.sqrt(frames))
+        change = (mean - self.baseline) * self._scene.excitation.phase.conj()
+        values = np.stack([change.real, change.imag], axis=2) / self.settings.flux_noise_t
+        bank, seen = self._judged(values, noise)
+        if self._in_use().sum() < self.settings.min_references:
+            return self._too_few(stamp_ns, level)
+        result = self._result(stamp_ns, bank, seen, level)
+        self._readmit(bank, seen, values, readable)
+        return result
+
+    def _in_use(self) -> NDArray[np.bool_]:
+        return np.asarray(~self._watch.excluded)
+
+    def _ordered(
+        self,
+        channels: NDArray[np.generic],
+        flux: NDArray[np.generic],
+        flags: NDArray[np.generic] | None,
+    ) -> tuple[ComplexArray, NDArray[np.bool_], list[str]]:
+        """Fluxes in the table's order, which of them can be used, and why others can't."""
+        given, number = np.asarray(flux), np.asarray(channels, dtype=np.int64)
+        marks = np.zeros(number.shape, dtype=np.int64) if flags is None else np.asarray(flags)
+        k = len(self.model.emitters)
+        if given.shape != (number.size, k) or marks.shape != number.shape:
+            raise FitError(
+                f'refit: {number.size} channels and {k} emitters need fluxes of that shape and '
+                f'as many flags, got {given.shape} and {marks.shape}'
+            )
+        if len(set(number.tolist())) != number.size:
+            raise FitError('refit: a channel appears twice in the frame')
+        place = np.array([self._place.get(c, -1) for c in number.tolist()], dtype=np.int64)
+        known = place >= 0
+        ordered = np.full(self.baseline.shape, np.nan, dtype=complex)
+        ordered[place[known]] = given[known]
+        code = np.zeros(len(self.references), dtype=np.int64)
+        code[place[known]] = np.where(marks[known] != 0, 2, 1)
+        code[(code == 1) & ~np.isfinite(ordered).all(axis=1)] = 3
+        code[~self._has_baseline] = 4
+        return ordered, np.asarray(code == 1), [_READABLE[c] for c in code.tolist()]
+
+    def _bank(self) -> Bank:
+        """The hypotheses for the coils in use; decomposed again only when those change."""
+        key = self._watch.excluded.tobytes()
+        if key not in self._banks:
+            k = len(self.model.emitters)
+            coils = np.flatnonzero(self._in_use())
+            rows = (coils[:, None] * k + np.arange(k)).ravel()
+            if len(self._banks) >= MOST_BANKS:
+                del self._banks[next(iter(self._banks))]
+            self._banks[key] = Bank(self._scene.priors, rows, self._drift)
+        return self._banks[key]
+
+    def _judged(self, values: Array, noise: float) -> tuple[Bank, Evaluation]:
+        """Evaluate the hypotheses, leaving out coils that are at fault, the worst first."""
+        while True:
+            bank, coils = self._bank(), np.flatnonzero(self._in_use())
+            seen = bank.evaluate(values[coils].reshape(-1, 2), noise)
+            best = int(seen.log_evidence.argmax())
+            self._distance, self._residual = bank.left_out(seen, best)
+            freedom = 2 * bank.width
+            suspects = self._watch.suspect(self._distance, freedom)
+            if not suspects.size or len(coils) <= self.settings.min_references:
+                return bank, seen
+            odds = [health.fault_odds(bank, seen, int(coil)) for coil in suspects]
+            worst = int(np.argmax(odds))
+            if odds[worst] < health.FAULT_ODDS:
+                self._watch.dismiss(self._distance, freedom)
+                return bank, seen
+            self._watch.exclude(int(coils[suspects[worst]]))
+            self._average.forget()
+
+    def _readmit(
+        self, bank: Bank, seen: Evaluation, values: Array, readable: NDArray[np.bool_]
+    ) -> None:
+        """Let coils return that agree with the others again."""
+        best, k = int(seen.log_evidence.argmax()), bank.width
+        for coil in np.flatnonzero(self._watch.excluded & readable):
+            distance = bank.distance(seen, best, coil * k + np.arange(k), values[coil])
+            self._watch.agreed(int(coil), distance < health.AGREES * 2 * k)
+
+    def _result(self, stamp_ns: int, bank: Bank, seen: Evaluation, level: float) -> RefitResult:
+        prior = self.settings.persistence * self._weights
+        prior += (1.0 - self.settings.persistence) / len(prior)
+        log_weight = np.log(prior) + seen.log_evidence
+        weights = np.exp(log_weight - log_weight.max())
+        self._weights = weights = weights / weights.sum()
+        best = int(weights.argmax())
+        typical = float(np.median(self._distance)) / (2 * bank.width)
+        mean, variance = bank.drifts(seen, best)
+        drift = self.settings.drift * (mean @ np.array([1.0, 1.0j]))
+        sure = (np.abs(mean) > DRIFT_SIGMAS * np.sqrt(np.maximum(variance, 1e-30))).any(axis=1)
+        moving = weights[0] < NOTHING
+        if not moving:
+            drift[~sure] = 0.0
+        model, state, reason = self.model, FROZEN, ''
+        if moving or sure.any():
+            phase, unit = self._scene.excitation.phase, self.settings.flux_noise_t
+            model = self._assembly.model(bank, seen, weights, drift, typical, phase, unit,
+                                         self.settings.modes)  # fmt: skip
+            state = REFIT
+        if moving and typical > POOR:
+            state = POOR_FIT
+            reason = f'readings are {np.sqrt(typical):.1f} times as far off as they should be'
+        return self._finish(
+            RefitResult(
+                stamp_ns,
+                model,
+                state,
+                model is not self._last_model,
+                self._healths(),
+                float(np.log(max(1.0 - weights[0], 1e-300)) - np.log(max(weights[0], 1e-300))),
+                dict(zip(self._names, weights.tolist(), strict=True)),
+                level * self.settings.flux_noise_t,
+                drift,
+                reason,
+                (lambda: self._metal(bank, seen, weights)) if moving else None,
+            )
+        )
+
+    def _finish(self, result: RefitResult) -> RefitResult:
+        self._last_model = result.model
+        return result
+
+    def _too_few(self, stamp_ns: int, level: float) -> RefitResult:
+        """Back to the calibrated model."""
+        self._weights = _fresh_weights(len(self._names))
+        self._average.forget()
+        count = int(self._in_use().sum())
+        need = self.settings.min_references
+        self._distance = self._residual = np.empty(0)
+        return self._finish(
+            RefitResult(
+                stamp_ns,
+                self.model,
+                FEW_REFERENCES,
+                self.model is not self._last_model,
+                self._healths(),
+                0.0,
+                {},
+                level * self.settings.flux_noise_t,
+                np.zeros(len(self.model.emitters), dtype=complex),
+                f'{count} usable references, {need} are needed',
+            )
+        )
+
+    def _healths(self) -> tuple[ReferenceHealth, ...]:
+        count = len(self.references)
+        residual, distance = np.full(count, np.nan), np.full(count, np.nan)
+        if len(self._distance):
+            used = self._in_use()
+            rms = np.sqrt((self._residual**2).mean(axis=(1, 2)))
+            residual[used] = rms * self.settings.flux_noise_t
+            distance[used] = np.sqrt(self._distance / (2 * len(self.model.emitters)))
+        return tuple(
+            map(
+                ReferenceHealth,
+                self.references.name,
+                self._watch.reason,
+                residual.tolist(),
+                distance.tolist(),
+            )
+        )
+
+    def _metal(self, bank: Bank, seen: Evaluation, weights: Array) -> Metal | None:
+        best = 1 + int(weights[1:].argmax())
+        values = bank.sources(seen, best) * self.settings.flux_noise_t
+        polarisability = values[:, 0] + 1j * values[:, 1]
+        power = np.abs(polarisability) ** 2
+        cloud = bank.priors[best - 1].cloud
+        if not power.sum() > 0.0:
+            return None
+        centroid = (cloud.positions * power[:, None]).sum(axis=0) / power.sum()
+        return Metal(cloud.positions, polarisability, centroid, cloud.standoff_m)
+
+
+def _fresh_weights(count: int) -> Array:
+    weights = np.zeros(count)
+    weights[0] = 1.0
+    return weights
+
+
+def _checked_baseline(
+    model: FieldModel, references: SensorTable, baseline: ComplexArray
+) -> ComplexArray:
+    given = np.asarray(baseline, dtype=np.complex128)
+    if len(references) == 0:
+        raise FitError('refit: there are no reference sensors')
+    if given.shape != (len(references), len(model.emitters)):
+        raise FitError(
+            f'refit: {len(references)} references and {len(model.emitters)} emitters need a '
+            f'baseline of that shape, got {given.shape}'
+        )
+    if len(set(references.channel.tolist())) != len(references):
+        raise FitError('refit: a channel appears twice in the references')
+    return given

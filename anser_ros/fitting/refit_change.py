@@ -1,0 +1,84 @@
+"""How noisy the references are, and their readings averaged while nothing moves."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+MEMORY_FRAMES = 50.0
+STEP = 1.1
+"""Noise levels are rounded to powers of this, so that tables made for one serve for a while."""
+
+
+@dataclass
+class NoiseLevel:
+    """Noise of a phasor component, from second differences in time (what moves smoothly cancels).
+
+    Attributes
+    ----------
+    nominal_t : float
+        T; the estimate starts here and stays within a factor 20.
+    """
+
+    nominal_t: float
+    _previous: list[ComplexArray] = field(default_factory=list)
+    _ratio: float = 1.0
+
+    def update(self, flux: ComplexArray) -> float:
+        """Take in one frame, shape (S, K), NaN where unknown; returns noise over nominal."""
+        if len(self._previous) == 2:
+            bend = flux - 2.0 * self._previous[1] + self._previous[0]
+            power = np.abs(bend) ** 2 / (12.0 * self.nominal_t**2)
+            power = power[np.isfinite(power).all(axis=1)]
+            if power.size:
+                # The median over coils, so that a coil that jumps does not count.
+                now = float(np.median(power.mean(axis=1)))
+                now = min(now, 4.0 * self._ratio)
+                self._ratio += (now - self._ratio) / MEMORY_FRAMES
+                self._ratio = min(max(self._ratio, 1.0 / 400.0), 400.0)
+        self._previous = [*self._previous[-1:], flux]
+        steps = round(np.log(np.sqrt(self._ratio)) / np.log(STEP))
+        return float(STEP**steps)
+
+    def forget(self) -> None:
+        """Start anew after a gap in time; the level is kept."""
+        self._previous.clear()
+
+
+@dataclass
+class Average:
+    """Running mean of the readings over the frames in which they don't change.
+
+    Attributes
+    ----------
+    longest : int
+        Most frames that are averaged; 1 switches it off.
+    """
+
+    longest: int
+    _mean: ComplexArray | None = None
+    _frames: int = 0
+
+    def update(self, flux: ComplexArray, sigma_t: float) -> tuple[ComplexArray, int]:
+        """Take in one frame (S, K); returns the mean and the number of frames in it."""
+        if self._mean is None or self._mean.shape != flux.shape:
+            self._mean, self._frames = flux.copy(), 1
+            return flux, 1
+        step = flux - self._mean
+        power = np.abs(step[np.isfinite(step)]) ** 2
+        expected = 2.0 * sigma_t**2 * (1.0 + 1.0 / self._frames)
+        limit = 1.0 + 3.0 / np.sqrt(max(power.size, 1))
+        same = np.isfinite(flux) == np.isfinite(self._mean)
+        if not power.size or power.mean() > limit * expected or not same.all():
+            self._mean, self._frames = flux.copy(), 1
+            return flux, 1
+        self._frames = min(self._frames + 1, self.longest)
+        self._mean = self._mean + step / self._frames
+        return self._mean, self._frames
+
+    def forget(self) -> None:
+        """Drop the mean."""
+        self._mean, self._frames = None, 0

@@ -1,0 +1,140 @@
+"""Where unknown metal may be: clouds of candidate sources, one a hypothesis.
+
+A cloud fills a region of space with point sources of independent polarisability, each of a
+variance proportional to the volume it stands for: the prior is then white in space and does not
+depend on how finely the region is sampled. The one thing that a cloud asserts is that no metal is
+nearer to the field generator (or to the tracked volume) than its standoff. Which standoff is right
+is told by the evidence, frame by frame (see `refit_posterior`).
+
+The frame ``fg`` has its board at z = 0 with z up towards the patient, so "below" is z < 0.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+LAYER_RATIO = 1.45
+"""Ratio of the depths of neighbouring layers of sources."""
+SPACING_PER_DEPTH = 0.7
+"""Lateral spacing of a layer's sources over its depth."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """The board's extent and the space over it where sensors are tracked.
+
+    Attributes
+    ----------
+    centre : ndarray, shape (2,)
+        x and y of the board's middle, m.
+    half : float
+        Half of the board's larger side, m.
+    """
+
+    centre: Array
+    half: float
+
+    @property
+    def floor(self) -> float:
+        """Height over the board, m, from which on tools are tracked."""
+        return 0.3 * self.half
+
+    @property
+    def ceiling(self) -> float:
+        """Height up to which tools are tracked, m."""
+        return 2.0 * self.half
+
+    @property
+    def margin(self) -> float:
+        """How far tools may be outside the board's edge, m."""
+        return 0.15 * self.half
+
+    def samples(self, across: int = 6, up: int = 5, part: float = 1.0) -> Array:
+        """Points of the tracked volume, shape (across^2 up, 3), denser near the board."""
+        side = np.linspace(-part, part, across) * (self.half + self.margin)
+        height = self.floor * (part * self.ceiling / self.floor) ** np.linspace(0.0, 1.0, up)
+        x, y, z = np.meshgrid(side + self.centre[0], side + self.centre[1], height, indexing='ij')
+        return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Candidate sources of one hypothesis.
+
+    Attributes
+    ----------
+    name : str
+    standoff_m : float
+        Distance of the nearest source from the board (or from the tracked volume), m.
+    overhead : bool
+        Whether the sources are around and over the volume, not below the board.
+    positions : ndarray, shape (M, 3)
+        m, frame fg.
+    volumes : ndarray, shape (M,)
+        Volume that each source stands for, m^3.
+    """
+
+    name: str
+    standoff_m: float
+    overhead: bool
+    positions: Array
+    volumes: Array
+
+
+def below(region: Region, standoff: float) -> Cloud:
+    """Layers of sources from ``standoff`` under the board down to more than the board's size."""
+    deepest = max(2.7 * region.half, 3.0 * standoff)
+    count = max(3, 1 + int(math.log(deepest / standoff) / math.log(LAYER_RATIO)))
+    depths = standoff * LAYER_RATIO ** np.arange(count)
+    edges = np.concatenate([depths[:1], (depths[1:] + depths[:-1]) / 2.0, depths[-1:]])
+    positions, volumes = [], []
+    for depth, thickness in zip(depths, np.diff(edges), strict=True):
+        reach = 1.3 * region.half + 0.5 * depth
+        spacing = max(region.half / 6.0, SPACING_PER_DEPTH * depth)
+        across = math.ceil(2.0 * reach / spacing) + 1
+        side = np.linspace(-reach, reach, across)
+        x, y = np.meshgrid(side + region.centre[0], side + region.centre[1], indexing='ij')
+        positions.append(np.stack([x.ravel(), y.ravel(), np.full(x.size, -depth)], axis=1))
+        volumes.append(np.full(x.size, thickness * (side[1] - side[0]) ** 2))
+    return Cloud(
+        f'below {1e3 * standoff:.0f} mm',
+        standoff,
+        False,
+        np.concatenate(positions),
+        np.concatenate(volumes),
+    )
+
+
+def overhead(region: Region, standoff: float) -> Cloud:
+    """Sources beside and over the tracked volume, at least ``standoff`` away from it."""
+    spacing = max(0.8 * standoff, 0.3 * region.half)
+    side = region.half + region.margin + standoff
+    top = region.ceiling + standoff
+    reach = side + 1.2 * region.half
+    flat = np.arange(-reach, reach + spacing / 2.0, spacing)
+    height = np.arange(spacing / 2.0, top + region.half, spacing)
+    x, y, z = (axis.ravel() for axis in np.meshgrid(flat, flat, height, indexing='ij'))
+    outside = (np.abs(x) >= side) | (np.abs(y) >= side) | (z >= top)
+    points = np.stack([x, y, z], axis=1)[outside]
+    points[:, :2] += region.centre
+    return Cloud(
+        f'around {1e3 * standoff:.0f} mm',
+        standoff,
+        True,
+        points,
+        np.full(len(points), spacing**3),
+    )
+
+
+def default_clouds(region: Region) -> tuple[Cloud, ...]:
+    """Hypotheses for any board: standoffs in a geometric series, from nearly touching to far."""
+    near = 0.08 * region.half
+    standoffs = near * 1.55 ** np.arange(8)
+    around = region.half * np.array([0.4, 0.9])
+    return tuple(below(region, float(s)) for s in standoffs) + tuple(
+        overhead(region, float(s)) for s in around
+    )

@@ -1,0 +1,131 @@
+"""Which references can be believed: each is judged by what all the others say.
+
+A reference that is dead, moved, saturated or unplugged changes alone; metal changes many readings
+at once, in the proportions that the emitters' fields have at one place. So "coil s is at fault" is
+one more hypothesis, with its readings of any size and the metal told by the others alone, and its
+odds against "all is well" come from the same evidence. A coil that is left out is watched, and
+returns when it has agreed with the others for a while.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.fitting.refit_posterior import Bank, Evaluation, log_sum
+
+Array = NDArray[np.float64]
+
+OK = 'ok'
+FLAGGED = 'flagged'
+NOT_FINITE = 'not finite'
+MISSING = 'missing'
+NO_BASELINE = 'no baseline'
+DISAGREES = 'disagrees'
+
+FAULT_SCALES = 10.0 ** np.arange(0.0, 6.1, 0.5)
+"""Sizes of a faulty reading's error, in noise deviations, all as likely."""
+SUSPICIOUS = 2.8
+"""Left-out chi-square per degree of freedom from which on a fault is considered."""
+FAULT_ODDS = 100.0
+"""Logarithm of the odds that a coil is at fault from which on it is left out.
+
+Metal that the clouds describe badly reaches 70 in recordings; faults that matter begin at 100.
+"""
+AGREES = 2.5
+"""Left-out chi-square per degree of freedom below which an excluded coil agrees again."""
+RETRY_FRAMES = 10
+
+
+@dataclass(frozen=True)
+class ReferenceHealth:
+    """One reference coil in one frame.
+
+    Attributes
+    ----------
+    name : str
+    state : str
+        ``ok``, or why it was left out: ``flagged``, ``not finite``, ``missing``, ``no baseline``,
+        ``disagrees``.
+    residual_t : float
+        Root mean square of measured minus predicted by all others, T a component; NaN where the
+        coil has no reading.
+    distance : float
+        The same in units of its expected size; about 1 for a healthy coil.
+    """
+
+    name: str
+    state: str
+    residual_t: float
+    distance: float
+
+
+def fault_odds(bank: Bank, seen: Evaluation, coil: int) -> float:
+    """Logarithm of the odds that a coil in use is at fault."""
+    others, residual = bank.without(seen, coil)
+    size = float((residual**2).sum())
+    likelihood = -0.5 * size / FAULT_SCALES**2 - residual.size * np.log(FAULT_SCALES)
+    broad = log_sum(likelihood) - np.log(len(FAULT_SCALES))
+    return float(log_sum(others) + broad - log_sum(seen.log_evidence))
+
+
+@dataclass
+class Watch:
+    """Keeps account of which coils are left out, and for how long.
+
+    Attributes
+    ----------
+    count : int
+        Reference coils S.
+    hold_frames : int
+        Frames for which a coil must be readable and agree before it is used again.
+    """
+
+    count: int
+    hold_frames: int
+    excluded: NDArray[np.bool_] = field(init=False)
+    reason: list[str] = field(init=False)
+    _good: NDArray[np.int64] = field(init=False)
+    _dismissed: float = field(init=False, default=0.0)
+    _since: int = field(init=False, default=0)
+
+    def __post_init__(self) -> None:
+        self.excluded = np.zeros(self.count, dtype=bool)
+        self.reason = [OK] * self.count
+        self._good = np.zeros(self.count, dtype=np.int64)
+
+    def note(self, readable: NDArray[np.bool_], reasons: list[str]) -> None:
+        """Leave out what can't be read; an unreadable coil starts its waiting time again."""
+        for coil in np.flatnonzero(~readable):
+            self.excluded[coil] = True
+            self.reason[coil] = reasons[coil]
+            self._good[coil] = 0
+
+    def exclude(self, coil: int) -> None:
+        """Leave out a coil that disagrees with the others."""
+        self.excluded[coil], self.reason[coil], self._good[coil] = True, DISAGREES, 0
+
+    def agreed(self, coil: int, agrees: bool) -> None:
+        """Count a frame in which an excluded coil could be compared; it returns in the end."""
+        self._good[coil] = self._good[coil] + 1 if agrees else 0
+        if self._good[coil] >= self.hold_frames:
+            self.excluded[coil], self.reason[coil] = False, OK
+
+    def suspect(self, chi2: Array, freedom: int) -> NDArray[np.int64]:
+        """Coils in use whose fault is worth the computation, the worst first; often none.
+
+        A suspicion that was just dismissed is taken up again when it has grown, or after a while.
+        """
+        self._since += 1
+        worst = float(chi2.max()) / freedom
+        if worst < SUSPICIOUS:
+            return np.empty(0, dtype=np.int64)
+        if worst < 1.3 * self._dismissed and self._since < RETRY_FRAMES:
+            return np.empty(0, dtype=np.int64)
+        self._since = 0
+        order = np.argsort(-chi2)[:3]
+        return np.asarray(order[chi2[order] > 0.5 * chi2[order[0]]])
+
+    def dismiss(self, chi2: Array, freedom: int) -> None:
+        """The suspicion proved wrong."""
+        self._dismissed = float(chi2.max()) / freedom

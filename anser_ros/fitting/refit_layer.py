@@ -1,0 +1,155 @@
+"""The equivalent layer: a few dipoles whose field in the tracked volume is that of any cloud.
+
+A field whose sources are all below a plane is also the field of dipoles on that plane (the
+equivalent layer of potential theory; Blakely, Potential Theory in Gravity and Magnetic
+Applications, chapter 3). So the refitted model keeps its size however fine the clouds are. Where
+the calibrated model is such a layer itself, its own dipoles take the change and the model does not
+grow at all. Metal beside or over the volume needs dipoles beside and over it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cholesky
+
+from anser_ros.fitting.model import FieldModel
+from anser_ros.fitting.refit_clouds import Region
+from anser_ros.fitting.refit_references import vector_basis
+from anser_ros.physics.dipole import flux_basis
+
+Array = NDArray[np.float64]
+
+RIDGE = 1e-5
+"""Damping of the layer's fit relative to its largest singular value."""
+MOST_OWN = 200
+"""A calibrated layer of more dipoles than this is not used as the equivalent layer."""
+GOOD_ENOUGH = 0.012
+"""Relative rms misfit, over the tracked volume, up to which the model's own dipoles are used."""
+SHALLOW = (12, 1.3, 0.15)
+DEEP = (7, 2.5, 1.0)
+INNER = 0.83
+"""Dipoles along a side, half size and depth of a lattice, the last two in halves of the board."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Dipoles that stand for a cloud.
+
+    Attributes
+    ----------
+    rows : ndarray of int, shape (Q,), or None
+        The calibrated model's own dipoles that take part of the change; they are the layer's first
+        Q. None when all of the layer is added to the model.
+    positions, directions : ndarray, shape (N, 3)
+    inverse : ndarray, shape (N, 3P)
+        From field samples (T, point by point) to moments (A m^2).
+    points : ndarray, shape (P, 3)
+        Where the field is sampled, m.
+    metric : ndarray, shape (N, N)
+        Upper triangle C: moments m make a field of rms ``|C m|`` over the samples' components.
+    """
+
+    rows: NDArray[np.int64] | None
+    positions: Array
+    directions: Array
+    inverse: Array
+    points: Array
+    metric: Array
+
+    def project(self, sources: Array) -> Array:
+        """Moments of the layer per unit moment of each source's component, shape (N, 3M)."""
+        return np.asarray(self.inverse @ _field_rows(self.points, sources))
+
+    def misfit(self, sources: Array) -> float:
+        """Relative rms error of the field that the layer makes in place of the sources."""
+        field = _field_rows(self.points, sources)
+        made = _component_rows(self.points, self.positions, self.directions) @ (
+            self.inverse @ field
+        )
+        return float(np.linalg.norm(made - field) / np.linalg.norm(field))
+
+
+def _axes_at(points: Array) -> tuple[Array, Array]:
+    return np.repeat(points, 3, axis=0), np.tile(np.eye(3), (len(points), 1))
+
+
+def _field_rows(points: Array, sources: Array) -> Array:
+    """Field samples per unit moment component, shape (3P, 3M)."""
+    at, axes = _axes_at(points)
+    return vector_basis(at, axes, None, sources).reshape(len(at), -1)
+
+
+def _component_rows(points: Array, positions: Array, directions: Array) -> Array:
+    at, axes = _axes_at(points)
+    return flux_basis(at, axes, None, positions, directions)
+
+
+def _build(
+    rows: NDArray[np.int64] | None, positions: Array, directions: Array, points: Array
+) -> Layer:
+    basis = _component_rows(points, positions, directions)
+    scale = np.linalg.norm(basis, axis=0)
+    u, s, vt = np.linalg.svd(basis / scale, full_matrices=False)
+    inverse = (vt.T * (s / (s**2 + (RIDGE * s[0]) ** 2))) @ u.T / scale[:, None]
+    gram = basis.T @ basis / len(basis)
+    gram[np.diag_indices_from(gram)] += 1e-12 * np.diag(gram)
+    return Layer(rows, positions, directions, inverse, points, cholesky(gram))
+
+
+def _lattice(region: Region, across: int, extent: float, depth: float) -> Array:
+    side = np.linspace(-extent, extent, across) * region.half
+    x, y = np.meshgrid(side + region.centre[0], side + region.centre[1], indexing='ij')
+    return np.stack([x.ravel(), y.ravel(), np.full(x.size, -depth * region.half)], axis=1)
+
+
+def _upright(positions: Array) -> Array:
+    return np.tile([0.0, 0.0, 1.0], (len(positions), 1))
+
+
+def bottom_layer(model: FieldModel, region: Region, sources: Array) -> Layer:
+    """The layer for clouds below the board.
+
+    Parameters
+    ----------
+    model : FieldModel
+        Calibrated; its dipoles are used again where they can stand for the sources.
+    region : Region
+    sources : ndarray, shape (M, 3)
+        Sources of the cloud that is hardest to stand for, the nearest one.
+    """
+    points, deep = region.samples(), _lattice(region, *DEEP)
+    upright = np.abs(model.directions[:, 2]) > 0.999
+    low = np.abs(model.positions[:, 2]) < 0.5 * region.half
+    rows = np.flatnonzero(upright & low)
+    if 64 <= rows.size <= MOST_OWN:
+        own = np.concatenate([model.positions[rows], deep])
+        layer = _build(rows, own, _upright(own), points)
+        if layer.misfit(sources) <= GOOD_ENOUGH:
+            return layer
+    positions = np.concatenate([_lattice(region, *SHALLOW), deep])
+    return _build(None, positions, _upright(positions), points)
+
+
+def box_layer(region: Region) -> Layer:
+    """Dipoles on the faces of a box around the tracked volume, pointing inwards."""
+    gap = 0.8 * region.half
+    half = region.half + region.margin + gap
+    across = np.linspace(-half, half, 6)
+    faces = [(axis, sign) for axis in range(2) for sign in (-1.0, 1.0)]
+    positions, directions = [], []
+    for axis, sign in faces:
+        up = np.linspace(-gap, region.ceiling + gap, 4)
+        u, v = (a.ravel() for a in np.meshgrid(across, up, indexing='ij'))
+        face = np.empty((u.size, 3))
+        face[:, axis], face[:, 1 - axis], face[:, 2] = sign * half, u, v
+        positions.append(face)
+        directions.append(np.tile(-sign * np.eye(3)[axis], (u.size, 1)))
+    u, v = (a.ravel() for a in np.meshgrid(across, across, indexing='ij'))
+    for height, inwards in ((region.ceiling + gap, -1.0), (-gap, 1.0)):
+        positions.append(np.stack([u, v, np.full(u.size, height)], axis=1))
+        directions.append(inwards * _upright(positions[-1]))
+    stacked = np.concatenate(positions)
+    stacked[:, :2] += region.centre
+    # Near the faces the field of what is just outside has more detail than the box can make.
+    return _build(None, stacked, np.concatenate(directions), region.samples(part=INNER))

@@ -1,0 +1,328 @@
+"""From the references' change to the field's change: evidence, posterior mean and uncertainty.
+
+Every cloud's hypothesis is a Gaussian of the readings, ``y ~ N(0, a C + s^2 N)``: metal of a total
+strength ``a`` as the cloud has it, the survey's errors in proportion, and noise. In the
+eigenvectors of C (whitened by N) all of it is diagonal, so the evidence of any strength costs a
+sum, and the strength is integrated over a grid instead of being chosen (MacKay, Neural Computation
+4 (1992) 415). In-phase and quadrature parts share the geometry and have a strength each.
+Hypothesis 0 is that nothing has changed.
+
+N is white noise plus the drift of the emitters: a coil whose current reading is a little off shows
+in all references in proportion to their baseline, which is nothing that metal does.
+
+Readings are in units of the nominal noise throughout this module.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh
+
+from anser_ros.fitting.refit_prior import CloudPrior
+
+Array = NDArray[np.float64]
+
+STRENGTHS = 10.0 ** np.arange(-2.0, 11.0, 0.5)
+"""Variances of a reading, in noise variances, that the evidence is summed over."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What one frame says about the hypotheses.
+
+    Attributes
+    ----------
+    projected : ndarray, shape (H, n, 2)
+        Whitened readings in each hypothesis' eigenvectors; real, imaginary.
+    log_evidence : ndarray, shape (H,)
+    curve : ndarray, shape (H, A, 2)
+        Logarithm of the likelihood of each strength, real and imaginary part.
+    strength : ndarray, shape (H, 2, A)
+        Probability of each strength.
+    noise : float
+        Noise in units of the nominal one.
+    """
+
+    projected: Array
+    log_evidence: Array
+    curve: Array
+    strength: Array
+    noise: float
+
+
+MOST = len(STRENGTHS) - 1
+MOST_TABLES, MOST_BLOCKS = 12, 128
+"""Noise levels and coil blocks that are kept ready."""
+
+
+@dataclass(frozen=True)
+class ErrorLevel:
+    """Noise, and index of the strength of the real and the imaginary part."""
+
+    noise: float
+    strengths: tuple[int, int]
+
+
+def _make_room(table: dict[Any, Any], most: int) -> None:
+    """Forget the oldest entry when a table is full."""
+    if len(table) >= most:
+        del table[next(iter(table))]
+
+
+def log_sum(values: Array) -> float:
+    """Logarithm of the sum of exponentials."""
+    top = float(values.max())
+    return top + float(np.log(np.exp(values - top).sum()))
+
+
+def _over_strengths(curve: Array) -> tuple[Array, Array]:
+    """Log evidence (H,) and strength probabilities (H, 2, A) from the curves (H, A, 2)."""
+    top = curve.max(axis=1, keepdims=True)
+    weight = np.exp(curve - top)
+    total = weight.sum(axis=1, keepdims=True)
+    evidence = (top + np.log(total / len(STRENGTHS)))[:, 0].sum(axis=1)
+    return evidence, (weight / total).swapaxes(1, 2)
+
+
+class Bank:
+    """All hypotheses for the references that are in use.
+
+    Parameters
+    ----------
+    priors : sequence of CloudPrior
+    rows : ndarray of int, shape (n,)
+        Readings in use, as rows of the priors' covariance; all K of a coil or none.
+    drift : ndarray, shape (all readings, K)
+        Reading that one deviation of each emitter's drift makes, in noise units.
+    """
+
+    def __init__(
+        self, priors: Sequence[CloudPrior], rows: NDArray[np.int64], drift: Array
+    ) -> None:
+        self.priors = tuple(priors)
+        self.rows = rows
+        self.width = drift.shape[1]
+        self._all_drift = drift
+        self.drift = drift[rows]
+        whitening = _whitening(self.drift)
+        spectra, bases = [np.zeros(len(rows))], [whitening]
+        for prior in self.priors:
+            block = prior.covariance[np.ix_(rows, rows)]
+            values, vectors = eigh(whitening @ block @ whitening, driver='evd')
+            spectra.append(np.maximum(values, 0.0))
+            bases.append(whitening @ vectors)
+        self.spectra = np.array(spectra)
+        self.bases = np.array(bases)
+        # The two large products of every frame wait for memory, not for arithmetic; single
+        # precision is 1e-7 of a reading that is at most 1e6 noise deviations.
+        turned = self.bases.swapaxes(1, 2).reshape(-1, len(rows))
+        self._analysis = np.ascontiguousarray(turned, dtype=np.float32)
+        self._synthesis: dict[int, NDArray[np.float32]] = {}
+        self._blocks: dict[tuple[float, int, int], Array] = {}
+        self._tables: dict[float, tuple[Array, Array]] = {}
+
+    def precision(self, noise: float) -> tuple[Array, Array]:
+        """Inverse variances (H, A, n) and log determinants (H, A) at a noise level."""
+        if noise not in self._tables:
+            variance = STRENGTHS[None, :, None] * self.spectra[:, None, :] + noise**2
+            _make_room(self._tables, MOST_TABLES)
+            self._tables[noise] = (1.0 / variance, np.log(variance).sum(axis=2))
+        return self._tables[noise]
+
+    def evaluate(self, readings: Array, noise: float) -> Evaluation:
+        """Evidence of every hypothesis.
+
+        Parameters
+        ----------
+        readings : ndarray, shape (n, 2)
+            Change since the baseline, real and imaginary part, in nominal noise deviations.
+        noise : float
+            Noise in units of the nominal one.
+        """
+        precision, log_det = self.precision(noise)
+        projected = (self._analysis @ readings.astype(np.float32)).astype(np.float64)
+        projected = projected.reshape(len(self.bases), -1, 2)
+        curve = -0.5 * (precision @ projected**2 + log_det[:, :, None])
+        evidence, strength = _over_strengths(curve)
+        return Evaluation(projected, evidence, curve, strength, noise)
+
+    def coefficients(self, seen: Evaluation, hypothesis: int) -> Array:
+        """Coordinates (n, 2) of the posterior mean in a hypothesis' eigenvectors."""
+        precision, _ = self.precision(seen.noise)
+        shrink = (seen.strength[hypothesis] * STRENGTHS) @ precision[hypothesis]
+        return np.asarray(seen.projected[hypothesis] * shrink.T)
+
+    def _to_moments(self, hypothesis: int) -> NDArray[np.float32]:
+        if hypothesis not in self._synthesis:
+            transfer = self.priors[hypothesis - 1].transfer[:, self.rows]
+            self._synthesis[hypothesis] = (transfer @ self.bases[hypothesis]).astype(np.float32)
+        return self._synthesis[hypothesis]
+
+    def moments(self, seen: Evaluation, hypothesis: int) -> Array:
+        """Posterior mean of the layer's moments (N K, 2) in noise units."""
+        coefficients = self.coefficients(seen, hypothesis).astype(np.float32)
+        return np.asarray(self._to_moments(hypothesis) @ coefficients, dtype=np.float64)
+
+    def innovation(self, seen: Evaluation, hypothesis: int) -> Array:
+        """Inverse covariance times the readings, (n, 2), averaged over the strengths."""
+        precision, _ = self.precision(seen.noise)
+        mean = seen.strength[hypothesis] @ precision[hypothesis]
+        return np.asarray(self.bases[hypothesis] @ (seen.projected[hypothesis] * mean.T))
+
+    def drifts(self, seen: Evaluation, hypothesis: int) -> tuple[Array, Array]:
+        """Emitters' drift, mean (K, 2) and variance (K, 2), in prior deviations."""
+        precision, _ = self.precision(seen.noise)
+        scale = seen.noise**2
+        mean = self.drift.T @ self.innovation(seen, hypothesis) * scale
+        power = (self.drift.T @ self.bases[hypothesis]) ** 2
+        inverse = seen.strength[hypothesis] @ precision[hypothesis]
+        return mean, scale * (1.0 - scale * (power @ inverse.T))
+
+    def sources(self, seen: Evaluation, hypothesis: int) -> Array:
+        """Posterior mean polarisability (M, 2) of a cloud's sources, in noise units."""
+        weights = self.bases[hypothesis] @ self.coefficients(seen, hypothesis)
+        prior = self.priors[hypothesis - 1]
+        root = np.sqrt(prior.cloud.volumes)[:, None]
+        return np.asarray(root * (prior.coupling[self.rows].T @ weights) / prior.scale)
+
+    def left_out(self, seen: Evaluation, hypothesis: int) -> tuple[Array, Array]:
+        """How far each coil's readings are from what all others predict.
+
+        Returns
+        -------
+        chi2 : ndarray, shape (S,)
+            Squared distance in units of the prediction's covariance; 2 K degrees of freedom.
+        residual : ndarray, shape (S, K, 2)
+            Measured minus predicted, in noise units.
+        """
+        precision, _ = self.precision(seen.noise)
+        shape = (-1, self.width, 1)
+        chi2 = np.zeros(len(self.rows) // self.width)
+        residual = np.empty((len(chi2), self.width, 2))
+        for part in range(2):
+            strength = int(seen.strength[hypothesis, part].argmax())
+            q = self.bases[hypothesis] @ (
+                seen.projected[hypothesis, :, part] * precision[hypothesis, strength]
+            )
+            r = self._block(seen.noise, hypothesis, strength) @ q.reshape(shape)
+            chi2 += (q.reshape(shape) * r)[:, :, 0].sum(axis=1)
+            residual[:, :, part] = r[:, :, 0]
+        return chi2, residual
+
+    def _block(self, noise: float, hypothesis: int, strength: int) -> Array:
+        """Covariance of each coil's readings given all others, (S, K, K)."""
+        key = (noise, hypothesis, strength)
+        if key not in self._blocks:
+            precision, _ = self.precision(noise)
+            _make_room(self._blocks, MOST_BLOCKS)
+            rows = self.bases[hypothesis].reshape(-1, self.width, len(self.rows))
+            blocks = (rows * precision[hypothesis, strength]) @ rows.swapaxes(1, 2)
+            self._blocks[key] = np.linalg.inv(blocks)
+        return self._blocks[key]
+
+    def without(self, seen: Evaluation, coil: int) -> tuple[Array, Array]:
+        """Evidence of all hypotheses from the other coils alone, and this one's residual.
+
+        By the rules of the conditional normal distribution no matrix is decomposed again.
+
+        Parameters
+        ----------
+        coil : int
+            Number of the coil among those in use.
+
+        Returns
+        -------
+        log_evidence : ndarray, shape (H,)
+        residual : ndarray, shape (K, 2)
+            Measured minus predicted under the most likely hypothesis, in noise units.
+        """
+        precision, _ = self.precision(seen.noise)
+        part = slice(coil * self.width, (coil + 1) * self.width)
+        curve, residuals = np.empty_like(seen.curve), []
+        for h, basis in enumerate(self.bases[:, part]):
+            weighted = precision[h][:, None, :] * basis
+            block = weighted @ basis.T
+            q = weighted @ seen.projected[h]
+            r = np.linalg.solve(block, q)
+            log_det = np.linalg.slogdet(block)[1]
+            curve[h] = seen.curve[h] + 0.5 * (q * r).sum(axis=1) - 0.5 * log_det[:, None]
+            best = curve[h].argmax(axis=0)
+            residuals.append(r[best, :, [0, 1]].T)
+        evidence, _ = _over_strengths(curve)
+        return evidence, residuals[int(evidence.argmax())]
+
+    def distance(
+        self, seen: Evaluation, hypothesis: int, rows: NDArray[np.int64], readings: Array
+    ) -> float:
+        """How far readings of a coil that is not in use are from what those in use predict.
+
+        Parameters
+        ----------
+        rows : ndarray of int, shape (K,)
+            Rows of the priors' covariance.
+        readings : ndarray, shape (K, 2)
+
+        Returns
+        -------
+        float
+            Squared distance in units of the prediction's covariance; 2 K degrees of freedom.
+        """
+        precision, _ = self.precision(seen.noise)
+        basis, variance = self.bases[hypothesis], seen.noise**2
+        ahead = self._all_drift[rows]
+        shared = variance * (ahead @ self.drift.T)
+        own = variance * (np.eye(len(rows)) + ahead @ ahead.T)
+        total = 0.0
+        for part in range(2):
+            strength = int(seen.strength[hypothesis, part].argmax())
+            cross, block = shared, own
+            if hypothesis > 0:
+                prior = self.priors[hypothesis - 1].covariance
+                cross = cross + STRENGTHS[strength] * prior[np.ix_(rows, self.rows)]
+                block = block + STRENGTHS[strength] * prior[np.ix_(rows, rows)]
+            seen_by = cross @ basis
+            weighted = seen_by * precision[hypothesis, strength]
+            r = readings[:, part] - weighted @ seen.projected[hypothesis, :, part]
+            total += float(r @ np.linalg.solve(block - weighted @ seen_by.T, r))
+        return total
+
+    def error_level(self, seen: Evaluation, hypothesis: int) -> ErrorLevel:
+        """Noise and strengths, rounded up, that an uncertainty is worked out for."""
+        noise = 2.0 ** float(np.ceil(np.log2(seen.noise) - 0.1))
+        real, imaginary = (int(part.argmax()) for part in seen.strength[hypothesis])
+        strengths = min(real + real % 2, MOST), min(imaginary + imaginary % 2, MOST)
+        return ErrorLevel(noise, strengths)
+
+    def error_draws(self, hypothesis: int, noise: float, strength: int, part: int) -> Array:
+        """Draws of the posterior's error of the layer's moments, (N K, D), in noise units.
+
+        A draw from the prior minus the posterior mean of its own noisy readings is a draw of the
+        posterior's error (Matheron's rule; Wilson et al., JMLR 22 (2021) 105).
+        """
+        precision, _ = self.precision(noise)
+        prior, root = self.priors[hypothesis - 1], np.sqrt(STRENGTHS[strength])
+        drawn = _noise_draws(prior.draw_readings.shape[1], self.drift, noise, part)
+        readings = root * prior.draw_readings[self.rows] + drawn
+        gain = (STRENGTHS[strength] * precision[hypothesis, strength])[:, None]
+        weights = gain * (self.bases[hypothesis].T @ readings)
+        return np.asarray(root * prior.draw_moments - self._to_moments(hypothesis) @ weights)
+
+
+def _whitening(drift: Array) -> Array:
+    """Inverse root of ``I + drift drift^T``, whose columns are orthogonal: one emitter's each."""
+    out = np.eye(len(drift))
+    norm = np.linalg.norm(drift, axis=0)
+    for column in np.flatnonzero(norm > 0.0):
+        unit = drift[:, column] / norm[column]
+        out -= np.outer(unit, unit) * (1.0 - 1.0 / np.sqrt(1.0 + norm[column] ** 2))
+    return out
+
+
+def _noise_draws(count: int, drift: Array, noise: float, part: int) -> Array:
+    """Repeatable draws of the readings' noise and drift, (n, D)."""
+    rng = np.random.default_rng(1 + part)
+    white = rng.standard_normal((len(drift), count))
+    return np.asarray(noise * (white + drift @ rng.standard_normal((drift.shape[1], count))))

@@ -1,0 +1,65 @@
+"""The reference coils: what a source does to their readings, and what their survey is worth.
+
+A surveyed coil is a little elsewhere, points a little elsewhere and has a little other gain than
+the table says. In a clean room that is part of its baseline and cancels; of the change that metal
+makes it leaves an error proportional to the change. To first order it is the reading of a few
+displaced, turned and scaled copies of the coil (`survey_variants`).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.physics.dipole import flux_basis
+from anser_ros.physics.sensor import SensorTable
+
+Array = NDArray[np.float64]
+
+STEP_M = 1e-4
+
+
+@dataclass(frozen=True)
+class SurveyError:
+    """Standard deviations of the survey: position (m) and tilt (rad) per axis, gain."""
+
+    position_m: float = 0.2e-3
+    rotation_rad: float = float(np.deg2rad(0.3))
+    gain: float = 0.004
+
+
+def vector_basis(points: Array, axes: Array, lengths: Array | None, sources: Array) -> Array:
+    """Flux of each coil per unit moment along x, y and z of each source, shape (S, M, 3)."""
+    out = np.empty((points.shape[0], sources.shape[0], 3))
+    for component, unit in enumerate(np.eye(3)):
+        directions = np.broadcast_to(unit, sources.shape)
+        out[:, :, component] = flux_basis(points, axes, lengths, sources, directions)
+    return out
+
+
+def tangents(axes: Array) -> Array:
+    """Two unit vectors across each axis, shape (S, 2, 3)."""
+    least = np.zeros_like(axes)
+    least[np.arange(len(axes)), np.abs(axes).argmin(axis=1)] = 1.0
+    first = np.cross(axes, least)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(axes, first)], axis=1)
+
+
+def survey_variants(
+    references: SensorTable, sources: Array, survey: SurveyError
+) -> Iterator[Array]:
+    """Change of `vector_basis` by one standard deviation of each survey error, (S, M, 3) each."""
+    p, n, lengths = references.position, references.axis, references.length
+    if survey.gain > 0.0:
+        yield survey.gain * vector_basis(p, n, lengths, sources)
+    if survey.rotation_rad > 0.0:
+        across = tangents(n)
+        for side in range(2):
+            yield survey.rotation_rad * vector_basis(p, across[:, side], lengths, sources)
+    if survey.position_m > 0.0:
+        for unit in np.eye(3) * STEP_M:
+            ahead = vector_basis(p + unit, n, lengths, sources)
+            ahead -= vector_basis(p - unit, n, lengths, sources)
+            yield ahead * (survey.position_m / (2.0 * STEP_M))
