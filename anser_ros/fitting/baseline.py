@@ -88,8 +88,8 @@ class ReadingWindow:
                 f'there are {len(self._frames)}'
             )
         stack = np.stack([frame for _, frame in self._frames])
-        good = np.isfinite(stack).all(axis=2)
-        count = good.sum(axis=0)
+        good = np.asarray(np.isfinite(stack).all(axis=2))
+        count = np.asarray(good.sum(axis=0))
         total = np.where(good[:, :, None], stack, 0.0).sum(axis=0)
         enough = np.asarray(2 * count >= len(stack))
         if not enough.any():

@@ -1,0 +1,250 @@
+"""One coil's solve: against exact poses, its own derivatives, and its own claim of accuracy."""
+
+import numpy as np
+import pytest
+from tracking_world import NOISE_T, certain_model
+
+from anser_ros.errors import TrackingError
+from anser_ros.physics.dipole import flux_jacobian
+from anser_ros.tracking import rotations
+from anser_ros.tracking.projection import descend_projected
+from anser_ros.tracking.seed import Volume
+from anser_ros.tracking.solve import RealField, fill_coil, fill_tangent, solve_coil, whitening_of
+from anser_ros.tracking.uncertainty import (
+    UNKNOWN_VARIANCE,
+    bounded_inverse,
+    chi2_limit,
+    coil_covariance,
+)
+
+MODEL = certain_model()
+FIELD = RealField.of(MODEL.positions, MODEL.directions, MODEL.moments)
+LOW, HIGH = Volume().grown(0.03)
+WIDTH = FIELD.moments.shape[1]
+WHITENING = whitening_of(np.full(WIDTH, NOISE_T))
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(21)
+
+
+def pose(rng, low=0.08, high=0.25):
+    axis = rng.normal(size=3)
+    return rng.uniform([-0.12, -0.12, low], [0.12, 0.12, high]), axis / np.linalg.norm(axis)
+
+
+def flux_of(position, axis, length=0.0):
+    flux = MODEL.flux(position[None], axis[None], np.array([length]))
+    return np.ascontiguousarray(flux).view(np.float64)[0]
+
+
+def nearby(rng, position, axis, move=2e-3, turn=0.035):
+    step = rng.normal(size=3)
+    other = axis + turn * np.cross(axis, rng.normal(size=3))
+    return position + move * step / np.linalg.norm(step), other / np.linalg.norm(other)
+
+
+@pytest.mark.parametrize('length', [0.0, 0.008])
+def test_kernel_is_the_public_jacobian(rng, length):
+    position, axis = pose(rng)
+    flux, slopes = np.empty(WIDTH), np.empty((6, WIDTH))
+    basis = np.empty((9, len(FIELD.positions)))
+    fill_coil(
+        position, axis, length, FIELD.positions, FIELD.directions, FIELD.moments, basis, flux,
+        slopes,
+    )  # fmt: skip
+    value, by_place, by_axis = flux_jacobian(
+        position[None], axis[None], np.array([length]), MODEL.positions, MODEL.directions,
+        MODEL.moments,
+    )  # fmt: skip
+    np.testing.assert_allclose(flux, value.view(np.float64)[0], rtol=1e-12)
+    np.testing.assert_allclose(slopes[:3], by_place.view(np.float64)[0], rtol=1e-10)
+    np.testing.assert_allclose(slopes[3:], by_axis.view(np.float64)[0], rtol=1e-10)
+
+
+@pytest.mark.parametrize('length', [0.0, 0.008])
+@pytest.mark.parametrize(('move', 'turn'), [(2e-3, 0.035), (0.02, 0.3)])
+def test_exact_fluxes_give_the_exact_pose(rng, length, move, turn):
+    for _ in range(50):
+        position, axis = pose(rng)
+        start, first = nearby(rng, position, axis, move, turn)
+        found = solve_coil(
+            FIELD, flux_of(position, axis, length), WHITENING, start, first, LOW, HIGH, length
+        )
+        assert found.converged
+        assert found.chi2 < 1e-3
+        assert np.linalg.norm(found.position - position) < 1e-6
+        assert np.linalg.norm(found.axis - axis) < 1e-5
+        assert np.linalg.norm(found.axis) == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize('axis', [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0, -1, 0)])
+def test_no_axis_is_singular(rng, axis):
+    """Along z is where people calibrate, and where theta and phi fail."""
+    axis = np.array(axis, dtype=float)
+    position = np.array([0.02, -0.03, 0.15])
+    start, first = nearby(rng, position, axis)
+    found = solve_coil(FIELD, flux_of(position, axis), WHITENING, start, first, LOW, HIGH)
+    assert np.linalg.norm(found.position - position) < 1e-6
+    assert np.isfinite(coil_covariance(found.normal, found.axis, 3.3)).all()
+
+
+def test_warm_solve_needs_few_evaluations(rng):
+    used = []
+    for _ in range(100):
+        position, axis = pose(rng)
+        flux = flux_of(position, axis) + NOISE_T * rng.normal(size=WIDTH)
+        start, first = nearby(rng, position, axis)
+        used.append(solve_coil(FIELD, flux, WHITENING, start, first, LOW, HIGH).evaluations)
+    assert np.median(used) <= 5
+    assert max(used) <= 10
+
+
+def test_covariance_and_chi_square_are_what_happens(rng):
+    """500 noisy solves: errors in units of their covariance have unit variance."""
+    errors, chi2 = [], []
+    for _ in range(500):
+        position, axis = pose(rng)
+        flux = flux_of(position, axis) + NOISE_T * rng.normal(size=WIDTH)
+        found = solve_coil(FIELD, flux, WHITENING, position, axis, LOW, HIGH)
+        covariance = coil_covariance(found.normal, found.axis, 3.3)
+        turn = np.cross(axis, found.axis)
+        error = np.concatenate([found.position - position, turn])
+        # The roll is unknown; leave its direction out.
+        values, vectors = np.linalg.eigh(covariance)
+        part = vectors[:, :5].T @ error / np.sqrt(values[:5])
+        errors.append(part @ part)
+        chi2.append(found.chi2)
+    assert np.mean(errors) == pytest.approx(5.0, rel=0.1)
+    assert np.mean(chi2) == pytest.approx(WIDTH - 5, rel=0.1)
+
+
+def test_common_errors_count_less_when_the_model_is_uncertain(rng):
+    """With modes in the whitening, errors along them are expected, and the pose is less sure."""
+    position, axis = pose(rng)
+    flux = flux_of(position, axis)
+    modes = 0.01 * np.diag(np.abs(flux))[::2]
+    weights = whitening_of(np.full(WIDTH, NOISE_T), modes)
+    covariance = np.linalg.inv(weights.T @ weights)
+    expected = np.eye(WIDTH) * NOISE_T**2 + modes.T @ modes
+    np.testing.assert_allclose(covariance, expected, rtol=1e-6, atol=1e-9 * expected.max())
+    found = solve_coil(FIELD, flux + modes[2], weights, position, axis, LOW, HIGH)
+    assert found.chi2 < 2.0
+    plain = solve_coil(FIELD, flux + modes[2], WHITENING, position, axis, LOW, HIGH)
+    assert plain.chi2 > 100.0
+    sure = np.trace(coil_covariance(plain.normal, plain.axis, 1.0)[:3, :3])
+    assert np.trace(coil_covariance(found.normal, found.axis, 1.0)[:3, :3]) > 10 * sure
+
+
+def test_the_solver_never_leaves_its_box(rng):
+    position, axis = np.array([0.05, 0.02, 0.09]), np.array([0.0, 0.0, 1.0])
+    mirrored = position * [1, 1, -1]
+    low, high = np.array([-0.3, -0.3, 0.02]), np.array([0.3, 0.3, 0.5])
+    found = solve_coil(FIELD, flux_of(mirrored, axis), WHITENING, position, axis, low, high)
+    assert (found.position >= low).all()
+    assert (found.position <= high).all()
+
+
+def test_projected_descent_reaches_further(rng):
+    """From 5 cm off with no axis: nine in ten end at the truth or near it."""
+    near = 0
+    for _ in range(100):
+        position, axis = pose(rng, 0.1, 0.22)
+        flux = flux_of(position, axis)
+        start = position + 0.05 * rng.normal(size=3) / np.sqrt(3.0)
+        start = np.clip(start, LOW, HIGH)
+        first = axis + 0.5 * rng.normal(size=3)
+        first /= np.linalg.norm(first)
+        descend_projected(
+            start, first, flux, np.full(WIDTH, 1 / NOISE_T), FIELD.positions, FIELD.directions,
+            FIELD.moments, LOW, HIGH, 25,
+        )  # fmt: skip
+        near += np.linalg.norm(start - position) < 3e-3
+    assert near >= 90
+
+
+def test_tangents_complete_a_right_handed_frame(rng):
+    for axis in [*rng.normal(size=(50, 3)), [0, 0, 1], [0, 0, -1], [1e-12, 0, -1]]:
+        n = np.array(axis, dtype=float)
+        n /= np.linalg.norm(n)
+        t = np.empty((2, 3))
+        fill_tangent(n, t)
+        frame = np.stack([t[0], t[1], n])
+        np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-9)
+        assert np.linalg.det(frame) == pytest.approx(1.0)
+
+
+def test_weak_directions_are_bounded():
+    covariance = bounded_inverse(np.diag([1e8, 1e4, 0.0]))
+    np.testing.assert_allclose(np.diag(covariance)[:2], [1e-8, 1e-4])
+    assert covariance[2, 2] == pytest.approx(UNKNOWN_VARIANCE)
+
+
+def test_gate_is_the_chi_square_quantile():
+    assert chi2_limit(11, 0.05) == pytest.approx(19.675, abs=1e-3)
+    assert chi2_limit(0, 0.05) == chi2_limit(1, 0.05)
+
+
+def test_refusals():
+    good = (MODEL.positions, MODEL.directions, MODEL.moments)
+    with pytest.raises(TrackingError, match='needs positions and directions'):
+        RealField.of(good[0][:, :2], good[1], good[2])
+    with pytest.raises(TrackingError, match='can not have moments'):
+        RealField.of(good[0], good[1], good[2][:5])
+    with pytest.raises(TrackingError, match='must be finite'):
+        RealField.of(good[0] * np.nan, good[1], good[2])
+    for sigma in (0.0, -1.0, np.nan):
+        with pytest.raises(TrackingError, match='positive and finite'):
+            whitening_of(np.full(WIDTH, sigma))
+    with pytest.raises(TrackingError, match='covariance must be finite'):
+        whitening_of(np.full(WIDTH, 1.0), np.full((2, WIDTH), np.inf))
+    with pytest.raises(TrackingError, match='flux components'):
+        solve_coil(FIELD, np.zeros(4), WHITENING, LOW, LOW, LOW, HIGH)
+
+
+# Rotations ------------------------------------------------------------------------------
+
+
+def test_roll_rule_takes_z_to_the_axis_the_shortest_way(rng):
+    for _ in range(50):
+        _, axis = pose(rng)
+        matrix = rotations.rotation_of_quaternion(np.array(rotations.quaternion_of_axis(axis)))
+        np.testing.assert_allclose(matrix[:, 2], axis, atol=1e-12)
+        turn = rotations.rotation_between(np.eye(3), matrix)
+        assert abs(turn[2]) < 1e-12, 'no roll'
+        assert np.linalg.norm(turn) == pytest.approx(np.arccos(axis[2]), abs=1e-9)
+    assert rotations.quaternion_of_axis(np.array([0.0, 0, -1])) == (1.0, 0.0, 0.0, 0.0)
+    assert rotations.quaternion_of_axis(np.array([0.0, 0, 1])) == (0.0, 0.0, 0.0, 1.0)
+
+
+def test_rotation_conversions_agree(rng):
+    for scale in (1e-9, 1e-3, 1.0, 3.1):
+        vector = rng.normal(size=3)
+        vector *= scale / np.linalg.norm(vector)
+        matrix = rotations.rotation_of_vector(vector)
+        np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(
+            rotations.rotation_between(np.eye(3), matrix), vector, atol=1e-9
+        )
+        q = rotations.quaternion_of_rotation(matrix)
+        assert q[3] >= 0
+        np.testing.assert_allclose(
+            rotations.rotation_of_quaternion(np.array(q)), matrix, atol=1e-12
+        )
+
+
+@pytest.mark.parametrize('i', [0, 1, 2])
+def test_half_turns(i):
+    matrix = -np.eye(3)
+    matrix[i, i] = 1.0
+    turn = rotations.rotation_between(np.eye(3), matrix)
+    assert np.linalg.norm(turn) == pytest.approx(np.pi)
+    assert abs(turn[i]) == pytest.approx(np.pi)
+    q = rotations.quaternion_of_rotation(matrix)
+    np.testing.assert_allclose(rotations.rotation_of_quaternion(np.array(q)), matrix, atol=1e-12)
+
+
+def test_nearest_rotation_is_proper(rng):
+    mirror = np.diag([1.0, 1.0, -1.0]) + 0.01 * rng.normal(size=(3, 3))
+    assert np.linalg.det(rotations.nearest_rotation(mirror)) == pytest.approx(1.0)
