@@ -31,7 +31,7 @@ from anser_ros.wire.setup import parse_setup, topic_of
 
 WINDOW_S = 0.02
 STRETCH_S = 0.001
-STARTUP_S = 3.0
+STARTUP_S = 30.0
 SETTLE_S = 3.0
 MEASURE_S = 10.0
 RATES_HZ = (200.0, 100.0)
@@ -52,6 +52,8 @@ def main():
     got = []
     def subscribe(index, topic):
         def callback(message):
+            if not got:
+                open(output + '.first', 'w').close()
             stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
             got.append((index, stamp, time.monotonic_ns()))
         node.create_subscription(PoseStamped, topic, callback, qos.STREAM)
@@ -129,7 +131,7 @@ class Run:
     load: dict[str, float]
 
 
-def _start(name: str, *words: str, **parameters: object) -> subprocess.Popen:
+def _start(name: str, /, *words: str, **parameters: object) -> subprocess.Popen:
     command = [sys.executable, '-m', f'anser_ros.nodes.{name}', '--ros-args', *words]
     for key, value in parameters.items():
         command += ['-p', f'{key}:={value}']
@@ -154,14 +156,12 @@ def run_chain(rate_hz: float, measure_s: float = MEASURE_S) -> Run:
             'field_model': _start('field_model'),
             'tracker': _start('tracker'),
             'recorder': _start('recorder', directory=folder, name='bag'),
+            'acquisition': _start('acquisition', device=link, rate_hz=rate_hz, window_s=WINDOW_S),
         }
         try:
-            time.sleep(STARTUP_S)
-            chain['acquisition'] = _start(
-                'acquisition', device=link, rate_hz=rate_hz, window_s=WINDOW_S
-            )
             feeder.start()
-            time.sleep(STARTUP_S + SETTLE_S)
+            _wait_for(Path(f'{output}.first'))
+            time.sleep(SETTLE_S)
             before, from_ns = {n: _cpu_s(p) for n, p in chain.items()}, time.monotonic_ns()
             time.sleep(measure_s)
             after, until_ns = {n: _cpu_s(p) for n, p in chain.items()}, time.monotonic_ns()
@@ -174,6 +174,15 @@ def run_chain(rate_hz: float, measure_s: float = MEASURE_S) -> Run:
         poses = np.load(output)
     latency_ms, share = _match(poses, feeder, rate_hz, from_ns, until_ns)
     return Run(latency_ms, share, load)
+
+
+def _wait_for(path: Path) -> None:
+    """Wait for the listener's word that the first pose has come."""
+    end = time.monotonic() + STARTUP_S
+    while not path.exists():
+        if time.monotonic() > end:
+            raise RuntimeError(f'no pose within {STARTUP_S:g} s')
+        time.sleep(0.1)
 
 
 def _end(processes: list[subprocess.Popen]) -> None:
