@@ -20,7 +20,11 @@ RARE = 0.01
 """Probability of a residual that counts as more than this frame's share of noise."""
 SUSPICIOUS_JUMP_M = 0.02
 FIRST_RETRY_S = 0.05
-LAST_RETRY_S = 1.0
+LAST_RETRY_S = 0.25
+THOROUGH_EVERY = 4
+"""A long distortion gets a scan after growing pauses; every so many of them tries all starts."""
+CHANGED = 3.0
+"""A suspect's chi-square that changes by this factor calls for a scan before its time."""
 WHITENING_REACH_M = 3e-3
 WHITENING_REACH = 0.05
 """Move (m) and turn (chord of the axes) up to which the model's error at a pose is reused."""
@@ -119,6 +123,7 @@ def _cold(track: CoilTrack, frame: _Frame) -> list[CoilSolution]:
         scene.high,
         frame.length,
         limit,
+        thorough=track.failures % THOROUGH_EVERY == 0,
     )
     if scene.modes is None:
         return found
@@ -147,7 +152,8 @@ def track_coil(
     if track.suspect is not None and stamp_ns < track.retry_ns:
         solution = _descend(track, frame, track.suspect)
         verdict = _judge(track, frame, solution, [])
-        if verdict.state != states.OK:
+        change = solution.chi2 / max(track.suspect.chi2, 1e-300)
+        if verdict.state != states.OK and 1.0 / CHANGED < change < CHANGED:
             return CoilResult(verdict, solution)
     solution, *rivals = _cold(track, frame)
     return _finish(track, frame, solution, rivals, True)

@@ -15,7 +15,8 @@ from anser_ros.tracking.solve import RealField
 
 Array = NDArray[np.float64]
 
-BOX_MARGIN_M = 0.03
+BOX_MARGIN_M = 0.1
+"""How far beyond the volume the solver may go, so that a tool there is said to be there."""
 GRID_TOLERANCE = 0.05
 """Relative change of the field up to which a grid may go on serving as a source of starts."""
 

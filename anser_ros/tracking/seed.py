@@ -317,6 +317,7 @@ def solve_cold(
     length_m: float = 0.0,
     gate: float = math.inf,
     candidates: int = 6,
+    thorough: bool = True,
 ) -> list[CoilSolution]:
     """Every distinct pose that the best grid points lead to, least chi-square first.
 
@@ -331,6 +332,8 @@ def solve_cold(
         more are tried.
     candidates : int
         Starts that are always tried.
+    thorough : bool
+        Whether more are tried when those lead to nothing acceptable.
 
     Returns
     -------
@@ -347,6 +350,6 @@ def solve_cold(
         found += [new for new in more if not any(_same(new, old) for old in found)]
         found.sort(key=lambda solution: solution.chi2)
         tried = len(chosen)
-        if found[0].chi2 <= gate:
+        if found[0].chi2 <= gate or not thorough:
             break
     return found

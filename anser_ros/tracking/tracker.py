@@ -23,6 +23,7 @@ from anser_ros.tracking.scene import Scene, build_scene
 
 Array = NDArray[np.float64]
 
+LARGEST_FLUX_T = 1.0
 FLAGS = ((1, states.SATURATED), (2, states.STALE), (4, states.DROPPED))
 """Flag bits of a flux point (interfaces, section 3) and the states that they cause."""
 
@@ -264,6 +265,7 @@ def _refusal(row: int, values: Array, bits: int) -> tuple[str, str] | None:
     for bit, state in FLAGS:
         if bits & bit:
             return state, f'flagged {state} by the acquisition'
-    if not np.isfinite(values).all():
-        return states.NO_SIGNAL, 'the fluxes are not finite'
+    # A comparison with NaN is false, so this is also what is not finite.
+    if not bool((np.abs(values) < LARGEST_FLUX_T).all()):
+        return states.NO_SIGNAL, 'the fluxes are not finite or beyond all reason'
     return None

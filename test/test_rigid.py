@@ -1,0 +1,147 @@
+"""Rigid tools: exact poses, cold starts, common model errors, coils that are left out."""
+
+import numpy as np
+import pytest
+from tracking_world import NOISE_T, certain_model, fluxes, random_pose, triaxial_tool
+
+from anser_ros.errors import TrackingError
+from anser_ros.tracking.rigid import (
+    BodyCoils,
+    common_factor,
+    solve_body,
+    start_from_coils,
+    start_from_grid,
+)
+from anser_ros.tracking.rotations import rotation_between, rotation_of_vector
+from anser_ros.tracking.seed import Volume, build_grid
+from anser_ros.tracking.solve import RealField
+from anser_ros.tracking.uncertainty import bounded_inverse
+
+MODEL = certain_model()
+FIELD = RealField.of(MODEL.positions, MODEL.directions, MODEL.moments)
+WIDTH = FIELD.moments.shape[1]
+TOOL = triaxial_tool()
+COILS = BodyCoils(TOOL.position, TOOL.axis, TOOL.length)
+WEIGHTS = np.full((9, WIDTH), 1 / NOISE_T)
+NOTHING = common_factor(np.zeros((0, 9, WIDTH)), WEIGHTS)
+LOW, HIGH = (corner + sign * 0.03 for corner, sign in zip(Volume().grown(0.03), (-1, 1),
+                                                           strict=True))  # fmt: skip
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(41)
+
+
+def real(flux):
+    return np.ascontiguousarray(flux).view(np.float64)
+
+
+def solve(flux, position, rotation, common=NOTHING, coils=COILS, weights=WEIGHTS):
+    return solve_body(FIELD, coils, real(flux), weights, common, position, rotation, LOW, HIGH)
+
+
+def nearby(rng, position, rotation, move=0.01, turn=0.2):
+    step, axis = rng.normal(size=(2, 3))
+    start = position + move * step / np.linalg.norm(step)
+    return start, rotation_of_vector(turn * axis / np.linalg.norm(axis)) @ rotation
+
+
+@pytest.mark.parametrize('length', [0.0, 0.008])
+def test_exact_fluxes_give_the_exact_pose(rng, length):
+    tool = triaxial_tool(length_m=length)
+    coils = BodyCoils(tool.position, tool.axis, tool.length)
+    for _ in range(20):
+        position, rotation = random_pose(rng)
+        found = solve(
+            fluxes(MODEL, tool, position, rotation), *nearby(rng, position, rotation), coils=coils
+        )
+        assert found.converged
+        assert np.linalg.norm(found.position - position) < 1e-6
+        np.testing.assert_allclose(found.rotation, rotation, atol=1e-5)
+        np.testing.assert_allclose(found.rotation @ found.rotation.T, np.eye(3), atol=1e-12)
+
+
+def test_information_is_the_curvature_of_chi_square(rng):
+    position, rotation = random_pose(rng)
+    flux = fluxes(MODEL, TOOL, position, rotation)
+    base = solve(flux, position, rotation)
+    for i in range(6):
+        step = np.zeros(6)
+        step[i] = 1e-6
+        points, axes = TOOL.placed(position + step[:3], rotation_of_vector(step[3:]) @ rotation)
+        moved = MODEL.flux(points, axes, TOOL.length)
+        chi2 = np.sum((real(moved - flux) / NOISE_T) ** 2)
+        assert chi2 == pytest.approx(base.information[i, i] * 1e-12, rel=1e-2)
+
+
+def test_covariance_and_chi_square_are_what_happens(rng):
+    squares, chi2 = [], []
+    for _ in range(200):
+        position, rotation = random_pose(rng)
+        found = solve(fluxes(MODEL, TOOL, position, rotation, rng), position, rotation)
+        error = np.concatenate(
+            [found.position - position, rotation_between(rotation, found.rotation)]
+        )
+        squares.append(error @ found.information @ error)
+        chi2.append(found.chi2)
+    assert np.mean(squares) == pytest.approx(6.0, rel=0.15)
+    assert np.mean(chi2) == pytest.approx(9 * WIDTH - 6, rel=0.05)
+
+
+def test_errors_that_all_coils_share_do_not_average_out(rng):
+    """The whole model off by one per cent: nine coils know no better than their model."""
+    position, rotation = random_pose(rng)
+    clean = fluxes(MODEL, TOOL, position, rotation)
+    modes = 0.01 * real(clean)[None]
+    common = common_factor(modes, WEIGHTS)
+    white = (modes * WEIGHTS).reshape(1, -1)
+    expected = np.linalg.inv(np.eye(white.size) + white.T @ white)
+    np.testing.assert_allclose(np.eye(white.size) - common.T @ common, expected, atol=1e-9)
+    found = solve(1.01 * clean, *nearby(rng, position, rotation, 1e-3, 0.01), common=common)
+    assert found.chi2 < 3.0
+    assert np.linalg.norm(found.position - position) < 3 * np.sqrt(
+        np.trace(bounded_inverse(found.information)[:3, :3])
+    )
+    assert solve(1.01 * clean, position, rotation).chi2 > 100.0
+
+
+def test_start_from_the_coils_own_poses(rng):
+    position, rotation = random_pose(rng)
+    points, axes = TOOL.placed(position, rotation)
+    start = start_from_coils(COILS, points, axes, np.ones(9))
+    assert start is not None
+    np.testing.assert_allclose(start[0], position, atol=1e-12)
+    np.testing.assert_allclose(start[1], rotation, atol=1e-12)
+    two = COILS.subset(np.array([0, 1]))
+    start = start_from_coils(two, points[:2], axes[:2], np.ones(2))
+    assert start is not None
+    np.testing.assert_allclose(start[1], rotation, atol=1e-12)
+    assert start_from_coils(COILS.subset([0]), points[:1], axes[:1], np.ones(1)) is None
+    assert start_from_coils(COILS.subset([]), points[:0], axes[:0], np.ones(0)) is None
+
+
+def test_start_from_the_grid_alone(rng):
+    """For few emitters, when no coil has a pose of its own."""
+    grid = build_grid(FIELD, np.full(WIDTH, NOISE_T), Volume(), 0.04)
+    for _ in range(10):
+        position, rotation = random_pose(rng)
+        flux = fluxes(MODEL, TOOL, position, rotation, rng)
+        starts = start_from_grid(grid, FIELD, COILS, real(flux))
+        best = min((solve(flux, *start) for start in starts), key=lambda s: s.chi2)
+        assert np.linalg.norm(best.position - position) < 1e-3
+        np.testing.assert_allclose(best.rotation, rotation, atol=5e-3)
+
+
+def test_what_is_observable():
+    assert COILS.observable
+    assert not COILS.subset([0]).observable
+    assert not COILS.subset([2, 5, 8]).observable, 'all along z'
+    assert COILS.subset([2, 3]).observable
+
+
+def test_refusals():
+    with pytest.raises(TrackingError, match='9 coils'):
+        solve(np.zeros((8, 8), complex), np.zeros(3), np.eye(3))
+    with pytest.raises(TrackingError, match='must be finite'):
+        common_factor(np.full((1, 9, WIDTH), np.nan), WEIGHTS)
