@@ -18,6 +18,7 @@ from anser_ros.fitting.calibration import Calibration, Options, calibrate, to_do
 from anser_ros.fitting.layouts import Generator, Layout
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.moments import Uncertainty
+from anser_ros.fitting.sensor_survey import KINDS
 from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.session import Session, load_session
 from anser_ros.wire.setup import Setup
@@ -37,6 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--dipoles', type=_layer, metavar='NxN',
         help='layer of N x N z-dipoles on the board instead of the choice by held-out error',
     )  # fmt: skip
+    parser.add_argument(
+        '--estimate', type=_kinds, default=(), metavar='LIST',
+        help=f'find these of the sensors together with the field: {",".join(KINDS)}',
+    )  # fmt: skip
     parser.add_argument('--damping', type=float, help='damping instead of the choice')
     parser.add_argument('--flux-noise', type=float, default=60e-12, help='T a component')
     parser.add_argument('--pose-jitter-mm', type=float, default=0.07, help='optical, per axis')
@@ -48,6 +53,14 @@ def _layer(text: str) -> Layout:
     if not first.isdigit() or second not in ('', first) or not 1 <= int(first) <= 64:
         raise argparse.ArgumentTypeError(f'must be NxN with N in 1..64, got {text!r}')
     return Layout('layer', int(first), 1.0, 0.0)
+
+
+def _kinds(text: str) -> tuple[str, ...]:
+    kinds = tuple(part for part in text.split(',') if part)
+    unknown = [kind for kind in kinds if kind not in KINDS]
+    if unknown or not kinds:
+        raise argparse.ArgumentTypeError(f'must be among {",".join(KINDS)}, got {text!r}')
+    return kinds
 
 
 def run(args: argparse.Namespace) -> int:
@@ -85,7 +98,7 @@ def _options(args: argparse.Namespace) -> Options:
     uncertainty = Uncertainty(
         args.flux_noise, 1e-3 * args.pose_jitter_mm, 1e-3 * args.pose_jitter_mrad
     )
-    return Options(uncertainty, args.dipoles, args.damping)
+    return Options(uncertainty, args.dipoles, args.damping, args.estimate)
 
 
 def check_same_board(sessions: list[Session]) -> None:
@@ -173,4 +186,13 @@ def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
     )
     for name, value in rows:
         table.add_row(name, value)
+    for effect in calibration.model.effects:
+        found = {**effect.parameters}
+        table.add_row(effect.name, ', '.join(f'{k} {_short(v)}' for k, v in found.items()))
     return table
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, list):
+        return '[' + ' '.join(_short(v) for v in value) + ']'
+    return f'{value:.5g}' if isinstance(value, float) else str(value)

@@ -13,7 +13,7 @@ from anser_ros.fitting.held_out import HeldOut, predict_held_out
 from anser_ros.fitting.layout_fit import LayoutFit, fit_layout
 from anser_ros.fitting.layouts import Generator, Layout, place
 from anser_ros.fitting.measurements import Measurements
-from anser_ros.fitting.model import FieldModel
+from anser_ros.fitting.model import EffectRecord, FieldModel
 from anser_ros.fitting.moments import (
     ComplexArray,
     MomentFit,
@@ -30,6 +30,7 @@ from anser_ros.fitting.selection import (
     choose_layout,
     thin_frames,
 )
+from anser_ros.fitting.sensor_survey import SensorSurveyor
 
 Array = NDArray[np.float64]
 
@@ -51,11 +52,14 @@ class Options:
         The dipoles asked for; chosen by held-out error when not given.
     damping : float or None
         Likewise.
+    estimate : tuple of str
+        What is found of the sensors together with the field: `sensor_survey.KINDS`.
     """
 
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
     layout: Layout | None = None
     damping: float | None = None
+    estimate: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -221,7 +225,7 @@ def calibrate(
     options = options or Options()
     asked = 36 if options.layout is None else len(place(options.layout, generator))
     readings = check_measurements(measurements, asked)
-    posed = [with_pose(m) for m in measurements]
+    posed, effects = _surveyed([with_pose(m) for m in measurements], generator, options)
     thin = thin_frames(posed)
     folds = fold_of_frames([m.position for m in thin])
     drawn = None if nominal is None else DrawnBoard(nominal, thin)
@@ -243,6 +247,7 @@ def calibrate(
         emitters=emitters,
         frequencies_hz=frequencies_hz,
         flux_error_t=held_out.flux_error_t,
+        effects=effects,
     )
     error, flux = _residual(posed, model)
     calibration = Calibration(
@@ -250,6 +255,18 @@ def calibrate(
         chosen, chosen.layout, damping, readings, error, flux,
     )  # fmt: skip
     return replace(calibration, model=replace(model, provenance=provenance(calibration, names)))
+
+
+def _surveyed(
+    posed: list[Measurements], generator: Generator, options: Options
+) -> tuple[list[Measurements], tuple[EffectRecord, ...]]:
+    """The measurements with their sensors as found, and the records that say so."""
+    if not options.estimate:
+        return posed, ()
+    surveyor = SensorSurveyor(posed, options.estimate, generator, options.uncertainty)
+    surveys = surveyor.fit()
+    records = tuple(record for survey in surveys.values() for record in survey.records)
+    return [surveys[m.body].apply(m) for m in posed], records
 
 
 Final = tuple[Candidate, LayoutFit, HeldOut]
