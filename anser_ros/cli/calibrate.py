@@ -14,10 +14,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from anser_ros.errors import AnserError, FitError, ParameterError
-from anser_ros.fitting.calibration import Calibration, Options, calibrate, to_document
+from anser_ros.fitting.calibration import Calibration, Options, calibrate
+from anser_ros.fitting.calibration_document import to_document
 from anser_ros.fitting.layouts import Generator, Layout
 from anser_ros.fitting.model import FieldModel
-from anser_ros.fitting.moments import Uncertainty
+from anser_ros.fitting.pose_correction import Uncertainty
 from anser_ros.fitting.sensor_survey import KINDS
 from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.session import Session, load_session

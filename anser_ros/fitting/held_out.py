@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.fitting.factors import ComplexArray
 from anser_ros.fitting.layout_fit import LayoutFit
 from anser_ros.fitting.measurements import Measurements
-from anser_ros.fitting.moments import (
-    ComplexArray,
+from anser_ros.fitting.pose_correction import (
     PoseTerms,
     Uncertainty,
     frame_blocks,
@@ -187,3 +187,8 @@ class _Tally:
             noise_t=self.noise_t,
             flux_error_t=float(np.sqrt(max(excess, 0.0))),
         )
+
+
+def rms(error: ComplexArray) -> float:
+    """Root of the mean squared magnitude of complex errors."""
+    return float(np.sqrt(np.mean(np.abs(error) ** 2)))

@@ -6,17 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.fitting.dipoles import Dipoles
+from anser_ros.fitting.factors import ComplexArray
 from anser_ros.fitting.layouts import Generator, Layout, place
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.model import FieldModel
-from anser_ros.fitting.moments import (
-    ComplexArray,
-    Dipoles,
-    MomentFit,
-    MomentFitter,
-    Progress,
-    Uncertainty,
-)
+from anser_ros.fitting.moments import MomentFit, MomentFitter, Progress
+from anser_ros.fitting.pose_correction import Uncertainty
 from anser_ros.fitting.positions import PositionFitter
 from anser_ros.fitting.prior import DrawnBoard
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.fitting.moments import Dipoles
+from anser_ros.fitting.dipoles import Dipoles
 
 Array = NDArray[np.float64]
 

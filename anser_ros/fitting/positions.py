@@ -14,15 +14,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.fitting.dipoles import Dipoles
+from anser_ros.fitting.factors import ComplexArray, as_complex, as_real
 from anser_ros.fitting.measurements import Measurements
-from anser_ros.fitting.moments import (
-    BLOCK_ROWS,
-    ComplexArray,
-    Dipoles,
-    as_complex,
-    as_real,
-    frame_blocks,
-)
+from anser_ros.fitting.pose_correction import BLOCK_ROWS, frame_blocks
 from anser_ros.physics.dipole import GAUSS_OFFSET, fill_field_and_gradient, flux_basis
 
 Array = NDArray[np.float64]

@@ -10,9 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.fitting.dipoles import Dipoles
+from anser_ros.fitting.factors import ComplexArray, GramFactor, as_complex, as_real
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.model import FieldModel
-from anser_ros.fitting.moments import ComplexArray, Dipoles, GramFactor, as_complex, as_real
 from anser_ros.physics.dipole import flux_basis
 
 Array = NDArray[np.float64]

@@ -1,0 +1,128 @@
+"""Least squares of many rows with several right-hand sides, kept as one small matrix."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+RIGHT_SCALE = 1e9
+"""Fluxes in nT beside columns near 1e-7 / (0.1 m)^3: numbers of like size in one matrix."""
+
+
+class TriangularFactor:
+    """Rows of a least-squares problem, reduced to a triangle as they come."""
+
+    def __init__(self, unknowns: int, right_sides: int) -> None:
+        self.unknowns = unknowns
+        self.rows = 0
+        self.triangle = np.zeros((0, unknowns + right_sides))
+
+    def add(self, matrix: Array, right: Array) -> None:
+        """Take in rows (P, N) with their right-hand sides (P, M)."""
+        self.rows += matrix.shape[0]
+        block = np.concatenate([matrix, right], axis=1)
+        stack = np.concatenate([self.triangle, block])
+        self.triangle = np.asarray(np.linalg.qr(stack, mode='r'))
+
+    def spectrum(self) -> 'Spectrum':
+        """Column-scaled singular value decomposition."""
+        n = self.unknowns
+        matrix, right = self.triangle[:n, :n], self.triangle[:n, n:]
+        scale = np.linalg.norm(matrix, axis=0)
+        scale[scale == 0.0] = 1.0
+        u, s, vt = np.linalg.svd(matrix / scale, full_matrices=False)
+        return Spectrum(scale, s, vt, u.T @ right)
+
+
+class GramFactor:
+    """The same problem as inner products: several times faster, half the digits.
+
+    Enough for the passes that only prepare the next one, and for damped fits whose damping is far
+    above rounding; the moments that are kept come from `TriangularFactor`.
+    """
+
+    def __init__(self, unknowns: int, right_sides: int) -> None:
+        self.unknowns = unknowns
+        self.rows = 0
+        self.gram = np.zeros((unknowns + right_sides, unknowns + right_sides))
+
+    def add(self, matrix: Array, right: Array) -> None:
+        """Take in rows (P, N) with their right-hand sides (P, M)."""
+        self.rows += matrix.shape[0]
+        block = np.concatenate([matrix, right * RIGHT_SCALE], axis=1)
+        self.gram += block.T @ block
+
+    def spectrum(self) -> 'Spectrum':
+        """Column-scaled eigenvectors, as the singular value decomposition would give them."""
+        n = self.unknowns
+        scale = np.sqrt(np.diag(self.gram)[:n])
+        scale[scale == 0.0] = 1.0
+        values, vectors = np.linalg.eigh(self.gram[:n, :n] / np.outer(scale, scale))
+        floor = values[-1] * np.finfo(float).eps * n
+        s = np.sqrt(np.maximum(values, floor))[::-1]
+        v = vectors[:, ::-1].T
+        right = self.gram[:n, n:] / (scale[:, None] * RIGHT_SCALE)
+        return Spectrum(scale, s, v, (v @ right) / s[:, None])
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """A least-squares problem in its singular vectors, from which every damping is cheap.
+
+    Attributes
+    ----------
+    scale : ndarray, shape (N,)
+        Column norms.
+    values : ndarray, shape (R,)
+        Singular values of the scaled matrix, descending.
+    vectors : ndarray, shape (R, N)
+        Right singular vectors.
+    projected : ndarray, shape (R, M)
+        Right-hand sides in the left singular vectors.
+    """
+
+    scale: Array
+    values: Array
+    vectors: Array
+    projected: Array
+
+    @property
+    def rank(self) -> int:
+        """Singular values above rounding."""
+        limit = self.values[0] * np.finfo(float).eps * max(self.vectors.shape)
+        return int((self.values > limit).sum())
+
+    def filter(self, damping: float) -> Array:
+        """Tikhonov's factors ``s / (s^2 + (damping s_0)^2)``; zero below the rank."""
+        s = self.values
+        out = np.zeros_like(s)
+        keep = np.arange(s.size) < self.rank
+        out[keep] = s[keep] / (s[keep] ** 2 + (damping * s[0]) ** 2)
+        return out
+
+    def solve(self, damping: float, prior: Array | None = None) -> Array:
+        """Unknowns (N, M), pulled towards ``prior`` (N, M) or towards zero."""
+        projected = self.projected
+        if prior is not None:
+            start = self.vectors @ (prior * self.scale[:, None])
+            projected = projected - self.values[:, None] * start
+        step = self.vectors.T @ (self.filter(damping)[:, None] * projected)
+        step /= self.scale[:, None]
+        return np.asarray(step if prior is None else prior + step)
+
+    def freedom(self, damping: float) -> float:
+        """Effective number of parameters, the trace of the influence matrix."""
+        return float((self.values * self.filter(damping)).sum())
+
+
+def as_real(values: ComplexArray) -> Array:
+    """Complex (..., K) as real (..., 2K), real and imaginary part by turns."""
+    return np.ascontiguousarray(values, dtype=np.complex128).view(np.float64)
+
+
+def as_complex(values: Array) -> ComplexArray:
+    """The inverse of `as_real`."""
+    return np.ascontiguousarray(values).view(np.complex128)
