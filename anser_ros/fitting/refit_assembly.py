@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.refit_layer import Layer
 from anser_ros.fitting.refit_modes import error_modes
-from anser_ros.fitting.refit_posterior import Bank, Evaluation
+from anser_ros.fitting.refit_posterior import Bank, ErrorLevel, Evaluation
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -18,6 +18,9 @@ NEGLIGIBLE = 0.01
 """Hypotheses less probable than this take no part in the mean."""
 INFLATION_STEP = 1.2
 MOST_MODES = 16
+KEEP_FRAMES = 25
+RIVAL = 0.05
+"""Probability from which on a second hypothesis adds what it disagrees about."""
 
 
 class Assembly:
@@ -35,6 +38,8 @@ class Assembly:
         self.base = model
         self.layers = tuple(layers)
         self._modes: dict[tuple[object, ...], ComplexArray] = {}
+        self._whole: dict[tuple[object, ...], tuple[int, ComplexArray | None]] = {}
+        self._count = 0
         self._geometry: dict[int, tuple[Array, Array, list[NDArray[np.int64]]]] = {}
 
     def _place(self, count: int) -> tuple[Array, Array, list[NDArray[np.int64]]]:
@@ -90,43 +95,75 @@ class Assembly:
         parts = {h: self._moments(bank, seen, h) * (phase * unit) for h in active}
         for h, part in parts.items():
             moments[rows[of[h]]] += weights[h] * part
-        modes = self.base.modes
-        if active:
-            best = max(active, key=lambda h: float(weights[h]))
-            own = self._error(bank, seen, best, typical, n_modes) * (phase * unit)
-            modes = np.zeros((len(own) + 1, *moments.shape), dtype=complex)
-            modes[:-1, rows[of[best]]] = own
-            others = [h for h in active if h != best]
-            if others:
-                other = max(others, key=lambda h: float(weights[h]))
-                size = np.sqrt(weights[best] * weights[other])
-                modes[-1, rows[of[best]]] += size * parts[best]
-                modes[-1, rows[of[other]]] -= size * parts[other]
-            if self.base.modes is not None:
-                kept = np.zeros((len(self.base.modes), *moments.shape), dtype=complex)
-                kept[:, : len(self.base.moments)] = self.base.modes
-                modes = np.concatenate([kept, modes])
-        elif modes is not None and len(positions) > len(self.base.positions):
-            pad = np.zeros((len(modes), len(positions) - modes.shape[1], modes.shape[2]))
-            modes = np.concatenate([modes, pad], axis=1)
+        modes = self._uncertainty(bank, seen, weights, parts, typical, phase * unit, n_modes, rows)
         return replace(
             self.base, positions=positions, directions=directions, moments=moments, modes=modes
         )
+
+    def _uncertainty(
+        self,
+        bank: Bank,
+        seen: Evaluation,
+        weights: Array,
+        parts: dict[int, ComplexArray],
+        typical: float,
+        scale: ComplexArray,
+        n_modes: int,
+        rows: list[NDArray[np.int64]],
+    ) -> ComplexArray | None:
+        """All modes of a model; the same array for a while, so that receivers can keep theirs."""
+        ranked = sorted(parts, key=lambda h: -float(weights[h]))
+        rival = next((h for h in ranked[1:] if weights[h] > RIVAL), None)
+        steps = max(0, round(np.log(max(typical, 1.0)) / (2.0 * np.log(INFLATION_STEP))))
+        level = bank.error_level(seen, ranked[0]) if ranked else None
+        key = (bank.rows.tobytes(), tuple(ranked[:1]), rival, level, steps, len(rows))
+        self._count += 1
+        kept = self._whole.get(key)
+        if kept is not None and self._count - kept[0] < KEEP_FRAMES:
+            return kept[1]
+        size = 1 + max(int(r.max(initial=-1)) for r in rows)
+        size = max(size, len(self.base.positions))
+        shape = (size, len(scale))
+        modes = [] if self.base.modes is None else [_padded(self.base.modes, size)]
+        if ranked and level is not None:
+            own = np.zeros((n_modes, *shape), dtype=complex)
+            place = self._rows_of(bank, ranked[0], rows)
+            errors = self._error(bank, ranked[0], level, n_modes - 1)
+            own[: len(errors), place] = errors * (INFLATION_STEP**steps * scale)
+            if rival is not None:
+                part = np.sqrt(weights[ranked[0]] * weights[rival])
+                own[-1, place] += part * parts[ranked[0]]
+                own[-1, self._rows_of(bank, rival, rows)] -= part * parts[rival]
+            modes.append(own)
+        whole = np.concatenate(modes) if modes else None
+        if len(self._whole) >= MOST_MODES:
+            del self._whole[next(iter(self._whole))]
+        self._whole[key] = (self._count, whole)
+        return whole
+
+    def _rows_of(
+        self, bank: Bank, hypothesis: int, rows: list[NDArray[np.int64]]
+    ) -> NDArray[np.int64]:
+        layer = bank.priors[hypothesis - 1].layer
+        return rows[next(i for i, own in enumerate(self.layers) if own is layer)]
 
     @staticmethod
     def _moments(bank: Bank, seen: Evaluation, hypothesis: int) -> ComplexArray:
         parts = bank.moments(seen, hypothesis)
         return np.asarray((parts[:, 0] + 1j * parts[:, 1]).reshape(-1, bank.width))
 
-    def _error(
-        self, bank: Bank, seen: Evaluation, hypothesis: int, typical: float, n_modes: int
-    ) -> ComplexArray:
-        """Modes of one standard deviation, in noise units; larger where readings fit badly."""
-        steps = max(0, round(np.log(max(typical, 1.0)) / (2.0 * np.log(INFLATION_STEP))))
-        level = bank.error_level(seen, hypothesis)
-        key = (id(bank), hypothesis, level, n_modes)
+    def _error(self, bank: Bank, hypothesis: int, level: ErrorLevel, count: int) -> ComplexArray:
+        """Modes of one standard deviation of a hypothesis' own error, in noise units."""
+        key = (bank.rows.tobytes(), hypothesis, level, count)
         if key not in self._modes:
             if len(self._modes) >= MOST_MODES:
                 del self._modes[next(iter(self._modes))]
-            self._modes[key] = error_modes(bank, hypothesis, level, n_modes - 1)
-        return np.asarray(INFLATION_STEP**steps * self._modes[key])
+            self._modes[key] = error_modes(bank, hypothesis, level, count)
+        return self._modes[key]
+
+
+def _padded(modes: ComplexArray, size: int) -> ComplexArray:
+    """Modes (R, N, K) with rows of zeros for the dipoles that were added."""
+    out = np.zeros((modes.shape[0], size, modes.shape[2]), dtype=complex)
+    out[:, : modes.shape[1]] = modes
+    return out
