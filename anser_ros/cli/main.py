@@ -30,6 +30,8 @@ NODES = {
 EXIT_OK = 0
 EXIT_DEFECT = 1
 EXIT_BAD_INPUT = 2
+# Small matrices: a second BLAS thread gains nothing, and waits for a busy core for milliseconds.
+ONE_THREAD = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
 PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 
 
@@ -58,6 +60,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         0 done, 2 bad usage or bad input (one clear line on stderr), 1 a defect (a traceback).
     """
+    for variable in ONE_THREAD:  # before anything imports numpy
+        os.environ.setdefault(variable, '1')
     try:
         code = _dispatch(list(sys.argv[1:] if argv is None else argv))
         sys.stdout.flush()

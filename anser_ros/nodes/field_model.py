@@ -32,6 +32,8 @@ from anser_ros.sessions.session import load_session, sensor_table
 from anser_ros.sessions.starting_model import NOMINAL, board_of
 from anser_ros.wire.setup import Setup, parse_setup
 
+BURST = 5
+
 
 @dataclass(frozen=True)
 class FieldModelParameters:
@@ -161,8 +163,9 @@ class FieldModelNode(AnserNode):
         if begin_s < self._next_refit_s:
             self.count('readings_between_refits')
             return
-        # A little early rather than every other frame when the rates are the same.
-        self._next_refit_s = begin_s + 0.8 / self.parameters.refit_rate_hz
+        # Readings don't come evenly; a few may follow each other at once.
+        period_s = 1.0 / self.parameters.refit_rate_hz
+        self._next_refit_s = max(self._next_refit_s, begin_s - BURST * period_s) + period_s
         self._result = refit.update(stamp_ns, channels, flux, flags)
         self._refit_s = time.monotonic() - begin_s
         self.count('refits')

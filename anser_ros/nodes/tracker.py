@@ -112,8 +112,9 @@ class TrackerNode(AnserNode):
         self._transforms = transform_publisher(self) if table.publish_tf else None
         warm_up()
         self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
-        self.create_subscription(PointCloud2, 'field_model', self._on_model, qos.LATCHED)
+        # The executor takes topics in this order, so a model finds its uncertainty there.
         self.create_subscription(PointCloud2, 'field_model_error', self._on_error, qos.LATCHED)
+        self.create_subscription(PointCloud2, 'field_model', self._on_model, qos.LATCHED)
         self.create_subscription(PointCloud2, 'tool/flux', self._on_flux, qos.STREAM)
 
     # What is subscribed to ----------------------------------------------------------------
