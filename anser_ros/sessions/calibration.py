@@ -1,0 +1,72 @@
+"""Calibration of recorded sessions: boards checked, tools gathered, the drawing as a prior."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from anser_ros.errors import AnserError, FitError
+from anser_ros.fitting.calibration import Calibration, Options, calibrate
+from anser_ros.fitting.layouts import Generator
+from anser_ros.fitting.model import FieldModel
+from anser_ros.sessions.session import Session
+from anser_ros.sessions.starting_model import NOMINAL, model_for
+from anser_ros.wire.setup import Setup
+
+
+def check_same_board(sessions: list[Session]) -> None:
+    """Raise `FitError` when two sessions' setups have different emitters."""
+    first = sessions[0]
+    for other in sessions[1:]:
+        if other.setup.emitter != first.setup.emitter:
+            raise FitError(
+                f'all sessions must be of one board: {first.path} and {other.path} differ in '
+                f'{_difference(first.setup, other.setup)}'
+            )
+
+
+def _difference(one: Setup, other: Setup) -> str:
+    if len(one.emitter.coils) != len(other.emitter.coils):
+        return f'the number of coils, {len(one.emitter.coils)} and {len(other.emitter.coils)}'
+    for mine, theirs in zip(one.emitter.coils, other.emitter.coils, strict=True):
+        if mine != theirs:
+            return f'coil {mine.name}: {mine} and {theirs}'
+    return 'the geometry of the coils'
+
+
+def generator_of(setup: Setup) -> Generator:
+    """Where the setup's coils are; their side from the geometry, or from their spacing."""
+    centres = np.array([coil.centre_m for coil in setup.emitter.coils])
+    turns = np.array([coil.rotation_deg for coil in setup.emitter.coils])
+    side = setup.emitter.geometry.get('side_m')
+    if not isinstance(side, int | float) or not side > 0:
+        gaps = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+        gaps = gaps[gaps > 0.0]
+        side = float(gaps.min()) if gaps.size else 0.1
+    return Generator(centres, turns, float(side))
+
+
+def nominal_of(session: Session) -> FieldModel | None:
+    """The nominal model, or None where the setup's geometry makes none."""
+    try:
+        return model_for(NOMINAL, session)
+    except AnserError:
+        return None
+
+
+def calibrate_sessions(
+    sessions: list[Session],
+    options: Options,
+    progress: Callable[[str, float], None] | None = None,
+) -> Calibration:
+    """Calibrate on all tool sensors of the sessions.
+
+    Reference sensors are left out: their survey is less accurate than the field model becomes.
+    """
+    setup = sessions[0].setup
+    measurements = [tool for session in sessions for tool in session.tools]
+    names = [Path(session.path).name for session in sessions for _ in session.tools]
+    return calibrate(
+        measurements, names, generator_of(setup), setup.emitter_names, setup.frequencies_hz,
+        options, nominal_of(sessions[0]), progress,
+    )  # fmt: skip
