@@ -304,6 +304,16 @@ def test_duplicates_jumps_and_gaps(rng):
     assert tracker.counters['cold_starts'] == 36
 
 
+def test_a_tool_that_leaps_between_frames_is_found_every_time(rng):
+    """A robot's raster leaps from the end of a row to the next: the last pose is no start."""
+    tracker = Tracker(MODEL, TOOL)
+    for i in range(40):
+        position, rotation = random_pose(rng)
+        found = one_frame(tracker, fluxes(MODEL, TOOL, position, rotation, rng), (i + 1) * STEP_NS)
+        assert {e.state for e in found.values()} == {'ok'}, i
+        assert np.linalg.norm(found['tool_a'].position - position) < 3e-4
+
+
 def test_only_good_poses_start_the_next_frame(rng):
     """A tool that jumps while it can't be seen is found again, not followed into a false place."""
     tracker = Tracker(MODEL, TOOL)

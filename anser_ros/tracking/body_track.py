@@ -56,6 +56,10 @@ class _Fit:
     def ratio(self) -> float:
         return self.solution.chi2 / self.freedom
 
+    def good(self, gate: float) -> bool:
+        """Whether the descent has ended, and below the gate."""
+        return self.solution.converged and self.ratio <= gate**2
+
 
 def _solve(
     scene: Scene, coils: BodyCoils, flux: Array, used: NDArray[np.int64], start: Start
@@ -172,12 +176,12 @@ def _from_good(
         kept = np.array([i for i in used if int(i) not in track.left_out], dtype=np.int64)
         if len(kept) > 1 and coils.subset(kept).observable:
             fit = _solve(scene, coils, flux, kept, start)
-            if fit.ratio <= settings.gate**2:
+            if fit.good(settings.gate):
                 return [fit]
     track.again_ns = stamp_ns + round(LEFT_OUT_S / NANO)
     fit = _solve(scene, coils, flux, used, start)
     fit = _without_disagreeing(fit, scene, coils, flux, settings.gate)
-    return [fit] if fit.ratio <= settings.gate**2 else []
+    return [fit] if fit.good(settings.gate) else []
 
 
 def _judge(
@@ -207,7 +211,9 @@ def _judge(
     elif not settings.volume.contains(centre):
         state = states.OUTSIDE_VOLUME
         reason = 'at ' + ', '.join(f'{1e3 * v:.1f}' for v in centre) + ' mm'
-    elif not solution.converged or sigma > settings.max_sigma_m:
+    elif not solution.converged:
+        state, reason = states.AMBIGUOUS, 'the solve did not converge'
+    elif sigma > settings.max_sigma_m:
         state, reason = states.AMBIGUOUS, f'position uncertain by {1e3 * sigma:.3g} mm'
     else:
         margin = 2.0 * math.log(settings.odds) * max(1.0, fit.ratio)
