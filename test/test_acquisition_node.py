@@ -137,8 +137,8 @@ def test_fluxes_arrive_with_layout_stamps_and_health(chain):
     assert float(values['current_a']) == pytest.approx(0.25, rel=0.03)
     assert 1e-11 < float(values['flux_noise_t']) < 3e-10
     assert 'anser/acquisition: ref/15/1' in listener.states
-    listener.set('acquisition', 'rate_hz', 200.0)
     count = len(listener.setups)
+    listener.set('acquisition', 'rate_hz', 200.0)
     listener.until(lambda: len(listener.setups) > count)
     assert parse_setup(listener.setups[-1].data).flux_rate_hz == 200.0
     fast = len(listener.tool) + 20

@@ -195,7 +195,7 @@ def test_silence_is_counted_and_ends_with_the_next_record(wire, port):
 
 
 def test_slow_receiver_loses_blocks_but_no_hello_and_stops_nobody(wire):
-    port = ControlUnitPort(str(wire.link), queue_batches=3)
+    port = ControlUnitPort(str(wire.link), queue_blocks=3)
     port.start()
     assert wait(lambda: port.state is PortState.WAITING)
     try:
@@ -209,6 +209,18 @@ def test_slow_receiver_loses_blocks_but_no_hello_and_stops_nobody(wire):
         assert HELLO in [record.payload for batch in batches for record in batch.records]
     finally:
         port.stop()
+
+
+def test_receiver_is_woken_for_as_many_blocks_as_it_wants(wire, port):
+    port.blocks_wanted = 5
+    for sequence in range(12):
+        wire.write(block(sequence))
+        assert wait(lambda n=sequence: port.fault_counters()['records'] == n + 1)
+    sizes = [len(batch.records) for batch in iter(lambda: port.get(0.2), None) if batch.records]
+    assert sizes == [5, 5, 2] or sum(sizes) == 12, 'a pause hands over what there is'
+    assert len(sizes) < 8
+    wire.write(block(12) + encode(HELLO))
+    assert len(receive(port, 2)) == 2, 'a hello waits for nothing'
 
 
 def test_port_can_be_started_once(port):

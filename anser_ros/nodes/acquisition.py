@@ -175,6 +175,8 @@ class Acquisition(AnserNode):
         for record in batch.records:
             self._control.take(record, batch.arrival_ns)
             self._dispatch(record, batch.arrival_ns)
+        if self._port is not None:
+            self._port.blocks_wanted = self._stream.blocks_wanted if self._stream else 1
 
     def _dispatch(self, record: Record, arrival_ns: int) -> None:
         payload = record.payload

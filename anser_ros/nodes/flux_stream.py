@@ -96,6 +96,7 @@ class FluxStream:
         hop = max(1, round(rate / options.rate_hz))
         self.rate_hz = rate / hop
         self._tick_hz, self._sample_rate_hz = hello.tick_hz, rate
+        self._block_samples = hello.block_samples
         self._demodulator = Demodulator(
             rate, self.tones_hz, window, mains_hz=options.mains_hz or None
         )
@@ -107,6 +108,11 @@ class FluxStream:
         self._split = sum(s.body != FIELD_GENERATOR for s in self.sensors)
         self._tool = _geometry(self.sensors[: self._split])
         self._reference = _geometry(self.sensors[self._split :])
+
+    @property
+    def blocks_wanted(self) -> int:
+        """Blocks until the next window is complete."""
+        return -(-self._cutter.samples_wanted // self._block_samples)
 
     def push(self, block: SampleBlock, arrival_ns: int) -> list[FluxFrame]:
         """Take a block and return the frames that it completes."""

@@ -95,6 +95,11 @@ class WindowCutter:
         self._expected: int | None = None
         self._last_ticks = 0
 
+    @property
+    def samples_wanted(self) -> int:
+        """Samples until the next window is complete."""
+        return self._until_next
+
     def push(self, sequence: int, timestamp_ticks: int, codes: NDArray[np.int16]) -> list[Window]:
         """Add a block and return the windows that it completes.
 

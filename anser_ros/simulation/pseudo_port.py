@@ -66,6 +66,10 @@ class PseudoPort:
             os.close(descriptor)
         self._fds, self._pending = None, b''
 
+    def close(self) -> None:
+        """Pull the cable out for good."""
+        self.unplug()
+
     def write(self, pieces: Sequence[Piece]) -> int:
         """Send records; returns how many blocks found the line full and were dropped."""
         if self._fds is None:

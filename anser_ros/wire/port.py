@@ -68,11 +68,11 @@ class PortCounters:
 
 @dataclass(frozen=True)
 class Batch:
-    """Records that one read completed.
+    """Records that were received together.
 
     Attributes
     ----------
-    arrival_ns : monotonic host time right after the read
+    arrival_ns : monotonic host time right after the read of the last one
     records : in the order of the stream; empty when the connection began or ended
     connected : False tells that the connection ended
     """
@@ -90,8 +90,13 @@ class ControlUnitPort:
     device : device path, or any pyserial URL
     baud : line speed; without meaning on USB and pseudo-terminals
     silence_s : no byte for so long is a fault; a hello comes once a second even when idle
-    queue_batches : reads that may wait for the receiver
+    queue_blocks : blocks of samples that may wait for the receiver
     pause_s, longest_pause_s : first and longest pause between attempts to open, doubled each time
+
+    Attributes
+    ----------
+    blocks_wanted : blocks to collect before the receiver is woken; it may change this at any time.
+        A receiver that needs twenty blocks for a window is spared nineteen changes of threads.
     """
 
     def __init__(
@@ -100,7 +105,7 @@ class ControlUnitPort:
         *,
         baud: int = DEFAULT_BAUD,
         silence_s: float = 1.5,
-        queue_batches: int = 2048,
+        queue_blocks: int = 2048,
         pause_s: float = 0.1,
         longest_pause_s: float = 2.0,
     ) -> None:
@@ -110,7 +115,10 @@ class ControlUnitPort:
         self.reason = ''
         self._baud = baud
         self._silence_s = silence_s
-        self._queue_batches = queue_batches
+        self.blocks_wanted = 1
+        self._queue_blocks = queue_blocks
+        self._held: list[Record] = []
+        self._held_blocks = 0
         self._pauses = (pause_s, longest_pause_s)
         self._reader = FrameReader()
         self._queue: queue.SimpleQueue[Batch] = queue.SimpleQueue()
@@ -194,6 +202,7 @@ class ControlUnitPort:
                     self.state, self.reason = PortState.ABSENT, f'unplugged: {error}'
             finally:
                 _close(port)
+                self._hand_over()
                 self._queue.put(Batch(time.monotonic_ns(), (), connected=False))
             wait = pause if time.monotonic() - opened > longest else min(2 * wait, longest)
             self._stopping.wait(wait)
@@ -218,6 +227,8 @@ class ControlUnitPort:
                 if records:
                     self.state = PortState.RECEIVING
                     self._take(records)
+            elif self._held:
+                self._hand_over()
             elif now - last_byte > self._silence_s:
                 self.counters.silence += 1
                 self.state = PortState.SILENT
@@ -230,21 +241,29 @@ class ControlUnitPort:
                 period_records = reader.counters.records
 
     def _take(self, records: list[Record]) -> None:
-        arrival_ns = time.monotonic_ns()
-        blocks = 0
+        """Hold blocks until there are as many as wanted; anything else goes on at once."""
+        urgent = False
         for record in records:
             payload = record.payload
             if isinstance(payload, SampleBlock):
-                blocks += 1
                 self._count_gap(payload.sequence)
-            elif isinstance(payload, Hello):
-                self._reader.max_payload = max(_SHORTEST_PAYLOAD, payload.samples_size())
-        if self._queue.qsize() >= self._queue_batches:
-            self.counters.overrun_blocks += blocks
-            records = [r for r in records if not isinstance(r.payload, SampleBlock)]
-            if not records or self._queue.qsize() >= 2 * self._queue_batches:
-                return
-        self._queue.put(Batch(arrival_ns, tuple(records)))
+                if self._queue.qsize() * self.blocks_wanted >= self._queue_blocks:
+                    self.counters.overrun_blocks += 1
+                    continue
+                self._held_blocks += 1
+            else:
+                urgent = True
+                if isinstance(payload, Hello):
+                    self._reader.max_payload = max(_SHORTEST_PAYLOAD, payload.samples_size())
+            self._held.append(record)
+        if urgent or self._held_blocks >= self.blocks_wanted:
+            self._hand_over()
+
+    def _hand_over(self) -> None:
+        """Queue what is held; a receiver that never reads gets no more than records fit."""
+        if self._held and self._queue.qsize() < 2 * self._queue_blocks:
+            self._queue.put(Batch(time.monotonic_ns(), tuple(self._held)))
+        self._held, self._held_blocks = [], 0
 
     def _count_gap(self, sequence: int) -> None:
         if self._next_sequence is not None and sequence:

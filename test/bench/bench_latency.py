@@ -8,9 +8,8 @@ monotonic one.
 
 from __future__ import annotations
 
+import contextlib
 import os
-import signal
-import subprocess
 import sys
 import tempfile
 import threading
@@ -20,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from anser_ros.cli.supervisor import Child, Supervisor
 from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.control_unit import ControlUnit
 from anser_ros.simulation.pseudo_port import PseudoPort
@@ -29,6 +29,9 @@ from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.frames import Start, encode
 from anser_ros.wire.setup import parse_setup, topic_of
 
+for _variable in ('OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):  # as `anser` does for its nodes
+    os.environ.setdefault(_variable, '1')
+
 WINDOW_S = 0.02
 STRETCH_S = 0.001
 STARTUP_S = 30.0
@@ -36,18 +39,22 @@ SETTLE_S = 3.0
 MEASURE_S = 10.0
 RATES_HZ = (200.0, 100.0)
 TOOL_SENSORS = 9
+BUSY_MS = 3.0
 
 LISTENER = """
-import sys, time
+import signal, sys, time
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
 from anser_ros.nodes import qos
 
 def main():
     output, *topics = sys.argv[1:]
-    rclpy.init()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    ending = []
+    signal.signal(signal.SIGINT, lambda *_: ending.append(1))
     node = rclpy.create_node('latency_listener')
     got = []
     def subscribe(index, topic):
@@ -61,11 +68,8 @@ def main():
         subscribe(index, topic)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    try:
-        while True:
-            executor.spin_once(timeout_sec=0.1)
-    except KeyboardInterrupt:
-        pass
+    while not ending:
+        executor.spin_once(timeout_sec=0.1)
     np.save(output, np.array(got, np.int64).reshape(-1, 3))
 
 main()
@@ -124,22 +128,25 @@ class Run:
     latency_ms : ndarray, from the last byte of a window to its pose, each pose
     share : poses that came, of those that should have
     load : CPU seconds a second, by process
+    device_late_ms : how late the bytes themselves were at the 99th percentile; above a few ms the
+        machine was busy with something else, and the figures say more of that than of the chain
     """
 
     latency_ms: np.ndarray
     share: float
     load: dict[str, float]
+    device_late_ms: float
 
 
-def _start(name: str, /, *words: str, **parameters: object) -> subprocess.Popen:
-    command = [sys.executable, '-m', f'anser_ros.nodes.{name}', '--ros-args', *words]
+def _command(name: str, /, **parameters: object) -> list[str]:
+    command = [sys.executable, '-m', f'anser_ros.nodes.{name}', '--ros-args']
     for key, value in parameters.items():
         command += ['-p', f'{key}:={value}']
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return command
 
 
-def _cpu_s(process: subprocess.Popen) -> float:
-    fields = Path(f'/proc/{process.pid}/stat').read_text().rsplit(')', 1)[1].split()
+def _cpu_s(child: Child) -> float:
+    fields = Path(f'/proc/{child.process.pid}/stat').read_text().rsplit(')', 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf('SC_CLK_TCK')
 
 
@@ -151,29 +158,36 @@ def run_chain(rate_hz: float, measure_s: float = MEASURE_S) -> Run:
         link, output = Path(folder) / 'cu', Path(folder) / 'poses.npy'
         port = PseudoPort(link)
         feeder = Feeder(port, STARTUP_S + SETTLE_S + measure_s + 1.0)
-        listener = subprocess.Popen([sys.executable, '-c', LISTENER, str(output), *topics])
-        chain = {
-            'field_model': _start('field_model'),
-            'tracker': _start('tracker'),
-            'recorder': _start('recorder', directory=folder, name='bag'),
-            'acquisition': _start('acquisition', device=link, rate_hz=rate_hz, window_s=WINDOW_S),
-        }
-        try:
+        # the supervisor ends them all, also when this process is killed
+        with contextlib.closing(port), Supervisor(Path(folder) / 'logs') as supervisor:
+            supervisor.start('listener', [sys.executable, '-c', LISTENER, str(output), *topics])
+            chain = {
+                name: supervisor.start(name, _command(name, **parameters))
+                for name, parameters in (
+                    ('field_model', {}),
+                    ('tracker', {}),
+                    ('recorder', {'directory': folder, 'name': 'bag'}),
+                    (
+                        'acquisition',
+                        {'device': link, 'rate_hz': rate_hz, 'window_s': WINDOW_S},
+                    ),
+                )
+            }
             feeder.start()
             _wait_for(Path(f'{output}.first'))
             time.sleep(SETTLE_S)
-            before, from_ns = {n: _cpu_s(p) for n, p in chain.items()}, time.monotonic_ns()
+            before, from_ns = {n: _cpu_s(c) for n, c in chain.items()}, time.monotonic_ns()
             time.sleep(measure_s)
-            after, until_ns = {n: _cpu_s(p) for n, p in chain.items()}, time.monotonic_ns()
+            after, until_ns = {n: _cpu_s(c) for n, c in chain.items()}, time.monotonic_ns()
             time.sleep(0.3)
             load = {name: (after[name] - before[name]) / measure_s for name in chain}
-        finally:
             feeder.stopping.set()
-            _end([*chain.values(), listener])
-            port.unplug()
         poses = np.load(output)
     latency_ms, share = _match(poses, feeder, rate_hz, from_ns, until_ns)
-    return Run(latency_ms, share, load)
+    taken = np.array(feeder.taken_ns)
+    due = feeder.begin_ns + (1 + np.arange(len(taken))) * STRETCH_S * 1e9
+    late = ((taken - due) / 1e6)[(taken > from_ns) & (taken < until_ns)]
+    return Run(latency_ms, share, load, float(np.percentile(late, 99)))
 
 
 def _wait_for(path: Path) -> None:
@@ -183,17 +197,6 @@ def _wait_for(path: Path) -> None:
         if time.monotonic() > end:
             raise RuntimeError(f'no pose within {STARTUP_S:g} s')
         time.sleep(0.1)
-
-
-def _end(processes: list[subprocess.Popen]) -> None:
-    for process in processes:
-        process.send_signal(signal.SIGINT)
-    for process in processes:
-        try:
-            process.wait(5)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
 
 
 def _match(
@@ -225,6 +228,8 @@ def rows() -> list[dict]:
     p50, p99 = np.percentile(slow.latency_ms, [50, 99])
     window_ms = 1e3 * WINDOW_S
     what = 'serial port to PoseStamped, 9 + 32 channels at 50 Hz'
+    if slow.device_late_ms > BUSY_MS:
+        what += f' (machine busy: the bytes themselves {slow.device_late_ms:.0f} ms late)'
     table = [
         {
             'name': f'{what}, {name}',
