@@ -7,9 +7,10 @@ from tracking_world import NOISE_T, certain_model
 from anser_ros.errors import TrackingError
 from anser_ros.physics.dipole import flux_jacobian
 from anser_ros.tracking import rotations
+from anser_ros.tracking.descent import fill_coil, fill_tangent
 from anser_ros.tracking.projection import descend_projected
 from anser_ros.tracking.seed import Volume
-from anser_ros.tracking.solve import RealField, fill_coil, fill_tangent, solve_coil, whitening_of
+from anser_ros.tracking.solve import RealField, solve_coil, whitening_of
 from anser_ros.tracking.uncertainty import (
     UNKNOWN_VARIANCE,
     bounded_inverse,

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
 from anser_ros.physics.dipole import flux_jacobian
+from anser_ros.tracking.descent import fill_coil
 from anser_ros.tracking.rotations import nearest_rotation, rotation_of_vector
 from anser_ros.tracking.seed import SeedGrid
-from anser_ros.tracking.solve import Array, RealField, fill_coil
+from anser_ros.tracking.solve import Array, RealField
 
 MAX_EVALUATIONS = 30
 LARGEST_MOVE_M = 0.04
