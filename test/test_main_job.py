@@ -1,0 +1,56 @@
+"""The main job: a session replayed through the real nodes over DDS gives the right poses."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chain import replay_through_nodes
+
+from anser_ros.cli.main import main
+from anser_ros.sessions.evaluation import track_session
+from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.session import load_session
+from anser_ros.wire.setup import topic_of
+
+BAGS = Path(__file__).resolve().parents[1] / 'bags'
+
+
+def compare(bag: Path, model: Path) -> None:
+    """Poses over DDS are those of the offline evaluation, and as good as the reference."""
+    session = load_session(bag)
+    tool = session.tools[0]
+    topics = {name: f'/anser/{topic_of(name)}/pose' for name in (*tool.sensors.name, tool.body)}
+    received = replay_through_nodes(
+        bag, list(topics.values()), domain=int(os.environ['ROS_DOMAIN_ID']), model=model
+    )
+    offline = track_session(session, load_model(model))
+    centres, axes = tool.placed()
+    stamps = session.start_ns + np.round(tool.time * 1e9).astype(np.int64)
+    for column, name in enumerate(tool.sensors.name):
+        live = received[topics[name]]
+        frames = np.searchsorted(stamps, live.stamp_ns)
+        np.testing.assert_array_equal(np.abs(stamps[frames] - live.stamp_ns) < 2, True)
+        assert np.unique(frames).size == frames.size >= 0.99 * stamps.size
+        error = np.linalg.norm(live.position - centres[frames, column], axis=1)
+        assert np.sqrt(np.mean(error**2)) < 0.25e-3
+        turn = np.linalg.norm(np.cross(live.axis, axes[frames, column]), axis=1)
+        assert np.sqrt(np.mean(turn**2)) < np.radians(0.15)
+        estimates = offline.sensors[name].estimates
+        same = np.array([estimates[frame].position for frame in frames])
+        # The nodes' first frames may start before a model's uncertainty has arrived.
+        assert np.median(np.abs(live.position - same)) < 1e-8
+        assert np.abs(live.position - same).max() < 2e-5
+
+
+def test_our_own_bag(domain, tmp_path):
+    model = tmp_path / 'model.yaml'
+    assert main(['calibrate', str(BAGS / 'factory.mcap'), '--out', str(model)]) == 0
+    compare(BAGS / 'moving.mcap', model)
+
+
+@pytest.mark.timeout(180)
+def test_a_session_that_this_package_did_not_make(domain, shared, tmp_path):
+    effects, model = shared / 'sessions' / 'effects', tmp_path / 'model.yaml'
+    assert main(['calibrate', str(effects / 'factory.mcap'), '--out', str(model)]) == 0
+    compare(effects / 's01.mcap', model)
