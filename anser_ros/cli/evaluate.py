@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.sessions.evaluation import Evaluation, PoseSeries, metrics, track_session
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for
+from anser_ros.tracking.estimate import TrackerSettings
 
 SCHEMA = 'anser_evaluation/1'
 POSE_COLUMNS = (
@@ -41,6 +42,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--in-phase', action='store_true', help="use in-phase fluxes only, the article's way"
     )
+    parser.add_argument(
+        '--gate',
+        type=float,
+        default=TrackerSettings().gate,
+        help='largest residual of a pose, in units of the expected one; inf refuses none '
+        '(for the error that a wrong model would make, never for use)',
+    )
     parser.add_argument('--json', action='store_true', help='print evaluation.json on stdout')
 
 
@@ -56,6 +64,7 @@ def run(args: argparse.Namespace) -> int:
         evaluation = track_session(
             session,
             model,
+            TrackerSettings(gate=args.gate),
             baseline=baseline,
             refit=args.refit,
             in_phase=args.in_phase,

@@ -22,7 +22,8 @@ sys.path.insert(0, str(REPO / 'test'))
 
 from chain import replay_through_nodes  # noqa: E402
 
-from anser_ros.cli.calibrate import calibrate_sessions  # noqa: E402
+from anser_ros.fitting.calibration import Options  # noqa: E402
+from anser_ros.sessions.calibration import calibrate_sessions  # noqa: E402
 from anser_ros.sessions.evaluation import metrics, track_session  # noqa: E402
 from anser_ros.sessions.model_file import load_model, save_model  # noqa: E402
 from anser_ros.sessions.session import load_session  # noqa: E402
@@ -48,7 +49,7 @@ def rows() -> list[dict[str, Any]]:
     topics = {sensor: f'/anser/{topic_of(sensor)}/pose' for sensor in sensors}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / 'model.yaml'
-        save_model(path, calibrate_sessions([load_session(scan)]).model)
+        save_model(path, calibrate_sessions([load_session(scan)], Options()).model)
         received = replay_through_nodes(
             bag, list(topics.values()), domain=random.randint(1, 100), model=path
         )
