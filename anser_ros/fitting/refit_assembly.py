@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.refit_layer import Layer
-from anser_ros.fitting.refit_modes import error_modes
+from anser_ros.fitting.refit_modes import ErrorModes, error_modes
 from anser_ros.fitting.refit_posterior import Bank, ErrorLevel, Evaluation
 
 Array = NDArray[np.float64]
@@ -17,6 +17,9 @@ ComplexArray = NDArray[np.complex128]
 NEGLIGIBLE = 0.01
 """Hypotheses less probable than this take no part in the mean."""
 INFLATION_STEP = 1.2
+Uncertainty = tuple[ComplexArray | None, float]
+"""Modes and flux error of a model."""
+
 MOST_MODES = 16
 KEEP_FRAMES = 25
 RIVAL = 0.05
@@ -37,8 +40,8 @@ class Assembly:
     def __init__(self, model: FieldModel, layers: Sequence[Layer]) -> None:
         self.base = model
         self.layers = tuple(layers)
-        self._modes: dict[tuple[object, ...], ComplexArray] = {}
-        self._whole: dict[tuple[object, ...], tuple[int, ComplexArray | None]] = {}
+        self._modes: dict[tuple[object, ...], ErrorModes] = {}
+        self._whole: dict[tuple[object, ...], tuple[int, Uncertainty]] = {}
         self._count = 0
         self._geometry: dict[int, tuple[Array, Array, list[NDArray[np.int64]]]] = {}
 
@@ -95,9 +98,15 @@ class Assembly:
         parts = {h: self._moments(bank, seen, h) * (phase * unit) for h in active}
         for h, part in parts.items():
             moments[rows[of[h]]] += weights[h] * part
-        modes = self._uncertainty(bank, seen, weights, parts, typical, phase * unit, n_modes, rows)
+        scale = phase * unit
+        modes, rest = self._uncertainty(bank, seen, weights, parts, typical, scale, n_modes, rows)
         return replace(
-            self.base, positions=positions, directions=directions, moments=moments, modes=modes
+            self.base,
+            positions=positions,
+            directions=directions,
+            moments=moments,
+            modes=modes,
+            flux_error_t=rest,
         )
 
     def _uncertainty(
@@ -110,10 +119,10 @@ class Assembly:
         scale: ComplexArray,
         n_modes: int,
         rows: list[NDArray[np.int64]],
-    ) -> ComplexArray | None:
-        """All modes of a model; the same array for a while, so that receivers can keep theirs."""
+    ) -> Uncertainty:
+        """All modes and the rest; the same array for a while, so that receivers keep theirs."""
         ranked = sorted(parts, key=lambda h: -float(weights[h]))
-        rival = next((h for h in ranked[1:] if weights[h] > RIVAL), None)
+        rival = next((h for h in ranked[1:] if float(weights[h]) > RIVAL), None)
         steps = max(0, round(np.log(max(typical, 1.0)) / (2.0 * np.log(INFLATION_STEP))))
         level = bank.error_level(seen, ranked[0]) if ranked else None
         key = (bank.rows.tobytes(), tuple(ranked[:1]), rival, level, steps, len(rows))
@@ -125,17 +134,20 @@ class Assembly:
         size = max(size, len(self.base.positions))
         shape = (size, len(scale))
         modes = [] if self.base.modes is None else [_padded(self.base.modes, size)]
+        rest = 0.0
         if ranked and level is not None:
             own = np.zeros((n_modes, *shape), dtype=complex)
             place = self._rows_of(bank, ranked[0], rows)
             errors = self._error(bank, ranked[0], level, n_modes - 1)
-            own[: len(errors), place] = errors * (INFLATION_STEP**steps * scale)
+            own[: len(errors.moments), place] = errors.moments * (INFLATION_STEP**steps * scale)
+            rest = errors.rest * INFLATION_STEP**steps * float(np.abs(scale[0]))
             if rival is not None:
                 part = np.sqrt(weights[ranked[0]] * weights[rival])
                 own[-1, place] += part * parts[ranked[0]]
                 own[-1, self._rows_of(bank, rival, rows)] -= part * parts[rival]
             modes.append(own)
-        whole = np.concatenate(modes) if modes else None
+        flux_error = float(np.hypot(self.base.flux_error_t, rest))
+        whole = (np.concatenate(modes) if modes else None, flux_error)
         if len(self._whole) >= MOST_MODES:
             del self._whole[next(iter(self._whole))]
         self._whole[key] = (self._count, whole)
@@ -152,8 +164,8 @@ class Assembly:
         parts = bank.moments(seen, hypothesis)
         return np.asarray((parts[:, 0] + 1j * parts[:, 1]).reshape(-1, bank.width))
 
-    def _error(self, bank: Bank, hypothesis: int, level: ErrorLevel, count: int) -> ComplexArray:
-        """Modes of one standard deviation of a hypothesis' own error, in noise units."""
+    def _error(self, bank: Bank, hypothesis: int, level: ErrorLevel, count: int) -> ErrorModes:
+        """A hypothesis' own error, in noise units."""
         key = (bank.rows.tobytes(), hypothesis, level, count)
         if key not in self._modes:
             if len(self._modes) >= MOST_MODES:

@@ -15,6 +15,7 @@ from scipy.linalg import cholesky
 
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.refit_clouds import Region
+from anser_ros.fitting.refit_excitation import Excitation
 from anser_ros.fitting.refit_references import vector_basis
 from anser_ros.physics.dipole import flux_basis
 
@@ -47,7 +48,11 @@ class Layer:
     points : ndarray, shape (P, 3)
         Where the field is sampled, m.
     metric : ndarray, shape (N, N)
-        Upper triangle C: moments m make a field of rms ``|C m|`` over the samples' components.
+        Upper triangle C: ``|C m|`` is what the field of moments m does to poses, an rms over the
+        samples of the field relative to the emitters' own, times the height (an error of the field
+        moves a pose by its size over the field's gradient). Its unit does not matter.
+    middle : ndarray, shape (Q, N)
+        Field components per unit moment at the samples in the middle of the volume.
     """
 
     rows: NDArray[np.int64] | None
@@ -56,6 +61,7 @@ class Layer:
     inverse: Array
     points: Array
     metric: Array
+    middle: Array
 
     def project(self, sources: Array) -> Array:
         """Moments of the layer per unit moment of each source's component, shape (N, 3M)."""
@@ -86,15 +92,23 @@ def _component_rows(points: Array, positions: Array, directions: Array) -> Array
 
 
 def _build(
-    rows: NDArray[np.int64] | None, positions: Array, directions: Array, points: Array
+    rows: NDArray[np.int64] | None,
+    positions: Array,
+    directions: Array,
+    points: Array,
+    excitation: Excitation,
+    half: float,
 ) -> Layer:
     basis = _component_rows(points, positions, directions)
     scale = np.linalg.norm(basis, axis=0)
     u, s, vt = np.linalg.svd(basis / scale, full_matrices=False)
     inverse = (vt.T * (s / (s**2 + (RIDGE * s[0]) ** 2))) @ u.T / scale[:, None]
-    gram = basis.T @ basis / len(basis)
+    weight = points[:, 2] / np.linalg.norm(excitation.field(points), axis=(1, 2))
+    weighted = basis * np.repeat(weight / weight.mean(), 3)[:, None]
+    gram = weighted.T @ weighted
     gram[np.diag_indices_from(gram)] += 1e-12 * np.diag(gram)
-    return Layer(rows, positions, directions, inverse, points, cholesky(gram))
+    middle = np.repeat((points[:, 2] > 0.5 * half) & (points[:, 2] < half), 3)
+    return Layer(rows, positions, directions, inverse, points, cholesky(gram), basis[middle])
 
 
 def _lattice(region: Region, across: int, extent: float, depth: float) -> Array:
@@ -107,7 +121,9 @@ def _upright(positions: Array) -> Array:
     return np.tile([0.0, 0.0, 1.0], (len(positions), 1))
 
 
-def bottom_layer(model: FieldModel, region: Region, sources: Array) -> Layer:
+def bottom_layer(
+    model: FieldModel, region: Region, excitation: Excitation, sources: Array
+) -> Layer:
     """The layer for clouds below the board.
 
     Parameters
@@ -115,6 +131,7 @@ def bottom_layer(model: FieldModel, region: Region, sources: Array) -> Layer:
     model : FieldModel
         Calibrated; its dipoles are used again where they can stand for the sources.
     region : Region
+    excitation : Excitation
     sources : ndarray, shape (M, 3)
         Sources of the cloud that is hardest to stand for, the nearest one.
     """
@@ -124,14 +141,14 @@ def bottom_layer(model: FieldModel, region: Region, sources: Array) -> Layer:
     rows = np.flatnonzero(upright & low)
     if 64 <= rows.size <= MOST_OWN:
         own = np.concatenate([model.positions[rows], deep])
-        layer = _build(rows, own, _upright(own), points)
+        layer = _build(rows, own, _upright(own), points, excitation, region.half)
         if layer.misfit(sources) <= GOOD_ENOUGH:
             return layer
     positions = np.concatenate([_lattice(region, *SHALLOW), deep])
-    return _build(None, positions, _upright(positions), points)
+    return _build(None, positions, _upright(positions), points, excitation, region.half)
 
 
-def box_layer(region: Region) -> Layer:
+def box_layer(region: Region, excitation: Excitation) -> Layer:
     """Dipoles on the faces of a box around the tracked volume, pointing inwards."""
     gap = 0.8 * region.half
     half = region.half + region.margin + gap
@@ -152,4 +169,6 @@ def box_layer(region: Region) -> Layer:
     stacked = np.concatenate(positions)
     stacked[:, :2] += region.centre
     # Near the faces the field of what is just outside has more detail than the box can make.
-    return _build(None, stacked, np.concatenate(directions), region.samples(part=INNER))
+    points = region.samples(part=INNER)
+    axes = np.concatenate(directions)
+    return _build(None, stacked, axes, points, excitation, region.half)

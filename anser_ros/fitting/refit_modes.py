@@ -1,4 +1,6 @@
-"""The refit's own uncertainty as a few fields of one standard deviation each."""
+"""The refit's own uncertainty: a few fields of one standard deviation each, and what is left."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +11,25 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 
-def error_modes(bank: Bank, hypothesis: int, level: ErrorLevel, count: int) -> ComplexArray:
-    """Principal modes of the posterior's error of one hypothesis.
+@dataclass(frozen=True)
+class ErrorModes:
+    """Error of a hypothesis' posterior, in noise units.
+
+    Attributes
+    ----------
+    moments : ndarray, shape (R, N, K), complex
+        Of the hypothesis' layer; the error is a sum of these with independent normal factors.
+    rest : float
+        Standard deviation of a phasor component of what they leave, in the middle of the volume.
+        Without it a pose would trust the directions that no mode points in.
+    """
+
+    moments: ComplexArray
+    rest: float
+
+
+def error_modes(bank: Bank, hypothesis: int, level: ErrorLevel, count: int) -> ErrorModes:
+    """Principal modes of the posterior's error of one hypothesis, as far as poses feel it.
 
     Parameters
     ----------
@@ -20,30 +39,22 @@ def error_modes(bank: Bank, hypothesis: int, level: ErrorLevel, count: int) -> C
     level : ErrorLevel
         From `Bank.error_level`.
     count : int
-        Modes R; their power is scaled up to that of all draws, so none is lost.
-
-    Returns
-    -------
-    ndarray, shape (R, N, K), complex
-        Moments of the hypothesis' layer, noise units.
+        Modes R.
     """
     layer = bank.priors[hypothesis - 1].layer
     draws = []
     for part in range(2):
         error = bank.error_draws(hypothesis, level.noise, level.strengths[part], part)
         draws.append(error.reshape(len(layer.positions), bank.width, -1))
-    gram = np.zeros((2 * draws[0].shape[2],) * 2)
     half = draws[0].shape[2]
+    gram = np.zeros((2 * half, 2 * half))
     for part in range(2):
-        field = np.einsum('nm,mkd->dnk', layer.metric, draws[part], optimize=True)
-        field = field.reshape(half, -1)
+        felt = np.einsum('nm,mkd->dnk', layer.metric, draws[part], optimize=True)
+        felt = felt.reshape(half, -1)
         here = slice(part * half, (part + 1) * half)
-        gram[here, here] = field @ field.T
-    values, vectors = np.linalg.eigh(gram)
-    vectors = vectors[:, ::-1][:, :count]
-    kept = float(np.maximum(values[::-1][:count], 0.0).sum())
-    total = float(np.maximum(values, 0.0).sum())
-    scale = np.sqrt(total / kept / half) if kept > 0.0 else 0.0
-    real = draws[0] @ vectors[:half]
-    imaginary = draws[1] @ vectors[half:]
-    return np.asarray(scale * (real + 1j * imaginary).transpose(2, 0, 1))
+        gram[here, here] = felt @ felt.T
+    vectors = np.linalg.eigh(gram)[1][:, ::-1] / np.sqrt(half)
+    moments = (draws[0] @ vectors[:half] + 1j * (draws[1] @ vectors[half:])).transpose(2, 0, 1)
+    field = np.einsum('qn,rnk->qrk', layer.middle, moments[count:], optimize=True)
+    rest = np.sqrt(np.median((np.abs(field) ** 2).sum(axis=1)) / 2.0)
+    return ErrorModes(np.ascontiguousarray(moments[:count]), float(rest))

@@ -41,8 +41,8 @@ def build_scene(
     """Compute the scene; raises `FitError` as `excitation_for` does."""
     excitation, region = excitation_for(model, drawing)
     clouds = default_clouds(region)
-    bottom = bottom_layer(model, region, clouds[0].positions)
-    box = box_layer(region)
+    bottom = bottom_layer(model, region, excitation, clouds[0].positions)
+    box = box_layer(region, excitation)
     rng = np.random.default_rng(settings.seed)
     frequencies = np.array(model.frequencies_hz)
     priors = [
