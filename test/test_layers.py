@@ -23,7 +23,8 @@ ALLOWED = {
     'sessions': {'wire', 'tracking', 'fitting', 'effects', 'physics'},
     'simulation': {'sessions', 'effects', 'fitting', 'physics', 'signals', 'wire'},
     'measured': CORE,
-    'cli': {*CORE, 'simulation', 'measured'},
+    'experiments': {*CORE, 'simulation'},
+    'cli': {*CORE, 'simulation', 'measured', 'experiments'},
     'nodes': {*CORE, 'simulation'},
 }
 # Libraries that only some places may know.
@@ -36,7 +37,7 @@ ROOMS = {
     'mcap_ros2': ('wire/bag.py', 'wire/bag_writer.py'),
     'pyigtl': ('nodes/igtl_server.py',),
     'rich': ('nodes/', 'cli/'),
-    'matplotlib': ('diagnosis/', 'cli/'),
+    'matplotlib': ('diagnosis/', 'experiments/', 'cli/'),
     'magpylib': (),
 }
 

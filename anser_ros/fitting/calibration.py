@@ -19,7 +19,7 @@ from anser_ros.fitting.pose_correction import Uncertainty, with_pose
 from anser_ros.fitting.prior import DrawnBoard
 from anser_ros.fitting.requirements import check_agreement, check_measurements
 from anser_ros.fitting.selection import (
-    WORTH,
+    WORTH_MANY,
     Candidate,
     Selection,
     choose_layout,
@@ -211,8 +211,8 @@ def _final(
 
 
 def _better(finals: Sequence[Final]) -> Final:
-    """The one with the fewest dipoles whose held-out error is the least to within `WORTH`."""
-    limit = min(final[2].score_t for final in finals) * (1.0 + WORTH)
+    """The one with the fewest dipoles whose held-out error is the least to within `WORTH_MANY`."""
+    limit = min(final[2].score_t for final in finals) * (1.0 + WORTH_MANY)
     good = [final for final in finals if final[2].score_t <= limit]
     return min(good, key=lambda final: (len(final[1].dipoles), final[2].score_t))
 

@@ -36,7 +36,7 @@ class DrawnBoard:
 
     def __init__(self, nominal: FieldModel, measurements: Sequence[Measurements]) -> None:
         self.points, self.axes = _around(measurements)
-        self.gains = _gains(nominal, measurements)
+        self.gains = emitter_gains(nominal, measurements)
         self.flux = nominal.flux(self.points, self.axes) * self.gains
 
     def moments(self, dipoles: Dipoles) -> ComplexArray:
@@ -61,7 +61,7 @@ def _around(measurements: Sequence[Measurements]) -> tuple[Array, Array]:
     return np.repeat(where, 3, axis=0), np.tile(np.eye(3), (len(where), 1))
 
 
-def _gains(nominal: FieldModel, measurements: Sequence[Measurements]) -> ComplexArray:
+def emitter_gains(nominal: FieldModel, measurements: Sequence[Measurements]) -> ComplexArray:
     """Complex factor of each emitter's drawn field that fits its fluxes best."""
     above, below = np.zeros(len(nominal.emitters), complex), np.zeros(len(nominal.emitters))
     for m in measurements:

@@ -43,8 +43,10 @@ MOVING = (
 """Where dipoles start from that are moved."""
 MOVING_READINGS = 12
 """Readings that a moved dipole must have at least: three coordinates and a moment, thrice."""
-WORTH = 0.15
+WORTH = 0.05
 """A richer layout must lower the predictive error by this part to be worth its dipoles."""
+WORTH_MANY = 0.15
+"""The same for a layer that stays over one that moves, which has a third of the dipoles."""
 
 
 @dataclass(frozen=True)

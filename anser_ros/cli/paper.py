@@ -1,0 +1,87 @@
+"""Redo the article's experiments: Tables II to V, Figs. 2 and 5 to 10."""
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from anser_ros.experiments.figures import draw_all
+from anser_ros.experiments.recordings import (
+    Recordings,
+    default_folder,
+    given_recordings,
+    missing,
+)
+from anser_ros.experiments.report import write_report
+from anser_ros.experiments.simulated import simulate_recordings
+from anser_ros.experiments.study import Results, Study
+
+SHOWN = ('table_2', 'table_3 aluminium', 'table_3 mu-metal', 'table_5 compensated')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument(
+        '--sessions', type=Path, help='folder of the recordings; simulated where there is none'
+    )
+    parser.add_argument(
+        '--out', type=Path, default=Path('out/paper'), help='folder for the report'
+    )
+    parser.add_argument('--simulate', action='store_true', help='use our own simulator anyway')
+    parser.add_argument('--seed', type=int, default=1, help='of our own simulator')
+    parser.add_argument('--json', action='store_true', help='print paper.json on stdout')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; the exit code."""
+    console = Console(stderr=True)
+    columns = (TextColumn('{task.description}'), BarColumn(), TimeElapsedColumn())
+    with (
+        tempfile.TemporaryDirectory() as scratch,
+        Progress(*columns, console=console, disable=not sys.stderr.isatty()) as bar,
+    ):
+        task = bar.add_task('recordings', total=1.0)
+        recordings = _recordings(args, Path(scratch))
+        study = Study(
+            recordings, lambda name, share: bar.update(task, description=name, completed=share)
+        )
+        results = study.run()
+        args.out.mkdir(parents=True, exist_ok=True)
+        figures = draw_all(study, args.out)
+    write_report(results, figures, args.out / 'paper.md')
+    text = json.dumps(results.document(), indent=1)
+    (args.out / 'paper.json').write_text(text + '\n', encoding='utf-8')
+    if args.json:
+        print(text)
+    else:
+        Console().print(_table(results))
+        Console().print(f'report: {args.out / "paper.md"}', highlight=False)
+    return 0
+
+
+def _recordings(args: argparse.Namespace, scratch: Path) -> Recordings:
+    """The recordings asked for, the shared ones, or ones made here."""
+    if args.simulate:
+        return simulate_recordings(scratch, args.seed)
+    if args.sessions is not None:
+        return given_recordings(args.sessions)
+    folder = default_folder()
+    if not missing(folder):
+        return given_recordings(folder)
+    return simulate_recordings(scratch, args.seed)
+
+
+def _table(results: Results) -> Table:
+    table = Table(title=f'position RMSE, mm; simulated data ({results.origin})')
+    for name in ('experiment', 'method', 'Y', 'Z'):
+        table.add_column(name)
+    for experiment in SHOWN:
+        for method, errors in results.tracking[experiment].items():
+            values = [f'{errors[s].millimetres()["RMSE"]:.3f}' for s in ('Y', 'Z')]
+            table.add_row(experiment.replace('_', ' '), method, *values)
+    return table

@@ -1,0 +1,77 @@
+"""The field models that are compared: the drawing, the article's own method, and ours."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from anser_ros.fitting.calibration import Calibration, Options
+from anser_ros.fitting.dipoles import basis_rows
+from anser_ros.fitting.factors import TriangularFactor, as_complex, as_real
+from anser_ros.fitting.layouts import Layout, place
+from anser_ros.fitting.measurements import Measurements
+from anser_ros.fitting.model import FieldModel
+from anser_ros.fitting.pose_correction import with_pose
+from anser_ros.fitting.prior import emitter_gains
+from anser_ros.sessions.calibration import calibrate_sessions, generator_of
+from anser_ros.sessions.session import Session
+from anser_ros.sessions.starting_model import NOMINAL, model_for
+
+ARTICLE_COUNT = 12
+OUTLINE = 1.0
+"""The article's layer as large as the coils' outline."""
+
+
+def centres_extension(session: Session) -> float:
+    """Size of a layer that ends at the outermost coils' centres, as a part of the outline."""
+    generator = generator_of(session.setup)
+    centres = generator.centres[:, :2]
+    reach = np.abs(centres - generator.middle[:2]).max(axis=0)
+    return float((reach / generator.half_extent).max())
+
+
+def drawn_model(session: Session, learnt_from: Sequence[Session]) -> FieldModel:
+    """Biot-Savart of the drawing with one real gain an emitter, found on undistorted data."""
+    nominal = model_for(NOMINAL, session)
+    tools = [with_pose(tool) for other in learnt_from for tool in other.tools]
+    gains = emitter_gains(nominal, tools).real
+    # The drawing's own tolerances are what the gains and the data now replace.
+    model = replace(nominal, moments=nominal.moments * gains, modes=None)
+    return expecting(model, _residual_rms(model, tools))
+
+
+def expecting(model: FieldModel, flux_error_t: float) -> FieldModel:
+    """The model, told that it may be wrong by so much: its solutions are then not refused."""
+    return replace(model, flux_error_t=max(flux_error_t, model.flux_error_t))
+
+
+def _residual_rms(model: FieldModel, tools: Sequence[Measurements]) -> float:
+    """Root mean square of an in-phase residual at the measured poses, T."""
+    errors = []
+    for tool in tools:
+        points, axes = tool.placed()
+        lengths = np.broadcast_to(tool.sensors.length, tool.usable.shape)
+        flux = model.flux(points[tool.usable], axes[tool.usable], lengths[tool.usable])
+        errors.append((tool.flux[tool.usable] - flux).real.ravel())
+    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+
+
+def article_model(session: Session, extension: float = OUTLINE) -> FieldModel:
+    """The article's equation (6): 12 x 12 fixed z-dipoles, plain least squares, in phase."""
+    dipoles = place(Layout('layer', ARTICLE_COUNT, extension, 0.0), generator_of(session.setup))
+    factor = TriangularFactor(len(dipoles), 2 * len(session.setup.emitter_names))
+    for tool in session.tools:
+        posed = with_pose(tool)
+        used = posed.usable.ravel()
+        right = as_real(posed.flux).reshape(used.size, -1)
+        factor.add(basis_rows(posed, dipoles)[used], right[used])
+    moments = as_complex(factor.spectrum().solve(0.0)).real.astype(complex)
+    return FieldModel(
+        dipoles.positions, dipoles.directions, moments,
+        session.setup.emitter_names, session.setup.frequencies_hz,
+    )  # fmt: skip
+
+
+def our_model(sessions: Sequence[Session]) -> Calibration:
+    """Everything chosen by held-out error."""
+    return calibrate_sessions(list(sessions), Options())

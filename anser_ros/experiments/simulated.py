@@ -1,0 +1,167 @@
+"""The experiments' recordings made by our own simulator, where nobody else's are at hand.
+
+The board is a little off its drawing. Plates and the X-ray head are lattices of metal balls that
+the board magnetises and that do not feel each other: rougher than plates and heads, and enough to
+bend the field by as much.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from anser_ros.experiments.recordings import HEAD_DISTANCES_CM, MATERIALS, Recordings
+from anser_ros.physics.dipole import field_basis
+from anser_ros.simulation.board_source import board_source
+from anser_ros.simulation.manufacture import manufactured
+from anser_ros.simulation.metal import MetalBody, steel_disc
+from anser_ros.simulation.motion import Pose
+from anser_ros.simulation.recording import Errors, record
+from anser_ros.simulation.world import FieldSource, World
+from anser_ros.wire.config_folder import config_path
+from anser_ros.wire.setup import SensorSpec, Setup, parse_setup
+
+Array = NDArray[np.float64]
+
+STATIC = Errors(flux_noise_t=30e-12)
+PLATE_EDGE_M = 0.25
+PLATE_BALLS = 12
+PLATE_DEPTH_M = 0.02
+COLLIMATOR_DEPTH_M = 0.03
+METALS = {'aluminium': (35e6, 1.0), 'mu-metal': (1.8e6, 1e4)}
+"""Conductivity, S/m, and relative permeability (article, Table I)."""
+
+
+@dataclass(frozen=True)
+class Raster:
+    """A body that rests at the points of a lattice, one a second, held by a not quite steady hand.
+
+    Attributes
+    ----------
+    side : int
+        Points along x and along y.
+    span_m : float
+        Edge of the square.
+    height_m : float
+        Height of the lattice; each point is up to 4 mm off, and turned by up to 20 mrad.
+    """
+
+    side: int
+    span_m: float
+    height_m: float
+
+    def __call__(self, time_s: float) -> Pose:
+        """Pose at a time."""
+        index = int(np.clip(round(time_s), 0, self.side**2 - 1))
+        row, column = divmod(index, self.side)
+        line = np.linspace(-self.span_m / 2, self.span_m / 2, self.side)
+        # Golden-ratio multiples: evenly spread and the same in every run.
+        unsteady = np.mod(np.outer([0.6180340, 0.7548777, 0.5698403], [1, 2]) * (index + 1), 1.0)
+        offset = 0.004 * (2.0 * unsteady[:, 0] - 1.0)
+        turn = 0.02 * (2.0 * unsteady[:, 1] - 1.0)
+        place = np.array([line[column], line[row], self.height_m]) + offset
+        return place, np.asarray(Rotation.from_rotvec(turn).as_matrix())
+
+
+def _tool_a() -> tuple[SensorSpec, ...]:
+    sensors = []
+    for cluster in range(3):
+        for axis, letter in enumerate('xyz'):
+            unit = [0.0, 0.0, 0.0]
+            unit[axis] = 1.0
+            place = (0.0, 0.0, 0.03 * (cluster - 1))
+            name = f'tool_a/{cluster}/{letter}'
+            x, y, z = unit
+            sensors.append(SensorSpec(len(sensors), name, 'tool_a', place, (x, y, z), 0.0))
+    return tuple(sensors)
+
+
+def _tool_b() -> tuple[SensorSpec, ...]:
+    return (
+        SensorSpec(0, 'tool_b/y', 'tool_b', (-0.006, 0.0, 0.0), (0.0, 1.0, 0.0), 0.0082),
+        SensorSpec(1, 'tool_b/z', 'tool_b', (0.006, 0.0, 0.0), (0.0, 0.0, 1.0), 0.0082),
+    )
+
+
+def _at_rest(place: Array) -> Pose:
+    return place, np.eye(3)
+
+
+def plate(material: str) -> MetalBody:
+    """A square plate below the board."""
+    ball = PLATE_EDGE_M / (2 * PLATE_BALLS)
+    line = np.linspace(-PLATE_EDGE_M / 2 + ball, PLATE_EDGE_M / 2 - ball, PLATE_BALLS)
+    x, y = np.meshgrid(line, line)
+    offsets = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    conductivity, permeability = METALS[material]
+    place = np.array([0.0, 0.0, -PLATE_DEPTH_M])
+    return MetalBody(offsets, ball, conductivity, permeability, lambda _: _at_rest(place))
+
+
+def head(depth_m: float) -> MetalBody:
+    """The X-ray head below the board."""
+    place = np.array([0.01, -0.01, -depth_m])
+    return steel_disc(lambda _: _at_rest(place), radius_m=0.1, rings=4)
+
+
+def with_metal(source: FieldSource, metal: Sequence[MetalBody], setup: Setup) -> FieldSource:
+    """The field of the board and of what it induces in metal at rest."""
+    tones = np.array(setup.frequencies_hz)
+    places, moments = [], []
+    for body in metal:
+        centres = body.centres(0.0)
+        places.append(centres)
+        moments.append(source(centres) * body.polarisability(tones))
+    if not places:
+        return source
+    where, induced = np.concatenate(places), np.concatenate(moments)
+
+    def field(points: Array) -> NDArray[np.complex128]:
+        out = np.array(source(points), dtype=complex)
+        for component, unit in enumerate(np.eye(3)):
+            basis = field_basis(points, where, np.broadcast_to(unit, where.shape))
+            out += np.einsum('pni,nk->pik', basis, induced[:, component])
+        return out
+
+    return field
+
+
+def simulate_recordings(folder: Path, seed: int) -> Recordings:
+    """Write a bag for every experiment into a folder."""
+    rng = np.random.default_rng(seed)
+    text = config_path('demo_setup.yaml').read_text(encoding='utf-8')
+    drawn = replace(parse_setup(text), flux_rate_hz=1.0)
+    board = board_source(manufactured(drawn, rng))
+    setups = {
+        'tool_a': replace(drawn, sensors=_tool_a()),
+        'tool_b': replace(drawn, sensors=_tool_b()),
+    }
+    small = Raster(8, 0.2, 0.15)
+    jobs: list[tuple[str, Raster, list[MetalBody]]] = [
+        ('factory_tool_a', Raster(31, 0.30, 0.15), []),
+        ('midplane_tool_b', Raster(26, 0.25, 0.15), []),
+    ]
+    for material in MATERIALS:
+        stem = f'shield_{material.replace("-", "_")}'
+        jobs.append((f'{stem}_tool_b', Raster(25, 0.25, 0.15), [plate(material)]))
+        jobs.append((f'{stem}_c_arm_tool_b', small, [plate(material), head(0.05)]))
+    for distance in HEAD_DISTANCES_CM:
+        jobs.append((f'c_arm_{distance:02d}cm_tool_b', small, [head(0.03 + distance / 100)]))
+    collimator = [head(COLLIMATOR_DEPTH_M)]
+    jobs += [
+        ('collimator_tool_a', Raster(13, 0.24, 0.15), collimator),
+        ('collimator_bottom_tool_b', Raster(8, 0.2, 0.12), collimator),
+        ('collimator_midplane_tool_b', small, collimator),
+    ]
+    for name, raster, metal in jobs:
+        body = 'tool_a' if name.endswith('tool_a') else 'tool_b'
+        setup = setups[body]
+        world = World(setup, with_metal(board, metal, setup), paths={body: raster})
+        record(
+            str(folder / f'{name}.mcap'), world, frames=raster.side**2, rate_hz=1.0,
+            optical_rate_hz=None, errors=STATIC, rng=rng,
+        )  # fmt: skip
+    return Recordings(folder, "simulated by this package's own world")

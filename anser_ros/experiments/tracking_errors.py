@@ -1,0 +1,85 @@
+"""Errors of tracked poses against the optical ones, sensor by sensor."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.experiments.article import STATISTICS
+from anser_ros.fitting.model import FieldModel
+from anser_ros.sessions.evaluation import track_session
+from anser_ros.sessions.session import Session
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SensorErrors:
+    """One sensor's errors, frame by frame; NaN where it was not tracked.
+
+    Attributes
+    ----------
+    tracked, true : ndarray, shape (F, 3)
+        m, frame fg.
+    distance, angle : ndarray, shape (F,)
+        m and rad.
+    """
+
+    tracked: Array
+    true: Array
+    distance: Array
+    angle: Array
+
+    def corrected(self, tracked: Array) -> 'SensorErrors':
+        """The same with other positions."""
+        distance = np.where(
+            np.isfinite(self.distance), np.linalg.norm(tracked - self.true, axis=1), np.nan
+        )
+        return SensorErrors(tracked, self.true, distance, self.angle)
+
+    @property
+    def tracked_fraction(self) -> float:
+        """Part of the frames with a pose."""
+        return float(np.isfinite(self.distance).mean())
+
+    def millimetres(self) -> dict[str, float]:
+        """RMSE, ME, PRC50, PRC95 of the position (article, equation 7), mm."""
+        return statistics(1e3 * self.distance)
+
+    def degrees(self) -> dict[str, float]:
+        """The same of the orientation, degrees."""
+        return statistics(np.degrees(self.angle))
+
+
+def statistics(errors: Array) -> dict[str, float]:
+    """The article's four figures; NaN when there is no error at all."""
+    good = errors[np.isfinite(errors)]
+    if good.size == 0:
+        return dict.fromkeys(STATISTICS, float('nan'))
+    return {
+        'RMSE': float(np.sqrt(np.mean(good**2))),
+        'ME': float(good.mean()),
+        'PRC50': float(np.percentile(good, 50)),
+        'PRC95': float(np.percentile(good, 95)),
+    }
+
+
+def track(session: Session, model: FieldModel, in_phase: bool = False) -> dict[str, SensorErrors]:
+    """Track a session; the errors by the last token of a sensor's name, in capitals.
+
+    As in the article every solution counts, those too whose residual a tracker would refuse.
+    """
+    evaluation = track_session(session, model, in_phase=in_phase)
+    out = {}
+    for tool in session.tools:
+        centres, axes = tool.placed()
+        for column, name in enumerate(tool.sensors.name):
+            series = evaluation.sensors[name]
+            tracked = np.array([estimate.position for estimate in series.estimates])
+            found = np.array([estimate.axis for estimate in series.estimates])
+            distance = np.linalg.norm(tracked - centres[:, column], axis=1)
+            sine = np.linalg.norm(np.cross(found, axes[:, column]), axis=1)
+            angle = np.arctan2(sine, (found * axes[:, column]).sum(axis=1))
+            token = name.rsplit('/', 1)[-1].upper()
+            out[token] = SensorErrors(tracked, centres[:, column], distance, angle)
+    return out
