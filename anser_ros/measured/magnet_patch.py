@@ -1,9 +1,9 @@
 """A magnet before a patch of 16 sensors: what is learnt on one file, scored on the others.
 
-A gain that was learnt may have changed by the time of the next file, and one file cannot say by how
-much. The spread of the gains among the sensors is the natural size of such a change, so the tracker
-carries it in the covariance of the readings: all three axes of a sensor scale together, which leaves
-the direction of its field as good as the noise.
+A gain that was learnt may have changed by the time of the next file, and one file cannot say by
+how much. The spread of the gains among the sensors is the natural size of such a change, so the
+tracker carries it in the covariance of the readings: all three axes of a sensor scale together,
+which leaves the direction of its field as good as the noise.
 
 The data (github xpy-zju/Dual-stage-magnetic-localization, MIT) are read where they lie.
 """
@@ -289,7 +289,7 @@ def tables(analysis: Analysis) -> str:
             lines.append(search_text(title, model.search, 'of the noise'))
         lines.append(
             f'  strength {model.moment * (1.0 + float(model.found["moment"][0])):.4f} A m^2, '
-            f'noise {1e6 * model.noise_t:.2f} uT, spread of the gains {100 * part.gain_error:.2f} %'
+            f'noise {1e6 * model.noise_t:.2f} uT, gain spread {100 * part.gain_error:.2f} %'
         )
         for name in model.found:
             if name != 'moment':
