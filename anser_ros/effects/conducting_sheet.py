@@ -3,12 +3,14 @@
 Loop i of a mesh of edge h obeys ``sum_j (R_ij + j w M_ij) I_j = -j w Phi_i``: M from Neumann's
 formula for parallel filaments (the mean distance of a strip of width h from itself is 0.2235 h,
 Grover, Inductance Calculations, 1946, ch. 3), R from the sheet resistance, one square an edge.
+M scales with h and R not at all, so one generalised eigenproblem serves all sizes and resistances.
 """
 
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eigh
 
 from anser_ros.effects.dipoles import Dipoles
 from anser_ros.physics.constants import MU_0
@@ -32,15 +34,21 @@ def _parallel(ahead: Array, aside: Array) -> Array:
 def unit_mesh(count: int) -> tuple[Array, Array]:
     """Inductance (H at an edge of 1 m) and resistance (at 1 ohm a square) of a count^2 mesh."""
     i, j = np.meshgrid(np.arange(count * 1.0), np.arange(count * 1.0), indexing='ij')
-    table = sum(
-        2 * _parallel(a, b) - _parallel(a, b + 1) - _parallel(a, b - 1)
-        for a, b in ((i, j), (j, i))
-    )
+    table = np.zeros((count, count))
+    for a, b in ((i, j), (j, i)):
+        table += 2 * _parallel(a, b) - _parallel(a, b + 1) - _parallel(a, b - 1)
     row, column = np.divmod(np.arange(count * count), count)
     di, dj = np.abs(row[:, None] - row), np.abs(column[:, None] - column)
-    inductance = MU_0 / (4 * np.pi) * np.asarray(table)[di, dj]
+    inductance = MU_0 / (4 * np.pi) * table[di, dj]
     resistance = 4.0 * (di + dj == 0) - 1.0 * (di + dj == 1)
     return inductance, resistance
+
+
+@cache
+def _modes(count: int) -> tuple[Array, Array]:
+    """Time constants and shapes: ``M x = value R x`` with ``x^T R x = 1``."""
+    values, vectors = eigh(*unit_mesh(count))
+    return np.asarray(values), np.asarray(vectors)
 
 
 def sheet_sources(
@@ -58,16 +66,17 @@ def sheet_sources(
         Resistance of a square.
     count : int
         Loops along an edge.
+    illumination : Dipoles
+    omega : ndarray, shape (K,)
+        rad/s.
     """
-    inductance, resistance = unit_mesh(count)
+    values, vectors = _modes(count)
     steps = (np.arange(count) + 0.5) / count - 0.5
     x, y = np.meshgrid(steps * edges[0], steps * edges[1], indexing='ij')
     points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1) + centre
     area = float(edges[0] * edges[1]) / count**2
-    flux = illumination.field(points)[:, 2] * area
-    current = np.empty_like(flux)
-    for k, w in enumerate(omega):
-        system = inductance * np.sqrt(area) + resistance * (sheet_ohm / (1j * w))
-        current[:, k] = -np.linalg.solve(system, flux[:, k])
     up = np.tile([0.0, 0.0, 1.0], (points.shape[0], 1))
+    flux = illumination.flux(points, up, None) * area
+    response = values[:, None] * np.sqrt(area) + sheet_ohm / (1j * omega)
+    current = -(vectors @ ((vectors.T @ flux) / response))
     return Dipoles(points, up, current * area)

@@ -7,6 +7,7 @@ import numpy as np
 from anser_ros.effects.conducting_sheet import sheet_sources
 from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import (
+    FROZEN,
     Array,
     ComplexArray,
     Effect,
@@ -51,7 +52,9 @@ class ConductivePlate(Effect):
         ]
 
     def prior(self, term: Term) -> Array:
-        """Anywhere near the board; sheet resistances over decades."""
+        """Anywhere near the board; sheet resistances over decades. A frozen sheet stays."""
+        if term.site.get('_frozen'):
+            return np.full(5, FROZEN)
         return np.array([0.1, 0.2, 0.1, 0.1, 3.0])
 
     def bounded(self, term: Term) -> Term:

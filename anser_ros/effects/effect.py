@@ -26,6 +26,10 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 
+FROZEN = 1e-12
+"""Prior spread of a parameter that a fit must leave where it is."""
+
+
 class Remedy(Enum):
     """What is done about an effect live."""
 
@@ -146,6 +150,14 @@ class View:
         """Zeros of shape (F, S, K, count)."""
         return np.zeros((*self.flux.shape, count), dtype=complex)
 
+    def frames(self, rows: NDArray[np.int64]) -> 'View':
+        """The frames named by index."""
+        each = (
+            'time', 'position', 'rotation', 'velocity', 'centres', 'axes', 'linear', 'flux',
+            'd_position', 'd_axis',
+        )  # fmt: skip
+        return replace(self, **{name: getattr(self, name)[rows] for name in each})
+
     def along(self, field_flux: ComplexArray) -> ComplexArray:
         """Fluxes of flattened sensors (F S, K) in the shape (F, S, K)."""
         return field_flux.reshape(self.flux.shape)
@@ -177,6 +189,11 @@ class Term:
     def with_theta(self, theta: Array) -> 'Term':
         """The same term with other parameters."""
         return replace(self, theta=np.asarray(theta, dtype=np.float64))
+
+    def frozen(self, held: bool) -> 'Term':
+        """The same term with the parameters that are not linear held, or free again."""
+        site = {key: value for key, value in self.site.items() if key != '_frozen'}
+        return replace(self, site={**site, '_frozen': True} if held else site)
 
     @property
     def label(self) -> str:

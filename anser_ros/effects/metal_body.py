@@ -126,29 +126,23 @@ def group_flux(
     return flux.reshape(len(centres), -1, moments.shape[0])
 
 
-def moving_group_flux(
-    points: Array, moments: ComplexArray, centres: Array, axes: Array
-) -> ComplexArray:
-    """Flux of scatterers that are elsewhere in every frame.
+def scatterer_coupling(points: Array, centres: Array, axes: Array) -> Array:
+    """Flux of unit moments along x, y, z at points that are elsewhere in every frame.
 
     Parameters
     ----------
     points : ndarray, shape (F, n, 3)
-    moments : ndarray, shape (F, g, n, 3, K)
     centres, axes : ndarray, shape (F, S, 3)
         Sensors, taken as points.
 
     Returns
     -------
-    ndarray, shape (F, S, K, g)
+    ndarray, shape (F, S, n, 3)
+        T / (A m^2).
     """
     d = centres[:, :, None, :] - points[:, None, :, :]
     r2 = np.einsum('fsni,fsni->fsn', d, d)
     inverse3 = DIPOLE_CONSTANT / (r2 * np.sqrt(r2))
     along = np.einsum('fsni,fsi->fsn', d, axes) * (3 * inverse3 / r2)
     # n . B of a moment m is m . (3 (n.d) d / d^5 - n / d^3).
-    coupling = along[..., None] * d - inverse3[..., None] * axes[:, :, None, :]
-    frames, sensors = centres.shape[:2]
-    left = coupling.reshape(frames, sensors, -1)
-    right = np.moveaxis(moments, 1, -1).reshape(frames, left.shape[2], -1)
-    return (left @ right).reshape(frames, sensors, -1, moments.shape[1])
+    return np.asarray(along[..., None] * d - inverse3[..., None] * axes[:, :, None, :])

@@ -4,6 +4,7 @@ import numpy as np
 
 from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import (
+    FROZEN,
     Array,
     ComplexArray,
     Effect,
@@ -12,117 +13,162 @@ from anser_ros.effects.effect import (
     View,
     needed,
     sigmas,
-)  # fmt: skip
-from anser_ros.effects.metal_body import UNIT, BodyShape, moving_group_flux
+)
+from anser_ros.effects.metal_body import SPHERE_POINTS, SPHERE_WEIGHTS, UNIT, scatterer_coupling
 from anser_ros.fitting.model import EffectRecord
 from anser_ros.physics.constants import MU_0
 
-BALL = BodyShape.ball()
 NODES = 33
 STEP = 1e-3
 SHORTEST = 0.2
+PATH = 9
+"""Number of parameters of the path, before the polarisabilities."""
 
 
-def _progress(theta: Array, time: Array) -> Array:
+def progress(theta: Array, time: Array) -> Array:
     """Share of the way made at each time, 0 to 1."""
+    u = np.clip((time - theta[6]) / max(float(theta[7] - theta[6]), SHORTEST), 0.0, 1.0)
+    return np.asarray(u + theta[8] * u * (1 - u) * (2 * u - 1))
+
+
+def _rates(theta: Array, time: Array) -> tuple[Array, Array, Array]:
+    """Derivative of the progress by start time, end time and ease."""
     span = max(float(theta[7] - theta[6]), SHORTEST)
-    return np.asarray(np.clip((time - theta[6]) / span, 0.0, 1.0))
+    u = np.clip((time - theta[6]) / span, 0.0, 1.0)
+    going = ((u > 0) & (u < 1)).astype(np.float64)
+    speed = going * (1 + theta[8] * (6 * u - 6 * u**2 - 1)) / span
+    return -(1 - u) * speed, -u * speed, u * (1 - u) * (2 * u - 1)
+
+
+def centre_at(theta: Array, time: Array) -> Array:
+    """Centre of the body at each time, shape (F, 3), m."""
+    return np.asarray(theta[:3] + progress(theta, time)[:, None] * (theta[3:6] - theta[:3]))
+
+
+def simple_body() -> tuple[Array, Array]:
+    """Offsets (n, 3) and modes (3 n, 4): the centre along x, y, z, and an isotropic shell."""
+    offsets = np.concatenate([np.zeros((1, 3)), 0.025 * SPHERE_POINTS])
+    count = offsets.shape[0]
+    modes = np.zeros((3, count, 4))
+    modes[[0, 1, 2], 0, [0, 1, 2]] = 1.0
+    modes[:, 1:, 3] = SPHERE_WEIGHTS
+    return offsets, modes.reshape(3 * count, 4)
 
 
 class MovingMetal(Effect):
-    """theta: start (m, 3), end (m, 3), start and end time (s), then polarisabilities.
+    """theta: start and end (m), start and end time (s), ease, then the modes' polarisabilities.
 
-    The centre goes straight and evenly from start to end between the two times and rests before
-    and after; the body doesn't turn.
+    The centre goes straight from start to end between the two times and rests before and after;
+    the body doesn't turn. An ease of 0 is even speed, of 1 a smooth step. The body is a cloud of
+    scatterers (the field along an axis makes a moment along it) in a few fixed combinations.
     """
 
     name = 'moving_metal'
     summary = 'a metal object moves during the session'
-    units = {
-        'start_m': 'm', 'end_m': 'm', 't_start_s': 's', 't_end_s': 's',
+    units = {  # noqa: RUF012
+        'start_m': 'm', 'end_m': 'm', 't_start_s': 's', 't_end_s': 's', 'ease': '1',
         'polarizability': 'm^3 (3x3, [re, im])',
     }  # fmt: skip
-    plausible = {'t_start_s': (0.0, 1e5), 't_end_s': (0.0, 1e5)}
     remedy = Remedy.FIELD
     moving = True
 
     def starting(self, start: Array, end: Array, times: tuple[float, float], alpha: Array) -> Term:
         """A term with one isotropic scatterer (re, im in 1e-4 m^3)."""
-        groups = np.zeros((2, BALL.groups))
-        groups[:, 0] = alpha
-        return Term(self, {}, np.concatenate([start, end, times, groups.ravel()]))
+        offsets, modes = simple_body()
+        amplitudes = np.zeros((2, modes.shape[1]))
+        amplitudes[:, :3] = np.asarray(alpha)[:, None]
+        theta = np.concatenate([start, end, times, [0.5], amplitudes.ravel()])
+        return Term(self, {'_offsets': offsets, '_modes': modes, '_size': 10.0}, theta)
+
+    def with_body(self, term: Term, offsets: Array, modes: Array, size: float) -> Term:
+        """The same path, another body, whose amplitudes (prior ``size``) are still zero."""
+        site = {**term.site, '_offsets': offsets, '_modes': modes, '_size': size}
+        return Term(self, site, np.concatenate([term.theta[:PATH], np.zeros(2 * modes.shape[1])]))
 
     def prior(self, term: Term) -> Array:
-        """Anywhere, any time."""
-        return np.concatenate([np.full(6, 0.1), np.full(2, 10.0), np.full(2 * BALL.groups, 10.0)])
+        """Anywhere, any time. Frozen metal stays on its path."""
+        path = np.concatenate([np.full(6, 0.1), np.full(2, 10.0), [0.5]])
+        if term.site.get('_frozen'):
+            path = np.full(PATH, FROZEN)
+        count = term.theta.size - PATH
+        return np.concatenate([path, np.full(count, float(term.site['_size']))])
 
     def bounded(self, term: Term) -> Term:
-        """The end comes after the start."""
+        """The end comes after the start, and the body never goes back."""
         theta = term.theta.copy()
         theta[7] = max(theta[7], theta[6] + SHORTEST)
+        theta[8] = np.clip(theta[8], -0.5, 1.2)
         return term.with_theta(theta)
 
-    def _groups(self, theta: Array, view: View, shift: Array) -> ComplexArray:
-        """Flux of every group's unit polarisability, (F, S, K, g)."""
+    def _amplitudes(self, term: Term) -> ComplexArray:
+        parts = term.theta[PATH:].reshape(2, -1)
+        return np.asarray(parts[0] + 1j * parts[1])
+
+    def _lit(self, term: Term, view: View, shift: Array) -> ComplexArray:
+        """Flux of each single scatterer of 1e-4 m^3, shape (F, S, K, 3 n)."""
+        theta, offsets = term.theta, term.site['_offsets']
         nodes = np.linspace(0.0, 1.0, NODES)
         path = theta[:3] + nodes[:, None] * (theta[3:6] - theta[:3]) + shift
-        points = path[:, None, :] + BALL.offsets
-        field = view.illumination.field(points.reshape(-1, 3))
-        field = field.reshape(*points.shape, -1)
-        share = _progress(theta, view.time) * (NODES - 1)
+        grid = path[:, None, :] + offsets
+        field = view.illumination.field(grid.reshape(-1, 3)).reshape(*grid.shape, -1)
+        share = np.clip(progress(theta, view.time), 0.0, 1.0) * (NODES - 1)
         left = np.minimum(share.astype(int), NODES - 2)
         part = (share - left)[:, None, None, None]
         at = field[left] * (1 - part) + field[left + 1] * part
-        where = points[left] * (1 - part[..., 0]) + points[left + 1] * part[..., 0]
-        moments = np.einsum('gnij,fnjk->fgnik', BALL.tensors, at, optimize=True) * (UNIT / MU_0)
-        return moving_group_flux(where, moments, view.centres, view.axes)
+        points = grid[left] * (1 - part[..., 0]) + grid[left + 1] * part[..., 0]
+        coupling = scatterer_coupling(points, view.centres, view.axes)
+        frames, sensors = view.centres.shape[:2]
+        # Axis by axis: (F, S, 3 n) against (F, K, 3 n).
+        coupling = np.moveaxis(coupling, 3, 2).reshape(frames, sensors, 1, -1)
+        driven = np.transpose(at, (0, 3, 2, 1)).reshape(frames, 1, at.shape[3], -1)
+        return np.asarray(coupling * driven * (UNIT / MU_0))
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """By path (differences, chained) and by polarisability (exact)."""
-        theta, alpha = term.theta, term.theta[8:]
-        unit = self._groups(theta, view, np.zeros(3))
+        theta, modes = term.theta, term.site['_modes']
+        unit = self._lit(term, view, np.zeros(3)) @ modes
         groups = unit.shape[-1]
         out = view.columns(theta.size)
-        out[..., 8 : 8 + groups], out[..., 8 + groups :] = unit, 1j * unit
-        weights = alpha.reshape(2, -1)[0] + 1j * alpha.reshape(2, -1)[1]
+        out[..., PATH : PATH + groups], out[..., PATH + groups :] = unit, 1j * unit
+        if term.site.get('_frozen'):
+            return out
+        weights = modes @ self._amplitudes(term)
         by_place = np.stack(
             [
-                (
-                    self._groups(theta, view, step) @ weights
-                    - self._groups(theta, view, -step) @ weights
-                )
-                / (2 * STEP)
+                (self._lit(term, view, step) - self._lit(term, view, -step)) @ weights / (2 * STEP)
                 for step in STEP * np.eye(3)
             ],
             axis=-1,
         )
-        share = _progress(theta, view.time)
-        way, span = theta[3:6] - theta[:3], max(float(theta[7] - theta[6]), SHORTEST)
-        going = ((share > 0) & (share < 1)).astype(np.float64)
-        out[..., :3] = by_place * (1 - share)[:, None, None, None]
-        out[..., 3:6] = by_place * share[:, None, None, None]
-        along = by_place @ way
-        out[..., 6] = along * (-(1 - share) * going / span)[:, None, None]
-        out[..., 7] = along * (-share * going / span)[:, None, None]
+        share = progress(theta, view.time)[:, None, None, None]
+        out[..., :3], out[..., 3:6] = by_place * (1 - share), by_place * share
+        along = by_place @ (theta[3:6] - theta[:3])
+        for i, rate in enumerate(_rates(theta, view.time)):
+            out[..., 6 + i] = along * rate[:, None, None]
         return out
+
+    def moving_flux(self, term: Term, view: View) -> ComplexArray:
+        """What the body adds to a view."""
+        weights = term.site['_modes'] @ self._amplitudes(term)
+        return np.asarray(self._lit(term, view, np.zeros(3)) @ weights)
+
+    def _strength(self, term: Term) -> ComplexArray:
+        """Polarisability of each scatterer along each axis, shape (n, 3), m^3."""
+        weights = term.site['_modes'] @ self._amplitudes(term)
+        return np.asarray(weights.reshape(3, -1).T * UNIT)
 
     def sources_at(
         self, term: Term, illumination: Dipoles, omega: Array, time: float
     ) -> Dipoles | None:
         """Induced dipoles with the body where it is."""
-        share = float(_progress(term.theta, np.array([time]))[0])
-        centre = term.theta[:3] + share * (term.theta[3:6] - term.theta[:3])
-        return BALL.sources(centre, term.theta[8:], illumination)
-
-    def moving_flux(self, term: Term, view: View) -> ComplexArray:
-        """What the body adds to a view."""
-        parts = term.theta[8:].reshape(2, -1)
-        unit = self._groups(term.theta, view, np.zeros(3))
-        return np.asarray(unit @ (parts[0] + 1j * parts[1]))
+        points = centre_at(term.theta, np.array([time]))[0] + term.site['_offsets']
+        moments = illumination.field(points) * self._strength(term)[..., None] / MU_0
+        return Dipoles.vectors(points, moments)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Path, times and whole polarisability."""
-        total, sigma = BALL.total(term.theta[8:]), sigmas(covariance)
+        sigma, total = sigmas(covariance), np.diag(self._strength(term).sum(axis=0))
+        strength = self._strength(term)
         return EffectRecord(
             self.name,
             {
@@ -130,28 +176,36 @@ class MovingMetal(Effect):
                 'end_m': term.theta[3:6].tolist(),
                 't_start_s': float(term.theta[6]),
                 't_end_s': float(term.theta[7]),
+                'ease': float(term.theta[8]),
                 'polarizability': np.stack([total.real, total.imag], axis=-1).tolist(),
-                'groups': (UNIT * term.theta[8:]).tolist(),
+                'scatterers_m': term.site['_offsets'].tolist(),
+                'scatterers_m3': np.stack([strength.real, strength.imag], axis=-1).tolist(),
             },
             {
                 'start_m': sigma[:3].tolist(),
                 'end_m': sigma[3:6].tolist(),
                 't_start_s': float(sigma[6]),
                 't_end_s': float(sigma[7]),
+                'ease': float(sigma[8]),
             },
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """From path, times and groups."""
+        """From path, times and scatterers."""
+        offsets = np.asarray(needed(record, 'scatterers_m'), dtype=np.float64)
+        strength = np.asarray(needed(record, 'scatterers_m3'), dtype=np.float64) / UNIT
+        flat = strength.transpose(1, 0, 2).reshape(-1, 2)
         theta = np.concatenate(
             [
                 np.asarray(needed(record, 'start_m'), dtype=np.float64),
                 np.asarray(needed(record, 'end_m'), dtype=np.float64),
                 [float(needed(record, 't_start_s')), float(needed(record, 't_end_s'))],
-                np.asarray(needed(record, 'groups'), dtype=np.float64) / UNIT,
+                [float(record.parameters.get('ease', 0.0))],
+                flat.T.ravel(),
             ]
         )
-        return Term(self, {}, theta)
+        site = {'_offsets': offsets, '_modes': np.eye(flat.shape[0]), '_size': 10.0}
+        return Term(self, site, theta)
 
 
 EFFECTS = (MovingMetal(),)

@@ -1,15 +1,14 @@
 """A channel compresses large signals.
 
-The amplifier sees the sum of all tones, v(t), and gives fs tanh(v / fs). To third order this takes
-``(S / 2 - |V_k|^2 / 4) / fs^2`` of tone k away, where S is the sum of the squared amplitudes of all
-tones (trigonometric products of independent phases): the other tones count twice.
+The amplifier sees the sum of all tones, v(t), and gives fs tanh(v / fs), or its first two terms
+v - v^3 / (3 fs^2). The cube takes ``(S / 2 - |V_k|^2 / 4) / fs^2`` of tone k away, where S is the
+sum of the squared amplitudes of all tones, of independent phases: the other tones count twice.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from anser_ros.effects.effect import (
     Array,
@@ -25,7 +24,9 @@ from anser_ros.fitting.model import EffectRecord
 
 UNIT = 1e12
 """theta counts 1/fs^2 in units of 1/uT^2."""
-PHASES = 64
+POINTS, GENERATOR = 1021, 331
+"""Size and generator of the lattice of phases (Korobov)."""
+SHAPES = ('cubic', 'tanh')
 
 
 def third_order(flux: ComplexArray) -> ComplexArray:
@@ -35,21 +36,21 @@ def third_order(flux: ComplexArray) -> ComplexArray:
     return np.asarray(-(0.5 * total - 0.25 * squared) * flux)
 
 
-def compressed(flux: ComplexArray, per_full_scale_squared: float) -> ComplexArray:
-    """Amplitudes (..., K) behind fs tanh(v / fs), averaged over the phases of the tones.
+def compressed(flux: ComplexArray, per_full_scale_squared: float, shape: str) -> ComplexArray:
+    """Amplitudes (..., K) behind the amplifier, averaged over the phases of the tones.
 
-    The third order is exact; what lies above it is an average over a fixed set of phases.
+    The third order is exact; what lies above it is an average over a fixed lattice of phases.
     """
-    if per_full_scale_squared <= 0.0:
-        return np.asarray(flux + per_full_scale_squared * third_order(flux))
-    emitters = flux.shape[-1]
+    third = flux + per_full_scale_squared * third_order(flux)
+    if shape == 'cubic' or per_full_scale_squared <= 0.0:
+        return np.asarray(third)
     full_scale = 1 / np.sqrt(per_full_scale_squared)
-    phase = 2 * np.pi * qmc.Sobol(emitters, scramble=False).random(PHASES)
+    steps = np.array([pow(GENERATOR, k, POINTS) for k in range(flux.shape[-1])])
+    phase = 2 * np.pi * ((np.arange(POINTS)[:, None] * steps) % POINTS) / POINTS
     turn = np.exp(1j * phase)
-    x = np.einsum('...k,pk->...p', flux / full_scale, turn).real
+    x = ((flux / full_scale) @ turn.T).real
     rest = full_scale * (np.tanh(x) - x + x**3 / 3)
-    average = np.einsum('...p,pk->...k', rest, turn.conj()) * 2 / PHASES
-    return np.asarray(flux + per_full_scale_squared * third_order(flux) + average)
+    return np.asarray(third + (rest @ turn.conj()) * (2 / POINTS))
 
 
 class Saturation(Effect):
@@ -57,13 +58,17 @@ class Saturation(Effect):
 
     name = 'saturation'
     summary = 'a channel compresses large signals'
-    units = {'channel': '1', 'full_scale_t': 'T'}
+    units = {'channel': '1', 'full_scale_t': 'T', 'shape': 'name of the curve'}
     plausible = {'full_scale_t': (1e-8, 1e-3)}
     remedy = Remedy.FLUX
 
     def candidates(self, scene: Scene) -> Sequence[Term]:
         """Every channel of a tool; references don't see signals of different size."""
-        return [Term(self, {'channel': c}, np.zeros(1)) for c in scene.tool_channels]
+        return [
+            Term(self, {'channel': c, 'shape': shape}, np.zeros(1))
+            for c in scene.tool_channels
+            for shape in SHAPES
+        ]
 
     def prior(self, term: Term) -> Array:
         """Full scales down to the size of the signals."""
@@ -79,8 +84,8 @@ class Saturation(Effect):
             out[:, row, :, 0] = UNIT * third_order(own)
         else:
             step = 0.01 * term.theta[0]
-            more = compressed(own, UNIT * (term.theta[0] + step))
-            less = compressed(own, UNIT * (term.theta[0] - step))
+            more = compressed(own, UNIT * (term.theta[0] + step), term.site['shape'])
+            less = compressed(own, UNIT * (term.theta[0] - step), term.site['shape'])
             out[:, row, :, 0] = (more - less) / (2 * step)
         return out
 
@@ -90,7 +95,7 @@ class Saturation(Effect):
         """The channel behind its amplifier."""
         out = flux.copy()
         for row in np.flatnonzero(channels == term.site['channel']):
-            out[:, row] = compressed(flux[:, row], UNIT * float(term.theta[0]))
+            out[:, row] = compressed(flux[:, row], UNIT * float(term.theta[0]), term.site['shape'])
         return out
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
@@ -100,14 +105,19 @@ class Saturation(Effect):
         relative = 0.5 * float(np.sqrt(covariance[0, 0])) / value
         return EffectRecord(
             self.name,
-            {'channel': term.site['channel'], 'full_scale_t': float(full_scale)},
+            {
+                'channel': term.site['channel'],
+                'full_scale_t': float(full_scale),
+                'shape': term.site['shape'],
+            },
             {'full_scale_t': float(full_scale * relative)},
         )
 
     def term(self, record: EffectRecord) -> Term:
         """From the full scale."""
         full_scale = float(needed(record, 'full_scale_t'))
-        site = {'channel': int(needed(record, 'channel'))}
+        shape = str(record.parameters.get('shape', SHAPES[0]))
+        site = {'channel': int(needed(record, 'channel')), 'shape': shape}
         return Term(self, site, np.array([1 / (UNIT * full_scale**2)]))
 
 

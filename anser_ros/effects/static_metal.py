@@ -7,6 +7,7 @@ import numpy as np
 
 from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import (
+    FROZEN,
     Array,
     ComplexArray,
     Effect,
@@ -69,8 +70,9 @@ class StaticMetal(Effect):
         ]
 
     def prior(self, term: Term) -> Array:
-        """Anywhere; a few litres of metal at most."""
-        return np.concatenate([np.full(3, 0.1), np.full(2 * BALL.groups, 10.0)])
+        """Anywhere; a few litres of metal at most. Frozen metal stays at its place."""
+        place = FROZEN if term.site.get('_frozen') else 0.1
+        return np.concatenate([np.full(3, place), np.full(2 * BALL.groups, 10.0)])
 
     def _flux(self, centre: Array, alpha: Array, view: View) -> ComplexArray:
         return BALL.sources(centre, alpha, view.illumination).flux(*view.flat)

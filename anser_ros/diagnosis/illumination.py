@@ -1,0 +1,90 @@
+"""The emitters' own field where no tool sensor ever was: beside the board and below it.
+
+A calibrated model is only as good as its data: it may be any field at the places of metal and of
+reference sensors. Currents in a board make a sheet of vertical dipoles in its plane, so such a sheet
+is fitted to the model inside the volume and to the references' clean readings, starting from the
+drawn board where the setup draws one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.dipoles import Dipoles
+from anser_ros.fitting.model import FieldModel
+from anser_ros.physics.dipole import field_basis, flux_basis
+from anser_ros.physics.sensor import SensorTable
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+VOLUME_ERROR = 1e-3
+REFERENCE_ERROR = 4e-3
+"""Relative errors that the fit allows: of the model in the volume, of a reference's survey."""
+DRAWING_ERROR = 0.05
+"""Prior spread of the sheet's moments about the drawn ones, as a share of their rms."""
+
+
+@dataclass(frozen=True)
+class CleanReferences:
+    """Reference sensors and their clean readings, shape (R, K), T."""
+
+    sensors: SensorTable
+    flux: ComplexArray
+
+
+def board_box(model: FieldModel) -> Array:
+    """Lower and upper corner of the model's dipoles that carry the field, shape (2, 3), m."""
+    strength = np.abs(model.moments).max(axis=1)
+    used = model.positions[strength > 1e-3 * strength.max()]
+    return np.stack([used.min(axis=0), used.max(axis=0)])
+
+
+def fit_illumination(
+    model: FieldModel,
+    drawn: FieldModel | None,
+    points: Array,
+    references: CleanReferences | None,
+) -> Dipoles:
+    """A sheet of dipoles that is good in the volume, at the references and below the board.
+
+    Parameters
+    ----------
+    model : FieldModel
+        Trusted at ``points``.
+    drawn : FieldModel or None
+        The nominal model of the setup's geometry; None where it has none, and the model itself is
+        all that there is.
+    points : ndarray, shape (P, 3)
+        Some places in the volume, m.
+    references : CleanReferences or None
+    """
+    if drawn is None:
+        return Dipoles(model.positions, model.directions, model.moments)
+    place, direction = drawn.positions, drawn.directions
+    basis = field_basis(points, place, direction).transpose(0, 2, 1).reshape(-1, len(place))
+    wanted = Dipoles(model.positions, model.directions, model.moments).field(points)
+    wanted = wanted.reshape(-1, wanted.shape[2])
+    start = drawn.moments * _gains(basis @ drawn.moments, wanted)
+    scale = VOLUME_ERROR * np.sqrt(np.mean(np.abs(wanted) ** 2))
+    rows, values = [basis / scale], [(wanted - basis @ start) / scale]
+    if references is not None:
+        good = np.isfinite(references.flux).all(axis=1)
+        s = references.sensors.select(good)
+        sheet = flux_basis(s.position, s.axis, s.length, place, direction)
+        clean = references.flux[good]
+        weight = REFERENCE_ERROR * np.sqrt(np.mean(np.abs(clean) ** 2))
+        rows.append(sheet / weight)
+        values.append((clean - sheet @ start) / weight)
+    spread = DRAWING_ERROR * np.sqrt(np.mean(np.abs(start) ** 2))
+    matrix, target = np.concatenate(rows) * spread, np.concatenate(values)
+    normal = matrix.T @ matrix + np.eye(len(place))
+    change = np.linalg.solve(normal, matrix.T @ target) * spread
+    return Dipoles(place, direction, start + change)
+
+
+def _gains(drawn: ComplexArray, wanted: ComplexArray) -> ComplexArray:
+    """Complex gain of each emitter that brings the drawn field nearest to the wanted one."""
+    power = np.sum(np.abs(drawn) ** 2, axis=0)
+    return np.asarray(np.sum(drawn.conj() * wanted, axis=0) / np.where(power > 0, power, 1.0))

@@ -1,0 +1,156 @@
+"""From measurements to a problem: bins of reference readings, time blocks, and what stays unseen."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.diagnosis.illumination import CleanReferences, board_box, fit_illumination
+from anser_ros.diagnosis.problem import Problem, References
+from anser_ros.diagnosis.whitening import Spread
+from anser_ros.effects.dipoles import Dipoles
+from anser_ros.effects.effect import Scene
+from anser_ros.effects.prediction import Fields
+from anser_ros.errors import DiagnosisError
+from anser_ros.fitting.measurements import Measurements
+from anser_ros.fitting.model import FieldModel
+from anser_ros.physics.sensor import SensorTable
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+BLOCKS = 25
+TEST_EVERY = 5
+"""One block of five never takes part in choosing or fitting."""
+BINS_PER_BLOCK = 2
+FEWEST_FRAMES = 30
+POINTS = 250
+MARGIN_S = 0.15
+
+
+def test_blocks() -> NDArray[np.int64]:
+    """Numbers of the blocks that are held out to the end."""
+    return np.arange(TEST_EVERY // 2, BLOCKS, TEST_EVERY)
+
+
+def train_blocks() -> NDArray[np.int64]:
+    """Numbers of the blocks that effects are chosen and fitted on."""
+    return np.setdiff1d(np.arange(BLOCKS), test_blocks())
+
+
+def build_problem(
+    tools: Sequence[Measurements],
+    reference: Measurements | None,
+    baseline: ComplexArray | None,
+    model: FieldModel,
+    drawn: FieldModel | None,
+    spread: Spread,
+) -> Problem:
+    """Set up the diagnosis of a session.
+
+    Parameters
+    ----------
+    tools : sequence of Measurements
+        Bodies without an optical pose are left out.
+    reference : Measurements or None
+    baseline : ndarray, shape (R, K), complex, or None
+        Clean readings of the reference sensors (NaN where there are none); without them the
+        references say nothing.
+    model : FieldModel
+    drawn : FieldModel or None
+        The nominal model of the setup, if its kind of emitter has one.
+    spread : Spread
+
+    Raises
+    ------
+    DiagnosisError
+        When fewer than 30 frames have fluxes and a pose.
+    """
+    posed = tuple(t for t in (_with_pose(tool) for tool in tools) if t.time.size)
+    count = sum(tool.time.size for tool in posed)
+    if count < FEWEST_FRAMES:
+        raise DiagnosisError(
+            f'a diagnosis needs at least {FEWEST_FRAMES} frames with an optical pose, got {count}'
+        )
+    ends = [tool.time for tool in posed]
+    start, end = min(t[0] for t in ends), max(t[-1] for t in ends)
+    edges = np.linspace(start, end + 1e-9, BLOCKS + 1)
+    references, reference_blocks = None, np.zeros(0, dtype=np.int64)
+    if reference is not None and baseline is not None:
+        references = _binned(reference, baseline, edges)
+    if references is not None:
+        reference_blocks = _numbers(references.readings.time, edges)
+    centres = np.concatenate([tool.placed()[0].reshape(-1, 3) for tool in posed])
+    clean = None
+    if references is not None:
+        clean = CleanReferences(references.readings.sensors, references.baseline)
+    some = centres[:: max(1, centres.shape[0] // POINTS)]
+    illumination = fit_illumination(model, drawn, some, clean)
+    omega = 2 * np.pi * np.asarray(model.frequencies_hz)
+    fields = Fields(Dipoles(model.positions, model.directions, model.moments), illumination, omega)
+    scene = Scene(
+        tools=tuple(tool.sensors for tool in posed),
+        references=None if references is None else references.readings.sensors,
+        emitters=omega.size,
+        omega=omega,
+        duration=float(end - start),
+        illumination=illumination,
+        working_volume=np.stack([centres.min(axis=0), centres.max(axis=0)]),
+        board=board_box(drawn or model),
+    )
+    blocks = tuple(_numbers(tool.time, edges) for tool in posed)
+    good = tuple(tool.valid.copy() for tool in posed)
+    return Problem(posed, blocks, references, reference_blocks, fields, scene, spread, good)
+
+
+def _numbers(time: Array, edges: Array) -> NDArray[np.int64]:
+    return np.clip(np.searchsorted(edges, time, side='right') - 1, 0, BLOCKS - 1)
+
+
+def _with_pose(tool: Measurements) -> Measurements:
+    keep = tool.has_pose & tool.valid.any(axis=1)
+    if tool.track is not None and tool.track.time.size > 1:
+        track = tool.track
+        keep &= (tool.time >= track.time[0] - MARGIN_S) & (tool.time <= track.time[-1] + MARGIN_S)
+    return tool.frames(np.flatnonzero(keep))
+
+
+def _binned(reference: Measurements, baseline: ComplexArray, edges: Array) -> References | None:
+    """Means over equal bins of time, two a block."""
+    known = np.isfinite(baseline).all(axis=1) & reference.valid.any(axis=0)
+    if not known.any():
+        return None
+    readings = reference.sensors_only(np.flatnonzero(known))
+    fine = np.interp(
+        np.linspace(0, BLOCKS, BINS_PER_BLOCK * BLOCKS + 1), np.arange(BLOCKS + 1), edges
+    )
+    inside = (readings.time >= fine[0]) & (readings.time < fine[-1])
+    readings = readings.frames(np.flatnonzero(inside))
+    number = np.searchsorted(fine, readings.time, side='right') - 1
+    flux, count, time = [], [], []
+    for bin_number in np.unique(number):
+        rows = number == bin_number
+        good = readings.valid[rows]
+        n = good.sum(axis=0)
+        total = np.where(good[..., None], readings.flux[rows], 0.0).sum(axis=0)
+        flux.append(total / np.maximum(n, 1)[:, None])
+        count.append(n)
+        time.append(float(readings.time[rows].mean()))
+    n_bins = len(time)
+    if n_bins == 0:
+        return None
+    counts = np.array(count)
+    binned = Measurements(
+        body=readings.body, sensors=readings.sensors, time=np.array(time), flux=np.array(flux),
+        valid=counts > 0, flags=np.zeros(counts.shape, dtype=np.int64),
+        position=np.zeros((n_bins, 3)), rotation=np.broadcast_to(np.eye(3), (n_bins, 3, 3)),
+        has_pose=np.ones(n_bins, dtype=bool),
+    )  # fmt: skip
+    return References(binned, counts.astype(np.float64), baseline[known])
+
+
+def sensors_of(tables: Sequence[SensorTable]) -> dict[int, str]:
+    """Name of each channel."""
+    return {
+        int(c): name for table in tables for c, name in zip(table.channel, table.name, strict=True)
+    }

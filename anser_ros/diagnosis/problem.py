@@ -1,0 +1,182 @@
+"""A session set up for diagnosis: what was measured, what is expected, and the rows in blocks."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.diagnosis.whitening import Spread, Whitener, parts, pose_jacobian
+from anser_ros.effects.effect import Scene, Term, View
+from anser_ros.effects.prediction import Fields, reference_view, tool_view
+from anser_ros.fitting.measurements import Measurements
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+Mask = NDArray[np.bool_]
+
+SURVEY_ERROR = 0.01
+"""Relative error of a change that a surveyed reference sensor sees (0.2 mm, 0.3 deg, 0.4 %)."""
+
+
+@dataclass(frozen=True)
+class References:
+    """Reference readings as means over short bins, with their clean baseline.
+
+    Attributes
+    ----------
+    readings : Measurements
+        One frame a bin; ``valid`` where the bin has any reading.
+    count : ndarray, shape (B, R)
+        Readings in each mean.
+    baseline : ndarray, shape (R, K), complex
+    """
+
+    readings: Measurements
+    count: Array
+    baseline: ComplexArray
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Everything that a diagnosis starts from.
+
+    Attributes
+    ----------
+    tools : tuple of Measurements
+        Frames with a pose only.
+    blocks : tuple of ndarray of int, one a tool, shape (F,)
+        Number of the time block that each frame is in.
+    references : References or None
+    reference_blocks : ndarray of int, shape (B,)
+    fields : Fields
+    scene : Scene
+    spread : Spread
+    good : tuple of ndarray of bool, one a tool, shape (F, S)
+        Values that take part (valid, and no outliers).
+    """
+
+    tools: tuple[Measurements, ...]
+    blocks: tuple[NDArray[np.int64], ...]
+    references: References | None
+    reference_blocks: NDArray[np.int64]
+    fields: Fields
+    scene: Scene
+    spread: Spread
+    good: tuple[Mask, ...]
+
+    def frames(self, keep: Sequence[NDArray[np.generic]], bins: NDArray[np.generic]) -> 'Problem':
+        """The frames of each tool, and the bins, that are named by index or mask."""
+        references = self.references
+        if references is not None:
+            references = References(
+                references.readings.frames(bins), references.count[bins], references.baseline
+            )
+        return replace(
+            self,
+            tools=tuple(tool.frames(rows) for tool, rows in zip(self.tools, keep, strict=True)),
+            blocks=tuple(b[rows] for b, rows in zip(self.blocks, keep, strict=True)),
+            good=tuple(g[rows] for g, rows in zip(self.good, keep, strict=True)),
+            references=references,
+            reference_blocks=self.reference_blocks[bins],
+        )
+
+    def in_blocks(self, wanted: NDArray[np.int64], step: int = 1) -> 'Problem':
+        """Every ``step``-th frame of some blocks; bins of those blocks."""
+        keep = []
+        for blocks in self.blocks:
+            rows = np.flatnonzero(np.isin(blocks, wanted))
+            keep.append(rows[::step])
+        return self.frames(keep, np.flatnonzero(np.isin(self.reference_blocks, wanted)))
+
+
+@dataclass(frozen=True)
+class Part:
+    """One body's prediction, residual and whitener at one state."""
+
+    view: View
+    residual: Array
+    whitener: Whitener
+    white: Array
+    blocks: NDArray[np.int64]
+
+    @property
+    def count(self) -> int:
+        """Values that count."""
+        return int(np.count_nonzero(self.whitener.weight))
+
+
+@dataclass(frozen=True)
+class State:
+    """A problem with a list of effects in force."""
+
+    problem: Problem
+    terms: tuple[Term, ...]
+    parts: tuple[Part, ...]
+
+    @property
+    def white(self) -> Array:
+        """All whitened residuals in one vector."""
+        return np.concatenate([part.white.ravel() for part in self.parts])
+
+    @property
+    def sum_of_squares(self) -> float:
+        """Of the whitened residuals."""
+        return float(sum(np.sum(part.white**2) for part in self.parts))
+
+    @property
+    def count(self) -> int:
+        """Values that count."""
+        return sum(part.count for part in self.parts)
+
+    def design(self, term: Term, probe: bool = False) -> list[Array | None]:
+        """Whitened columns of a term, one array (F, n, q) a part, None where it has none."""
+        columns = []
+        for part in self.parts:
+            find = term.effect.probe if probe else term.effect.columns
+            raw = find(term, part.view)
+            columns.append(None if raw is None else part.whitener(parts(raw)))
+        return columns
+
+
+def evaluate(problem: Problem, terms: Sequence[Term]) -> State:
+    """Predict and compare."""
+    found = []
+    for tool, blocks, good in zip(problem.tools, problem.blocks, problem.good, strict=True):
+        if tool.time.size == 0:
+            continue
+        view = tool_view(tool, terms, problem.fields)
+        residual = parts(np.where(good[..., None], tool.flux - view.flux, 0.0))
+        weight = _repeat(good / problem.spread.flux_t, tool.flux.shape[2])
+        whitener = Whitener.of(weight, pose_jacobian(view), problem.spread)
+        found.append(Part(view, residual, whitener, whitener(residual), blocks))
+    if problem.references is not None and problem.references.readings.time.size:
+        found.append(_reference_part(problem, problem.references, terms))
+    return State(problem, tuple(terms), tuple(found))
+
+
+def _repeat(per_sensor: Array, emitters: int) -> Array:
+    """Weights (F, S) for all parts of a sensor, (F, 2 S K)."""
+    one = np.repeat(per_sensor, emitters, axis=1)
+    return np.concatenate([one, one], axis=1)
+
+
+def _reference_part(problem: Problem, references: References, terms: Sequence[Term]) -> Part:
+    readings = references.readings
+    view = reference_view(readings, references.baseline, terms, problem.fields)
+    good = readings.valid
+    residual = parts(np.where(good[..., None], readings.flux - view.flux, 0.0))
+    # A survey error is the same in every bin: shared among B bins it must count B times as much.
+    exact = [term for term in terms if not _on_field(term)]
+    unchanged = reference_view(readings, references.baseline, exact, problem.fields)
+    change = np.where(good[..., None], readings.flux - unchanged.flux, 0.0)
+    size = np.sqrt(np.mean(np.abs(change) ** 2, axis=2) / 2)
+    noise = problem.spread.flux_t / np.sqrt(np.maximum(references.count, 1))
+    survey = SURVEY_ERROR * size * np.sqrt(readings.time.size)
+    weight = np.where(good, 1 / np.sqrt(noise**2 + survey**2), 0.0)
+    whitener = Whitener(_repeat(weight, view.omega.size))
+    return Part(view, residual, whitener, whitener(residual), problem.reference_blocks)
+
+
+def _on_field(term: Term) -> bool:
+    return term.effect.remedy.name == 'FIELD'

@@ -1,0 +1,198 @@
+"""Cross-validated worth of groups of columns, from sums over time blocks."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.diagnosis.problem import State
+from anser_ros.effects.effect import Term
+
+Array = NDArray[np.float64]
+Columns = Sequence[Array | None]
+
+
+@dataclass(frozen=True)
+class BlockSums:
+    """Normal equations of some columns and the residual, block by block.
+
+    Attributes
+    ----------
+    normal : ndarray, shape (B, q, q)
+    right : ndarray, shape (B, q)
+    squares : ndarray, shape (B,)
+        Sum of the squared residuals.
+    """
+
+    normal: Array
+    right: Array
+    squares: Array
+
+    @property
+    def size(self) -> int:
+        """Number of columns."""
+        return int(self.right.shape[1])
+
+    def part(self, rows: NDArray[np.int64]) -> 'BlockSums':
+        """The sums of some blocks, by index."""
+        return BlockSums(self.normal[rows], self.right[rows], self.squares[rows])
+
+    def solve(self, prior: Array) -> tuple[Array, Array]:
+        """Estimate and covariance with a Gaussian prior about zero (standard deviations (q,))."""
+        return _solve(self.normal.sum(axis=0), self.right.sum(axis=0), prior)
+
+    def step(self, prior: Array, damping: float) -> Array:
+        """Estimate with the diagonal raised by a share ``damping`` of itself (Marquardt)."""
+        normal = self.normal.sum(axis=0)
+        raised = normal + damping * np.diag(np.diag(normal))
+        return _solve(raised, self.right.sum(axis=0), prior)[0]
+
+    def held_out(self, prior: Array, folds: int) -> float:
+        """Sum of squared residuals of each fold, predicted from the others."""
+        if self.size == 0:
+            return float(self.squares.sum())
+        total_normal, total_right = self.normal.sum(axis=0), self.right.sum(axis=0)
+        left = 0.0
+        number = np.arange(self.squares.size) % folds
+        for fold in range(folds):
+            rows = number == fold
+            normal, right = self.normal[rows].sum(axis=0), self.right[rows].sum(axis=0)
+            estimate, _ = _solve(total_normal - normal, total_right - right, prior)
+            left += float(
+                self.squares[rows].sum() - 2 * right @ estimate + estimate @ normal @ estimate
+            )
+        return left
+
+
+def _solve(normal: Array, right: Array, prior: Array) -> tuple[Array, Array]:
+    """Scaled, with the prior added."""
+    full = normal + np.diag(1 / prior**2)
+    scale = 1 / np.sqrt(np.diag(full))
+    inverse = np.linalg.pinv(full * scale[:, None] * scale[None, :], rcond=1e-13, hermitian=True)
+    covariance = inverse * scale[:, None] * scale[None, :]
+    return covariance @ right, covariance
+
+
+def block_sums(state: State, columns: Columns, block_numbers: NDArray[np.int64]) -> BlockSums:
+    """Sums over the blocks that are listed.
+
+    Parameters
+    ----------
+    state : State
+    columns : one array (F, n, q) or None a part of the state
+    block_numbers : ndarray, shape (B,)
+    """
+    widths = [c.shape[2] for c in columns if c is not None]
+    size = widths[0] if widths else 0
+    normal = np.zeros((block_numbers.size, size, size))
+    right = np.zeros((block_numbers.size, size))
+    squares = np.zeros(block_numbers.size)
+    for part, column in zip(state.parts, columns, strict=True):
+        for i, number in enumerate(block_numbers):
+            rows = part.blocks == number
+            if not rows.any():
+                continue
+            white = part.white[rows].ravel()
+            squares[i] += white @ white
+            if column is not None:
+                flat = column[rows].reshape(-1, size)
+                normal[i] += flat.T @ flat
+                right[i] += flat.T @ white
+    return BlockSums(normal, right, squares)
+
+
+def joined(groups: Sequence[Columns]) -> list[Array | None]:
+    """Columns of several groups side by side; zeros where a group has none."""
+    out: list[Array | None] = []
+    for pieces in zip(*groups, strict=True):
+        known = [p for p in pieces if p is not None]
+        if not known:
+            out.append(None)
+            continue
+        rows = known[0].shape[:2]
+        widths = [_width(group) for group in groups]
+        out.append(
+            np.concatenate(
+                [
+                    np.zeros((*rows, width)) if p is None else p
+                    for p, width in zip(pieces, widths, strict=True)
+                ],
+                axis=2,
+            )
+        )
+    return out
+
+
+def _width(group: Columns) -> int:
+    return next((c.shape[2] for c in group if c is not None), 0)
+
+
+@dataclass(frozen=True)
+class Score:
+    """What one candidate is worth beside the effects that are in force.
+
+    Attributes
+    ----------
+    held_out : float
+        Sum of squares of the held-out residuals with the candidate.
+    solution : ndarray, shape (q,)
+        The candidate's columns' coefficients, the effects in force refitted.
+    own : BlockSums
+        Of the candidate alone.
+    """
+
+    held_out: float
+    solution: Array
+    own: BlockSums
+
+
+class Scorer:
+    """Scores candidates against one state; the sums of the effects in force are made once."""
+
+    def __init__(self, state: State, blocks: NDArray[np.int64], folds: int) -> None:
+        self.state, self.blocks, self.folds = state, blocks, folds
+        terms = state.terms
+        self._active = joined([state.design(t) for t in terms]) if terms else None
+        self.prior = np.concatenate([t.effect.prior(t) for t in terms] or [np.zeros(0)])
+        empty: list[Array | None] = [None] * len(state.parts)
+        self.sums = block_sums(state, self._active or empty, blocks)
+        self.held_out = self.sums.held_out(self.prior, folds)
+
+    def score(self, term: 'Term') -> Score | None:
+        """Worth of a candidate; None when it touches no value."""
+        probe = self.state.design(term, probe=True)
+        width = _width(probe)
+        if width == 0:
+            return None
+        own = block_sums(self.state, probe, self.blocks)
+        if not np.any(own.normal):
+            return None
+        sums = self._beside(probe, own)
+        scale = np.sqrt(np.diag(own.normal.sum(axis=0)))
+        prior = np.where(scale > 0, 1e4 / np.maximum(scale, 1e-300), 1.0)
+        full_prior = np.concatenate([self.prior, prior])
+        estimate, _ = sums.solve(full_prior)
+        return Score(sums.held_out(full_prior, self.folds), estimate[-width:], own)
+
+    def _beside(self, probe: Columns, own: BlockSums) -> BlockSums:
+        active = self.sums
+        a, b = active.size, own.size
+        if a == 0:
+            return own
+        cross = np.zeros((self.blocks.size, a, b))
+        for part, left, right in zip(self.state.parts, self._active or [], probe, strict=True):
+            if left is None or right is None:
+                continue
+            for i, number in enumerate(self.blocks):
+                rows = part.blocks == number
+                if rows.any():
+                    cross[i] += left[rows].reshape(-1, a).T @ right[rows].reshape(-1, b)
+        normal = np.concatenate(
+            [
+                np.concatenate([active.normal, cross], axis=2),
+                np.concatenate([cross.transpose(0, 2, 1), own.normal], axis=2),
+            ],
+            axis=1,
+        )
+        return BlockSums(normal, np.concatenate([active.right, own.right], axis=1), own.squares)

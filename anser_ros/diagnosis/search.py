@@ -1,0 +1,304 @@
+"""Which effects hold: added one at a time while they pay on held-out blocks, then thinned out.
+
+Every candidate is first scored by its linear columns (a score test beside the effects in force).
+The best ones are fitted in full, and the best of these is taken, or a simpler one that is as good.
+What others explain away is removed at the end.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.diagnosis.fit import Fit, fit_terms
+from anser_ros.diagnosis.problem import Problem
+from anser_ros.diagnosis.scoring import BlockSums, Score, Scorer
+from anser_ros.diagnosis.refine import METALS, settled
+from anser_ros.effects.effect import Effect, Term
+from anser_ros.effects.metal_remainder import REMAINDER
+from anser_ros.effects.moving_metal import MovingMetal
+from anser_ros.effects.registry import all_effects
+
+Array = NDArray[np.float64]
+Progress = Callable[[str], None]
+
+PROMISING = 0.5
+"""A candidate whose probe promises less than this share of the best fitted gain is not fitted."""
+REMNANT = 0.01
+"""Further metal that takes off less than this share of the first metal's gain is what its model left."""
+APART = 0.12
+"""Distance (m) from metal in force within which further metal is the same body's."""
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """How the search goes.
+
+    Attributes
+    ----------
+    folds : int
+        Of the cross-validation over time blocks.
+    most_effects : int
+    finalists : int
+        Candidates that are fitted in full a round.
+    least_gain, gain_per_parameter : float
+        What an effect must take off the held-out sum of squares, in units of the misfit that it
+        leaves; a clean session's best of 700 candidates takes off about 15.
+    iterations : int
+    """
+
+    folds: int = 4
+    most_effects: int = 6
+    finalists: int = 7
+    least_gain: float = 40.0
+    gain_per_parameter: float = 6.0
+    least_share: float = 0.002
+    least_share_beside_metal: float = 0.01
+    iterations: int = 8
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A row of the table of candidates: gain by the score test and, for finalists, by the fit."""
+
+    term: Term
+    parameters: int
+    gain: float
+    fitted_gain: float | None = None
+
+
+@dataclass
+class Search:
+    """What the search found and tried.
+
+    Attributes
+    ----------
+    fit : Fit
+        The effects that were kept, fitted on the problem that was searched.
+    rounds : list of list of Candidate
+        All candidates' scores, a list a round.
+    removed : list of Term
+        Effects that others explained away.
+    rivals : dict
+        Label of an effect to the candidates that explained as much as it did.
+    metal_gain : float
+        What the strongest metal took off.
+    """
+
+    fit: Fit
+    rounds: list[list[Candidate]] = field(default_factory=list)
+    removed: list[Term] = field(default_factory=list)
+    rivals: dict[str, list[Candidate]] = field(default_factory=dict)
+    metal_gain: float = 0.0
+
+
+def search_effects(
+    problem: Problem,
+    blocks: NDArray[np.int64],
+    start: Sequence[Term] = (),
+    settings: SearchSettings | None = None,
+    progress: Progress | None = None,
+) -> Search:
+    """Find the effects that explain a problem.
+
+    Parameters
+    ----------
+    problem : Problem
+    blocks : ndarray
+        Time blocks that take part.
+    start : sequence of Term
+        Effects that are known already (polarities, for example).
+    settings : SearchSettings, optional
+    progress : callable, optional
+        Told in words what has been found.
+    """
+    how = settings or SearchSettings()
+    say = progress or (lambda text: None)
+    search = Search(fit_terms(problem, start, blocks, how.iterations))
+    for _ in range(how.most_effects):
+        found = _round(problem, blocks, search, how)
+        if found is None:
+            break
+        search.fit = found
+        newest = [t for t in found.terms if t.effect is not REMAINDER][-1]
+        say(f'{newest.label}: misfit {misfit(found):.4g}')
+        _thin_out(problem, blocks, search, how)
+    return search
+
+
+def misfit(fit: Fit) -> float:
+    """Mean square of the whitened residuals; one where only noise is left."""
+    return fit.state.sum_of_squares / max(fit.state.count, 1)
+
+
+def worth(gain: float, parameters: int, fit: Fit, how: SearchSettings) -> bool:
+    """Whether a gain pays for its parameters, with this fit left."""
+    left = max(misfit(fit), 1.0)
+    metal = any(term.effect.name in METALS for term in fit.terms)
+    share = how.least_share_beside_metal if metal else how.least_share
+    least = how.least_gain + how.gain_per_parameter * parameters + share * fit.state.count
+    return gain > least * left
+
+
+def _round(
+    problem: Problem, blocks: NDArray[np.int64], search: Search, how: SearchSettings
+) -> Fit | None:
+    """The fit with one effect more, or None when none pays."""
+    before = search.fit
+    scorer = Scorer(before.state, blocks, how.folds)
+    scored = _scored(problem, scorer)
+    table = [Candidate(t, s.solution.size, scorer.held_out - s.held_out) for t, s in scored]
+    starts = _finalists(scored, scorer, how) + _moving(problem, scored, scorer, blocks)
+    fitted: list[tuple[float, Fit]] = []
+    for expected, term in sorted(starts, key=lambda pair: -pair[0]):
+        if fitted and expected < PROMISING * max(g for g, _ in fitted):
+            continue
+        fit = fit_terms(problem, [*before.terms, term], blocks, how.iterations)
+        gain = scorer.held_out - fit.held_out(how.folds)
+        fitted.append((gain, fit))
+        table.append(Candidate(fit.terms[-1], term.theta.size, gain, gain))
+    search.rounds.append(sorted(table, key=lambda c: -c.gain))
+    if not fitted:
+        return None
+    gain, best = choose(fitted, how)
+    term = best.terms[-1]
+    if not worth(gain, term.theta.size, best, how):
+        return None
+    if term.effect.name in METALS and gain < REMNANT * search.metal_gain:
+        return None
+    if term.effect.name in METALS:
+        search.metal_gain = max(search.metal_gain, gain)
+    search.rivals[term.label] = [
+        Candidate(f.terms[-1], f.terms[-1].theta.size, g, g)
+        for g, f in fitted
+        if f is not best and g > gain - 10 * max(misfit(best), 1.0) - 0.02 * abs(gain)
+    ]
+    if any(t.effect.name in METALS for t in best.terms):
+        return settled(problem, best.terms, blocks, how.folds, how.iterations)
+    return best
+
+
+def choose(fitted: Sequence[tuple[float, Fit]], how: SearchSettings) -> tuple[float, Fit]:
+    """The best fit, or a simpler one that is as good within what its parameters could gain."""
+    gain, best = max(fitted, key=lambda pair: pair[0])
+    simpler = [
+        (g, f)
+        for g, f in fitted
+        if f.terms[-1].theta.size < best.terms[-1].theta.size
+        and gain - g
+        < (10 + 4 * (best.terms[-1].theta.size - f.terms[-1].theta.size)) * max(misfit(best), 1.0)
+    ]
+    if not simpler:
+        return gain, best
+    return min(simpler, key=lambda pair: (pair[1].terms[-1].theta.size, -pair[0]))
+
+
+def _scored(problem: Problem, scorer: Scorer) -> list[tuple[Term, Score]]:
+    """All candidates that are not in force already, best first."""
+    taken, ours = scorer.state.terms, problem.scene.tool_channels
+    metal = any(term.effect.name in METALS for term in taken)
+    out = []
+    for effect in all_effects().values():
+        for term in effect.candidates(problem.scene):
+            if any(_same(term, other) for other in taken):
+                continue
+            if metal and term.site.get('channel', ours[0]) not in ours:
+                # Beside metal a reference's survey error looks like a fault of its channel.
+                continue
+            score = scorer.score(term)
+            if score is not None:
+                out.append((term, score))
+    return sorted(out, key=lambda pair: pair[1].held_out)
+
+
+def _same(term: Term, other: Term) -> bool:
+    """Whether a candidate is what another term stands for already."""
+    if term.effect is not other.effect:
+        return False
+    if term.effect.name == 'static_metal':
+        return bool(np.linalg.norm(term.theta[:3] - other.theta[:3]) < APART)
+    if term.effect.name == 'conductive_plate':
+        return True
+    if term.effect.name == 'saturation':
+        return bool(term.site['channel'] == other.site['channel'])
+    return _site(term) == _site(other)
+
+
+def _site(term: Term) -> str:
+    return repr(sorted((k, v) for k, v in term.site.items() if k[0] != '_'))
+
+
+def _finalists(
+    scored: Sequence[tuple[Term, Score]], scorer: Scorer, how: SearchSettings
+) -> list[tuple[float, Term]]:
+    """Expected gain and start values of the best candidates, at most two of a name."""
+    out: list[tuple[float, Term]] = []
+    count: dict[str, int] = {}
+    for term, score in scored:
+        gain = scorer.held_out - score.held_out
+        name = term.effect.name
+        if len(out) >= how.finalists or gain < how.least_gain:
+            break
+        if count.get(name, 0) >= 2:
+            continue
+        count[name] = count.get(name, 0) + 1
+        out += [(gain, start) for start in term.effect.started(term, score.solution)]
+    return out
+
+
+def _moving(
+    problem: Problem,
+    scored: Sequence[tuple[Term, Score]],
+    scorer: Scorer,
+    blocks: NDArray[np.int64],
+) -> list[tuple[float, Term]]:
+    """Expected gain and starts for metal that moves: where metal fits best in the first and in the last blocks."""
+    effect: Effect | None = all_effects().get('moving_metal')
+    places = [(t, s) for t, s in scored if t.effect.name == 'static_metal']
+    if not isinstance(effect, MovingMetal) or not places:
+        return []
+    still = min(s.held_out for _, s in places)
+    window = max(2, blocks.size // 8)
+    first, last = np.arange(window), np.arange(blocks.size - window, blocks.size)
+    own = [(t, s.own) for t, s in places]
+    alone = sum(max(_gain(sums, np.array([i])) for _, sums in own) for i in range(blocks.size))
+    if alone < 1.05 * (scorer.held_out - still) + 100:
+        return []
+    ends = [max(own, key=lambda pair, rows=rows: _gain(pair[1], rows)) for rows in (first, last)]
+    strongest = max(((_gain(ends[0][1], first), 0), (_gain(ends[1][1], last), 1)))[1]
+    alpha = ends[strongest][1].part((first, last)[strongest]).solve(np.full(2, 1e6))[0]
+    duration = problem.scene.duration
+    start, end = ends[0][0].theta[:3], ends[1][0].theta[:3]
+    if np.linalg.norm(end - start) < 0.02:
+        start = start + np.array([0.0, 0.0, -0.05])
+    times = [(0.2 * duration, 0.8 * duration), (0.05 * duration, 0.5 * duration)]
+    return [(alone, effect.starting(start, end, pair, alpha)) for pair in times]
+
+
+def _gain(sums: BlockSums, rows: NDArray[np.int64]) -> float:
+    part = sums.part(rows)
+    estimate, _ = part.solve(np.full(part.size, 1e6))
+    return float(part.right.sum(axis=0) @ estimate)
+
+
+def _thin_out(
+    problem: Problem, blocks: NDArray[np.int64], search: Search, how: SearchSettings
+) -> None:
+    """Remove effects that the others explain away."""
+    while len(search.fit.terms) > 1:
+        terms = search.fit.terms
+        full = search.fit.held_out(how.folds)
+        newest = [t for t in terms if t.effect is not REMAINDER][-1]
+        for term in terms:
+            if term is newest or term.effect is REMAINDER or term.theta.size == 0:
+                continue
+            rest = [t for t in terms if t is not term]
+            without = settled(problem, rest, blocks, how.folds, how.iterations)
+            gain = without.held_out(how.folds) - full
+            if not worth(gain, term.theta.size, search.fit, how):
+                search.removed.append(term)
+                search.fit = without
+                break
+        else:
+            return
