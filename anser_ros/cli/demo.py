@@ -137,7 +137,7 @@ def _print(summary: dict[str, object]) -> None:
         print('interrupted: no picture')
 
 
-def _node(name: str, /, *words: str, **parameters: object) -> list[str]:
+def node_command(name: str, /, *words: str, **parameters: object) -> list[str]:
     """Command of a node; `words` are further ROS arguments."""
     command = [sys.executable, '-P', '-m', f'anser_ros.nodes.{name}', '--ros-args', *words]
     for key, value in parameters.items():
@@ -154,7 +154,7 @@ def _commands(folder: Path, port: Path, args: argparse.Namespace) -> list[tuple[
     return [
         (
             'cu_simulator',
-            _node(
+            node_command(
                 'cu_simulator',
                 link=port,
                 metal=not args.no_metal,
@@ -163,17 +163,17 @@ def _commands(folder: Path, port: Path, args: argparse.Namespace) -> list[tuple[
                 sample_rate_hz=SAMPLE_RATE_HZ,
             ),
         ),
-        ('acquisition', _node('acquisition', device=port, rate_hz=float(args.rate))),
-        ('field_model', _node('field_model', model_file=model, baseline_at_start=True)),
-        ('tracker', _node('tracker')),
-        ('field_model_frozen', _node('field_model', *apart, model_file=model)),
-        ('tracker_frozen', _node('tracker', *apart, **NO_GATE)),
-        ('recorder', _node('recorder', directory=folder, name='bag')),
+        ('acquisition', node_command('acquisition', device=port, rate_hz=float(args.rate))),
+        ('field_model', node_command('field_model', model_file=model, baseline_at_start=True)),
+        ('tracker', node_command('tracker')),
+        ('field_model_frozen', node_command('field_model', *apart, model_file=model)),
+        ('tracker_frozen', node_command('tracker', *apart, **NO_GATE)),
+        ('recorder', node_command('recorder', directory=folder, name='bag')),
     ]
 
 
 def _monitor(data: Path, args: argparse.Namespace) -> list[str]:
-    return _node(
+    return node_command(
         'monitor',
         duration_s=float(args.duration),
         patience_s=PATIENCE_S,
