@@ -5,7 +5,7 @@ the search knows no physics: it adds the name that explains most, as long as the
 of its own scatter over the blocks, and takes one back when the others have made it idle.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,8 @@ Score = Callable[[tuple[str, ...]], Array]
 
 CLEAR = 2.0
 """Standard errors (over the blocks) by which a gain must differ from zero."""
+IDLE = 1.0
+"""Standard errors below which an effect that was chosen before is taken back."""
 WORTH = 0.01
 """Least change of the logarithm of the power, so that trifles stay out."""
 
@@ -66,11 +68,25 @@ def _compare(
     return Trial(before, name, float(np.sqrt(new.mean())), float(change.mean()), scatter, chosen)
 
 
-def _pays(trial: Trial) -> bool:
-    return trial.change < -WORTH and trial.change < -CLEAR * trial.scatter
+def _pays(trial: Trial, clear: float) -> bool:
+    return trial.change < -WORTH and trial.change < -clear * trial.scatter
 
 
-def grow(names: Sequence[str], score: Score) -> Search:
+def _simplest(
+    paying: Sequence[tuple[Trial, Array]], sizes: Mapping[str, int]
+) -> tuple[Trial, Array]:
+    """Of those that the blocks cannot tell from the best, the one of the fewest parameters."""
+    best = min(paying, key=lambda item: item[0].change)
+    alike = [p for p in paying if p[0].change <= best[0].change + best[0].scatter]
+    return min(alike, key=lambda item: (sizes.get(item[0].name, 0), item[0].change))
+
+
+def grow(
+    names: Sequence[str],
+    score: Score,
+    sizes: Mapping[str, int] | None = None,
+    clear: float = CLEAR,
+) -> Search:
     """Add effects one at a time while they pay on held-out blocks; drop what became idle.
 
     Parameters
@@ -79,6 +95,10 @@ def grow(names: Sequence[str], score: Score) -> Search:
         The candidates.
     score : callable
         From a tuple of names to the mean squared residual of each held-out block, shape (B,).
+    sizes : mapping, optional
+        Number of parameters of each candidate: decides between those that score alike.
+    clear : float
+        Standard errors by which a gain must differ from zero.
 
     Returns
     -------
@@ -95,8 +115,8 @@ def grow(names: Sequence[str], score: Score) -> Search:
             if name not in chosen
             for loss in (score((*chosen, name)),)
         ]
-        paying = [item for item in tried if _pays(item[0])]
-        best = min(paying, key=lambda item: item[0].change) if paying else None
+        paying = [item for item in tried if _pays(item[0], clear)]
+        best = _simplest(paying, sizes or {}) if paying else None
         trials += [
             _compare(t.before, t.name, power, loss, best is not None and t is best[0])
             for t, loss in tried
@@ -115,7 +135,7 @@ def _prune(
         rest = tuple(other for other in chosen if other != name)
         loss = score(rest)
         trial = _compare(rest, name, loss, power)
-        if not _pays(trial):
+        if trial.change > -WORTH or trial.change > -IDLE * trial.scatter:
             trials.append(_compare(chosen, f'-{name}', power, loss, chosen=True))
             chosen, power = rest, loss
     return chosen, power

@@ -369,9 +369,10 @@ def tables(analysis: Analysis) -> str:
     for item in sorted(analysis.shared, key=lambda item: -item.gain):
         places = np.array([fit.places_m[0] for fit in item.fits])
         distance = distance_mm(places, analysis.data.digitised_m)
+        value = f'{item.value:+.5f} +- {item.sigma:.5f} {UNITS.get(item.name, "")}'
         lines.append(
-            f'    {item.name:<20} {item.gain:+7.2f} (price {item.price:.2f})  {item.value:+.5f} +- '
-            f'{item.sigma:.5f} {UNITS.get(item.name, "")}; coils then {distance:.2f} mm off'
+            f'    {item.name:<20} {item.gain:+7.2f} (price {item.price:.2f})  {value}; '
+            f'coils then {distance:.2f} mm off'
             f'{"  <- accepted" if item.name == analysis.accepted else ""}'
         )
     places = np.array([fit.places_m[0] for fit in analysis.final])

@@ -127,14 +127,15 @@ def fit(
     """
     moment, found = start_moment(recording, source), dict[str, Array]()
     names, sensors = ('moment', *names), recording.field_t.shape[1]
-    covariance, white = np.zeros((0, 0)), np.zeros((0, 0, 0))
+    covariance: Array = np.zeros((0, 0))
+    white: Array = np.zeros((0, 0, 0))
     for _ in range(ROUNDS):
         white = whiteners(recording, source, moment, found, noise_t, jitter)
         matrix, residual = _design(recording, source, moment, found, names, white)
         flat = matrix.reshape(-1, matrix.shape[2])
         if flat.shape[0] < flat.shape[1]:
             raise FitError(f'{flat.shape[0]} readings cannot give {flat.shape[1]} parameters')
-        covariance = np.linalg.inv(flat.T @ flat + np.eye(flat.shape[1]))
+        covariance = np.asarray(np.linalg.inv(flat.T @ flat + np.eye(flat.shape[1])))
         pull = np.concatenate([_in_spreads(found, name, sensors) for name in names])
         step = covariance @ (flat.T @ residual.ravel() - pull)
         found = add(found, names, step, sensors)
@@ -193,7 +194,8 @@ def search(
         residual = design['moment'][1]
         return held_out_power(matrix, residual, block)
 
-    return grow(names, score)
+    sizes = {name: item[0].shape[2] for name, item in design.items()}
+    return grow(names, score, sizes)
 
 
 def held_out_power(matrix: Array, residual: Array, block: NDArray[np.int64]) -> Array:

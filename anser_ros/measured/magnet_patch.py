@@ -130,14 +130,14 @@ def read_poses(path: Path, magnet: str) -> tuple[dict[str, Array], int]:
         'magnet': tuple(f'{magnet}_{c}' for c in ('x', 'y', 'z')),
         'magnet_turn': tuple(f'{magnet}_{c}' for c in ('ox', 'oy', 'oz')),
     }
-    out = {}
+    out: dict[str, Array] = {}
     for key, names in groups.items():
         lost = [name for name in names if name not in column]
         if lost:
             raise FitError(f'{path.name} lacks the columns {", ".join(lost)}')
         out[key] = table[:, [column[name] for name in names]].reshape(-1, SENSORS, 3)
     if 'timestamp' in column:
-        out['stamp'] = table[:, column['timestamp']].reshape(-1, SENSORS)
+        out |= {'stamp': table[:, column['timestamp']].reshape(-1, SENSORS)}
     return out, len(table) // SENSORS
 
 

@@ -1,0 +1,125 @@
+"""Other people's measurements: what they contain, and the error before and after."""
+
+import argparse
+import json
+import math
+import os
+from dataclasses import asdict
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from anser_ros.errors import ParameterError
+from anser_ros.measured import Row, anser_board, hpi_coils, magnet_patch, magnet_session, navion
+
+MODULES: dict[str, ModuleType] = {
+    module.NAME: module for module in (navion, magnet_patch, hpi_coils, anser_board)
+}
+SHARED = 'ANSER_SHARED'
+SCHEMA = 'anser_measured/1'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument(
+        'datasets', nargs='*', metavar='DATASET', help=f'of {", ".join(MODULES)}; all by default'
+    )
+    parser.add_argument(
+        '--shared',
+        type=Path,
+        help=f'folder with measured/ (${SHARED}, or ../shared of the source)',
+    )
+    parser.add_argument('--out', type=Path, help='folder for measured.json and the candidates')
+    parser.add_argument('--bags', type=Path, help='folder for MCAP sessions of the data')
+    parser.add_argument('--quiet', action='store_true', help='only the table, no candidates')
+    parser.add_argument('--json', action='store_true', help='print measured.json on stdout')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; the exit code."""
+    wrong = [name for name in args.datasets if name not in MODULES]
+    if wrong:
+        raise ParameterError(f'no data set {wrong[0]!r}; there are {", ".join(MODULES)}')
+    shared = shared_folder(args.shared)
+    console = Console(stderr=args.json, width=None if os.isatty(1) else 200)
+    rows: list[Row] = []
+    for name in args.datasets or MODULES:
+        found, text = study(MODULES[name], shared / 'measured' / name)
+        rows += found
+        if not args.quiet and not args.json:
+            console.print(text, markup=False, highlight=False, soft_wrap=True)
+        if args.out is not None:
+            args.out.mkdir(parents=True, exist_ok=True)
+            (args.out / f'{name}.txt').write_text(text + '\n', encoding='utf-8')
+        if args.bags is not None and name == magnet_patch.NAME:
+            for path in magnet_session.write_sessions(shared / 'measured' / name, args.bags):
+                console.print(f'wrote {path}', highlight=False)
+    document = json.dumps(to_document(rows), indent=1)
+    if args.out is not None:
+        (args.out / 'measured.json').write_text(document + '\n', encoding='utf-8')
+    if args.json:
+        print(document)
+    else:
+        console.print(table(rows))
+    return 0
+
+
+def shared_folder(given: Path | None) -> Path:
+    """The folder that holds ``measured/``.
+
+    Raises
+    ------
+    ParameterError
+        When it is nowhere.
+    """
+    source = Path(__file__).resolve().parents[2].parent / 'shared'
+    folder = given or Path(os.environ.get(SHARED, source))
+    if not (folder / 'measured').is_dir():
+        raise ParameterError(f'no measured data: {folder} has no folder measured; use --shared')
+    return folder
+
+
+def study(module: ModuleType, folder: Path) -> tuple[list[Row], str]:
+    """Rows and candidate tables of one data set."""
+    analysis = module.analyse(folder)
+    if module is navion:
+        return module.rows(analysis, folder), module.tables(analysis)
+    return module.rows(analysis), module.tables(analysis)
+
+
+def to_document(rows: list[Row]) -> dict[str, Any]:
+    """The table for machines; a missing number is null."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, float | np.floating):
+            return float(value) if math.isfinite(value) else None
+        return value
+
+    return {
+        'schema': SCHEMA,
+        'rows': [{key: plain(value) for key, value in asdict(row).items()} for row in rows],
+    }
+
+
+def table(rows: list[Row]) -> Table:
+    """The table for people."""
+    out = Table(title='Measured data: before and after, on data that took no part')
+    for heading in ('data set', 'figure', 'before', 'after', 'target', 'met', 'chosen on'):
+        number = heading in ('before', 'after', 'target')
+        out.add_column(heading, justify='right' if number else 'left', overflow='fold')
+    for row in rows:
+        met = {None: '', True: 'yes', False: 'no'}[row.met]
+        values = [_number(value) for value in (row.before, row.after, row.target)]
+        values = [f'{value} {row.unit}'.strip() if value else '' for value in values]
+        out.add_row(row.dataset, row.figure, *values, met, row.chosen_on)
+    return out
+
+
+def _number(value: float | None) -> str:
+    if value is None or not math.isfinite(value):
+        return ''
+    return f'{value:.8f}' if 0.99 < value < 1.0 else f'{value:.3g}'

@@ -1,0 +1,97 @@
+"""Sessions of the magnet data: the magnet is the field generator, the patch the tool.
+
+By reciprocity the contract fits as it stands: frame `fg` is the magnet's own, its one emitter is a
+constant dipole (written as a tone of 1 Hz, since a tone is asked for; all phasors are real), and
+every axis of every sensor is a tool sensor of the rigid body `patch`.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from anser_ros.measured.magnet_model import Recording
+from anser_ros.measured.magnet_patch import HALF_LENGTH_M, RADIUS_M, file_names, load
+from anser_ros.wire.bag_writer import SessionWriter
+from anser_ros.wire.points import FluxPoints, encode_flux
+from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup, dump_setup
+
+Array = NDArray[np.float64]
+
+BODY = 'patch'
+AXES = 'xyz'
+NS = 1e9
+
+
+def _vector(values: Array) -> tuple[float, float, float]:
+    return (float(values[0]), float(values[1]), float(values[2]))
+
+
+def patch_in_fg(recording: Recording) -> tuple[Array, Array]:
+    """Pose of the patch in the magnet's frame: rotations (F, 3, 3), positions (F, 3) in m.
+
+    The patch's own frame has its origin at the middle of the sensors and the optical axes.
+    """
+    middle = recording.sensor_m.mean(axis=1)
+    turn = recording.magnet_rotation.swapaxes(1, 2)
+    return turn, np.einsum('fij,fj->fi', turn, middle - recording.magnet_m)
+
+
+def setup_of(recording: Recording) -> Setup:
+    """One emitter, three channels a sensor, as the first frame states them."""
+    place = recording.sensor_m[0] - recording.sensor_m[0].mean(axis=0)
+    turn = recording.sensor_rotation[0]
+    sensors = tuple(
+        SensorSpec(
+            3 * k + axis,
+            f'{BODY}/s{k + 1}/{AXES[axis]}',
+            BODY,
+            _vector(place[k]),
+            _vector(turn[k, :, axis] / np.linalg.norm(turn[k, :, axis])),
+            0.0,
+        )
+        for k in range(len(place))
+        for axis in range(3)
+    )
+    geometry = {'radius_m': RADIUS_M, 'half_length_m': HALF_LENGTH_M}
+    emitter = Emitter('cylinder_magnet', geometry, (Coil('magnet', (0.0, 0.0, 0.0), 0.0, 1.0),))
+    rate = 1.0 / float(np.median(np.diff(recording.stamp_s)))
+    return Setup('fg', rate, emitter, sensors)
+
+
+def write_session(recording: Recording, path: Path) -> None:
+    """Write one recording as an MCAP session.
+
+    Raises
+    ------
+    BagError
+        When the file exists already.
+    """
+    turn, place = patch_in_fg(recording)
+    stamps = np.round(recording.stamp_s * NS).astype(np.int64)
+    count = 3 * recording.field_t.shape[1]
+    moving = np.full((count, 3), np.nan)
+    channel = np.arange(count, dtype=np.int64)
+    with SessionWriter(path) as writer:
+        writer.write_setup(dump_setup(setup_of(recording)), int(stamps[0]))
+        for frame, stamp in enumerate(stamps.tolist()):
+            flux = recording.field_t[frame].reshape(count, 1).astype(np.complex128)
+            points = FluxPoints(channel, np.zeros(count, np.int64), flux, moving, moving)
+            fields, step, data = encode_flux(points)
+            writer.write_flux('/anser/tool/flux', stamp, fields, step, count, data)
+            quaternion = Rotation.from_matrix(turn[frame]).as_quat()
+            writer.write_pose(
+                f'/optical/{BODY}/pose', stamp, place[frame].tolist(), quaternion.tolist()
+            )
+
+
+def write_sessions(folder: Path, into: Path) -> list[Path]:
+    """Every file of poses as a session; the files written."""
+    into.mkdir(parents=True, exist_ok=True)
+    out = []
+    for name in file_names(folder):
+        path = into / f'magnet_{name}.mcap'
+        write_session(load(folder, name), path)
+        out.append(path)
+    return out
