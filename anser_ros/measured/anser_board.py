@@ -350,7 +350,7 @@ def tables(analysis: Analysis) -> str:
         spread = 1e3 * np.sqrt(np.mean(part.residual_m**2, axis=0))
         lines.append(
             f'  residual x {spread[0]:.2f}, y {spread[1]:.2f}, z {spread[2]:.2f} mm; correlation '
-            f'of neighbours {part.neighbour:+.2f} ; '
+            f'of neighbours {part.neighbour:+.2f} (a field error: {part.field_neighbour:+.2f}); '
             f'{far} points beyond {ROBUST:g} medians'
         )
     lines.append(f'{NAME}: ln power of each run, effect fitted to all other runs')
