@@ -204,19 +204,19 @@ class LiveRefit:
         """Evaluate the hypotheses, leaving out coils that are at fault, the worst first."""
         while True:
             bank, coils = self._bank(), np.flatnonzero(self._in_use())
-            seen = bank.evaluate(values[coils].reshape(-1, 2), noise)
+            used = values[coils]
+            seen = bank.evaluate(used.reshape(-1, 2), noise)
             best = int(seen.log_evidence.argmax())
             self._distance, self._residual = bank.left_out(seen, best)
-            freedom = 2 * bank.width
-            suspects = self._watch.suspect(self._distance, freedom)
-            if not suspects.size or len(coils) <= self.settings.min_references:
+            if len(coils) <= self.settings.min_references:
                 return bank, seen
-            odds = [health.fault_odds(bank, seen, int(coil)) for coil in suspects]
-            worst = int(np.argmax(odds))
-            if odds[worst] < health.FAULT_ODDS:
-                self._watch.dismiss(self._distance, freedom)
+            power = (used**2).sum(axis=(1, 2)) / noise**2
+            suspects = self._watch.suspects(self._distance, power, 2 * bank.width)
+            faulty = health.find_faults(bank, seen, suspects)
+            if not faulty.size:
                 return bank, seen
-            self._watch.exclude(int(coils[suspects[worst]]))
+            for coil in faulty:
+                self._watch.exclude(int(coils[coil]))
             self._average.forget()
 
     def _readmit(

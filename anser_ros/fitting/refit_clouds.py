@@ -110,31 +110,51 @@ def below(region: Region, standoff: float) -> Cloud:
 
 
 def overhead(region: Region, standoff: float) -> Cloud:
-    """Sources beside and over the tracked volume, at least ``standoff`` away from it."""
-    spacing = max(0.8 * standoff, 0.3 * region.half)
-    side = region.half + region.margin + standoff
-    top = region.ceiling + standoff
-    reach = side + 1.2 * region.half
-    flat = np.arange(-reach, reach + spacing / 2.0, spacing)
-    height = np.arange(spacing / 2.0, top + region.half, spacing)
-    x, y, z = (axis.ravel() for axis in np.meshgrid(flat, flat, height, indexing='ij'))
-    outside = (np.abs(x) >= side) | (np.abs(y) >= side) | (z >= top)
-    points = np.stack([x, y, z], axis=1)[outside]
-    points[:, :2] += region.centre
+    """Sources beside and over the tracked volume, at least ``standoff`` away from it.
+
+    Shells of growing thickness, each on a lattice as fine as the distance to the volume asks for.
+    """
+    positions, volumes = [], []
+    inner, reach = standoff, standoff + 1.2 * region.half
+    while inner < reach:
+        outer = min(1.9 * inner, reach)
+        spacing = max(0.5 * inner, region.half / 9.0)
+        shell = _shell(region, inner, outer, spacing)
+        positions.append(shell)
+        volumes.append(np.full(len(shell), spacing**3))
+        inner = outer
     return Cloud(
         f'around {1e3 * standoff:.0f} mm',
         standoff,
         True,
-        points,
-        np.full(len(points), spacing**3),
+        np.concatenate(positions),
+        np.concatenate(volumes),
     )
+
+
+def _shell(region: Region, inner: float, outer: float, spacing: float) -> Array:
+    """Lattice points between two boxes around the tracked volume that are open at the bottom."""
+    side, deep = region.half + region.margin, 0.3 * region.half
+    flat = _centred(side + outer, spacing)
+    height = np.arange(-deep + spacing / 2.0, region.ceiling + outer, spacing)
+    x, y, z = (axis.ravel() for axis in np.meshgrid(flat, flat, height, indexing='ij'))
+    away = np.maximum(np.maximum(np.abs(x), np.abs(y)) - side, z - region.ceiling)
+    points: Array = np.stack([x, y, z], axis=1)[(away >= inner) & (away < outer)]
+    points[:, :2] += region.centre
+    return points
+
+
+def _centred(reach: float, spacing: float) -> Array:
+    """Lattice over -reach..reach, symmetric about 0."""
+    count = int(reach / spacing)
+    return np.asarray(spacing * np.arange(-count, count + 1))
 
 
 def default_clouds(region: Region) -> tuple[Cloud, ...]:
     """Hypotheses for any board: standoffs in a geometric series, from nearly touching to far."""
     near = 0.08 * region.half
     standoffs = near * 1.55 ** np.arange(8)
-    around = region.half * np.array([0.4, 0.9])
+    around = region.half * np.array([0.25, 0.5, 0.9])
     return tuple(below(region, float(s)) for s in standoffs) + tuple(
         overhead(region, float(s)) for s in around
     )

@@ -34,7 +34,11 @@ Metal that the clouds describe badly reaches 70 in recordings; faults that matte
 """
 AGREES = 2.5
 """Left-out chi-square per degree of freedom below which an excluded coil agrees again."""
-RETRY_FRAMES = 10
+RETRY_FRAMES = 25
+OUTSTANDING = 8.0
+"""A change this many times the median coil's is looked at as a possible fault."""
+MOST_AT_ONCE = 4
+"""Coils that may fail together and be found."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +64,27 @@ class ReferenceHealth:
     distance: float
 
 
-def fault_odds(bank: Bank, seen: Evaluation, coil: int) -> float:
-    """Logarithm of the odds that a coil in use is at fault."""
-    others, residual = bank.without(seen, coil)
-    size = float((residual**2).sum())
-    likelihood = -0.5 * size / FAULT_SCALES**2 - residual.size * np.log(FAULT_SCALES)
-    broad = log_sum(likelihood) - np.log(len(FAULT_SCALES))
+def fault_odds(bank: Bank, seen: Evaluation, coils: NDArray[np.int64]) -> float:
+    """Logarithm of the odds that all of some coils in use are at fault, each in its own way."""
+    others, residuals = bank.without(seen, coils)
+    broad = 0.0
+    for residual in residuals:
+        size = float((residual**2).sum())
+        likelihood = -0.5 * size / FAULT_SCALES**2 - residual.size * np.log(FAULT_SCALES)
+        broad += log_sum(likelihood) - float(np.log(len(FAULT_SCALES)))
     return float(log_sum(others) + broad - log_sum(seen.log_evidence))
+
+
+def find_faults(
+    bank: Bank, seen: Evaluation, suspects: list[NDArray[np.int64]]
+) -> NDArray[np.int64]:
+    """The set of suspects that is most surely at fault; empty when none is."""
+    best, margin = np.empty(0, dtype=np.int64), 0.0
+    for coils in suspects:
+        beyond = fault_odds(bank, seen, coils) - FAULT_ODDS * len(coils)
+        if beyond > margin:
+            best, margin = coils, beyond
+    return best
 
 
 @dataclass
@@ -86,7 +104,7 @@ class Watch:
     excluded: NDArray[np.bool_] = field(init=False)
     reason: list[str] = field(init=False)
     _good: NDArray[np.int64] = field(init=False)
-    _dismissed: float = field(init=False, default=0.0)
+    _dismissed: tuple[float, int] = field(init=False, default=(0.0, 0))
     _since: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
@@ -111,21 +129,38 @@ class Watch:
         if self._good[coil] >= self.hold_frames:
             self.excluded[coil], self.reason[coil] = False, OK
 
-    def suspect(self, chi2: Array, freedom: int) -> NDArray[np.int64]:
-        """Coils in use whose fault is worth the computation, the worst first; often none.
+    def suspects(self, chi2: Array, power: Array, freedom: int) -> list[NDArray[np.int64]]:
+        """Sets of coils in use whose common fault is worth the computation; often none.
 
+        Coils that are far from what the others predict are suspected one by one; several that are
+        wrong at once hide each other, so those whose readings stand out are suspected together.
         A suspicion that was just dismissed is taken up again when it has grown, or after a while.
+
+        Parameters
+        ----------
+        chi2 : ndarray, shape (S,)
+            Left-out chi-square.
+        power : ndarray, shape (S,)
+            Squared change of each coil's readings, noise units.
+        freedom : int
+            Readings a coil.
         """
         self._since += 1
-        worst = float(chi2.max()) / freedom
-        if worst < SUSPICIOUS:
-            return np.empty(0, dtype=np.int64)
-        if worst < 1.3 * self._dismissed and self._since < RETRY_FRAMES:
-            return np.empty(0, dtype=np.int64)
-        self._since = 0
         order = np.argsort(-chi2)[:3]
-        return np.asarray(order[chi2[order] > 0.5 * chi2[order[0]]])
-
-    def dismiss(self, chi2: Array, freedom: int) -> None:
-        """The suspicion proved wrong."""
-        self._dismissed = float(chi2.max()) / freedom
+        sets = [order[i : i + 1] for i in range(len(order))]
+        sets = [s for s in sets if chi2[s[0]] > max(SUSPICIOUS * freedom, 0.5 * chi2[order[0]])]
+        by_power = np.argsort(-power)
+        level = OUTSTANDING**2 * max(float(np.median(power)), freedom)
+        out = by_power[: MOST_AT_ONCE + 1]
+        out = out[power[out] > level]
+        if 1 < len(out) <= min(MOST_AT_ONCE, len(power) // 3):
+            sets += [np.sort(out[:count]) for count in range(2, len(out) + 1)]
+        if not sets:
+            return []
+        alarm = (float(chi2[order[0]]) / freedom, len(out))
+        worse = alarm[0] > 1.3 * self._dismissed[0] or alarm[1] > self._dismissed[1]
+        if not worse and self._since < RETRY_FRAMES:
+            return []
+        self._since = 0
+        self._dismissed = alarm
+        return sets

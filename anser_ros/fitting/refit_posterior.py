@@ -223,26 +223,26 @@ class Bank:
             self._blocks[key] = np.linalg.inv(blocks)
         return self._blocks[key]
 
-    def without(self, seen: Evaluation, coil: int) -> tuple[Array, Array]:
-        """Evidence of all hypotheses from the other coils alone, and this one's residual.
+    def without(self, seen: Evaluation, coils: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Evidence of all hypotheses from the other coils alone, and what these are then off.
 
         By the rules of the conditional normal distribution no matrix is decomposed again.
 
         Parameters
         ----------
-        coil : int
-            Number of the coil among those in use.
+        coils : ndarray of int, shape (Q,)
+            Numbers of the coils among those in use.
 
         Returns
         -------
         log_evidence : ndarray, shape (H,)
-        residual : ndarray, shape (K, 2)
+        residual : ndarray, shape (Q, K, 2)
             Measured minus predicted under the most likely hypothesis, in noise units.
         """
         precision, _ = self.precision(seen.noise)
-        part = slice(coil * self.width, (coil + 1) * self.width)
+        rows = (coils[:, None] * self.width + np.arange(self.width)).ravel()
         curve, residuals = np.empty_like(seen.curve), []
-        for h, basis in enumerate(self.bases[:, part]):
+        for h, basis in enumerate(self.bases[:, rows]):
             weighted = precision[h][:, None, :] * basis
             block = weighted @ basis.T
             q = weighted @ seen.projected[h]
@@ -252,7 +252,7 @@ class Bank:
             best = curve[h].argmax(axis=0)
             residuals.append(r[best, :, [0, 1]].T)
         evidence, _ = _over_strengths(curve)
-        return evidence, residuals[int(evidence.argmax())]
+        return evidence, residuals[int(evidence.argmax())].reshape(len(coils), self.width, 2)
 
     def distance(
         self, seen: Evaluation, hypothesis: int, rows: NDArray[np.int64], readings: Array
