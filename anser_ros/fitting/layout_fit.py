@@ -68,7 +68,7 @@ def fit_layout(
     generator: Generator,
     uncertainty: Uncertainty,
     nominal: FieldModel | None = None,
-    alternations: int = 5,
+    alternations: int = 6,
     exact: bool = True,
     progress: Progress | None = None,
 ) -> LayoutFit:

@@ -98,6 +98,61 @@ def pose_terms(measurements: Measurements, dipoles: Dipoles, moments: ComplexArr
     return PoseTerms(residual, np.concatenate([place, turn], axis=3))
 
 
+class PoseWhitener:
+    """The frames' covariance C, factored once for many residuals.
+
+    Parameters
+    ----------
+    slope : ndarray, shape (F, S, 2K, 6)
+        Derivatives of the fluxes by the pose.
+    weights : ndarray, shape (F, S)
+    noise_t : float
+    precision : ndarray, shape (6,)
+        Inverse variances of the pose.
+    """
+
+    def __init__(self, slope: Array, weights: Array, noise_t: float, precision: Array) -> None:
+        frames, _, parts, _ = slope.shape
+        self.noise_t = noise_t
+        self.root = np.repeat(np.sqrt(weights), parts, axis=1)
+        flat = slope.reshape(frames, -1, 6) * (self.root / noise_t)[:, :, None]
+        normal = np.einsum('fri,frj->fij', flat, flat, optimize=True)
+        self.inverse = np.linalg.inv(normal + np.diag(precision))
+        self.slope = flat
+        self.share = np.asarray(self.inverse @ normal)
+        self.readings = self.root.astype(bool).sum(axis=1)
+
+    def chi_square(self, residual: Array) -> Array:
+        """Predictive chi-square of every frame, shape (F,), of residuals (F, S, 2K)."""
+        white = residual.reshape(self.root.shape) * self.root / self.noise_t
+        along = np.einsum('fri,fr->fi', self.slope, white)
+        explained = np.einsum('fi,fij,fj->f', along, self.inverse, along)
+        return np.asarray((white**2).sum(axis=1) - explained)
+
+    def left_over(self, residual: Array) -> Array:
+        """What no pose explains, T, shape (F, S, 2K), of residuals at the measured pose."""
+        white = residual.reshape(self.root.shape) * self.root / self.noise_t
+        along = np.einsum('fri,fr->fi', self.slope, white)
+        step = np.einsum('fij,fj->fi', self.inverse, along)
+        left = white - np.einsum('fri,fi->fr', self.slope, step)
+        return np.asarray((left * self.noise_t).reshape(residual.shape))
+
+    def excess_power(self, residual: Array) -> Array:
+        """Estimate of each frame's variance beyond noise and jitter, T^2 a component, shape (F,).
+
+        White errors of variance v leave the power v tr(W^2), W = sigma^2 C^-1, in what no pose
+        explains; noise and jitter as assumed leave sigma^2 tr(W). The eigenvalues of W are one
+        minus those of the share of each pose parameter that the readings determine.
+        """
+        left = self.left_over(residual).reshape(self.root.shape)
+        power = (left**2).sum(axis=1)
+        taken = np.trace(self.share, axis1=1, axis2=2)
+        square = np.einsum('fij,fji->f', self.share, self.share)
+        first = self.readings - taken
+        second = np.maximum(self.readings - 2.0 * taken + square, 1.0)
+        return np.asarray((power - self.noise_t**2 * first) / second)
+
+
 def most_probable_step(
     terms: PoseTerms, weights: Array, noise_t: float, precision: Array, offset: Array
 ) -> tuple[Array, Array]:

@@ -12,6 +12,8 @@ from anser_ros.fitting.moments import MomentFit
 FEWEST_FRAMES = 10
 FLATTEST = 0.002
 """Thickness (rms) of the cloud of sensors that the fit needs, as a part of its extent."""
+THINNEST_M = 2e-4
+"""The same in metres: what the jitter of the poses alone would feign, thrice."""
 DISAGREEMENT = 10.0
 """Sessions whose common fit leaves this many times what each alone leaves: different boards."""
 
@@ -53,11 +55,11 @@ def check_measurements(measurements: Sequence[Measurements], needed: int) -> int
 def _check_thickness(measurements: Sequence[Measurements]) -> None:
     points = np.concatenate([m.placed()[0][m.usable] for m in measurements])
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
-    need = FLATTEST * float(spread[0])
-    if spread[-1] < need or spread[0] < 1e-3:
+    need = max(FLATTEST * float(spread[0]), THINNEST_M)
+    if spread[-1] < need:
         raise FitError(
             f'all readings lie in one plane: their spread across it must be at least '
-            f'{1e3 * max(need, 0.05):.2f} mm rms, got {1e3 * spread[-1]:.2f} mm'
+            f'{1e3 * need:.2f} mm rms, got {1e3 * spread[-1]:.2f} mm'
         )
 
 

@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from anser_ros.errors import FitError
 from anser_ros.fitting.dipoles import Dipoles, basis_rows
 from anser_ros.fitting.factors import ComplexArray, as_real
-from anser_ros.fitting.held_out import PoseWhitener
 from anser_ros.fitting.layout_fit import RICH, optimise_positions, prior_of
 from anser_ros.fitting.layouts import Generator, Layout, place
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.moments import MomentFit, MomentFitter
-from anser_ros.fitting.pose_correction import Uncertainty, pose_terms, with_pose
+from anser_ros.fitting.pose_correction import PoseWhitener, Uncertainty, pose_terms, with_pose
 from anser_ros.fitting.prior import DrawnBoard
 
 Array = NDArray[np.float64]

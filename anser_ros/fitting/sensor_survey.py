@@ -16,13 +16,18 @@ from numpy.typing import NDArray
 
 from anser_ros.fitting.dipoles import Dipoles
 from anser_ros.fitting.factors import ComplexArray, as_real
-from anser_ros.fitting.held_out import PoseWhitener
 from anser_ros.fitting.layout_fit import RICH, RICH_DAMPING
 from anser_ros.fitting.layouts import Generator, place
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.model import EffectRecord
 from anser_ros.fitting.moments import MomentFitter
-from anser_ros.fitting.pose_correction import Uncertainty, frame_blocks, pose_terms, with_pose
+from anser_ros.fitting.pose_correction import (
+    PoseWhitener,
+    Uncertainty,
+    frame_blocks,
+    pose_terms,
+    with_pose,
+)
 from anser_ros.physics.dipole import flux_basis, flux_jacobian
 
 Array = NDArray[np.float64]

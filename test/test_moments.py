@@ -1,0 +1,235 @@
+"""Moments at poses that jitter.
+
+| what                                   | must agree with                                  |
+|----------------------------------------|--------------------------------------------------|
+| triangular factor, Gram factor         | numpy's least squares; whatever the blocks       |
+| damping, prior                         | least squares with explicit further rows         |
+| slopes of the flux by a pose           | central differences                              |
+| most probable step                     | the jitter that was put in, to its posterior     |
+| fit at corrected poses                 | the true field, closer than plain least squares  |
+| estimated noise                        | the noise put in                                 |
+| predictive chi-square                  | one, at the true field                           |
+| gross outliers                         | the fit without them                             |
+"""
+
+import numpy as np
+import pytest
+from calibration_world import JITTER_M, JITTER_RAD, NOISE_T, scene
+from scipy.spatial.transform import Rotation
+
+from anser_ros.errors import FitError
+from anser_ros.fitting.dipoles import basis_rows
+from anser_ros.fitting.factors import GramFactor, TriangularFactor, as_complex, as_real
+from anser_ros.fitting.layouts import Layout, place
+from anser_ros.fitting.moments import MomentFitter
+from anser_ros.fitting.pose_correction import (
+    PoseWhitener,
+    Uncertainty,
+    frame_blocks,
+    most_probable_step,
+    moved,
+    outlier_weights,
+    pose_terms,
+    usable_weights,
+    with_pose,
+)
+
+LAYER = Layout('layer', 9, 1.3, 0.0)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(5)
+
+
+@pytest.fixture
+def rows(rng):
+    return rng.normal(size=(60, 7)) * 10.0 ** rng.uniform(-8, -4, 7), rng.normal(
+        size=(60, 4)
+    ) * 1e-9
+
+
+@pytest.mark.parametrize('kind', [TriangularFactor, GramFactor])
+@pytest.mark.parametrize('blocks', [[60], [1, 59], [20, 20, 20], [7, 53]])
+def test_factor_is_least_squares_whatever_the_blocks(rows, kind, blocks):
+    matrix, right = rows
+    factor = kind(7, 4)
+    for part in np.split(np.arange(60), np.cumsum(blocks)[:-1]):
+        factor.add(matrix[part], right[part])
+    expected = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    assert np.allclose(factor.spectrum().solve(0.0), expected, rtol=1e-6)
+    assert factor.rows == 60
+    assert factor.spectrum().rank == 7
+
+
+@pytest.mark.parametrize('kind', [TriangularFactor, GramFactor])
+def test_damping_and_prior_are_further_rows(rows, rng, kind):
+    matrix, right = rows
+    factor = kind(7, 4)
+    factor.add(matrix, right)
+    spectrum = factor.spectrum()
+    prior = rng.normal(size=(7, 4)) / np.linalg.norm(matrix, axis=0)[:, None] * 1e-9
+    ridge = 0.3 * spectrum.values[0] * np.diag(np.linalg.norm(matrix, axis=0))
+    expected = np.linalg.lstsq(
+        np.vstack([matrix, ridge]), np.vstack([right, ridge @ prior]), rcond=None
+    )[0]
+    assert np.allclose(spectrum.solve(0.3, prior), expected, rtol=1e-6)
+    assert 0 < spectrum.freedom(0.3) < spectrum.freedom(0.0) == pytest.approx(7)
+
+
+def test_a_column_of_zeros_is_left_out(rows):
+    matrix, right = rows
+    matrix = np.hstack([matrix, np.zeros((60, 1))])
+    factor = TriangularFactor(8, 4)
+    factor.add(matrix, right)
+    spectrum = factor.spectrum()
+    assert spectrum.rank == 7
+    assert np.all(spectrum.solve(0.0)[7] == 0)
+
+
+def test_complex_and_real_are_inverse(rng):
+    values = rng.normal(size=(3, 4)) + 1j * rng.normal(size=(3, 4))
+    assert np.array_equal(as_complex(as_real(values)), values)
+
+
+def test_blocks_are_whole_frames_and_cover_all():
+    for count, sensors, most in ((10, 3, 7), (1, 900, 10), (0, 3, 7), (100, 2, 1000)):
+        slices = frame_blocks(count, sensors, most)
+        covered = [i for s in slices for i in range(s.start, s.stop)]
+        assert covered == list(range(count))
+
+
+def test_pose_slopes_are_differences(rng):
+    world = scene(rng, side=3)
+    terms = pose_terms(world.measurements, world.dipoles, world.moments)
+    for parameter in range(6):
+        step = np.zeros((len(world.measurements.time), 6))
+        step[:, parameter] = 1e-6
+        up, down = (
+            pose_terms(moved(world.measurements, s), world.dipoles, world.moments).residual
+            for s in (step, -step)
+        )
+        slope = -(up - down) / 2e-6  # the residual is measured minus modelled
+        assert np.allclose(terms.slope[..., parameter], slope, atol=1e-6 * np.abs(slope).max())
+
+
+def test_step_finds_the_jitter(rng):
+    world = scene(rng)
+    terms = pose_terms(world.measurements, world.dipoles, world.moments)
+    weights = usable_weights(world.measurements)
+    none = np.zeros((len(weights), 6))
+    step, left = most_probable_step(terms, weights, NOISE_T, Uncertainty().pose_precision, none)
+    truth = world.position - world.measurements.position
+    assert truth.std() > 0.9 * JITTER_M
+    assert (step[:, :3] - truth).std() < 0.1 * JITTER_M
+    turned = Rotation.from_rotvec(step[:, 3:]).as_matrix() @ world.measurements.rotation
+    assert (turned - world.rotation).std() < 0.2 * JITTER_RAD
+    assert left.std() == pytest.approx(NOISE_T, rel=0.2)
+
+
+def test_without_jitter_the_poses_stay(rng):
+    world = scene(rng, side=4)
+    terms = pose_terms(world.measurements, world.dipoles, world.moments)
+    exact = Uncertainty(position_m=0.0, rotation_rad=0.0)
+    weights = usable_weights(world.measurements)
+    step, _ = most_probable_step(
+        terms, weights, NOISE_T, exact.pose_precision, np.zeros((len(weights), 6))
+    )
+    assert np.abs(step).max() < 1e-9
+
+
+def field_error(world, model_flux):
+    points = np.random.default_rng(1).uniform([-0.08, -0.08, 0.12], [0.08, 0.08, 0.16], (200, 3))
+    axes = np.tile(np.eye(3), (67, 1))[:200]
+    return np.abs(model_flux(points, axes) - world.flux(points, axes)).std()
+
+
+def fitted(world, damping=0.0, **options):
+    dipoles = world.dipoles
+    fitter = MomentFitter([world.measurements], dipoles, damping, Uncertainty())
+
+    def flux(moments):
+        from anser_ros.physics.dipole import flux_basis
+
+        return lambda points, axes: (
+            flux_basis(points, axes, None, dipoles.positions, dipoles.directions) @ moments
+        )
+
+    plain = flux(fitter.solve()[0])
+    fit = fitter.fit(**options)
+    return fit, plain, flux(fit.moments)
+
+
+def test_corrected_poses_give_a_better_field_and_the_noise(rng):
+    world = scene(rng, side=9)
+    fit, plain, corrected = fitted(world, alternations=12)
+    assert field_error(world, corrected) < 0.95 * field_error(world, plain)
+    assert 0.9 * NOISE_T < fit.noise_t < 2 * NOISE_T
+    assert fit.rank == len(world.dipoles)
+    assert fit.alternations >= 2
+
+
+def test_fit_is_deterministic(rng):
+    world = scene(rng, side=5)
+    first, second = fitted(world)[0], fitted(world)[0]
+    assert np.array_equal(first.moments, second.moments)
+
+
+def test_gross_outliers_lose_their_weight(rng):
+    world = scene(rng, side=9)
+    clean = field_error(world, fitted(world)[2])
+    flux = world.measurements.flux.copy()
+    bad = rng.choice(len(flux), 4, replace=False)
+    flux[bad] = flux[bad[::-1]]
+    flux[bad[0] + 1, 2] += 1e-7
+    spoilt = type(world)(
+        **{
+            **world.__dict__,
+            'measurements': type(world.measurements)(
+                **{**world.measurements.__dict__, 'flux': flux}
+            ),
+        }
+    )
+    fit, plain, robust = fitted(spoilt, alternations=12)
+    assert field_error(world, plain) > 50 * clean
+    assert field_error(world, robust) < 3 * clean
+    assert fit.weights[0][bad].max() < 0.1
+    assert fit.weights[0][bad[0] + 1, 2] < 0.1
+
+
+def test_weights_of_unused_readings_stay_zero():
+    weights = np.array([[1.0, 0.0]])
+    residual = np.full((1, 2, 4), 1e-9)
+    assert np.array_equal(outlier_weights(residual, weights), weights)
+    assert np.array_equal(outlier_weights(residual, 0 * weights), 0 * weights)
+
+
+def test_predictive_chi_square_is_one_at_the_truth(rng):
+    world = scene(rng, side=12)
+    terms = pose_terms(world.measurements, world.dipoles, world.moments)
+    weights = usable_weights(world.measurements)
+    white = PoseWhitener(terms.slope, weights, NOISE_T, Uncertainty().pose_precision)
+    each = white.chi_square(terms.residual) / terms.residual[0].size
+    assert each.mean() == pytest.approx(1.0, abs=0.05)
+    assert abs(np.mean(white.excess_power(terms.residual))) < (0.3 * NOISE_T) ** 2
+    error = 60e-12 * np.random.default_rng(2).normal(size=terms.residual.shape)
+    found = np.sqrt(np.median(white.excess_power(terms.residual + error)))
+    assert found == pytest.approx(60e-12, rel=0.1)
+
+
+def test_readings_without_pose_are_left_out(rng):
+    world = scene(rng, side=4)
+    m = world.measurements
+    has_pose = m.has_pose.copy()
+    has_pose[:3] = False
+    part = with_pose(type(m)(**{**m.__dict__, 'has_pose': has_pose}))
+    assert len(part.time) == 13
+    nothing = type(m)(**{**m.__dict__, 'has_pose': np.zeros(16, dtype=bool)})
+    with pytest.raises(FitError, match='no reading has a pose'):
+        MomentFitter([nothing], place(LAYER, world.generator), 1e-6, Uncertainty())
+
+
+def test_basis_rows_are_in_order_of_frames_and_sensors(rng):
+    world = scene(rng, side=3, noise=0.0, jitter=0.0)
+    flux = basis_rows(world.measurements, world.dipoles) @ world.moments
+    assert np.allclose(flux.reshape(world.measurements.flux.shape), world.measurements.flux)

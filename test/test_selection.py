@@ -1,0 +1,269 @@
+"""Choices by held-out error: blocks, layouts, the drawn board as a prior, error maps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibration_world import NOISE_T, scene
+
+from anser_ros.errors import FitError
+from anser_ros.fitting.blocks import FOLDS, fold_of_frames
+from anser_ros.fitting.calibration import Options, calibrate, rms
+from anser_ros.fitting.error_map import FEWEST_POINTS, IDENTITY, learn_error_map
+from anser_ros.fitting.layouts import Generator, Layout, place
+from anser_ros.fitting.model import FieldModel
+from anser_ros.fitting.pose_correction import Uncertainty
+from anser_ros.fitting.prior import DrawnBoard, emitter_gains
+from anser_ros.fitting.selection import Selector, choose_layout, thin_frames
+
+EMITTERS = ('a', 'b', 'c')
+TONES = (1000.0, 1100.0, 1200.0)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(21)
+
+
+@pytest.fixture(scope='module')
+def world():
+    return scene(np.random.default_rng(3), side=9)
+
+
+def drawn(world, gain=1.0):
+    return FieldModel(
+        world.dipoles.positions, world.dipoles.directions, gain * world.moments, EMITTERS, TONES
+    )
+
+
+# Blocks of space.
+
+
+def test_a_fold_holds_whole_cells_and_every_frame(rng):
+    where = rng.uniform(-0.1, 0.1, (800, 3)) * [1, 1, 0.02]
+    folds = fold_of_frames([where[:500], where[500:]])
+    both = np.concatenate(folds)
+    assert set(both) == set(range(FOLDS))
+    assert np.bincount(both).min() > 100
+    cell = np.floor((where[:, :2] - where[:, :2].min(axis=0)) / (np.ptp(where, axis=0).max() / 5))
+    key = np.minimum(cell, 4) @ [10, 1]
+    for value in np.unique(key):
+        assert len(set(both[key == value])) == 1
+
+
+def test_neighbouring_cells_are_of_other_folds():
+    line = np.linspace(0, 1, 25)
+    x, y = np.meshgrid(line, line)
+    fold = fold_of_frames([np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1)])[0]
+    lattice = fold.reshape(25, 25)[2::5, 2::5]
+    assert (lattice[1:] != lattice[:-1]).all()
+    assert (lattice[:, 1:] != lattice[:, :-1]).all()
+
+
+def test_frames_at_one_place_can_not_be_held_out():
+    with pytest.raises(FitError, match='got 1: all frames are at one place'):
+        fold_of_frames([np.zeros((30, 3))])
+
+
+# Layouts.
+
+
+def test_layouts_lie_where_they_say():
+    generator = Generator(
+        np.array([[-0.1, 0, 0.001], [0.1, 0, 0.001]]), np.array([0.0, 45.0]), 0.07
+    )
+    assert generator.half_extent[0] == pytest.approx((0.2 + 0.035 + 0.0495) / 2, abs=1e-3)
+    layer = place(Layout('layer', 4, 1.5, 0.01), generator)
+    assert len(layer) == 16
+    assert np.ptp(layer.positions[:, 0]) == pytest.approx(3.0 * generator.half_extent[0])
+    assert np.allclose(layer.positions[:, 2], -0.009)
+    three = place(Layout('layer_xyz', 2, 1.0, 0.0), generator)
+    assert len(three) == 12
+    assert np.allclose(three.directions[:3], np.eye(3))
+    coils = place(Layout('coils', 3, 1.0, 0.0), generator)
+    assert len(coils) == 18
+    assert np.abs(coils.positions[:9, 0] + 0.1).max() < 0.035
+    words = {Layout(k, 3, 1.0, 0.0).describe() for k in ('layer', 'layer_xyz', 'coils')}
+    assert len(words) == 3
+
+
+# The drawn board.
+
+
+def test_the_drawn_board_is_expressed_by_any_layer(world):
+    board = DrawnBoard(drawn(world), [world.measurements])
+    layer = place(Layout('layer', 14, 1.6, 0.0), world.generator)
+    model = FieldModel(layer.positions, layer.directions, board.moments(layer), EMITTERS, TONES)
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-0.1, -0.1, 0.12], [0.1, 0.1, 0.16], (50, 3))
+    axes = np.tile([0.0, 0.6, 0.8], (50, 1))
+    truth = world.flux(points, axes)
+    assert rms(model.flux(points, axes) - truth) < 3e-3 * rms(truth)
+
+
+def test_gains_of_the_drawn_board_are_found(world):
+    gains = emitter_gains(drawn(world, 0.5 + 0.1j), [world.measurements])
+    assert np.allclose(gains * (0.5 + 0.1j), 1.0, atol=2e-3)
+
+
+# Selection.
+
+
+def test_the_choice_is_neither_too_coarse_nor_undamped(world):
+    thin = thin_frames([world.measurements])
+    folds = fold_of_frames([m.position for m in thin])
+    selector = Selector(
+        thin, folds, place(Layout('layer', 10, 1.25, 0.0), world.generator), Uncertainty()
+    )
+    scores = {}
+    for count in (3, 9):
+        layout = Layout('layer', count, 1.25, 0.0)
+        scores[count] = selector.score(layout, place(layout, world.generator))
+    assert scores[9].score < 0.5 * scores[3].score
+    curve = dict(scores[9].curve)
+    assert scores[9].score == min(curve.values())
+    assert curve[1e-2] > scores[9].score
+
+
+def test_selection_finds_a_prior_and_is_deterministic(world):
+    thin = thin_frames([world.measurements], 300)
+    folds = fold_of_frames([m.position for m in thin])
+    board = DrawnBoard(drawn(world, 0.9), thin)
+    runs = [
+        choose_layout(thin, folds, world.generator, Uncertainty(), drawn=board) for _ in range(2)
+    ]
+    assert runs[0].finalists[0].layout == runs[1].finalists[0].layout
+    assert runs[0].finalists[0].layout.prior == 'nominal'
+    assert len(runs[0].candidates) > 10
+
+
+def test_thinning_is_even_and_bounded(world):
+    thin = thin_frames([world.measurements, world.measurements], 200)
+    assert sum(m.flux.shape[0] * m.flux.shape[1] for m in thin) <= 212
+    assert (np.diff(thin[0].time) == thin[0].time[1]).all()
+
+
+# Calibration.
+
+
+@pytest.fixture(scope='module')
+def calibrated(world):
+    return calibrate(
+        [world.measurements], ['one'], world.generator, EMITTERS, TONES, nominal=drawn(world, 1.02)
+    )
+
+
+def test_calibration_reaches_the_noise_and_says_so(world, calibrated):
+    assert 0.8 * NOISE_T < calibrated.fit.noise_t < 2.5 * NOISE_T
+    assert calibrated.model.flux_error_t == calibrated.held_out.flux_error_t < 3 * NOISE_T
+    assert calibrated.better_than_nominal
+    assert calibrated.model.provenance['sessions'] == ['one']
+    rng = np.random.default_rng(9)
+    points = rng.uniform([-0.07, -0.07, 0.125], [0.07, 0.07, 0.155], (100, 3))
+    axes = np.tile([0.0, 0.6, 0.8], (100, 1))
+    true_error = rms(calibrated.model.flux(points, axes) - world.flux(points, axes))
+    assert true_error < 1e-3 * rms(world.flux(points, axes))
+
+
+def test_held_out_error_is_no_smaller_than_the_fit(calibrated):
+    assert rms(calibrated.held_out.error) > rms(calibrated.error)
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        ({'has_pose': np.zeros(81, dtype=bool)}, 'got 0 of 81'),
+        ({'valid': np.arange(81)[:, None] < np.full(6, 4)}, 'at least 10 frames .* got 4'),
+        ({'position': np.zeros((81, 3)), 'rotation': np.tile(np.eye(3), (81, 1, 1))}, 'one plane'),
+    ],
+)
+def test_refusals_name_what_is_needed_and_found(world, change, message):
+    bad = replace(world.measurements, **change)
+    with pytest.raises(FitError, match=message):
+        calibrate([bad], ['one'], world.generator, EMITTERS, TONES)
+
+
+def test_a_plane_is_refused(world):
+    table = world.measurements.sensors
+    flat = replace(
+        world.measurements.sensors_only(np.arange(3)),
+        position=world.measurements.position * [1, 1, 0] + [0, 0, 0.14],
+        rotation=np.tile(np.eye(3), (81, 1, 1)),
+    )
+    assert len(table) == 6
+    with pytest.raises(FitError, match=r'one plane: .* at least 0\.\d+ mm rms, got 0\.00 mm'):
+        calibrate([flat], ['one'], world.generator, EMITTERS, TONES)
+
+
+def test_more_dipoles_than_readings_are_refused(world):
+    few = world.measurements.frames(np.arange(0, 81, 7))
+    options = Options(layout=Layout('layer', 12, 1.0, 0.0))
+    with pytest.raises(FitError, match=r'144 dipoles need at least 144 readings .* got 72'):
+        calibrate([few], ['one'], world.generator, EMITTERS, TONES, options)
+    one = world.measurements.frames(np.arange(0, 81, 7)).sensors_only(np.arange(2))
+    with pytest.raises(FitError, match=r'36 dipoles need at least 36 readings .* got 24'):
+        calibrate([one], ['one'], world.generator, EMITTERS, TONES)
+    with pytest.raises(FitError, match='got 0: no session has tool fluxes'):
+        calibrate([], [], world.generator, EMITTERS, TONES)
+
+
+def test_two_boards_are_told_apart(world):
+    other = scene(np.random.default_rng(4), side=9)
+    with pytest.raises(FitError, match='different boards'):
+        calibrate(
+            [world.measurements, other.measurements], ['one', 'two'], world.generator, EMITTERS,
+            TONES, Options(layout=Layout('layer', 10, 1.25, 0.0)),
+        )  # fmt: skip
+
+
+def test_two_sessions_of_one_board_agree(world):
+    halves = [world.measurements.frames(np.arange(start, 81, 2)) for start in (0, 1)]
+    options = Options(layout=Layout('layer', 10, 1.25, 0.0))
+    found = calibrate(halves, ['one', 'two'], world.generator, EMITTERS, TONES, options)
+    assert found.n_measurements == 81 * 6
+    assert found.model.provenance['sessions'] == ['one', 'two']
+
+
+def test_estimated_sensors_travel_with_the_model(world):
+    table = world.measurements.sensors
+    gain = np.array([1.01, 0.99, 1.0, 1.02, 0.98, 1.0])
+    told = replace(world.measurements, flux=world.measurements.flux * gain[:, None])
+    options = Options(layout=Layout('layer', 10, 1.25, 0.0), estimate=('gains',))
+    found = calibrate([told], ['one'], world.generator, EMITTERS, TONES, options)
+    gains = [effect.parameters['gain'] for effect in found.model.effects]
+    assert len(gains) == len(table)
+    assert np.allclose(gains, gain, atol=2e-3)
+
+
+# Error maps.
+
+
+def bent(places):
+    return places + 0.003 * np.sin(places / 0.05) + [0.001, -0.002, 0.0]
+
+
+def test_an_error_map_undoes_a_smooth_error(rng):
+    true = rng.uniform(-0.1, 0.1, (120, 3))
+    tracked = bent(true) + 1e-4 * rng.normal(size=true.shape)
+    found = learn_error_map(tracked, true)
+    assert found.helps
+    assert found.after_m < 0.3 * found.before_m
+    fresh = rng.uniform(-0.08, 0.08, (50, 3))
+    left = found.apply(bent(fresh)) - fresh
+    assert np.sqrt((left**2).sum(axis=1).mean()) < 0.3 * found.before_m
+
+
+def test_a_map_of_mere_noise_is_not_used(rng):
+    true = rng.uniform(-0.1, 0.1, (60, 3))
+    found = learn_error_map(true + 1e-4 * rng.normal(size=true.shape), true)
+    assert not found.helps
+    assert found.shape == IDENTITY
+    assert np.array_equal(found.apply(true), true)
+    assert found.after_m == found.before_m
+
+
+def test_error_map_refusals():
+    with pytest.raises(FitError, match=r'\(n, 3\)'):
+        learn_error_map(np.zeros((9, 3)), np.zeros((8, 3)))
+    with pytest.raises(FitError, match=f'at least {FEWEST_POINTS} points .* got 7'):
+        learn_error_map(np.zeros((7, 3)), np.zeros((7, 3)))
