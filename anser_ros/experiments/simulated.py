@@ -129,8 +129,16 @@ def with_metal(source: FieldSource, metal: Sequence[MetalBody], setup: Setup) ->
     return field
 
 
-def simulate_recordings(folder: Path, seed: int) -> Recordings:
-    """Write a bag for every experiment into a folder."""
+def simulate_recordings(folder: Path, seed: int, share: float = 1.0) -> Recordings:
+    """Write a bag for every experiment into a folder.
+
+    Parameters
+    ----------
+    folder : Path
+    seed : int
+    share : float
+        Points along a lattice's side, as a part of the article's; at least six are left.
+    """
     rng = np.random.default_rng(seed)
     text = config_path('demo_setup.yaml').read_text(encoding='utf-8')
     drawn = replace(parse_setup(text), flux_rate_hz=1.0)
@@ -156,7 +164,8 @@ def simulate_recordings(folder: Path, seed: int) -> Recordings:
         ('collimator_bottom_tool_b', Raster(8, 0.2, 0.12), collimator),
         ('collimator_midplane_tool_b', small, collimator),
     ]
-    for name, raster, metal in jobs:
+    for name, full, metal in jobs:
+        raster = replace(full, side=max(round(full.side * share), 6))
         body = 'tool_a' if name.endswith('tool_a') else 'tool_b'
         setup = setups[body]
         world = World(setup, with_metal(board, metal, setup), paths={body: raster})

@@ -1,0 +1,260 @@
+"""`anser calibrate` on bags: files, figures, refusals with the number needed and found."""
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from anser_ros.cli import calibrate as command
+from anser_ros.cli.main import main
+from anser_ros.errors import FitError, ParameterError
+from anser_ros.fitting.calibration import Options, rms
+from anser_ros.fitting.layouts import Layout
+from anser_ros.sessions.calibration import calibrate_sessions, generator_of, nominal_of
+from anser_ros.sessions.evaluation import track_session
+from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.session import load_session
+from anser_ros.wire.bag_writer import SessionWriter
+from anser_ros.wire.points import FluxPoints, encode_flux
+from anser_ros.wire.setup import dump_setup
+
+BAGS = Path(__file__).resolve().parents[1] / 'bags'
+FACTORY = BAGS / 'factory.mcap'
+START = 1_700_000_000_000_000_000
+
+
+@pytest.fixture(scope='module')
+def factory():
+    return load_session(FACTORY)
+
+
+def write_bag(path, setup, tool, *, poses=True, fluxes=True, with_setup=True):
+    """A bag of one tool's frames; the stamps are a second apart."""
+    quaternion = np.array([0.0, 0.0, 0.0, 1.0])
+    with SessionWriter(str(path)) as writer:
+        if with_setup:
+            writer.write_setup(dump_setup(setup), START)
+        for frame in range(len(tool.time)):
+            stamp = START + frame * 1_000_000_000
+            if poses:
+                writer.write_pose(
+                    f'/optical/{tool.body}/pose', stamp, tool.position[frame], quaternion
+                )
+            if fluxes:
+                nowhere = np.full((len(tool.sensors), 3), np.nan)
+                cloud = FluxPoints(
+                    tool.sensors.channel, np.zeros(len(tool.sensors), dtype=np.int64),
+                    tool.flux[frame], nowhere, nowhere,
+                )  # fmt: skip
+                fields, step, data = encode_flux(cloud)
+                count = len(tool.sensors)
+                writer.write_flux('/anser/tool/flux', stamp, fields, step, count, data)
+    return path
+
+
+def calibrate(*arguments):
+    return main(['calibrate', *map(str, arguments)])
+
+
+@pytest.fixture(scope='module')
+def done(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('calibration')
+    assert calibrate(FACTORY, '--out', folder / 'model.yaml', '--report', folder) == 0
+    return folder
+
+
+def test_calibration_json_is_the_contracts(done):
+    document = json.loads((done / 'calibration.json').read_text())
+    assert document['schema'] == 'anser_calibration/1'
+    assert document['n_measurements'] == 169 * 9
+    assert document['n_dipoles'] == len(load_model(done / 'model.yaml').positions)
+    for key in ('flux_rmse_t', 'heldout_flux_rmse_t'):
+        assert 0 < document[key] < 2e-9
+        assert all(0 < emitter[key] < 2e-9 for emitter in document['emitters'])
+    assert document['heldout_flux_rmse_t'] > document['flux_rmse_t']
+    assert 0 < document['heldout_n_mae_percent'] < document['heldout_n_rmse_percent'] < 0.1
+    assert [emitter['name'] for emitter in document['emitters']] == [f'coil{k}' for k in range(8)]
+    curve = document['choice']['curve']
+    assert len({row['layout'] for row in curve}) > 10
+    assert {'layout', 'n_dipoles', 'damping', 'heldout_t'} == set(curve[0])
+
+
+def test_the_model_file_says_where_it_comes_from(done):
+    text = yaml.safe_load((done / 'model.yaml').read_text())
+    assert text['provenance']['sessions'] == ['factory.mcap']
+    assert text['provenance']['heldout_flux_rmse_t'] > 0
+    assert text['units']['moment'] == 'A m^2'
+    assert 0 <= text['flux_error_t'] < 100e-12
+
+
+def test_the_model_tracks_to_the_optical_jitter(done):
+    evaluation = track_session(load_session(BAGS / 'moving.mcap'), load_model(done / 'model.yaml'))
+    for series in evaluation.sensors.values():
+        assert np.sqrt(np.nanmean(series.position_error**2)) < 0.16e-3
+
+
+def test_json_is_all_of_stdout(tmp_path, capsys):
+    arguments = (FACTORY, '--out', tmp_path / 'm.yaml', '--dipoles', '9x9', '--json')
+    assert calibrate(*arguments) == 0
+    out = capsys.readouterr().out
+    assert json.loads(out)['n_dipoles'] == 81
+
+
+def test_the_same_twice_gives_the_same_file(tmp_path):
+    for name in ('a', 'b'):
+        assert calibrate(FACTORY, '--out', tmp_path / name, '--dipoles', '10') == 0
+    assert (tmp_path / 'a').read_bytes() == (tmp_path / 'b').read_bytes()
+
+
+def test_reference_sensors_take_no_part(factory):
+    options = Options(layout=Layout('layer', 9, 1.25, 0.0))
+    without = replace(factory, reference=None)
+    models = [calibrate_sessions([s], options).model for s in (factory, without)]
+    assert factory.reference is not None
+    assert np.array_equal(models[0].moments, models[1].moments)
+
+
+# Refusals.
+
+
+def refusal(capsys, *arguments):
+    assert calibrate(*arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ''
+    assert len(captured.err.strip().split('\n')) == 1
+    return captured.err
+
+
+def test_without_poses(factory, tmp_path, capsys):
+    bag = write_bag(tmp_path / 'b.mcap', factory.setup, factory.tools[0], poses=False)
+    text = refusal(capsys, bag, '--out', tmp_path / 'm.yaml')
+    assert 'at least 10 frames with a pose, got 0 of 169' in text
+    assert not (tmp_path / 'm.yaml').exists()
+
+
+def test_without_fluxes(factory, tmp_path, capsys):
+    bag = write_bag(tmp_path / 'b.mcap', factory.setup, factory.tools[0], fluxes=False)
+    assert 'no flux' in refusal(capsys, bag, '--out', tmp_path / 'm.yaml')
+
+
+def test_without_setup(factory, tmp_path, capsys):
+    bag = write_bag(tmp_path / 'b.mcap', factory.setup, factory.tools[0], with_setup=False)
+    assert 'no setup' in refusal(capsys, bag, '--out', tmp_path / 'm.yaml')
+
+
+def test_too_few_points(factory, tmp_path, capsys):
+    few = factory.tools[0].frames(np.arange(0, 169, 24))
+    bag = write_bag(tmp_path / 'b.mcap', factory.setup, few)
+    assert 'at least 10 frames with poses and valid fluxes, got 8' in refusal(
+        capsys, bag, '--out', tmp_path / 'm.yaml'
+    )
+    text = refusal(capsys, FACTORY, '--out', tmp_path / 'm.yaml', '--dipoles', '40x40')
+    assert '1600 dipoles need at least 1600 readings an emitter, got 1521' in text
+
+
+def test_all_points_in_one_plane(factory, tmp_path, capsys):
+    tool = factory.tools[0].sensors_only(np.arange(3, 6))
+    flat = replace(tool, position=tool.position * [1, 1, 0] + [0, 0, 0.15])
+    sensors = tuple(s for s in factory.setup.sensors if s.name.startswith('tool_a/1'))
+    bag = write_bag(tmp_path / 'b.mcap', replace(factory.setup, sensors=sensors), flat)
+    text = refusal(capsys, bag, '--out', tmp_path / 'm.yaml')
+    assert 'one plane: their spread across it must be at least' in text
+    assert 'got 0.00 mm' in text
+
+
+def test_two_drawings(factory, tmp_path, capsys):
+    coils = factory.setup.emitter.coils
+    moved = replace(coils[2], centre_m=(0.1, 0.1, 0.0))
+    emitter = replace(factory.setup.emitter, coils=(*coils[:2], moved, *coils[3:]))
+    bag = write_bag(tmp_path / 'b.mcap', replace(factory.setup, emitter=emitter), factory.tools[0])
+    text = refusal(capsys, FACTORY, bag, '--out', tmp_path / 'm.yaml')
+    assert 'one board' in text
+    assert 'coil2' in text
+    fewer = replace(factory.setup.emitter, coils=coils[:7])
+    tool = replace(factory.tools[0], flux=factory.tools[0].flux[:, :, :7])
+    bag = write_bag(tmp_path / 'c.mcap', replace(factory.setup, emitter=fewer), tool)
+    assert 'number of coils, 8 and 7' in refusal(
+        capsys, FACTORY, bag, '--out', tmp_path / 'm.yaml'
+    )
+
+
+def test_a_model_worse_than_the_nominal_one_is_only_written_when_forced(factory, tmp_path, capsys):
+    tool = factory.tools[0]
+    rng = np.random.default_rng(0)
+    # Points that say almost nothing of the places between them, and a drawing that is exact.
+    nominal = nominal_of(factory)
+    points, axes = tool.placed()
+    flux = nominal.flux(points, axes, tool.sensors.length)
+    flux = flux + 3e-9 * rng.normal(size=flux.shape)
+    few = replace(tool, flux=flux).frames(np.arange(0, 169, 12))
+    bag = write_bag(tmp_path / 'b.mcap', factory.setup, few)
+    arguments = (bag, '--out', tmp_path / 'm.yaml', '--dipoles', '6x6', '--damping', '1e-9')
+    text = refusal(capsys, *arguments)
+    assert "worse than the nominal model's" in text
+    assert '--force' in text
+    assert not (tmp_path / 'm.yaml').exists()
+    assert calibrate(*arguments, '--force') == 0
+    assert (tmp_path / 'm.yaml').exists()
+
+
+@pytest.mark.parametrize(
+    'arguments',
+    [
+        ('--dipoles', '3x4'),
+        ('--dipoles', '0x0'),
+        ('--dipoles', 'many'),
+        ('--estimate', 'colour'),
+        ('--damping', 'x'),
+    ],
+)
+def test_bad_usage(tmp_path, arguments, capsys):
+    assert calibrate(FACTORY, '--out', tmp_path / 'm.yaml', *arguments) == 2
+    assert 'usage' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    'arguments',
+    [('--flux-noise', '0'), ('--pose-jitter-mm', '-1'), ('--damping', '-1'), ('--damping', 'nan')],
+)
+def test_parameters_out_of_range(tmp_path, arguments, capsys):
+    text = refusal(capsys, FACTORY, '--out', tmp_path / 'm.yaml', *arguments)
+    assert 'must be positive' in text
+
+
+def test_options_raise_typed_errors():
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    args = parser.parse_args(['a', '--out', 'b', '--flux-noise', '-1'])
+    with pytest.raises(ParameterError):
+        command._options(args)
+
+
+def test_a_board_of_unknown_kind_still_calibrates(factory):
+    emitter = replace(factory.setup.emitter, kind='something_else', geometry={})
+    session = replace(factory, setup=replace(factory.setup, emitter=emitter))
+    assert nominal_of(session) is None
+    assert generator_of(session.setup).side_m == pytest.approx(0.0969, abs=2e-3)
+    options = Options(layout=Layout('layer', 10, 1.25, 0.0))
+    found = calibrate_sessions([session], options)
+    assert found.nominal_rmse_t is None
+    assert found.better_than_nominal
+    assert rms(found.error) < 1e-9
+
+
+def test_three_emitters_need_nothing_else(factory):
+    setup = factory.setup
+    emitter = replace(setup.emitter, coils=setup.emitter.coils[:3])
+    tool = replace(factory.tools[0], flux=factory.tools[0].flux[:, :, :3])
+    session = replace(factory, setup=replace(setup, emitter=emitter), tools=(tool,))
+    found = calibrate_sessions([session], Options(layout=Layout('layer', 10, 1.5, 0.0)))
+    assert found.model.moments.shape == (100, 3)
+    assert rms(found.held_out.error) < 2e-9
+
+
+def test_sessions_are_needed():
+    with pytest.raises(FitError, match='at least 10 frames'):
+        calibrate_sessions([replace(load_session(FACTORY), tools=())], Options())

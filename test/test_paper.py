@@ -1,0 +1,154 @@
+"""The article's experiments on small recordings of our own simulator."""
+
+import json
+
+import numpy as np
+import pytest
+
+from anser_ros.cli.main import main
+from anser_ros.errors import BagError
+from anser_ros.experiments import article
+from anser_ros.experiments.bound import position_bound
+from anser_ros.experiments.figures import draw_all
+from anser_ros.experiments.methods import article_model, centres_extension, drawn_model
+from anser_ros.experiments.recordings import (
+    HEAD_DISTANCES_CM,
+    NAMES,
+    checkerboard,
+    given_recordings,
+    missing,
+)
+from anser_ros.experiments.report import write_report
+from anser_ros.experiments.simulated import Raster, simulate_recordings
+from anser_ros.experiments.study import Study, field_errors, outer_planes
+from anser_ros.experiments.tracking_errors import statistics, track
+
+
+@pytest.fixture(scope='module')
+def recordings(tmp_path_factory):
+    return simulate_recordings(tmp_path_factory.mktemp('recordings'), seed=3, share=0.36)
+
+
+@pytest.fixture(scope='module')
+def study(recordings):
+    study = Study(recordings)
+    study.run()
+    return study
+
+
+def test_every_recording_is_made_and_named(recordings):
+    assert missing(recordings.folder) == []
+    assert 'own' in recordings.origin
+    assert recordings.load('midplane_tool_b').tools[0].sensors.length.tolist() == [0.0082, 0.0082]
+
+
+def test_a_folder_that_lacks_some_is_refused(tmp_path, capsys):
+    with pytest.raises(BagError, match=f'{len(NAMES)} of {len(NAMES)} recordings are missing'):
+        given_recordings(tmp_path)
+    assert main(['paper', '--sessions', str(tmp_path), '--out', str(tmp_path / 'out')]) == 2
+    assert 'factory_tool_a.mcap' in capsys.readouterr().err
+
+
+def test_the_checkerboard_halves_the_points(recordings):
+    session = recordings.shield('aluminium')
+    training, test = checkerboard(session)
+    counts = [len(part.tools[0].time) for part in (training, test)]
+    assert sum(counts) == len(session.tools[0].time)
+    assert abs(counts[0] - counts[1]) <= 1
+    between = training.tools[0].position[:, None, :2] - test.tools[0].position[None, :, :2]
+    assert np.linalg.norm(between, axis=2).min() > 0.01
+
+
+def test_outer_planes_leave_the_middle_out(recordings):
+    names = outer_planes(recordings.load('collimator_tool_a')).tools[0].sensors.name
+    assert {name.split('/')[1] for name in names} == {'0', '2'}
+
+
+def test_the_articles_own_method_is_real_least_squares(recordings):
+    session = recordings.load('factory_tool_a')
+    model = article_model(session)
+    assert model.moments.shape == (144, 8)
+    assert not model.moments.imag.any()
+    assert field_errors(session, model)['N-RMSE'] < 0.1
+    assert 0.5 < centres_extension(session) < 1.0
+
+
+def test_the_drawing_gets_one_gain_an_emitter(recordings):
+    session = recordings.load('factory_tool_a')
+    model = drawn_model(session, [session])
+    assert model.modes is None
+    assert model.flux_error_t > 0
+    assert field_errors(session, model)['N-RMSE'] < 3.0
+
+
+def test_ours_is_near_the_jitter_and_the_article_is_not_better(study):
+    tracking = study.results.tracking['table_2']
+    for sensor in article.SENSORS:
+        ours = tracking['ours'][sensor].millimetres()['RMSE']
+        assert ours < 0.145
+        assert ours < tracking['article'][sensor].millimetres()['RMSE'] + 0.01
+        assert tracking['drawing'][sensor].millimetres()['RMSE'] > 2 * ours
+        assert study.results.bounds['table_2'][sensor] < 0.1e-3
+
+
+def test_the_head_makes_it_worse_the_nearer_it_is(study):
+    errors = [
+        study.results.tracking[f'fig_7 {d} cm']['ours']['Y'].millimetres()['RMSE']
+        for d in HEAD_DISTANCES_CM
+    ]
+    assert errors[-1] > 5 * errors[0]
+    assert np.argmax(errors) >= len(errors) - 2
+
+
+def test_compensation_takes_the_distortion_away(study):
+    tracking = study.results.tracking
+    for sensor in article.SENSORS:
+        bent = tracking['table_5 uncompensated']['ours'][sensor].millimetres()['RMSE']
+        straight = tracking['table_5 compensated']['ours'][sensor].millimetres()['RMSE']
+        assert straight < 0.3 < bent
+
+
+def test_report_and_figures_say_simulated(study, tmp_path):
+    figures = draw_all(study, tmp_path)
+    write_report(study.results, figures, tmp_path / 'paper.md')
+    text = (tmp_path / 'paper.md').read_text()
+    for heading in ('Table II', 'Table III', 'Table IV', 'Table V', 'Figures'):
+        assert any(heading in line and 'imulated' in line for line in text.split('\n'))
+    assert set(figures) == {f'Fig. {n}' for n in (2, 5, 6, 7, 8, 9, 10)}
+    for file in figures.values():
+        assert f']({file})' in text
+        assert (tmp_path / file).read_bytes()[:4] == b'\x89PNG'
+    assert 'Cramer-Rao' in text
+    assert f'{article.TABLE_2_MM["data-driven"]["Y"]["RMSE"]:.2f}' in text
+
+
+def test_the_document_is_plain(study):
+    document = json.loads(json.dumps(study.results.document()))
+    assert document['schema'] == 'anser_paper/1'
+    assert 'own' in document['origin']
+
+
+def test_the_bound_shrinks_with_the_noise(recordings):
+    session = recordings.load('midplane_tool_b')
+    model = article_model(recordings.load('factory_tool_a'))
+    one, two = (position_bound(session.tools[0], model, noise) for noise in (30e-12, 60e-12))
+    assert np.allclose(two, 2 * one)
+    assert (one > 5e-6).all()
+
+
+def test_errors_of_nothing_are_nothing():
+    assert np.isnan(statistics(np.full(3, np.nan))['RMSE'])
+    assert statistics(np.array([3.0, 4.0]))['RMSE'] == pytest.approx(np.sqrt(12.5))
+
+
+def test_corrected_errors_keep_what_was_not_tracked(recordings):
+    session = recordings.load('c_arm_30cm_tool_b')
+    found = track(session, article_model(recordings.load('factory_tool_a')), in_phase=True)['Y']
+    assert found.tracked_fraction == 1.0
+    assert np.allclose(found.corrected(found.true).distance, 0.0)
+
+
+def test_a_raster_is_the_same_every_time():
+    raster = Raster(5, 0.2, 0.15)
+    assert np.array_equal(raster(7.0)[0], raster(7.0)[0])
+    assert abs(raster(0.0)[0] - [-0.1, -0.1, 0.15]).max() <= 0.004
