@@ -6,6 +6,8 @@ dozen readings determine the change of the whole field. `docs/refit.md` tells th
 figures, and what was tried and left.
 """
 
+from copy import copy
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -58,6 +60,9 @@ class LiveRefit:
     drawing : callable, optional
         Field of the board as drawn (`physics.board.Board.field`): points (P, 3) to (P, K, 3), T.
         Without it the model's own dipoles drive the metal, which is much less accurate.
+    noise : ndarray, shape (S,), optional
+        Noise of each reference over the nominal one, at least 1; more for coils whose place is
+        only known from a tracker (see `refit_patches`).
 
     Raises
     ------
@@ -72,12 +77,20 @@ class LiveRefit:
         baseline: ComplexArray,
         settings: RefitSettings | None = None,
         drawing: FieldFunction | None = None,
+        noise: Array | None = None,
     ) -> None:
         self.model = model
         self.references = references
         self.settings = settings or RefitSettings()
         self.baseline = _checked_baseline(model, references, baseline)
+        self._row_noise = _checked_noise(noise, len(references), len(model.emitters))
         self._scene = build_scene(model, references, self.settings, drawing)
+        self._prepare()
+        self.reset()
+
+    def _prepare(self) -> None:
+        """Work out what depends on the baseline and the references' places."""
+        model, references, baseline = self.model, self.references, self.baseline
         k = len(model.emitters)
         turned = self.baseline * self._scene.excitation.phase.conj()
         scale = self.settings.drift / self.settings.flux_noise_t
@@ -89,7 +102,6 @@ class LiveRefit:
         self._place = {int(c): i for i, c in enumerate(references.channel.tolist())}
         self._names = ('nothing', *(prior.cloud.name for prior in self._scene.priors))
         self._assembly = Assembly(model, self._scene.layers)
-        self.reset()
 
     @property
     def excitation_source(self) -> str:
@@ -106,12 +118,36 @@ class LiveRefit:
         self._last_ns = 0
         self._last_model = self.model
 
+    def moved(
+        self, references: SensorTable, baseline: ComplexArray, noise: Array | None = None
+    ) -> 'LiveRefit':
+        """The same refit for references that are elsewhere now; what was learnt is kept.
+
+        Parameters
+        ----------
+        references : SensorTable
+            The same coils in the same order.
+        baseline, noise
+            As for the constructor.
+        """
+        if references.name != self.references.name:
+            raise FitError('refit: moved references must be the same coils in the same order')
+        other = copy(self)
+        other.references = references
+        other.baseline = _checked_baseline(self.model, references, baseline)
+        other._row_noise = _checked_noise(noise, len(references), len(self.model.emitters))
+        other._scene = self._scene.moved(references, self.settings)
+        other._prepare()
+        other._average = Average(self.settings.average_frames)
+        return other
+
     def update(
         self,
         stamp_ns: int,
         channels: NDArray[np.generic],
         flux: NDArray[np.generic],
         flags: NDArray[np.generic] | None = None,
+        baseline: ComplexArray | None = None,
     ) -> RefitResult:
         """Take in one frame of reference fluxes.
 
@@ -125,6 +161,8 @@ class LiveRefit:
             T.
         flags : ndarray, shape (S,), optional
             Flag bits; a flagged reading is not used.
+        baseline : ndarray, shape (S, K), complex, optional
+            Clean readings in this frame, in the order of the references, where some of them move.
 
         Returns
         -------
@@ -145,6 +183,9 @@ class LiveRefit:
         level = self._noise.update(usable)
         if self._in_use().sum() < self.settings.min_references:
             return self._too_few(stamp_ns, level)
+        if baseline is not None:
+            # What is averaged is the change; the clean part moves with the coil.
+            ordered = ordered - baseline + self.baseline
         used = np.where(self._watch.excluded[:, None], np.nan, ordered)
         mean, frames = self._average.update(used, level * self.settings.flux_noise_t)
         mean = np.where(np.isfinite(mean), mean, ordered)
@@ -197,7 +238,7 @@ class LiveRefit:
             rows = (coils[:, None] * k + np.arange(k)).ravel()
             if len(self._banks) >= MOST_BANKS:
                 del self._banks[next(iter(self._banks))]
-            self._banks[key] = Bank(self._scene.priors, rows, self._drift)
+            self._banks[key] = Bank(self._scene.priors, rows, self._drift, self._row_noise)
         return self._banks[key]
 
     def _judged(self, values: Array, noise: float) -> tuple[Bank, Evaluation]:
@@ -210,7 +251,8 @@ class LiveRefit:
             self._distance, self._residual = bank.left_out(seen, best)
             if len(coils) <= self.settings.min_references:
                 return bank, seen
-            power = (used**2).sum(axis=(1, 2)) / noise**2
+            loudness = noise * self._row_noise[:: bank.width][coils]
+            power = (used**2).sum(axis=(1, 2)) / loudness**2
             suspects = self._watch.suspects(self._distance, power, 2 * bank.width)
             faulty = health.find_faults(bank, seen, suspects)
             if not faulty.size:
@@ -321,6 +363,14 @@ class LiveRefit:
             return None
         centroid = (cloud.positions * power[:, None]).sum(axis=0) / power.sum()
         return Metal(cloud.positions, polarisability, centroid, cloud.standoff_m)
+
+
+def _checked_noise(noise: Array | None, count: int, width: int) -> Array:
+    """Noise of every reading, (S K,), from that of every coil."""
+    given = np.ones(count) if noise is None else np.asarray(noise, dtype=np.float64)
+    if given.shape != (count,) or not (given >= 1.0).all() or not np.isfinite(given).all():
+        raise FitError(f'refit: noise must be {count} finite numbers of at least 1, got {given}')
+    return np.repeat(given, width)
 
 
 def _fresh_weights(count: int) -> Array:

@@ -97,21 +97,29 @@ class Bank:
         Readings in use, as rows of the priors' covariance; all K of a coil or none.
     drift : ndarray, shape (all readings, K)
         Reading that one deviation of each emitter's drift makes, in noise units.
+    noise : ndarray, shape (all readings,), optional
+        Noise of each reading over the others' (1 where not given).
     """
 
     def __init__(
-        self, priors: Sequence[CloudPrior], rows: NDArray[np.int64], drift: Array
+        self,
+        priors: Sequence[CloudPrior],
+        rows: NDArray[np.int64],
+        drift: Array,
+        noise: Array | None = None,
     ) -> None:
         self.priors = tuple(priors)
         self.rows = rows
         self.width = drift.shape[1]
         self._all_drift = drift
         self.drift = drift[rows]
-        whitening = _whitening(self.drift)
+        self._all_noise = np.ones(len(drift)) if noise is None else noise
+        self._row_noise = self._all_noise[rows]
+        whitening = _whitening(self.drift, self._row_noise)
         spectra, bases = [np.zeros(len(rows))], [whitening]
         for prior in self.priors:
             block = prior.covariance[np.ix_(rows, rows)]
-            values, vectors = eigh(whitening @ block @ whitening, driver='evd')
+            values, vectors = eigh(whitening.T @ block @ whitening, driver='evd')
             spectra.append(np.maximum(values, 0.0))
             bases.append(whitening @ vectors)
         self.spectra = np.array(spectra)
@@ -274,7 +282,7 @@ class Bank:
         basis, variance = self.bases[hypothesis], seen.noise**2
         ahead = self._all_drift[rows]
         shared = variance * (ahead @ self.drift.T)
-        own = variance * (np.eye(len(rows)) + ahead @ ahead.T)
+        own = variance * (np.diag(self._all_noise[rows] ** 2) + ahead @ ahead.T)
         total = 0.0
         for part in range(2):
             strength = int(seen.strength[hypothesis, part].argmax())
@@ -304,25 +312,30 @@ class Bank:
         """
         precision, _ = self.precision(noise)
         prior, root = self.priors[hypothesis - 1], np.sqrt(STRENGTHS[strength])
-        drawn = _noise_draws(prior.draw_readings.shape[1], self.drift, noise, part)
+        count = prior.draw_readings.shape[1]
+        drawn = noise * _noise_draws(count, self.drift, self._row_noise, part)
         readings = root * prior.draw_readings[self.rows] + drawn
         gain = (STRENGTHS[strength] * precision[hypothesis, strength])[:, None]
         weights = gain * (self.bases[hypothesis].T @ readings)
         return np.asarray(root * prior.draw_moments - self._to_moments(hypothesis) @ weights)
 
 
-def _whitening(drift: Array) -> Array:
-    """Inverse root of ``I + drift drift^T``, whose columns are orthogonal: one emitter's each."""
+def _whitening(drift: Array, noise: Array) -> Array:
+    """Matrix W with ``W^T (diag(noise)^2 + drift drift^T) W = 1``.
+
+    The columns of ``drift`` are one emitter's readings each, so they are orthogonal.
+    """
+    scaled = drift / noise[:, None]
     out = np.eye(len(drift))
-    norm = np.linalg.norm(drift, axis=0)
+    norm = np.linalg.norm(scaled, axis=0)
     for column in np.flatnonzero(norm > 0.0):
-        unit = drift[:, column] / norm[column]
+        unit = scaled[:, column] / norm[column]
         out -= np.outer(unit, unit) * (1.0 - 1.0 / np.sqrt(1.0 + norm[column] ** 2))
-    return out
+    return np.asarray(out / noise[:, None])
 
 
-def _noise_draws(count: int, drift: Array, noise: float, part: int) -> Array:
+def _noise_draws(count: int, drift: Array, noise: Array, part: int) -> Array:
     """Repeatable draws of the readings' noise and drift, (n, D)."""
     rng = np.random.default_rng(1 + part)
-    white = rng.standard_normal((len(drift), count))
-    return np.asarray(noise * (white + drift @ rng.standard_normal((drift.shape[1], count))))
+    white = noise[:, None] * rng.standard_normal((len(drift), count))
+    return np.asarray(white + drift @ rng.standard_normal((drift.shape[1], count)))
