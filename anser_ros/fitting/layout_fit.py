@@ -1,7 +1,7 @@
 """A layout fitted to measurements: dipoles placed, pulled to the drawn board, moved if asked."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from anser_ros.fitting.dipoles import Dipoles
 from anser_ros.fitting.factors import ComplexArray
 from anser_ros.fitting.layouts import Generator, Layout, place
+from anser_ros.fitting.local import join_regions
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.moments import MomentFit, MomentFitter, Progress
@@ -96,4 +97,9 @@ def fit_layout(
         dipoles = optimise_positions(reference.measurements, reference.weights, dipoles, prior)
         prior = prior_of(layout, dipoles, drawn)
     fitter = MomentFitter(measurements, dipoles, damping, uncertainty, prior)
-    return LayoutFit(dipoles, prior, fitter.fit(alternations, progress, exact))
+    fit = fitter.fit(alternations, progress, exact)
+    if not layout.local:
+        return LayoutFit(dipoles, prior, fit)
+    layer = place(replace(RICH, extension=layout.extension, depth_m=layout.depth_m), generator)
+    moments = join_regions(measurements, dipoles, fit, damping, layer)
+    return LayoutFit(layer, None, replace(fit, moments=moments))

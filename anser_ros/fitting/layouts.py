@@ -68,6 +68,8 @@ class Layout:
         What the damping pulls the moments towards: zero, or those of the drawn board.
     moved : bool
         Whether the dipoles are moved from there to where they explain the data best.
+    local : bool
+        Whether overlapping regions get moments of their own.
     """
 
     kind: str
@@ -76,11 +78,13 @@ class Layout:
     depth_m: float
     prior: str = 'none'
     moved: bool = False
+    local: bool = False
 
     def describe(self) -> str:
         """One line for a report."""
         drawn = ', pulled to the drawn board' if self.prior == 'nominal' else ''
         drawn += ', positions optimised' if self.moved else ''
+        drawn += ', in overlapping regions' if self.local else ''
         if self.kind == 'coils':
             return f'{self.count}x{self.count} z-dipoles on every coil{drawn}'
         parts = 'z-dipoles' if self.kind == 'layer' else 'three-component dipoles'

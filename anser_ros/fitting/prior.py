@@ -35,7 +35,7 @@ class DrawnBoard:
     """
 
     def __init__(self, nominal: FieldModel, measurements: Sequence[Measurements]) -> None:
-        self.points, self.axes = _around(measurements)
+        self.points, self.axes = volume_lattice(measurements)
         self.gains = emitter_gains(nominal, measurements)
         self.flux = nominal.flux(self.points, self.axes) * self.gains
 
@@ -47,8 +47,8 @@ class DrawnBoard:
         return as_complex(factor.spectrum().solve(PROJECTION_DAMPING))
 
 
-def _around(measurements: Sequence[Measurements]) -> tuple[Array, Array]:
-    """Three axes at each point of a lattice around the measured volume."""
+def volume_lattice(measurements: Sequence[Measurements]) -> tuple[Array, Array]:
+    """Points and axes (P, 3): three axes at each point of a lattice about the measured volume."""
     points = np.concatenate([m.placed()[0][m.usable] for m in measurements])
     low, high = points.min(axis=0), points.max(axis=0)
     middle, half = (low + high) / 2.0, (high - low) / 2.0

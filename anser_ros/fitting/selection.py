@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 DAMPINGS = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 1e-2)
 EXTENSIONS = (1.0, 1.25, 1.5, 1.8, 2.2)
-COUNTS = (6, 8, 10, 12, 14, 16, 18, 20)
+COUNTS = (6, 8, 10, 12, 14, 16, 18)
 DEPTHS = (-0.15, 0.15, 0.3)
 """As a part of the lowest sensor's height over the coils."""
 MOST_ROWS = 12_000
@@ -40,9 +40,12 @@ MOVING = (
     Layout('layer', 8, 1.25, 0.01),
 )
 """Where dipoles start from that are moved."""
+LOCAL_COUNT = 10
+LOCAL_READINGS = 24
+"""Readings a dipole that local models need: four regions that overlap by half."""
 MOVING_READINGS = 12
 """Readings that a moved dipole must have at least: three coordinates and a moment, thrice."""
-WORTH = 0.05
+WORTH = 0.08
 """A richer layout must lower the predictive error by this part to be worth its dipoles."""
 WORTH_MANY = 0.15
 """The same for a layer that stays over one that moves, which has a third of the dipoles."""
@@ -299,6 +302,10 @@ def choose_layout(
     moving = [m for m in moving if MOVING_READINGS * len(place(m, generator)) <= rows]
     if moving:
         finalists.append(min(map(search.score, moving), key=lambda c: c.score))
+    if rows >= LOCAL_READINGS * LOCAL_COUNT**2:
+        own = Layout('layer', LOCAL_COUNT, EXTENSIONS[1], max(best.layout.depth_m, 0.0), prior)
+        common = search.score(own)
+        finalists.append(replace(common, layout=replace(common.layout, local=True)))
     return Selection(tuple(finalists), tuple(search.tried.values()), selector.reference)
 
 
