@@ -9,6 +9,7 @@ from anser_ros.cli.main import main
 from anser_ros.errors import BagError
 from anser_ros.experiments import article
 from anser_ros.experiments.bound import position_bound
+from anser_ros.experiments.error_maps import board_folder, board_places, board_runs
 from anser_ros.experiments.figures import draw_all
 from anser_ros.experiments.methods import article_model, centres_extension, drawn_model
 from anser_ros.experiments.recordings import (
@@ -146,6 +147,59 @@ def test_corrected_errors_keep_what_was_not_tracked(recordings):
     found = track(session, article_model(recordings.load('factory_tool_a')), in_phase=True)['Y']
     assert found.tracked_fraction == 1.0
     assert np.allclose(found.corrected(found.true).distance, 0.0)
+
+
+def test_fiducials_are_read_aligned_and_mapped(tmp_path):
+    places = board_places()
+    assert places.shape == (41, 3)
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    tracked = 1e3 * (places + 0.02 * places * np.abs(places)[:, ::-1] / 0.06) @ turn.T + 150.0
+    lines = [f'id{i},{x:.4f},{y:.4f},{z:.4f},0' for i, (x, y, z) in enumerate(tracked)]
+    (tmp_path / 'run.fcsv').write_text('# markups\n' + '\n'.join(lines) + '\n')
+    (run,) = board_runs(tmp_path)
+    assert run.points == 41
+    assert run.after_m < 0.8 * run.before_m
+    assert board_runs(tmp_path / 'nowhere') == []
+    (tmp_path / 'run.fcsv').write_text('a,b,c,d\n')
+    with pytest.raises(BagError, match='no table of fiducials'):
+        board_runs(tmp_path)
+    (tmp_path / 'run.fcsv').write_text(lines[0] + '\n')
+    with pytest.raises(BagError, match='41 fiducials expected, got 1'):
+        board_runs(tmp_path)
+
+
+@pytest.mark.skipif(not board_folder().is_dir(), reason='the measured board is not at hand')
+def test_the_measured_board_is_no_worse_with_a_map():
+    runs = {run.name: run for run in board_runs(board_folder())}
+    assert 1e3 * runs['standard_data_grid'].before_m == pytest.approx(2.26, abs=0.01)
+    assert 1e3 * runs['steel_shield'].before_m == pytest.approx(5.21, abs=0.01)
+    assert all(run.after_m <= run.before_m for run in runs.values())
+    assert runs['standard_data_grid'].after_m < 0.75 * runs['standard_data_grid'].before_m
+
+
+def test_error_map_command(tmp_path, capsys):
+    rng = np.random.default_rng(1)
+    true = rng.uniform(-0.1, 0.1, (80, 3))
+    tracked = true + 0.002 * np.sin(true / 0.05)
+    header = 'x_m,y_m,z_m,true_x_m,true_y_m,true_z_m\n'
+    rows = [','.join(f'{v:.7f}' for v in (*t, *r)) for t, r in zip(tracked, true, strict=True)]
+    (tmp_path / 'points.csv').write_text(header + '\n'.join(rows) + '\n')
+    points = str(tmp_path / 'points.csv')
+    arguments = ['error_map', points, '--out', str(tmp_path), '--apply', points, '--json']
+    assert main(arguments) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document['heldout_rmse_after_m'] < 0.3 * document['heldout_rmse_before_m']
+    lines = (tmp_path / 'corrected.csv').read_text().splitlines()
+    assert len(lines) == 81
+    first = np.array(lines[1].split(','), dtype=float)
+    assert np.linalg.norm(first[:3] - true[0]) < 0.5 * np.linalg.norm(tracked[0] - true[0]) + 1e-4
+    assert main(['error_map', points, '--out', str(tmp_path)]) == 0
+    assert 'held out' in capsys.readouterr().out
+    (tmp_path / 'bad.csv').write_text('x_m,y_m\n1,2\n')
+    assert main(['error_map', str(tmp_path / 'bad.csv'), '--out', str(tmp_path)]) == 2
+    assert 'needs the columns' in capsys.readouterr().err
+    (tmp_path / 'none.csv').write_text(header)
+    assert main(['error_map', str(tmp_path / 'none.csv'), '--out', str(tmp_path)]) == 2
 
 
 def test_a_raster_is_the_same_every_time():

@@ -10,7 +10,9 @@ from anser_ros.errors import FitError
 from anser_ros.fitting.blocks import FOLDS, fold_of_frames
 from anser_ros.fitting.calibration import Options, calibrate, rms
 from anser_ros.fitting.error_map import FEWEST_POINTS, IDENTITY, learn_error_map
+from anser_ros.fitting.layout_fit import fit_layout
 from anser_ros.fitting.layouts import Generator, Layout, place
+from anser_ros.fitting.local import Regions
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.pose_correction import Uncertainty
 from anser_ros.fitting.prior import DrawnBoard, emitter_gains
@@ -267,3 +269,40 @@ def test_error_map_refusals():
         learn_error_map(np.zeros((9, 3)), np.zeros((8, 3)))
     with pytest.raises(FitError, match=f'at least {FEWEST_POINTS} points .* got 7'):
         learn_error_map(np.zeros((7, 3)), np.zeros((7, 3)))
+
+
+# Local models.
+
+
+def test_shares_of_regions_add_up_to_one(rng):
+    regions = Regions(rng.uniform(-1, 1, (100, 3)) * [1.0, 0.9, 0.1])
+    assert len(regions) == 4
+    where = rng.uniform(-2, 2, (50, 3))
+    shares = regions.shares(where)
+    assert np.allclose(shares.sum(axis=1), 1.0)
+    assert (shares >= 0).all()
+    assert regions.shares(np.array([[-1.0, -0.9, 0.0]])).max() == pytest.approx(1.0)
+
+
+def test_joined_regions_make_the_common_field_where_one_model_does(world):
+    layout = Layout('layer', 9, 1.5, 0.0, local=True)
+    plain = replace(layout, local=False)
+    common = (Uncertainty(), None, 3, False)
+    local, whole = (
+        fit_layout([world.measurements], one, 1e-3, world.generator, *common)
+        for one in (layout, plain)
+    )
+    points = rng_points()
+    axes = np.tile([0.0, 0.6, 0.8], (len(points), 1))
+    fluxes = [
+        FieldModel(
+            part.dipoles.positions, part.dipoles.directions, part.fit.moments, EMITTERS, TONES
+        ).flux(points, axes)
+        for part in (local, whole)
+    ]
+    assert rms(fluxes[0] - fluxes[1]) < 0.02 * rms(fluxes[1])
+    assert 'regions' in layout.describe()
+
+
+def rng_points():
+    return np.random.default_rng(9).uniform([-0.07, -0.07, 0.125], [0.07, 0.07, 0.155], (100, 3))

@@ -1,7 +1,7 @@
 """The article's experiments, run on recordings: Tables II to V and what its figures show."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.experiments.bound import position_bound
+from anser_ros.experiments.error_maps import BoardRun, board_folder, board_runs
 from anser_ros.experiments.methods import (
     article_model,
     centres_extension,
@@ -56,6 +57,8 @@ class Results:
         By what they were trained on: how our model was chosen.
     corrections : dict
         By method, then sensor: the error map of Table V, in words.
+    board_runs : list of BoardRun
+        Error maps of a real tracker's positions; the only measured data here.
     """
 
     origin: str
@@ -64,6 +67,7 @@ class Results:
     bounds: dict[str, dict[str, float]] = field(default_factory=dict)
     models: dict[str, str] = field(default_factory=dict)
     corrections: dict[str, dict[str, str]] = field(default_factory=dict)
+    board_runs: list[BoardRun] = field(default_factory=list)
 
     def document(self) -> dict[str, Any]:
         """The figures as plain data."""
@@ -88,6 +92,7 @@ class Results:
             'bounds_m': self.bounds,
             'models': self.models,
             'corrections': self.corrections,
+            'measured_board': [asdict(run) for run in self.board_runs],
         }
 
 
@@ -131,6 +136,7 @@ class Study:
             ('Fig. 7', self.head),
             ('Table IV', self.shields_and_head),
             ('Table V', self.compensation),
+            ('error maps', self.error_maps),
         )
         for count, (name, step) in enumerate(steps):
             if self.progress is not None:
@@ -250,6 +256,10 @@ class Study:
             for method, errors in compensated.items()
         }
         self._bound('table_5 compensated', test, ours)
+
+    def error_maps(self) -> None:
+        """The classic error map, for a tracker that gives positions only."""
+        self.results.board_runs = board_runs(board_folder())
 
     def _corrected(self, method: str, known: Errors, errors: Errors) -> Errors:
         """Positions corrected with what the bottom plane says, where that helps there."""
