@@ -17,6 +17,7 @@ from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.refit_assembly import Assembly
 from anser_ros.fitting.refit_change import Average, NoiseLevel
 from anser_ros.fitting.refit_excitation import FieldFunction
+from anser_ros.fitting.refit_frame import FrameOrder
 from anser_ros.fitting.refit_health import ReferenceHealth, Watch
 from anser_ros.fitting.refit_posterior import Bank, Evaluation
 from anser_ros.fitting.refit_result import (
@@ -36,7 +37,6 @@ __all__ = ['LiveRefit', 'Metal', 'RefitResult', 'RefitSettings']
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_READABLE = (health.MISSING, health.OK, health.FLAGGED, health.NOT_FINITE, health.NO_BASELINE)
 MOST_BANKS = 4
 NOTHING = 0.99
 """Probability of no change from which on the calibrated model is in force."""
@@ -98,8 +98,7 @@ class LiveRefit:
         for emitter in range(k):
             self._drift[emitter::k, emitter] = np.nan_to_num(turned[:, emitter].real) * scale
         self._banks: dict[bytes, Bank] = {}
-        self._has_baseline = np.isfinite(self.baseline).all(axis=1)
-        self._place = {int(c): i for i, c in enumerate(references.channel.tolist())}
+        self._order = FrameOrder(references.channel, self.baseline)
         self._names = ('nothing', *(prior.cloud.name for prior in self._scene.priors))
         self._assembly = Assembly(model, self._scene.layers)
 
@@ -173,7 +172,7 @@ class LiveRefit:
         FitError
             When shapes don't fit or a channel appears twice.
         """
-        ordered, readable, reasons = self._ordered(channels, flux, flags)
+        ordered, readable, reasons = self._order.read(channels, flux, flags)
         if stamp_ns < self._last_ns:
             self._noise.forget()
             self._average.forget()
@@ -196,38 +195,11 @@ class LiveRefit:
         if self._in_use().sum() < self.settings.min_references:
             return self._too_few(stamp_ns, level)
         result = self._result(stamp_ns, bank, seen, level)
-        self._readmit(bank, seen, values, readable)
+        self._readmit(bank, seen, values, readable, level)
         return result
 
     def _in_use(self) -> NDArray[np.bool_]:
         return np.asarray(~self._watch.excluded)
-
-    def _ordered(
-        self,
-        channels: NDArray[np.generic],
-        flux: NDArray[np.generic],
-        flags: NDArray[np.generic] | None,
-    ) -> tuple[ComplexArray, NDArray[np.bool_], list[str]]:
-        """Fluxes in the table's order, which of them can be used, and why others can't."""
-        given, number = np.asarray(flux), np.asarray(channels, dtype=np.int64)
-        marks = np.zeros(number.shape, dtype=np.int64) if flags is None else np.asarray(flags)
-        k = len(self.model.emitters)
-        if given.shape != (number.size, k) or marks.shape != number.shape:
-            raise FitError(
-                f'refit: {number.size} channels and {k} emitters need fluxes of that shape and '
-                f'as many flags, got {given.shape} and {marks.shape}'
-            )
-        if len(set(number.tolist())) != number.size:
-            raise FitError('refit: a channel appears twice in the frame')
-        place = np.array([self._place.get(c, -1) for c in number.tolist()], dtype=np.int64)
-        known = place >= 0
-        ordered = np.full(self.baseline.shape, np.nan, dtype=complex)
-        ordered[place[known]] = given[known]
-        code = np.zeros(len(self.references), dtype=np.int64)
-        code[place[known]] = np.where(marks[known] != 0, 2, 1)
-        code[(code == 1) & ~np.isfinite(ordered).all(axis=1)] = 3
-        code[~self._has_baseline] = 4
-        return ordered, np.asarray(code == 1), [_READABLE[c] for c in code.tolist()]
 
     def _bank(self) -> Bank:
         """The hypotheses for the coils in use; decomposed again only when those change."""
@@ -262,12 +234,18 @@ class LiveRefit:
             self._average.forget()
 
     def _readmit(
-        self, bank: Bank, seen: Evaluation, values: Array, readable: NDArray[np.bool_]
+        self,
+        bank: Bank,
+        seen: Evaluation,
+        values: Array,
+        readable: NDArray[np.bool_],
+        level: float,
     ) -> None:
         """Let coils return that agree with the others again."""
         best, k = int(seen.log_evidence.argmax()), bank.width
         for coil in np.flatnonzero(self._watch.excluded & readable):
-            distance = bank.distance(seen, best, coil * k + np.arange(k), values[coil])
+            rows = coil * k + np.arange(k)
+            distance = bank.distance(seen, best, rows, values[coil], level)
             self._watch.agreed(int(coil), distance < health.AGREES * 2 * k)
 
     def _result(self, stamp_ns: int, bank: Bank, seen: Evaluation, level: float) -> RefitResult:
@@ -357,12 +335,12 @@ class LiveRefit:
         best = 1 + int(weights[1:].argmax())
         values = bank.sources(seen, best) * self.settings.flux_noise_t
         polarisability = values[:, 0] + 1j * values[:, 1]
-        power = np.abs(polarisability) ** 2
         cloud = bank.priors[best - 1].cloud
+        power = np.abs(polarisability) ** 2 / cloud.volumes
         if not power.sum() > 0.0:
             return None
         centroid = (cloud.positions * power[:, None]).sum(axis=0) / power.sum()
-        return Metal(cloud.positions, polarisability, centroid, cloud.standoff_m)
+        return Metal(cloud.positions, polarisability, cloud.volumes, centroid, cloud.standoff_m)
 
 
 def _checked_noise(noise: Array | None, count: int, width: int) -> Array:

@@ -263,7 +263,12 @@ class Bank:
         return evidence, residuals[int(evidence.argmax())].reshape(len(coils), self.width, 2)
 
     def distance(
-        self, seen: Evaluation, hypothesis: int, rows: NDArray[np.int64], readings: Array
+        self,
+        seen: Evaluation,
+        hypothesis: int,
+        rows: NDArray[np.int64],
+        readings: Array,
+        noise: float,
     ) -> float:
         """How far readings of a coil that is not in use are from what those in use predict.
 
@@ -272,6 +277,8 @@ class Bank:
         rows : ndarray of int, shape (K,)
             Rows of the priors' covariance.
         readings : ndarray, shape (K, 2)
+        noise : float
+            Of these readings, which are not averaged, in units of the nominal one.
 
         Returns
         -------
@@ -282,7 +289,7 @@ class Bank:
         basis, variance = self.bases[hypothesis], seen.noise**2
         ahead = self._all_drift[rows]
         shared = variance * (ahead @ self.drift.T)
-        own = variance * (np.diag(self._all_noise[rows] ** 2) + ahead @ ahead.T)
+        own = np.diag((noise * self._all_noise[rows]) ** 2) + variance * (ahead @ ahead.T)
         total = 0.0
         for part in range(2):
             strength = int(seen.strength[hypothesis, part].argmax())

@@ -78,14 +78,18 @@ class Metal:
         m, frame fg.
     polarisability : ndarray, shape (M,), complex
         A m^2 / T.
+    volumes : ndarray, shape (M,)
+        Volume that each source stands for, m^3.
     centroid : ndarray, shape (3,)
-        Mean of the positions, weighted by the polarisabilities' squared magnitude.
+        Mean of the space, weighted by the squared magnitude of the polarisability's density. It
+        leans towards the part of the metal that the emitters reach best.
     standoff_m : float
         The cloud's distance from the board.
     """
 
     positions: Array
     polarisability: ComplexArray
+    volumes: Array
     centroid: Array
     standoff_m: float
 

@@ -1,0 +1,61 @@
+"""Frames of reference fluxes in the references' order, with a reason for each unusable one."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import FitError
+from anser_ros.fitting import refit_health as health
+
+ComplexArray = NDArray[np.complex128]
+
+_REASONS = (health.MISSING, health.OK, health.FLAGGED, health.NOT_FINITE, health.NO_BASELINE)
+
+
+class FrameOrder:
+    """Knows which row of a frame belongs to which reference.
+
+    Parameters
+    ----------
+    channel : ndarray of int, shape (S,)
+        Channels of the references.
+    baseline : ndarray, shape (S, K), complex
+        A coil whose baseline is not finite can't be used.
+    """
+
+    def __init__(self, channel: NDArray[np.int64], baseline: ComplexArray) -> None:
+        self._place = {int(c): i for i, c in enumerate(channel.tolist())}
+        self._shape = baseline.shape
+        self._has_baseline = np.isfinite(baseline).all(axis=1)
+
+    def read(
+        self,
+        channels: NDArray[np.generic],
+        flux: NDArray[np.generic],
+        flags: NDArray[np.generic] | None,
+    ) -> tuple[ComplexArray, NDArray[np.bool_], list[str]]:
+        """Fluxes (S, K) in the references' order, which can be used, and why others can't.
+
+        Raises
+        ------
+        FitError
+            When shapes don't fit or a channel appears twice.
+        """
+        given, number = np.asarray(flux), np.asarray(channels, dtype=np.int64)
+        marks = np.zeros(number.shape, dtype=np.int64) if flags is None else np.asarray(flags)
+        count, k = self._shape
+        if given.shape != (number.size, k) or marks.shape != number.shape:
+            raise FitError(
+                f'refit: {number.size} channels and {k} emitters need fluxes of that shape and '
+                f'as many flags, got {given.shape} and {marks.shape}'
+            )
+        if len(set(number.tolist())) != number.size:
+            raise FitError('refit: a channel appears twice in the frame')
+        place = np.array([self._place.get(c, -1) for c in number.tolist()], dtype=np.int64)
+        known = place >= 0
+        ordered = np.full(self._shape, np.nan, dtype=complex)
+        ordered[place[known]] = given[known]
+        code = np.zeros(count, dtype=np.int64)
+        code[place[known]] = np.where(marks[known] != 0, 2, 1)
+        code[(code == 1) & ~np.isfinite(ordered).all(axis=1)] = 3
+        code[~self._has_baseline] = 4
+        return ordered, np.asarray(code == 1), [_REASONS[c] for c in code.tolist()]

@@ -1,0 +1,354 @@
+"""The live refit: what it corrects, what it leaves alone, and whom it believes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from refit_world import (
+    NOISE_T,
+    anser_world,
+    metal_block,
+    three_coil_world,
+    volume_points,
+)
+
+from anser_ros.errors import FitError
+from anser_ros.fitting.refit import LiveRefit, RefitSettings
+
+STEP_NS = 20_000_000
+HEAD = metal_block([0.03, -0.02, -0.11], [0.1, 0.12, 0.06])
+
+
+@pytest.fixture(scope='module')
+def refit():
+    """One refit for the module: its geometry is worked out once."""
+    return anser_world().refit()
+
+
+@pytest.fixture(autouse=True)
+def fresh(refit):
+    """Every test begins with a refit that has seen nothing."""
+    refit.reset()
+
+
+def run(refit, world, change, frames=3, seed=1, start=1, fault=None, flags=None):
+    """Feed frames with noise; the last result."""
+    rng, result = np.random.default_rng(seed), None
+    for frame in range(frames):
+        flux = world.baseline + change + world.noise(rng)
+        if fault is not None:
+            fault(flux)
+        stamp = (start + frame) * STEP_NS
+        result = refit.update(stamp, world.references.channel, flux, flags)
+    return result
+
+
+def errors(world, model, points):
+    """Rms of the field's error before and after, and the predicted sigma, over the volume, T."""
+    places, axes = volume_points()
+    tools = replace_geometry(world.references, places, axes)
+    truth = world.metal(points, tools)
+    made = model.flux(places, axes) - world.model.flux(places, axes)
+    modes = np.zeros((0, 1)) if model.modes is None else model.modes
+    spread = np.full(truth.shape, model.flux_error_t**2)
+    for mode in modes:
+        spread += np.abs(replace(model, moments=mode, modes=None).flux(places, axes)) ** 2 / 2.0
+    return rms(truth), rms(truth - made), np.sqrt(spread), truth - made
+
+
+def replace_geometry(table, places, axes):
+    """The references' table cut or repeated to other places."""
+    rows = np.arange(len(places)) % len(table)
+    return table.select(rows).with_geometry(places, axes, np.zeros(len(places)))
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.abs(values) ** 2)))
+
+
+def test_nothing_changed_leaves_the_calibrated_model_itself(refit):
+    world = anser_world()
+    for frame in range(40):
+        result = run(refit, world, 0.0, frames=1, seed=frame, start=1 + frame)
+        assert result.model is world.model
+        assert (result.state, result.changed, result.left_out) == ('frozen', False, ())
+        assert result.metal is None
+    assert result.noise_t == pytest.approx(NOISE_T, rel=0.15)
+
+
+def test_metal_is_seen_at_once_and_its_field_is_taken_off(refit):
+    world = anser_world()
+    run(refit, world, 0.0)
+    result = run(refit, world, world.metal(HEAD), frames=1, start=10)
+    assert (result.state, result.changed) == ('refit', True)
+    assert result.log_odds > 10
+    before, after, _, _ = errors(world, result.model, HEAD)
+    assert before > 1e-9
+    assert after < 0.02 * before
+    centre = HEAD.mean(axis=0)
+    assert np.linalg.norm(result.metal.centroid - centre) < 0.06
+    assert result.metal.polarisability.shape == (len(result.metal.positions),)
+    # When it has gone, the model is the calibrated one again.
+    result = run(refit, world, 0.0, frames=3, start=20)
+    assert result.model is world.model
+
+
+def test_far_metal_is_corrected_too_and_the_uncertainty_is_honest(refit):
+    world = anser_world()
+    for depth in (0.2, 0.12, 0.06):
+        points = metal_block([-0.04, 0.03, -depth - 0.02], [0.08, 0.08, 0.04])
+        result = run(refit, world, world.metal(points), frames=6, start=1 + int(1e4 * depth))
+        before, after, sigma, error = errors(world, result.model, points)
+        assert after < 0.1 * before
+        score = np.abs(error) / sigma
+        assert np.sqrt(np.mean(score**2)) < 2.5
+        assert np.mean(sigma) < 0.5 * before
+
+
+def test_metal_over_the_volume(refit):
+    world = anser_world()
+    points = metal_block([0.02, 0.01, 0.36], [0.25, 0.2, 0.04])
+    result = run(refit, world, world.metal(points, polarisability=-15000.0), frames=6)
+    before, after, _, _ = errors_of(world, result.model, points, -15000.0)
+    assert max(result.weights, key=result.weights.get).startswith('around')
+    assert after < 0.35 * before
+
+
+def errors_of(world, model, points, polarisability):
+    scaled = replace(world, board=_Scaled(world.board, polarisability / (-600.0 + 80.0j)))
+    return errors(scaled, model, points)
+
+
+class _Scaled:
+    """A board whose metal answers more strongly."""
+
+    def __init__(self, board, factor):
+        self.board, self.factor = board, factor
+
+    def field(self, points):
+        return self.board.field(points) * self.factor
+
+
+def test_no_dipoles_are_lost_and_the_layer_is_small(refit):
+    world = anser_world()
+    result = run(refit, world, world.metal(HEAD))
+    assert 0 < len(result.model.positions) - len(world.model.positions) <= 200
+    assert 0 < len(result.model.modes) <= 12
+    np.testing.assert_array_equal(
+        result.model.positions[: len(world.model.positions)], world.model.positions
+    )
+
+
+def test_an_emitter_that_drifts_is_followed_without_inventing_metal(refit):
+    world = anser_world()
+    drift = np.zeros(8, complex)
+    drift[4] = 0.004 - 0.001j
+    run(refit, world, 0.0)
+    result = run(refit, world, world.baseline * drift, frames=8, start=10)
+    assert result.state == 'refit'
+    assert abs(result.drift[4] - drift[4]) < 2e-4
+    places, axes = volume_points()
+    clean = world.model.flux(places, axes)
+    np.testing.assert_allclose(
+        result.model.flux(places, axes), clean * (1 + drift), atol=0.03 * rms(clean * drift)
+    )
+
+
+FAULTS = {
+    'dead': lambda flux: flux.__setitem__(5, 0.0),
+    'turned round': lambda flux: flux.__setitem__(5, -flux[5]),
+    'gain': lambda flux: flux.__setitem__(5, 0.9 * flux[5]),
+}
+
+
+@pytest.mark.parametrize('fault', FAULTS.values(), ids=FAULTS)
+@pytest.mark.parametrize('metal', [False, True])
+def test_a_reference_that_fails_is_named_and_left_out(refit, fault, metal):
+    world = anser_world()
+    change = world.metal(HEAD) if metal else 0.0
+    run(refit, world, change)
+    result = run(refit, world, change, frames=1, start=10, fault=fault)
+    assert result.left_out == ('ref/5',)
+    assert result.references[5].state == 'disagrees'
+    if metal:
+        before, after, _, _ = errors(world, result.model, HEAD)
+        assert after < 0.02 * before
+    else:
+        assert result.model is world.model
+
+
+def test_two_that_fail_together_do_not_hide_each_other(refit):
+    world = anser_world()
+
+    def swap(flux):
+        flux[[3, 11]] = flux[[11, 3]]
+
+    result = run(refit, world, world.metal(HEAD), frames=1, fault=swap)
+    assert result.left_out == ('ref/3', 'ref/11')
+    before, after, _, _ = errors(world, result.model, HEAD)
+    assert after < 0.02 * before
+
+
+def test_one_that_works_again_comes_back_after_a_while(refit):
+    world = anser_world()
+    run(refit, world, 0.0, fault=FAULTS['dead'])
+    hold = refit.settings.hold_frames
+    result = run(refit, world, 0.0, frames=hold - 1, start=10)
+    assert result.left_out == ('ref/5',)
+    result = run(refit, world, 0.0, frames=3, start=100)
+    assert result.left_out == ()
+
+
+@pytest.mark.parametrize('reason', ['flagged', 'not finite', 'missing'])
+def test_what_can_not_be_read_is_left_out_with_its_reason(refit, reason):
+    world, rng = anser_world(), np.random.default_rng(2)
+    flux = world.baseline + world.metal(HEAD) + world.noise(rng)
+    flags = np.zeros(len(flux), dtype=int)
+    channels = world.references.channel
+    if reason == 'flagged':
+        flags[2], flux[2] = 1, 3e-6
+    elif reason == 'not finite':
+        flux[2, 3] = np.nan
+    else:
+        keep = np.arange(len(flux)) != 2
+        flux, flags, channels = flux[keep], flags[keep], channels[keep]
+    result = refit.update(STEP_NS, channels, flux, flags)
+    assert result.left_out == ('ref/2',)
+    assert result.references[2].state == reason
+    assert np.isnan(result.references[2].residual_t)
+    before, after, _, _ = errors(world, result.model, HEAD)
+    assert after < 0.02 * before
+
+
+def test_too_few_references_mean_the_calibrated_model_and_say_so(refit):
+    world = anser_world()
+    run(refit, world, world.metal(HEAD))
+    few = world.references.channel[:3]
+    result = refit.update(10 * STEP_NS, few, world.baseline[:3])
+    assert result.state == 'few_references'
+    assert result.changed
+    assert result.model is world.model
+    assert '3 usable' in result.reason
+    assert result.left_out == world.references.name[3:]
+
+
+def test_a_reference_without_a_baseline_takes_no_part():
+    world = anser_world()
+    baseline = world.baseline.copy()
+    baseline[7, 2] = np.nan
+    refit = LiveRefit(world.model, world.references, baseline, drawing=world.board.field)
+    result = run(refit, world, world.metal(HEAD))
+    assert result.references[7].state == 'no baseline'
+    before, after, _, _ = errors(world, result.model, HEAD)
+    assert after < 0.02 * before
+
+
+def test_the_order_of_channels_does_not_matter_and_strange_ones_are_passed_over(refit):
+    world, rng = anser_world(), np.random.default_rng(4)
+    flux = world.baseline + world.metal(HEAD) + world.noise(rng)
+    first = refit.update(STEP_NS, world.references.channel, flux)
+    refit.reset()
+    order = rng.permutation(len(flux))
+    channels = np.concatenate([[7], world.references.channel[order]])
+    second = refit.update(STEP_NS, channels, np.concatenate([flux[:1], flux[order]]))
+    np.testing.assert_allclose(first.model.moments, second.model.moments, rtol=1e-12)
+
+
+def test_any_number_of_emitters():
+    world = three_coil_world()
+    points = metal_block([0.01, 0.02, -0.08], [0.06, 0.06, 0.03])
+    refit = world.refit()
+    result = run(refit, world, world.metal(points), frames=4)
+    places = volume_points()[0] * [0.7, 0.7, 0.8]
+    axes = volume_points()[1]
+    tools = replace_geometry(world.references, places, axes)
+    truth = world.metal(points, tools)
+    made = result.model.flux(places, axes) - world.model.flux(places, axes)
+    assert rms(truth - made) < 0.05 * rms(truth)
+
+
+def test_phases_of_the_emitters_are_turned_back():
+    world = anser_world()
+    turn = np.exp(1j * np.linspace(0.2, 0.9, 8))
+    model = replace(world.model, moments=world.model.moments * turn)
+    refit = LiveRefit(model, world.references, world.baseline * turn, drawing=world.board.field)
+    rng = np.random.default_rng(3)
+    flux = (world.baseline + world.metal(HEAD)) * turn + world.noise(rng)
+    result = refit.update(STEP_NS, world.references.channel, flux)
+    places, axes = volume_points()
+    truth = world.metal(HEAD, replace_geometry(world.references, places, axes)) * turn
+    made = result.model.flux(places, axes) - model.flux(places, axes)
+    assert rms(truth - made) < 0.02 * rms(truth)
+
+
+def test_a_drawing_of_another_board_is_not_believed():
+    world, other = anser_world(), three_coil_world()
+    assert world.refit().excitation_source == 'board'
+
+    def shuffled(points):
+        return world.board.field(points)[:, ::-1]
+
+    refit = LiveRefit(world.model, world.references, world.baseline, drawing=shuffled)
+    assert refit.excitation_source == 'model'
+    result = run(refit, world, world.metal(HEAD))
+    before, after, _, _ = errors(world, result.model, HEAD)
+    assert after < 0.3 * before
+    with pytest.raises(FitError, match='the drawing makes fields'):
+        LiveRefit(world.model, world.references, world.baseline, drawing=other.board.field)
+
+
+def test_references_that_move(refit):
+    world = anser_world()
+    result = run(refit, world, world.metal(HEAD))
+    shifted = world.references.with_geometry(world.references.position + [0.0, 0.0, 0.02])
+    there = np.einsum('pka,pa->pk', world.board.field(shifted.position), shifted.axis)
+    moved = refit.moved(shifted, there.astype(complex))
+    flux = there + world.metal(HEAD, shifted) + world.noise(np.random.default_rng(5))
+    again = moved.update(100 * STEP_NS, shifted.channel, flux)
+    places, axes = volume_points()
+    step = again.model.flux(places, axes) - result.model.flux(places, axes)
+    change = result.model.flux(places, axes) - world.model.flux(places, axes)
+    assert rms(step) < 0.03 * rms(change)
+    with pytest.raises(FitError, match='the same coils'):
+        refit.moved(shifted.select(range(5)), there[:5])
+
+
+def test_a_change_that_nothing_explains_is_a_state_not_a_confident_model(refit):
+    world, rng = anser_world(), np.random.default_rng(8)
+    strange = 0.4 * world.baseline * rng.normal(size=world.baseline.shape)
+    result = run(refit, world, strange)
+    assert result.state in ('poor_fit', 'few_references') or result.model.flux_error_t > 1e-8
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        ({'flux_noise_t': 0.0}, 'flux_noise_t'),
+        ({'min_references': 0}, 'min_references'),
+        ({'persistence': 1.0}, 'persistence'),
+        ({'modes': 0}, 'modes'),
+    ],
+)
+def test_settings_are_checked(change, message):
+    with pytest.raises(FitError, match=message):
+        RefitSettings(**change)
+
+
+def test_what_does_not_fit_is_refused(refit):
+    world = anser_world()
+    table, baseline = world.references, world.baseline
+    with pytest.raises(FitError, match='no reference sensors'):
+        LiveRefit(world.model, table.select(np.zeros(0, dtype=int)), baseline[:0])
+    with pytest.raises(FitError, match='baseline of that shape'):
+        LiveRefit(world.model, table, baseline[:, :3])
+    with pytest.raises(FitError, match='twice in the references'):
+        LiveRefit(world.model, table.select([0, 0]), baseline[[0, 0]])
+    with pytest.raises(FitError, match='noise must be'):
+        LiveRefit(world.model, table, baseline, noise=np.zeros(len(table)))
+    with pytest.raises(FitError, match='as many flags'):
+        refit.update(1, table.channel, baseline[:, :2])
+    with pytest.raises(FitError, match='twice in the frame'):
+        refit.update(1, table.channel[[0, 0]], baseline[[0, 0]])
+    dark = replace(world.model, moments=0.0 * world.model.moments)
+    with pytest.raises(FitError, match='no field'):
+        LiveRefit(dark, table, baseline)

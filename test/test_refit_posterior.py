@@ -1,0 +1,285 @@
+"""The refit's algebra against its plain definition: dense normal distributions and brute force."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from refit_world import anser_world
+from scipy.stats import multivariate_normal
+
+from anser_ros.fitting import refit_health as health
+from anser_ros.fitting.refit_change import Average, NoiseLevel
+from anser_ros.fitting.refit_clouds import Region, below, default_clouds, overhead
+from anser_ros.fitting.refit_excitation import excitation_for, region_of
+from anser_ros.fitting.refit_layer import bottom_layer, box_layer
+from anser_ros.fitting.refit_modes import error_modes
+from anser_ros.fitting.refit_patches import PoseError, clean_reading, has_moved
+from anser_ros.fitting.refit_posterior import STRENGTHS, Bank
+from anser_ros.fitting.refit_prior import build_prior
+from anser_ros.fitting.refit_references import SurveyError, survey_variants, vector_basis
+
+K = 8
+NOISE = 1.3
+
+
+@pytest.fixture(scope='module')
+def world():
+    return anser_world()
+
+
+@pytest.fixture(scope='module')
+def parts(world):
+    """Excitation, region, layer and two priors of six references."""
+    excitation, region = excitation_for(world.model, world.board.field)
+    clouds = [below(region, 0.06), below(region, 0.12)]
+    layer = bottom_layer(world.model, region, excitation, clouds[0].positions)
+    references = world.references.select(range(6))
+    rng = np.random.default_rng(1)
+    priors = [
+        build_prior(
+            cloud, layer, references, excitation.field(cloud.positions),
+            np.array(world.model.frequencies_hz), SurveyError(), rng,
+        )
+        for cloud in clouds
+    ]  # fmt: skip
+    return excitation, region, layer, references, priors
+
+
+@pytest.fixture(scope='module')
+def drift(world):
+    out = np.zeros((6 * K, K))
+    for k in range(K):
+        out[k::K, k] = 2.0 * world.baseline[:6, k].real / np.abs(world.baseline[:6]).max()
+    return out
+
+
+@pytest.fixture(scope='module')
+def loudness():
+    return np.repeat([1.0, 1.0, 3.0, 1.0, 1.0, 1.5], K)
+
+
+@pytest.fixture(scope='module')
+def bank(parts, drift, loudness):
+    return Bank(parts[4], np.arange(6 * K), drift, loudness)
+
+
+@pytest.fixture(scope='module')
+def readings(parts):
+    rng = np.random.default_rng(3)
+    prior = parts[4][0]
+    metal = np.sqrt(1e4) * np.linalg.cholesky(prior.covariance + 1e-9 * np.eye(6 * K))
+    return metal @ rng.normal(size=(6 * K, 2)) * [1.0, 0.2] + NOISE * rng.normal(size=(6 * K, 2))
+
+
+def dense(parts, drift, loudness, hypothesis, strength):
+    """Covariance of the readings as it is defined."""
+    noise = NOISE**2 * (np.diag(loudness**2) + drift @ drift.T)
+    if hypothesis == 0:
+        return noise
+    return strength * parts[4][hypothesis - 1].covariance + noise
+
+
+def test_evidence_is_that_of_the_dense_normal_distribution(bank, parts, drift, loudness, readings):
+    seen = bank.evaluate(readings, NOISE)
+    constant = 0.5 * 6 * K * np.log(2 * np.pi)
+    offset = np.log(loudness).sum()
+    half = (
+        0.5 * np.linalg.slogdet(np.eye(6 * K) + drift @ drift.T / np.outer(loudness, loudness))[1]
+    )
+    for hypothesis in range(3):
+        for a in (0, 7, 12):
+            covariance = dense(parts, drift, loudness, hypothesis, STRENGTHS[a])
+            for part in range(2):
+                expected = multivariate_normal.logpdf(readings[:, part], cov=covariance)
+                got = seen.curve[hypothesis, a, part] - constant - offset - half
+                assert got == pytest.approx(expected, rel=1e-4)
+    assert int(seen.log_evidence.argmax()) == 1
+    np.testing.assert_allclose(seen.strength.sum(axis=2), 1.0)
+
+
+def test_posterior_mean_is_the_dense_one(bank, parts, drift, loudness, readings):
+    seen = bank.evaluate(readings, NOISE)
+    prior = parts[4][0]
+    expected = np.zeros((len(prior.transfer), 2))
+    innovation = np.zeros_like(readings)
+    for part in range(2):
+        for a, probability in enumerate(seen.strength[1, part]):
+            if probability < 1e-9:
+                continue
+            inverse = np.linalg.inv(dense(parts, drift, loudness, 1, STRENGTHS[a]))
+            q = probability * (inverse @ readings[:, part])
+            innovation[:, part] += q
+            expected[:, part] += STRENGTHS[a] * (prior.transfer @ q)
+    got = bank.moments(seen, 1)
+    assert np.abs(got - expected).max() < 1e-4 * np.abs(expected).max()
+    scale = np.abs(innovation).max()
+    np.testing.assert_allclose(bank.innovation(seen, 1), innovation, atol=1e-4 * scale)
+    mean, variance = bank.drifts(seen, 1)
+    np.testing.assert_allclose(mean, NOISE**2 * drift.T @ innovation, atol=1e-3 * NOISE)
+    assert ((variance > 0) & (variance <= NOISE**2 * (1 + 1e-9))).all()
+
+
+def test_leaving_out_needs_no_new_decomposition(bank, parts, drift, loudness, readings):
+    seen = bank.evaluate(readings, NOISE)
+    for coils in ([2], [0, 4]):
+        rest = np.setdiff1d(np.arange(6), coils)
+        rows = (rest[:, None] * K + np.arange(K)).ravel()
+        other = Bank(parts[4], rows, drift, loudness)
+        direct = other.evaluate(readings[rows], NOISE)
+        evidence, residual = bank.without(seen, np.array(coils))
+        shift = evidence - direct.log_evidence
+        np.testing.assert_allclose(shift, shift[0], atol=2e-3 * np.abs(evidence).max())
+        gone = (np.array(coils)[:, None] * K + np.arange(K)).ravel()
+        assert residual.shape == (len(coils), K, 2)
+        if len(coils) == 1:
+            best = int(direct.log_evidence.argmax())
+            chi2 = other.distance(direct, best, gone, readings[gone], NOISE)
+            here, _ = bank.left_out(seen, best)
+            assert here[coils[0]] == pytest.approx(chi2, rel=0.02)
+
+
+def test_a_healthy_coil_is_not_at_fault_and_a_wild_one_is(bank, readings):
+    seen = bank.evaluate(readings, NOISE)
+    assert all(health.fault_odds(bank, seen, np.array([c])) < 5.0 for c in range(6))
+    wild = readings.copy()
+    wild[3 * K : 4 * K] += 3000.0
+    seen = bank.evaluate(wild, NOISE)
+    odds = [health.fault_odds(bank, seen, np.array([c])) for c in range(6)]
+    assert int(np.argmax(odds)) == 3
+
+
+def test_error_modes_have_the_posterior_s_power(bank, parts, drift, loudness, readings):
+    seen = bank.evaluate(readings, NOISE)
+    level = bank.error_level(seen, 1)
+    assert level.noise >= NOISE
+    modes = error_modes(bank, 1, level, 90)
+    prior = parts[4][0]
+    strength = STRENGTHS[level.strengths[0]]
+    covariance = strength * prior.covariance
+    covariance += level.noise**2 * (np.diag(loudness**2) + drift @ drift.T)
+    # The prior's own share from many draws, the data's share exactly.
+    draws = np.sqrt(strength) * prior.draw_moments
+    gain = strength * prior.transfer
+    before = (draws**2).mean(axis=1).sum()
+    after = before - np.trace(gain @ np.linalg.solve(covariance, gain.T))
+    real = (modes.moments.real**2).sum()
+    assert real == pytest.approx(after, rel=0.5)
+    assert modes.rest >= 0.0
+    few = error_modes(bank, 1, level, 4)
+    assert len(few.moments) == 4
+    assert few.rest > modes.rest
+
+
+def test_layers_stand_for_their_clouds(world, parts):
+    excitation, region, layer, _, _ = parts
+    for cloud in default_clouds(region):
+        stand_in = box_layer(region, excitation) if cloud.overhead else layer
+        limit = 0.25 if cloud.overhead else 0.012
+        assert stand_in.misfit(cloud.positions) < limit, cloud.name
+        assert len(stand_in.positions) <= 200
+
+
+def test_a_calibrated_layer_takes_the_change_itself(world, parts):
+    excitation, region, layer, _, _ = parts
+    own = layer.positions[:144]
+    model = replace(
+        world.model,
+        positions=own,
+        directions=np.tile([0.0, 0.0, 1.0], (144, 1)),
+        moments=np.zeros((144, K), complex),
+    )
+    again = bottom_layer(model, region, excitation, below(region, 0.012).positions)
+    np.testing.assert_array_equal(again.rows, np.arange(144))
+    assert len(again.positions) - len(again.rows) < 60
+
+
+def test_clouds_stay_out_of_the_volume_and_weigh_their_volume():
+    region = Region(np.array([0.01, -0.02]), 0.15)
+    for cloud in default_clouds(region):
+        assert (cloud.volumes > 0).all()
+        p = cloud.positions - [*region.centre, 0.0]
+        inside = (np.abs(p[:, 0]) < region.half) & (np.abs(p[:, 1]) < region.half)
+        assert not (inside & (p[:, 2] > 0) & (p[:, 2] < region.ceiling)).any()
+        if not cloud.overhead:
+            assert p[:, 2].max() == pytest.approx(-cloud.standoff_m)
+    near, far = overhead(region, 0.04), overhead(region, 0.1)
+    assert len(near.positions) > len(far.positions)
+
+
+def test_region_is_where_the_board_is(world):
+    region = region_of(world.board.field)
+    np.testing.assert_allclose(region.centre, 0.0, atol=2e-3)
+    assert 0.12 < region.half < 0.17
+
+    def elsewhere(points):
+        return world.board.field(points - [0.1, -0.2, 0.0])
+
+    np.testing.assert_allclose(region_of(elsewhere).centre, [0.1, -0.2], atol=3e-3)
+
+
+def test_survey_variants_are_the_first_order_of_a_wrong_survey(world):
+    table = world.references.select([1])
+    source = np.array([[0.02, 0.03, -0.08]])
+    survey = SurveyError(position_m=1e-5, rotation_rad=1e-4, gain=0.01)
+    plain = vector_basis(table.position, table.axis, table.length, source)
+    gain, turn, _, x, _, _ = survey_variants(table, source, survey)
+    np.testing.assert_allclose(gain, 0.01 * plain)
+    moved = vector_basis(table.position + [1e-5, 0, 0], table.axis, table.length, source)
+    np.testing.assert_allclose(x, moved - plain, atol=2e-3 * np.abs(moved - plain).max())
+    assert np.abs(turn).max() < 1e-3 * np.abs(plain).max()
+
+
+def test_a_patch_reads_what_the_model_says_with_its_pose_s_error(world):
+    coils = world.references.select([0, 4, 9])
+    error = PoseError(2e-4, 3e-3, 0.0)
+    flux, sigma = clean_reading(world.model, coils, error)
+    np.testing.assert_allclose(
+        flux, world.model.flux(coils.position, coils.axis, coils.length), rtol=1e-9
+    )
+    rng = np.random.default_rng(1)
+    steps = []
+    for _ in range(600):
+        turn = rng.normal(0.0, error.rotation_rad, (3, 3))
+        shifted = coils.with_geometry(
+            coils.position + rng.normal(0.0, error.position_m, (3, 3)),
+            coils.axis + np.cross(turn, coils.axis),
+        )
+        steps.append(world.model.flux(shifted.position, shifted.axis, shifted.length) - flux)
+    spread = np.sqrt((np.abs(np.array(steps)) ** 2).mean(axis=(0, 2)))
+    np.testing.assert_allclose(sigma, spread, rtol=0.15)
+    assert not has_moved(coils, coils)
+    assert has_moved(coils, coils.with_geometry(coils.position + [0.0, 0.004, 0.0]))
+    assert has_moved(coils, coils.with_geometry(None, -coils.axis))
+
+
+def test_noise_is_measured_whatever_moves_smoothly():
+    rng, level = np.random.default_rng(1), NoiseLevel(60e-12)
+    for frame in range(300):
+        moving = 1e-9 * frame * np.ones((16, 8))
+        noise = rng.normal(size=(16, 8)) + 1j * rng.normal(size=(16, 8))
+        flux = moving + 180e-12 * noise
+        flux[3] = np.nan
+        flux[5] += rng.normal() * 1e-6  # one that is broken says nothing of the others
+        ratio = level.update(flux)
+    assert ratio == pytest.approx(3.0, rel=0.12)
+    level.forget()
+    assert level.update(flux) == ratio
+
+
+def test_readings_are_averaged_until_they_change():
+    rng, average = np.random.default_rng(1), Average(5)
+
+    def frame(value):
+        return value + 1e-10 * (rng.normal(size=(16, 8)) + 1j * rng.normal(size=(16, 8)))
+
+    for _ in range(12):
+        mean, count = average.update(frame(1e-6), 1e-10)
+    assert count == 5
+    assert np.abs(mean - 1e-6).std() < 0.08e-9
+    mean, count = average.update(frame(1e-6 + 4e-10), 1e-10)
+    assert count == 1
+    gone = frame(1e-6)
+    gone[2] = np.nan
+    assert average.update(gone, 1e-10)[1] == 1
+    average.forget()
+    assert average.update(frame(2e-6), 1e-10)[1] == 1
