@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from geometry_msgs.msg import PointStamped
 from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
+from visualization_msgs.msg import MarkerArray
 
 from anser_ros.errors import AnserError, FitError, ModelFileError, SetupError
 from anser_ros.fitting.baseline import ReadingWindow
@@ -22,6 +24,7 @@ from anser_ros.fitting.nominal import nominal_model
 from anser_ros.fitting.refit import LiveRefit, RefitResult
 from anser_ros.nodes import qos
 from anser_ros.nodes.flux_reader import read_flux
+from anser_ros.nodes.metal_view import centroid_message, metal_markers
 from anser_ros.nodes.model_clouds import ModelWriter
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
@@ -33,6 +36,9 @@ from anser_ros.sessions.starting_model import NOMINAL, board_of
 from anser_ros.wire.setup import Setup, parse_setup
 
 BURST = 5
+
+VIEW_PERIOD_S = 0.2
+"""How often the metal's marker is renewed."""
 
 
 @dataclass(frozen=True)
@@ -84,11 +90,16 @@ class FieldModelNode(AnserNode):
         self._frozen = False
         self._trouble = ''
         self._stamp_ns = 0
+        self._told: tuple[NDArray[np.complex128] | None, float, int] | None = None
+        self._view_s = 0.0
+        self._shown = False
         self._refit_s = 0.0
         self._next_refit_s = 0.0
         self._writer = ModelWriter()
         self._models = self.create_publisher(PointCloud2, 'field_model', qos.LATCHED)
         self._errors = self.create_publisher(PointCloud2, 'field_model_error', qos.LATCHED)
+        self._markers = self.create_publisher(MarkerArray, 'metal', qos.LATCHED)
+        self._centroid = self.create_publisher(PointStamped, 'metal/centroid', qos.STREAM)
         self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
         self.create_subscription(PointCloud2, 'reference/flux', self._on_flux, qos.STREAM)
         self.create_service(Trigger, 'field_model/reset', self._on_reset)
@@ -171,15 +182,38 @@ class FieldModelNode(AnserNode):
         self.count('refits')
         if self._result.changed:
             self._serve(self._result.model, stamp_ns)
+        self._show_metal(self._result, stamp_ns)
+
+    def _show_metal(self, result: RefitResult, stamp_ns: int) -> None:
+        """Show the operator where the metal is, a few times a second."""
+        now_s = time.monotonic()
+        if result.find is None:
+            if self._shown:
+                self._markers.publish(metal_markers(None, self._frame_id, stamp_ns))
+                self._shown = False
+            return
+        if now_s - self._view_s < VIEW_PERIOD_S or result.metal is None:
+            return
+        self._view_s, self._shown = now_s, True
+        self._markers.publish(metal_markers(result.metal, self._frame_id, stamp_ns))
+        self._centroid.publish(centroid_message(result.metal, self._frame_id, stamp_ns))
+
+    @property
+    def _frame_id(self) -> str:
+        return self._setup.frame_id if self._setup is not None else 'fg'
 
     # The model and its baseline -----------------------------------------------------------
 
     def _serve(self, model: FieldModel, stamp_ns: int) -> None:
         """Put a model in force; every one has a stamp of its own."""
         self._stamp_ns = max(stamp_ns, self._stamp_ns + 1)
-        frame_id = self._setup.frame_id if self._setup is not None else 'fg'
-        # The uncertainty goes first, so that a receiver has both when the model comes.
-        self._errors.publish(self._writer.error(model, frame_id, self._stamp_ns))
+        frame_id = self._frame_id
+        # The uncertainty goes first, so that a receiver has both when the model comes; where it
+        # is the same as before, that one still holds.
+        told, uncertainty = self._told, (model.modes, model.flux_error_t, len(model.positions))
+        if told is None or told[0] is not uncertainty[0] or told[1:] != uncertainty[1:]:
+            self._errors.publish(self._writer.error(model, frame_id, self._stamp_ns))
+            self._told = uncertainty
         self._models.publish(self._writer.dipoles(model, frame_id, self._stamp_ns))
         self._model = model
         self.count('models')
@@ -269,6 +303,8 @@ class FieldModelNode(AnserNode):
             'reference_noise_t': result.noise_t,
             'change_log_odds': result.log_odds,
             'references_left_out': ', '.join(result.left_out),
+            'most_likely': max(result.weights, key=result.weights.__getitem__, default=''),
+            'largest_drift': float(np.abs(result.drift).max(initial=0.0)),
         }
         return result.state if not result.reason else f'{result.state}: {result.reason}'
 

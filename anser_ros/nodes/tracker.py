@@ -25,6 +25,7 @@ from anser_ros.tracking.estimate import OK, TrackerSettings
 from anser_ros.tracking.seed import Volume
 from anser_ros.tracking.tracker import Tracker
 from anser_ros.tracking.warm_up import warm_up
+from anser_ros.wire.model_error import ModelError
 from anser_ros.wire.points import DipolePoints
 from anser_ros.wire.setup import Setup, parse_setup
 
@@ -106,6 +107,7 @@ class TrackerNode(AnserNode):
         self._topics: dict[str, PoseTopic] = {}
         self._dipoles: tuple[int, DipolePoints] | None = None
         self._error: PointCloud2 | None = None
+        self._error_read: tuple[PointCloud2, int, ModelError] | None = None
         self._trouble = ''
         self._solve_s = 0.0
         self._told_s = 0.0
@@ -188,11 +190,25 @@ class TrackerNode(AnserNode):
             flux_error_t=0.0 if given is None else given.flux_error_t,
             effects=() if given is None else given.effects,
         )  # fmt: skip
-        if self._error is not None and stamp_of(self._error) == stamp_ns:
-            error = read_error(self._error, *points.moments.shape)
+        error = self._error_of(stamp_ns, *points.moments.shape)
+        if error is not None:
             modes = error.modes if len(error.modes) else None
             model = replace(model, flux_error_t=error.flux_error_t, modes=modes)
         return model, str(stamp_ns)
+
+    def _error_of(self, stamp_ns: int, n_dipoles: int, n_emitters: int) -> ModelError | None:
+        """Return a model's uncertainty: that of its stamp, or the one before that still holds.
+
+        It is read once, so that models that share it share all that is derived from it.
+        """
+        read = self._error_read
+        if self._error is not None and stamp_of(self._error) == stamp_ns:
+            if read is None or read[0] is not self._error:
+                error = read_error(self._error, n_dipoles, n_emitters)
+                read = self._error_read = (self._error, n_dipoles, error)
+            return read[2]
+        holds = read is not None and read[0] is self._error and read[1] == n_dipoles
+        return read[2] if read is not None and holds else None
 
     def _on_flux(self, message: PointCloud2) -> None:
         tracker = self._tracker

@@ -14,6 +14,7 @@ from anser_ros.tracking.seed import SeedGrid, Volume, build_grid
 from anser_ros.tracking.solve import RealField
 
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 BOX_MARGIN_M = 0.1
 """How far beyond the volume the solver may go, so that a tool there is said to be there."""
@@ -32,6 +33,9 @@ class Scene:
         Noise and the model's own unexplained part, T.
     modes : ndarray, shape (N, R 2K), or None
         The moments' covariance factor, laid out for one product with a sensor's basis.
+    given_modes : ndarray, shape (R, N, K), or None
+        The model's own array that ``modes`` was made from: a model that has the same array has the
+        same modes, and all that sensors derived from them stays good.
     relative_error : float
         Typical model error by ``modes`` over the field's strength.
     grid : SeedGrid
@@ -45,6 +49,7 @@ class Scene:
     field: RealField
     sigma: Array
     modes: Array | None
+    given_modes: ComplexArray | None
     relative_error: float
     grid: SeedGrid
     landmarks: Array
@@ -82,6 +87,14 @@ def _landmark_basis(volume: Volume, field: RealField) -> Array:
     )  # fmt: skip
 
 
+def _same_modes(model: FieldModel, previous: Scene) -> bool:
+    return (
+        model.modes is previous.given_modes
+        and model.modes is not None
+        and len(model.positions) == len(previous.field.positions)
+    )
+
+
 def build_scene(
     model: FieldModel,
     settings: TrackerSettings,
@@ -103,7 +116,9 @@ def build_scene(
     basis = _landmark_basis(settings.volume, field)
     landmarks = basis @ field.moments
     relative = 0.0
-    if model.modes is not None and len(model.modes):
+    if previous is not None and previous.modes is not None and _same_modes(model, previous):
+        modes, relative = previous.modes, previous.relative_error
+    elif model.modes is not None and len(model.modes):
         real = np.ascontiguousarray(model.modes, dtype=np.complex128).view(np.float64)
         modes = np.ascontiguousarray(real.swapaxes(0, 1).reshape(len(real[0]), -1))
         error = (basis @ modes).reshape(len(basis), -1, width)
@@ -118,6 +133,6 @@ def build_scene(
     if grid is None:
         grid = build_grid(field, sigma, settings.volume, settings.grid_spacing_m)
     return Scene(
-        field, sigma, modes, relative, grid, landmarks, low, high,
+        field, sigma, modes, model.modes, relative, grid, landmarks, low, high,
         model_digest(model) if model_id is None else model_id,
     )  # fmt: skip

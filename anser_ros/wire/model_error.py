@@ -3,8 +3,9 @@
 A point for every dipole that a mode moves: ``mode`` and ``dipole`` uint16, ``flux_error`` float32
 (T, the same in all points: what the model leaves unexplained), then ``m<k>_re``, ``m<k>_im``
 float32 (A m^2). The moments are wrong by the sum of all modes, each times an independent unit
-normal number. The message has the stamp of the ``field_model`` message that it belongs to; a
-receiver that does without it still has the field.
+normal number. The message has the stamp of the ``field_model`` message that it belongs to,
+and holds for later models of that size until there is another one: the uncertainty changes less
+often than the field. A receiver that does without it still has the field.
 """
 
 from collections.abc import Sequence

@@ -1,0 +1,73 @@
+"""The metal that the refit sees, as a marker for the operator."""
+
+import numpy as np
+from geometry_msgs.msg import Point, PointStamped, Pose
+from std_msgs.msg import ColorRGBA
+from visualization_msgs.msg import Marker, MarkerArray
+
+from anser_ros.fitting.refit_result import Metal
+from anser_ros.nodes.model_clouds import NANO
+
+SHOWN = 0.15
+"""Sources whose density is at least this part of the strongest one's are shown."""
+MOST_SHOWN = 400
+CENTROID_M = 0.03
+
+
+def centroid_message(metal: Metal, frame_id: str, stamp_ns: int) -> PointStamped:
+    """Return where the metal's middle is, as far as the emitters reach it."""
+    message = PointStamped()
+    message.header.frame_id = frame_id
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, NANO)
+    message.point = _point(metal.centroid)
+    return message
+
+
+def metal_markers(metal: Metal | None, frame_id: str, stamp_ns: int) -> MarkerArray:
+    """Return spheres as large as the space they stand for, and one at the centroid.
+
+    Without metal, what was shown before is taken away.
+    """
+    if metal is None:
+        gone = _marker(frame_id, stamp_ns, 0)
+        gone.action = Marker.DELETEALL
+        return MarkerArray(markers=[gone])
+    density = np.abs(metal.polarisability) / metal.volumes
+    rows = np.argsort(-density)[:MOST_SHOWN]
+    rows = rows[density[rows] >= SHOWN * density[rows[0]]]
+    markers = []
+    for volume in np.unique(metal.volumes[rows]).tolist():
+        here = rows[metal.volumes[rows] == volume]
+        spheres = _marker(frame_id, stamp_ns, len(markers))
+        spheres.type = Marker.SPHERE_LIST
+        spheres.scale.x = spheres.scale.y = spheres.scale.z = 0.8 * float(volume) ** (1.0 / 3.0)
+        spheres.color = ColorRGBA(r=0.8, g=0.4, b=0.1, a=1.0)
+        spheres.points = [_point(metal.positions[row]) for row in here]
+        strength = density[here] / density[rows[0]]
+        spheres.colors = [
+            ColorRGBA(r=0.8, g=0.4, b=0.1, a=float(0.1 + 0.5 * part)) for part in strength
+        ]
+        markers.append(spheres)
+    centre = _marker(frame_id, stamp_ns, len(markers))
+    centre.type = Marker.SPHERE
+    centre.pose.position = _point(metal.centroid)
+    centre.scale.x = centre.scale.y = centre.scale.z = CENTROID_M
+    centre.color = ColorRGBA(r=0.9, g=0.1, b=0.1, a=0.9)
+    # The number of lists changes; what is left of a longer array must not stay.
+    clear = _marker(frame_id, stamp_ns, 0)
+    clear.action = Marker.DELETEALL
+    return MarkerArray(markers=[clear, *markers, centre])
+
+
+def _marker(frame_id: str, stamp_ns: int, number: int) -> Marker:
+    marker = Marker(ns='metal', id=number, action=Marker.ADD)
+    marker.header.frame_id = frame_id
+    marker.header.stamp.sec, marker.header.stamp.nanosec = divmod(stamp_ns, NANO)
+    marker.pose = Pose()
+    marker.pose.orientation.w = 1.0
+    return marker
+
+
+def _point(values: np.ndarray) -> Point:
+    x, y, z = (float(v) for v in values)
+    return Point(x=x, y=y, z=z)
