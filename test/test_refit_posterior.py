@@ -247,9 +247,9 @@ def test_a_patch_reads_what_the_model_says_with_its_pose_s_error(world):
         steps.append(world.model.flux(shifted.position, shifted.axis, shifted.length) - flux)
     spread = np.sqrt((np.abs(np.array(steps)) ** 2).mean(axis=(0, 2)))
     np.testing.assert_allclose(sigma, spread, rtol=0.15)
-    assert not has_moved(coils, coils)
-    assert has_moved(coils, coils.with_geometry(coils.position + [0.0, 0.004, 0.0]))
-    assert has_moved(coils, coils.with_geometry(None, -coils.axis))
+    assert not has_moved(coils, coils).any()
+    assert has_moved(coils, coils.with_geometry(coils.position + [0.0, 0.004, 0.0])).all()
+    assert has_moved(coils, coils.with_geometry(None, -coils.axis)).all()
 
 
 def test_noise_is_measured_whatever_moves_smoothly():

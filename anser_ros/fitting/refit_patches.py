@@ -63,9 +63,9 @@ def clean_reading(
     return flux, np.sqrt(power)
 
 
-def has_moved(then: SensorTable, now: SensorTable) -> bool:
-    """Whether coils are too far from where they were for what was worked out there."""
+def has_moved(then: SensorTable, now: SensorTable) -> NDArray[np.bool_]:
+    """Which coils are too far from where they were for what was worked out there, (S,)."""
     shift = np.linalg.norm(now.position - then.position, axis=1)
     turn = np.linalg.norm(np.cross(now.axis, then.axis), axis=1)
     opposite = (now.axis * then.axis).sum(axis=1) < 0.0
-    return bool((shift > MOVED_M).any() or (turn > TURNED_RAD).any() or opposite.any())
+    return np.asarray((shift > MOVED_M) | (turn > TURNED_RAD) | opposite)

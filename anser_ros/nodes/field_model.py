@@ -5,12 +5,13 @@
 
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PointStamped
+from geometry_msgs.msg import PointStamped, PoseStamped
 from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
@@ -22,12 +23,14 @@ from anser_ros.fitting.baseline import ReadingWindow
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.nominal import nominal_model
 from anser_ros.fitting.refit import LiveRefit, RefitResult
+from anser_ros.fitting.refit_patches import PoseError, clean_reading
 from anser_ros.nodes import qos
 from anser_ros.nodes.flux_reader import read_flux
 from anser_ros.nodes.metal_view import centroid_message, metal_markers
 from anser_ros.nodes.model_clouds import ModelWriter
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
+from anser_ros.nodes.patches import Patches, joined, parse_patches
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.sessions.evaluation import baseline_flux
 from anser_ros.sessions.model_file import load_model, save_model
@@ -62,6 +65,9 @@ class FieldModelParameters:
     )
     refit_rate_hz: float = parameter(
         50.0, 'most refits a second', minimum=0.1, maximum=1000.0, live=True
+    )
+    patches: tuple[str, ...] = parameter(
+        (), 'reference coils that move: entries body=topic, the topic a PoseStamped of that body'
     )
     save_file: str = parameter(
         'field_model.yaml', 'where the service save writes the model', live=True
@@ -102,6 +108,13 @@ class FieldModelNode(AnserNode):
         self._centroid = self.create_publisher(PointStamped, 'metal/centroid', qos.STREAM)
         self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
         self.create_subscription(PointCloud2, 'reference/flux', self._on_flux, qos.STREAM)
+        self._patch_topics = parse_patches(table.patches)
+        self._patches: Patches | None = None
+        self._fixed = np.empty((0, 0), dtype=np.complex128)
+        for body, topic in self._patch_topics.items():
+            self.create_subscription(PoseStamped, topic, self._pose_taker(body), qos.STREAM)
+        if self._patch_topics:
+            self.create_subscription(PointCloud2, 'tool/flux', self._on_tool_flux, qos.STREAM)
         self.create_service(Trigger, 'field_model/reset', self._on_reset)
         self.create_service(Trigger, 'field_model/save', self._on_save)
         self.create_service(SetBool, 'field_model/freeze', self._on_freeze)
@@ -133,6 +146,27 @@ class FieldModelNode(AnserNode):
         self._base = base
         if self._baseline_bag is not None and len(self._references):
             self._follow(baseline_flux(self._baseline_bag, self._references))
+
+    def _pose_taker(self, body: str) -> Callable[[PoseStamped], None]:
+        def take(message: PoseStamped) -> None:
+            if self._patches is None:
+                return
+            try:
+                self._patches.take_pose(body, message)
+            except AnserError as error:
+                self._trouble = str(error)
+                self.warn('patch_poses_refused', str(error))
+
+        return take
+
+    def _on_tool_flux(self, message: PointCloud2) -> None:
+        if self._patches is None:
+            return
+        try:
+            self._patches.take_flux(*read_flux(message))
+        except AnserError as error:
+            self._trouble = str(error)
+            self.warn('patch_fluxes_refused', str(error))
 
     def _starting_model(self, setup: Setup) -> FieldModel:
         if self._file_model is None:
@@ -177,12 +211,30 @@ class FieldModelNode(AnserNode):
         # Readings don't come evenly; a few may follow each other at once.
         period_s = 1.0 / self.parameters.refit_rate_hz
         self._next_refit_s = max(self._next_refit_s, begin_s - BURST * period_s) + period_s
-        self._result = refit.update(stamp_ns, channels, flux, flags)
+        baseline = None
+        if self._patches is not None:
+            refit = self._with_patches(self._patches, refit, stamp_ns)
+            placed = self._patches.frame(stamp_ns, refit.model)
+            fixed = np.isin(channels, self._patches.coils.channel, invert=True)
+            channels = np.concatenate([channels[fixed], self._patches.coils.channel])
+            flux = np.concatenate([flux[fixed], placed.flux])
+            flags = np.concatenate([flags[fixed], np.zeros(len(placed.flux), dtype=np.int64)])
+            baseline = np.concatenate([self._fixed, placed.baseline])
+        self._result = refit.update(stamp_ns, channels, flux, flags, baseline)
         self._refit_s = time.monotonic() - begin_s
         self.count('refits')
         if self._result.changed:
             self._serve(self._result.model, stamp_ns)
         self._show_metal(self._result, stamp_ns)
+
+    def _with_patches(self, patches: Patches, refit: LiveRefit, stamp_ns: int) -> LiveRefit:
+        """Take over the refit for the patches' new places once it has been worked out."""
+        moved = patches.moved_refit(refit, stamp_ns, self._fixed)
+        if moved is None:
+            return refit
+        self._refit = moved
+        self.count('patch_moves')
+        return moved
 
     def _show_metal(self, result: RefitResult, stamp_ns: int) -> None:
         """Show the operator where the metal is, a few times a second."""
@@ -226,7 +278,16 @@ class FieldModelNode(AnserNode):
             drawing = board_of(self._setup).field
         except SetupError:  # an emitter that can't be drawn: its own dipoles have to do
             drawing = None
-        self._refit = LiveRefit(self._base, self._references, baseline, drawing=drawing)
+        table, clean, self._patches = self._references, baseline, None
+        bodies = tuple(self._patch_topics)
+        moving = [s for s in self._setup.tool_sensors if s.body in bodies]
+        if moving:
+            patches = Patches(sensor_table(tuple(moving)), baseline.shape[1], self._frame_id)
+            start = patches.start_table()
+            table = joined(table, start)
+            clean = np.concatenate([baseline, clean_reading(self._base, start, PoseError())[0]])
+            self._patches, self._fixed = patches, baseline
+        self._refit = LiveRefit(self._base, table, clean, drawing=drawing)
         self._result = None
         self.count('baselines')
 

@@ -1,0 +1,258 @@
+"""The refit inside its node: marker, centroid, health with names, services, moving patches."""
+
+import time
+
+import numpy as np
+import pytest
+from refit_world import anser_world, metal_block
+from tracking_world import CENTRES_MM, GEOMETRY, TURNED
+
+from anser_ros.errors import FrameError, ParameterError
+from anser_ros.fitting.refit_result import Metal
+from anser_ros.sessions.model_file import save_model
+from anser_ros.wire.points import FluxPoints
+from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup, dump_setup
+
+HEAD = metal_block([0.03, -0.02, -0.11], [0.1, 0.12, 0.06])
+FIRST_NS = 1_750_000_000_000_000_000
+STEP_NS = 20_000_000
+PATCH_COILS = (
+    ((0.01, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    ((-0.01, 0.0, 0.0), (1.0, 0.0, 0.0)),
+)
+
+
+def setup_text(world):
+    """The test's world as a setup document, with a patch of two coils."""
+    names, tones = world.board.names, world.board.frequencies_hz
+    coils = tuple(
+        Coil(name, (x * 1e-3, y * 1e-3, 0.0), turn, tone)
+        for name, (x, y), turn, tone in zip(names, CENTRES_MM, TURNED, tones, strict=True)
+    )
+    table = world.references
+    sensors = [
+        SensorSpec(int(c), n, 'fg', tuple(p), tuple(a), float(length))
+        for c, n, p, a, length in zip(
+            table.channel, table.name, table.position.tolist(), table.axis.tolist(),
+            table.length, strict=True,
+        )
+    ]  # fmt: skip
+    for i, (place, axis) in enumerate(PATCH_COILS):
+        sensors.append(SensorSpec(40 + i, f'patch/{i}', 'patch', place, axis, 0.0))
+    emitter = Emitter('square_spiral_pcb', GEOMETRY, coils)
+    return dump_setup(Setup('fg', 50.0, emitter, tuple(sensors)))
+
+
+class Rig:
+    """A field_model node, what it publishes, and the callbacks that it is fed through."""
+
+    def __init__(self, ros, folder, **parameters):
+        from geometry_msgs.msg import PointStamped
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.parameter import Parameter
+        from visualization_msgs.msg import MarkerArray
+
+        from anser_ros.nodes import qos
+        from anser_ros.nodes.clouds import FluxCloud
+        from anser_ros.nodes.field_model import FieldModelNode
+
+        self.world = anser_world()
+        save_model(folder / 'model.yaml', self.world.model)
+        values = {'model_file': str(folder / 'model.yaml'), 'baseline_s': 0.2, **parameters}
+        self.node = FieldModelNode(
+            parameter_overrides=[Parameter(name, value=value) for name, value in values.items()]
+        )
+        self.peer = ros.create_node('peer', namespace='anser')
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.executor.add_node(self.peer)
+        self.markers, self.centroids = [], []
+        self.peer.create_subscription(MarkerArray, 'metal', self.markers.append, qos.LATCHED)
+        self.peer.create_subscription(
+            PointStamped, 'metal/centroid', self.centroids.append, qos.STREAM
+        )
+        self.until(lambda: self.node._centroid.get_subscription_count() > 0)
+        self.cloud, self.stamp_ns = FluxCloud('fg'), FIRST_NS
+        self.rng = np.random.default_rng(1)
+
+    def until(self, condition, timeout_s=20.0):
+        end = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < end, self.node.counters
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def message(self, channels, flux):
+        count = len(flux)
+        nothing = np.full((count, 3), np.nan)
+        points = FluxPoints(
+            np.asarray(channels), np.zeros(count, dtype=int), flux, nothing, nothing
+        )
+        return self.cloud.message(points, self.stamp_ns)
+
+    def say(self, change, fault=None):
+        """One frame of the references."""
+        self.stamp_ns += STEP_NS
+        flux = self.world.baseline + change + self.world.noise(self.rng)
+        if fault is not None:
+            flux[fault] = 0.0
+        self.node._on_flux(self.message(self.world.references.channel, flux))
+        self.executor.spin_once(timeout_sec=0.0)
+
+    def start(self):
+        from std_msgs.msg import String
+        from std_srvs.srv import Trigger
+
+        self.node._on_setup(String(data=setup_text(self.world)))
+        for _ in range(12):
+            self.say(0.0)
+        reply = self.node._on_set_baseline(Trigger.Request(), Trigger.Response())
+        assert reply.success, reply.message
+
+    def close(self):
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.peer.destroy_node()
+
+
+@pytest.fixture
+def make(ros, tmp_path):
+    rigs = []
+
+    def build(**parameters):
+        rigs.append(Rig(ros, tmp_path, **parameters))
+        return rigs[-1]
+
+    yield build
+    for rig in rigs:
+        rig.close()
+
+
+def test_metal_is_shown_named_and_taken_away_again(make):
+    from std_srvs.srv import SetBool, Trigger
+    from visualization_msgs.msg import Marker
+
+    rig = make(refit_rate_hz=1000.0)
+    rig.start()
+    change = rig.world.metal(HEAD)
+    calibrated = rig.node._model
+    for _ in range(4):
+        rig.say(change, fault=3)
+    rig.until(lambda: rig.markers and rig.centroids)
+    point = rig.centroids[-1].point
+    centre = HEAD.mean(axis=0)
+    assert np.hypot(point.x - centre[0], point.y - centre[1]) < 0.06
+    kinds = {m.type for m in rig.markers[-1].markers if m.action == Marker.ADD}
+    assert kinds == {Marker.SPHERE_LIST, Marker.SPHERE}
+    status = rig.node.status()
+    assert status.values['refit_state'] == 'refit'
+    assert status.values['references_left_out'] == 'ref/3'
+    named = {part.name: part.message for part in rig.node.part_statuses()}
+    assert named['ref/3'] == 'disagrees'
+    assert named['ref/0'] == 'ok'
+    assert rig.node._model is not calibrated
+    # Frozen, the model stays; the metal goes, and then so does the marker.
+    rig.node._on_freeze(SetBool.Request(data=True), SetBool.Response())
+    held = rig.node._model
+    rig.say(0.0)
+    assert rig.node._model is held
+    rig.node._on_freeze(SetBool.Request(data=False), SetBool.Response())
+    for _ in range(3):
+        rig.say(0.0)
+    np.testing.assert_array_equal(rig.node._model.moments, calibrated.moments)
+    rig.until(lambda: rig.markers[-1].markers[0].action == Marker.DELETEALL
+              and len(rig.markers[-1].markers) == 1)  # fmt: skip
+    for _ in range(2):
+        rig.say(change)
+    rig.node._on_reset(Trigger.Request(), Trigger.Response())
+    np.testing.assert_array_equal(rig.node._model.moments, calibrated.moments)
+
+
+def pose_message(stamp_ns, position, frame='fg'):
+    from geometry_msgs.msg import PoseStamped
+
+    message = PoseStamped()
+    message.header.frame_id = frame
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+    p = message.pose.position
+    p.x, p.y, p.z = (float(v) for v in position)
+    message.pose.orientation.w = 1.0
+    return message
+
+
+def test_coils_on_a_patch_take_part_where_the_pose_says(make):
+    rig = make(patches=['patch=/optical/patch/pose'], refit_rate_hz=1000.0)
+    rig.start()
+    world, place = rig.world, np.array([0.02, 0.05, 0.16])
+    offsets = np.array([c[0] for c in PATCH_COILS])
+    axes = np.array([c[1] for c in PATCH_COILS])
+    take = rig.node._pose_taker('patch')
+
+    def frame(change, shift=0.0, lost=False):
+        points = place + offsets + [0.0, 0.0, shift]
+        if not lost:
+            take(pose_message(rig.stamp_ns + STEP_NS, place + [0.0, 0.0, shift]))
+        flux = world.model.flux(points, axes)
+        if change:
+            table = world.references.select([0, 1]).with_geometry(points, axes, np.zeros(2))
+            flux = flux + world.metal(HEAD, table)
+        rig.stamp_ns += STEP_NS
+        rig.node._on_tool_flux(rig.message([40, 41], flux))
+        rig.stamp_ns -= STEP_NS
+        rig.say(world.metal(HEAD) if change else 0.0)
+        time.sleep(0.002)
+
+    def left_out():
+        return rig.node._result.left_out
+
+    frame(False)
+    assert left_out() == ('patch/0', 'patch/1'), 'nothing was worked out for that place yet'
+    end = time.monotonic() + 20.0
+    while rig.node.counters['patch_moves'] < 1:
+        assert time.monotonic() < end
+        frame(False)
+        time.sleep(0.01)
+    for _ in range(40):
+        frame(False)
+    assert left_out() == ()
+    assert rig.node._result.state == 'frozen'
+    for _ in range(3):
+        frame(True)
+    assert rig.node._result.state == 'refit'
+    assert left_out() == ()
+    # Moved by a millimetre it goes on; far away it waits; without a pose it is left out.
+    frame(True, shift=1e-3)
+    assert left_out() == ()
+    frame(True, shift=0.03)
+    assert left_out() == ('patch/0', 'patch/1')
+    for _ in range(15):
+        frame(True, lost=True)
+    assert left_out() == ('patch/0', 'patch/1')
+    assert rig.node._result.state == 'refit'
+
+
+def test_what_is_no_patch_is_refused(make):
+    from anser_ros.nodes.patches import Patches, parse_patches
+
+    assert parse_patches(['a=/x', 'b=/y']) == {'a': '/x', 'b': '/y'}
+    for wrong in (['a'], ['=x'], ['a='], ['a=x', 'a=y']):
+        with pytest.raises(ParameterError, match='no new body=topic'):
+            parse_patches(wrong)
+    patches = Patches(anser_world().references.select([0]), 8, 'fg')
+    with pytest.raises(FrameError, match="in 'camera', not 'fg'"):
+        patches.take_pose('fg', pose_message(1, [0, 0, 0], 'camera'))
+    with pytest.raises(FrameError, match='is no pose'):
+        patches.take_pose('fg', pose_message(1, [np.nan, 0, 0]))
+    patches.close()
+
+
+def test_markers_of_nothing_and_of_one_source(ros):
+    from visualization_msgs.msg import Marker
+
+    from anser_ros.nodes.metal_view import centroid_message, metal_markers
+
+    assert [m.action for m in metal_markers(None, 'fg', 5).markers] == [Marker.DELETEALL]
+    metal = Metal(np.ones((1, 3)), np.array([-3.0 + 0j]), np.array([1e-6]), np.ones(3), 0.05)
+    markers = metal_markers(metal, 'fg', 7_000_000_001).markers
+    assert [m.type for m in markers[1:]] == [Marker.SPHERE_LIST, Marker.SPHERE]
+    assert markers[1].scale.x == pytest.approx(0.008)
+    assert centroid_message(metal, 'fg', 7_000_000_001).header.stamp.nanosec == 1
