@@ -242,7 +242,7 @@ def test_a_board_of_unknown_kind_still_calibrates(factory):
     found = calibrate_sessions([session], options)
     assert found.nominal_rmse_t is None
     assert found.better_than_nominal
-    assert rms(found.error) < 1e-9
+    assert found.residuals.rmse_t < 1e-9
 
 
 def test_three_emitters_need_nothing_else(factory):

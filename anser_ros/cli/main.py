@@ -108,6 +108,8 @@ def exec_node(name: str, arguments: Sequence[str]) -> NoReturn:
 def run_verb(name: str, arguments: Sequence[str]) -> int:
     """Run one offline command in this process."""
     try:
+        # Before numpy is loaded: BLAS threads that wait for one another cost more than they bring.
+        os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
         module = importlib.import_module(f'anser_ros.cli.{name}')
         summary = (module.__doc__ or '').strip().split('\n')[0]
         parser = argparse.ArgumentParser(prog=f'anser {name}', description=summary)

@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.fitting.blocks import fold_of_frames
-from anser_ros.fitting.factors import ComplexArray, as_real
+from anser_ros.fitting.factors import as_real
 from anser_ros.fitting.held_out import HeldOut, predict_held_out, rms
 from anser_ros.fitting.layout_fit import LayoutFit, fit_layout
 from anser_ros.fitting.layouts import Generator, Layout, place
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.model import EffectRecord, FieldModel
 from anser_ros.fitting.moments import MomentFit, Progress
-from anser_ros.fitting.pose_correction import Uncertainty, with_pose
+from anser_ros.fitting.pose_correction import Uncertainty, frame_blocks, with_pose
 from anser_ros.fitting.prior import DrawnBoard
 from anser_ros.fitting.requirements import check_agreement, check_measurements
 from anser_ros.fitting.selection import (
@@ -70,8 +70,8 @@ class Calibration:
     damping : float
     n_measurements : int
         Readings an emitter.
-    error, flux : ndarray, shape (P, K), complex
-        Residual at the measured poses, and the measured fluxes, T.
+    residuals : Residuals
+        Of the model on everything it was fitted to.
     """
 
     model: FieldModel
@@ -83,8 +83,7 @@ class Calibration:
     layout: Layout
     damping: float
     n_measurements: int
-    error: ComplexArray
-    flux: ComplexArray
+    residuals: 'Residuals'
 
     @property
     def better_than_nominal(self) -> bool:
@@ -134,13 +133,16 @@ def calibrate(
     selection = choose_layout(
         thin, folds, generator, options.uncertainty, progress, options.layout, drawn
     )
-    finals = [
-        _final(posed, thin, folds, candidate, generator, options, nominal, selection, progress)
+    tested = [
+        (candidate, _tested(candidate, thin, folds, generator, options, nominal, selection))
         for candidate in selection.finalists
     ]
-    chosen, whole, held_out = _better(finals)
-    dipoles, fit = whole.dipoles, whole.fit
+    chosen, held_out = _better(tested)
     damping = chosen.damping if options.damping is None else options.damping
+    whole = fit_layout(
+        posed, chosen.layout, damping, generator, options.uncertainty, nominal, progress=progress
+    )
+    dipoles, fit = whole.dipoles, whole.fit
     check_agreement(posed, names, fit, _fitter(chosen, generator, options, nominal))
     model = FieldModel(
         positions=dipoles.positions,
@@ -151,10 +153,9 @@ def calibrate(
         flux_error_t=held_out.flux_error_t,
         effects=effects,
     )
-    error, flux = _residual(posed, model)
     calibration = Calibration(
-        model, fit, held_out, _nominal_rms(posed, nominal), selection.candidates,
-        chosen, chosen.layout, damping, readings, error, flux,
+        model, fit, held_out, None if nominal is None else residuals(posed, nominal).rmse_t,
+        selection.candidates, chosen, chosen.layout, damping, readings, residuals(posed, model),
     )  # fmt: skip
     return replace(calibration, model=replace(model, provenance=provenance(calibration, names)))
 
@@ -171,9 +172,6 @@ def _surveyed(
     return [surveys[m.body].apply(m) for m in posed], records
 
 
-Final = tuple[Candidate, LayoutFit, HeldOut]
-
-
 def _fitter(
     candidate: Candidate, generator: Generator, options: Options, nominal: FieldModel | None
 ) -> Callable[[list[Measurements]], LayoutFit]:
@@ -188,50 +186,66 @@ def _fitter(
     return fit
 
 
-def _final(
-    posed: Sequence[Measurements],
+def _tested(
+    candidate: Candidate,
     thin: Sequence[Measurements],
     folds: Sequence[NDArray[np.int64]],
-    candidate: Candidate,
     generator: Generator,
     options: Options,
     nominal: FieldModel | None,
     selection: Selection,
-    progress: Progress | None,
-) -> Final:
-    """The candidate fitted to everything, and its held-out error, every fold from the start."""
-    damping = candidate.damping if options.damping is None else options.damping
-    whole = fit_layout(
-        posed, candidate.layout, damping, generator, options.uncertainty, nominal,
-        progress=progress,
-    )  # fmt: skip
-    noise = min(whole.fit.noise_t, selection.reference.noise_t)
+) -> HeldOut:
+    """The candidate's held-out error, every fold fitted from the start."""
     fitter = _fitter(candidate, generator, options, nominal)
-    return candidate, whole, predict_held_out(thin, folds, fitter, options.uncertainty, noise)
+    noise = selection.reference.noise_t
+    return predict_held_out(thin, folds, fitter, options.uncertainty, noise)
 
 
-def _better(finals: Sequence[Final]) -> Final:
+def _better(tested: Sequence[tuple[Candidate, HeldOut]]) -> tuple[Candidate, HeldOut]:
     """The one with the fewest dipoles whose held-out error is the least to within `WORTH_MANY`."""
-    limit = min(final[2].score_t for final in finals) * (1.0 + WORTH_MANY)
-    good = [final for final in finals if final[2].score_t <= limit]
-    return min(good, key=lambda final: (len(final[1].dipoles), final[2].score_t))
+    limit = min(held_out.score_t for _, held_out in tested) * (1.0 + WORTH_MANY)
+    good = [pair for pair in tested if pair[1].score_t <= limit]
+    return min(good, key=lambda pair: (pair[1].n_dipoles, pair[1].score_t))
 
 
-def _residual(
-    measurements: Sequence[Measurements], model: FieldModel
-) -> tuple[ComplexArray, ComplexArray]:
-    errors, fluxes = [], []
-    for m in measurements:
-        points, axes = m.placed()
-        used = m.usable
-        lengths = np.broadcast_to(m.sensors.length, used.shape)[used]
-        errors.append(m.flux[used] - model.flux(points[used], axes[used], lengths))
-        fluxes.append(m.flux[used])
-    return np.concatenate(errors), np.concatenate(fluxes)
+@dataclass(frozen=True)
+class Residuals:
+    """What a model leaves of measurements at the measured poses.
+
+    Attributes
+    ----------
+    each_t : ndarray, shape (K,)
+        Root mean square of the complex residual's magnitude, T.
+    span_t : float
+        Range of the measured in-phase fluxes, T.
+    """
+
+    each_t: Array
+    span_t: float
+
+    @property
+    def rmse_t(self) -> float:
+        """Over all emitters, T."""
+        return float(np.sqrt(np.mean(self.each_t**2)))
 
 
-def _nominal_rms(measurements: Sequence[Measurements], nominal: FieldModel | None) -> float | None:
-    return None if nominal is None else rms(_residual(measurements, nominal)[0])
+def residuals(measurements: Sequence[Measurements], model: FieldModel) -> Residuals:
+    """Sum up a model's residuals, block by block."""
+    power, count = np.zeros(len(model.emitters)), 0
+    low, high = np.inf, -np.inf
+    for whole in measurements:
+        for block in frame_blocks(len(whole.time), len(whole.sensors)):
+            m = whole.frames(block)  # type: ignore[arg-type]
+            points, axes = m.placed()
+            used = m.usable
+            if not used.any():
+                continue
+            lengths = np.broadcast_to(m.sensors.length, used.shape)[used]
+            error = m.flux[used] - model.flux(points[used], axes[used], lengths)
+            power, count = power + (np.abs(error) ** 2).sum(axis=0), count + len(error)
+            low = min(low, float(m.flux[used].real.min()))
+            high = max(high, float(m.flux[used].real.max()))
+    return Residuals(np.sqrt(power / count), high - low)
 
 
 def provenance(calibration: Calibration, names: Sequence[str]) -> Mapping[str, Any]:

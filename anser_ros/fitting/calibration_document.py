@@ -17,20 +17,20 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
     normalised ones are divided by the range of the measured in-phase fluxes (article, equation 8).
     """
     held_out = calibration.held_out
-    span = float(np.ptp(calibration.flux.real))
-    each = zip(calibration.model.emitters, calibration.error.T, held_out.error.T, strict=True)
+    inside, span = calibration.residuals, calibration.residuals.span_t
+    each = zip(calibration.model.emitters, inside.each_t, held_out.error.T, strict=True)
     nominal = calibration.nominal_rmse_t
     return {
         'schema': 'anser_calibration/1',
         'n_measurements': calibration.n_measurements,
         'n_dipoles': len(calibration.model.positions),
-        'flux_rmse_t': rms(calibration.error),
+        'flux_rmse_t': inside.rmse_t,
         'heldout_flux_rmse_t': rms(held_out.error),
         'heldout_n_rmse_percent': 100.0 * rms(held_out.error) / span,
         'heldout_n_mae_percent': 100.0 * float(np.abs(held_out.error).mean()) / span,
         'emitters': [
-            {'name': name, 'flux_rmse_t': rms(inside), 'heldout_flux_rmse_t': rms(outside)}
-            for name, inside, outside in each
+            {'name': name, 'flux_rmse_t': float(own), 'heldout_flux_rmse_t': rms(outside)}
+            for name, own, outside in each
         ],
         'marginal': {
             'noise_t': held_out.noise_t,

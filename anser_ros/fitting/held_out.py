@@ -46,6 +46,8 @@ class HeldOut:
     flux_error_t : float
         Standard deviation of the field model's own error a phasor component, noise taken off,
         in the typical held-out frame.
+    n_dipoles : int
+        Of the model that was tested.
     """
 
     error: ComplexArray
@@ -53,6 +55,7 @@ class HeldOut:
     chi_square: float
     noise_t: float
     flux_error_t: float
+    n_dipoles: int
 
     @property
     def score_t(self) -> float:
@@ -90,7 +93,7 @@ def predict_held_out(
         train = [m.frames(f != fold) for m, f in zip(measurements, folds, strict=True)]
         fits.append((int(fold), fit(train)))
     noise = min(part.fit.noise_t for _, part in fits) if noise_t is None else noise_t
-    tally = _Tally(noise, uncertainty)
+    tally = _Tally(noise, uncertainty, len(fits[0][1].dipoles))
     for fold, fitted in fits:
         for m, f in zip(measurements, folds, strict=True):
             test = with_pose(m.frames(f == fold))
@@ -104,7 +107,8 @@ def predict_held_out(
 class _Tally:
     """Gathers held-out residuals."""
 
-    def __init__(self, noise_t: float, uncertainty: Uncertainty) -> None:
+    def __init__(self, noise_t: float, uncertainty: Uncertainty, n_dipoles: int) -> None:
+        self.n_dipoles = n_dipoles
         self.noise_t, self.precision = noise_t, uncertainty.pose_precision
         self.error: list[ComplexArray] = []
         self.left: list[ComplexArray] = []
@@ -132,6 +136,7 @@ class _Tally:
             chi_square=float(np.concatenate(self.chi).sum()) / components,
             noise_t=self.noise_t,
             flux_error_t=float(np.sqrt(max(excess, 0.0))),
+            n_dipoles=self.n_dipoles,
         )
 
 

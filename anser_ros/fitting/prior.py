@@ -14,6 +14,7 @@ from anser_ros.fitting.dipoles import Dipoles
 from anser_ros.fitting.factors import ComplexArray, GramFactor, as_complex, as_real
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.model import FieldModel
+from anser_ros.fitting.pose_correction import frame_blocks
 from anser_ros.physics.dipole import flux_basis
 
 Array = NDArray[np.float64]
@@ -64,11 +65,13 @@ def volume_lattice(measurements: Sequence[Measurements]) -> tuple[Array, Array]:
 def emitter_gains(nominal: FieldModel, measurements: Sequence[Measurements]) -> ComplexArray:
     """Complex factor of each emitter's drawn field that fits its fluxes best."""
     above, below = np.zeros(len(nominal.emitters), complex), np.zeros(len(nominal.emitters))
-    for m in measurements:
-        points, axes = m.placed()
-        used = m.usable
-        lengths = np.broadcast_to(m.sensors.length, used.shape)[used]
-        drawn = nominal.flux(points[used], axes[used], lengths)
-        above += (drawn.conj() * m.flux[used]).sum(axis=0)
-        below += (np.abs(drawn) ** 2).sum(axis=0)
+    for whole in measurements:
+        for block in frame_blocks(len(whole.time), len(whole.sensors)):
+            m = whole.frames(block)  # type: ignore[arg-type]
+            points, axes = m.placed()
+            used = m.usable
+            lengths = np.broadcast_to(m.sensors.length, used.shape)[used]
+            drawn = nominal.flux(points[used], axes[used], lengths)
+            above += (drawn.conj() * m.flux[used]).sum(axis=0)
+            below += (np.abs(drawn) ** 2).sum(axis=0)
     return np.asarray(above / np.maximum(below, 1e-300))
