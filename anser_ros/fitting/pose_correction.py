@@ -188,6 +188,8 @@ def most_probable_step(
 
 def moved(measurements: Measurements, step: Array) -> Measurements:
     """The measurements with every pose shifted and turned by ``step``, shape (F, 6)."""
+    if len(step) == 0:
+        return measurements
     turn = Rotation.from_rotvec(step[:, 3:]).as_matrix()
     return replace(
         measurements,

@@ -245,7 +245,7 @@ class SensorSurveyor:
         return np.asarray(step)
 
     def _fix_common_gain(self) -> None:
-        """A gain common to all sensors is the emitters' as well: it is set to one."""
+        """A gain common to all sensors is the emitters' as well: the median one is set to one."""
         if 'gains' not in self.kinds:
             return
         rows = np.concatenate(
@@ -256,7 +256,7 @@ class SensorSurveyor:
         )
         pairs = self.theta[rows].reshape(-1, 2)
         gain = 1.0 + pairs[:, 0] + 1j * pairs[:, 1]
-        gain = gain / gain.mean()
+        gain = gain / (np.median(np.abs(gain)) * np.exp(1j * np.median(np.angle(gain))))
         self.theta[rows] = np.stack([gain.real - 1.0, gain.imag], axis=1).ravel()
         common = np.zeros((self.theta.size, 2))
         common[rows[0::2], 0] = common[rows[1::2], 1] = 1.0 / np.sqrt(len(gain))
