@@ -4,9 +4,9 @@ import argparse
 import json
 import math
 import os
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -14,11 +14,46 @@ from rich.console import Console
 from rich.table import Table
 
 from anser_ros.errors import ParameterError
-from anser_ros.measured import Row, anser_board, hpi_coils, magnet_patch, magnet_session, navion
+from anser_ros.measured import (
+    Row,
+    anser_board,
+    hpi_coils,
+    magnet_patch,
+    magnet_session,
+    navion,
+    navion_report,
+)
 
-MODULES: dict[str, ModuleType] = {
-    module.NAME: module for module in (navion, magnet_patch, hpi_coils, anser_board)
+Study = Callable[[Path], tuple[list[Row], str]]
+
+
+def _navion(folder: Path) -> tuple[list[Row], str]:
+    analysis = navion_report.analyse(folder)
+    return navion.rows(analysis, folder), navion_report.tables(analysis)
+
+
+def _magnet_patch(folder: Path) -> tuple[list[Row], str]:
+    analysis = magnet_patch.analyse(folder)
+    return magnet_patch.rows(analysis), magnet_patch.tables(analysis)
+
+
+def _hpi_coils(folder: Path) -> tuple[list[Row], str]:
+    analysis = hpi_coils.analyse(folder)
+    return hpi_coils.rows(analysis), hpi_coils.tables(analysis)
+
+
+def _anser_board(folder: Path) -> tuple[list[Row], str]:
+    analysis = anser_board.analyse(folder)
+    return anser_board.rows(analysis), anser_board.tables(analysis)
+
+
+STUDIES: dict[str, Study] = {
+    navion.NAME: _navion,
+    magnet_patch.NAME: _magnet_patch,
+    hpi_coils.NAME: _hpi_coils,
+    anser_board.NAME: _anser_board,
 }
+"""Data set to its rows and the text of its candidates."""
 SHARED = 'ANSER_SHARED'
 SCHEMA = 'anser_measured/1'
 
@@ -26,7 +61,7 @@ SCHEMA = 'anser_measured/1'
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument(
-        'datasets', nargs='*', metavar='DATASET', help=f'of {", ".join(MODULES)}; all by default'
+        'datasets', nargs='*', metavar='DATASET', help=f'of {", ".join(STUDIES)}; all by default'
     )
     parser.add_argument(
         '--shared',
@@ -41,14 +76,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
-    wrong = [name for name in args.datasets if name not in MODULES]
+    wrong = [name for name in args.datasets if name not in STUDIES]
     if wrong:
-        raise ParameterError(f'no data set {wrong[0]!r}; there are {", ".join(MODULES)}')
+        raise ParameterError(f'no data set {wrong[0]!r}; there are {", ".join(STUDIES)}')
     shared = shared_folder(args.shared)
     console = Console(stderr=args.json, width=None if os.isatty(1) else 200)
     rows: list[Row] = []
-    for name in args.datasets or MODULES:
-        found, text = study(MODULES[name], shared / 'measured' / name)
+    for name in args.datasets or STUDIES:
+        found, text = STUDIES[name](shared / 'measured' / name)
         rows += found
         if not args.quiet and not args.json:
             console.print(text, markup=False, highlight=False, soft_wrap=True)
@@ -81,14 +116,6 @@ def shared_folder(given: Path | None) -> Path:
     if not (folder / 'measured').is_dir():
         raise ParameterError(f'no measured data: {folder} has no folder measured; use --shared')
     return folder
-
-
-def study(module: ModuleType, folder: Path) -> tuple[list[Row], str]:
-    """Rows and candidate tables of one data set."""
-    analysis = module.analyse(folder)
-    if module is navion:
-        return module.rows(analysis, folder), module.tables(analysis)
-    return module.rows(analysis), module.tables(analysis)
 
 
 def to_document(rows: list[Row]) -> dict[str, Any]:
