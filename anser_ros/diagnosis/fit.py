@@ -42,7 +42,10 @@ class Fit:
         return self.state.terms
 
     def covariance_of(self, index: int) -> Array:
-        """Block of one term."""
+        """Block of one term; where it was held, what it had when it was free."""
+        kept = self.terms[index].site.get('_covariance')
+        if kept is not None:
+            return np.asarray(kept)
         sizes = np.cumsum([0] + [t.theta.size for t in self.terms])
         rows = slice(sizes[index], sizes[index + 1])
         return self.covariance[rows, rows]

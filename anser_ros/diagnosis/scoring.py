@@ -5,12 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 
 from anser_ros.diagnosis.problem import State
 from anser_ros.effects.effect import Term
 
 Array = NDArray[np.float64]
 Columns = Sequence[Array | None]
+
+MOST_COLUMNS = 60
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,11 @@ class BlockSums:
         """The sums of some blocks, by index."""
         return BlockSums(self.normal[rows], self.right[rows], self.squares[rows])
 
+    def columns(self, keep: NDArray[np.int64]) -> 'BlockSums':
+        """The sums of some columns, by index."""
+        normal = self.normal[:, keep[:, None], keep[None, :]]
+        return BlockSums(normal, self.right[:, keep], self.squares)
+
     def solve(self, prior: Array) -> tuple[Array, Array]:
         """Estimate and covariance with a Gaussian prior about zero (standard deviations (q,))."""
         return _solve(self.normal.sum(axis=0), self.right.sum(axis=0), prior)
@@ -46,7 +54,7 @@ class BlockSums:
         """Estimate with the diagonal raised by a share ``damping`` of itself (Marquardt)."""
         normal = self.normal.sum(axis=0)
         raised = normal + damping * np.diag(np.diag(normal))
-        return _solve(raised, self.right.sum(axis=0), prior)[0]
+        return _estimate(raised, self.right.sum(axis=0), prior)
 
     def held_out(self, prior: Array, folds: int) -> float:
         """Sum of squared residuals of each fold, predicted from the others."""
@@ -58,20 +66,43 @@ class BlockSums:
         for fold in range(folds):
             rows = number == fold
             normal, right = self.normal[rows].sum(axis=0), self.right[rows].sum(axis=0)
-            estimate, _ = _solve(total_normal - normal, total_right - right, prior)
+            estimate = _estimate(total_normal - normal, total_right - right, prior)
             left += float(
                 self.squares[rows].sum() - 2 * right @ estimate + estimate @ normal @ estimate
             )
         return left
 
 
-def _solve(normal: Array, right: Array, prior: Array) -> tuple[Array, Array]:
-    """Scaled, with the prior added."""
+def _scaled(normal: Array, prior: Array) -> tuple[Array, Array]:
+    """Normal matrix with the prior, scaled to a unit diagonal, and the scale."""
     full = normal + np.diag(1 / prior**2)
     scale = 1 / np.sqrt(np.diag(full))
-    inverse = np.linalg.pinv(full * scale[:, None] * scale[None, :], rcond=1e-13, hermitian=True)
+    return full * scale[:, None] * scale[None, :], scale
+
+
+def _solve(normal: Array, right: Array, prior: Array) -> tuple[Array, Array]:
+    """Estimate and covariance."""
+    full, scale = _scaled(normal, prior)
+    inverse = np.linalg.pinv(full, rcond=1e-13, hermitian=True)
     covariance = inverse * scale[:, None] * scale[None, :]
     return covariance @ right, covariance
+
+
+def _estimate(normal: Array, right: Array, prior: Array) -> Array:
+    """The estimate alone, by Cholesky where that goes."""
+    full, scale = _scaled(normal, prior)
+    try:
+        factor = cho_factor(full + 1e-12 * np.eye(scale.size), check_finite=False)
+    except np.linalg.LinAlgError:
+        return _solve(normal, right, prior)[0]
+    return np.asarray(scale * cho_solve(factor, scale * right, check_finite=False))
+
+
+def spans(blocks: NDArray[np.int64], wanted: NDArray[np.int64]) -> list[slice]:
+    """Rows of each wanted block; frames are in the order of time, so a block is one run."""
+    starts = np.searchsorted(blocks, wanted, side='left')
+    ends = np.searchsorted(blocks, wanted, side='right')
+    return [slice(int(a), int(b)) for a, b in zip(starts, ends, strict=True)]
 
 
 def block_sums(state: State, columns: Columns, block_numbers: NDArray[np.int64]) -> BlockSums:
@@ -89,10 +120,7 @@ def block_sums(state: State, columns: Columns, block_numbers: NDArray[np.int64])
     right = np.zeros((block_numbers.size, size))
     squares = np.zeros(block_numbers.size)
     for part, column in zip(state.parts, columns, strict=True):
-        for i, number in enumerate(block_numbers):
-            rows = part.blocks == number
-            if not rows.any():
-                continue
+        for i, rows in enumerate(spans(part.blocks, block_numbers)):
             white = part.white[rows].ravel()
             squares[i] += white @ white
             if column is not None:
@@ -152,7 +180,8 @@ class Scorer:
 
     def __init__(self, state: State, blocks: NDArray[np.int64], folds: int) -> None:
         self.state, self.blocks, self.folds = state, blocks, folds
-        terms = state.terms
+        # Terms of very many columns stay as they are: they are what metal left, not effects.
+        terms = [t for t in state.terms if t.theta.size <= MOST_COLUMNS]
         self._active = joined([state.design(t) for t in terms]) if terms else None
         self.prior = np.concatenate([t.effect.prior(t) for t in terms] or [np.zeros(0)])
         empty: list[Array | None] = [None] * len(state.parts)
@@ -184,10 +213,8 @@ class Scorer:
         for part, left, right in zip(self.state.parts, self._active or [], probe, strict=True):
             if left is None or right is None:
                 continue
-            for i, number in enumerate(self.blocks):
-                rows = part.blocks == number
-                if rows.any():
-                    cross[i] += left[rows].reshape(-1, a).T @ right[rows].reshape(-1, b)
+            for i, rows in enumerate(spans(part.blocks, self.blocks)):
+                cross[i] += left[rows].reshape(-1, a).T @ right[rows].reshape(-1, b)
         normal = np.concatenate(
             [
                 np.concatenate([active.normal, cross], axis=2),

@@ -79,6 +79,8 @@ class ConductivePlate(Effect):
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """By differences."""
+        if term.site.get('_frozen'):
+            return view.columns(5)
         parts = [
             (self._flux(term.theta + step, view) - self._flux(term.theta - step, view))
             / (2 * STEPS[i])

@@ -190,10 +190,14 @@ class Term:
         """The same term with other parameters."""
         return replace(self, theta=np.asarray(theta, dtype=np.float64))
 
-    def frozen(self, held: bool) -> 'Term':
-        """The same term with the parameters that are not linear held, or free again."""
-        site = {key: value for key, value in self.site.items() if key != '_frozen'}
-        return replace(self, site={**site, '_frozen': True} if held else site)
+    def frozen(self, covariance: Array) -> 'Term':
+        """The same term, its parameters that are not linear held; their covariance is kept."""
+        return replace(self, site={**self.site, '_frozen': True, '_covariance': covariance})
+
+    def free(self) -> 'Term':
+        """The same term with all parameters free again."""
+        held = ('_frozen', '_covariance')
+        return replace(self, site={k: v for k, v in self.site.items() if k not in held})
 
     @property
     def label(self) -> str:

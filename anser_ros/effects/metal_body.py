@@ -146,3 +146,11 @@ def scatterer_coupling(points: Array, centres: Array, axes: Array) -> Array:
     along = np.einsum('fsni,fsi->fsn', d, axes) * (3 * inverse3 / r2)
     # n . B of a moment m is m . (3 (n.d) d / d^5 - n / d^3).
     return np.asarray(along[..., None] * d - inverse3[..., None] * axes[:, :, None, :])
+
+
+def by_modes(lit: ComplexArray, modes: Array) -> ComplexArray:
+    """Fluxes of single scatterers (..., n) gathered into modes (n, m): (..., m)."""
+    flat = lit.reshape(-1, lit.shape[-1])
+    out = np.empty((flat.shape[0], modes.shape[1]), dtype=complex)
+    out.real, out.imag = np.ascontiguousarray(flat.real) @ modes, flat.imag.copy() @ modes
+    return out.reshape(*lit.shape[:-1], modes.shape[1])

@@ -10,7 +10,7 @@ import numpy as np
 
 from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term, View
-from anser_ros.effects.metal_body import UNIT
+from anser_ros.effects.metal_body import UNIT, by_modes
 from anser_ros.fitting.model import EffectRecord
 from anser_ros.physics.constants import MU_0
 from anser_ros.physics.dipole import flux_basis
@@ -51,7 +51,7 @@ class MetalRemainder(Effect):
         parts = term.theta.reshape(2, -1)
         return np.asarray(parts[0] + 1j * parts[1])
 
-    def _unit(self, term: Term, view: View) -> ComplexArray:
+    def unit(self, term: Term, view: View) -> ComplexArray:
         """Flux of each mode, (F, S, K, m)."""
         offsets = term.site['_offsets']
         frames, sensors, emitters = view.flux.shape
@@ -65,12 +65,12 @@ class MetalRemainder(Effect):
         )
         field = view.illumination.field(offsets).transpose(1, 0, 2).reshape(-1, emitters)
         lit = coupling[:, None, :] * field.T[None]
-        unit = (lit.reshape(-1, lit.shape[-1]) @ term.site['_modes']) * (UNIT / MU_0)
-        return np.asarray(unit.reshape(frames, sensors, emitters, -1))
+        unit = by_modes(lit, term.site['_modes']) * (UNIT / MU_0)
+        return unit.reshape(frames, sensors, emitters, -1)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Linear."""
-        unit = self._unit(term, view)
+        unit = self.unit(term, view)
         return np.concatenate([unit, 1j * unit], axis=-1)
 
     def sources(

@@ -14,7 +14,13 @@ from anser_ros.effects.effect import (
     needed,
     sigmas,
 )
-from anser_ros.effects.metal_body import SPHERE_POINTS, SPHERE_WEIGHTS, UNIT, scatterer_coupling
+from anser_ros.effects.metal_body import (
+    SPHERE_POINTS,
+    SPHERE_WEIGHTS,
+    UNIT,
+    by_modes,
+    scatterer_coupling,
+)
 from anser_ros.fitting.model import EffectRecord
 from anser_ros.physics.constants import MU_0
 
@@ -104,8 +110,8 @@ class MovingMetal(Effect):
         parts = term.theta[PATH:].reshape(2, -1)
         return np.asarray(parts[0] + 1j * parts[1])
 
-    def _lit(self, term: Term, view: View, shift: Array) -> ComplexArray:
-        """Flux of each single scatterer of 1e-4 m^3, shape (F, S, K, 3 n)."""
+    def _there(self, term: Term, view: View, shift: Array) -> tuple[Array, ComplexArray]:
+        """Coupling (F, S, 3 n) and driving field (F, K, 3 n) of every scatterer, axis by axis."""
         theta, offsets = term.theta, term.site['_offsets']
         nodes = np.linspace(0.0, 1.0, NODES)
         path = theta[:3] + nodes[:, None] * (theta[3:6] - theta[:3]) + shift
@@ -118,24 +124,34 @@ class MovingMetal(Effect):
         points = grid[left] * (1 - part[..., 0]) + grid[left + 1] * part[..., 0]
         coupling = scatterer_coupling(points, view.centres, view.axes)
         frames, sensors = view.centres.shape[:2]
-        # Axis by axis: (F, S, 3 n) against (F, K, 3 n).
-        coupling = np.moveaxis(coupling, 3, 2).reshape(frames, sensors, 1, -1)
-        driven = np.transpose(at, (0, 3, 2, 1)).reshape(frames, 1, at.shape[3], -1)
-        return np.asarray(coupling * driven * (UNIT / MU_0))
+        driven = np.transpose(at, (0, 3, 2, 1)).reshape(frames, at.shape[3], -1)
+        flat = np.moveaxis(coupling, 3, 2).reshape(frames, sensors, -1)
+        return flat, driven * (UNIT / MU_0)
+
+    def _sum(self, term: Term, view: View, shift: Array) -> ComplexArray:
+        """Flux (F, S, K) of the whole body, moved by a shift."""
+        coupling, driven = self._there(term, view, shift)
+        weights = term.site['_modes'] @ self._amplitudes(term)
+        return np.asarray(coupling @ (driven * weights).transpose(0, 2, 1))
+
+    def unit(self, term: Term, view: View) -> ComplexArray:
+        """Flux of each mode, (F, S, K, m)."""
+        coupling, driven = self._there(term, view, np.zeros(3))
+        lit = coupling[:, :, None, :] * driven[:, None, :, :]
+        return by_modes(lit, term.site['_modes'])
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """By path (differences, chained) and by polarisability (exact)."""
-        theta, modes = term.theta, term.site['_modes']
-        unit = self._lit(term, view, np.zeros(3)) @ modes
+        theta = term.theta
+        unit = self.unit(term, view)
         groups = unit.shape[-1]
         out = view.columns(theta.size)
         out[..., PATH : PATH + groups], out[..., PATH + groups :] = unit, 1j * unit
         if term.site.get('_frozen'):
             return out
-        weights = modes @ self._amplitudes(term)
         by_place = np.stack(
             [
-                (self._lit(term, view, step) - self._lit(term, view, -step)) @ weights / (2 * STEP)
+                (self._sum(term, view, step) - self._sum(term, view, -step)) / (2 * STEP)
                 for step in STEP * np.eye(3)
             ],
             axis=-1,
@@ -149,8 +165,7 @@ class MovingMetal(Effect):
 
     def moving_flux(self, term: Term, view: View) -> ComplexArray:
         """What the body adds to a view."""
-        weights = term.site['_modes'] @ self._amplitudes(term)
-        return np.asarray(self._lit(term, view, np.zeros(3)) @ weights)
+        return self._sum(term, view, np.zeros(3))
 
     def _strength(self, term: Term) -> ComplexArray:
         """Polarisability of each scatterer along each axis, shape (n, 3), m^3."""

@@ -22,6 +22,7 @@ from anser_ros.effects.metal_body import UNIT, BodyShape, group_flux
 from anser_ros.fitting.model import EffectRecord
 
 BALL = BodyShape.ball()
+POINT = BodyShape.ball(())
 STEP = 1e-3
 CLOSEST = 0.02
 """Metal that is searched keeps this distance (m) from where sensors were."""
@@ -49,6 +50,10 @@ def places(scene: Scene) -> Array:
     return points[~inside & ~on_board]
 
 
+def _shape(term: Term) -> BodyShape:
+    return POINT if term.site.get('_point') else BALL
+
+
 class StaticMetal(Effect):
     """theta: centre (m, 3), then real and imaginary parts of the groups' polarisabilities."""
 
@@ -72,20 +77,20 @@ class StaticMetal(Effect):
     def prior(self, term: Term) -> Array:
         """Anywhere; a few litres of metal at most. Frozen metal stays at its place."""
         place = FROZEN if term.site.get('_frozen') else 0.1
-        return np.concatenate([np.full(3, place), np.full(2 * BALL.groups, 10.0)])
+        return np.concatenate([np.full(3, place), np.full(term.theta.size - 3, 10.0)])
 
-    def _flux(self, centre: Array, alpha: Array, view: View) -> ComplexArray:
-        return BALL.sources(centre, alpha, view.illumination).flux(*view.flat)
+    def _flux(self, term: Term, centre: Array, view: View) -> ComplexArray:
+        return _shape(term).sources(centre, term.theta[3:], view.illumination).flux(*view.flat)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """By place (differences) and by polarisability (exact)."""
         centre, alpha = term.theta[:3], term.theta[3:]
         out = view.columns(term.theta.size)
-        if np.any(alpha):
+        if np.any(alpha) and not term.site.get('_frozen'):
             for i, step in enumerate(STEP * np.eye(3)):
-                more, less = (self._flux(centre + s, alpha, view) for s in (step, -step))
+                more, less = (self._flux(term, centre + s, view) for s in (step, -step))
                 out[..., i] = view.along((more - less) / (2 * STEP))
-        points, moments = BALL.responses(centre, view.illumination)
+        points, moments = _shape(term).responses(centre, view.illumination)
         unit = group_flux(points, moments, *view.flat).reshape(*view.flux.shape, -1)
         groups = unit.shape[-1]
         out[..., 3 : 3 + groups], out[..., 3 + groups :] = unit, 1j * unit
@@ -109,7 +114,7 @@ class StaticMetal(Effect):
         """Induced dipoles."""
         if not np.any(term.theta[3:]):
             return None
-        return BALL.sources(term.theta[:3], term.theta[3:], illumination)
+        return _shape(term).sources(term.theta[:3], term.theta[3:], illumination)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Place and whole polarisability."""

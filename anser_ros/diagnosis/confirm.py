@@ -1,0 +1,106 @@
+"""Whether an effect is the same in all parts of the data, as a real one must be.
+
+What an unknown effect leaves is often picked up by some known one, with parameters that are
+different from one part of the data to the next. So each effect is fitted again in parts of the time
+and emitter by emitter, and the power that those fits take off besides is set against the power that
+the effect itself takes off.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.diagnosis.fit import Fit
+from anser_ros.diagnosis.problem import Problem, State, evaluate
+from anser_ros.diagnosis.refine import belongs_to
+from anser_ros.diagnosis.search import misfit
+from anser_ros.effects.effect import Term
+
+Array = NDArray[np.float64]
+
+TIME_PARTS = 6
+LARGEST_VARIATION = 0.1
+"""Share of an effect's power that may vary."""
+LEAST_OF_THE_REST = 0.2
+"""An effect that takes off less than this share of what stays unexplained is not named."""
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """What speaks for an effect.
+
+    Attributes
+    ----------
+    power : float
+        What it takes off the sum of squares.
+    variation : float
+        Share of that power that refits in parts of the data take off besides.
+    share_of_rest : float
+        Its power over the power that stays unexplained.
+    """
+
+    power: float
+    variation: float
+    share_of_rest: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether the effect may be named."""
+        return self.variation < LARGEST_VARIATION and self.share_of_rest > LEAST_OF_THE_REST
+
+
+def confirm(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmation:
+    """Check one term of a fit; ``noise`` is the variance of the whitened noise."""
+    rest = [t for t in fit.terms if t is not term and not belongs_to(t, term)]
+    without = evaluate(problem, rest)
+    power = without.sum_of_squares - fit.state.sum_of_squares
+    left = max(fit.state.sum_of_squares - noise * fit.state.count, 0.0)
+    left_tools = left if misfit(fit) > 1.02 * noise else 0.0
+    varying = max(_by_time(fit.state, term, noise), _by_emitter(fit.state, term, noise))
+    return Confirmation(
+        power, varying / max(power, 1e-300), power / max(left_tools, 1e-3 * fit.state.count)
+    )
+
+
+def _extra(normal: Array, right: Array, noise: float) -> float:
+    """Power beyond chance that a refit in one part takes off."""
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    scaled = normal / scale[:, None] / scale[None, :]
+    inverse = np.linalg.pinv(scaled, rcond=1e-8, hermitian=True)
+    b = right / scale
+    return float(b @ inverse @ b - noise * right.size)
+
+
+def _by_time(state: State, term: Term, noise: float) -> float:
+    columns = state.design(term)
+    numbers = np.unique(np.concatenate([part.blocks for part in state.parts]))
+    total = 0.0
+    for group in np.array_split(numbers, TIME_PARTS):
+        normal, right = np.zeros((term.theta.size,) * 2), np.zeros(term.theta.size)
+        for part, column in zip(state.parts, columns, strict=True):
+            if column is None or part.view.is_reference:
+                continue
+            rows = np.isin(part.blocks, group)
+            flat = column[rows].reshape(-1, term.theta.size)
+            normal += flat.T @ flat
+            right += flat.T @ part.white[rows].ravel()
+        total += max(_extra(normal, right, noise), 0.0)
+    return total
+
+
+def _by_emitter(state: State, term: Term, noise: float) -> float:
+    columns = state.design(term)
+    emitters = state.problem.fields.omega.size
+    total = 0.0
+    for k in range(emitters):
+        normal, right = np.zeros((term.theta.size,) * 2), np.zeros(term.theta.size)
+        for part, column in zip(state.parts, columns, strict=True):
+            if column is None or part.view.is_reference:
+                continue
+            own = np.arange(part.white.shape[1]) % emitters == k
+            flat = column[:, own].reshape(-1, term.theta.size)
+            normal += flat.T @ flat
+            right += flat.T @ part.white[:, own].ravel()
+        total += max(_extra(normal, right, noise), 0.0)
+    return total

@@ -1,0 +1,59 @@
+"""The model with the effects that were found: field effects in its dipoles, the rest as records."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.dipoles import Dipoles
+from anser_ros.effects.effect import Remedy, Term
+from anser_ros.effects.prediction import Fields
+from anser_ros.fitting.model import EffectRecord, FieldModel
+
+Array = NDArray[np.float64]
+
+
+def corrected_model(
+    model: FieldModel, terms: Sequence[Term], records: Sequence[EffectRecord], fields: Fields
+) -> FieldModel:
+    """Bake field effects into the dipoles and list all effects.
+
+    Metal that moves is not baked in: where it is, the live refit finds from the references.
+    """
+    dipoles = Dipoles(model.positions, model.directions, model.moments)
+    for term in terms:
+        if term.effect.remedy is Remedy.FIELD and not term.effect.moving:
+            added = term.effect.sources(term, fields.model, fields.illumination, fields.omega)
+            if added is not None:
+                dipoles = dipoles.joined(added)
+    if dipoles.positions.shape[0] == model.positions.shape[0]:
+        return replace(model, effects=(*model.effects, *records))
+    merged, rows = _merged(dipoles)
+    modes = model.modes
+    if modes is not None:
+        wide = np.zeros((modes.shape[0], merged.positions.shape[0], modes.shape[2]), dtype=complex)
+        np.add.at(wide, (slice(None), rows[: model.positions.shape[0]]), modes)
+        modes = wide
+    return replace(
+        model,
+        positions=merged.positions,
+        directions=merged.directions,
+        moments=merged.moments,
+        modes=modes,
+        effects=(*model.effects, *records),
+    )
+
+
+def _merged(dipoles: Dipoles) -> tuple[Dipoles, NDArray[np.int64]]:
+    """Dipoles of the same place and direction added up, and the row that each went to."""
+    key = np.round(np.concatenate([dipoles.positions * 1e9, dipoles.directions * 1e9], axis=1))
+    _, first, rows = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    rows = rows.ravel()
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(order.size)
+    rows, first = rank[rows], first[order]
+    moments = np.zeros((first.size, dipoles.moments.shape[1]), dtype=complex)
+    np.add.at(moments, rows, dipoles.moments)
+    return Dipoles(dipoles.positions[first], dipoles.directions[first], moments), rows

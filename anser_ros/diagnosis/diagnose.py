@@ -1,0 +1,321 @@
+"""The whole loop: residual, effect, correction, and the error before and after on unseen data."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.diagnosis.confirm import Confirmation, confirm
+from anser_ros.diagnosis.corrected_model import corrected_model
+from anser_ros.diagnosis.fit import Fit
+from anser_ros.diagnosis.outlying import clean_start, outlying_share, without_outliers
+from anser_ros.diagnosis.prepare import test_blocks, train_blocks
+from anser_ros.diagnosis.problem import Part, Problem, State, evaluate
+from anser_ros.diagnosis.refine import belongs_to, settled
+from anser_ros.diagnosis.search import (
+    Progress,
+    Search,
+    SearchSettings,
+    misfit,
+    search_effects,
+)
+from anser_ros.diagnosis.structure import StructureTest, noise_scale, structure_tests
+from anser_ros.effects.effect import Effect, Term
+from anser_ros.effects.metal_remainder import REMAINDER
+from anser_ros.effects.registry import all_effects
+from anser_ros.fitting.model import EffectRecord, FieldModel
+
+Array = NDArray[np.float64]
+
+SEARCH_FRAMES, FINAL_FRAMES = 270, 400
+"""Frames a tool that the search and the last fit work on."""
+NOISIER = 1.15
+"""Factor from which noise counts as grown."""
+FEWEST_OUTLIERS = 0.004
+TURNED_ROUND = 0.3
+"""A gain within this of -1 is a polarity."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One effect that was named.
+
+    Attributes
+    ----------
+    record : EffectRecord
+        Parameters, uncertainty and evidence.
+    term : Term or None
+        None where nothing is in force (noise, outliers).
+    flux_rms_without_t : float
+        Held-out residual with all effects but this one, T.
+    """
+
+    record: EffectRecord
+    term: Term | None
+    flux_rms_without_t: float
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found.
+
+    Attributes
+    ----------
+    findings : tuple of Finding
+    flux_rms_before_t, flux_rms_after_t, flux_rms_floor_t : float
+        Held-out residuals with the pose jitter taken out, T a phasor component.
+    raw_rms_before_t, raw_rms_after_t : float
+        The same with the jitter in.
+    unexplained : float
+        Share of the power above the floor that remains.
+    depends_on : tuple of str
+    tests_before, tests_after : tuple of StructureTest
+    model : FieldModel
+        With the effects.
+    search : Search
+    refused : tuple of Term
+        Effects that explained something but were not confirmed.
+    before, after : State
+        The held-out part.
+    """
+
+    findings: tuple[Finding, ...]
+    flux_rms_before_t: float
+    flux_rms_after_t: float
+    flux_rms_floor_t: float
+    raw_rms_before_t: float
+    raw_rms_after_t: float
+    unexplained: float
+    depends_on: tuple[str, ...]
+    tests_before: tuple[StructureTest, ...]
+    tests_after: tuple[StructureTest, ...]
+    model: FieldModel
+    search: Search
+    refused: tuple[tuple[Term, Confirmation], ...]
+    before: State
+    after: State
+    terms: tuple[Term, ...] = field(default_factory=tuple)
+
+
+def diagnose(
+    problem: Problem,
+    model: FieldModel,
+    settings: SearchSettings | None = None,
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Find what a model lacks.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of the whole session (`anser_ros.diagnosis.prepare.build_problem`).
+    model : FieldModel
+        What the problem was built with.
+    settings : SearchSettings, optional
+    progress : callable, optional
+        Told in words what goes on.
+    """
+    how, say = settings or SearchSettings(), progress or (lambda text: None)
+    blocks = train_blocks()
+    known = _polarities(problem)
+    whole = problem
+    problem = clean_start(problem) if not known else problem
+    training = problem.in_blocks(blocks)
+    search = search_effects(_thinned(training, SEARCH_FRAMES), blocks, known, how, say)
+    say('joint fit')
+    fit, refused = _confirmed(_thinned(training, FINAL_FRAMES), search, blocks, how)
+    cleaned = without_outliers(whole, evaluate(whole, fit.terms))
+    if outlying_share(problem, cleaned)[0] > FEWEST_OUTLIERS:
+        thinned = _thinned(cleaned.in_blocks(blocks), FINAL_FRAMES)
+        fit = settled(thinned, fit.terms, blocks, how.folds, how.iterations)
+    return _concluded(whole, cleaned, fit, search, refused, model)
+
+
+def _thinned(problem: Problem, frames: int) -> Problem:
+    """About so many frames a tool."""
+    most = max((tool.time.size for tool in problem.tools), default=0)
+    step = max(1, round(most / frames))
+    keep = [np.arange(0, tool.time.size, step) for tool in problem.tools]
+    return problem.frames(keep, np.arange(problem.reference_blocks.size))
+
+
+def _polarities(problem: Problem) -> list[Term]:
+    """Channels whose readings are the prediction turned round."""
+    effect = all_effects()['sensor_polarity']
+    state = evaluate(_thinned(problem, 150), ())
+    turned = []
+    for part, tool, good in zip(
+        state.parts, state.problem.tools, state.problem.good, strict=False
+    ):
+        for row, channel in enumerate(tool.sensors.channel.tolist()):
+            use = good[:, row]
+            seen, wanted = tool.flux[use, row].ravel(), part.view.flux[use, row].ravel()
+            power = float(np.sum(np.abs(wanted) ** 2))
+            if power == 0.0:
+                continue
+            gain = complex(np.sum(wanted.conj() * seen) / power)
+            fit = abs(np.sum(wanted.conj() * seen)) / np.sqrt(
+                power * max(float(np.sum(np.abs(seen) ** 2)), 1e-300)
+            )
+            if abs(gain + 1) < TURNED_ROUND and fit > 0.9:
+                turned.append(int(channel))
+    return [Term(effect, {'channels': tuple(turned)})] if turned else []
+
+
+def _confirmed(
+    problem: Problem, search: Search, blocks: NDArray[np.int64], how: SearchSettings
+) -> tuple[Fit, tuple[tuple[Term, Confirmation], ...]]:
+    """The joint fit of the effects that are the same in all parts of the data."""
+    terms: Sequence[Term] = search.fit.terms
+    refused: list[tuple[Term, Confirmation]] = []
+    while True:
+        fit = settled(problem, terms, blocks, how.folds, how.iterations)
+        noise = noise_scale(fit.state) ** 2
+        checks = [
+            (confirm(problem, fit, term, noise), term)
+            for term in fit.terms
+            if term.effect is not REMAINDER and term.theta.size
+        ]
+        doubtful = [(check, term) for check, term in checks if not check.holds]
+        if not doubtful:
+            return fit, tuple(refused)
+        worst, term = min(doubtful, key=lambda pair: pair[0].power)
+        refused.append((term, worst))
+        terms = [t for t in fit.terms if t is not term and not belongs_to(t, term)]
+
+
+def _tools(state: State) -> list[Part]:
+    return [part for part in state.parts if not part.view.is_reference]
+
+
+def rms(state: State) -> float:
+    """Residual of the tools with the jitter taken out, T a phasor component."""
+    squares = sum(float(np.sum(part.white**2)) for part in _tools(state))
+    count = sum(part.count for part in _tools(state))
+    return float(np.sqrt(squares / max(count, 1))) * state.problem.spread.flux_t
+
+
+def raw_rms(state: State) -> float:
+    """Residual of the tools as it is, T a phasor component."""
+    squares, count = 0.0, 0
+    for part in _tools(state):
+        good = part.whitener.weight > 0
+        squares += float(np.sum(part.residual[good] ** 2))
+        count += int(good.sum())
+    return float(np.sqrt(squares / max(count, 1)))
+
+
+def _concluded(
+    whole: Problem,
+    cleaned: Problem,
+    fit: Fit,
+    search: Search,
+    refused: tuple[tuple[Term, Confirmation], ...],
+    model: FieldModel,
+) -> Diagnosis:
+    unseen = cleaned.in_blocks(test_blocks())
+    before, after = evaluate(unseen, ()), evaluate(unseen, fit.terms)
+    scale = noise_scale(after)
+    expected = cleaned.spread.flux_t
+    floor = min(scale * expected, rms(after))
+    tests = tuple(structure_tests(after))
+    excess = max(rms(after) ** 2 - floor**2, 0.0)
+    significant = excess > 0.03 * floor**2
+    possible = max(rms(before) ** 2 - floor**2, excess)
+    findings = [
+        _finding(fit, i, term, unseen, search)
+        for i, term in enumerate(fit.terms)
+        if term.effect is not REMAINDER
+    ]
+    findings += _noise_findings(whole, cleaned, after, scale, significant)
+    records = [finding.record for finding in findings]
+    depends = tuple(t.variable for t in tests if t.significant) if significant else ()
+    return Diagnosis(
+        findings=tuple(findings),
+        flux_rms_before_t=rms(before),
+        flux_rms_after_t=rms(after),
+        flux_rms_floor_t=floor,
+        raw_rms_before_t=raw_rms(before),
+        raw_rms_after_t=raw_rms(after),
+        unexplained=excess / possible if significant and possible > 0 else 0.0,
+        depends_on=depends,
+        tests_before=tuple(structure_tests(before)),
+        tests_after=tests,
+        model=corrected_model(model, fit.terms, records, cleaned.fields),
+        search=search,
+        refused=refused,
+        before=before,
+        after=after,
+        terms=fit.terms,
+    )
+
+
+def _finding(fit: Fit, index: int, term: Term, unseen: Problem, search: Search) -> Finding:
+    rest = [t for t in fit.terms if t is not term and not belongs_to(t, term)]
+    without = rms(evaluate(unseen, rest))
+    record = term.effect.record(term, fit.covariance_of(index))
+    gain = next(
+        (
+            c.gain
+            for found in search.rounds
+            for c in found
+            if c.fitted_gain is not None and c.term.label == term.label
+        ),
+        None,
+    )
+    evidence = {
+        'summary': term.effect.summary,
+        'remedy': term.effect.remedy.value,
+        'parameters_spent': int(term.theta.size),
+        'held_out_gain': None if gain is None else float(gain),
+        'rivals': [c.term.label for c in search.rivals.get(term.label, [])],
+    }
+    return Finding(replace(record, evidence={**record.evidence, **evidence}), term, without)
+
+
+def _noise_findings(
+    whole: Problem, cleaned: Problem, after: State, scale: float, significant: bool
+) -> list[Finding]:
+    found = []
+    share, channels = outlying_share(whole, cleaned)
+    effects: dict[str, Effect] = all_effects()
+    frames = sum(tool.time.size for tool in whole.tools)
+    if share > FEWEST_OUTLIERS:
+        site = {'fraction': share, 'sigma': float(np.sqrt(share / max(frames, 1)))}
+        if channels:
+            site['channels'] = tuple(channels)
+        found.append(_plain(effects['outliers'], site, rms(after)))
+    if scale > NOISIER and not significant:
+        sigma = scale / np.sqrt(2 * max(after.count, 1))
+        noisy = _noisy_channels(after)
+        site = {'factor': scale, 'sigma': float(sigma)}
+        if noisy:
+            site['channels'] = noisy
+        found.append(_plain(effects['excess_noise'], site, rms(after)))
+    return found
+
+
+def _plain(effect: Effect, site: dict[str, object], without: float) -> Finding:
+    record = effect.record(Term(effect, site), np.zeros((0, 0)))
+    evidence = {'summary': effect.summary, 'remedy': effect.remedy.value}
+    return Finding(replace(record, evidence=evidence), None, without)
+
+
+def _noisy_channels(state: State) -> tuple[int, ...]:
+    """Channels with grown noise, where others have none."""
+    emitters = state.problem.fields.omega.size
+    noisy, sound = [], 0
+    for part in _tools(state):
+        squares = part.white**2 * (part.whitener.weight > 0)
+        sensors = len(part.view.sensors)
+        size = squares.reshape(-1, 2, sensors, emitters).mean(axis=(0, 1, 3))
+        for channel, value in zip(part.view.sensors.channel.tolist(), size, strict=True):
+            if value > NOISIER**2:
+                noisy.append(int(channel))
+            else:
+                sound += 1
+    return tuple(noisy) if sound else ()
+
+
+__all__ = ['Diagnosis', 'Finding', 'diagnose', 'misfit', 'raw_rms', 'rms']

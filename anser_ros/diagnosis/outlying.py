@@ -1,0 +1,80 @@
+"""Frames and single readings that stand out from their neighbours in time."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from anser_ros.diagnosis.problem import Problem, State, evaluate
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+WINDOW = 11
+READING_RATIO, FRAME_RATIO = 6.0, 2.5
+"""Mean squares over the neighbours' median from which a reading (16 values with 8 emitters) or a
+frame (ten times as many) is no member of the same distribution; noise passes once in 1e6."""
+
+
+def find_outliers(state: State) -> tuple[Mask, ...]:
+    """Mask (F, S) of outlying readings, one a tool; a frame that stands out is out as a whole."""
+    masks = []
+    for part, good in zip(state.parts, state.problem.good, strict=False):
+        emitters = state.problem.fields.omega.size
+        # The residual along the pose's own directions is left in: an optical glitch shows there.
+        size = (part.residual * part.whitener.weight) ** 2
+        white = part.white**2
+        readings = _by_reading(white, good.shape[1], emitters)
+        count = np.maximum(good.sum(axis=1), 1)
+        frames = np.where(good, readings, 0.0).sum(axis=1) / count
+        jumps = np.where(good, _by_reading(size, good.shape[1], emitters), 0.0).sum(axis=1) / count
+        bad = _stands_out(readings, READING_RATIO) | _stands_out(frames[:, None], FRAME_RATIO)
+        bad |= _stands_out(jumps[:, None], 40.0)
+        masks.append(bad & good)
+    return tuple(masks)
+
+
+def _by_reading(values: Array, sensors: int, emitters: int) -> Array:
+    """Mean over the parts of each sensor's phasors, (F, S)."""
+    shaped = values.reshape(values.shape[0], 2, sensors, emitters)
+    return np.asarray(shaped.mean(axis=(1, 3)))
+
+
+def _stands_out(values: Array, ratio: float) -> Mask:
+    """Above ``ratio`` times the median of the neighbours in time, and above noise."""
+    local = median_filter(values, size=(WINDOW, 1), mode='nearest')
+    return np.asarray(values > ratio * np.maximum(local, 1.0))
+
+
+def without_outliers(problem: Problem, state: State) -> Problem:
+    """The problem with outlying readings left out."""
+    masks = find_outliers(state)
+    good = tuple(g & ~bad for g, bad in zip(problem.good, masks, strict=True))
+    return replace(problem, good=good)
+
+
+def outlying_share(before: Problem, after: Problem) -> tuple[float, list[int]]:
+    """Share of frames that lost a reading, and the channels that lost most of them.
+
+    The list is empty where whole frames are out.
+    """
+    lost_frames, frames = 0, 0
+    by_channel: dict[int, int] = {}
+    whole = 0
+    for tool, old, new in zip(before.tools, before.good, after.good, strict=True):
+        lost = old & ~new
+        lost_frames += int(lost.any(axis=1).sum())
+        whole += int((lost.sum(axis=1) > 0.5 * old.sum(axis=1).clip(1)).sum())
+        frames += tool.time.size
+        for row, channel in enumerate(tool.sensors.channel.tolist()):
+            by_channel[channel] = int(lost[:, row].sum())
+    share = lost_frames / max(frames, 1)
+    if whole > 0.5 * max(lost_frames, 1):
+        return share, []
+    return share, [c for c, n in by_channel.items() if n > 0.2 * max(lost_frames, 1)]
+
+
+def clean_start(problem: Problem) -> Problem:
+    """The problem without what stands out before anything is explained."""
+    return without_outliers(problem, evaluate(problem, ()))

@@ -1,0 +1,173 @@
+"""What residuals depend on: means over cells of each variable, against what noise would give."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from anser_ros.diagnosis.problem import Part, State
+
+Array = NDArray[np.float64]
+
+BINS = 12
+SIGNIFICANT = 1e-5
+FEWEST = 4
+
+
+@dataclass(frozen=True)
+class StructureTest:
+    """One variable's test.
+
+    Attributes
+    ----------
+    variable : str
+    share : float
+        Part of the residual power that the cell means explain beyond chance.
+    probability : float
+        Of as much structure in noise.
+    """
+
+    variable: str
+    share: float
+    probability: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether noise hardly does that, and it matters."""
+        return self.probability < SIGNIFICANT and self.share > 0.005
+
+
+def structure_tests(state: State) -> list[StructureTest]:
+    """Test the tools' whitened residuals against every variable, strongest first.
+
+    For time, position, orientation, speed and amplitude the frames are binned, and the mean of each
+    phasor part of each sensor in each bin is compared with zero. For channel, emitter and frequency
+    the spread over the groups is compared with the spread of all.
+    """
+    tools = [part for part in state.parts if not part.view.is_reference]
+    noise = _noise(tools)
+    tests = [_binned(tools, name, noise) for name in _VARIABLES]
+    tests += [_grouped(tools, name, noise) for name in ('channel', 'emitter', 'quadrature')]
+    return sorted(tests, key=lambda test: -test.share)
+
+
+def _noise(parts: list[Part]) -> float:
+    """Variance of the white part of the residuals, from differences of neighbouring frames."""
+    squares, count = 0.0, 0
+    for part in parts:
+        if part.white.shape[0] < 2:
+            continue
+        both = (part.whitener.weight[1:] > 0) & (part.whitener.weight[:-1] > 0)
+        close = np.diff(part.view.time) < 3 * np.median(np.diff(part.view.time))
+        step = np.diff(part.white, axis=0)[close][both[close]] / np.sqrt(2)
+        squares += float(np.sum(step**2))
+        count += step.size
+    return squares / count if count else 1.0
+
+
+def noise_scale(state: State) -> float:
+    """Standard deviation of the white part of the tools' residuals, in expected ones."""
+    tools = [part for part in state.parts if not part.view.is_reference]
+    return float(np.sqrt(_noise(tools)))
+
+
+def _quantiles(values: Array, bins: int) -> NDArray[np.int64]:
+    edges = np.quantile(values, np.linspace(0, 1, bins + 1)[1:-1])
+    return np.searchsorted(edges, values, side='right')
+
+
+def _time(part: Part) -> list[NDArray[np.int64]]:
+    return [_quantiles(part.view.time, BINS)]
+
+
+def _position(part: Part) -> list[NDArray[np.int64]]:
+    x, y, z = part.view.position.T
+    return [_quantiles(x, 4) * 8 + _quantiles(y, 4) * 2 + _quantiles(z, 2)]
+
+
+def _orientation(part: Part) -> list[NDArray[np.int64]]:
+    # The turn about the mean orientation, by its components.
+    reference = part.view.rotation[part.view.rotation.shape[0] // 2]
+    turn = reference.T @ part.view.rotation
+    parts = np.stack(
+        [
+            turn[:, 2, 1] - turn[:, 1, 2],
+            turn[:, 0, 2] - turn[:, 2, 0],
+            turn[:, 1, 0] - turn[:, 0, 1],
+        ]
+    )
+    return [_quantiles(parts[0], 3) * 9 + _quantiles(parts[1], 3) * 3 + _quantiles(parts[2], 3)]
+
+
+def _speed(part: Part) -> list[NDArray[np.int64]]:
+    x, y, z = part.view.velocity[:, :3].T
+    return [_quantiles(x, 3) * 9 + _quantiles(y, 3) * 3 + _quantiles(z, 3)]
+
+
+def _amplitude(part: Part) -> list[NDArray[np.int64]]:
+    flux = part.view.flux
+    size = flux.real.reshape(flux.shape[0], -1)
+    return [_quantiles(column, BINS) for column in size.T]
+
+
+_VARIABLES = {
+    'time': _time,
+    'position': _position,
+    'orientation': _orientation,
+    'speed': _speed,
+    'amplitude': _amplitude,
+}
+
+
+def _binned(parts: list[Part], name: str, noise: float) -> StructureTest:
+    explained, cells, total = 0.0, 0, 0.0
+    for part in parts:
+        bins = _VARIABLES[name](part)
+        good = part.whitener.weight > 0
+        total += float(np.sum(part.white[good] ** 2))
+        half = part.white.shape[1] // 2
+        for i, number in enumerate(bins):
+            columns = slice(None) if len(bins) == 1 else [i, half + i]
+            white, counted = part.white[:, columns], good[:, columns]
+            for cell in np.unique(number):
+                rows = number == cell
+                n = counted[rows].sum(axis=0)
+                sums = (white[rows] * counted[rows]).sum(axis=0)
+                use = n >= FEWEST
+                explained += float(np.sum(sums[use] ** 2 / n[use]))
+                cells += int(use.sum())
+    return _verdict(name, explained, cells, total, noise)
+
+
+def _grouped(parts: list[Part], name: str, noise: float) -> StructureTest:
+    squares: dict[int, float] = {}
+    counts: dict[int, int] = {}
+    for part in parts:
+        sensors, emitters = part.view.flux.shape[1:]
+        shape = (2, sensors, emitters)
+        quadrature, sensor, emitter = (a.ravel() for a in np.indices(shape))
+        channels = part.view.sensors.channel[sensor]
+        group = {'channel': channels, 'emitter': emitter, 'quadrature': quadrature}[name]
+        good = part.whitener.weight > 0
+        for value in np.unique(group):
+            columns = group == value
+            squares[int(value)] = squares.get(int(value), 0.0) + float(
+                np.sum((part.white[:, columns] * good[:, columns]) ** 2)
+            )
+            counts[int(value)] = counts.get(int(value), 0) + int(good[:, columns].sum())
+    total = sum(squares.values())
+    excess, statistic = 0.0, 0.0
+    for value, square in squares.items():
+        n = max(counts[value], 1)
+        over = square / n / noise - 1.0
+        statistic += over**2 * n / 2
+        excess += max(square - n * noise, 0.0)
+    probability = float(chi2.sf(statistic, max(len(squares), 1)))
+    return StructureTest(name, excess / max(total, 1e-300), probability)
+
+
+def _verdict(name: str, explained: float, cells: int, total: float, noise: float) -> StructureTest:
+    share = max(explained - cells * noise, 0.0) / max(total, 1e-300)
+    probability = float(chi2.sf(explained / noise, max(cells, 1)))
+    return StructureTest(name, share, probability)
