@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from anser_ros.errors import LayoutError
 from anser_ros.wire.points import (
+    FLOAT32,
     DipolePoints,
     FluxPoints,
     decode_field_model,
@@ -113,6 +114,22 @@ def shuffle(encoded, width):
 def test_a_broken_cloud_is_refused(change, message):
     with pytest.raises(LayoutError, match=message):
         decode_flux(*change(*shuffle(encode_flux(flux_points()), 4)))
+
+
+@pytest.mark.filterwarnings('error')
+def test_what_is_not_finite_is_read_as_it_is():
+    flux = np.full((2, 3), complex(np.inf, 1.0))
+    flux[1] = complex(-1.0, np.nan), complex(np.nan, -np.inf), 0.0
+    nothing = np.full((2, 3), np.nan)
+    points = FluxPoints(np.arange(2), np.zeros(2, int), flux, nothing, nothing)
+    fields, step, data = encode_flux(points)
+    read = decode_flux(fields, step, 2, data).flux
+    np.testing.assert_array_equal(read.real, flux.real)
+    np.testing.assert_array_equal(read.imag, flux.imag)
+    changed = [(n, o, FLOAT32 if n == 'channel' else t, c) for n, o, t, c in fields]
+    changed = [(n, 28 if n == 'channel' else o, t, c) for n, o, t, c in changed]
+    with pytest.raises(LayoutError, match="'channel' holds"):
+        decode_flux(changed, step, 2, data)
 
 
 FIELD = st.tuples(

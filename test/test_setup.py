@@ -67,6 +67,7 @@ def edited(path: tuple, value: object) -> str:
         (('emitter', 'coils'), [], 'at least one coil'),
         (('emitter', 'coils', 0, 'frequency_hz'), -5.0, 'must be finite and in'),
         (('emitter', 'coils', 1, 'name'), 'coil0', 'appears twice'),
+        (('emitter', 'coils', 1, 'frequency_hz'), 6000.0, 'frequency_hz 6000.0 appears twice'),
         (('emitter', 'coils', 0, 'centre_m'), [1, 2], 'three numbers'),
         (('sensors',), [], 'at least one sensor'),
         (('sensors', 0, 'channel'), 70000, 'integer in'),

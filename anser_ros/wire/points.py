@@ -101,9 +101,17 @@ def _columns(records: NDArray[np.void], names: Sequence[str]) -> Array:
     if missing:
         raise LayoutError(f'the cloud lacks the field {missing[0]!r}')
     out = np.empty((records.shape[0], len(names)))
-    for i, name in enumerate(names):
-        out[:, i] = records[name]
+    with np.errstate(invalid='ignore'):  # a signalling NaN is as good as any other
+        for i, name in enumerate(names):
+            out[:, i] = records[name]
     return out
+
+
+def _integers(records: NDArray[np.void], name: str) -> NDArray[np.int64]:
+    values = _columns(records, (name,))[:, 0]
+    if not (np.abs(values) < 2.0**31).all():
+        raise LayoutError(f'the field {name!r} holds what is no small integer')
+    return values.astype(np.int64)
 
 
 def _phasors(records: NDArray[np.void], stem: str) -> ComplexArray:
@@ -115,7 +123,9 @@ def _phasors(records: NDArray[np.void], stem: str) -> ComplexArray:
         raise LayoutError(f'the cloud lacks the field {f"{stem}0_re"!r}')
     real = _columns(records, [f'{stem}{k}_re' for k in range(count)])
     imag = _columns(records, [f'{stem}{k}_im' for k in range(count)])
-    return np.asarray(real + 1j * imag)
+    phasors = np.empty(real.shape, dtype=np.complex128)
+    phasors.real, phasors.imag = real, imag  # 1j times an infinity would be a NaN
+    return phasors
 
 
 def decode_flux(
@@ -131,16 +141,17 @@ def decode_flux(
     ------
     LayoutError
         When a field is missing, doubled, of an unknown type or outside the point, when the number
-        of bytes is not ``width * point_step``, or when a channel appears twice.
+        of bytes is not ``width * point_step``, when a channel appears twice, or when a channel or
+        flag is no integer.
     """
     records = _records(fields, point_step, width, data, is_bigendian)
     geometry = _columns(records, ('x', 'y', 'z', 'nx', 'ny', 'nz'))
-    channel = _columns(records, ('channel',))[:, 0].astype(np.int64)
+    channel = _integers(records, 'channel')
     if len(set(channel.tolist())) != channel.size:
         raise LayoutError('a channel appears twice in the cloud')
     return FluxPoints(
         channel=channel,
-        flags=_columns(records, ('flags',))[:, 0].astype(np.int64),
+        flags=_integers(records, 'flags'),
         flux=_phasors(records, 'coil'),
         position=geometry[:, :3],
         axis=geometry[:, 3:],

@@ -182,6 +182,8 @@ def _parse_emitter(item: Any) -> Emitter:
         raise SetupError('setup: emitter.coils must be a list of at least one coil')
     parsed = tuple(_parse_coil(coil, f'emitter.coils[{i}]') for i, coil in enumerate(coils))
     _unique([coil.name for coil in parsed], 'coil')
+    # What tells emitters apart is their tone.
+    _unique([coil.frequency_hz for coil in parsed], "emitter's frequency_hz")
     geometry = {k: v for k, v in emitter.items() if k not in ('kind', 'coils')}
     kind = _take(emitter, 'kind', 'emitter')
     return Emitter(_name(kind, 'emitter.kind'), geometry, parsed)
