@@ -132,12 +132,17 @@ def test_services_start_and_stop(start, source, tmp_path):
     assert len(list(tmp_path.glob('anser_*/*.mcap'))) == 2
 
 
-def test_a_bag_is_never_written_over(start, tmp_path):
+def test_a_bag_is_never_written_over(start, source, tmp_path):
     (tmp_path / 'bag').mkdir()
     (tmp_path / 'bag' / 'bag_0.mcap').write_bytes(b'precious')
     process = start('recorder', '--ros-args', '-p', f'directory:={tmp_path}', '-p', 'name:=bag')
-    assert process.popen.wait(20) == 2
-    assert 'is there already' in process.output and 'Traceback' not in process.output
+    process.wait_for(f'recording to {tmp_path / "bag_1"}')
+    assert call(source, '/anser/recorder/stop').success
+    again = call(source, '/anser/recorder/start')
+    assert (again.success, again.message) == (True, str(tmp_path / 'bag_2'))
+    assert process.interrupt() == 0
+    assert (tmp_path / 'bag_1' / 'bag_1_0.mcap').is_file()
+    assert (tmp_path / 'bag_2' / 'bag_2_0.mcap').is_file()
     assert (tmp_path / 'bag' / 'bag_0.mcap').read_bytes() == b'precious'
 
 

@@ -37,7 +37,9 @@ class RecorderParameters:
     """Parameters of the recorder."""
 
     directory: str = parameter('recordings', 'folder that gets one folder a bag')
-    name: str = parameter('', "the bag's folder; empty for one with date and time")
+    name: str = parameter(
+        '', "the bag's folder, with _1, _2 behind it where there is one; empty: date and time"
+    )
     autostart: bool = parameter(True, 'record from the start on')
     flush_period_s: float = parameter(
         0.25, 'most that a crash may cost, s', minimum=0.05, maximum=1.0
@@ -88,7 +90,7 @@ class Recorder(AnserNode):
         Raises
         ------
         BagError
-            The bag is there already, or cannot be made.
+            The bag cannot be made.
         """
         folder = self._new_folder()
         self._error = ''
@@ -212,10 +214,8 @@ class Recorder(AnserNode):
 
     def _new_folder(self) -> Path:
         parent = Path(self.parameters.directory).expanduser()
-        if self.parameters.name:
-            return parent / self.parameters.name
-        name = time.strftime('anser_%Y%m%d_%H%M%S')
-        folder, number = parent / name, 1
+        name = self.parameters.name or time.strftime('anser_%Y%m%d_%H%M%S')
+        folder, number = parent / name, 0
         while folder.exists():
             number += 1
             folder = parent / f'{name}_{number}'
