@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from anser_ros.cli.main import main
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.model_file import load_model, save_model
 from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import model_for
+from anser_ros.tracking.estimate import TrackerSettings
 
 BAGS = Path(__file__).resolve().parents[1] / 'bags'
 OPTICAL_JITTER_M = 0.12e-3
@@ -55,6 +58,25 @@ def test_a_pose_near_unmodelled_metal_is_withheld_not_wrong(model):
     for series in evaluation.sensors.values():
         assert 0.2 < series.ok.mean() < 0.9
         assert np.nanmax(series.position_error) < 2e-3
+
+
+def test_without_a_gate_no_pose_is_withheld_for_what_the_model_lacks(model):
+    settings = TrackerSettings(gate=math.inf)
+    evaluation = track_session(load_session(BAGS / 'metal.mcap'), load_model(model), settings)
+    for series in evaluation.sensors.values():
+        assert {e.state for e in series.estimates} <= {'ok', 'outside_volume'}
+        assert series.ok.mean() > 0.9
+        assert np.nanmax(series.position_error) > 1e-3
+
+
+def test_without_a_gate_a_drawn_board_has_its_figures_in_the_lab(shared):
+    bag = shared / 'sessions' / 'paper' / 'collimator_midplane_tool_b.mcap'
+    session = load_session(bag)
+    settings = TrackerSettings(gate=math.inf)
+    evaluation = track_session(session, model_for('nominal', session), settings)
+    for series in (*evaluation.sensors.values(), *evaluation.bodies.values()):
+        assert series.ok.all()
+        assert 5e-3 < np.sqrt(np.nanmean(series.position_error**2)) < 50e-3
 
 
 def test_files_and_json_are_the_contracts(model, tmp_path, capsys):

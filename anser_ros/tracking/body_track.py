@@ -213,10 +213,10 @@ def _judge(
         reason = 'at ' + ', '.join(f'{1e3 * v:.1f}' for v in centre) + ' mm'
     elif not solution.converged:
         state, reason = states.AMBIGUOUS, 'the solve did not converge'
-    elif sigma > settings.max_sigma_m:
+    elif sigma > settings.max_sigma_m * settings.leniency(scale):
         state, reason = states.AMBIGUOUS, f'position uncertain by {1e3 * sigma:.3g} mm'
     else:
-        margin = 2.0 * math.log(settings.odds) * max(1.0, fit.ratio)
+        margin = settings.margin(fit.ratio)
         for rival in rivals:
             apart = np.linalg.norm(rival.solution.position - solution.position) > 2e-3
             apart |= np.linalg.norm(rival.solution.rotation - solution.rotation) > 0.1

@@ -227,10 +227,10 @@ def _judge(
         state, reason = states.OUTSIDE_VOLUME, f'at {_millimetres(solution.position)} mm'
     elif not solution.converged:
         state, reason = states.AMBIGUOUS, 'the solve did not converge'
-    elif sigma > settings.max_sigma_m:
+    elif sigma > settings.max_sigma_m * settings.leniency(scale):
         state, reason = states.AMBIGUOUS, f'position uncertain by {1e3 * sigma:.3g} mm'
     else:
-        margin = 2.0 * math.log(settings.odds) * max(1.0, ratio)
+        margin = settings.margin(ratio)
         for rival in rivals:
             likely = rival.converged and rival.chi2 < solution.chi2 + margin
             if likely and settings.volume.contains(rival.position):

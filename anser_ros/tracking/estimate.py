@@ -25,6 +25,8 @@ STATES = (
     OK, NO_MODEL, NO_SIGNAL, RESIDUAL, OUTSIDE_VOLUME, AMBIGUOUS, STALE, SATURATED, DROPPED,
 )  # fmt: skip
 
+USUAL_GATE = 4.0
+
 HIDDEN = 2.0
 """How much more of a distortion's power goes into the pose than its share of the dimensions.
 
@@ -47,7 +49,8 @@ class TrackerSettings:
     grid_spacing_m : float
         Spacing of the cold start's grid at 0.1 m height.
     gate : float
-        A pose whose residual is more than so many times the expected one is refused.
+        A pose whose residual is more than so many times the expected one is refused; infinite: no
+        pose is refused for what the model lacks (to measure what that costs, never for use).
     odds : float
         A second pose that is more likely than one to so many makes the first ambiguous.
     max_sigma_m : float
@@ -64,7 +67,7 @@ class TrackerSettings:
     adaptive: bool = True
     volume: Volume = field(default_factory=Volume)
     grid_spacing_m: float = 0.035
-    gate: float = 4.0
+    gate: float = USUAL_GATE
     odds: float = 1000.0
     max_sigma_m: float = 0.02
     min_signal: float = 4.0
@@ -80,6 +83,20 @@ class TrackerSettings:
                 raise TrackingError(f'setting {name} must be positive and finite, got {value}')
         if not self.odds >= 1 or not self.min_signal >= 0:
             raise TrackingError('settings: odds must be at least 1, min_signal at least 0')
+
+    def margin(self, ratio: float) -> float:
+        """Chi-square by which a rival must be worse, at a residual power per freedom ``ratio``.
+
+        A misfit takes part in it as noise would; with an infinite gate the best of poses that all
+        fit badly is taken.
+        """
+        if math.isinf(self.gate) and ratio > USUAL_GATE**2:
+            return -math.inf
+        return 2.0 * math.log(self.odds) * max(1.0, ratio)
+
+    def leniency(self, scale: float) -> float:
+        """What ``max_sigma_m`` is multiplied by: with an infinite gate what misfit adds is free."""
+        return 1.0 if math.isfinite(self.gate) else math.sqrt(max(1.0, scale))
 
 
 @dataclass(frozen=True)
