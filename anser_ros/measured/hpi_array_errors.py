@@ -1,7 +1,8 @@
 """Errors that all chips of a SQUID array share, weighed by the likelihood of the signals.
 
 Nothing here sees where the coils were digitised: the likelihood of the channels' signals chooses,
-with half the logarithm of the number of signals as the price of a parameter.
+with half the logarithm of the number of signals as the price of a parameter, and the logarithm of
+the number of candidates as the price of having looked at all of them.
 """
 
 from collections.abc import Sequence
