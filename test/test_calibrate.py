@@ -81,6 +81,7 @@ def test_calibration_json_is_the_contracts(done):
     curve = document['choice']['curve']
     assert len({row['layout'] for row in curve}) > 10
     assert {'layout', 'n_dipoles', 'damping', 'heldout_t'} == set(curve[0])
+    assert (done / 'choice.png').read_bytes()[:4] == b'\x89PNG'
 
 
 def test_the_model_file_says_where_it_comes_from(done):

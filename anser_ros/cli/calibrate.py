@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from anser_ros.cli.calibration_figure import draw_choice
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.fitting.calibration import Calibration, Options
 from anser_ros.fitting.calibration_document import to_document
@@ -28,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument('sessions', nargs='+', metavar='SESSION', help='bags to learn from')
     parser.add_argument('--out', required=True, type=Path, help='model file to write')
-    parser.add_argument('--report', type=Path, help='folder for calibration.json and the figures')
+    parser.add_argument('--report', type=Path, help='folder for calibration.json and choice.png')
     parser.add_argument('--json', action='store_true', help='print calibration.json on stdout')
     parser.add_argument(
         '--force', action='store_true',
@@ -74,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
     if args.report is not None:
         args.report.mkdir(parents=True, exist_ok=True)
         (args.report / 'calibration.json').write_text(text + '\n', encoding='utf-8')
+        draw_choice(calibration, args.report / 'choice.png')
     if not calibration.better_than_nominal and not args.force:
         raise FitError(
             f'no model written: its held-out error {document["heldout_flux_rmse_t"]:.3g} T is '

@@ -197,8 +197,10 @@ def _tested(
 ) -> HeldOut:
     """The candidate's held-out error, every fold fitted from the start."""
     fitter = _fitter(candidate, generator, options, nominal)
-    noise = selection.reference.noise_t
-    return predict_held_out(thin, folds, fitter, options.uncertainty, noise)
+    reference = selection.reference
+    return predict_held_out(
+        thin, folds, fitter, options.uncertainty, reference.noise_t, reference.quadrature_noise_t
+    )
 
 
 def _better(tested: Sequence[tuple[Candidate, HeldOut]]) -> tuple[Candidate, HeldOut]:

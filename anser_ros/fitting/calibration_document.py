@@ -34,6 +34,7 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
         ],
         'marginal': {
             'noise_t': held_out.noise_t,
+            'flux_noise_t': held_out.flux_noise_t,
             'heldout_component_rmse_t': float(np.sqrt(np.mean(as_real(held_out.left_over) ** 2))),
             'heldout_chi_square': held_out.chi_square,
             'flux_error_t': held_out.flux_error_t,

@@ -43,6 +43,8 @@ class HeldOut:
         Mean predictive chi-square a phasor component.
     noise_t : float
         The noise that the chi-square was divided by.
+    flux_noise_t : float
+        The flux noise alone, T a component; never more than the imaginary parts leave.
     flux_error_t : float
         Standard deviation of the field model's own error a phasor component, noise taken off,
         in the typical held-out frame.
@@ -54,6 +56,7 @@ class HeldOut:
     left_over: ComplexArray
     chi_square: float
     noise_t: float
+    flux_noise_t: float
     flux_error_t: float
     n_dipoles: int
 
@@ -73,6 +76,7 @@ def predict_held_out(
     fit: Callable[[list[Measurements]], LayoutFit],
     uncertainty: Uncertainty,
     noise_t: float | None = None,
+    flux_noise_t: float | None = None,
 ) -> HeldOut:
     """Fit without each fold in turn, from the start, and predict it.
 
@@ -84,6 +88,8 @@ def predict_held_out(
     fit : callable
         Fits a model to measurements, from the start.
     uncertainty : Uncertainty
+    flux_noise_t : float or None
+        The flux noise alone, to be taken off; by the imaginary parts when not given.
     noise_t : float or None
         Noise of a phasor component, T, for weighing noise against jitter and to be taken off;
         when not given, the smallest that any fold's fit left.
@@ -93,7 +99,9 @@ def predict_held_out(
         train = [m.frames(f != fold) for m, f in zip(measurements, folds, strict=True)]
         fits.append((int(fold), fit(train)))
     noise = min(part.fit.noise_t for _, part in fits) if noise_t is None else noise_t
-    tally = _Tally(noise, uncertainty, len(fits[0][1].dipoles))
+    quadrature = min(part.fit.quadrature_noise_t for _, part in fits)
+    flux_noise = min(noise, quadrature if flux_noise_t is None else flux_noise_t)
+    tally = _Tally(noise, flux_noise, uncertainty, len(fits[0][1].dipoles))
     for fold, fitted in fits:
         for m, f in zip(measurements, folds, strict=True):
             test = with_pose(m.frames(f == fold))
@@ -107,8 +115,10 @@ def predict_held_out(
 class _Tally:
     """Gathers held-out residuals."""
 
-    def __init__(self, noise_t: float, uncertainty: Uncertainty, n_dipoles: int) -> None:
-        self.n_dipoles = n_dipoles
+    def __init__(
+        self, noise_t: float, flux_noise_t: float, uncertainty: Uncertainty, n_dipoles: int
+    ) -> None:
+        self.flux_noise_t, self.n_dipoles = flux_noise_t, n_dipoles
         self.noise_t, self.precision = noise_t, uncertainty.pose_precision
         self.error: list[ComplexArray] = []
         self.left: list[ComplexArray] = []
@@ -123,7 +133,7 @@ class _Tally:
         self.error.append(_complex_rows(terms.residual, used))
         self.left.append(_complex_rows(white.left_over(terms.residual), used))
         self.chi.append(white.chi_square(terms.residual))
-        self.excess.append(white.excess_power(terms.residual))
+        self.excess.append(white.excess_power(terms.residual, self.flux_noise_t))
 
     def result(self) -> HeldOut:
         error, left = np.concatenate(self.error), np.concatenate(self.left)
@@ -135,6 +145,7 @@ class _Tally:
             left_over=left,
             chi_square=float(np.concatenate(self.chi).sum()) / components,
             noise_t=self.noise_t,
+            flux_noise_t=self.flux_noise_t,
             flux_error_t=float(np.sqrt(max(excess, 0.0))),
             n_dipoles=self.n_dipoles,
         )

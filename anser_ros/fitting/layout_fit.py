@@ -20,7 +20,10 @@ from anser_ros.fitting.prior import DrawnBoard
 Array = NDArray[np.float64]
 
 RICH = Layout('layer', 16, 1.8, 0.0)
-"""The layout at which poses are corrected before positions are optimised."""
+"""The layout at which poses are corrected, for sensors that stay well above the coils."""
+RICH_MOST = 22
+RICH_SPACING = 0.4
+"""Spacing of that layer's dipoles that is fine enough, as a part of the lowest sensor's height."""
 RICH_DAMPING = 1e-5
 MOVING_DAMPING = 1e-4
 MOST_MOVING_ROWS = 6000
@@ -33,6 +36,21 @@ class LayoutFit:
     dipoles: Dipoles
     prior: ComplexArray | None
     fit: MomentFit
+
+
+def lowest_height(measurements: Sequence[Measurements], generator: Generator) -> float:
+    """Height of the lowest reading over the coils, m; at least 1 cm."""
+    lowest = min(float(np.nanmin(m.placed()[0][..., 2])) for m in measurements if len(m.time))
+    return max(lowest - float(generator.middle[2]), 0.01)
+
+
+def rich_layout(measurements: Sequence[Measurements], generator: Generator) -> Layout:
+    """A layer fine enough for the lowest sensor; a smaller one where that takes too many dipoles."""
+    width = 2.0 * float(generator.half_extent.max())
+    spacing = RICH_SPACING * lowest_height(measurements, generator)
+    count = int(np.clip(np.ceil(width * RICH.extension / spacing) + 1, RICH.count, RICH_MOST))
+    extension = float(np.clip(spacing * (count - 1) / width, 1.1, RICH.extension))
+    return replace(RICH, count=count, extension=extension)
 
 
 def placed(
@@ -92,7 +110,8 @@ def fit_layout(
         drawn = DrawnBoard(nominal, measurements)
     dipoles, prior = placed(layout, generator, drawn)
     if layout.moved:
-        rich = MomentFitter(measurements, place(RICH, generator), RICH_DAMPING, uncertainty)
+        layer = place(rich_layout(measurements, generator), generator)
+        rich = MomentFitter(measurements, layer, RICH_DAMPING, uncertainty)
         reference = rich.fit(3, exact=False)
         dipoles = optimise_positions(reference.measurements, reference.weights, dipoles, prior)
         prior = prior_of(layout, dipoles, drawn)
@@ -100,6 +119,6 @@ def fit_layout(
     fit = fitter.fit(alternations, progress, exact)
     if not layout.local:
         return LayoutFit(dipoles, prior, fit)
-    layer = place(replace(RICH, extension=layout.extension, depth_m=layout.depth_m), generator)
+    layer = place(rich_layout(measurements, generator), generator)
     moments = join_regions(measurements, dipoles, fit, damping, layer)
     return LayoutFit(layer, None, replace(fit, moments=moments))

@@ -56,6 +56,9 @@ class MomentFit:
     noise_t : float
         Estimated noise of a phasor component with the degrees of freedom taken off, T; it holds
         whatever the model can't explain.
+    quadrature_noise_t : float
+        The same of the imaginary parts alone: where nothing turns the phase it is the flux noise,
+        whatever poses and model are wrong by.
     rank : int
     freedom : float
         Effective number of parameters an emitter's component.
@@ -68,6 +71,7 @@ class MomentFit:
     measurements: tuple[Measurements, ...]
     weights: tuple[Array, ...]
     noise_t: float
+    quadrature_noise_t: float
     rank: int
     freedom: float
     condition: float
@@ -110,7 +114,7 @@ class MomentFitter:
     ) -> None:
         self.dipoles, self.damping, self.uncertainty = dipoles, damping, uncertainty
         self.prior = None if prior is None else as_real(prior)
-        self.noise_t = uncertainty.flux_t
+        self.noise_t = self.quadrature_noise_t = uncertainty.flux_t
         self.states = [self._state(with_pose(m)) for m in measurements]
         count = sum(int(state.usable.sum()) for state in self.states)
         if count == 0:
@@ -146,7 +150,7 @@ class MomentFitter:
 
     def correct(self, moments: ComplexArray, freedom: float) -> float:
         """Move all poses to their most probable values; returns the new noise estimate, T."""
-        power, count, used = 0.0, 0.0, 0.0
+        power, turned, count, used = 0.0, 0.0, 0.0, 0.0
         for state in self.states:
             precision = self._precision(state)
             for block in frame_blocks(*state.weights.shape):
@@ -159,10 +163,13 @@ class MomentFitter:
                 state.weights[block] = outlier_weights(left, state.usable[block])
                 weight = state.weights[block]
                 power += float((weight[:, :, None] * left**2).sum())
+                turned += float((weight[:, :, None] * left[:, :, 1::2] ** 2).sum())
                 count += float(weight.sum()) * left.shape[2]
                 used += pose_freedom(terms, weight, self.noise_t, precision)
             state.corrected = moved(state.measured, state.offset)
         left_over = max(count - used - freedom * 2 * self.emitters, 0.05 * count)
+        halved = max(count / 2.0 - freedom * self.emitters, 0.025 * count)
+        self.quadrature_noise_t = max(float(np.sqrt(turned / halved)), SMALLEST_NOISE_T)
         return max(float(np.sqrt(power / left_over)), SMALLEST_NOISE_T)
 
     def _precision(self, state: _State) -> Array:
@@ -193,6 +200,7 @@ class MomentFitter:
             measurements=tuple(state.corrected for state in self.states),
             weights=tuple(state.weights for state in self.states),
             noise_t=self.noise_t,
+            quadrature_noise_t=self.quadrature_noise_t,
             rank=spectrum.rank,
             freedom=spectrum.freedom(self.damping),
             condition=float(values[0] / max(values[-1], np.finfo(float).tiny)),

@@ -137,12 +137,13 @@ class PoseWhitener:
         left = white - np.einsum('fri,fi->fr', self.slope, step)
         return np.asarray((left * self.noise_t).reshape(residual.shape))
 
-    def excess_power(self, residual: Array) -> Array:
+    def excess_power(self, residual: Array, flux_noise_t: float | None = None) -> Array:
         """Estimate of each frame's variance beyond noise and jitter, T^2 a component, shape (F,).
 
         White errors of variance v leave the power v tr(W^2), W = sigma^2 C^-1, in what no pose
-        explains; noise and jitter as assumed leave sigma^2 tr(W). The eigenvalues of W are one
-        minus those of the share of each pose parameter that the readings determine.
+        explains; flux noise leaves its variance times tr(W^2) too, and jitter as assumed
+        ``sigma^2 (tr(W) - tr(W^2))``. The eigenvalues of W are one minus those of the share of
+        each pose parameter that the readings determine. The flux noise is sigma when not given.
         """
         left = self.left_over(residual).reshape(self.root.shape)
         power = (left**2).sum(axis=1)
@@ -150,7 +151,9 @@ class PoseWhitener:
         square = np.einsum('fij,fji->f', self.share, self.share)
         first = self.readings - taken
         second = np.maximum(self.readings - 2.0 * taken + square, 1.0)
-        return np.asarray((power - self.noise_t**2 * first) / second)
+        noise = self.noise_t if flux_noise_t is None else flux_noise_t
+        jitter = self.noise_t**2 * (first - second)
+        return np.asarray((power - noise**2 * second - jitter) / second)
 
 
 def most_probable_step(

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from anser_ros.errors import FitError
 from anser_ros.fitting.dipoles import Dipoles, basis_rows
 from anser_ros.fitting.factors import ComplexArray, as_real
-from anser_ros.fitting.layout_fit import RICH, optimise_positions, prior_of
+from anser_ros.fitting.layout_fit import lowest_height, optimise_positions, prior_of, rich_layout
 from anser_ros.fitting.layouts import Generator, Layout, place
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.moments import MomentFit, MomentFitter
@@ -280,7 +280,9 @@ def choose_layout(
     affordable = [n for n in COUNTS if n * n <= max(4 * rows, 144)]
     height = lowest_height(measurements, generator)
     prior = 'none' if drawn is None else 'nominal'
-    rich = replace(RICH, count=min(RICH.count, affordable[-1]))
+    rich = rich_layout(measurements, generator)
+    if rows < rich.count**2:
+        rich = replace(rich, count=affordable[-1])
     selector = Selector(measurements, folds, place(rich, generator), uncertainty)
     search = _Search(selector, generator, progress, drawn)
     if asked is not None:
@@ -307,12 +309,6 @@ def choose_layout(
         common = search.score(own)
         finalists.append(replace(common, layout=replace(common.layout, local=True)))
     return Selection(tuple(finalists), tuple(search.tried.values()), selector.reference)
-
-
-def lowest_height(measurements: Sequence[Measurements], generator: Generator) -> float:
-    """Height of the lowest reading over the coils, m; at least 1 cm."""
-    lowest = min(float(np.nanmin(m.placed()[0][..., 2])) for m in measurements)
-    return max(lowest - float(generator.middle[2]), 0.01)
 
 
 class _Search:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from anser_ros.fitting.dipoles import Dipoles
 from anser_ros.fitting.factors import ComplexArray, as_real
-from anser_ros.fitting.layout_fit import RICH, RICH_DAMPING
+from anser_ros.fitting.layout_fit import RICH_DAMPING, rich_layout
 from anser_ros.fitting.layouts import Generator, place
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.model import EffectRecord
@@ -98,7 +98,7 @@ class SensorSurveyor:
     ) -> None:
         self.measured, self.kinds = list(measurements), tuple(kinds)
         self.uncertainty = uncertainty
-        self.dipoles: Dipoles = place(RICH, generator)
+        self.dipoles: Dipoles = place(rich_layout(measurements, generator), generator)
         self.bodies = list(dict.fromkeys(m.body for m in measurements))
         tables = {m.body: m.sensors for m in measurements}
         self.tables = [tables[body] for body in self.bodies]

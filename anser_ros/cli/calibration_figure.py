@@ -1,0 +1,38 @@
+"""The figure of a calibration: held-out error of everything that was tried."""
+
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use('Agg')
+from matplotlib import pyplot as plt
+
+from anser_ros.fitting.calibration import Calibration
+
+
+def draw_choice(calibration: Calibration, path: Path) -> None:
+    """Draw the curve of held-out errors: by dipoles, and by damping for the best layouts."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4))
+    for mark, name, chosen in (
+        ('o', 'placed', lambda layout: not layout.moved),
+        ('^', 'positions optimised', lambda layout: layout.moved),
+    ):
+        found = [c for c in calibration.candidates if chosen(c.layout)]
+        left.plot(
+            [len(c.dipoles) for c in found], [1e12 * c.score for c in found], mark, label=name
+        )
+    picked = calibration.chosen
+    left.plot(len(picked.dipoles), 1e12 * picked.score, 's', ms=12, mfc='none', label='chosen')
+    left.set(xlabel='dipoles', ylabel='predictive error of held-out blocks, pT', yscale='log')
+    for candidate in sorted(calibration.candidates, key=lambda c: c.score)[:6]:
+        damping, score = zip(*candidate.curve, strict=True)
+        words = candidate.layout.describe().split(', pulled')[0]
+        right.plot(damping, [1e12 * s for s in score], '.-', label=words)
+    right.set(xlabel='damping', xscale='log', yscale='log')
+    for panel in (left, right):
+        panel.grid(alpha=0.3)
+        panel.legend(fontsize=6)
+    figure.suptitle('Choice by held-out error, pose marginalised', fontsize=10)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110, metadata={'Software': None})
+    plt.close(figure)
