@@ -1,0 +1,93 @@
+"""Find what a model leaves unexplained on a session, name the effect, correct it."""
+
+import argparse
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from anser_ros.cli.diagnosis_report import render, verdict
+from anser_ros.fitting.model import EffectRecord, FieldModel
+from anser_ros.sessions.diagnosis import diagnose_session, plain, to_document
+from anser_ros.sessions.model_file import save_model
+from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import model_for
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument('session', help='bag to diagnose (.mcap file or bag folder)')
+    parser.add_argument(
+        '--model', required=True, help="model file, or 'nominal' for the setup's own geometry"
+    )
+    parser.add_argument('--out', required=True, type=Path, help='folder for the results')
+    parser.add_argument('--baseline', help='distortion-free recording of the same board')
+    parser.add_argument('--json', action='store_true', help='print diagnosis.json on stdout')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; the exit code."""
+    session = load_session(args.session)
+    model = model_for(args.model, session)
+    baseline = load_session(args.baseline) if args.baseline else None
+    console = Console(stderr=True)
+    with _progress(console) as say:
+        result = diagnose_session(session, model, baseline, say)
+        say('writing the report')
+        document = to_document(result)
+        text = json.dumps(document, indent=1)
+        args.out.mkdir(parents=True, exist_ok=True)
+        (args.out / 'diagnosis.json').write_text(text + '\n', encoding='utf-8')
+        save_model(args.out / 'model.yaml', _plain_effects(result.diagnosis.model))
+        page = render(result, document, session=args.session, model=args.model)
+        (args.out / 'report.html').write_text(page, encoding='utf-8')
+    if session.lost:
+        console.print(f'{args.session}: {session.lost}', style='yellow', highlight=False)
+    if args.json:
+        print(text)
+    else:
+        _show(document)
+        print(verdict(document))
+        print(f'report: {args.out / "report.html"}')
+    return 0
+
+
+@contextmanager
+def _progress(console: Console) -> Iterator[Callable[[str], None]]:
+    """A status line where there is a terminal, nothing elsewhere."""
+    if not console.is_terminal:
+        yield lambda text: None
+        return
+    with console.status('preparing') as status:
+        yield status.update
+
+
+def _plain_effects(model: FieldModel) -> FieldModel:
+    """The model with effect records that any YAML reader takes."""
+    records = tuple(
+        EffectRecord(
+            effect.name,
+            plain(dict(effect.parameters)),
+            plain(dict(effect.uncertainty)),
+            plain(dict(effect.evidence)),
+        )
+        for effect in model.effects
+    )
+    return replace(model, effects=records)
+
+
+def _show(document: dict[str, Any]) -> None:
+    held, table = document['held_out'], Table('held out', 'before', 'after')
+    for label, key, unit, scale in (
+        ('flux residual, pT', 'flux_rms', 't', 1e12),
+        ('position RMSE, mm', 'position_rmse', 'm', 1e3),
+        ('orientation RMSE, deg', 'orientation_rmse', 'rad', 57.29578),
+    ):
+        cells = [held[f'{key}_{when}_{unit}'] for when in ('before', 'after')]
+        table.add_row(label, *('-' if c is None else f'{scale * c:.4g}' for c in cells))
+    Console().print(table)

@@ -1,0 +1,195 @@
+"""Diagnoses a recorded session: the problem, the search, and tracking of the held-out part."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.diagnosis.diagnose import Diagnosis, diagnose
+from anser_ros.diagnosis.prepare import build_problem, test_blocks
+from anser_ros.diagnosis.problem import Problem
+from anser_ros.diagnosis.whitening import Spread
+from anser_ros.errors import DiagnosisError, SetupError
+from anser_ros.fitting.measurements import Measurements
+from anser_ros.fitting.model import FieldModel
+from anser_ros.fitting.nominal import nominal_model
+from anser_ros.sessions.evaluation import baseline_flux, track_session
+from anser_ros.sessions.session import Session
+from anser_ros.sessions.starting_model import board_of, check_fits
+from anser_ros.tracking.estimate import TrackerSettings
+
+Array = NDArray[np.float64]
+
+SCHEMA = 'anser_diagnosis/1'
+DEPENDENCIES = (
+    'time', 'position', 'orientation', 'speed', 'emitter', 'channel', 'amplitude', 'frequency',
+)  # fmt: skip
+DEFAULT_NOISE_T = 60e-12
+
+
+@dataclass(frozen=True)
+class TrackingErrors:
+    """RMSE over all coils tracked singly in the held-out part; None where none was tracked."""
+
+    position_rmse_m: float | None
+    orientation_rmse_rad: float | None
+
+
+@dataclass(frozen=True)
+class SessionDiagnosis:
+    """What was found, and how the held-out part is tracked without and with it."""
+
+    diagnosis: Diagnosis
+    before: TrackingErrors
+    after: TrackingErrors
+
+
+def diagnose_session(
+    session: Session,
+    model: FieldModel,
+    baseline: Session | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> SessionDiagnosis:
+    """Find what a model lacks on a session.
+
+    Parameters
+    ----------
+    session : Session
+        With optical poses of at least one tool.
+    model : FieldModel
+        Of the session's emitters.
+    baseline : Session, optional
+        Distortion-free recording of the same board; with it the reference sensors have a say.
+    progress : callable, optional
+        Told in words what goes on.
+
+    Raises
+    ------
+    DiagnosisError
+        When fewer than 30 frames have fluxes and a pose.
+    ModelFileError
+        When the model's emitters are not the session's.
+    BagError
+        When the baseline's references are not the session's.
+    """
+    check_fits(model, session)
+    if baseline is not None:
+        check_fits(model, baseline)
+    if not session.tools:
+        raise DiagnosisError(
+            f'{session.path}: a diagnosis needs tool fluxes, the session has none'
+        )
+    clean = None
+    if baseline is not None and session.reference is not None:
+        clean = baseline_flux(baseline, session.reference.sensors)
+    spread = Spread(flux_t=float(np.hypot(DEFAULT_NOISE_T, model.flux_error_t)))
+    problem = build_problem(
+        session.tools, session.reference, clean, model, _drawn(session), spread
+    )
+    found = diagnose(problem, model, progress=progress)
+    say = progress or (lambda text: None)
+    say('tracking the held-out part')
+    unseen = _unseen(session, problem)
+    moves = any(term.effect.moving for term in found.terms)
+    follow = moves and baseline is not None and session.reference is not None
+    return SessionDiagnosis(
+        found,
+        _tracked(unseen, model, None, refit=False),
+        _tracked(unseen, found.model, baseline, refit=follow),
+    )
+
+
+def _drawn(session: Session) -> FieldModel | None:
+    """The nominal model, where the setup's geometry makes one."""
+    try:
+        return nominal_model(board_of(session.setup))
+    except SetupError:
+        return None
+
+
+def _unseen(session: Session, problem: Problem) -> Session:
+    """The session's frames in the blocks that took no part in the search."""
+    held = {
+        tool.body: tool.time[np.isin(blocks, test_blocks())]
+        for tool, blocks in zip(problem.tools, problem.blocks, strict=True)
+    }
+    tools = tuple(
+        tool.frames(np.flatnonzero(np.isin(tool.time, held[tool.body])))
+        for tool in session.tools
+        if tool.body in held
+    )
+    reference = session.reference
+    if reference is not None:
+        times = np.concatenate(list(held.values()))
+        reference = _at(reference, times)
+    return replace(session, tools=tools, reference=reference)
+
+
+def _at(measurements: Measurements, times: Array) -> Measurements:
+    return measurements.frames(np.flatnonzero(np.isin(measurements.time, times)))
+
+
+def _tracked(
+    session: Session, model: FieldModel, baseline: Session | None, *, refit: bool
+) -> TrackingErrors:
+    """Errors with the gate off, so that before and after are about the same frames."""
+    settings = TrackerSettings(gate=float('inf'))
+    evaluation = track_session(session, model, settings, baseline=baseline, refit=refit)
+    return TrackingErrors(
+        _rms([series.position_error for series in evaluation.sensors.values()]),
+        _rms([series.orientation_error for series in evaluation.sensors.values()]),
+    )
+
+
+def _rms(errors: list[Array]) -> float | None:
+    values = np.concatenate(errors)
+    values = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(values**2))) if values.size else None
+
+
+def plain(value: Any) -> Any:
+    """Numbers, lists and mappings as JSON and YAML have them."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, complex):
+        return [value.real, value.imag]
+    return value
+
+
+def to_document(result: SessionDiagnosis) -> dict[str, Any]:
+    """The contract's diagnosis document."""
+    found = result.diagnosis
+    return {
+        'schema': SCHEMA,
+        'held_out': {
+            'flux_rms_before_t': found.flux_rms_before_t,
+            'flux_rms_after_t': found.flux_rms_after_t,
+            'flux_rms_floor_t': found.flux_rms_floor_t,
+            'position_rmse_before_m': result.before.position_rmse_m,
+            'position_rmse_after_m': result.after.position_rmse_m,
+            'orientation_rmse_before_rad': result.before.orientation_rmse_rad,
+            'orientation_rmse_after_rad': result.after.orientation_rmse_rad,
+        },
+        'effects': [
+            {
+                'name': finding.record.name,
+                'parameters': plain(dict(finding.record.parameters)),
+                'uncertainty': plain(dict(finding.record.uncertainty)),
+                'evidence': plain(dict(finding.record.evidence)),
+                'flux_rms_without_t': finding.flux_rms_without_t,
+            }
+            for finding in found.findings
+        ],
+        'unexplained': {
+            'fraction': found.unexplained,
+            'depends_on': [name for name in found.depends_on if name in DEPENDENCIES],
+        },
+    }
