@@ -22,7 +22,8 @@ GAUSS_OFFSET = 0.5 / math.sqrt(3.0)
 
 
 @numba.njit(cache=True, error_model='numpy')
-def _fill_flux_basis(points, axes, lengths, positions, directions, out):  # type: ignore[no-untyped-def]
+def fill_flux_basis(points, axes, lengths, positions, directions, out):  # type: ignore[no-untyped-def]
+    """Write each unit dipole's flux density along each coil's axis into ``out``, shape (P, N)."""
     for p in range(points.shape[0]):
         nx, ny, nz = axes[p, 0], axes[p, 1], axes[p, 2]
         half = lengths[p] * GAUSS_OFFSET
@@ -152,7 +153,7 @@ def flux_basis(
     r, n, spans = _sensors(points, axes, lengths)
     q, u = _rows(positions, 3, 'positions'), _rows(directions, 3, 'directions')
     out = np.empty((r.shape[0], q.shape[0]))
-    _fill_flux_basis(r, n, spans, q, u, out)
+    fill_flux_basis(r, n, spans, q, u, out)
     return out
 
 

@@ -6,7 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.errors import TrackingError
 from anser_ros.tracking import estimate as states
+from anser_ros.tracking.error_whitening import error_whitening
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.scene import Scene
 from anser_ros.tracking.seed import solve_cold
@@ -101,9 +103,14 @@ def _whitening(
             and float(np.abs(axis - at[2]).max()) < WHITENING_REACH
         )
         if not fresh:
-            modes = scene.error_modes(position[None], axis[None], np.array([length]))
-            track.whitening = whitening_of(scene.sigma, None if modes is None else modes[:, 0])
-            track.whitening_at = (scene, position, axis)
+            field = scene.field
+            weights = error_whitening(
+                position, axis, length, field.positions, field.directions, scene.modes,
+                scene.sigma,
+            )  # fmt: skip
+            if weights is None:
+                raise TrackingError('the model covariance must be finite')
+            track.whitening, track.whitening_at = weights, (scene, position, axis)
     assert track.whitening is not None
     return track.whitening
 

@@ -1,0 +1,47 @@
+"""The kernel that whitens by noise and model error does what the plain algebra does."""
+
+import numpy as np
+from tracking_world import certain_model
+
+from anser_ros.physics.dipole import flux_basis
+from anser_ros.tracking.error_whitening import error_whitening
+from anser_ros.tracking.solve import whitening_of
+
+POINT, AXIS = np.array([0.02, -0.05, 0.13]), np.array([0.6, 0.0, 0.8])
+
+
+def both(modes, sigma, length):
+    model = certain_model()
+    span = np.array([length])
+    basis = flux_basis(POINT[None], AXIS[None], span, model.positions, model.directions)
+    flux = np.ascontiguousarray(np.einsum('sn,rnk->rsk', basis, modes)).view(float)
+    laid_out = np.ascontiguousarray(
+        np.ascontiguousarray(modes).view(float).swapaxes(0, 1).reshape(len(model.positions), -1)
+    )
+    weights = error_whitening(
+        POINT, AXIS, length, model.positions, model.directions, laid_out, sigma
+    )
+    return whitening_of(sigma, flux[:, 0]), weights
+
+
+def test_it_is_the_inverse_factor_of_the_covariance():
+    rng = np.random.default_rng(1)
+    count = len(certain_model().positions)
+    modes = 1e-5 * (rng.normal(size=(5, count, 8)) + 1j * rng.normal(size=(5, count, 8)))
+    sigma = rng.uniform(50e-12, 90e-12, 16)
+    for length in (0.0, 0.008):
+        plain, kernel = both(modes, sigma, length)
+        np.testing.assert_allclose(kernel, plain, rtol=1e-8, atol=1e-9 * np.abs(plain).max())
+
+
+def test_what_is_not_finite_gives_none():
+    count = len(certain_model().positions)
+    modes = np.full((1, count, 8), np.inf + 0j)
+    model = certain_model()
+    laid_out = np.ascontiguousarray(modes).view(float).swapaxes(0, 1).reshape(count, -1)
+    with np.errstate(all='ignore'):
+        weights = error_whitening(
+            POINT, AXIS, 0.0, model.positions, model.directions,
+            np.ascontiguousarray(laid_out), np.full(16, 60e-12),
+        )  # fmt: skip
+    assert weights is None
