@@ -230,7 +230,7 @@ def _concluded(
     ]
     findings += _noise_findings(whole, cleaned, after, scale, significant)
     records = [finding.record for finding in findings]
-    depends = tuple(t.variable for t in tests if t.significant) if significant else ()
+    depends = tuple(t.variable for t in tests if t.significant) if excess > 0.05 * floor**2 else ()
     return Diagnosis(
         findings=tuple(findings),
         flux_rms_before_t=rms(before),

@@ -27,6 +27,8 @@ DEPENDENCIES = (
     'time', 'position', 'orientation', 'speed', 'emitter', 'channel', 'amplitude', 'frequency',
 )  # fmt: skip
 DEFAULT_NOISE_T = 60e-12
+BULKY = ('groups', 'scatterers_m', 'scatterers_m3')
+"""Parameters that only a program needs; they stand in the model file."""
 
 
 @dataclass(frozen=True)
@@ -110,19 +112,19 @@ def _drawn(session: Session) -> FieldModel | None:
 
 
 def _unseen(session: Session, problem: Problem) -> Session:
-    """The session's frames in the blocks that took no part in the search."""
+    """The first frame, which sets the clock, and those in the blocks that took no part."""
     held = {
         tool.body: tool.time[np.isin(blocks, test_blocks())]
         for tool, blocks in zip(problem.tools, problem.blocks, strict=True)
     }
     tools = tuple(
-        tool.frames(np.flatnonzero(np.isin(tool.time, held[tool.body])))
+        tool.frames(np.union1d([0], np.flatnonzero(np.isin(tool.time, held[tool.body]))))
         for tool in session.tools
         if tool.body in held
     )
     reference = session.reference
     if reference is not None:
-        times = np.concatenate(list(held.values()))
+        times = np.concatenate([tool.time for tool in tools])
         reference = _at(reference, times)
     return replace(session, tools=tools, reference=reference)
 
@@ -138,8 +140,8 @@ def _tracked(
     settings = TrackerSettings(gate=float('inf'))
     evaluation = track_session(session, model, settings, baseline=baseline, refit=refit)
     return TrackingErrors(
-        _rms([series.position_error for series in evaluation.sensors.values()]),
-        _rms([series.orientation_error for series in evaluation.sensors.values()]),
+        _rms([series.position_error[1:] for series in evaluation.sensors.values()]),
+        _rms([series.orientation_error[1:] for series in evaluation.sensors.values()]),
     )
 
 
@@ -181,7 +183,9 @@ def to_document(result: SessionDiagnosis) -> dict[str, Any]:
         'effects': [
             {
                 'name': finding.record.name,
-                'parameters': plain(dict(finding.record.parameters)),
+                'parameters': plain(
+                    {k: v for k, v in finding.record.parameters.items() if k not in BULKY}
+                ),
                 'uncertainty': plain(dict(finding.record.uncertainty)),
                 'evidence': plain(dict(finding.record.evidence)),
                 'flux_rms_without_t': finding.flux_rms_without_t,
