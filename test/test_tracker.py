@@ -146,6 +146,65 @@ def test_every_state_has_its_reason(rng):
     assert {e.state for e in found.values()} <= set(states.STATES)
 
 
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('silence', [0.0, np.nan, np.inf])
+def test_a_dead_emitter_is_named_and_the_others_go_on(rng, silence):
+    """Two may die of eight; covariances grow; one more, and there is no signal."""
+    uncertain = nominal_model(anser_board())
+    for model, rough in ((MODEL, set()), (uncertain, {states.AMBIGUOUS})):
+        tracker = Tracker(model, TOOL)
+        whole, part = [], []
+        for i, (stamp, position, rotation) in enumerate(path(40)):
+            flux = fluxes(model, TOOL, position, rotation, rng)
+            dead = [(), (), (2,), (2, 5)][i // 10]
+            flux[:, list(dead)] = silence
+            found = one_frame(tracker, flux, stamp)
+            # A rough model may leave a single coil ambiguous.
+            assert {e.state for e in found.values()} <= ({'ok'} | rough)
+            assert found['tool_a'].state == 'ok'
+            assert tracker.dead_emitters == tuple(f'coil{k}' for k in dead)
+            away = np.linalg.norm(found['tool_a'].position - position)
+            assert away < 5.0 * found['tool_a'].sigma_position_m
+            (part if dead else whole).append([e.sigma_position_m for e in found.values()])
+        assert (np.mean(part, axis=0) > np.mean(whole, axis=0)).all()
+        assert tracker.counters['frames_dead_emitter'] == 20
+        assert rough or tracker.counters['cold_starts'] == 9, 'warm through all of it'
+    flux[:, 0] = silence
+    found = one_frame(tracker, flux, 41 * STEP_NS)
+    assert {e.state for e in found.values()} == {states.NO_SIGNAL}
+    assert 'coil0, coil2, coil5; 5 emitters are left, 6 needed' in found['tool_a'].reason
+
+
+def test_a_cold_start_and_a_model_swap_with_a_dead_emitter(rng):
+    tracker = Tracker(MODEL, TOOL)
+    for i in range(5):
+        position, rotation = random_pose(rng)
+        flux = fluxes(MODEL, TOOL, position, rotation, rng)
+        flux[:, 3] = 0.0
+        found = one_frame(tracker, flux, (i + 1) * 10**10)
+        assert np.linalg.norm(found['tool_a'].position - position) < 5e-4
+        tracker = tracker.with_model(replace(MODEL, moments=MODEL.moments * (1 + 1e-9 * i)))
+    assert tracker.counters['cold_starts'] == 45
+
+
+@pytest.mark.filterwarnings('error')
+def test_what_is_not_used_is_counted_by_its_kind(rng):
+    tracker = Tracker(MODEL, TOOL)
+    flux = fluxes(MODEL, TOOL, *random_pose(rng), rng)
+    flux[0, 1], flux[1, 2], flux[2, 3] = np.nan, complex(1.0, np.inf), 1e30
+    marks = np.array([0, 0, 0, 1, 2, 4, 0, 0])
+    tracker.update(STEP_NS, CHANNELS[:8], flux[:8], flags=marks)
+    nothing = np.zeros(0, dtype=int)
+    found = tracker.update(2 * STEP_NS, nothing, flux[:0])
+    assert {e.state for e in found} == {states.STALE}
+    one_frame(tracker, flux, 10**10)
+    kinds = ('not_finite', 'absurd', 'saturated', 'stale', 'dropped', 'missing')
+    assert [tracker.counters[f'readings_{kind}'] for kind in kinds] == [4, 2, 1, 1, 1, 10]
+    assert tracker.counters['frames_empty'] == 1
+    assert tracker.counters['time_jumps_forward'] == 1
+    assert tracker.counters['time_jumps'] == 0
+
+
 def test_no_model(rng):
     found = one_frame(Tracker(None, TOOL), fluxes(MODEL, TOOL, *random_pose(rng)))
     assert {e.state for e in found.values()} == {states.NO_MODEL}

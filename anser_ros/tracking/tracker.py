@@ -16,7 +16,13 @@ from anser_ros.fitting.model import EffectRecord, FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.tracking import estimate as states
 from anser_ros.tracking.body_track import BodyTrack, track_body
-from anser_ros.tracking.coil_track import CoilResult, CoilTrack, track_coil
+from anser_ros.tracking.coil_track import NANO, CoilResult, CoilTrack, track_coil
+from anser_ros.tracking.emitters import (
+    FEWEST_EMITTERS,
+    ReducedScene,
+    living_emitters,
+    without_dead,
+)
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.rigid import BodyCoils
 from anser_ros.tracking.scene import Scene, build_scene
@@ -46,7 +52,10 @@ class Tracker:
     Attributes
     ----------
     counters : collections.Counter
-        ``frames``, ``cold_starts``, ``duplicates``, ``time_jumps``.
+        ``frames``, ``cold_starts``, ``duplicates``; ``time_jumps`` back, ``time_jumps_forward``
+        beyond the age of a warm start; ``frames_empty``; ``frames_dead_emitter``; and sensors'
+        readings that were not used: ``readings_missing``, ``readings_saturated``,
+        ``readings_stale``, ``readings_dropped``, ``readings_not_finite``, ``readings_absurd``.
 
     Raises
     ------
@@ -77,6 +86,8 @@ class Tracker:
         self._last_ns = [0]
         self._first_ns: list[int] = []
         self._scene: Scene | None = None
+        self._reduced: ReducedScene | None = None
+        self._dead: list[str] = []
         self._effects: tuple[EffectRecord, ...] = ()
         self._correction: Correction | None = None
         self._table = sensors
@@ -104,6 +115,11 @@ class Tracker:
         return self._model
 
     @property
+    def dead_emitters(self) -> tuple[str, ...]:
+        """Emitters that no sensor heard in the last frame while others were heard."""
+        return tuple(self._dead)
+
+    @property
     def bodies(self) -> tuple[str, ...]:
         """Bodies that get a 6-DoF pose."""
         return tuple(self._bodies)
@@ -127,7 +143,7 @@ class Tracker:
         other.__dict__.update(self.__dict__)
         other.settings = settings
         if self._model is not None and self._scene is not None:
-            model_id, other._scene = self._scene.model_id, None
+            model_id, other._scene, other._reduced = self._scene.model_id, None, None
             other._use(self._model, model_id)
         return other
 
@@ -176,17 +192,47 @@ class Tracker:
         if stamp_ns < self._last_ns[0]:
             self.counters['time_jumps'] += 1
             self.reset()
+        elif 0 < self._last_ns[0] < stamp_ns - self.settings.warm_age_s / NANO:
+            self.counters['time_jumps_forward'] += 1
         self._last_ns[0] = stamp_ns
-        values = self._corrected(stamp_ns, values)
+        if not self._first_ns:
+            self._first_ns.append(stamp_ns)
         self.counters['frames'] += 1
+        if not len(channels):
+            self.counters['frames_empty'] += 1
         scene, table = self._scene, self._table
+        names = (*table.name, *self._bodies)
+        living = living_emitters(values.view(np.complex128), (rows >= 0) & (bits == 0))
+        self._note_dead(living)
         if scene is None:
-            names = (*table.name, *self._bodies)
             return [no_pose(n, stamp_ns, states.NO_MODEL, '', 'no field model yet') for n in names]
+        if living is not None:
+            if living.sum() < FEWEST_EMITTERS:
+                reason = (
+                    f'no flux of {", ".join(self._dead)}; {living.sum()} emitters are left, '
+                    f'{FEWEST_EMITTERS} needed'
+                )
+                return [
+                    no_pose(n, stamp_ns, states.NO_SIGNAL, scene.model_id, reason) for n in names
+                ]
+            # An emitter that is off leaks nothing into another's tone either.
+            values.view(np.complex128)[:, ~living] = 0.0
+            self._reduced = without_dead(scene, living, self.settings, self._reduced)
+            scene = self._reduced.scene
+        # Arithmetic on an infinity only warns; the kind of a bad value is counted as it came.
+        faults = [_fault(row, v, int(b)) for row, v, b in zip(rows, values, bits, strict=True)]
+        values[~np.isfinite(values)] = np.nan
+        corrected = self._corrected(stamp_ns, values)
+        if corrected is not values:
+            values = corrected
+            faults = [f or _fault(0, v, 0) for f, v in zip(faults, values, strict=True)]
+        if living is not None:
+            values = np.ascontiguousarray(values[:, np.repeat(living, 2)])
         results = []
         for i, name in enumerate(table.name):
-            refusal = _refusal(rows[i], values[i], int(bits[i]))
+            refusal = faults[i]
             if refusal is not None:
+                self.counters[f'readings_{refusal[2]}'] += 1
                 bad = no_pose(name, stamp_ns, refusal[0], scene.model_id, refusal[1])
                 results.append(CoilResult(bad, None))
                 continue
@@ -214,10 +260,18 @@ class Tracker:
             )
         return estimates
 
+    def _note_dead(self, living: NDArray[np.bool_] | None) -> None:
+        """Keep the names of emitters that are not heard (trackers of other models share them)."""
+        self._dead.clear()
+        if living is None:
+            return
+        self.counters['frames_dead_emitter'] += 1
+        given = None if self._model is None else self._model.emitters
+        dead = np.flatnonzero(~living).tolist()
+        self._dead.extend(f'emitter {k}' if given is None else given[k] for k in dead)
+
     def _corrected(self, stamp_ns: int, values: Array) -> Array:
         """Fluxes (S, 2K) without what the model's effects did to them."""
-        if not self._first_ns:
-            self._first_ns.append(stamp_ns)
         if self._correction is None or not self._correction.changes_flux:
             return values
         time = (stamp_ns - self._first_ns[0]) * 1e-9
@@ -258,14 +312,16 @@ class Tracker:
         return rows, values.view(np.float64), bits
 
 
-def _refusal(row: int, values: Array, bits: int) -> tuple[str, str] | None:
-    """State and reason of a sensor whose fluxes must not be used."""
+def _fault(row: int, values: Array, bits: int) -> tuple[str, str, str] | None:
+    """State, reason and kind of a sensor whose fluxes must not be used."""
     if row < 0:
-        return states.STALE, 'its channel is not in the frame'
+        return states.STALE, 'its channel is not in the frame', 'missing'
     for bit, state in FLAGS:
         if bits & bit:
-            return state, f'flagged {state} by the acquisition'
+            return state, f'flagged {state} by the acquisition', state
     # A comparison with NaN is false, so this is also what is not finite.
-    if not bool((np.abs(values) < LARGEST_FLUX_T).all()):
-        return states.NO_SIGNAL, 'the fluxes are not finite or beyond all reason'
-    return None
+    if bool((np.abs(values) < LARGEST_FLUX_T).all()):
+        return None
+    if np.isfinite(values).all():
+        return states.NO_SIGNAL, f'fluxes beyond {LARGEST_FLUX_T:g} T are absurd', 'absurd'
+    return states.NO_SIGNAL, 'the fluxes are not finite', 'not_finite'
