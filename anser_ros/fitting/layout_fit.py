@@ -45,7 +45,7 @@ def lowest_height(measurements: Sequence[Measurements], generator: Generator) ->
 
 
 def rich_layout(measurements: Sequence[Measurements], generator: Generator) -> Layout:
-    """A layer fine enough for the lowest sensor; a smaller one where that takes too many dipoles."""
+    """A layer fine enough for the lowest sensor; a smaller one where that takes too many."""
     width = 2.0 * float(generator.half_extent.max())
     spacing = RICH_SPACING * lowest_height(measurements, generator)
     count = int(np.clip(np.ceil(width * RICH.extension / spacing) + 1, RICH.count, RICH_MOST))
