@@ -21,10 +21,10 @@ sys.path.insert(0, str(REPO / 'test'))
 
 from refit_world import anser_world, metal_block  # noqa: E402
 
+from anser_ros.experiments import refit_ablation as ablation  # noqa: E402
 from anser_ros.fitting.calibration import Options  # noqa: E402
 from anser_ros.fitting.layouts import Layout  # noqa: E402
 from anser_ros.fitting.refit import LiveRefit  # noqa: E402
-from anser_ros.sessions import refit_ablation as ablation  # noqa: E402
 from anser_ros.sessions.calibration import calibrate_sessions  # noqa: E402
 from anser_ros.sessions.evaluation import track_session  # noqa: E402
 from anser_ros.sessions.session import load_session  # noqa: E402
@@ -35,7 +35,7 @@ JITTER_M = 0.12e-3
 LAYOUT = Layout('coils', 3, 1.0, 0.0, prior='nominal', moved=True)
 """What the choice by held-out error ends with on the shared scan, without its minutes."""
 TARGETS = {'online/approach': 0.27, 'online/sweep': 0.15, 'effects/s05': 0.18}
-PLOT = REPO / 'bench_refit.png'
+PLOT = REPO / 'docs' / 'refit_ablation.png'
 
 
 def recordings() -> tuple[Path, dict[str, Path]]:
