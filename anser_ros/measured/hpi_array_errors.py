@@ -116,4 +116,5 @@ def weigh(
     top = refit(array.changed({name: value}), coils, fits, errors)
     sigma = float(1.0 / np.sqrt(-bend)) if bend < 0.0 else float('nan')
     count = sum(int(data.used.sum()) for data in coils)
-    return SharedError(name, value, sigma, likelihood(top) - here, 0.5 * float(np.log(count)), top)
+    price = 0.5 * float(np.log(count)) + float(np.log(len(STEPS)))
+    return SharedError(name, value, sigma, likelihood(top) - here, price, top)
