@@ -11,12 +11,13 @@ from anser_ros.diagnosis.diagnose import Diagnosis, diagnose
 from anser_ros.diagnosis.prepare import build_problem, test_blocks
 from anser_ros.diagnosis.problem import Problem
 from anser_ros.diagnosis.whitening import Spread
+from anser_ros.effects.correction import Correction
 from anser_ros.errors import DiagnosisError, SetupError
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.nominal import nominal_model
 from anser_ros.sessions.evaluation import baseline_flux, track_session
-from anser_ros.sessions.session import Session
+from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, Session
 from anser_ros.sessions.starting_model import board_of, check_fits
 from anser_ros.tracking.estimate import TrackerSettings
 
@@ -27,6 +28,7 @@ DEPENDENCIES = (
     'time', 'position', 'orientation', 'speed', 'emitter', 'channel', 'amplitude', 'frequency',
 )  # fmt: skip
 DEFAULT_NOISE_T = 60e-12
+ROOM = 2.0
 BULKY = ('groups', 'scatterers_m', 'scatterers_m3')
 """Parameters that only a program needs; they stand in the model file."""
 
@@ -87,20 +89,39 @@ def diagnose_session(
     if baseline is not None and session.reference is not None:
         clean = baseline_flux(baseline, session.reference.sensors)
     spread = Spread(flux_t=float(np.hypot(DEFAULT_NOISE_T, model.flux_error_t)))
-    problem = build_problem(
-        session.tools, session.reference, clean, model, _drawn(session), spread
-    )
+    known = [_corrected(tool, model) for tool in session.tools]
+    reference = None if session.reference is None else _corrected(session.reference, model)
+    problem = build_problem(known, reference, clean, model, _drawn(session), spread)
     found = diagnose(problem, model, progress=progress)
     say = progress or (lambda text: None)
     say('tracking the held-out part')
     unseen = _unseen(session, problem)
     moves = any(term.effect.moving for term in found.terms)
     follow = moves and baseline is not None and session.reference is not None
+    floor = max(found.flux_rms_floor_t, 1e-30)
     return SessionDiagnosis(
         found,
-        _tracked(unseen, model, None, refit=False),
-        _tracked(unseen, found.model, baseline, refit=follow),
+        _tracked(unseen, model, None, found.flux_rms_before_t / floor, refit=False),
+        _tracked(unseen, found.model, baseline, found.flux_rms_after_t / floor, refit=follow),
     )
+
+
+def _corrected(measurements: Measurements, model: FieldModel) -> Measurements:
+    """The measurements as the effects that the model already knows leave them."""
+    correction = Correction.of(model.effects, measurements.sensors, model.frequencies_hz)
+    if not correction.terms:
+        return measurements
+    flux = measurements.flux
+    if correction.changes_flux:
+        channels = measurements.sensors.channel
+        rows = zip(measurements.time.tolist(), flux, strict=True)
+        flux = np.array([correction.flux(time, channels, frame) for time, frame in rows])
+    out = replace(measurements, sensors=correction.sensors(), flux=flux)
+    if measurements.track is None:
+        return out
+    track = correction.optical(measurements.track)
+    position, rotation, has_pose = track.at(measurements.time, LONGEST_OPTICAL_GAP_S)
+    return replace(out, track=track, position=position, rotation=rotation, has_pose=has_pose)
 
 
 def _drawn(session: Session) -> FieldModel | None:
@@ -134,10 +155,14 @@ def _at(measurements: Measurements, times: Array) -> Measurements:
 
 
 def _tracked(
-    session: Session, model: FieldModel, baseline: Session | None, *, refit: bool
+    session: Session, model: FieldModel, baseline: Session | None, misfit: float, *, refit: bool
 ) -> TrackingErrors:
-    """Errors with the gate off, so that before and after are about the same frames."""
-    settings = TrackerSettings(gate=float('inf'))
+    """Errors with a gate as wide as the misfit: a wrong model's poses are to be seen here.
+
+    A gate that lets everything pass would also take wrong minima for poses.
+    """
+    usual = TrackerSettings()
+    settings = replace(usual, gate=usual.gate * max(1.0, ROOM * misfit))
     evaluation = track_session(session, model, settings, baseline=baseline, refit=refit)
     return TrackingErrors(
         _rms([series.position_error[1:] for series in evaluation.sensors.values()]),

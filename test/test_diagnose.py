@@ -1,0 +1,101 @@
+"""`anser diagnose` on simulated bags: a clean one passes, a wrong gain is named and mended."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from anser_ros.cli.main import main
+from anser_ros.sessions.session import load_session
+from anser_ros.wire.bag import read_bag
+from anser_ros.wire.bag_writer import SessionWriter
+from anser_ros.wire.points import FluxPoints, encode_flux
+
+ROOT = Path(__file__).resolve().parents[1]
+BAGS, MODEL = ROOT / 'bags', ROOT / 'config' / 'demo_model.yaml'
+CHANNEL, GAIN = 4, 0.97
+HELD_OUT = {
+    'flux_rms_before_t', 'flux_rms_after_t', 'flux_rms_floor_t', 'position_rmse_before_m',
+    'position_rmse_after_m', 'orientation_rmse_before_rad', 'orientation_rmse_after_rad',
+}  # fmt: skip
+
+
+def with_gain(path: Path) -> Path:
+    """The moving session with one channel's readings too small."""
+    bag = read_bag(BAGS / 'moving.mcap')
+    with SessionWriter(path) as writer:
+        writer.write_setup(bag.setup_text, int(bag.tool.stamp_ns[0]))
+        gain = np.where(bag.tool.channel == CHANNEL, GAIN, 1.0)[:, None]
+        empty = np.full((bag.tool.channel.size, 3), np.nan)
+        for stamp, flux in zip(bag.tool.stamp_ns.tolist(), bag.tool.flux, strict=True):
+            flags = np.zeros(bag.tool.channel.size, int)
+            points = FluxPoints(bag.tool.channel, flags, flux * gain, empty, empty)
+            fields, step, data = encode_flux(points)
+            writer.write_flux('/anser/tool/flux', stamp, fields, step, len(gain), data)
+        for body, track in bag.optical.items():
+            for stamp, position, quaternion in zip(
+                track.stamp_ns.tolist(), track.position, track.quaternion, strict=True
+            ):
+                writer.write_pose(f'/optical/{body}/pose', stamp, position, quaternion)
+    return path
+
+
+def run(bag: Path, out: Path, model: Path = MODEL, *more: str) -> dict:
+    assert main(['diagnose', str(bag), '--model', str(model), '--out', str(out), *more]) == 0
+    return json.loads((out / 'diagnosis.json').read_text())
+
+
+def test_a_clean_session_has_no_effect(tmp_path):
+    document = run(BAGS / 'moving.mcap', tmp_path, MODEL, '--baseline', str(BAGS / 'factory.mcap'))
+    assert document['schema'] == 'anser_diagnosis/1'
+    assert set(document['held_out']) == HELD_OUT
+    assert document['effects'] == []
+    assert document['unexplained']['fraction'] == 0.0
+
+
+def test_a_wrong_gain_is_named_and_the_model_corrects_it(tmp_path):
+    bag = with_gain(tmp_path / 'gain.mcap')
+    document = run(bag, tmp_path / 'out')
+    (effect,) = document['effects']
+    assert effect['name'] == 'sensor_gain'
+    assert effect['parameters']['channel'] == CHANNEL
+    found, sigma = effect['parameters']['gain'], effect['uncertainty']['gain']
+    assert abs(found - GAIN) < max(1e-3, 4 * sigma)
+    held = document['held_out']
+    assert held['flux_rms_after_t'] < 0.1 * held['flux_rms_before_t']
+    assert held['flux_rms_after_t'] < effect['flux_rms_without_t']
+    assert held['position_rmse_after_m'] < 0.16e-3
+    page = (tmp_path / 'out' / 'report.html').read_text()
+    assert 'sensor_gain' in page
+    assert 'http' not in page.replace('http-equiv', '')
+    again = run(bag, tmp_path / 'again', tmp_path / 'out' / 'model.yaml')
+    assert again['effects'] == [], 'the corrected model leaves nothing to find'
+
+
+@pytest.mark.parametrize(
+    ('bag', 'message'),
+    [('absent.mcap', 'no such bag'), (str(MODEL), 'not an MCAP file')],
+)
+def test_bad_input_is_one_line_and_exit_two(tmp_path, capsys, bag, message):
+    arguments = ['diagnose', bag, '--model', str(MODEL), '--out', str(tmp_path)]
+    assert main(arguments) == 2
+    text = capsys.readouterr().err
+    assert message in text
+    assert len(text.strip().split('\n')) == 1
+
+
+def test_the_session_needs_poses(tmp_path, capsys):
+    bag = read_bag(BAGS / 'moving.mcap')
+    path = tmp_path / 'blind.mcap'
+    with SessionWriter(path) as writer:
+        writer.write_setup(bag.setup_text, int(bag.tool.stamp_ns[0]))
+        empty = np.full((bag.tool.channel.size, 3), np.nan)
+        flags = np.zeros(bag.tool.channel.size, int)
+        points = FluxPoints(bag.tool.channel, flags, bag.tool.flux[0], empty, empty)
+        fields, step, data = encode_flux(points)
+        stamp = int(bag.tool.stamp_ns[0])
+        writer.write_flux('/anser/tool/flux', stamp, fields, step, len(empty), data)
+    assert load_session(path).tools[0].track is None
+    assert main(['diagnose', str(path), '--model', str(MODEL), '--out', str(tmp_path)]) == 2
+    assert 'at least 30 frames with an optical pose, got 0' in capsys.readouterr().err
