@@ -1,5 +1,6 @@
 """The nodes tracker and field_model over DDS: poses, states, and what they refuse."""
 
+import threading
 import time
 
 import numpy as np
@@ -8,6 +9,7 @@ from tracking_world import certain_model, fluxes, random_pose, setup_of, triaxia
 
 from anser_ros.sessions.model_file import load_model, save_model
 from anser_ros.tracking.rotations import rotation_of_quaternion
+from anser_ros.tracking.tracker import Tracker
 from anser_ros.wire.points import DipolePoints, FluxPoints, encode_field_model
 from anser_ros.wire.setup import SensorSpec, dump_setup
 
@@ -322,6 +324,85 @@ def test_a_jump_back_in_time_and_duplicates(tracker):
     assert counters['duplicates'] == 1
     assert counters['time_jumps'] == 1
     tracker.spin_until(lambda: len(tracker.poses.get(BODY, [])) == 2)
+
+
+def test_every_kind_of_bad_flux_has_its_counter(tracker):
+    rng = np.random.default_rng(8)
+    ready(tracker)
+    flux = fluxes(certain_model(), SENSORS, *random_pose(rng), rng)
+    node = tracker.node
+
+    def send(values, **header):
+        tracker.stamp_ns += 20_000_000
+        message = tracker.cloud.message(tracker.points(values), tracker.stamp_ns)
+        for name, value in header.items():
+            setattr(message.header if name == 'frame_id' else message.header.stamp, name, value)
+        tracker.flux.publish(message)
+
+    bad = flux.copy()
+    bad[0, 0], bad[1, 1] = np.inf, 1e20
+    dead = flux.copy()
+    dead[:, 6] = np.nan
+    send(flux, frame_id='world')
+    send(flux, nanosec=1_000_000_000)
+    send(flux[:0])
+    tracker.spin_until(lambda: node.counters['frames'] == 1)
+    send(bad)
+    message = tracker.cloud.message(tracker.points(flux), tracker.stamp_ns + 1)
+    message.is_bigendian = True
+    tracker.flux.publish(message)
+    tracker.spin_until(lambda: node.counters['fluxes_big_endian'] == 1)
+    send(dead)
+    tracker.stamp_ns += 10**10
+    send(dead)
+    tracker.spin_until(lambda: node._tracker.counters['time_jumps_forward'] == 1)
+    node.publish_diagnostics()
+    tracker.spin_until(lambda: tracker.value('anser/tracker', 'dead_emitters') == 'coil6')
+    assert tracker.state('anser/tracker') == 'no flux of coil6'
+    for counter, count in (
+        ('fluxes_other_frame_id', 1), ('fluxes_without_stamp', 1), ('frames_empty', 1),
+        ('readings_not_finite', 1), ('frames_dead_emitter', 2), ('fluxes_refused', 2),
+        ('fluxes_big_endian', 1), ('time_jumps_forward', 1),
+    ):  # fmt: skip
+        assert tracker.value('anser/tracker', counter) == str(count), counter
+    # The bytes that were called big endian make other channels.
+    assert int(tracker.value('anser/tracker', 'readings_missing')) > 9
+    assert int(tracker.value('anser/tracker', 'readings_absurd')) >= 1
+    assert node.counters['callback_faults'] == 0
+
+
+def test_frames_too_fast_to_solve_are_skipped_but_a_pause_loses_none(tracker, monkeypatch):
+    rng = np.random.default_rng(9)
+    ready(tracker)
+    flux = fluxes(certain_model(), SENSORS, *random_pose(rng), rng)
+    node, whole, pause_s = tracker.node, Tracker.update, [0.2]
+
+    def slow(self, *arguments):
+        time.sleep(pause_s.pop() if pause_s else work_s)
+        return whole(self, *arguments)
+
+    monkeypatch.setattr(Tracker, 'update', slow)
+    work_s = 0.0
+    for _ in range(20):
+        tracker.say_flux(flux)
+    wait_frame(tracker, 20)
+    assert node.counters['frames_skipped'] == 0
+    work_s, late_s = 0.05, []
+
+    def send():
+        for _ in range(100):
+            time.sleep(0.02)
+            tracker.say_flux(flux)
+            late_s.append(1e-9 * (tracker.stamp_ns - node._tracker._last_ns[0]))
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    tracker.spin_until(lambda: not sender.is_alive())
+    tracker.spin_until(lambda: node._tracker._last_ns[0] == tracker.stamp_ns)
+    assert node.counters['frames_skipped'] > 20
+    assert node.counters['frames_skipped'] + node.counters['frames'] == 120
+    assert max(late_s) < 1.5
+    assert max(late_s[60:]) < 0.3, 'a backlog that is dropped does not grow'
 
 
 def test_the_gate_may_change_while_it_runs(tracker):

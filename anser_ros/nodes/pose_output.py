@@ -52,6 +52,13 @@ class PoseTopic:
         self.states: Counter[str] = Counter()
         self.tally = Tally()
 
+    def is_matched(self, node: Any) -> bool:
+        """Whether everybody who subscribes to the topics would get what is published now."""
+        return all(
+            publisher.get_subscription_count() >= node.count_subscribers(publisher.topic_name)
+            for publisher in (self._pose, self._uncertain)
+        )
+
     def destroy(self, node: Any) -> None:
         """Take the topics off the graph."""
         node.destroy_publisher(self._pose)

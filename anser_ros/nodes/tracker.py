@@ -14,13 +14,15 @@ from std_msgs.msg import String
 from anser_ros.errors import AnserError, LayoutError, ModelFileError, ParameterError
 from anser_ros.fitting.model import FieldModel
 from anser_ros.nodes import qos
+from anser_ros.nodes.backlog import Backlog, take_waiting
 from anser_ros.nodes.flux_reader import read_flux
-from anser_ros.nodes.model_clouds import read_dipoles, read_error, stamp_of
+from anser_ros.nodes.model_clouds import NANO, read_dipoles, read_error, stamp_of
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.pose_output import PoseTopic, transform_message, transform_publisher
+from anser_ros.nodes.readiness import digest_of
 from anser_ros.sessions.model_file import load_model
-from anser_ros.sessions.session import sensor_table
+from anser_ros.sessions.session import noise_of, sensor_table
 from anser_ros.tracking.estimate import OK, TrackerSettings
 from anser_ros.tracking.seed import Volume
 from anser_ros.tracking.tracker import Tracker
@@ -103,6 +105,7 @@ class TrackerNode(AnserNode):
         self._file_model = load_model(table.model_file) if table.model_file else None
         self._setup_text = ''
         self._setup: Setup | None = None
+        self._flux_noise_t = 0.0
         self._tracker: Tracker | None = None
         self._topics: dict[str, PoseTopic] = {}
         self._dipoles: tuple[int, DipolePoints] | None = None
@@ -110,6 +113,7 @@ class TrackerNode(AnserNode):
         self._error_read: tuple[PointCloud2, int, ModelError] | None = None
         self._trouble = ''
         self._solve_s = 0.0
+        self._backlog = Backlog()
         self._told_s = 0.0
         self._transforms = transform_publisher(self) if table.publish_tf else None
         warm_up()
@@ -117,7 +121,9 @@ class TrackerNode(AnserNode):
         # The executor takes topics in this order, so a model finds its uncertainty there.
         self.create_subscription(PointCloud2, 'field_model_error', self._on_error, qos.LATCHED)
         self.create_subscription(PointCloud2, 'field_model', self._on_model, qos.LATCHED)
-        self.create_subscription(PointCloud2, 'tool/flux', self._on_flux, qos.STREAM)
+        self._fluxes = self.create_subscription(
+            PointCloud2, 'tool/flux', self._on_flux, qos.STREAM
+        )
 
     # What is subscribed to ----------------------------------------------------------------
 
@@ -127,7 +133,8 @@ class TrackerNode(AnserNode):
         try:
             setup = parse_setup(message.data)
             sensors = sensor_table(setup.tool_sensors)
-            tracker = Tracker(None, sensors, self._settings)
+            self._flux_noise_t = noise_of(setup)
+            tracker = Tracker(None, sensors, self._wanted_settings())
         except AnserError as error:
             self._refuse('setups_refused', error)
             return
@@ -210,13 +217,37 @@ class TrackerNode(AnserNode):
         holds = read is not None and read[0] is self._error and read[1] == n_dipoles
         return read[2] if read is not None and holds else None
 
-    def _on_flux(self, message: PointCloud2) -> None:
-        tracker = self._tracker
-        if tracker is None:
+    def _on_flux(self, message: PointCloud2, info: dict[str, int]) -> None:
+        """Track a frame; one that is late beyond hope gives way to the newest."""
+        received_ns = info.get('received_timestamp') or info.get('source_timestamp') or 0
+        now_ns = time.time_ns()
+        self._backlog.arrived(received_ns, stamp_of(message))
+        if received_ns and self._backlog.is_hopeless((now_ns - received_ns) / NANO):
+            waiting = take_waiting(self._fluxes)
+            if waiting:
+                self.count('frames_skipped', len(waiting))
+                message = waiting[-1]
+        begin_s = time.perf_counter()
+        self._track(message)
+        self._solve_s = time.perf_counter() - begin_s
+        self._backlog.worked(self._solve_s)
+
+    def _track(self, message: PointCloud2) -> None:
+        tracker, setup = self._tracker, self._setup
+        if tracker is None or setup is None:
             self.count('fluxes_before_setup')
             return
-        begin_s = time.perf_counter()
+        if message.is_bigendian:
+            self.count('fluxes_big_endian')
         try:
+            if message.header.frame_id != setup.frame_id:
+                self.count('fluxes_other_frame_id')
+                raise LayoutError(
+                    f'fluxes in the frame {message.header.frame_id!r}, '
+                    f'the setup is in {setup.frame_id!r}'
+                )
+            if stamp_of(message) <= 0 or message.header.stamp.nanosec >= NANO:
+                self.count('fluxes_without_stamp')
             stamp_ns, points = read_flux(message)
             estimates = tracker.update(stamp_ns, points.channel, points.flux, points.flags)
         except AnserError as error:
@@ -230,10 +261,14 @@ class TrackerNode(AnserNode):
             moved = [self._topics[e.name] for e in estimates if e.state == OK]
             if moved:
                 self._transforms.publish(transform_message(moved))
-        self._solve_s = time.perf_counter() - begin_s
         self.count('frames')
         if changed and time.monotonic() - self._told_s > EARLIEST_DIAGNOSTICS_S:
             self.publish_diagnostics()
+
+    def _wanted_settings(self) -> TrackerSettings:
+        """The settings; the noise that the setup tells counts where it is larger."""
+        noise_t = max(self._settings.flux_noise_t, self._flux_noise_t)
+        return replace(self._settings, flux_noise_t=noise_t)
 
     # What is told -------------------------------------------------------------------------
 
@@ -245,13 +280,14 @@ class TrackerNode(AnserNode):
         """Track on with the new settings, from where the tools were."""
         self._settings = settings_of(new)
         if self._tracker is not None:
-            self._tracker = self._tracker.with_settings(self._settings)
+            self._tracker = self._tracker.with_settings(self._wanted_settings())
 
     def status(self) -> Status:
         """Return what the tracker lacks, if anything, and its counters."""
         self._told_s = time.monotonic()
         tracker = self._tracker
         values: dict[str, object] = {'frame_time_s': self._solve_s, 'last_refusal': self._trouble}
+        values['ready_for'] = self._ready_for()
         if tracker is not None:
             values |= {name: count for name, count in tracker.counters.items() if name != 'frames'}
         if self._setup is None:
@@ -261,12 +297,33 @@ class TrackerNode(AnserNode):
         values |= {
             'dipoles': len(tracker.model.positions),
             'emitters': len(tracker.model.emitters),
+            'model_stamp_ns': '' if self._dipoles is None else self._dipoles[0],
         }
         good = sum(
             t.estimate is not None and t.estimate.state == OK for t in self._topics.values()
         )
         values['tracked'] = good
+        dead = ', '.join(tracker.dead_emitters)
+        values['dead_emitters'] = dead
+        if dead:
+            return Status('', Level.WARN, f'no flux of {dead}', values)
         return Status('', Level.OK, f'{good} of {len(self._topics)} tracked', values)
+
+    def _ready_for(self) -> str:
+        """Digest of the setup that no pose will be lost of: all listeners and the model are there.
+
+        Who starts to send fluxes (a replay) reads it in ``/diagnostics``.
+        """
+        tracker = self._tracker
+        if tracker is None or tracker.model is None:
+            return ''
+        if self._dipoles is None and self.count_publishers('field_model'):
+            return ''
+        if self._error is None and self.count_publishers('field_model_error'):
+            return ''
+        if not all(topic.is_matched(self) for topic in self._topics.values()):
+            return ''
+        return digest_of(self._setup_text)
 
     def part_statuses(self) -> list[Status]:
         """Return a line for every sensor and body."""

@@ -95,7 +95,7 @@ class TrackerSettings:
         return 2.0 * math.log(self.odds) * max(1.0, ratio)
 
     def leniency(self, scale: float) -> float:
-        """What ``max_sigma_m`` is multiplied by: with an infinite gate what misfit adds is free."""
+        """What ``max_sigma_m`` is multiplied by: an infinite gate forgives what misfit adds."""
         return 1.0 if math.isfinite(self.gate) else math.sqrt(max(1.0, scale))
 
 

@@ -1,0 +1,63 @@
+"""Tells when a node has fallen behind what it receives, so far that it won't catch up by itself.
+
+Poses that are late by several windows are of no use to anybody who steers by them, so a node that
+is slower than its input drops what waits and takes the newest. One that only paused is left to
+catch up: it loses nothing.
+"""
+
+from collections import deque
+from statistics import median
+from typing import Any
+
+NANO = 1e-9
+LATE_WINDOWS = 3.0
+"""Age of a message, in the spacing of messages, from which it may be late."""
+SHORTEST_LATE_S = 0.05
+CATCH_UP_S = 1.0
+"""A backlog that will be gone within this time is worked off."""
+MEMORY = 25
+"""Messages that typical figures are taken of, so that a few slow ones say nothing."""
+FEWEST = 10
+
+
+class Backlog:
+    """Typical spacing of messages, and the time that each takes."""
+
+    def __init__(self) -> None:
+        self._spacing_s: deque[float] = deque(maxlen=MEMORY)
+        self._work_s: deque[float] = deque(maxlen=MEMORY)
+        self._last = (0, 0)
+
+    def arrived(self, received_ns: int, stamp_ns: int) -> None:
+        """Note when the middleware received the message that is worked on next, and its stamp.
+
+        Messages that come in a burst are no faster than their stamps.
+        """
+        last, self._last = self._last, (received_ns, stamp_ns)
+        if last[0]:
+            self._spacing_s.append(max(received_ns - last[0], stamp_ns - last[1], 0) * NANO)
+
+    def worked(self, seconds: float) -> None:
+        """Note how long a message took."""
+        self._work_s.append(seconds)
+
+    def is_hopeless(self, age_s: float) -> bool:
+        """Whether a message of this age shows a backlog that will not be gone soon."""
+        if age_s < SHORTEST_LATE_S or len(self._work_s) < FEWEST:
+            return False
+        spacing_s, work_s = median(self._spacing_s), median(self._work_s)
+        if age_s < LATE_WINDOWS * spacing_s:
+            return False
+        share = work_s / max(spacing_s, 1e-9)
+        return share >= 1.0 or age_s * share / (1.0 - share) > CATCH_UP_S
+
+
+def take_waiting(subscription: Any) -> list[Any]:
+    """Messages that wait in a subscription's queue, oldest first; they are out of it then."""
+    taken = []
+    with subscription.handle:
+        while True:
+            item = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            if item is None:
+                return taken
+            taken.append(item[0])

@@ -1,0 +1,153 @@
+"""Tells when all who will listen to a replay are ready, so that nothing of it is lost.
+
+The graph shows who subscribes to the fluxes and to the poses that the setup promises, and which of
+the nodes that work on fluxes are running. ``/diagnostics`` tells whether the tracker has the
+setup, its model, and everybody connected who wants its poses (``ready_for``), and that its model
+is the one that ``field_model`` serves.
+"""
+
+import hashlib
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.node import Node
+
+from anser_ros.errors import SetupError
+from anser_ros.nodes import qos
+from anser_ros.wire.setup import parse_setup, topic_of
+
+TRACKER, FIELD_MODEL = 'tracker', 'field_model'
+# They take what there is, and nobody waits for them alone.
+PASSIVE = ('recorder', 'openigtlink', 'monitor')
+SETTLE_S = 0.7
+"""The graph must not have changed for so long; a recorder looks for new topics more often."""
+PATIENCE_S = 8.0
+"""The same while somebody is missed who may still be starting."""
+
+
+def digest_of(setup_text: str) -> str:
+    """Eight hexadecimal digits that tell setups apart."""
+    return hashlib.blake2b(setup_text.encode(), digest_size=4).hexdigest()
+
+
+@dataclass
+class _Told:
+    """What a node said last about itself, and when."""
+
+    at_s: float
+    values: dict[str, str] = field(default_factory=dict)
+
+
+class Readiness:
+    """Watches the graph and ``/diagnostics`` from a node whose executor spins elsewhere.
+
+    Parameters
+    ----------
+    node : Node
+    fluxes : list of Publisher
+        What is going to be published.
+    setup_text : str
+        The setup that has been published; empty where there is none.
+    """
+
+    def __init__(self, node: Node, fluxes: list[Any], setup_text: str) -> None:
+        self._node, self._fluxes = node, fluxes
+        self._namespace = node.get_namespace()
+        self._digest = digest_of(setup_text)
+        self._poses: list[str] = []
+        try:
+            setup = parse_setup(setup_text)
+            names = [sensor.name for sensor in setup.tool_sensors]
+            self._poses = [f'{topic_of(name)}/pose' for name in (*names, *setup.bodies)]
+        except SetupError:
+            pass  # who listens may make more of it
+        self._told: dict[str, _Told] = {}
+        self._seen: object = None
+        self._since_s = time.monotonic()
+        self._subscription = node.create_subscription(
+            DiagnosticArray, '/diagnostics', self._on_diagnostics, qos.EVENTS
+        )
+
+    def close(self) -> None:
+        """Stop watching."""
+        self._node.destroy_subscription(self._subscription)
+
+    def missing(self) -> str:
+        """Return what is waited for; empty when all who can be known are ready."""
+        now_s = time.monotonic()
+        listeners = {flux.topic_name: self._listeners(flux.topic_name) for flux in self._fluxes}
+        matched = [flux.get_subscription_count() for flux in self._fluxes]
+        wanted = [self._node.count_subscribers(topic) for topic in self._poses]
+        given = [self._node.count_publishers(topic) for topic in self._poses]
+        working = self._working_nodes()
+        seen = (listeners, matched, wanted, given, working)
+        if seen != self._seen:
+            self._seen, self._since_s = seen, now_s
+        quiet_s = now_s - self._since_s
+        if not any(matched):
+            return 'nobody listens to the fluxes'
+        unready = [name for name in working if not self._is_ready(name, listeners)]
+        if unready:
+            return f'{", ".join(unready)} not ready'
+        if quiet_s < SETTLE_S:
+            return 'others are joining'
+        if quiet_s < PATIENCE_S:
+            return self._missed(listeners, matched, wanted, given)
+        return ''
+
+    # What is known ------------------------------------------------------------------------
+
+    def _missed(
+        self,
+        listeners: dict[str, tuple[str, ...]],
+        matched: list[int],
+        wanted: list[int],
+        given: list[int],
+    ) -> str:
+        """Return who ought to be there by what others are waiting for."""
+        for (topic, names), count in zip(listeners.items(), matched, strict=True):
+            if all(name.rsplit('/', 1)[1] in PASSIVE for name in names):
+                return f'nobody works on {topic}'
+            if count < len(names):
+                return f'not all who listen to {topic} are connected'
+        if any(want and not give for want, give in zip(wanted, given, strict=True)):
+            return 'nobody publishes the poses that somebody listens to'
+        return ''
+
+    def _listeners(self, topic: str) -> tuple[str, ...]:
+        infos = self._node.get_subscriptions_info_by_topic(topic)
+        return tuple(sorted(f'{i.node_namespace.rstrip("/")}/{i.node_name}' for i in infos))
+
+    def _working_nodes(self) -> tuple[str, ...]:
+        """Full names of the nodes of this namespace that work on fluxes."""
+        found = self._node.get_node_names_and_namespaces()
+        own = self._namespace.rstrip('/')
+        return tuple(
+            sorted(
+                f'{own}/{name}'
+                for name, namespace in found
+                if namespace.rstrip('/') == own and name in (TRACKER, FIELD_MODEL)
+            )
+        )
+
+    def _is_ready(self, name: str, listeners: dict[str, tuple[str, ...]]) -> bool:
+        told = self._told.get(name.strip('/'))
+        # It must have looked at the graph as it is now.
+        if told is None or told.at_s < self._since_s:
+            return False
+        is_listening = any(name in names for names in listeners.values())
+        if name.endswith(FIELD_MODEL):
+            return is_listening and bool(told.values.get('stamp_ns'))
+        if told.values.get('ready_for') != self._digest or not is_listening:
+            return False
+        server = self._told.get(name.strip('/').removesuffix(TRACKER) + FIELD_MODEL)
+        served = '' if server is None else server.values.get('stamp_ns', '')
+        return not served or told.values.get('model_stamp_ns') == served
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        now_s = time.monotonic()
+        for status in message.status:
+            values = {item.key: item.value for item in status.values}
+            self._told[status.name] = _Told(now_s, values)
