@@ -19,6 +19,7 @@ from anser_ros.nodes import qos
 from anser_ros.nodes.consumers import Consumers
 from anser_ros.nodes.definitions import message_class
 from anser_ros.nodes.node import AnserNode, Level, Status, main
+from anser_ros.nodes.readiness import Readiness
 from anser_ros.wire.bag import RawMessage, Salvage, iter_messages
 
 BAG_NAMESPACE = '/anser/'
@@ -28,9 +29,9 @@ OUTPUT_ENDINGS = ('/pose', '/pose_with_covariance', '/field_model')
 OUTPUT_TOPICS = ('/diagnostics', '/tf', '/tf_static', '/clock')
 # A tracker that compiles its kernels for the first time listens late.
 WAIT_S = 30.0
-# The listeners count as complete when none has joined for so long.
-SETTLE_S = 0.5
-POLL_S = 0.02
+POLL_S = 0.05
+# Who is waited for is said after so long.
+TELL_AFTER_S = 3.0
 CLOCK_PERIOD_NS = 10_000_000
 LAST_ACK_S = 5.0
 
@@ -50,7 +51,7 @@ class Replay(AnserNode):
         Whether topics that running nodes publish themselves (poses, model, diagnostics) are
         played too.
     wait : float
-        Longest time to wait for somebody who takes the fluxes, s.
+        Longest time to wait until all who take the fluxes, or poses made of them, are ready, s.
 
     Raises
     ------
@@ -93,6 +94,7 @@ class Replay(AnserNode):
         self._wait_s = wait
         self._types: dict[str, type] = {}
         self._outlets: dict[str, Any] = {}
+        self._latched: dict[str, RawMessage] = {}
         self._total = 0
         self._lost = ''
         self._done = 0
@@ -150,24 +152,36 @@ class Replay(AnserNode):
         profile = qos.LATCHED if _is_latched(message) else qos.STREAM
         self._types[message.topic] = kind
         self._outlets[message.topic] = self.create_publisher(kind, name, profile)
+        if profile is qos.LATCHED and _message_of(message, kind) is not None:
+            self._latched[message.topic] = message
+
+    def _publish_latched(self) -> str:
+        """Publish what nodes need before they can take fluxes; return the setup's text."""
+        setup = ''
+        for topic, message in self._latched.items():
+            self._outlets[topic].publish(message.data)
+            self._done += 1
+            if topic.endswith('/setup'):
+                setup = getattr(_message_of(message, self._types[topic]), 'data', '')
+        return setup
 
     def _wait_for_listeners(self) -> None:
-        """Wait until somebody takes the fluxes and no more join."""
-        main_outlets = [o for t, o in self._outlets.items() if t.endswith(FLUX_ENDINGS)]
-        main_outlets = main_outlets or list(self._outlets.values())
-        end_s = time.monotonic() + self._wait_s
-        seen, since_s = -1, time.monotonic()
+        """Wait until all who can be known to listen are ready, at most as long as wanted."""
+        setup = self._publish_latched()
+        fluxes = [o for t, o in self._outlets.items() if t.endswith(FLUX_ENDINGS)]
+        readiness = Readiness(self, fluxes or list(self._outlets.values()), setup)
+        began_s, told = time.monotonic(), ''
         while not self._ending.wait(POLL_S):
-            now_s = time.monotonic()
-            matched = sum(o.get_subscription_count() for o in self._outlets.values())
-            if matched != seen:
-                seen, since_s = matched, now_s
-            wanted = any(outlet.get_subscription_count() for outlet in main_outlets)
-            if wanted and now_s - since_s >= SETTLE_S:
-                return
-            if now_s > end_s:
-                self.warn('no_listeners', f'nobody has listened for {self._wait_s:g} s')
-                return
+            waited_s, missing = time.monotonic() - began_s, readiness.missing()
+            if not missing:
+                break
+            if waited_s > self._wait_s:
+                self.warn('no_listeners', f'begins after {self._wait_s:g} s although {missing}')
+                break
+            if waited_s > TELL_AFTER_S and missing != told:
+                told = missing
+                self.get_logger().info(f'waits: {missing}')
+        readiness.close()
 
     # Playing ------------------------------------------------------------------------------
 
@@ -190,7 +204,10 @@ class Replay(AnserNode):
 
     def _play_once(self) -> None:
         first_ns, began_s, clock_ns = None, time.monotonic(), 0
+        given = dict(self._latched) if self._rounds == 0 else {}
         for message in self._messages():
+            if given.pop(message.topic, None) is not None:
+                continue  # the first of a latched topic is out already
             now_ns = message.log_time_ns
             first_ns = now_ns if first_ns is None else first_ns
             if self._rate > 0.0:
@@ -214,10 +231,8 @@ class Replay(AnserNode):
             kind = self._types.get(message.topic)
             if kind is None:
                 continue
-            try:
-                deserialize_message(message.data, kind)
-            except Exception as error:  # noqa: BLE001 - rclpy names none that is narrower
-                self.warn('messages_left_out', f'{message.topic}: {error}')
+            if _message_of(message, kind) is None:
+                self.warn('messages_left_out', f'{message.topic}: no {kind.__name__}')
                 continue
             yield message
 
@@ -236,6 +251,14 @@ class Replay(AnserNode):
         lost += f'; {left_out} messages that do not decode left out' if left_out else ''
         self.get_logger().info(f'published {self._done} of {self._total} messages{lost}')
         self.stop(0)
+
+
+def _message_of(message: RawMessage, kind: type) -> Any:
+    """Return the decoded message, or None where the bytes are none of that type."""
+    try:
+        return deserialize_message(message.data, kind)
+    except Exception:  # noqa: BLE001 - rclpy names none that is narrower
+        return None
 
 
 def _is_latched(message: RawMessage) -> bool:
