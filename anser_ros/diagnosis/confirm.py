@@ -1,9 +1,9 @@
 """Whether an effect is the same in all parts of the data, as a real one must be.
 
 What an unknown effect leaves is often picked up by some known one, with parameters that are
-different from one part of the data to the next. So each effect is fitted again in parts of the time
-and emitter by emitter, and the power that those fits take off besides is set against the power that
-the effect itself takes off.
+different from one part of the data to the next. So each effect is fitted again in parts of the
+time and emitter by emitter, and the power that those fits take off besides is set against the
+power that the effect itself takes off.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The model with the effects that were found: field effects in its dipoles, the rest as records."""
+"""The model with the effects found: field effects in its dipoles, the rest as records."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -33,7 +33,8 @@ def corrected_model(
     modes = model.modes
     if modes is not None:
         wide = np.zeros((modes.shape[0], merged.positions.shape[0], modes.shape[2]), dtype=complex)
-        np.add.at(wide, (slice(None), rows[: model.positions.shape[0]]), modes)
+        for mode, own in zip(wide, modes, strict=True):
+            np.add.at(mode, rows[: model.positions.shape[0]], own)
         modes = wide
     return replace(
         model,

@@ -278,6 +278,7 @@ def _noise_findings(
     whole: Problem, cleaned: Problem, after: State, scale: float, significant: bool
 ) -> list[Finding]:
     found = []
+    site: dict[str, object]
     share, channels = outlying_share(whole, cleaned)
     effects: dict[str, Effect] = all_effects()
     frames = sum(tool.time.size for tool in whole.tools)

@@ -1,9 +1,9 @@
 """The emitters' own field where no tool sensor ever was: beside the board and below it.
 
 A calibrated model is only as good as its data: it may be any field at the places of metal and of
-reference sensors. Currents in a board make a sheet of vertical dipoles in its plane, so such a sheet
-is fitted to the model inside the volume and to the references' clean readings, starting from the
-drawn board where the setup draws one.
+reference sensors. Currents in a board make a sheet of vertical dipoles in its plane, so such a
+sheet is fitted to the model inside the volume and to the references' clean readings, starting from
+the drawn board where the setup draws one.
 """
 
 from dataclasses import dataclass
@@ -71,7 +71,7 @@ def fit_illumination(
     rows, values = [basis / scale], [(wanted - basis @ start) / scale]
     if references is not None:
         good = np.isfinite(references.flux).all(axis=1)
-        s = references.sensors.select(good)
+        s = references.sensors.select(np.flatnonzero(good))
         sheet = flux_basis(s.position, s.axis, s.length, place, direction)
         clean = references.flux[good]
         weight = REFERENCE_ERROR * np.sqrt(np.mean(np.abs(clean) ** 2))

@@ -1,4 +1,4 @@
-"""From measurements to a problem: bins of reference readings, time blocks, and what stays unseen."""
+"""From measurements to a problem: bins of references, time blocks, and what stays unseen."""
 
 from collections.abc import Sequence
 

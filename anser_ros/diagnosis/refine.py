@@ -41,8 +41,8 @@ def settled(
 ) -> Fit:
     """The joint fit of all effects, metal with a remainder each.
 
-    Places and sizes are fitted without remainders, which could take their part; with them, they are
-    held. Metal that moves shows its shape by moving, so its path stays free.
+    Places and sizes are fitted without remainders, which could take their part; with them, they
+    are held. Metal that moves shows its shape by moving, so its path stays free.
     """
     plain = [term.free() for term in terms if term.effect is not REMAINDER]
     fit = fit_terms(problem, plain, blocks, iterations)

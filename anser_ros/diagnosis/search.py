@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from anser_ros.diagnosis.fit import Fit, fit_terms
 from anser_ros.diagnosis.problem import Problem
-from anser_ros.diagnosis.scoring import BlockSums, Score, Scorer
 from anser_ros.diagnosis.refine import METALS, settled
+from anser_ros.diagnosis.scoring import BlockSums, Score, Scorer
 from anser_ros.effects.effect import Effect, Term
 from anser_ros.effects.metal_remainder import REMAINDER
 from anser_ros.effects.moving_metal import MovingMetal
@@ -26,7 +26,7 @@ Progress = Callable[[str], None]
 PROMISING = 0.5
 """A candidate whose probe promises less than this share of the best fitted gain is not fitted."""
 REMNANT = 0.01
-"""Further metal that takes off less than this share of the first metal's gain is what its model left."""
+"""Further metal with less than this share of the first metal's gain is what its model left."""
 APART = 0.12
 """Distance (m) from metal in force within which further metal is the same body's."""
 
@@ -253,7 +253,7 @@ def _moving(
     scorer: Scorer,
     blocks: NDArray[np.int64],
 ) -> list[tuple[float, Term]]:
-    """Expected gain and starts for metal that moves: where metal fits best in the first and in the last blocks."""
+    """Expected gain and starts for moving metal: where metal fits best at first and at last."""
     effect: Effect | None = all_effects().get('moving_metal')
     places = [(t, s) for t, s in scored if t.effect.name == 'static_metal']
     if not isinstance(effect, MovingMetal) or not places:
@@ -265,7 +265,10 @@ def _moving(
     alone = sum(max(_gain(sums, np.array([i])) for _, sums in own) for i in range(blocks.size))
     if alone < 1.05 * (scorer.held_out - still) + 100:
         return []
-    ends = [max(own, key=lambda pair, rows=rows: _gain(pair[1], rows)) for rows in (first, last)]
+    ends = []
+    for rows in (first, last):
+        gains = [_gain(sums, rows) for _, sums in own]
+        ends.append(own[int(np.argmax(gains))])
     strongest = max(((_gain(ends[0][1], first), 0), (_gain(ends[1][1], last), 1)))[1]
     alpha = ends[strongest][1].part((first, last)[strongest]).solve(np.full(2, 1e6))[0]
     duration = problem.scene.duration

@@ -41,9 +41,9 @@ class StructureTest:
 def structure_tests(state: State) -> list[StructureTest]:
     """Test the tools' whitened residuals against every variable, strongest first.
 
-    For time, position, orientation, speed and amplitude the frames are binned, and the mean of each
-    phasor part of each sensor in each bin is compared with zero. For channel, emitter and frequency
-    the spread over the groups is compared with the spread of all.
+    For time, position, orientation, speed and amplitude the frames are binned, and the mean of
+    each phasor part of each sensor in each bin is compared with zero. For channel, emitter and
+    frequency the spread over the groups is compared with the spread of all.
     """
     tools = [part for part in state.parts if not part.view.is_reference]
     noise = _noise(tools)

@@ -1,8 +1,8 @@
 """Residuals in units of what they may be: noise everywhere, pose jitter along six directions.
 
-An optical pose that is a little off moves all channels and emitters of its frame together, along the
-six columns of the frame's pose Jacobian. Taking that known freedom out lowers the floor several
-times, and shows what plain residuals hide.
+An optical pose that is a little off moves all channels and emitters of its frame together, along
+the six columns of the frame's pose Jacobian. Taking that known freedom out lowers the floor
+several times, and shows what plain residuals hide.
 """
 
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ def parts(values: ComplexArray) -> Array:
 
 
 def pose_jacobian(view: View) -> Array:
-    """Derivative of the flux parts by the body's pose, shape (F, 2 S K, 6): m, rad about fg's axes."""
+    """Derivative of the flux parts by the body's pose, (F, 2 S K, 6): m, rad about fg's axes."""
     lever = view.centres - view.position[:, None, :]
     turn = np.cross(lever[..., :, None], view.d_position, axis=2)
     turn = turn + np.cross(view.axes[..., :, None], view.d_axis, axis=2)

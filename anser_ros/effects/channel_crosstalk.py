@@ -55,7 +55,7 @@ class ChannelCrosstalk(Effect):
             return None
         size = len(rows)
         known = [i for i, row in enumerate(rows) if row is not None]
-        here = [rows[i] for i in known]
+        here = np.array([row for row in rows if row is not None])
         matrix = self._matrix(term)[np.ix_(known, known)]
         own = np.linalg.solve(matrix, view.linear[:, here])
         out = view.columns(term.theta.size)

@@ -1,8 +1,8 @@
 """Undoes a model's effects on what is measured: live in the tracker and node, and offline.
 
 The forward chain is ``flux = compress(C T (field) + offset)`` with C mixing channels and T mixing
-emitters; it is undone from the outside in. Effects on the field are in the model's dipoles already,
-and what can't be corrected is passed over.
+emitters; it is undone from the outside in. Effects on the field are in the model's dipoles
+already, and what can't be corrected is passed over.
 """
 
 from collections.abc import Sequence
@@ -121,16 +121,18 @@ class Correction:
         if not good.any():
             return out
         number = np.asarray(channels, dtype=np.int64)[good]
-        values = self._decompressed(terms, number, out[good])
+        values: ComplexArray = self._decompressed(terms, number, out[good])
         for term in terms:
             added = term.effect.offset(term, number, self.omega.size)
             values = values if added is None else values - added
         for term in reversed(terms):
             mixing = term.effect.channel_matrix(term, number)
-            values = values if mixing is None else np.linalg.solve(mixing, values)
+            if mixing is not None:
+                values = np.asarray(np.linalg.solve(mixing, values), dtype=complex)
         for term in reversed(terms):
             matrix = self._emitters(term, time, strengths)
-            values = values if matrix is None else np.linalg.solve(matrix, values.T).T
+            if matrix is not None:
+                values = np.asarray(np.linalg.solve(matrix, values.T).T, dtype=complex)
         out[good] = values
         return out
 
@@ -142,10 +144,10 @@ class Correction:
             return None
         if strengths is not None and term.effect.name == 'coil_drift':
             coil = int(term.site['coil'])
-            live = matrix[0].copy()
+            live: ComplexArray = matrix[0].copy()
             live[coil, coil] = strengths[coil]
             return live
-        return matrix[0]
+        return np.asarray(matrix[0])
 
     @staticmethod
     def _decompressed(
@@ -159,7 +161,7 @@ class Correction:
                 loss = term.effect.compress(term, channels, loss)
             step = measured - (loss[0] - x)
             if np.allclose(step, x, rtol=1e-9, atol=0.0):
-                return step
+                return np.asarray(step)
             x = step
         return x
 

@@ -5,7 +5,8 @@ The measurement chain that an effect may change runs in this order::
     optical track -> sensor table -> field -> emitters -> channels -> offset -> compression
 
 An effect overrides the stages at which it acts, and gives the derivative of the predicted flux by
-its own parameters. Its forward stages are also what undoes it live (`anser_ros.effects.correction`).
+its own parameters. Its forward stages are also what undoes it live
+(`anser_ros.effects.correction`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -247,7 +248,7 @@ class Effect:
         return np.ones(term.theta.size)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """Derivative of the view's flux by the parameters, (F, S, K, q); None where it has none."""
+        """Derivative of the view's flux by the parameters, (F, S, K, q), or None."""
         return None
 
     def probe(self, term: Term, view: View) -> ComplexArray | None:
@@ -274,7 +275,7 @@ class Effect:
     def sources(
         self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
-        """Dipoles that the effect adds to the field; ``base`` makes the field where sensors are."""
+        """Dipoles that the effect adds; ``base`` makes the field where sensors are."""
         return None
 
     def sources_at(

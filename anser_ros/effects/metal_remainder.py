@@ -1,9 +1,9 @@
 """What a simple metal body leaves: small scatterers about it, a few modes of them.
 
-Not an effect of its own (no registry holds it): it belongs to the metal that it refines, so that the
-corrected field is as good as the data allow while the metal's own parameters stay few. Each point
-carries a scatterer along x, y and z (the field along the axis makes a moment along it); a mode is a
-fixed combination of all of them, with a complex amplitude.
+Not an effect of its own (no registry holds it): it belongs to the metal that it refines, so that
+the corrected field is as good as the data allow while the metal's own parameters stay few. Each
+point carries a scatterer along x, y and z (the field along the axis makes a moment along it); a
+mode is a fixed combination of all of them, with a complex amplitude.
 """
 
 import numpy as np

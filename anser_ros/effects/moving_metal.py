@@ -71,7 +71,7 @@ class MovingMetal(Effect):
 
     name = 'moving_metal'
     summary = 'a metal object moves during the session'
-    units = {  # noqa: RUF012
+    units = {
         'start_m': 'm', 'end_m': 'm', 't_start_s': 's', 't_end_s': 's', 'ease': '1',
         'polarizability': 'm^3 (3x3, [re, im])',
     }  # fmt: skip
@@ -126,7 +126,7 @@ class MovingMetal(Effect):
         frames, sensors = view.centres.shape[:2]
         driven = np.transpose(at, (0, 3, 2, 1)).reshape(frames, at.shape[3], -1)
         flat = np.moveaxis(coupling, 3, 2).reshape(frames, sensors, -1)
-        return flat, driven * (UNIT / MU_0)
+        return flat, (driven * (UNIT / MU_0)).astype(complex)
 
     def _sum(self, term: Term, view: View, shift: Array) -> ComplexArray:
         """Flux (F, S, K) of the whole body, moved by a shift."""

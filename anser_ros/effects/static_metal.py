@@ -47,7 +47,7 @@ def places(scene: Scene) -> Array:
     on_board = np.all(
         (points > scene.board[0] - [0, 0, 0.01]) & (points < scene.board[1] + [0, 0, 0.04]), axis=1
     )
-    return points[~inside & ~on_board]
+    return np.asarray(points[~inside & ~on_board])
 
 
 def _shape(term: Term) -> BodyShape:
