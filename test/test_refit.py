@@ -232,6 +232,26 @@ def test_too_few_references_mean_the_calibrated_model_and_say_so(refit):
     assert result.left_out == world.references.name[3:]
 
 
+def test_a_frame_with_lost_samples_leaves_no_trace(refit):
+    world = anser_world()
+    flags = np.full(len(world.baseline), 4)
+    before = run(refit, world, world.metal(HEAD))
+    assert run(refit, world, world.metal(HEAD), 1, 5, 10, flags=flags).state == 'few_references'
+    after = run(refit, world, world.metal(HEAD), 1, 6, 11)
+    assert (after.state, after.left_out) == (before.state, ())
+
+
+def test_coils_that_could_not_be_read_one_after_the_other_return(refit):
+    world = anser_world()
+    count = len(world.baseline)
+    for first in range(0, count, 3):
+        flags = np.zeros(count, dtype=int)
+        flags[first : first + 3] = 1
+        run(refit, world, 0.0, 1, 5, 10 + first, flags=flags)
+    result = run(refit, world, 0.0, 2 * refit.settings.hold_frames, 6, 100)
+    assert (result.state, result.left_out) == ('frozen', ())
+
+
 def test_a_reference_without_a_baseline_takes_no_part():
     world = anser_world()
     baseline = world.baseline.copy()

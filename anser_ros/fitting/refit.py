@@ -177,10 +177,11 @@ class LiveRefit:
             self._noise.forget()
             self._average.forget()
         self._last_ns = stamp_ns
-        self._watch.note(readable, reasons)
+        self._watch.note(readable, reasons, self.settings.min_references)
         usable = np.where(readable[:, None], ordered, np.nan)
         level = self._noise.update(usable)
         if self._in_use().sum() < self.settings.min_references:
+            self._watch.wait(readable)
             return self._too_few(stamp_ns, level)
         if baseline is not None:
             # What is averaged is the change; the clean part moves with the coil.

@@ -104,6 +104,9 @@ class Watch:
     excluded: NDArray[np.bool_] = field(init=False)
     reason: list[str] = field(init=False)
     _good: NDArray[np.int64] = field(init=False)
+    _before: tuple[NDArray[np.bool_], list[str], NDArray[np.int64]] | None = field(
+        init=False, default=None
+    )
     _dismissed: tuple[float, int] = field(init=False, default=(0.0, 0))
     _since: int = field(init=False, default=0)
 
@@ -112,8 +115,17 @@ class Watch:
         self.reason = [OK] * self.count
         self._good = np.zeros(self.count, dtype=np.int64)
 
-    def note(self, readable: NDArray[np.bool_], reasons: list[str]) -> None:
-        """Leave out what can't be read; an unreadable coil starts its waiting time again."""
+    def note(self, readable: NDArray[np.bool_], reasons: list[str], least: int = 0) -> None:
+        """Leave out what can't be read; an unreadable coil starts its waiting time again.
+
+        Where fewer than `least` can be read, samples were lost and no coil is at fault: with the
+        next frame all is as it was before.
+        """
+        if self._before is not None:
+            self.excluded, self.reason, self._good = self._before
+            self._before = None
+        if readable.sum() < least:
+            self._before = self.excluded.copy(), self.reason.copy(), self._good.copy()
         for coil in np.flatnonzero(~readable):
             self.excluded[coil] = True
             self.reason[coil] = reasons[coil]
@@ -128,6 +140,11 @@ class Watch:
         self._good[coil] = self._good[coil] + 1 if agrees else 0
         if self._good[coil] >= self.hold_frames:
             self.excluded[coil], self.reason[coil] = False, OK
+
+    def wait(self, readable: NDArray[np.bool_]) -> None:
+        """Count a frame with too few coils to compare: who was only unreadable returns in time."""
+        for coil in np.flatnonzero(self.excluded & readable):
+            self.agreed(int(coil), self.reason[coil] != DISAGREES)
 
     def suspects(self, chi2: Array, power: Array, freedom: int) -> list[NDArray[np.int64]]:
         """Sets of coils in use whose common fault is worth the computation; often none.
