@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -175,17 +176,16 @@ def against_references(
     return rows
 
 
-def rows() -> list[dict[str, Any]]:
+def rows() -> Iterator[dict[str, Any]]:
     """All figures of the refit."""
     scan, paths = recordings()
     baseline = load_session(scan)
     model = calibrate_sessions([baseline], Options(layout=LAYOUT, damping=1e-6)).model
     model = replace(model, provenance={**model.provenance, 'layout': 'fixed by the benchmark'})
     sessions = {name: load_session(path) for name, path in paths.items()}
-    out = []
     for name, session in sessions.items():
-        out += accuracy(name, session, model, baseline)
+        yield from accuracy(name, session, model, baseline)
     moving = next(iter(sessions.values()))
-    return out + costs(moving, model, baseline) + detection() + against_references(
-        sessions, model, baseline
-    )  # fmt: skip
+    yield from costs(moving, model, baseline)
+    yield from detection()
+    yield from against_references(sessions, model, baseline)

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -169,11 +170,12 @@ def cold(world: World) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def rows() -> list[dict[str, Any]]:
+def rows() -> Iterator[dict[str, Any]]:
     """Rows of the table."""
     world = World()
     rng = np.random.default_rng(3)
     points, axes = world.poses(rng, 1)
     flux = world.fluxes(rng, points, axes)[0]
     solve_cold(world.field, world.grid, flux, world.whitening, world.low, world.high)
-    return warm(world) + cold(world)
+    yield from warm(world)
+    yield from cold(world)

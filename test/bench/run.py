@@ -1,9 +1,10 @@
 """Runs every benchmark here, prints their table and writes bench.json.
 
-A benchmark is a module ``bench_*.py`` with ``rows() -> list[dict]``. A row has ``name``, ``value``
-and ``unit``, and where there are such: ``rival``, ``rival_value``, ``ratio`` (the rival's value
-over ours), ``target`` (a number, with ``target_is`` 'most' or 'least') and ``met``. Everything
-runs on one thread, ours and the rival in the same process one after the other.
+A benchmark is a module ``bench_*.py`` with ``rows()``, which returns or yields dicts. A row has
+``name``, ``value`` and ``unit``, and where there are such: ``rival``, ``rival_value``, ``ratio``
+(the rival's value over ours), ``target`` (a number, with ``target_is`` 'most' or 'least') and
+``met``. Everything runs on one thread, ours and the rival in the same process one after the other.
+Each row is printed as it comes; bench.json is written after every module.
 """
 
 import argparse
@@ -58,6 +59,16 @@ def text(value: Any) -> str:
     return f'{value:.4g}' if isinstance(value, float) else str(value)
 
 
+def line(row: dict[str, Any]) -> str:
+    """Return a row as one line, for whoever watches."""
+    parts = [f'  {row["name"]}: {text(row["value"])} {row["unit"]}']
+    if row['rival_value'] is not None:
+        parts.append(f'{row["rival"]} {text(row["rival_value"])}')
+    if row['target'] is not None:
+        parts.append(f'target {text(row["target"])}: {"met" if row["met"] else "NOT met"}')
+    return '; '.join(parts)
+
+
 def table(rows: list[dict[str, Any]]) -> str:
     """Return the rows as aligned text."""
     cells = [list(KEYS), *([text(row[key]) for key in KEYS] for row in rows)]
@@ -79,22 +90,36 @@ def main() -> int:
     if unknown:
         print(f'bench: no {", ".join(sorted(unknown))}; there are: {", ".join(known)}')
         return 2
-    rows, broken = [], []
-    for name, path in known.items():
-        if args.names and name not in args.names:
-            continue
-        began_s = time.monotonic()
-        try:
-            rows += [complete(row) for row in load(path).rows()]
-        except Exception:  # noqa: BLE001 - the others are still worth their figures
-            traceback.print_exc()
-            broken.append(name)
-        print(f'{name}: {time.monotonic() - began_s:.1f} s', file=sys.stderr, flush=True)
-    print(table(rows))
-    args.out.write_text(json.dumps(rows, indent=1) + '\n', encoding='utf-8')
+    chosen = {name: path for name, path in known.items() if not args.names or name in args.names}
+    rows: list[dict[str, Any]] = []
+    try:
+        broken = run(chosen, rows, args.out)
+    except KeyboardInterrupt:
+        print(f'bench: interrupted; {len(rows)} rows are in {args.out}', file=sys.stderr)
+        return 130
+    print('\n' + table(rows))
     if broken:
         print(f'bench: broken: {", ".join(broken)}', file=sys.stderr)
     return 1 if broken else 0
+
+
+def run(chosen: dict[str, Path], rows: list[dict[str, Any]], out: Path) -> list[str]:
+    """Run benchmarks one after the other into ``rows``; return the names of those that broke."""
+    broken = []
+    for name, path in chosen.items():
+        began_s = time.monotonic()
+        print(f'{name} ...', file=sys.stderr, flush=True)
+        try:
+            for row in load(path).rows():
+                rows.append(complete(row))
+                print(line(rows[-1]), flush=True)
+        except Exception:  # noqa: BLE001 - the others are still worth their figures
+            traceback.print_exc()
+            broken.append(name)
+        finally:
+            out.write_text(json.dumps(rows, indent=1) + '\n', encoding='utf-8')
+        print(f'{name}: {time.monotonic() - began_s:.1f} s', file=sys.stderr, flush=True)
+    return broken
 
 
 if __name__ == '__main__':
