@@ -11,6 +11,7 @@ from anser_ros.errors import FitError, ParameterError
 from anser_ros.signals.clock import DeviceClock
 from anser_ros.signals.demodulation import Demodulator
 from anser_ros.signals.flux import FluxConverter
+from anser_ros.signals.motion import FluxRates
 from anser_ros.signals.window import WindowCutter
 
 RATE = 40e3
@@ -206,6 +207,44 @@ class TestFlux:
             )
         with pytest.raises(ParameterError, match='nominal current'):
             self.converter(nominal_currents_a=np.zeros(8))
+
+
+class TestShortWindows:
+    def test_motion_is_taken_from_the_windows_before(self):
+        samples, hop_s = 200, 5e-3
+        rng = np.random.default_rng(4)
+        start = phasors(3, 8) * 1e-12
+        rate = 0.5 * np.abs(start) * rng.standard_normal((3, 8))
+        demodulator = Demodulator(RATE, TONES, samples)
+        assert not demodulator.follows_motion
+        to_code = 2j * np.pi * TONES * 1e6
+        converter = FluxConverter(
+            TONES, np.arange(3), np.full(3, 1e-6), np.ones(3), np.zeros(3),
+            current_column=3, amperes_per_code=1e-4, nominal_currents_a=np.full(8, 0.25),
+        )  # fmt: skip
+        rates, errors = FluxRates(), []
+        time_s = (np.arange(samples) - (samples - 1) / 2) / RATE
+        for window in range(8):
+            middle_s = window * hop_s
+            turn = np.exp(2j * np.pi * TONES * middle_s)
+            level = (start + rate * middle_s) * to_code * turn
+            slope = waves(rate * to_code * turn, samples) * time_s[:, None]
+            current = waves(2500.0 * turn[None], samples)
+            fit = demodulator.demodulate(np.hstack([waves(level, samples) + slope, current]))
+            flux = converter.convert(fit, rates.at(middle_s)).flux
+            rates.add(middle_s, flux)
+            errors.append(np.abs(flux - start - rate * middle_s).max() / np.abs(start).max())
+        assert errors[0] > 1e-4
+        assert max(errors[-3:]) < 0.1 * errors[0]
+
+    def test_a_gap_starts_anew(self):
+        rates = FluxRates()
+        for window in range(4):
+            rates.add(0.005 * window, np.full((1, 1), 1j * window))
+        assert rates.at(0.02)[0, 0] == pytest.approx(200j)
+        assert rates.at(0.2) is None
+        rates.add(0.2, np.zeros((1, 1), complex))
+        assert rates.at(0.205) is None
 
 
 class TestWindows:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import FitError, SetupError
 from anser_ros.signals.clock import DeviceClock
-from anser_ros.signals.demodulation import Demodulator
+from anser_ros.signals.demodulation import Demodulator, ToneFit
 from anser_ros.signals.flux import FluxConverter, FluxWindow
+from anser_ros.signals.motion import FluxRates
 from anser_ros.signals.window import Window, WindowCutter
 from anser_ros.wire.channel_calibration import ChannelCalibration
 from anser_ros.wire.frames import ChannelKind, Hello, SampleBlock
@@ -101,6 +102,7 @@ class FluxStream:
             rate, self.tones_hz, window, mains_hz=options.mains_hz or None
         )
         self._converter = _converter(hello, self, columns, calibration)
+        self._rates = None if self._demodulator.follows_motion else FluxRates()
         self._cutter = WindowCutter(window, hop, len(hello.channels), rate / hello.tick_hz)
         self.counters = self._cutter.counters
         self.clock = DeviceClock(hello.tick_hz)
@@ -132,7 +134,7 @@ class FluxStream:
 
     def _frame(self, window: Window) -> FluxFrame:
         fit = self._demodulator.demodulate(window.codes, window.present)
-        converted = self._converter.convert(fit)
+        converted = self._converted(fit, window.middle_ticks / self._tick_hz)
         flags = np.where(window.saturated[self._columns], SATURATED, 0)
         flags |= np.where(window.stuck[self._columns], STALE, 0)
         if window.dropped:
@@ -145,6 +147,14 @@ class FluxStream:
             converted,
             flags,
         )
+
+    def _converted(self, fit: ToneFit, middle_s: float) -> FluxWindow:
+        """Fluxes of a fit; one too short to follow motion takes it from the windows before."""
+        if self._rates is None:
+            return self._converter.convert(fit)
+        converted = self._converter.convert(fit, self._rates.at(middle_s))
+        self._rates.add(middle_s, converted.flux)
+        return converted
 
 
 @dataclass(frozen=True)

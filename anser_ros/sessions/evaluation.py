@@ -18,7 +18,7 @@ from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.refit import LiveRefit
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, NANO, Session
+from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, NANO, Session, noise_of
 from anser_ros.sessions.starting_model import check_fits, drawing_of
 from anser_ros.tracking.tracker import PoseEstimate, Tracker, TrackerSettings
 
@@ -138,7 +138,9 @@ def track_session(
         model = in_phase_model(model)
     sensors = _all_sensors(session)
     correction = Correction.of(model.effects, sensors, model.frequencies_hz)
-    tracker = Tracker(model, sensors, settings or TrackerSettings())
+    wanted = settings or TrackerSettings()
+    noise_t = max(wanted.flux_noise_t, noise_of(session.setup))
+    tracker = Tracker(model, sensors, replace(wanted, flux_noise_t=noise_t))
     follower = _follower(session, model, baseline) if refit else None
     estimates: dict[str, list[PoseEstimate]] = {}
     frames = list(_frames(session))

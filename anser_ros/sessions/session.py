@@ -17,6 +17,7 @@ from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
 NANO = 1e-9
 LONGEST_OPTICAL_GAP_S = 0.25
 """An optical tracker at 60 Hz that misses more than a quarter of a second has no pose between."""
+MOST_NOISE_T = 1e-3
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,13 @@ def sensor_table(specs: tuple[SensorSpec, ...]) -> SensorTable:
         axis=np.array([s.axis for s in specs], dtype=np.float64).reshape(-1, 3),
         length=np.array([s.length_m for s in specs], dtype=np.float64),
     )
+
+
+def noise_of(setup: Setup) -> float:
+    """What a setup says that the fluxes' components scatter by, T; 0 where it says nothing."""
+    told = setup.extra.get('flux_noise_t', 0.0)
+    is_number = isinstance(told, (int, float)) and not isinstance(told, bool)
+    return float(told) if is_number and 0.0 < told < MOST_NOISE_T else 0.0
 
 
 def pose_track(stream: PoseStream, start_ns: int) -> PoseTrack:

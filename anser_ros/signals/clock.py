@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-_TOLERANCE = 2e-4
+_TOLERANCE = 1e-4
 _JUMP_NS = 1_000_000_000
 
 
@@ -11,7 +11,7 @@ class DeviceClock:
 
     Every arrival is late by an unknown delay that is never negative, so the smallest difference
     seen between arrival and device time is the best estimate of the offset. The estimate may rise
-    by 200 ppm, more than two quartz clocks drift apart, so that it follows a slow device clock and
+    by 100 ppm, more than two quartz clocks drift apart, so that it follows a slow device clock and
     forgets an early outlier.
 
     Parameters

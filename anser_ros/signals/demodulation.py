@@ -7,7 +7,8 @@ A window of samples x(t) of one channel is modelled as
 with t = 0 in the middle of the window. P_k is the phasor wanted, Q_k its rate of change: a coil
 that moves changes all its amplitudes within the window, and a fit without Q_k takes that change
 for other tones. The model is linear, so its pseudo-inverse is computed once and a window costs one
-matrix product (Kay, Fundamentals of Statistical Signal Processing I, section 4.3).
+matrix product (Kay, Fundamentals of Statistical Signal Processing I, section 4.3). Windows too
+short to hold the Q_k are fitted without them; what known rates add to such a fit is linear too.
 """
 
 from __future__ import annotations
@@ -36,12 +37,15 @@ class ToneFit:
     sigma : ndarray, shape (C, K), standard deviation of the real and of the imaginary part
     noise : ndarray, shape (C,), root mean square of what the model leaves, per sample
     rates : ndarray, shape (C, K), complex, change of the phasors per second; zero where not fitted
+    motion_bias : ndarray, shape (2K, 2K), or None where the rates are fitted: what rates [Re, Im]
+        per second, which the fit knows nothing of, add to the phasors [Re, Im]
     """
 
     phasors: NDArray[np.complex128]
     sigma: NDArray[np.float64]
     noise: NDArray[np.float64]
     rates: NDArray[np.complex128]
+    motion_bias: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -90,12 +94,17 @@ class Demodulator:
         self.frequencies_hz = tones
         self.window_samples = window_samples
         self.window_s = length_s
+        self._times_s = _times_s(sample_rate_hz, window_samples)
+        self._bias: NDArray[np.float64] | None = None
         harmonics = _kept_harmonics(mains_hz, mains_harmonics, tones, sample_rate_hz, length_s)
 
         def prepare(motion: bool, worst: float) -> None:
             self._design = _design_matrix(sample_rate_hz, window_samples, tones, harmonics, motion)
             self._solution = _solve(self._design, 2 * tones.size, worst)
             self.follows_motion = motion
+            self._bias = (
+                None if motion else self._motion_bias(self._solution, self._design, self._times_s)
+            )
 
         try:
             if follow_motion is None:
@@ -126,11 +135,13 @@ class Demodulator:
         FitError
             When the samples that are left do not determine the tones.
         """
-        solution = self._solution
+        solution, bias = self._solution, self._bias
         values = samples.astype(np.float64)
         if present is not None and not present.all():
             solution = _solve(self._design[present], 2 * self.frequencies_hz.size)
             values = values[present]
+            if bias is not None:
+                bias = self._motion_bias(solution, self._design[present], self._times_s[present])
         projected = solution.basis.T @ values
         coefficients = solution.to_coefficients @ projected
         energy = np.einsum('nc,nc->c', values, values) - np.einsum(
@@ -146,7 +157,15 @@ class Demodulator:
         else:
             rates = np.zeros_like(phasors)
         variance = (solution.variance[:count] + solution.variance[count : 2 * count]) / 2
-        return ToneFit(phasors, noise[:, None] * np.sqrt(variance), noise, rates)
+        return ToneFit(phasors, noise[:, None] * np.sqrt(variance), noise, rates, bias)
+
+    def _motion_bias(
+        self, solution: _Solution, design: NDArray[np.float64], times_s: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Phasors that a fit without motion finds in tones of size t, shape (2K, 2K), s."""
+        count = 2 * self.frequencies_hz.size
+        projected = solution.basis.T @ (times_s[:, None] * design[:, :count])
+        return np.asarray((solution.to_coefficients @ projected)[:count])
 
 
 def _smallest_spacing(tones: NDArray[np.float64]) -> float:
@@ -170,6 +189,11 @@ def _kept_harmonics(
     return kept
 
 
+def _times_s(sample_rate_hz: float, window_samples: int) -> NDArray[np.float64]:
+    """Times of a window's samples from its middle."""
+    return (np.arange(window_samples) - (window_samples - 1) / 2) / sample_rate_hz
+
+
 def _design_matrix(
     sample_rate_hz: float,
     window_samples: int,
@@ -178,7 +202,7 @@ def _design_matrix(
     follow_motion: bool,
 ) -> NDArray[np.float64]:
     """Columns: cos and -sin of the tones, the same times t, offset and slope, mains."""
-    time = (np.arange(window_samples) - (window_samples - 1) / 2) / sample_rate_hz
+    time = _times_s(sample_rate_hz, window_samples)
     unit = time / (window_samples / sample_rate_hz / 2)
     angle = 2 * np.pi * time[:, None] * tones
     waves = np.hstack([np.cos(angle), -np.sin(angle)])

@@ -91,8 +91,17 @@ class FluxConverter:
         self._nominal_a = nominal_currents_a
         self._least = least_current
 
-    def convert(self, fit: ToneFit) -> FluxWindow:
-        """Convert one window."""
+    def convert(
+        self, fit: ToneFit, flux_rates: NDArray[np.complex128] | None = None
+    ) -> FluxWindow:
+        """Convert one window.
+
+        Parameters
+        ----------
+        fit : phasors of all columns
+        flux_rates : ndarray, shape (S, K), T/s, where they are known though the window was too
+            short to fit them; what they add to the phasors is taken off
+        """
         current = fit.phasors[self._current_column] * self._amperes_per_code
         current_sigma = fit.sigma[self._current_column] * np.abs(self._amperes_per_code)
         magnitude = np.abs(current)
@@ -100,7 +109,13 @@ class FluxConverter:
         reference = np.full(current.shape, complex(np.nan, np.nan))
         reference[driven] = self._nominal_a[driven] / current[driven]
         to_flux = self._tesla_per_code * reference
-        flux = fit.phasors[self._columns] * to_flux
+        phasors = fit.phasors[self._columns]
+        if fit.motion_bias is not None and flux_rates is not None:
+            rates = np.zeros_like(flux_rates)
+            np.divide(flux_rates, to_flux, where=driven & np.isfinite(flux_rates), out=rates)
+            added = np.hstack([rates.real, rates.imag]) @ fit.motion_bias.T
+            phasors = phasors - added[:, : driven.size] - 1j * added[:, driven.size :]
+        flux = phasors * to_flux
         own = fit.sigma[self._columns] * np.abs(to_flux)
         shared = np.divide(current_sigma, magnitude, where=driven, out=np.zeros_like(magnitude))
         return FluxWindow(
