@@ -18,6 +18,7 @@ from std_msgs.msg import String
 from anser_ros.errors import AnserError, PortError
 from anser_ros.nodes import qos
 from anser_ros.nodes.clouds import FluxCloud
+from anser_ros.nodes.fault_memory import FAULTS, RecentFaults, device_words
 from anser_ros.nodes.flux_stream import FluxFrame, FluxStream, StreamOptions
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
@@ -31,6 +32,8 @@ from anser_ros.wire.setup import Setup, dump_setup, parse_setup
 from anser_ros.wire.stream_control import StreamControl
 
 AUTO = 'auto'
+FLUX_NOISE = 'flux_noise_t'
+"""Key of the setup document: what the fluxes' components scatter by, T."""
 WAIT_S = 0.1
 GOODBYE_S = 0.1
 
@@ -123,6 +126,8 @@ class Acquisition(AnserNode):
         self._sensor_flags: np.ndarray | None = None
         self._past: Counter[str] = Counter()
         self._published_setup = ''
+        self._noise_told = False
+        self._faults = RecentFaults()
         self._publish_setup(self._setup)
         self._port: ControlUnitPort | None = None
         self._closing = threading.Event()
@@ -172,9 +177,9 @@ class Acquisition(AnserNode):
             self._control.reset()
             self._drop_stream()
             return
-        for record in batch.records:
-            self._control.take(record, batch.arrival_ns)
-            self._dispatch(record, batch.arrival_ns)
+        for record, arrival_ns in zip(batch.records, batch.arrivals_ns, strict=True):
+            self._control.take(record, arrival_ns)
+            self._dispatch(record, arrival_ns)
         if self._port is not None:
             self._port.blocks_wanted = self._stream.blocks_wanted if self._stream else 1
 
@@ -219,7 +224,7 @@ class Acquisition(AnserNode):
         except AnserError as error:
             self._refusal = str(error)
             raise
-        self._publish_setup(replace(self._setup, flux_rate_hz=self._stream.rate_hz))
+        self._noise_told = False
 
     def _publish_setup(self, setup: Setup) -> None:
         text = dump_setup(setup)
@@ -228,6 +233,9 @@ class Acquisition(AnserNode):
             self._setup_publisher.publish(String(data=text))
 
     def _publish_frame(self, frame: FluxFrame, arrival_ns: int) -> None:
+        if not self._noise_told and self._stream is not None:
+            self._noise_told = True
+            self._publish_setup(_with_noise(self._setup, self._stream.rate_hz, frame))
         # The system's clock may be set while we run; the offset is taken anew for every stamp.
         stamp_ns = frame.host_ns + time.time_ns() - time.monotonic_ns()
         if len(frame.tool.channel):
@@ -266,16 +274,17 @@ class Acquisition(AnserNode):
         port, stream, device = self._port, self._stream, self._device
         if port is not None:
             values |= {'device': port.device, 'port': port.state.value, **port.fault_counters()}
-        if stream is not None:
-            live = self._stream_counters(stream)
-            values |= {name: value + self._past[name] for name, value in live.items()}
+        live = self._stream_counters(stream) if stream is not None else {}
+        values |= {name: live.get(name, 0) + self._past[name] for name in {*live, *self._past}}
         if device is not None:
             values |= {
                 'device_state': device.state.name.lower(),
-                'device_flags': int(device.flags),
+                'device_flags': device_words(device) or 'none',
                 'device_dropped_blocks': device.dropped_blocks,
                 'device_temperature_deg_c': device.temperature_deg_c,
             }
+        counters = {name: int(values.get(name, 0)) for name in FAULTS}  # type: ignore[call-overload]
+        self._faults.note(counters, time.monotonic())
         level, message = self._verdict(interval.frames)
         return Status('', level, message, values)
 
@@ -287,14 +296,17 @@ class Acquisition(AnserNode):
             return Level.WARN, 'looking for the control unit'
         if port.state is not PortState.RECEIVING:
             reason = f': {port.reason}' if port.reason else ''
-            return Level.ERROR, f'{port.state.value}{reason}'
+            words = [f'{port.state.value}{reason}', self._faults.words]
+            return Level.ERROR, '; '.join(filter(None, words))
+        if self._faults.words:
+            return self._faults.level, self._faults.words
         if frames == 0:
             return Level.WARN, 'no windows yet'
         if self._stream is not None and self._stream.missing:
             names = ', '.join(s.name for s in self._stream.missing[:4])
             return Level.WARN, f'the control unit has no channel for {names}'
         if self._device is not None and self._device.flags:
-            return Level.WARN, f'control unit: {self._device.flags!r}'
+            return Level.WARN, f'control unit: {device_words(self._device)}'
         return Level.OK, 'streaming'
 
     def part_statuses(self) -> list[Status]:
@@ -340,6 +352,15 @@ class Acquisition(AnserNode):
             }
             statuses.append(Status(sensor.name, level, message, values))
         return statuses
+
+
+def _with_noise(setup: Setup, rate_hz: float, frame: FluxFrame) -> Setup:
+    """The setup with what only the stream tells: its true rate, and the noise of its fluxes."""
+    sigma = frame.window.sigma[np.isfinite(frame.window.sigma)]
+    if not sigma.size or not np.median(sigma) > 0:
+        return replace(setup, flux_rate_hz=rate_hz)
+    noise_t = float(f'{np.median(sigma):.2g}')
+    return replace(setup, flux_rate_hz=rate_hz, extra={**setup.extra, FLUX_NOISE: noise_t})
 
 
 def _sensor_state(flags: int) -> tuple[Level, str]:

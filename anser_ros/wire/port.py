@@ -75,11 +75,13 @@ class Batch:
     arrival_ns : monotonic host time right after the read of the last one
     records : in the order of the stream; empty when the connection began or ended
     connected : False tells that the connection ended
+    arrivals_ns : the same time of each record
     """
 
     arrival_ns: int
     records: tuple[Record, ...]
     connected: bool = True
+    arrivals_ns: tuple[int, ...] = ()
 
 
 class ControlUnitPort:
@@ -118,6 +120,7 @@ class ControlUnitPort:
         self.blocks_wanted = 1
         self._queue_blocks = queue_blocks
         self._held: list[Record] = []
+        self._arrivals_ns: list[int] = []
         self._held_blocks = 0
         self._pauses = (pause_s, longest_pause_s)
         self._reader = FrameReader()
@@ -218,7 +221,9 @@ class ControlUnitPort:
             while self._commands:
                 port.write(self._commands.popleft())
             data = receive()
-            now = time.monotonic()
+            # The stamps hang on this time: it is taken before anything is made of the bytes.
+            arrival_ns = time.monotonic_ns()
+            now = arrival_ns / 1e9
             if data:
                 last_byte = now
                 period_bytes += len(data)
@@ -226,7 +231,7 @@ class ControlUnitPort:
                 records = reader.feed(data)
                 if records:
                     self.state = PortState.RECEIVING
-                    self._take(records)
+                    self._take(records, arrival_ns)
             elif self._held:
                 self._hand_over()
             elif now - last_byte > self._silence_s:
@@ -240,7 +245,7 @@ class ControlUnitPort:
                 period_start, period_bytes = now, 0
                 period_records = reader.counters.records
 
-    def _take(self, records: list[Record]) -> None:
+    def _take(self, records: list[Record], arrival_ns: int) -> None:
         """Hold blocks until there are as many as wanted; anything else goes on at once."""
         urgent = False
         for record in records:
@@ -256,14 +261,16 @@ class ControlUnitPort:
                 if isinstance(payload, Hello):
                     self._reader.max_payload = max(_SHORTEST_PAYLOAD, payload.samples_size())
             self._held.append(record)
+            self._arrivals_ns.append(arrival_ns)
         if urgent or self._held_blocks >= self.blocks_wanted:
             self._hand_over()
 
     def _hand_over(self) -> None:
         """Queue what is held; a receiver that never reads gets no more than records fit."""
         if self._held and self._queue.qsize() < 2 * self._queue_blocks:
-            self._queue.put(Batch(time.monotonic_ns(), tuple(self._held)))
-        self._held, self._held_blocks = [], 0
+            arrivals_ns = tuple(self._arrivals_ns)
+            self._queue.put(Batch(arrivals_ns[-1], tuple(self._held), arrivals_ns=arrivals_ns))
+        self._held, self._arrivals_ns, self._held_blocks = [], [], 0
 
     def _count_gap(self, sequence: int) -> None:
         if self._next_sequence is not None and sequence:
