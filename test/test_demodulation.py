@@ -384,3 +384,14 @@ class TestClock:
         clock.observe(ticks, 10**12 + 1_000_000)
         assert clock.jumps == 1
         assert clock.host_ns(ticks) == 10**12 + 1_000_000
+
+    def test_a_host_that_stalls_does_not_move_the_stamps(self):
+        clock = DeviceClock(1e6)
+        clock.observe(1e6, 10**12)
+        clock.observe(1.1e6, 10**12 + 2_000_000_000)
+        assert clock.jumps == 0
+        assert abs(clock.host_ns(1.1e6) - 10**12 - 100_000_000) < 20_000
+        for second in range(2, 7):
+            clock.observe(second * 1e6, 10**12 + (second + 4) * 1_000_000_000)
+        assert clock.jumps == 1
+        assert abs(clock.host_ns(6e6) - 10**12 - 10_000_000_000) < 1_000_000
