@@ -19,6 +19,7 @@ ARGUMENTS = {
     'setup': ('demo_setup.yaml', 'setup document: a path, or a file of the package'),
     'channels': ('demo_channels.yaml', 'channel calibration: a path, or a file of the package'),
     'model': ('nominal', 'model file of calibrate, or nominal'),
+    'board_seed': ('0', "the simulated unit's board: 0 fits nominal, 1 demo_model.yaml"),
     'simulate': ('false', 'whether a simulated control unit takes the place of the real one'),
     'record': ('true', 'whether a bag is recorded'),
     'directory': ('recordings', 'folder of the bags'),
@@ -58,7 +59,13 @@ def generate_launch_description():
             GroupAction(
                 [
                     PushRosNamespace(value('namespace')),
-                    node('cu_simulator', 'simulate', link=value('device'), **board),
+                    node(
+                        'cu_simulator',
+                        'simulate',
+                        link=value('device'),
+                        board_seed=value('board_seed'),
+                        **board,
+                    ),
                     node('acquisition', device=value('device'), **board),
                     node('field_model', model_file=value('model')),
                     node('tracker'),

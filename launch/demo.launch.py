@@ -10,8 +10,9 @@ from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, EmitEvent, GroupAction, RegisterEventHandler
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node, PushRosNamespace
+from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = 'anser_ros'
 PORT = '/tmp/anser_cu'
@@ -40,11 +41,13 @@ def node(name, remappings=(), output='log', **parameters):
 def generate_launch_description():
     """Return the nodes, and the rule that the monitor's end is everybody's end."""
     value = LaunchConfiguration
+    model = PathJoinSubstitution([FindPackageShare(PACKAGE), 'config', 'demo_model.yaml'])
     monitor = node(
         'monitor',
         output='screen',
         duration_s=value('duration'),
         compare='frozen',
+        compare_note='"gate off: what a tracker without a residual gate would say"',
     )
     shared = [(topic, f'/anser/{topic}') for topic in SHARED_TOPICS]
     return LaunchDescription(
@@ -58,14 +61,14 @@ def generate_launch_description():
                     PushRosNamespace('anser'),
                     node('cu_simulator', link=PORT, metal=value('metal')),
                     node('acquisition', device=PORT),
-                    node('field_model'),
+                    node('field_model', model_file=model, baseline_at_start=True),
                     node('tracker'),
                     node('recorder', directory=value('directory')),
                     GroupAction(
                         [
                             PushRosNamespace('frozen'),
-                            node('field_model', shared),
-                            node('tracker', shared),
+                            node('field_model', shared, model_file=model),
+                            node('tracker', shared, gate=1e6, adaptive=False),
                         ]
                     ),
                     monitor,

@@ -9,7 +9,7 @@ from anser_ros.cli.main import main
 from anser_ros.sessions.session import load_session
 
 ROOT = Path(__file__).resolve().parents[1]
-NAMES = ('factory', 'moving', 'metal')
+NAMES = ('factory', 'moving', 'metal', 'scan')
 
 
 @pytest.fixture(scope='module')

@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 Results = dict[str, Any]
 LIVE = 'live'
+FROZEN = 'frozen'
+MEANINGS = {
+    LIVE: 'model refitted to the reference coils, gated',
+    FROZEN: 'frozen model, gate off: what a tracker without a residual gate would say',
+}
 COLOURS = ('tab:blue', 'tab:orange')
+GAP_S = 0.1
+SMOOTH = 25
 METAL_NEAR_M = 0.3
 
 
@@ -52,13 +59,19 @@ def draw(results: Results, path: Path) -> None:
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.6))
     shown = _shown_target(results)
+    views = []
     for row, (first, second) in enumerate(((0, 1), (0, 2))):
-        axes = figure.add_subplot(grid[row, 0])
-        _draw_path(axes, results, shown, first, second)
+        views.append(figure.add_subplot(grid[row, 0]))
+        _draw_path(views[-1], results, shown, first, second)
     axes = figure.add_subplot(grid[:, 1])
     _draw_error(axes, results, shown)
-    names = results['names']
-    figure.suptitle(f'{names[shown]}: simulated control unit, true and tracked')
+    lines, labels = views[0].get_legend_handles_labels()
+    more = axes.get_legend_handles_labels()
+    figure.legend(
+        [*lines, *more[0]], [*labels, *more[1]], loc='outside lower center', ncols=3,
+        fontsize='small',
+    )  # fmt: skip
+    figure.suptitle(f'{results["names"][shown]}: simulated control unit, true and tracked')
     figure.savefig(path, dpi=110)
 
 
@@ -68,45 +81,74 @@ def _shown_target(results: Results) -> int:
     return len(counts) - 1 if counts[-1] else int(np.argmax(counts))
 
 
+def _behind_first(results: Results) -> list[int]:
+    """Ranks of the chains: the live one, which matters, is drawn last and lies on top."""
+    return list(reversed(range(len(results['chains']))))
+
+
+def broken(stamp_s: NDArray[np.float64], values: NDArray[np.float64]) -> Any:
+    """Stamps and values with a NaN in every gap, so that no line goes across it."""
+    gaps = np.flatnonzero(np.diff(stamp_s) > GAP_S) + 1
+    middle = (stamp_s[gaps - 1] + stamp_s[gaps]) / 2
+    return np.insert(stamp_s, gaps, middle), np.insert(values, gaps, np.nan, axis=0)
+
+
 def _draw_path(axes: Any, results: Results, shown: int, first: int, second: int) -> None:
     letters = 'xyz'
     name = str(results['names'][shown])
     if f'optical_{name}' in results:
-        true = 1e3 * results[f'optical_{name}'][:, 1:]
-        axes.plot(true[:, first], true[:, second], color='0.6', lw=3, label='true')
-    for rank, chain in enumerate(results['chains']):
-        tracked = 1e3 * results[f'position_{rank}_{shown}']
-        if len(tracked):
-            label = f'tracked, {chain}' if chain else 'tracked'
+        stamps, true = results[f'optical_{name}'][:, 0], 1e3 * results[f'optical_{name}'][:, 1:]
+        tracked_s = results[f'stamp_0_{shown}']
+        if tracked_s.size:
+            true = true[(stamps >= tracked_s[0]) & (stamps <= tracked_s[-1])]
+        axes.plot(true[:, first], true[:, second], color='0.6', lw=4, label='true path')
+    for rank in _behind_first(results):
+        chain = str(results['chains'][rank]) or LIVE
+        stamp, position = results[f'stamp_{rank}_{shown}'], results[f'position_{rank}_{shown}']
+        if len(position):
+            tracked = 1e3 * broken(stamp, position)[1]
             axes.plot(
-                tracked[:, first], tracked[:, second], lw=0.8, color=COLOURS[rank], label=label
-            )
+                tracked[:, first], tracked[:, second], lw=1.0, color=COLOURS[rank],
+                label=f'tracked, {chain}',
+            )  # fmt: skip
     axes.set_xlabel(f'{letters[first]}, mm')
     axes.set_ylabel(f'{letters[second]}, mm')
     axes.set_aspect('equal', adjustable='datalim')
-    axes.legend(fontsize='small')
 
 
 def _draw_error(axes: Any, results: Results, shown: int) -> None:
-    begin = min(
-        (results[f'stamp_{r}_{shown}'][0] for r in range(len(results['chains']))
-         if len(results[f'stamp_{r}_{shown}'])),
-        default=0.0,
-    )  # fmt: skip
-    for rank, chain in enumerate(results['chains']):
-        stamp = results[f'stamp_{rank}_{shown}'] - begin
+    begin = float(results[f'stamp_0_{shown}'][0]) if len(results[f'stamp_0_{shown}']) else 0.0
+    end = begin
+    for rank in _behind_first(results):
+        stamp = results[f'stamp_{rank}_{shown}']
+        end = max(end, float(stamp[-1])) if stamp.size else end
         error = 1e3 * results[f'error_{rank}_{shown}']
-        label = f'error, {chain} model' if chain else 'error, model refitted live'
-        axes.plot(stamp, error, '.', ms=2, color=COLOURS[rank], label=label)
-        if rank == 0:
-            sigma = 1e3 * results[f'sigma_{rank}_{shown}']
-            axes.plot(stamp, sigma, color='k', lw=0.8, label='sigma')
+        chain = str(results['chains'][rank]) or LIVE
+        axes.plot(
+            stamp - begin, error, '.', ms=2.5, color=COLOURS[rank],
+            label=f'error, {chain}: {MEANINGS[chain]}',
+        )  # fmt: skip
+    stamp, sigma = results[f'stamp_0_{shown}'], 1e3 * results[f'sigma_0_{shown}']
+    if stamp.size:
+        at, level = broken(stamp - begin, _smoothed(sigma))
+        axes.fill_between(
+            at, level / 2, 2 * level, color='k', alpha=0.15, lw=0,
+            label='half to twice the sigma, live',
+        )  # fmt: skip
     _shade_metal(axes, results['metal'], begin)
     axes.set_yscale('log')
+    axes.set_xlim(0.0, max(end - begin, 1.0))
     axes.set_xlabel('time, s')
     axes.set_ylabel('position error, mm')
     axes.grid(alpha=0.3, which='both')
-    axes.legend(fontsize='small')
+
+
+def _smoothed(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Running median over `SMOOTH` values."""
+    reach = min(SMOOTH, len(values) - 1 + len(values) % 2) // 2
+    padded = np.pad(values, reach, mode='edge')
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1)
+    return np.asarray(np.median(windows, axis=1))
 
 
 def _shade_metal(axes: Any, metal: NDArray[np.float64], begin: float) -> None:

@@ -17,6 +17,7 @@ from rich.table import Table
 
 from anser_ros.cli.demo import BOARD_SEED, FROZEN, NO_GATE, SAMPLE_RATE_HZ, SHARED_TOPICS
 from anser_ros.cli.demo import node_command as node
+from anser_ros.cli.kernels import compile_kernels
 from anser_ros.cli.supervisor import Supervisor, tail
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import AnserError, DiagnosisError, ParameterError
@@ -27,7 +28,7 @@ from anser_ros.wire.bag import read_bag
 from anser_ros.wire.config_folder import config_path
 
 CLEAN_S = 6.0
-PATIENCE_S = 90.0
+PATIENCE_S = 180.0
 OPTICAL_NOISE_M = 0.07e-3
 CHAINS = {'after': '/anser', 'before': f'/anser/{FROZEN}'}
 
@@ -61,6 +62,10 @@ def run(args: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     say = Console(stderr=True)
     model = config_path('demo_model.yaml')
+    with Supervisor(folder / 'logs') as supervisor:
+        failed = compile_kernels(supervisor, say.print, lambda: False)
+        if failed is not None:
+            raise DiagnosisError(f'no kernels: {tail(failed)}')
     say.print(f'1 of 4: a clean recording, {CLEAN_S:g} s')
     clean = _record(folder / 'clean', CLEAN_S, 'none', seed, model, model)
     say.print(f'2 of 4: {args.duration:g} s with an effect that only truth.json knows')

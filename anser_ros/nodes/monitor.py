@@ -22,6 +22,8 @@ from anser_ros.nodes.traces import OpticalTrace, Row, Traces, targets_of
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
 LINE_PERIOD_S = 1.0
+WIDE = 100
+STATE_WIDTH = 14
 LEVELS = {0: 'green', 1: 'yellow', 2: 'red', 3: 'red'}
 
 
@@ -36,6 +38,7 @@ class MonitorParameters:
         0.0, 'gives up when no pose came in so long; 0 for never, s', minimum=0.0
     )
     compare: str = parameter('', 'namespace of a second tracker to show beside; empty for none')
+    compare_note: str = parameter('', 'what is special about the second tracker, in words')
     output: str = parameter('', 'file (.npz) that gets all poses and errors at the end')
     period_s: float = parameter(
         0.25,
@@ -72,6 +75,9 @@ class Monitor(AnserNode):
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, qos.EVENTS)
         period_s = table.period_s if self._live else LINE_PERIOD_S
         self.create_timer(period_s, self._show, clock=self.steady_clock)
+
+        if self._live is None and table.compare and table.compare_note:
+            print(f'{table.compare}: {table.compare_note}', flush=True)
 
     def _on_setup(self, message: String) -> None:
         setup = parse_setup(message.data)
@@ -165,30 +171,40 @@ class Monitor(AnserNode):
         return self._states.get(f'{prefix}/tracker: {name}', (1, 'waiting'))
 
     def _table(self, rows: dict[str, list[Row]]) -> Table:
+        """The table; one column for a position, and states only where they are not ok."""
         second = self.parameters.compare
-        title = self._title()
-        table = Table(title=title, title_justify='left', caption=self._caption())
-        table.add_column('sensor')
-        table.add_column('state')
-        for heading in ('x mm', 'y mm', 'z mm', 'sigma mm', 'error mm'):
-            table.add_column(heading, justify='right')
+        narrow = self._console.width < WIDE
+        table = Table(
+            title=self._title(), title_justify='left', caption=self._caption(),
+            caption_justify='left', padding=(0, 0) if narrow else (0, 1), collapse_padding=True,
+        )  # fmt: skip
+        table.add_column('sensor', no_wrap=True)
+        table.add_column('state', no_wrap=True)
+        table.add_column('x, y, z mm', justify='right', no_wrap=True)
+        for heading in ('sigma\nmm', 'error\nmm'):
+            table.add_column(heading, justify='right', no_wrap=True)
         if second:
-            table.add_column(f'{second}: error mm', justify='right')
-            table.add_column('state')
-        for heading in ('rate Hz', 'latency ms'):
-            table.add_column(heading, justify='right')
+            table.add_column(f'{second}\nerror', justify='right', no_wrap=True)
+        for heading in ('Hz', 'ms'):
+            table.add_column(heading, justify='right', no_wrap=True)
         others = {row.name: row for row in rows.get(second, [])} if second else {}
         for row in rows.get('', []):
-            level, state = self._state('', row.name)
-            cells = [row.name, f'[{LEVELS.get(level, "red")}]{state}']
-            cells += [_mm(v, 1) for v in row.position_m]
+            cells = [row.name, self._state_cell('', row.name, narrow)]
+            cells.append(' '.join(f'{_mm(v, 1):>6}' for v in row.position_m))
             cells += [_mm(row.sigma_m), _mm(row.error_m)]
             if second:
                 level, state = self._state(second, row.name)
-                cells += [_mm(others[row.name].error_m), f'[{LEVELS.get(level, "red")}]{state}']
+                error = _mm(others[row.name].error_m)
+                cells.append(error if level == 0 else f'[{LEVELS.get(level, "red")}]{state[:9]}')
             cells += [f'{row.rate_hz:.0f}', _number(1e3 * row.latency_s, 1)]
             table.add_row(*cells)
         return table
+
+    def _state_cell(self, chain: str, name: str, narrow: bool) -> str:
+        level, state = self._state(chain, name)
+        if narrow:  # the reason stands in /diagnostics
+            state = state.split(':')[0][:STATE_WIDTH]
+        return f'[{LEVELS.get(level, "red")}]{state}'
 
     def _title(self) -> str:
         if self._first_s is None:
@@ -198,10 +214,13 @@ class Monitor(AnserNode):
         return f'{ran_s:.0f} s' + (f' of {end_s:.0f} s' if end_s else '')
 
     def _caption(self) -> str:
-        words = ['latency from the middle of the window']
+        words = ['ms: latency from the middle of the window']
         if self._metal:
             words.insert(0, f'metal {100 * self._metal[-1][1]:.0f} cm from the board')
-        return '; '.join(words)
+        caption = '; '.join(words)
+        if self.parameters.compare and self.parameters.compare_note:
+            caption += f'\n{self.parameters.compare}: {self.parameters.compare_note}'
+        return caption
 
     def _line(self, rows: dict[str, list[Row]]) -> str:
         """One line with the medians over all sensors."""

@@ -13,7 +13,8 @@ from pathlib import Path
 from anser_ros.errors import PortError
 from anser_ros.simulation.control_unit import Piece
 
-_PENDING_LIMIT_BYTES = 1 << 21
+_PENDING_LIMIT_BYTES = 1 << 20
+"""Half a second of samples: a host that is slower loses blocks and does not fall behind more."""
 
 
 class PseudoPort:

@@ -38,35 +38,38 @@ class Errors:
 
 @dataclass(frozen=True)
 class GridScan:
-    """A body that rests at one point after another, row by row, ``dwell_s`` at each.
+    """A body that rests at one point after another, row by row and layer by layer.
 
     Attributes
     ----------
     count : points along x and along y
     span_m : edge of the square that they cover
-    height_m : z of the body's origin
+    heights_m : z of the body's origin in each layer
+    dwell_s : time at each point
     tilt_rad : small seeded turns at each point, so that no two poses are parallel
     """
 
     count: int = 13
     span_m: float = 0.30
-    height_m: float = 0.15
+    heights_m: tuple[float, ...] = (0.15,)
     dwell_s: float = 1.0
     tilt_rad: float = 0.02
 
     @property
     def frames(self) -> int:
         """Number of points."""
-        return self.count**2
+        return self.count**2 * len(self.heights_m)
 
     def __call__(self, time_s: float) -> Pose:
         """Pose at a time."""
         index = int(np.clip(round(time_s / self.dwell_s), 0, self.frames - 1))
-        row, column = divmod(index, self.count)
+        layer, place = divmod(index, self.count**2)
+        row, column = divmod(place, self.count)
         line = np.linspace(-self.span_m / 2, self.span_m / 2, self.count)
         tilt = self.tilt_rad * np.sin(np.array([1.0, 1.7, 2.3]) * (index + 1))
         rotation = Rotation.from_rotvec(tilt).as_matrix()
-        return np.array([line[column], line[row], self.height_m]), np.asarray(rotation)
+        position = np.array([line[column], line[row], self.heights_m[layer]])
+        return position, np.asarray(rotation)
 
 
 def _cloud(sensors: tuple[SensorSpec, ...], flux: NDArray[np.complex128]) -> FluxPoints:
