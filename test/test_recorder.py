@@ -65,6 +65,18 @@ def call(node, name):
     return future.result()
 
 
+def test_the_model_error_is_left_out_unless_wanted(start, source, tmp_path):
+    from std_msgs.msg import String
+
+    for topic in ('field_model', 'field_model_error'):
+        source.create_publisher(String, f'/anser/{topic}', 10)
+    process = begin(start, source, tmp_path)
+    time.sleep(0.8)
+    assert source.count_subscribers('/anser/field_model') == 1
+    assert source.count_subscribers('/anser/field_model_error') == 0
+    assert process.interrupt(signal.SIGTERM) == 0
+
+
 def test_a_bag_is_complete_and_described(start, source, tmp_path):
     process = begin(start, source, tmp_path)
     for _ in range(50):

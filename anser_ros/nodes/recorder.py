@@ -45,6 +45,11 @@ class RecorderParameters:
         0.25, 'most that a crash may cost, s', minimum=0.05, maximum=1.0
     )
     topics: tuple[str, ...] = parameter((), 'topics to record besides those of the contract')
+    without: tuple[str, ...] = parameter(
+        ('field_model_error',),
+        'last names of topics that are left out; the default: 100 kB each time that metal moves, '
+        'which evaluate works out anew from the fluxes',
+    )
 
 
 class Recorder(AnserNode):
@@ -169,11 +174,11 @@ class Recorder(AnserNode):
 
     def _wanted(self, topic: str) -> bool:
         own = self.get_namespace().rstrip('/') + '/'
-        return (
-            topic.startswith((own, *COMMON_PREFIXES))
-            or topic in COMMON_TOPICS
-            or topic in self.parameters.topics
-        )
+        if topic in self.parameters.topics:
+            return True
+        if topic.rsplit('/', 1)[-1] in self.parameters.without:
+            return False
+        return topic.startswith((own, *COMMON_PREFIXES)) or topic in COMMON_TOPICS
 
     def _add(self, topic: str, type_name: str) -> bool:
         """Subscribe to one topic; return whether it is recorded from now on."""
