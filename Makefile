@@ -27,7 +27,7 @@ $(READY_OLDEST): .ci/requirements-oldest.txt .ci/bootstrap setup.py
 	@touch $@
 
 demo: $(READY)
-	@$(ANSER) demo $(if $(DURATION),--duration $(DURATION)) $(ARGS)
+	@$(VENV)/bin/python .ci/foreground $(ANSER) demo $(if $(DURATION),--duration $(DURATION)) $(ARGS)
 
 lint: $(READY)
 	$(VENV)/bin/ruff check .
