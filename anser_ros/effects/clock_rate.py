@@ -1,7 +1,8 @@
 """The optical tracker's clock runs at another rate than the fluxes'."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -26,8 +27,11 @@ class ClockRate(Effect):
 
     name = 'clock_rate'
     summary = "one of the two clocks runs slow, so that the stamps' offset grows"
-    units = {'offset_s': 's', 'rate_ppm': '1e-6'}
-    plausible = {'offset_s': (-0.5, 0.5), 'rate_ppm': (-2e4, 2e4)}
+    units: ClassVar[Mapping[str, str]] = {'offset_s': 's', 'rate_ppm': '1e-6'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+        'offset_s': (-0.5, 0.5),
+        'rate_ppm': (-2e4, 2e4),
+    }
     remedy = Remedy.OPTICAL
 
     def candidates(self, scene: Scene) -> Sequence[Term]:

@@ -1,7 +1,8 @@
 """One emitter's tone leaks into another's."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations, permutations
+from typing import ClassVar
 
 import numpy as np
 
@@ -28,8 +29,13 @@ class CoilCrosstalk(Effect):
 
     name = 'coil_crosstalk'
     summary = "one emitter's tone leaks into another's"
-    units = {'coils': '1', 'eps': '1', 'eps_quadrature': '1', 'mutual': '1'}
-    plausible = {'eps': (-0.5, 0.5)}
+    units: ClassVar[Mapping[str, str]] = {
+        'coils': '1',
+        'eps': '1',
+        'eps_quadrature': '1',
+        'mutual': '1',
+    }
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'eps': (-0.5, 0.5)}
     remedy = Remedy.FLUX
 
     def candidates(self, scene: Scene) -> Sequence[Term]:

@@ -1,6 +1,7 @@
 """An emitter's strength changes with time, as its copper or its driver warms up."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -31,8 +32,11 @@ class CoilDrift(Effect):
 
     name = 'coil_drift'
     summary = "an emitter's strength changes with time"
-    units = {'coil': '1', 'amount': '1', 'tau_s': 's'}
-    plausible = {'amount': (-0.5, 0.5), 'tau_s': (0.5, 1000.0)}
+    units: ClassVar[Mapping[str, str]] = {'coil': '1', 'amount': '1', 'tau_s': 's'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+        'amount': (-0.5, 0.5),
+        'tau_s': (0.5, 1000.0),
+    }
     remedy = Remedy.FLUX
 
     def candidates(self, scene: Scene) -> Sequence[Term]:

@@ -1,6 +1,7 @@
 """An emitter is stronger or weaker than the model has it, all the time."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -23,8 +24,11 @@ class CoilGain(Effect):
 
     name = 'coil_gain'
     summary = "an emitter's strength is not the calibrated one"
-    units = {'coil': '1', 'gain': '1', 'phase_deg': 'deg'}
-    plausible = {'gain': (0.2, 3.0), 'phase_deg': (-60.0, 60.0)}
+    units: ClassVar[Mapping[str, str]] = {'coil': '1', 'gain': '1', 'phase_deg': 'deg'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+        'gain': (0.2, 3.0),
+        'phase_deg': (-60.0, 60.0),
+    }
     remedy = Remedy.FLUX
 
     def candidates(self, scene: Scene) -> Sequence[Term]:

@@ -1,6 +1,7 @@
 """An emitter is not where the model has it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -24,8 +25,8 @@ class CoilMoved(Effect):
 
     name = 'coil_moved'
     summary = 'an emitter is not where the model has it'
-    units = {'coil': '1', 'shift_m': 'm'}
-    plausible = {'shift_m': (-0.03, 0.03)}
+    units: ClassVar[Mapping[str, str]] = {'coil': '1', 'shift_m': 'm'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'shift_m': (-0.03, 0.03)}
     remedy = Remedy.FIELD
 
     def candidates(self, scene: Scene) -> Sequence[Term]:

@@ -1,6 +1,7 @@
 """A metal sheet parallel to the board."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -31,8 +32,17 @@ class ConductivePlate(Effect):
 
     name = 'conductive_plate'
     summary = 'a metal sheet lies parallel to the board'
-    units = {'z_m': 'm', 'edge_m': 'm', 'centre_m': 'm', 'sheet_ohm': 'ohm'}
-    plausible = {'z_m': (-1.0, 1.0), 'edge_m': (0.02, 2.0), 'sheet_ohm': (1e-7, 1.0)}
+    units: ClassVar[Mapping[str, str]] = {
+        'z_m': 'm',
+        'edge_m': 'm',
+        'centre_m': 'm',
+        'sheet_ohm': 'ohm',
+    }
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+        'z_m': (-1.0, 1.0),
+        'edge_m': (0.02, 2.0),
+        'sheet_ohm': (1e-7, 1.0),
+    }
     remedy = Remedy.FIELD
 
     def candidates(self, scene: Scene) -> Sequence[Term]:

@@ -1,5 +1,8 @@
 """Only the noise has grown."""
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 from anser_ros.effects.effect import Array, Effect, Remedy, Term, needed
 from anser_ros.fitting.model import EffectRecord
 
@@ -9,8 +12,8 @@ class ExcessNoise(Effect):
 
     name = 'excess_noise'
     summary = 'the noise is larger than it should be, and nothing else'
-    units = {'factor': '1', 'channels': '1'}
-    plausible = {'factor': (1.0, 1000.0)}
+    units: ClassVar[Mapping[str, str]] = {'factor': '1', 'channels': '1'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'factor': (1.0, 1000.0)}
     remedy = Remedy.NONE
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:

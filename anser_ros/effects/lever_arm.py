@@ -1,6 +1,7 @@
 """The sensors sit elsewhere in the body's frame than the setup says."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -24,8 +25,8 @@ class LeverArm(Effect):
 
     name = 'lever_arm'
     summary = "the sensors sit elsewhere in the body's frame"
-    units = {'offset_m': 'm', 'body': '1'}
-    plausible = {'offset_m': (-0.03, 0.03)}
+    units: ClassVar[Mapping[str, str]] = {'offset_m': 'm', 'body': '1'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'offset_m': (-0.03, 0.03)}
     remedy = Remedy.SENSORS
 
     def candidates(self, scene: Scene) -> Sequence[Term]:

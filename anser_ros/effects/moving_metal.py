@@ -1,5 +1,8 @@
 """A metal object that moves during the session, from one place to another."""
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import numpy as np
 
 from anser_ros.effects.dipoles import Dipoles
@@ -71,7 +74,7 @@ class MovingMetal(Effect):
 
     name = 'moving_metal'
     summary = 'a metal object moves during the session'
-    units = {
+    units: ClassVar[Mapping[str, str]] = {
         'start_m': 'm', 'end_m': 'm', 't_start_s': 's', 't_end_s': 's', 'ease': '1',
         'polarizability': 'm^3 (3x3, [re, im])',
     }  # fmt: skip

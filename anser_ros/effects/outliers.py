@@ -1,5 +1,8 @@
 """Frames that belong to no model."""
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 from anser_ros.effects.effect import Array, Effect, Remedy, Term, needed
 from anser_ros.fitting.model import EffectRecord
 
@@ -9,8 +12,8 @@ class Outliers(Effect):
 
     name = 'outliers'
     summary = 'some frames belong to no model'
-    units = {'fraction': '1', 'channels': '1'}
-    plausible = {'fraction': (0.0, 0.5)}
+    units: ClassVar[Mapping[str, str]] = {'fraction': '1', 'channels': '1'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'fraction': (0.0, 0.5)}
     remedy = Remedy.NONE
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:

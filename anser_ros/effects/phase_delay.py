@@ -1,6 +1,7 @@
 """A common acquisition delay turns all phasors, the faster the higher their frequency."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -25,8 +26,8 @@ class PhaseDelay(Effect):
 
     name = 'phase_delay'
     summary = 'a common acquisition delay turns all phasors'
-    units = {'delay_s': 's'}
-    plausible = {'delay_s': (-5e-5, 5e-5)}
+    units: ClassVar[Mapping[str, str]] = {'delay_s': 's'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'delay_s': (-5e-5, 5e-5)}
     remedy = Remedy.FLUX
 
     def candidates(self, scene: Scene) -> Sequence[Term]:

@@ -1,6 +1,7 @@
 """A constant phasor is added to a channel: cables, or drive that couples into sense."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +28,12 @@ class Pickup(Effect):
 
     name = 'pickup'
     summary = 'a constant phasor is added to a channel'
-    units = {'channel': '1', 'phasor_t': 'T (re, im of every emitter)', 'rms_t': 'T'}
-    plausible = {'rms_t': (0.0, 1e-6)}
+    units: ClassVar[Mapping[str, str]] = {
+        'channel': '1',
+        'phasor_t': 'T (re, im of every emitter)',
+        'rms_t': 'T',
+    }
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'rms_t': (0.0, 1e-6)}
     remedy = Remedy.FLUX
 
     def candidates(self, scene: Scene) -> Sequence[Term]:

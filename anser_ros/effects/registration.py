@@ -1,6 +1,7 @@
 """The optical tracker's frame is not the field generator's."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,8 +26,11 @@ class Registration(Effect):
 
     name = 'registration'
     summary = "the optical frame is not the field generator's"
-    units = {'rotation_deg': 'deg', 'translation_m': 'm'}
-    plausible = {'rotation_deg': (-10.0, 10.0), 'translation_m': (-0.05, 0.05)}
+    units: ClassVar[Mapping[str, str]] = {'rotation_deg': 'deg', 'translation_m': 'm'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+        'rotation_deg': (-10.0, 10.0),
+        'translation_m': (-0.05, 0.05),
+    }
     remedy = Remedy.OPTICAL
 
     def candidates(self, scene: Scene) -> Sequence[Term]:

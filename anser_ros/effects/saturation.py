@@ -5,7 +5,8 @@ v - v^3 / (3 fs^2). The cube takes ``(S / 2 - |V_k|^2 / 4) / fs^2`` of tone k aw
 sum of the squared amplitudes of all tones, of independent phases: the other tones count twice.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,8 +59,12 @@ class Saturation(Effect):
 
     name = 'saturation'
     summary = 'a channel compresses large signals'
-    units = {'channel': '1', 'full_scale_t': 'T', 'shape': 'name of the curve'}
-    plausible = {'full_scale_t': (1e-8, 1e-3)}
+    units: ClassVar[Mapping[str, str]] = {
+        'channel': '1',
+        'full_scale_t': 'T',
+        'shape': 'name of the curve',
+    }
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'full_scale_t': (1e-8, 1e-3)}
     remedy = Remedy.FLUX
 
     def candidates(self, scene: Scene) -> Sequence[Term]:

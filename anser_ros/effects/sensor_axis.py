@@ -1,6 +1,7 @@
 """A sensor's axis, or a whole triaxial cluster's frame, is not the surveyed one."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,8 +28,13 @@ class SensorAxis(Effect):
 
     name = 'sensor_axis'
     summary = "a sensor's axis is not the surveyed one"
-    units = {'channel': '1', 'tilt_deg': 'deg', 'axis': '1', 'rotation_deg': 'deg'}
-    plausible = {'tilt_deg': (0.0, 30.0)}
+    units: ClassVar[Mapping[str, str]] = {
+        'channel': '1',
+        'tilt_deg': 'deg',
+        'axis': '1',
+        'rotation_deg': 'deg',
+    }
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'tilt_deg': (0.0, 30.0)}
     remedy = Remedy.SENSORS
 
     def candidates(self, scene: Scene) -> Sequence[Term]:

@@ -1,6 +1,7 @@
 """One sensor's complex gain is off."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +25,11 @@ class SensorGain(Effect):
 
     name = 'sensor_gain'
     summary = "one sensor's gain is off"
-    units = {'channel': '1', 'gain': '1', 'phase_deg': 'deg'}
-    plausible = {'gain': (0.2, 3.0), 'phase_deg': (-60.0, 60.0)}
+    units: ClassVar[Mapping[str, str]] = {'channel': '1', 'gain': '1', 'phase_deg': 'deg'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+        'gain': (0.2, 3.0),
+        'phase_deg': (-60.0, 60.0),
+    }
     remedy = Remedy.FLUX
 
     def candidates(self, scene: Scene) -> Sequence[Term]:

@@ -1,5 +1,8 @@
 """Sensors that are wired the other way round."""
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,7 +15,7 @@ class SensorPolarity(Effect):
 
     name = 'sensor_polarity'
     summary = 'a sensor is wired the other way round'
-    units = {'channels': '1'}
+    units: ClassVar[Mapping[str, str]] = {'channels': '1'}
     remedy = Remedy.FLUX
 
     def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:

@@ -1,6 +1,7 @@
 """One sensor, or one cluster, sits elsewhere in the body than the others say."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -24,8 +25,8 @@ class SensorPosition(Effect):
 
     name = 'sensor_position'
     summary = 'one sensor of a body sits elsewhere than surveyed'
-    units = {'channels': '1', 'offset_m': 'm'}
-    plausible = {'offset_m': (-0.03, 0.03)}
+    units: ClassVar[Mapping[str, str]] = {'channels': '1', 'offset_m': 'm'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'offset_m': (-0.03, 0.03)}
     remedy = Remedy.SENSORS
 
     def candidates(self, scene: Scene) -> Sequence[Term]:

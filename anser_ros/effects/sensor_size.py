@@ -1,6 +1,7 @@
 """The tool's coils are too long to be points."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -30,8 +31,8 @@ class SensorSize(Effect):
 
     name = 'sensor_size'
     summary = 'the coils are too long to be points'
-    units = {'length_m': 'm', 'channels': '1'}
-    plausible = {'length_m': (0.0, 0.08)}
+    units: ClassVar[Mapping[str, str]] = {'length_m': 'm', 'channels': '1'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'length_m': (0.0, 0.08)}
     remedy = Remedy.SENSORS
 
     def candidates(self, scene: Scene) -> Sequence[Term]:

@@ -1,7 +1,8 @@
 """A metal object near the volume, at rest."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
+from typing import ClassVar
 
 import numpy as np
 
@@ -59,8 +60,11 @@ class StaticMetal(Effect):
 
     name = 'static_metal'
     summary = 'a metal object stands near the volume'
-    units = {'position_m': 'm', 'polarizability': 'm^3 (3x3, [re, im])'}
-    plausible = {'position_m': (-1.0, 1.0)}
+    units: ClassVar[Mapping[str, str]] = {
+        'position_m': 'm',
+        'polarizability': 'm^3 (3x3, [re, im])',
+    }
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'position_m': (-1.0, 1.0)}
     remedy = Remedy.FIELD
 
     def candidates(self, scene: Scene) -> Sequence[Term]:
