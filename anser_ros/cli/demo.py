@@ -87,7 +87,7 @@ def _run_in(folder: Path, args: argparse.Namespace, stopped: list[int]) -> int:
     try:
         with Supervisor(folder / 'logs') as supervisor:
             ended = compile_kernels(
-                supervisor, lambda text: print(text, file=sys.stderr), lambda: bool(stopped)
+                supervisor, lambda text: _say(text, args), lambda: bool(stopped)
             )
             if ended is not None:
                 print(f'anser demo: no kernels\n{tail(ended)}', file=sys.stderr)
@@ -111,6 +111,11 @@ def _run_in(folder: Path, args: argparse.Namespace, stopped: list[int]) -> int:
         print(f'anser demo: {failed}\nlogs: {folder / "logs"}', file=sys.stderr)
         return 1
     return _report(folder, data, args, interrupted=bool(stopped))
+
+
+def _say(text: str, args: argparse.Namespace) -> None:
+    if not args.json:
+        print(text, flush=True)
 
 
 def _report(folder: Path, data: Path, args: argparse.Namespace, *, interrupted: bool) -> int:

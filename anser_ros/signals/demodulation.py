@@ -191,7 +191,8 @@ def _kept_harmonics(
 
 def _times_s(sample_rate_hz: float, window_samples: int) -> NDArray[np.float64]:
     """Times of a window's samples from its middle."""
-    return (np.arange(window_samples) - (window_samples - 1) / 2) / sample_rate_hz
+    times = (np.arange(window_samples) - (window_samples - 1) / 2) / sample_rate_hz
+    return np.asarray(times, float)
 
 
 def _design_matrix(
