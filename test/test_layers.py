@@ -20,7 +20,7 @@ ALLOWED = {
     'effects': {'fitting', 'physics'},
     'tracking': {'effects', 'fitting', 'physics'},
     'diagnosis': {'effects', 'fitting', 'physics'},
-    'sessions': {'wire', 'tracking', 'fitting', 'effects', 'physics'},
+    'sessions': {'wire', 'diagnosis', 'tracking', 'fitting', 'effects', 'physics'},
     'simulation': {'sessions', 'effects', 'fitting', 'physics', 'signals', 'wire'},
     'measured': CORE,
     'experiments': {*CORE, 'simulation'},
