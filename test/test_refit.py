@@ -84,7 +84,7 @@ def test_metal_is_seen_at_once_and_its_field_is_taken_off(refit):
     assert result.log_odds > 10
     before, after, _, _ = errors(world, result.model, HEAD)
     assert before > 1e-9
-    assert after < 0.02 * before
+    assert after < 0.03 * before
     centre = HEAD.mean(axis=0)
     assert np.linalg.norm(result.metal.centroid - centre) < 0.06
     assert result.metal.polarisability.shape == (len(result.metal.positions),)
@@ -172,7 +172,7 @@ def test_a_reference_that_fails_is_named_and_left_out(refit, fault, metal):
     assert result.references[5].state == 'disagrees'
     if metal:
         before, after, _, _ = errors(world, result.model, HEAD)
-        assert after < 0.02 * before
+        assert after < 0.03 * before
     else:
         assert result.model is world.model
 
@@ -186,7 +186,7 @@ def test_two_that_fail_together_do_not_hide_each_other(refit):
     result = run(refit, world, world.metal(HEAD), frames=1, fault=swap)
     assert result.left_out == ('ref/3', 'ref/11')
     before, after, _, _ = errors(world, result.model, HEAD)
-    assert after < 0.02 * before
+    assert after < 0.03 * before
 
 
 def test_one_that_works_again_comes_back_after_a_while(refit):
@@ -217,7 +217,7 @@ def test_what_can_not_be_read_is_left_out_with_its_reason(refit, reason):
     assert result.references[2].state == reason
     assert np.isnan(result.references[2].residual_t)
     before, after, _, _ = errors(world, result.model, HEAD)
-    assert after < 0.02 * before
+    assert after < 0.03 * before
 
 
 def test_too_few_references_mean_the_calibrated_model_and_say_so(refit):
@@ -260,7 +260,7 @@ def test_a_reference_without_a_baseline_takes_no_part():
     result = run(refit, world, world.metal(HEAD))
     assert result.references[7].state == 'no baseline'
     before, after, _, _ = errors(world, result.model, HEAD)
-    assert after < 0.02 * before
+    assert after < 0.03 * before
 
 
 def test_the_order_of_channels_does_not_matter_and_strange_ones_are_passed_over(refit):
@@ -298,7 +298,7 @@ def test_phases_of_the_emitters_are_turned_back():
     places, axes = volume_points()
     truth = world.metal(HEAD, replace_geometry(world.references, places, axes)) * turn
     made = result.model.flux(places, axes) - model.flux(places, axes)
-    assert rms(truth - made) < 0.02 * rms(truth)
+    assert rms(truth - made) < 0.03 * rms(truth)
 
 
 def test_a_drawing_of_another_board_is_not_believed():

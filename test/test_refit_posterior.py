@@ -15,7 +15,7 @@ from anser_ros.fitting.refit_layer import bottom_layer, box_layer
 from anser_ros.fitting.refit_modes import error_modes
 from anser_ros.fitting.refit_patches import PoseError, clean_reading, has_moved
 from anser_ros.fitting.refit_posterior import STRENGTHS, Bank
-from anser_ros.fitting.refit_prior import build_prior
+from anser_ros.fitting.refit_prior import ORIENTED, UPRIGHT, Response, build_prior
 from anser_ros.fitting.refit_references import SurveyError, survey_variants, vector_basis
 
 K = 8
@@ -37,10 +37,10 @@ def parts(world):
     rng = np.random.default_rng(1)
     priors = [
         build_prior(
-            cloud, layer, references, excitation.field(cloud.positions),
+            cloud, response, layer, references, excitation.field(cloud.positions),
             np.array(world.model.frequencies_hz), SurveyError(), rng,
         )
-        for cloud in clouds
+        for cloud, response in zip(clouds, (UPRIGHT, ORIENTED), strict=True)
     ]  # fmt: skip
     return excitation, region, layer, references, priors
 
@@ -283,3 +283,38 @@ def test_readings_are_averaged_until_they_change():
     assert average.update(gone, 1e-10)[1] == 1
     average.forget()
     assert average.update(frame(2e-6), 1e-10)[1] == 1
+
+
+@pytest.mark.parametrize(
+    'response', [Response(), UPRIGHT, ORIENTED, Response('all', 0.7, 2.0, 0.6)]
+)
+def test_priors_are_the_covariance_of_their_own_draws(world, parts, response):
+    excitation, region, layer, references, _ = parts
+    cloud = below(region, 0.16)
+    tones = np.array(world.model.frequencies_hz)
+    arguments = (cloud, response, layer, references, excitation.field(cloud.positions), tones)
+    seeds = range(60)
+    priors = [
+        build_prior(*arguments, SurveyError(), np.random.default_rng(seed)) for seed in seeds
+    ]
+    draws = np.concatenate([prior.draw_readings for prior in priors], axis=1)
+    moments = np.concatenate([prior.draw_moments for prior in priors], axis=1)
+    count = draws.shape[1]
+    sampled = draws @ draws.T / count
+    exact = priors[0].covariance
+    assert np.abs(sampled - exact).max() < 6.0 * np.diag(exact).max() / np.sqrt(count)
+    assert np.trace(exact) == pytest.approx(len(exact))
+    across = moments @ draws.T / count
+    scale = np.sqrt((moments**2).mean(axis=1)[:, None] * np.diag(exact)[None, :])
+    assert np.abs((across - priors[0].transfer) / scale).max() < 6.0 / np.sqrt(count)
+    np.testing.assert_allclose(exact, exact.T, atol=1e-12)
+    assert np.linalg.eigvalsh(exact).min() > -1e-10
+
+
+def test_sources_are_the_posterior_mean_of_a_third_of_the_trace(bank, parts, readings):
+    seen = bank.evaluate(readings, NOISE)
+    found = bank.sources(seen, 1)
+    prior = parts[4][0]
+    assert found.shape == (len(prior.cloud.positions), 2)
+    weights = bank.bases[1] @ bank.coefficients(seen, 1)
+    np.testing.assert_allclose(found, prior.coupling.T @ weights)

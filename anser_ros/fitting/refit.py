@@ -99,7 +99,7 @@ class LiveRefit:
             self._drift[emitter::k, emitter] = np.nan_to_num(turned[:, emitter].real) * scale
         self._banks: dict[bytes, Bank] = {}
         self._order = FrameOrder(references.channel, self.baseline)
-        self._names = ('nothing', *(prior.cloud.name for prior in self._scene.priors))
+        self._names = ('nothing', *(prior.name for prior in self._scene.priors))
         self._assembly = Assembly(model, self._scene.layers)
 
     @property

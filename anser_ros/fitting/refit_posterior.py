@@ -192,9 +192,7 @@ class Bank:
     def sources(self, seen: Evaluation, hypothesis: int) -> Array:
         """Posterior mean polarisability (M, 2) of a cloud's sources, in noise units."""
         weights = self.bases[hypothesis] @ self.coefficients(seen, hypothesis)
-        prior = self.priors[hypothesis - 1]
-        root = np.sqrt(prior.cloud.volumes)[:, None]
-        return np.asarray(root * (prior.coupling[self.rows].T @ weights) / prior.scale)
+        return np.asarray(self.priors[hypothesis - 1].coupling[self.rows].T @ weights)
 
     def left_out(self, seen: Evaluation, hypothesis: int) -> tuple[Array, Array]:
         """How far each coil's readings are from what all others predict.

@@ -52,7 +52,7 @@ class RefitSettings:
 
     flux_noise_t: float = 60e-12
     survey: SurveyError = field(default_factory=SurveyError)
-    drift: float = 0.001
+    drift: float = 0.003
     min_references: int = 4
     average_frames: int = 5
     persistence: float = 0.98

@@ -9,9 +9,20 @@ from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.refit_clouds import Cloud, Region, default_clouds
 from anser_ros.fitting.refit_excitation import Excitation, FieldFunction, excitation_for
 from anser_ros.fitting.refit_layer import Layer, bottom_layer, box_layer
-from anser_ros.fitting.refit_prior import CloudPrior, build_prior
+from anser_ros.fitting.refit_prior import (
+    ORIENTED,
+    UPRIGHT,
+    CloudPrior,
+    Response,
+    build_prior,
+)
 from anser_ros.fitting.refit_result import RefitSettings
 from anser_ros.physics.sensor import SensorTable
+
+Hypothesis = tuple[Cloud, Response, Layer]
+
+MOST_ORIENTED = 1000
+"""A cloud of more sources than this gets no tensors: they cost most where they matter least."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +35,7 @@ class Scene:
     region : Region
     layers : tuple of Layer
         Below the board, and around the volume.
+    hypotheses : tuple of (Cloud, Response, Layer)
     priors : tuple of CloudPrior
     frequencies_hz : tuple of float
     """
@@ -31,13 +43,15 @@ class Scene:
     excitation: Excitation
     region: Region
     layers: tuple[Layer, ...]
+    hypotheses: tuple[Hypothesis, ...]
     priors: tuple[CloudPrior, ...]
     frequencies_hz: tuple[float, ...]
 
     def moved(self, references: SensorTable, settings: RefitSettings) -> 'Scene':
         """The scene for references that are elsewhere."""
-        pairs = [(prior.cloud, prior.layer) for prior in self.priors]
-        priors = _priors(pairs, references, self.excitation, self.frequencies_hz, settings)
+        priors = _priors(
+            self.hypotheses, references, self.excitation, self.frequencies_hz, settings
+        )
         return replace(self, priors=priors)
 
 
@@ -52,13 +66,25 @@ def build_scene(
     clouds = default_clouds(region)
     bottom = bottom_layer(model, region, excitation, clouds[0].positions)
     box = box_layer(region, excitation)
-    pairs = [(cloud, box if cloud.overhead else bottom) for cloud in clouds]
-    priors = _priors(pairs, references, excitation, model.frequencies_hz, settings)
-    return Scene(excitation, region, (bottom, box), priors, model.frequencies_hz)
+    hypotheses = _hypotheses(clouds, bottom, box)
+    priors = _priors(hypotheses, references, excitation, model.frequencies_hz, settings)
+    return Scene(excitation, region, (bottom, box), hypotheses, priors, model.frequencies_hz)
+
+
+def _hypotheses(clouds: Sequence[Cloud], bottom: Layer, box: Layer) -> tuple[Hypothesis, ...]:
+    """Every cloud with the responses that are worth their time."""
+    out: list[Hypothesis] = []
+    for cloud in clouds:
+        layer = box if cloud.overhead else bottom
+        plain = Response() if cloud.overhead else UPRIGHT
+        out.append((cloud, plain, layer))
+        if len(cloud.positions) <= MOST_ORIENTED:
+            out.append((cloud, ORIENTED, layer))
+    return tuple(out)
 
 
 def _priors(
-    pairs: Sequence[tuple[Cloud, Layer]],
+    hypotheses: Sequence[Hypothesis],
     references: SensorTable,
     excitation: Excitation,
     frequencies_hz: tuple[float, ...],
@@ -68,6 +94,7 @@ def _priors(
     return tuple(
         build_prior(
             cloud,
+            response,
             layer,
             references,
             excitation.field(cloud.positions),
@@ -75,5 +102,5 @@ def _priors(
             settings.survey,
             rng,
         )
-        for cloud, layer in pairs
+        for cloud, response, layer in hypotheses
     )
