@@ -92,13 +92,20 @@ class PoseTopic:
             pose.position.x, pose.position.y, pose.position.z = px, py, pz
             turn = pose.orientation
             turn.x, turn.y, turn.z, turn.w = x, y, z, w
-        self._full.pose.covariance = estimate.covariance.ravel()
         self._pose.publish(self._plain)
-        self._uncertain.publish(self._full)
         header, move = self.transform.header, self.transform.transform
         header.stamp.sec, header.stamp.nanosec = sec, nanosec
         move.translation.x, move.translation.y, move.translation.z = px, py, pz
         move.rotation.x, move.rotation.y, move.rotation.z, move.rotation.w = x, y, z, w
+
+    def publish_covariance(self) -> None:
+        """Publish the good pose just taken once more, with its covariance.
+
+        A step of its own, so that no sensor's plain pose waits for another's covariance.
+        """
+        if self.estimate is not None and self.estimate.state == OK:
+            self._full.pose.covariance = self.estimate.covariance.ravel()
+            self._uncertain.publish(self._full)
 
     def status(self, stale_after_s: float) -> Status:
         """Return the line of ``/diagnostics`` and begin a new interval."""

@@ -257,6 +257,8 @@ class TrackerNode(AnserNode):
         changed = False
         for estimate in estimates:
             changed |= self._topics[estimate.name].take(estimate, now_ns)
+        for estimate in estimates:
+            self._topics[estimate.name].publish_covariance()
         if self._transforms is not None:
             moved = [self._topics[e.name] for e in estimates if e.state == OK]
             if moved:
