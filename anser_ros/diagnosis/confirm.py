@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.fit import Fit
+from anser_ros.diagnosis.fit import Fit, misfit
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.diagnosis.refine import belongs_to
-from anser_ros.diagnosis.search import misfit
 from anser_ros.effects.effect import Term
+from anser_ros.effects.metal_remainder import REMAINDER
 
 Array = NDArray[np.float64]
 
@@ -61,6 +61,17 @@ def confirm(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmatio
     return Confirmation(
         power, varying / max(power, 1e-300), power / max(left_tools, 1e-3 * fit.state.count)
     )
+
+
+def doubtful(problem: Problem, fit: Fit, noise: float) -> list[tuple[Confirmation, Term]]:
+    """The effects of a fit that are not confirmed, the one with the least power first."""
+    checks = [
+        (confirm(problem, fit, term, noise), term)
+        for term in fit.terms
+        if term.effect is not REMAINDER and term.theta.size
+    ]
+    bad = [(check, term) for check, term in checks if not check.holds]
+    return sorted(bad, key=lambda pair: pair[0].power)
 
 
 def _extra(normal: Array, right: Array, noise: float) -> float:

@@ -1,26 +1,29 @@
 """The whole loop: residual, effect, correction, and the error before and after on unseen data."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.confirm import Confirmation, confirm
+from anser_ros.diagnosis.confirm import Confirmation, doubtful
 from anser_ros.diagnosis.corrected_model import corrected_model
-from anser_ros.diagnosis.fit import Fit
+from anser_ros.diagnosis.fit import Fit, misfit
 from anser_ros.diagnosis.outlying import clean_start, outlying_share, without_outliers
 from anser_ros.diagnosis.prepare import test_blocks, train_blocks
 from anser_ros.diagnosis.problem import Part, Problem, State, evaluate
-from anser_ros.diagnosis.refine import belongs_to, settled
+from anser_ros.diagnosis.refine import FINE, METALS, belongs_to, settled
 from anser_ros.diagnosis.search import (
     Progress,
     Search,
     SearchSettings,
-    misfit,
     search_effects,
 )
-from anser_ros.diagnosis.structure import StructureTest, noise_scale, structure_tests
+from anser_ros.diagnosis.structure import (
+    StructureTest,
+    noise_scale,
+    noise_t,
+    structure_tests,
+)
 from anser_ros.effects.effect import Effect, Term
 from anser_ros.effects.metal_remainder import REMAINDER
 from anser_ros.effects.registry import all_effects
@@ -128,7 +131,7 @@ def diagnose(
     cleaned = without_outliers(whole, evaluate(whole, fit.terms))
     if outlying_share(problem, cleaned)[0] > FEWEST_OUTLIERS:
         thinned = _thinned(cleaned.in_blocks(blocks), FINAL_FRAMES)
-        fit = settled(thinned, fit.terms, blocks, how.folds, how.iterations)
+        fit = settled(thinned, fit.terms, blocks, how.folds, how.iterations, FINE)
     return _concluded(whole, cleaned, fit, search, refused, model)
 
 
@@ -167,22 +170,19 @@ def _confirmed(
     problem: Problem, search: Search, blocks: NDArray[np.int64], how: SearchSettings
 ) -> tuple[Fit, tuple[tuple[Term, Confirmation], ...]]:
     """The joint fit of the effects that are the same in all parts of the data."""
-    terms: Sequence[Term] = search.fit.terms
-    refused: list[tuple[Term, Confirmation]] = []
+    fit, refused = search.fit, []
     while True:
-        fit = settled(problem, terms, blocks, how.folds, how.iterations)
-        noise = noise_scale(fit.state) ** 2
-        checks = [
-            (confirm(problem, fit, term, noise), term)
-            for term in fit.terms
-            if term.effect is not REMAINDER and term.theta.size
-        ]
-        doubtful = [(check, term) for check, term in checks if not check.holds]
-        if not doubtful:
-            return fit, tuple(refused)
-        worst, term = min(doubtful, key=lambda pair: pair[0].power)
-        refused.append((term, worst))
-        terms = [t for t in fit.terms if t is not term and not belongs_to(t, term)]
+        bad = doubtful(fit.state.problem, fit, noise_scale(fit.state) ** 2)
+        if not bad:
+            break
+        # Metal that is doubtful costs much to fit again and is hardly ever more than a stand-in.
+        metal = [pair for pair in bad if pair[1].effect.name in METALS]
+        dropped = metal or bad[:1]
+        refused += [(term, check) for check, term in dropped]
+        gone = [term for _, term in dropped]
+        rest = [t for t in fit.terms if not any(t is term or belongs_to(t, term) for term in gone)]
+        fit = settled(fit.state.problem, rest, blocks, how.folds, how.iterations)
+    return settled(problem, fit.terms, blocks, how.folds, how.iterations, FINE), tuple(refused)
 
 
 def _tools(state: State) -> list[Part]:
@@ -228,7 +228,7 @@ def _concluded(
         for i, term in enumerate(fit.terms)
         if term.effect is not REMAINDER
     ]
-    findings += _noise_findings(whole, cleaned, after, scale, significant)
+    findings += _noise_findings(whole, cleaned, after, significant)
     records = [finding.record for finding in findings]
     depends = tuple(t.variable for t in tests if t.significant) if excess > 0.05 * floor**2 else ()
     return Diagnosis(
@@ -275,7 +275,7 @@ def _finding(fit: Fit, index: int, term: Term, unseen: Problem, search: Search) 
 
 
 def _noise_findings(
-    whole: Problem, cleaned: Problem, after: State, scale: float, significant: bool
+    whole: Problem, cleaned: Problem, after: State, significant: bool
 ) -> list[Finding]:
     found = []
     site: dict[str, object]
@@ -287,10 +287,13 @@ def _noise_findings(
         if channels:
             site['channels'] = tuple(channels)
         found.append(_plain(effects['outliers'], site, rms(after)))
-    if scale > NOISIER and not significant:
-        sigma = scale / np.sqrt(2 * max(after.count, 1))
+    factor = noise_t(after) / whole.spread.noise_t
+    if factor > NOISIER and not significant:
         noisy = _noisy_channels(after)
-        site = {'factor': scale, 'sigma': float(sigma)}
+        if noisy:
+            factor = _factor_of(after, noisy)
+        count = after.count * (len(noisy) or 1) / (len(whole.scene.tool_channels) if noisy else 1)
+        site = {'factor': factor, 'sigma': factor / np.sqrt(2 * max(count, 1))}
         if noisy:
             site['channels'] = noisy
         found.append(_plain(effects['excess_noise'], site, rms(after)))
@@ -301,6 +304,20 @@ def _plain(effect: Effect, site: dict[str, object], without: float) -> Finding:
     record = effect.record(Term(effect, site), np.zeros((0, 0)))
     evidence = {'summary': effect.summary, 'remedy': effect.remedy.value}
     return Finding(replace(record, evidence=evidence), None, without)
+
+
+def _factor_of(state: State, channels: tuple[int, ...]) -> float:
+    """Noise of some channels over what it should be."""
+    squares, count = 0.0, 0
+    for part in _tools(state):
+        own = np.isin(part.view.sensors.channel, channels)
+        size = (part.white * (part.whitener.weight > 0)).reshape(
+            -1, 2, own.size, state.problem.fields.omega.size
+        )[:, :, own]
+        squares += float(np.sum(size**2))
+        count += size.size
+    spread = state.problem.spread
+    return float(np.sqrt(squares / max(count, 1))) * spread.flux_t / spread.noise_t
 
 
 def _noisy_channels(state: State) -> tuple[int, ...]:

@@ -25,7 +25,7 @@ class Fit:
     ----------
     state : State
     covariance : ndarray, shape (q, q)
-        Of all terms' parameters, in their order; scaled by the misfit where that is above one.
+        Of all terms' parameters, in their order.
     sums : BlockSums
         Normal equations at the optimum.
     prior : ndarray, shape (q,)
@@ -88,9 +88,28 @@ def fit_terms(
         sums, prior = _sums(state, block_numbers)
         if settled:
             break
-    covariance = sums.solve(prior)[1] if prior.size else np.zeros((0, 0))
-    misfit = state.sum_of_squares / max(state.count, 1)
-    return Fit(state, covariance * max(misfit, 1.0), sums, prior)
+    covariance = _covariance(state, sums, prior) if prior.size else np.zeros((0, 0))
+    return Fit(state, covariance, sums, prior)
+
+
+def _covariance(state: State, sums: BlockSums, prior: Array) -> Array:
+    """Covariance of all parameters, honest about errors that are alike within a block of time.
+
+    The formal one is scaled by the misfit; where the blocks' scores scatter more than it says
+    (White's sandwich with blocks as clusters), a parameter's variance is raised to that.
+    """
+    formal = sums.solve(prior)[1]
+    blocks = max(sums.squares.size, 2)
+    scores = sums.right @ formal
+    robust = np.sum(scores**2, axis=0) * blocks / (blocks - 1)
+    variance = np.diag(formal) * max(state.sum_of_squares / max(state.count, 1), 1.0)
+    scale = np.sqrt(np.maximum(variance, robust) / np.maximum(np.diag(formal), 1e-300))
+    return np.asarray(formal * scale[:, None] * scale[None, :])
+
+
+def misfit(fit: Fit) -> float:
+    """Mean square of the whitened residuals; one where only noise is left."""
+    return fit.state.sum_of_squares / max(fit.state.count, 1)
 
 
 def stepped(terms: Sequence[Term], step: Array) -> list[Term]:

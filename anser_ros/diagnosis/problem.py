@@ -17,6 +17,8 @@ Mask = NDArray[np.bool_]
 
 SURVEY_ERROR = 0.01
 """Relative error of a change that a surveyed reference sensor sees (0.2 mm, 0.3 deg, 0.4 %)."""
+GRADIENT_ERROR = 0.07
+"""The same of what an emitter's shift changes close to it, where its field is known less well."""
 
 
 @dataclass(frozen=True)
@@ -170,11 +172,18 @@ def _reference_part(problem: Problem, references: References, terms: Sequence[Te
     exact = [term for term in terms if not _on_field(term)]
     unchanged = reference_view(readings, references.baseline, exact, problem.fields)
     change = np.where(good[..., None], readings.flux - unchanged.flux, 0.0)
-    size = np.sqrt(np.mean(np.abs(change) ** 2, axis=2) / 2)
+    size = np.sqrt(np.mean(np.abs(change) ** 2, axis=2, keepdims=True) / 2)
     noise = problem.spread.flux_t / np.sqrt(np.maximum(references.count, 1))
-    survey = SURVEY_ERROR * size * np.sqrt(readings.time.size)
-    weight = np.where(good, 1 / np.sqrt(noise**2 + survey**2), 0.0)
-    whitener = Whitener(_repeat(weight, view.omega.size))
+    together = np.sqrt(readings.time.size)
+    survey = SURVEY_ERROR * size * together
+    shifted = [term for term in terms if term.effect.name == 'coil_moved']
+    gradient = np.zeros_like(view.flux.real)
+    for term in shifted:
+        alone = reference_view(readings, references.baseline, [term], problem.fields)
+        gradient += GRADIENT_ERROR * np.abs(alone.flux - references.baseline) * together
+    spread = np.sqrt(noise[..., None] ** 2 + survey**2 + gradient**2)
+    weight = np.where(good[..., None], 1 / spread, 0.0).reshape(good.shape[0], -1)
+    whitener = Whitener(np.concatenate([weight, weight], axis=1))
     return Part(view, residual, whitener, whitener(residual), problem.reference_blocks)
 
 

@@ -1,7 +1,7 @@
 """Refines a metal effect: the modes of a cloud of scatterers about it that the data can tell."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +18,26 @@ from anser_ros.effects.static_metal import BALL
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+
+@dataclass(frozen=True)
+class MovingBody:
+    """How richly metal that moves is shaped: points a side and upwards, their spacing (m), modes,
+    prior size of their amplitudes (1e-4 m^3), and how often the modes are chosen anew."""
+
+    side: int
+    height: int
+    spacing: float
+    modes: int
+    size: float
+    rounds: int
+
+
+COARSE, FINE = MovingBody(5, 3, 0.04, 60, 0.2, 2), MovingBody(7, 3, 0.03, 110, 0.1, 2)
 AT_REST = ('static_metal', 'conductive_plate')
 METALS = (*AT_REST, 'moving_metal')
 REFINEMENTS = 3
 """Iterations with a remainder, which is linear."""
-MOVING_SPACING, MOVING_MODES, MOVING_SIZE, SHAPINGS = 0.04, 80, 0.2, 3
+
 SPACING = 0.03
 CLEARANCE = 0.025
 """Scatterers keep this distance (m) from every sensor."""
@@ -37,7 +52,12 @@ def belongs_to(remainder: Term, term: Term) -> bool:
 
 
 def settled(
-    problem: Problem, terms: Sequence[Term], blocks: NDArray[np.int64], folds: int, iterations: int
+    problem: Problem,
+    terms: Sequence[Term],
+    blocks: NDArray[np.int64],
+    folds: int,
+    iterations: int,
+    body: MovingBody = COARSE,
 ) -> Fit:
     """The joint fit of all effects, metal with a remainder each.
 
@@ -48,7 +68,7 @@ def settled(
     fit = fit_terms(problem, plain, blocks, iterations)
     for index, term in enumerate(fit.terms):
         if term.effect.name == 'moving_metal':
-            fit = _shaped(fit, index, problem, blocks, iterations)
+            fit = _shaped(fit, index, problem, blocks, iterations, body)
     if not any(term.effect.name in AT_REST for term in fit.terms):
         return fit
     held = [
@@ -85,31 +105,32 @@ def _place_covariance(fit: Fit, index: int) -> Array:
 
 
 def _shaped(
-    fit: Fit, index: int, problem: Problem, blocks: NDArray[np.int64], iterations: int
+    fit: Fit,
+    index: int,
+    problem: Problem,
+    blocks: NDArray[np.int64],
+    iterations: int,
+    body: MovingBody,
 ) -> Fit:
     """The fit with a richer body for metal that moves."""
     effect = fit.terms[index].effect
-    if not isinstance(effect, MovingMetal) or '_rich' in fit.terms[index].site:
+    if not isinstance(effect, MovingMetal) or fit.terms[index].site.get('_body') == body:
         return fit
-    lateral, upright = (np.arange(5) - 2) * MOVING_SPACING, (np.arange(3) - 1) * MOVING_SPACING
+    lateral = (np.arange(body.side) - (body.side - 1) / 2) * body.spacing
+    upright = (np.arange(body.height) - (body.height - 1) / 2) * body.spacing
     offsets = np.array([(a, b, c) for a in lateral for b in lateral for c in upright])
-    for _ in range(SHAPINGS):
+    for _ in range(body.rounds):
         term = fit.terms[index]
         single = effect.with_body(term, offsets, np.eye(3 * len(offsets)), 1.0)
         modes, _ = _modes(fit.state, single, blocks, effect.unit)
-        rich = effect.with_body(term, offsets, modes[:, :MOVING_MODES], MOVING_SIZE)
+        rich = effect.with_body(term, offsets, modes[:, : body.modes], body.size)
+        rich = replace(rich, site={**rich.site, '_body': body})
         held = rich.frozen(np.zeros((0, 0)))
         start = fit_terms(problem, _with(fit.terms, index, held), blocks, 1)
-        free = start.terms[index].free()
-        fit = fit_terms(problem, _with(start.terms, index, free), blocks, iterations)
-    term = fit.terms[index]
-    return replace(
-        fit,
-        state=replace(
-            fit.state,
-            terms=_with(fit.terms, index, replace(term, site={**term.site, '_rich': True})),
-        ),
-    )
+        fit = fit_terms(
+            problem, _with(start.terms, index, start.terms[index].free()), blocks, iterations
+        )
+    return fit
 
 
 def _with(terms: Sequence[Term], index: int, term: Term) -> tuple[Term, ...]:

@@ -11,10 +11,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.fit import Fit, fit_terms
+from anser_ros.diagnosis.confirm import doubtful
+from anser_ros.diagnosis.fit import Fit, fit_terms, misfit
 from anser_ros.diagnosis.problem import Problem
 from anser_ros.diagnosis.refine import METALS, settled
 from anser_ros.diagnosis.scoring import BlockSums, Score, Scorer
+from anser_ros.diagnosis.structure import noise_scale
 from anser_ros.effects.effect import Effect, Term
 from anser_ros.effects.metal_remainder import REMAINDER
 from anser_ros.effects.moving_metal import MovingMetal
@@ -27,6 +29,12 @@ PROMISING = 0.5
 """A candidate whose probe promises less than this share of the best fitted gain is not fitted."""
 REMNANT = 0.01
 """Further metal with less than this share of the first metal's gain is what its model left."""
+MOST_DOUBTFUL = 2
+"""With so many effects in force that are not the same in all parts of the data, something else is
+the cause, and further effects would only stand in for it."""
+PLAIN_TO_SEE = 5.0
+"""An effect whose parameters stand so many times above what it must gain is not tried without."""
+MOST_METALS = 2
 APART = 0.12
 """Distance (m) from metal in force within which further metal is the same body's."""
 
@@ -124,12 +132,10 @@ def search_effects(
         newest = [t for t in found.terms if t.effect is not REMAINDER][-1]
         say(f'{newest.label}: misfit {misfit(found):.4g}')
         _thin_out(problem, blocks, search, how)
+        noise = noise_scale(search.fit.state) ** 2
+        if len(doubtful(problem, search.fit, noise)) >= MOST_DOUBTFUL:
+            break
     return search
-
-
-def misfit(fit: Fit) -> float:
-    """Mean square of the whitened residuals; one where only noise is left."""
-    return fit.state.sum_of_squares / max(fit.state.count, 1)
 
 
 def worth(gain: float, parameters: int, fit: Fit, how: SearchSettings) -> bool:
@@ -197,7 +203,8 @@ def choose(fitted: Sequence[tuple[float, Fit]], how: SearchSettings) -> tuple[fl
 def _scored(problem: Problem, scorer: Scorer) -> list[tuple[Term, Score]]:
     """All candidates that are not in force already, best first."""
     taken, ours = scorer.state.terms, problem.scene.tool_channels
-    metal = any(term.effect.name in METALS for term in taken)
+    metals = sum(term.effect.name in METALS for term in taken)
+    metal, moving = metals > 0, any(term.effect.name == 'moving_metal' for term in taken)
     out = []
     for effect in all_effects().values():
         for term in effect.candidates(problem.scene):
@@ -205,6 +212,8 @@ def _scored(problem: Problem, scorer: Scorer) -> list[tuple[Term, Score]]:
                 continue
             if metal and term.site.get('channel', ours[0]) not in ours:
                 # Beside metal a reference's survey error looks like a fault of its channel.
+                continue
+            if effect.name in METALS and (moving or metals >= MOST_METALS):
                 continue
             score = scorer.score(term)
             if score is not None:
@@ -285,6 +294,19 @@ def _gain(sums: BlockSums, rows: NDArray[np.int64]) -> float:
     return float(part.right.sum(axis=0) @ estimate)
 
 
+def _wald(fit: Fit, index: int) -> float:
+    """What the sum of squares would grow by without a term, the others refitted; linear."""
+    sizes = np.cumsum([0] + [t.theta.size for t in fit.terms])
+    rows = slice(sizes[index], sizes[index + 1])
+    term = fit.terms[index]
+    covariance = fit.sums.solve(fit.prior)[1][rows, rows]
+    use = np.flatnonzero(term.effect.prior(term) > 1e-9)
+    # What tells how much of an effect there is; the place of nothing says nothing.
+    use = np.intersect1d(use, term.effect.amounts(term))
+    theta, part = term.theta[use], covariance[np.ix_(use, use)]
+    return float(theta @ np.linalg.pinv(part, rcond=1e-10, hermitian=True) @ theta)
+
+
 def _thin_out(
     problem: Problem, blocks: NDArray[np.int64], search: Search, how: SearchSettings
 ) -> None:
@@ -293,8 +315,10 @@ def _thin_out(
         terms = search.fit.terms
         full = search.fit.held_out(how.folds)
         newest = [t for t in terms if t.effect is not REMAINDER][-1]
-        for term in terms:
+        for index, term in enumerate(terms):
             if term is newest or term.effect is REMAINDER or term.theta.size == 0:
+                continue
+            if worth(_wald(search.fit, index) / PLAIN_TO_SEE, term.theta.size, search.fit, how):
                 continue
             rest = [t for t in terms if t is not term]
             without = settled(problem, rest, blocks, how.folds, how.iterations)

@@ -45,7 +45,7 @@ def structure_tests(state: State) -> list[StructureTest]:
     each phasor part of each sensor in each bin is compared with zero. For channel, emitter and
     frequency the spread over the groups is compared with the spread of all.
     """
-    tools = [part for part in state.parts if not part.view.is_reference]
+    tools = _tools(state)
     noise = _noise(tools)
     tests = [_binned(tools, name, noise) for name in _VARIABLES]
     tests += [_grouped(tools, name, noise) for name in ('channel', 'emitter', 'quadrature')]
@@ -68,8 +68,25 @@ def _noise(parts: list[Part]) -> float:
 
 def noise_scale(state: State) -> float:
     """Standard deviation of the white part of the tools' residuals, in expected ones."""
-    tools = [part for part in state.parts if not part.view.is_reference]
-    return float(np.sqrt(_noise(tools)))
+    return float(np.sqrt(_noise(_tools(state))))
+
+
+def noise_t(state: State) -> float:
+    """Noise of a phasor component, T: the white part, without the pose's own directions.
+
+    Along those six directions of a frame the residual is as large as the jitter's prior allows,
+    whatever the noise; they are taken off the count.
+    """
+    tools = _tools(state)
+    count = sum(part.count for part in tools)
+    frames = sum(int((part.whitener.weight > 0).any(axis=1).sum()) for part in tools)
+    share = min(6 * frames / max(count, 1), 0.9)
+    variance = max((_noise(tools) - share) / (1 - share), 1e-6)
+    return float(np.sqrt(variance)) * state.problem.spread.flux_t
+
+
+def _tools(state: State) -> list[Part]:
+    return [part for part in state.parts if not part.view.is_reference]
 
 
 def _quantiles(values: Array, bins: int) -> NDArray[np.int64]:

@@ -24,11 +24,14 @@ class Spread:
     ----------
     flux_t : float
         Noise of a phasor component, the model's own error included, T.
+    noise_t : float
+        The part of it that is noise when all is well.
     position_m, rotation_rad : float
         Optical jitter of each axis, as it stands after interpolation.
     """
 
     flux_t: float = 60e-12
+    noise_t: float = 60e-12
     position_m: float = 0.07e-3
     rotation_rad: float = 0.4e-3
 

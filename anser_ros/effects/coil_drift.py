@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from anser_ros.effects.effect import (
     Array,
@@ -46,6 +47,10 @@ class CoilDrift(Effect):
             Term(self, {'coil': k, '_duration': scene.duration}, np.array([0.0, np.log(tau)]))
             for k in range(scene.emitters)
         ]
+
+    def amounts(self, term: Term) -> NDArray[np.int64]:
+        """The amount."""
+        return np.array([0])
 
     def prior(self, term: Term) -> Array:
         """Some percent; a time constant known to a factor of five."""

@@ -1,8 +1,8 @@
 """Eddy currents of a thin square sheet, on a mesh of square loops.
 
 Loop i of a mesh of edge h obeys ``sum_j (R_ij + j w M_ij) I_j = -j w Phi_i``: M from Neumann's
-formula for parallel filaments (the mean distance of a strip of width h from itself is 0.2235 h,
-Grover, Inductance Calculations, 1946, ch. 3), R from the sheet resistance, one square an edge.
+formula for parallel filaments at the mean distance of the strips that they stand for (Grover,
+Inductance Calculations, 1946, ch. 3), R from the sheet resistance, one square an edge.
 M scales with h and R not at all, so one generalised eigenproblem serves all sizes and resistances.
 """
 
@@ -17,12 +17,23 @@ from anser_ros.physics.constants import MU_0
 
 Array = NDArray[np.float64]
 
-STRIP = 0.2235
+
+def _strip_distance(aside: Array) -> Array:
+    """Geometric mean distance of two coplanar strips of width 1, their centres ``aside`` apart.
+
+    ``ln g = ((k+1)^2 ln(k+1) + (k-1)^2 ln|k-1|) / 2 - k^2 ln k - 3/2`` (Grover, ch. 3).
+    """
+    k = np.abs(aside)
+
+    def part(x: Array) -> Array:
+        return np.asarray(x**2 * np.log(np.where(x == 0, 1.0, np.abs(x))))
+
+    return np.asarray(np.exp((part(k + 1) + part(k - 1)) / 2 - part(k) - 1.5))
 
 
 def _parallel(ahead: Array, aside: Array) -> Array:
-    """Mutual inductance over mu0/(4 pi) of two unit filaments, offset ahead and aside."""
-    distance = np.where(aside == 0, STRIP, np.abs(aside))
+    """Mutual inductance over mu0/(4 pi) of two unit strips, offset ahead and aside."""
+    distance = _strip_distance(aside)
 
     def part(u: Array) -> Array:
         return np.asarray(u * np.arcsinh(u / distance) - np.sqrt(u**2 + distance**2))

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from anser_ros.effects.conducting_sheet import sheet_sources
 from anser_ros.effects.dipoles import Dipoles
@@ -60,6 +61,10 @@ class ConductivePlate(Effect):
             for z in (*below, *above)
             for edge in (0.6 * size, size, 1.8 * size)
         ]
+
+    def amounts(self, term: Term) -> NDArray[np.int64]:
+        """Its size."""
+        return np.array([1])
 
     def prior(self, term: Term) -> Array:
         """Anywhere near the board; sheet resistances over decades. A frozen sheet stays."""

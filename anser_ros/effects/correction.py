@@ -20,7 +20,7 @@ from anser_ros.physics.sensor import SensorTable
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-DECOMPRESSION_STEPS = 8
+DECOMPRESSION_STEPS = 12
 
 
 @dataclass(frozen=True)
@@ -153,17 +153,24 @@ class Correction:
     def _decompressed(
         terms: list[Term], channels: NDArray[np.int64], measured: ComplexArray
     ) -> ComplexArray:
-        """Fixed point of ``x = measured - (compress(x) - x)``: the loss is a small part of x."""
+        """Fixed point of ``x = measured - (compress(x) - x)``: the loss is a small part of x.
+
+        Where it would be more than half of x the channel is beyond what can be undone, and what is
+        put back is held at that.
+        """
         x = measured
         for _ in range(DECOMPRESSION_STEPS):
-            loss = x[None]
+            behind = x[None]
             for term in terms:
-                loss = term.effect.compress(term, channels, loss)
-            step = measured - (loss[0] - x)
+                behind = term.effect.compress(term, channels, behind)
+            loss = behind[0] - x
+            most = 0.5 * np.abs(measured)
+            share = most / np.maximum(np.abs(loss), np.maximum(most, 1e-300))
+            step = measured - loss * share
             if np.allclose(step, x, rtol=1e-9, atol=0.0):
                 return np.asarray(step)
             x = step
-        return x
+        return np.asarray(x)
 
 
 __all__ = ['Correction']

@@ -251,6 +251,10 @@ class Effect:
         """Derivative of the view's flux by the parameters, (F, S, K, q), or None."""
         return None
 
+    def amounts(self, term: Term) -> NDArray[np.int64]:
+        """Parameters, by index, that all being zero means that there is no effect."""
+        return np.arange(term.theta.size)
+
     def probe(self, term: Term, view: View) -> ComplexArray | None:
         """Linear columns that tell quickly whether the effect is there; by default `columns`."""
         return self.columns(term, view)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import (
@@ -93,6 +94,10 @@ class MovingMetal(Effect):
         """The same path, another body, whose amplitudes (prior ``size``) are still zero."""
         site = {**term.site, '_offsets': offsets, '_modes': modes, '_size': size}
         return Term(self, site, np.concatenate([term.theta[:PATH], np.zeros(2 * modes.shape[1])]))
+
+    def amounts(self, term: Term) -> NDArray[np.int64]:
+        """The polarisabilities."""
+        return np.arange(PATH, term.theta.size)
 
     def prior(self, term: Term) -> Array:
         """Anywhere, any time. Frozen metal stays on its path."""

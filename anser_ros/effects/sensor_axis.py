@@ -65,8 +65,11 @@ class SensorAxis(Effect):
             row = view.row(term.site['channel'])
             if row is None:
                 return None
-            pair = orthogonal_pair(np.array(term.site['_axis']))
-            steps = np.einsum('fij,tj->fti', view.rotation, pair)
+            surveyed = np.array(term.site['_axis'])
+            pair, axis = orthogonal_pair(surveyed), self._tilted(term)
+            length = np.linalg.norm(surveyed + term.theta @ pair)
+            across = (pair - np.outer(pair @ axis, axis)) / length
+            steps = np.einsum('fij,tj->fti', view.rotation, across)
             out[:, row] = np.einsum('fik,fti->fkt', view.d_axis[:, row], steps)
             return out
         rows = [view.row(c) for c in term.site['channels']]

@@ -5,6 +5,7 @@ from itertools import product
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import (
@@ -77,6 +78,10 @@ class StaticMetal(Effect):
             )
             for place in places(scene)
         ]
+
+    def amounts(self, term: Term) -> NDArray[np.int64]:
+        """The polarisabilities."""
+        return np.arange(3, term.theta.size)
 
     def prior(self, term: Term) -> Array:
         """Anywhere; a few litres of metal at most. Frozen metal stays at its place."""

@@ -88,7 +88,9 @@ def diagnose_session(
     clean = None
     if baseline is not None and session.reference is not None:
         clean = baseline_flux(baseline, session.reference.sensors)
-    spread = Spread(flux_t=float(np.hypot(DEFAULT_NOISE_T, model.flux_error_t)))
+    spread = Spread(
+        flux_t=float(np.hypot(DEFAULT_NOISE_T, model.flux_error_t)), noise_t=DEFAULT_NOISE_T
+    )
     known = [_corrected(tool, model) for tool in session.tools]
     reference = None if session.reference is None else _corrected(session.reference, model)
     problem = build_problem(known, reference, clean, model, _drawn(session), spread)

@@ -1,0 +1,170 @@
+"""A small session in memory: a sheet of dipoles, one tool of two clusters, references, jitter."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from anser_ros.diagnosis.prepare import build_problem
+from anser_ros.diagnosis.problem import Problem
+from anser_ros.diagnosis.whitening import Spread
+from anser_ros.effects.dipoles import Dipoles
+from anser_ros.fitting.measurements import Measurements
+from anser_ros.fitting.model import FieldModel
+from anser_ros.physics.pose_track import PoseTrack
+from anser_ros.physics.sensor import SensorTable
+
+NOISE_T = 60e-12
+JITTER_M, JITTER_RAD = 0.07e-3, 0.4e-3
+
+
+def board(emitters: int = 4) -> FieldModel:
+    """Vertical dipoles under square coils, smooth over their area."""
+    line = np.linspace(-0.12, 0.12, 7)
+    places = np.array([(x, y, 0.0) for x in line for y in line])
+    centres = 0.07 * np.array([(-1, -1), (1, -1), (-1, 1), (1, 1)])[:emitters]
+    distance = np.linalg.norm(places[:, None, :2] - centres[None], axis=2)
+    moments = 0.02 * np.exp(-((distance / 0.045) ** 2))
+    return FieldModel(
+        positions=places,
+        directions=np.tile([0.0, 0.0, 1.0], (len(places), 1)),
+        moments=moments.astype(complex),
+        emitters=tuple(f'coil{k}' for k in range(emitters)),
+        frequencies_hz=tuple(6000.0 + 170.0 * k for k in range(emitters)),
+    )
+
+
+def tool_sensors() -> SensorTable:
+    """Two triaxial clusters, 30 mm apart."""
+    place = np.repeat([[0.0, 0.0, -0.015], [0.0, 0.0, 0.015]], 3, axis=0)
+    names = tuple(f'tool/{c}/{a}' for c in (0, 1) for a in 'xyz')
+    axes = np.tile(np.eye(3), (2, 1))
+    return SensorTable(np.arange(6), names, ('tool',) * 6, place, axes, np.zeros(6))
+
+
+def reference_sensors(count: int = 12) -> SensorTable:
+    """Coils around the board, in seeded directions."""
+    rng = np.random.default_rng(5)
+    angle = 2 * np.pi * np.arange(count) / count
+    place = np.stack([0.16 * np.cos(angle), 0.16 * np.sin(angle), np.full(count, 0.03)], axis=1)
+    axes = rng.normal(size=(count, 3))
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    return SensorTable(
+        100 + np.arange(count),
+        tuple(f'ref{i}' for i in range(count)),
+        ('fg',) * count,
+        place,
+        axes,
+        np.full(count, 0.008),
+    )
+
+
+@dataclass
+class World:
+    """What a test changes before it builds the problem."""
+
+    model: FieldModel
+    tool: Measurements
+    reference: Measurements
+    baseline: np.ndarray
+    true_track: PoseTrack
+
+    @property
+    def dipoles(self) -> Dipoles:
+        """The field."""
+        return Dipoles(self.model.positions, self.model.directions, self.model.moments)
+
+    def true_pose(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position and rotation without jitter at the flux stamps."""
+        position, rotation, _ = self.true_track.at(self.tool.time, 1.0)
+        return position, rotation
+
+    def change(self, flux: np.ndarray, reference: np.ndarray | None = None) -> None:
+        """Other readings."""
+        self.tool = replace(self.tool, flux=flux)
+        if reference is not None:
+            self.reference = replace(self.reference, flux=reference)
+
+    def add_sources(self, sources: Dipoles) -> None:
+        """Add a static field."""
+        position, rotation = self.true_pose()
+        centres, axes = self.tool.sensors.placed(position, rotation)
+        more = sources.flux(centres.reshape(-1, 3), axes.reshape(-1, 3), None)
+        fixed = self.reference.sensors
+        self.change(
+            self.tool.flux + more.reshape(self.tool.flux.shape),
+            self.reference.flux + sources.flux(fixed.position, fixed.axis, fixed.length),
+        )
+
+    def move_track(self, track: PoseTrack) -> None:
+        """Another optical track."""
+        position, rotation, valid = track.at(self.tool.time, 0.25)
+        self.tool = replace(
+            self.tool, track=track, position=position, rotation=rotation, has_pose=valid
+        )
+
+    def problem(self, references: bool = True) -> Problem:
+        """Set up the diagnosis."""
+        spread = Spread(flux_t=float(np.hypot(NOISE_T, self.model.flux_error_t)))
+        return build_problem(
+            (self.tool,),
+            self.reference if references else None,
+            self.baseline if references else None,
+            self.model,
+            self.model,
+            spread,
+        )
+
+
+def _path(time: np.ndarray) -> tuple[np.ndarray, Rotation]:
+    swing = np.stack(
+        [
+            0.09 * np.sin(0.9 * time),
+            0.09 * np.sin(1.27 * time + 0.5),
+            0.15 + 0.03 * np.sin(0.61 * time),
+        ],
+        axis=1,
+    )
+    turn = np.stack(
+        [0.5 * np.sin(0.7 * time), 0.5 * np.sin(0.83 * time + 1.0), 0.8 * np.sin(0.47 * time)],
+        axis=1,
+    )
+    return swing, Rotation.from_rotvec(turn)
+
+
+def world(seed: int = 0, frames: int = 500, emitters: int = 4) -> World:
+    """A clean session at 25 Hz with an optical tracker at 60 Hz."""
+    rng = np.random.default_rng(seed)
+    model, sensors, fixed = board(emitters), tool_sensors(), reference_sensors()
+    dipoles = Dipoles(model.positions, model.directions, model.moments)
+    time = np.arange(frames) / 25.0
+    position, turn = _path(time)
+    centres, axes = sensors.placed(position, turn.as_matrix())
+    flux = dipoles.flux(centres.reshape(-1, 3), axes.reshape(-1, 3), None)
+    flux = flux.reshape(frames, len(sensors), -1)
+    clean = dipoles.flux(fixed.position, fixed.axis, fixed.length)
+    readings = np.broadcast_to(clean, (frames, *clean.shape))
+    optical = np.arange(-0.2, time[-1] + 0.2, 1 / 60)
+    seen, seen_turn = _path(optical)
+    true_track = PoseTrack(optical, seen, seen_turn.as_quat())
+    jitter = Rotation.from_rotvec(rng.normal(scale=JITTER_RAD, size=(optical.size, 3)))
+    track = PoseTrack(
+        optical,
+        seen + rng.normal(scale=JITTER_M, size=seen.shape),
+        (jitter * seen_turn).as_quat(),
+    )
+    at, rotation, valid = track.at(time, 0.25)
+    tool = Measurements(
+        'tool', sensors, time, flux + _noise(rng, flux.shape), np.ones(flux.shape[:2], bool),
+        np.zeros(flux.shape[:2], np.int64), at, rotation, valid, track,
+    )  # fmt: skip
+    reference = Measurements(
+        'fg', fixed, time, readings + _noise(rng, readings.shape),
+        np.ones(readings.shape[:2], bool), np.zeros(readings.shape[:2], np.int64),
+        np.zeros((frames, 3)), np.broadcast_to(np.eye(3), (frames, 3, 3)), np.ones(frames, bool),
+    )  # fmt: skip
+    return World(model, tool, reference, clean, true_track)
+
+
+def _noise(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    return NOISE_T * (rng.normal(size=shape) + 1j * rng.normal(size=shape))

@@ -1,0 +1,290 @@
+"""Effects: every derivative against differences, every correction against its forward model."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from diagnosis_world import world
+
+from anser_ros.effects.conducting_sheet import sheet_sources
+from anser_ros.effects.correction import Correction
+from anser_ros.effects.dipoles import Dipoles
+from anser_ros.effects.effect import Effect, Remedy, Term
+from anser_ros.effects.metal_remainder import REMAINDER
+from anser_ros.effects.moving_metal import centre_at
+from anser_ros.effects.prediction import reference_view, tool_view
+from anser_ros.effects.registry import all_effects, effect_named
+from anser_ros.effects.saturation import compressed
+from anser_ros.errors import ModelFileError
+from anser_ros.fitting.model import EffectRecord
+
+CONTRACT = {
+    'sensor_gain', 'sensor_axis', 'sensor_polarity', 'sensor_size', 'lever_arm', 'registration',
+    'time_offset', 'channel_crosstalk', 'coil_crosstalk', 'coil_drift', 'coil_moved', 'pickup',
+    'saturation', 'phase_delay', 'static_metal', 'conductive_plate', 'moving_metal',
+    'excess_noise', 'outliers',
+}  # fmt: skip
+
+
+@pytest.fixture(scope='module')
+def scenery():
+    made = world(frames=60)
+    made.move_track(made.true_track)
+    return made, made.problem()
+
+
+def _moving(scene) -> Term:
+    effect = all_effects()['moving_metal']
+    place = np.array([0.02, 0.0, -0.12])
+    return effect.starting(place, place + [0.05, 0.02, 0.03], (0.5, 1.9), np.array([-2.0, -0.3]))
+
+
+def _candidates(scene) -> list[Term]:
+    """The first candidate of every kind of site of every effect."""
+    terms, seen = [], set()
+    for effect in all_effects().values():
+        for term in effect.candidates(scene):
+            kind = (effect.name, tuple(sorted(k for k in term.site if k[0] != '_')))
+            if term.theta.size and kind not in seen:
+                seen.add(kind)
+                terms.append(term)
+    return [*terms, _moving(scene)]
+
+
+def _in_force(term: Term) -> Term:
+    """The term with parameters that are plainly there."""
+    rng = np.random.default_rng(3)
+    small = {
+        'lever_arm': 1e-3, 'sensor_position': 1e-3, 'coil_moved': 1e-3, 'registration': 1e-3,
+        'time_offset': 0.01, 'clock_rate': 1e-3, 'pickup': 2.0, 'phase_delay': 1.0,
+        'sensor_size': 2.0, 'saturation': 0.01,
+    }  # fmt: skip
+    if term.effect.name == 'coil_drift':
+        return term.with_theta(np.array([0.03, np.log(0.8)]))
+    if term.effect.name == 'static_metal':
+        theta = rng.normal(size=term.theta.size)
+        return term.with_theta(np.concatenate([[0.05, 0.02, -0.1], theta[3:]]))
+    if term.effect.name in ('conductive_plate', 'moving_metal'):
+        return term
+    scale = small.get(term.effect.name, 0.02)
+    return term.with_theta(scale * (0.5 + np.abs(rng.normal(size=term.theta.size))))
+
+
+def test_every_name_of_the_contract_is_found():
+    effects = all_effects()
+    assert set(effects) >= CONTRACT
+    for name, effect in effects.items():
+        assert effect.name == name
+        assert effect.summary
+        assert effect.units
+        assert isinstance(effect.remedy, Remedy)
+
+
+def test_an_effect_nobody_wrote_is_refused():
+    with pytest.raises(ModelFileError, match='no effect is called'):
+        effect_named('gremlin')
+
+
+def test_derivatives_agree_with_differences(scenery):
+    _, problem = scenery
+    tool, fields = problem.tools[0], problem.fields
+    for start in _candidates(problem.scene):
+        term = _in_force(start)
+        view = tool_view(tool, [term], fields)
+        columns = term.effect.columns(term, view)
+        step = 1e-4 * np.maximum(np.abs(term.theta), 1e-3)
+        if term.effect.name in ('conductive_plate', 'static_metal', 'moving_metal'):
+            step = np.full(term.theta.size, 1e-4)
+        for i in range(term.theta.size):
+            sides = []
+            for sign in (1, -1):
+                theta = term.theta.copy()
+                theta[i] += sign * step[i]
+                sides.append(tool_view(tool, [term.with_theta(theta)], fields).flux)
+            wanted = (sides[0] - sides[1]) / (2 * step[i])
+            scale = np.abs(wanted).max() + 1e-30
+            error = np.abs(columns[..., i] - wanted).max() / scale
+            assert error < 0.05, f'{term.label} parameter {i}: {error:.3g}'
+
+
+def test_reference_derivatives_agree_with_differences(scenery):
+    _, problem = scenery
+    references = problem.references
+    for start in _candidates(problem.scene):
+        term = _in_force(start)
+        if term.effect.name in ('coil_moved', 'saturation'):
+            continue
+        view = reference_view(references.readings, references.baseline, [term], problem.fields)
+        columns = term.effect.columns(term, view)
+        for i in range(term.theta.size):
+            theta = term.theta.copy()
+            theta[i] += 1e-5
+            other = reference_view(
+                references.readings, references.baseline, [term.with_theta(theta)], problem.fields
+            )
+            wanted = (other.flux - view.flux) / 1e-5
+            if columns is None:
+                assert not np.abs(wanted).max() > 0
+                continue
+            scale = np.abs(wanted).max() + 1e-30
+            assert np.abs(columns[..., i] - wanted).max() / scale < 0.05, term.label
+
+
+def test_records_give_the_same_term_back(scenery):
+    _, problem = scenery
+    for start in _candidates(problem.scene):
+        term = _in_force(start)
+        record = term.effect.record(term, 1e-6 * np.eye(term.theta.size))
+        again = term.effect.term(record)
+        one = tool_view(problem.tools[0], [term], problem.fields).flux
+        other = tool_view(problem.tools[0], [again], problem.fields).flux
+        np.testing.assert_allclose(other, one, rtol=1e-6, atol=1e-15, err_msg=term.label)
+
+
+def test_a_correction_undoes_its_effects(scenery):
+    made, problem = scenery
+    tool = problem.tools[0]
+    plain = tool_view(tool, [], problem.fields)
+    terms = [
+        _in_force(t)
+        for t in _candidates(problem.scene)
+        if t.effect.remedy is Remedy.FLUX and 'mutual' not in t.site
+    ]
+    terms.append(Term(effect_named('sensor_polarity'), {'channels': (1, 4)}))
+    records = [t.effect.record(t, 1e-8 * np.eye(t.theta.size)) for t in terms]
+    correction = Correction.of(records, tool.sensors, made.model.frequencies_hz)
+    assert correction.changes_flux
+    seen = tool_view(tool, correction.terms, problem.fields).flux
+    assert np.abs(seen - plain.flux).max() > 1e-8
+    for frame in (0, 20, 50):
+        back = correction.flux(float(tool.time[frame]), tool.sensors.channel, seen[frame])
+        np.testing.assert_allclose(back, plain.flux[frame], rtol=1e-5, atol=1e-13)
+
+
+def test_a_correction_keeps_missing_readings_missing(scenery):
+    made, problem = scenery
+    record = EffectRecord('sensor_gain', {'channel': 0, 'gain': 2.0})
+    correction = Correction.of([record], problem.tools[0].sensors, made.model.frequencies_hz)
+    flux = np.ones((2, 4), dtype=complex)
+    flux[1] = np.nan
+    back = correction.flux(0.0, np.array([0, 1]), flux)
+    np.testing.assert_allclose(back[0], 0.5)
+    assert np.isnan(back[1]).all()
+    nothing = Correction.of([], problem.tools[0].sensors, made.model.frequencies_hz)
+    assert nothing.flux(0.0, np.array([0, 1]), flux) is flux
+
+
+def test_references_tell_the_strength_of_a_drifting_emitter(scenery):
+    made, problem = scenery
+    record = EffectRecord('coil_drift', {'coil': 2, 'amount': 0.5, 'tau_s': 1.0})
+    correction = Correction.of([record], problem.tools[0].sensors, made.model.frequencies_hz)
+    now = made.baseline * np.array([1.0, 1.0, 0.9, 1.0])
+    now[3] = np.nan
+    strengths = correction.strengths(now, made.baseline)
+    np.testing.assert_allclose(strengths, [1.0, 1.0, 0.9, 1.0], atol=1e-12)
+    flux = np.ones((1, 4), dtype=complex)
+    back = correction.flux(100.0, np.array([0]), flux, strengths)
+    np.testing.assert_allclose(back[0], [1.0, 1.0, 1 / 0.9, 1.0])
+
+
+def test_sensors_and_track_are_corrected(scenery):
+    made, problem = scenery
+    tool = problem.tools[0]
+    records = [
+        EffectRecord('lever_arm', {'body': 'tool', 'offset_m': [1e-3, 0.0, 0.0]}),
+        EffectRecord('sensor_axis', {'channels': [0, 1, 2], 'rotation_deg': [0.0, 0.0, 90.0]}),
+        EffectRecord('time_offset', {'offset_s': 0.5}),
+        EffectRecord(
+            'registration', {'rotation_deg': [0.0, 0.0, 90.0], 'translation_m': [0.0, 0.0, 0.1]}
+        ),
+    ]
+    correction = Correction.of(records, tool.sensors, made.model.frequencies_hz)
+    table = correction.sensors()
+    np.testing.assert_allclose(table.position[:, 0], 1e-3)
+    np.testing.assert_allclose(table.axis[0], [0.0, 1.0, 0.0], atol=1e-12)
+    track = correction.optical(tool.track)
+    np.testing.assert_allclose(track.time, tool.track.time + 0.5)
+    x, y, z = tool.track.position[0]
+    np.testing.assert_allclose(track.position[0], [y, -x, z - 0.1], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('name', 'parameters', 'rule'),
+    [
+        ('sensor_gain', {'channel': 1}, "lacks 'gain'"),
+        ('channel_crosstalk', {'channels': [0, 1], 'matrix': [[1.0]]}, 'has a matrix'),
+        (
+            'sensor_axis',
+            {'channel': 0, 'axis': [-1.0, 0, 0], 'surveyed_axis': [1.0, 0, 0]},
+            'right angle',
+        ),
+    ],
+)
+def test_a_broken_record_is_refused(scenery, name, parameters, rule):
+    made, problem = scenery
+    with pytest.raises(ModelFileError, match=rule):
+        Correction.of(
+            [EffectRecord(name, parameters)], problem.tools[0].sensors, made.model.frequencies_hz
+        )
+
+
+def test_compression_keeps_small_signals_and_meets_its_third_order():
+    rng = np.random.default_rng(1)
+    flux = 1e-7 * (rng.normal(size=(3, 4)) + 1j * rng.normal(size=(3, 4)))
+    small = compressed(flux, 1.0, 'tanh')
+    np.testing.assert_allclose(small, flux, rtol=1e-12)
+    one = np.array([[0.3 + 0j]])
+    # A single tone: the first harmonic of tanh, by quadrature.
+    phase = np.linspace(0, 2 * np.pi, 400, endpoint=False)
+    wanted = 2 * np.mean(np.tanh(0.3 * np.cos(phase)) * np.cos(phase))
+    assert compressed(one, 1.0, 'tanh')[0, 0].real == pytest.approx(wanted, rel=1e-6)
+
+
+def test_a_large_perfect_sheet_is_a_mirror():
+    source = Dipoles(
+        np.array([[0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.0]]), np.array([[1.0 + 0j]])
+    )
+    sheet = sheet_sources(
+        np.array([0.0, 0.0, -0.1]), np.array([0.9, 0.9]), 1e-9, 36, source, np.array([4e4])
+    )
+    image = Dipoles(np.array([[0.0, 0.0, -0.2]]), source.directions, -source.moments)
+    points = np.array([[0.0, 0.0, 0.1], [0.05, 0.0, 0.12]])
+    np.testing.assert_allclose(sheet.field(points)[:, 2], image.field(points)[:, 2], rtol=0.03)
+
+
+def test_moving_metal_is_where_it_says(scenery):
+    _, problem = scenery
+    term = _moving(problem.scene)
+    centres = centre_at(term.theta, np.array([0.0, 1.2, 5.0]))
+    np.testing.assert_allclose(centres[0], term.theta[:3])
+    np.testing.assert_allclose(centres[2], term.theta[3:6])
+    view = tool_view(problem.tools[0], [], problem.fields)
+    moved = term.effect.moving_flux(term, view)
+    frame = 30
+    sources = term.effect.sources_at(
+        term, problem.fields.illumination, problem.fields.omega, float(view.time[frame])
+    )
+    alone = sources.flux(view.centres[frame], view.axes[frame], None)
+    np.testing.assert_allclose(moved[frame], alone, rtol=2e-3, atol=1e-13)
+
+
+def test_a_remainder_is_linear_and_belongs_to_its_metal(scenery):
+    _, problem = scenery
+    parent = next(t for t in _candidates(problem.scene) if t.effect.name == 'static_metal')
+    points = np.array([[0.0, 0.0, -0.1], [0.03, 0.0, -0.1]])
+    term = REMAINDER.about(parent, points, np.eye(6), 1.0)
+    rng = np.random.default_rng(0)
+    term = term.with_theta(rng.normal(size=12))
+    view = tool_view(problem.tools[0], [term], problem.fields)
+    plain = tool_view(problem.tools[0], [], problem.fields)
+    columns = REMAINDER.columns(term, view)
+    np.testing.assert_allclose(columns @ term.theta, view.flux - plain.flux, rtol=1e-6, atol=1e-14)
+
+
+def test_the_base_effect_changes_nothing(scenery):
+    _, problem = scenery
+    tool = problem.tools[0]
+    term = Term(Effect())
+    view = tool_view(tool, [term], problem.fields)
+    np.testing.assert_array_equal(view.flux, tool_view(tool, [], problem.fields).flux)
+    assert replace(term, site={'channel': 3}).label == ' (channel 3)'
