@@ -2,16 +2,12 @@
 
 import signal
 import time
-from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import spin_until
 
-from anser_ros.cli.main import main
 from anser_ros.wire import cdr
-from anser_ros.wire.bag import Salvage, iter_messages
 from anser_ros.wire.bag_writer import BagWriter, SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
 
@@ -179,47 +175,3 @@ def test_nobody_listens(ros, tmp_path):
     assert node.exit_code == 0 and node.counters['no_listeners'] == 1
     node.close()
     node.destroy_node()
-
-
-@pytest.mark.timeout(120)
-def test_all_started_together_lose_no_frame(start, ros, tmp_path):
-    """No wait between the starts, the replay first; poses counted by one who starts with them.
-
-    With the replay last, discovery may bring a listener up to three seconds after the tracker told
-    that all that it knows of are matched; then the first frames reach the recorder but not it.
-    """
-    import rclpy
-    from geometry_msgs.msg import PoseStamped
-
-    bag = Path(__file__).resolve().parents[1] / 'bags' / 'moving.mcap'
-    model = tmp_path / 'model.yaml'
-    assert main(['calibrate', str(bag.with_name('factory.mcap')), '--out', str(model)]) == 0
-    commands = [
-        ('field_model', '--ros-args', '-p', f'model_file:={model}'),
-        ('tracker',),
-        ('recorder', '--ros-args', '-p', f'directory:={tmp_path}', '-p', 'name:=bag'),
-    ]
-    play = ('replay', bag, '--rate', '1')
-    commands = [play, *commands]
-    processes = {command[0]: start(*command) for command in commands}
-    stamps = {topic: [] for topic in ('tool_a_0/x', 'tool_a_2/z', 'tool_a')}
-    node = ros.create_node('counter')
-    for topic, got in stamps.items():
-        take = lambda m, got=got: got.append((m.header.stamp.sec, m.header.stamp.nanosec))  # noqa: E731
-        node.create_subscription(PoseStamped, f'/anser/{topic}/pose', take, 300)
-    player = processes['replay']
-    try:
-        end = time.monotonic() + 90
-        while player.popen.poll() is None or time.monotonic() < end - 88:
-            assert time.monotonic() < end, player.output
-            rclpy.spin_once(node, timeout_sec=0.1)
-        assert spin_until(node, lambda: all(len(got) >= 200 for got in stamps.values()), 3.0), (
-            {topic: len(got) for topic, got in stamps.items()}, player.output
-        )  # fmt: skip
-    finally:
-        node.destroy_node()
-    assert all(len(set(got)) == 200 for got in stamps.values())
-    assert processes['recorder'].interrupt() == 0
-    counts = Counter(m.topic for m in iter_messages(str(tmp_path / 'bag'), Salvage()))
-    for topic in ('tool/flux', 'reference/flux', 'tool_a/pose', 'tool_a_1/y/pose'):
-        assert counts[f'/anser/{topic}'] == 200, topic
