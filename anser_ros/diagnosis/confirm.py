@@ -6,13 +6,14 @@ time and emitter by emitter, and the power that those fits take off besides is s
 power that the effect itself takes off.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.fit import Fit, misfit
-from anser_ros.diagnosis.problem import Problem, State, evaluate
+from anser_ros.diagnosis.problem import Part, Problem, State, evaluate
 from anser_ros.diagnosis.refine import belongs_to
 from anser_ros.effects.effect import Term
 from anser_ros.effects.metal_remainder import REMAINDER
@@ -57,7 +58,12 @@ def confirm(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmatio
     power = without.sum_of_squares - fit.state.sum_of_squares
     left = max(fit.state.sum_of_squares - noise * fit.state.count, 0.0)
     left_tools = left if misfit(fit) > 1.02 * noise else 0.0
-    varying = max(_by_time(fit.state, term, noise), _by_emitter(fit.state, term, noise))
+    columns = fit.state.design(term)
+    varying = max(
+        _by_time(fit.state, columns, noise),
+        _by_value(fit.state, columns, noise, _emitter_of),
+        _by_value(fit.state, columns, noise, _sensor_of),
+    )
     return Confirmation(
         power, varying / max(power, 1e-300), power / max(left_tools, 1e-3 * fit.state.count)
     )
@@ -83,35 +89,57 @@ def _extra(normal: Array, right: Array, noise: float) -> float:
     return float(b @ inverse @ b - noise * right.size)
 
 
-def _by_time(state: State, term: Term, noise: float) -> float:
-    columns = state.design(term)
+def _by_time(state: State, columns: Sequence[Array | None], noise: float) -> float:
     numbers = np.unique(np.concatenate([part.blocks for part in state.parts]))
     total = 0.0
     for group in np.array_split(numbers, TIME_PARTS):
-        normal, right = np.zeros((term.theta.size,) * 2), np.zeros(term.theta.size)
+        pieces = []
         for part, column in zip(state.parts, columns, strict=True):
-            if column is None or part.view.is_reference:
-                continue
-            rows = np.isin(part.blocks, group)
-            flat = column[rows].reshape(-1, term.theta.size)
-            normal += flat.T @ flat
-            right += flat.T @ part.white[rows].ravel()
-        total += max(_extra(normal, right, noise), 0.0)
+            if column is not None and not part.view.is_reference:
+                rows = np.isin(part.blocks, group)
+                pieces.append((column[rows], part.white[rows]))
+        total += _refitted(pieces, noise)
     return total
 
 
-def _by_emitter(state: State, term: Term, noise: float) -> float:
-    columns = state.design(term)
-    emitters = state.problem.fields.omega.size
+def _emitter_of(part: Part) -> NDArray[np.int64]:
+    return np.asarray(np.arange(part.white.shape[1]) % part.view.flux.shape[2])
+
+
+def _sensor_of(part: Part) -> NDArray[np.int64]:
+    sensors, emitters = part.view.flux.shape[1:]
+    return np.asarray((np.arange(part.white.shape[1]) // emitters) % sensors)
+
+
+def _by_value(
+    state: State,
+    columns: Sequence[Array | None],
+    noise: float,
+    group_of: Callable[[Part], NDArray[np.int64]],
+) -> float:
+    """Power of refits emitter by emitter, or sensor by sensor."""
+    used = [
+        (part, column, group_of(part))
+        for part, column in zip(state.parts, columns, strict=True)
+        if column is not None and not part.view.is_reference
+    ]
     total = 0.0
-    for k in range(emitters):
-        normal, right = np.zeros((term.theta.size,) * 2), np.zeros(term.theta.size)
-        for part, column in zip(state.parts, columns, strict=True):
-            if column is None or part.view.is_reference:
-                continue
-            own = np.arange(part.white.shape[1]) % emitters == k
-            flat = column[:, own].reshape(-1, term.theta.size)
-            normal += flat.T @ flat
-            right += flat.T @ part.white[:, own].ravel()
-        total += max(_extra(normal, right, noise), 0.0)
+    for value in range(max((int(g.max()) + 1 for _, _, g in used), default=0)):
+        pieces = [(c[:, g == value], part.white[:, g == value]) for part, c, g in used]
+        total += _refitted(pieces, noise)
     return total
+
+
+def _refitted(pieces: Sequence[tuple[Array, Array]], noise: float) -> float:
+    """Power beyond chance that a refit on some rows takes off."""
+    if not pieces:
+        return 0.0
+    size = pieces[0][0].shape[2]
+    normal, right = np.zeros((size, size)), np.zeros(size)
+    for column, white in pieces:
+        flat = column.reshape(-1, size)
+        normal += flat.T @ flat
+        right += flat.T @ white.ravel()
+    if not np.any(normal):
+        return 0.0
+    return max(_extra(normal, right, noise), 0.0)

@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 DECOMPRESSION_STEPS = 12
+DRIFTS = ('coil_drift', 'coil_fluctuation')
+"""Effects whose course over time the references can tell."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +131,9 @@ class Correction:
             mixing = term.effect.channel_matrix(term, number)
             if mixing is not None:
                 values = np.asarray(np.linalg.solve(mixing, values), dtype=complex)
+        for term in terms:
+            gain = term.effect.channel_gain(term, number, np.array([time]))
+            values = values if gain is None else values / gain[0][:, None]
         for term in reversed(terms):
             matrix = self._emitters(term, time, strengths)
             if matrix is not None:
@@ -142,7 +147,7 @@ class Correction:
         matrix = term.effect.emitter_matrix(term, np.array([time]), self.omega)
         if matrix is None:
             return None
-        if strengths is not None and term.effect.name == 'coil_drift':
+        if strengths is not None and term.effect.name in DRIFTS:
             coil = int(term.site['coil'])
             live: ComplexArray = matrix[0].copy()
             live[coil, coil] = strengths[coil]

@@ -300,6 +300,12 @@ class Effect:
         """Mixing of the channels, shape (S, S): row the channel that is read."""
         return None
 
+    def channel_gain(
+        self, term: Term, channels: NDArray[np.int64], time: Array
+    ) -> ComplexArray | None:
+        """Gain of each channel by time, shape (F, S), before the channels mix."""
+        return None
+
     def offset(
         self, term: Term, channels: NDArray[np.int64], emitters: int
     ) -> ComplexArray | None:

@@ -162,6 +162,11 @@ def _measured(view: View, terms: Sequence[Term]) -> View:
             d_position = np.einsum('fab,fsib->fsia', _frames(matrix, view), d_position)
             d_axis = np.einsum('fab,fsib->fsia', _frames(matrix, view), d_axis)
     for term in terms:
+        gain = term.effect.channel_gain(term, channels, view.time)
+        if gain is not None:
+            linear = linear * gain[..., None]
+            d_position, d_axis = d_position * gain[..., None, None], d_axis * gain[..., None, None]
+    for term in terms:
         mixing = term.effect.channel_matrix(term, channels)
         if mixing is not None:
             linear = np.einsum('st,ftk->fsk', mixing, linear)
