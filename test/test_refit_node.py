@@ -9,6 +9,7 @@ from tracking_world import CENTRES_MM, GEOMETRY, TURNED
 
 from anser_ros.errors import FrameError, ParameterError
 from anser_ros.fitting.refit_result import Metal
+from anser_ros.nodes.model_clouds import stamp_of
 from anser_ros.sessions.model_file import save_model
 from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup, dump_setup
@@ -165,6 +166,27 @@ def test_metal_is_shown_named_and_taken_away_again(make):
         rig.say(change)
     rig.node._on_reset(Trigger.Request(), Trigger.Response())
     np.testing.assert_array_equal(rig.node._model.moments, calibrated.moments)
+
+
+def test_every_frame_is_answered_under_its_own_stamp(make):
+    from sensor_msgs.msg import PointCloud2
+
+    from anser_ros.nodes import qos
+
+    rig, got = make(refit_rate_hz=10.0), []
+    rig.peer.create_subscription(PointCloud2, 'field_model', got.append, qos.LATCHED)
+    rig.until(lambda: rig.node._models.get_subscription_count() > 0)
+    rig.start()
+    answered, models = [], rig.node.counters['models']
+    for _ in range(12):
+        rig.say(0.0)
+        answered.append(rig.stamp_ns)
+        rig.until(lambda: got and stamp_of(got[-1]) == rig.stamp_ns)
+    assert rig.node.counters['readings_between_refits'] > 0
+    assert rig.node.counters['models'] == models, 'nothing changed, so it is the same model'
+    rig.say(rig.world.metal(HEAD))
+    rig.until(lambda: stamp_of(got[-1]) == rig.stamp_ns)
+    assert [stamp_of(m) for m in got[-13:-1]] == answered
 
 
 def pose_message(stamp_ns, position, frame='fg'):

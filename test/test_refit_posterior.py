@@ -8,7 +8,7 @@ from refit_world import anser_world
 from scipy.stats import multivariate_normal
 
 from anser_ros.fitting import refit_health as health
-from anser_ros.fitting.refit_change import Average, NoiseLevel
+from anser_ros.fitting.refit_change import Average, NoiseLevel, Pace
 from anser_ros.fitting.refit_clouds import Region, below, default_clouds, overhead
 from anser_ros.fitting.refit_excitation import excitation_for, region_of
 from anser_ros.fitting.refit_layer import bottom_layer, box_layer
@@ -250,6 +250,16 @@ def test_a_patch_reads_what_the_model_says_with_its_pose_s_error(world):
     assert not has_moved(coils, coils).any()
     assert has_moved(coils, coils.with_geometry(coils.position + [0.0, 0.004, 0.0])).all()
     assert has_moved(coils, coils.with_geometry(None, -coils.axis)).all()
+
+
+def test_the_pace_is_kept_by_the_stamps_alone():
+    pace, second = Pace(50.0), 10**9
+    due = [pace.is_due(second + i * second // 100) for i in range(400)]
+    assert 195 <= sum(due) <= 210
+    assert all(due[:5]), 'a few frames may follow each other at once'
+    assert pace.is_due(second // 2), 'time that jumps back starts anew'
+    slow = Pace(50.0)
+    assert all(slow.is_due(second + i * second // 40) for i in range(100))
 
 
 def test_noise_is_measured_whatever_moves_smoothly():

@@ -1,4 +1,4 @@
-"""How noisy the references are, and their readings averaged while nothing moves."""
+"""Which readings are refitted, how noisy they are, and their average while nothing moves."""
 
 from dataclasses import dataclass, field
 
@@ -11,6 +11,34 @@ ComplexArray = NDArray[np.complex128]
 MEMORY_FRAMES = 50.0
 STEP = 1.1
 """Noise levels are rounded to powers of this, so that tables made for one serve for a while."""
+
+BURST = 5
+"""Readings that may follow each other faster than the rate; they don't come evenly."""
+MOST_RATE_HZ = 50.0
+
+
+@dataclass
+class Pace:
+    """Which frames are refitted, so that there are not more than ``rate_hz`` a second.
+
+    Counted in the frames' own stamps: a recording that is replayed at another speed, or read from
+    its file, has the same frames refitted.
+    """
+
+    rate_hz: float = MOST_RATE_HZ
+    _last_ns: int = 0
+    _next_ns: float = 0.0
+
+    def is_due(self, stamp_ns: int) -> bool:
+        """Whether the frame of this stamp is to be refitted."""
+        period = 1e9 / self.rate_hz
+        if stamp_ns < self._last_ns:
+            self._next_ns = 0.0
+        self._last_ns = stamp_ns
+        if stamp_ns < self._next_ns:
+            return False
+        self._next_ns = max(self._next_ns, stamp_ns - BURST * period) + period
+        return True
 
 
 @dataclass

@@ -23,6 +23,7 @@ from anser_ros.fitting.baseline import ReadingWindow
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.nominal import nominal_model
 from anser_ros.fitting.refit import LiveRefit, RefitResult
+from anser_ros.fitting.refit_change import MOST_RATE_HZ, Pace
 from anser_ros.fitting.refit_patches import PoseError, clean_reading
 from anser_ros.nodes import qos
 from anser_ros.nodes.flux_reader import read_flux
@@ -37,8 +38,6 @@ from anser_ros.sessions.model_file import load_model, save_model
 from anser_ros.sessions.session import load_session, sensor_table
 from anser_ros.sessions.starting_model import NOMINAL, board_of
 from anser_ros.wire.setup import Setup, parse_setup
-
-BURST = 5
 
 VIEW_PERIOD_S = 0.2
 """How often the metal's marker is renewed."""
@@ -64,7 +63,7 @@ class FieldModelParameters:
         1.0, 'time that a baseline is averaged over, s', minimum=0.05, maximum=60.0
     )
     refit_rate_hz: float = parameter(
-        50.0, 'most refits a second', minimum=0.1, maximum=1000.0, live=True
+        MOST_RATE_HZ, 'most refits a second, by the stamps', minimum=0.1, maximum=1000.0, live=True
     )
     patches: tuple[str, ...] = parameter(
         (), 'reference coils that move: entries body=topic, the topic a PoseStamped of that body'
@@ -100,7 +99,7 @@ class FieldModelNode(AnserNode):
         self._view_s = 0.0
         self._shown = False
         self._refit_s = 0.0
-        self._next_refit_s = 0.0
+        self._pace = Pace(table.refit_rate_hz)
         self._writer = ModelWriter()
         self._models = self.create_publisher(PointCloud2, 'field_model', qos.LATCHED)
         self._errors = self.create_publisher(PointCloud2, 'field_model_error', qos.LATCHED)
@@ -206,15 +205,17 @@ class FieldModelNode(AnserNode):
         flux: NDArray[np.complex128],
         flags: NDArray[np.int64],
     ) -> None:
-        """Let the model follow the references, not more often than wanted."""
-        begin_s = time.monotonic()
-        if begin_s < self._next_refit_s:
+        """Let the model follow the references, not more often than wanted.
+
+        Every frame is answered by the model in force for it, even where that is as before: so the
+        tracker knows what to track a frame with, and gives the poses that are found offline.
+        """
+        if not self._pace.is_due(stamp_ns):
             self.count('readings_between_refits')
+            if self._model is not None:
+                self._serve(self._model, stamp_ns)
             return
-        # Readings don't come evenly; a few may follow each other at once.
-        period_s = 1.0 / self.parameters.refit_rate_hz
-        self._next_refit_s = max(self._next_refit_s, begin_s - BURST * period_s) + period_s
-        baseline = None
+        begin_s, baseline = time.monotonic(), None
         if self._patches is not None:
             refit = self._with_patches(self._patches, refit, stamp_ns)
             placed = self._patches.frame(stamp_ns, refit.model)
@@ -224,10 +225,9 @@ class FieldModelNode(AnserNode):
             flags = np.concatenate([flags[fixed], np.zeros(len(placed.flux), dtype=np.int64)])
             baseline = np.concatenate([self._fixed, placed.baseline])
         self._result = refit.update(stamp_ns, channels, flux, flags, baseline)
-        self._refit_s = time.monotonic() - begin_s
         self.count('refits')
-        if self._result.changed:
-            self._serve(self._result.model, stamp_ns)
+        self._serve(self._result.model, stamp_ns)
+        self._refit_s = time.monotonic() - begin_s
         self._show_metal(self._result, stamp_ns)
 
     def _with_patches(self, patches: Patches, refit: LiveRefit, stamp_ns: int) -> LiveRefit:
@@ -260,8 +260,11 @@ class FieldModelNode(AnserNode):
     # The model and its baseline -----------------------------------------------------------
 
     def _serve(self, model: FieldModel, stamp_ns: int) -> None:
-        """Put a model in force; every one has a stamp of its own."""
-        self._stamp_ns = max(stamp_ns, self._stamp_ns + 1)
+        """Put a model in force under a stamp that the last one did not have.
+
+        The model of a frame of readings has their stamp, which may be of another day.
+        """
+        self._stamp_ns = stamp_ns if stamp_ns != self._stamp_ns else stamp_ns + 1
         frame_id = self._frame_id
         # The uncertainty goes first, so that a receiver has both when the model comes; where it
         # is the same as before, that one still holds.
@@ -270,8 +273,9 @@ class FieldModelNode(AnserNode):
             self._errors.publish(self._writer.error(model, frame_id, self._stamp_ns))
             self._told = uncertainty
         self._models.publish(self._writer.dipoles(model, frame_id, self._stamp_ns))
+        if model is not self._model:
+            self.count('models')
         self._model = model
-        self.count('models')
 
     def _follow(self, baseline: NDArray[np.complex128]) -> None:
         """Refit from now on to what differs from a baseline, shape (S, K), T."""
@@ -331,6 +335,10 @@ class FieldModelNode(AnserNode):
         return response
 
     # What is told -------------------------------------------------------------------------
+
+    def on_parameters(self, old: FieldModelParameters, new: FieldModelParameters) -> None:
+        """Go on at the new rate."""
+        self._pace.rate_hz = new.refit_rate_hz
 
     def status(self) -> Status:
         """Return which model is in force, where it comes from, and what the refit does."""

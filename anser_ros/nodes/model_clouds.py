@@ -59,11 +59,19 @@ class ModelWriter:
 
     def __init__(self) -> None:
         self._maker = CloudMaker()
+        self._told: tuple[FieldModel, PointCloud2] | None = None
 
     def dipoles(self, model: FieldModel, frame_id: str, stamp_ns: int) -> PointCloud2:
-        """Return the ``field_model`` message."""
+        """Return the ``field_model`` message; for the model of the last one, that one renamed."""
+        if self._told is not None and self._told[0] is model:
+            message = self._told[1]
+            message.header.frame_id = frame_id
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, NANO)
+            return message
         points = DipolePoints(model.positions, model.directions, model.moments)
-        return self._maker.message(encode_field_model(points), frame_id, stamp_ns)
+        message = self._maker.message(encode_field_model(points), frame_id, stamp_ns)
+        self._told = (model, message)
+        return message
 
     def error(self, model: FieldModel, frame_id: str, stamp_ns: int) -> PointCloud2:
         """Return the ``field_model_error`` message."""

@@ -17,6 +17,7 @@ from anser_ros.errors import BagError
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.refit import LiveRefit
+from anser_ros.fitting.refit_change import Pace
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, NANO, Session, noise_of
 from anser_ros.sessions.starting_model import check_fits, drawing_of
@@ -142,13 +143,15 @@ def track_session(
     noise_t = max(wanted.flux_noise_t, noise_of(session.setup))
     tracker = Tracker(model, sensors, replace(wanted, flux_noise_t=noise_t))
     follower = _follower(session, model, baseline) if refit else None
+    pace = Pace()
     estimates: dict[str, list[PoseEstimate]] = {}
     frames = list(_frames(session))
     start = time.perf_counter()
     for count, (stamp, tools, reference_frame) in enumerate(frames):
         stamp_ns = session.start_ns + round(stamp / NANO)
-        if follower is not None and session.reference is not None and reference_frame is not None:
-            reference = session.reference
+        reference = session.reference
+        due = follower is not None and reference_frame is not None and pace.is_due(stamp_ns)
+        if due and follower is not None and reference is not None:
             result = follower.update(
                 stamp_ns,
                 reference.sensors.channel,
