@@ -157,6 +157,18 @@ def test_bad_messages_are_counted_and_the_rest_is_read(tmp_path):
     assert bag.optical == {}
 
 
+def test_the_last_setup_holds(tmp_path):
+    """Acquisition says its rate and noise once the stream is there, in a second document."""
+    path = tmp_path / 'two.mcap'
+    with SessionWriter(path) as writer:
+        writer.write_setup(SETUP, START)
+        writer.write_setup(f'{SETUP}flux_noise_t: 1.5e-10\n', START + 1)
+        writer.write_flux('/anser/tool/flux', START + 2, *cloud([2, 4], 0))
+    bag = read_bag(path)
+    assert bag.setup.extra['flux_noise_t'] == 1.5e-10
+    assert 'flux_noise_t' in bag.setup_text
+
+
 def test_another_number_of_emitters_than_the_setups_is_refused(tmp_path):
     path = tmp_path / 'three.mcap'
     with SessionWriter(path) as writer:

@@ -225,6 +225,30 @@ class TestEffects:
         ratio = got[:, 20] / [world().flux(t)[20] for t in times]
         assert ratio[0].real == pytest.approx([1, 1, 0.9, 1, 1, 1, 1, 1], abs=2e-2)
 
+    def test_drift_begins_with_the_first_start(self):
+        drift = raw_effects.CoilWeakens(2, -0.5, 0.05)
+
+        def current_share(unit, seconds):
+            unit.advance(int(seconds * unit.sample_rate_hz))
+            unit.receive(encode(Start()))
+            got, _, times = fluxes(unit, 0.1)
+            return got[:, 20, 2].real / [world().flux(t)[20, 2].real for t in times]
+
+        share = current_share(ControlUnit(world(), CHANNELS, effects=[drift]), 0.0)
+        assert share[0] > 0.85 and share[-1] < 0.65
+        unit = ControlUnit(world(), CHANNELS, effects=[drift])
+        idle = current_share(unit, 1.0)
+        assert idle[0] > 0.85, 'an idle unit does not drift'
+        again = current_share(unit, 1.0)
+        assert again[0] < 0.52, 'a second start does not cool the coils'
+
+    def test_what_is_small_is_lost_behind_a_crossover(self):
+        clean, _ = self.codes()
+        crossed, _ = self.codes(raw_effects.CrossoverAmplifier(20, 0.02))
+        volts = clean[:, 20] * 5.0 / 32768
+        expected = clean[:, 20] - 0.02 * np.tanh(volts / 0.02) * 32768 / 5.0
+        assert np.abs(crossed[:, 20] - expected).max() <= 2
+
     def test_slow_clock(self):
         _, blocks = self.codes(raw_effects.SlowClock(-1000.0))
         assert blocks[50].timestamp_ticks == round(50_000 * 0.999)
@@ -239,7 +263,7 @@ class TestEffects:
 class TestDraw:
     @pytest.mark.parametrize('name', sorted(CATALOGUE))
     def test_every_effect_of_the_catalogue_changes_the_signals(self, name):
-        drawn = draw(name, SETUP, np.random.default_rng(1))
+        drawn = draw(name, SETUP, CHANNELS, np.random.default_rng(1))
         assert drawn.name == name and drawn.parameters
         real = SETUP
         for effect in drawn.effects:
@@ -258,11 +282,13 @@ class TestDraw:
         assert (streams[0] != streams[1]) or late > 0
 
     def test_random_is_reproducible_and_none_is_nothing(self):
-        first, second = (draw('random', SETUP, np.random.default_rng(5)) for _ in range(2))
+        first, second = (
+            draw('random', SETUP, CHANNELS, np.random.default_rng(5)) for _ in range(2)
+        )
         assert (first.name, first.parameters) == (second.name, second.parameters)
-        assert draw('none', SETUP, np.random.default_rng(0)).effects == ()
+        assert draw('none', SETUP, CHANNELS, np.random.default_rng(0)).effects == ()
         with pytest.raises(ParameterError, match='no effect'):
-            draw('gremlin', SETUP, np.random.default_rng(0))
+            draw('gremlin', SETUP, CHANNELS, np.random.default_rng(0))
 
 
 class TestMetal:

@@ -1,45 +1,55 @@
-"""Put a random effect into simulated raw samples, find it blind, correct it, measure again."""
+"""Put an effect into simulated raw samples, find it blind, correct it, measure live again."""
 
 import argparse
 import json
 import os
-import shutil
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
-from anser_ros.cli.demo import BOARD_SEED, FROZEN, NO_GATE, SAMPLE_RATE_HZ, SHARED_TOPICS
-from anser_ros.cli.demo import node_command as node
 from anser_ros.cli.kernels import compile_kernels
+from anser_ros.cli.loop_result import parameter_errors, second_run, table, verdict
+from anser_ros.cli.loop_run import Run, record
 from anser_ros.cli.supervisor import Supervisor, tail
-from anser_ros.effects.correction import Correction
-from anser_ros.errors import AnserError, DiagnosisError, ParameterError
+from anser_ros.errors import DiagnosisError, ParameterError
 from anser_ros.sessions.model_file import load_model
-from anser_ros.sessions.recorded_poses import position_errors
+from anser_ros.sessions.recorded_health import kept_share, overload
 from anser_ros.sessions.session import load_session
-from anser_ros.wire.bag import read_bag
+from anser_ros.simulation.effect_draw import CATALOGUE, NONE, RANDOM
 from anser_ros.wire.config_folder import config_path
 
+ALL = 'all'
 CLEAN_S = 6.0
-PATIENCE_S = 180.0
+SECOND_SHARE = 0.6
+"""Duration of the second run over that of the first."""
+OTHER_PATH_RAD = 2.0
 OPTICAL_NOISE_M = 0.07e-3
-CHAINS = {'after': '/anser', 'before': f'/anser/{FROZEN}'}
+LEAST_KEPT = 0.85
+"""Share of whole frames below which a recording says more of the machine than of the effect."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument('--effect', default='random', help='random, or a name of the simulator')
+    known = ', '.join(sorted(CATALOGUE))
+    parser.add_argument(
+        '--effect', nargs='+', default=[RANDOM], metavar='NAME',
+        help=f'{RANDOM}, {ALL} (each in its turn), {NONE}, or of: {known}',
+    )  # fmt: skip
     parser.add_argument('--seed', type=int, help='of the effect; another one every time without')
-    parser.add_argument('--duration', type=float, default=30.0, metavar='S', help='of each run')
+    parser.add_argument(
+        '--duration', type=float, default=30.0, metavar='S', help='of the first run'
+    )
+    parser.add_argument(
+        '--baseline', type=Path, metavar='BAG',
+        help="clean recording of the simulator's board; recorded first when not given",
+    )  # fmt: skip
     parser.add_argument('--out', type=Path, default=Path('recordings'), metavar='DIR')
-    parser.add_argument('--json', action='store_true', help='print only the summary, as JSON')
+    parser.add_argument('--json', action='store_true', help='print only the result, as JSON')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -48,97 +58,90 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     ParameterError
-        When the duration or the seed is out of range.
+        When the duration, the seed or an effect's name is none that can be.
     DiagnosisError
-        When a run records nothing, or the diagnosis fails.
+        When a run records nothing or a diagnosis fails.
     """
     if not 10.0 <= args.duration <= 600.0:
         raise ParameterError(f'--duration must be 10 to 600 s, got {args.duration:g}')
     seed = int(np.random.default_rng().integers(1, 2**31)) if args.seed is None else args.seed
     if seed < 1:
         raise ParameterError(f'--seed must be at least 1, got {seed}')
+    effects = [*sorted(CATALOGUE), NONE] if ALL in args.effect else list(args.effect)
+    for name in effects:
+        if name not in (*CATALOGUE, NONE, RANDOM):
+            raise ParameterError(f'no effect {name!r}; there are: {", ".join(sorted(CATALOGUE))}')
+    for variable in ('OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
+        os.environ.setdefault(variable, '1')
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     folder = args.out / time.strftime('loop_%Y%m%d_%H%M%S')
     folder.mkdir(parents=True, exist_ok=True)
-    say = Console(stderr=True)
-    model = config_path('demo_model.yaml')
+    say = Console(stderr=True, highlight=False)
     with Supervisor(folder / 'logs') as supervisor:
         failed = compile_kernels(supervisor, say.print, lambda: False)
         if failed is not None:
             raise DiagnosisError(f'no kernels: {tail(failed)}')
-    say.print(f'1 of 4: a clean recording, {CLEAN_S:g} s')
-    clean = _record(folder / 'clean', CLEAN_S, 'none', seed, model, model)
-    say.print(f'2 of 4: {args.duration:g} s with an effect that only truth.json knows')
-    first = _record(folder / 'first', args.duration, args.effect, seed, model, model)
-    say.print('3 of 4: diagnosis')
-    diagnosis = _diagnose(first, clean, model, folder / 'diagnosis')
-    corrected = folder / 'diagnosis' / 'model.yaml'
-    say.print('4 of 4: the corrected model is served, a second recording')
-    second = _record(folder / 'second', args.duration, args.effect, seed, corrected, model)
-    summary = _summary(folder, second, corrected, diagnosis)
-    (folder / 'loop.json').write_text(json.dumps(summary, indent=1) + '\n', encoding='utf-8')
+    clean = args.baseline
+    if clean is None:
+        say.print(f'a clean recording, {CLEAN_S:g} s')
+        clean = record(Run(folder / 'clean', CLEAN_S))
+    document: dict[str, Any] = {'data': 'simulated', 'folder': str(folder), 'rounds': []}
+    for number, effect in enumerate(effects):
+        where = f'round {number + 1} of {len(effects)}: '
+        found = _round(
+            folder / f'{number + 1:02d}', clean, effect, seed + number, args.duration,
+            lambda text, where=where: say.print(where + text),
+        )  # fmt: skip
+        document['rounds'].append(found)
+        (folder / 'loop.json').write_text(json.dumps(document, indent=1) + '\n', encoding='utf-8')
     if args.json:
-        print(json.dumps(summary, indent=1))
+        print(json.dumps(document, indent=1))
     else:
-        _show(summary)
+        table(document['rounds'], Console(width=None if os.isatty(1) else 200))
+        print(f'folder: {folder}')
     return 0
 
 
-def _record(
-    folder: Path, duration_s: float, effect: str, seed: int, served: Path, known: Path
-) -> Path:
-    """Run the chain, with a second one that keeps the model known before; the bag's folder."""
-    ports = Path(tempfile.mkdtemp(prefix='anser_loop_'))
-    apart = ['-r', f'__ns:={CHAINS["before"]}']
-    for topic in SHARED_TOPICS:
-        apart += ['-r', f'{topic}:=/anser/{topic}']
-    commands = {
-        'cu_simulator': node(
-            'cu_simulator',
-            link=ports / 'cu',
-            metal=False,
-            board_seed=BOARD_SEED,
-            sample_rate_hz=SAMPLE_RATE_HZ,
-            optical_noise_m=OPTICAL_NOISE_M,
-            effect=effect,
-            effect_seed=seed,
-            effect_file=folder.parent / 'truth.json' if effect != 'none' else '',
-            seed=len(folder.name),
-        ),
-        'acquisition': node('acquisition', device=ports / 'cu', rate_hz=25.0),
-        'field_model': node('field_model', model_file=served, refit=False),
-        'tracker': node('tracker', model_file=served),
-        'field_model_before': node('field_model', *apart, model_file=known, refit=False),
-        'tracker_before': node('tracker', *apart, model_file=known, **NO_GATE),
-        'recorder': node('recorder', directory=folder, name='bag'),
+def _round(
+    folder: Path, clean: Path, effect: str, seed: int, duration_s: float, say: Any
+) -> dict[str, Any]:
+    """One effect, from the raw samples to the error of the second run."""
+    model, truth_file = config_path('demo_model.yaml'), folder / 'truth.json'
+    folder.mkdir()
+    unit = {'effect': effect, 'effect_seed': seed, 'effect_file': truth_file}
+    say(f'{duration_s:g} s with an effect that only truth.json knows')
+    noisy = {'optical_noise_m': OPTICAL_NOISE_M, 'seed': 2}
+    first = record(Run(folder / 'first', duration_s, {**unit, **noisy}))
+    say('diagnosis')
+    began_s = time.monotonic()
+    diagnosis = _diagnose(first, clean, model, folder / 'diagnosis')
+    took_s = time.monotonic() - began_s
+    corrected = folder / 'diagnosis' / 'model.yaml'
+    second_s = SECOND_SHARE * duration_s
+    say(f'the corrected model is served, {second_s:g} s on another path')
+    other = {'path_phase_rad': OTHER_PATH_RAD, 'seed': 3}
+    second = record(Run(folder / 'second', second_s, {**unit, **other}, corrected, model))
+    session = load_session(second)
+    truth = json.loads(truth_file.read_text(encoding='utf-8'))  # not before all is analysed
+    busy = {
+        name: signs
+        for name, bag in (('first', first), ('second', second))
+        if (signs := overload(bag))
     }
-    bag = folder / 'bag'
-    try:
-        with Supervisor(folder / 'logs') as supervisor:
-            for name, command in commands.items():
-                supervisor.start(name, command)
-            begin, end = time.monotonic(), None
-            while end is None or time.monotonic() < end:
-                ended = supervisor.ended()
-                if ended is not None:
-                    raise DiagnosisError(
-                        f'{ended.name} ended with {ended.process.returncode}: {tail(ended)}'
-                    )
-                if end is None and _has_flux(bag):
-                    end = time.monotonic() + duration_s
-                if end is None and time.monotonic() - begin > PATIENCE_S:
-                    raise DiagnosisError(f'no flux was recorded; logs: {folder / "logs"}')
-                time.sleep(0.2)
-    finally:
-        shutil.rmtree(ports, ignore_errors=True)
-    return bag
-
-
-def _has_flux(bag: Path) -> bool:
-    try:
-        return read_bag(bag).tool is not None
-    except AnserError:
-        return False
+    kept = {'first': kept_share(load_session(first)), 'second': kept_share(session)}
+    return {
+        'truth': truth,
+        'found': diagnosis['effects'],
+        'verdict': verdict(truth, diagnosis),
+        'parameters': parameter_errors(truth, diagnosis),
+        'unexplained': diagnosis['unexplained'],
+        'first_run_held_out': diagnosis['held_out'],
+        'second_run_live': second_run(session, load_model(corrected), load_model(model)),
+        'diagnosis_s': took_s,
+        'kept_share': kept,
+        'too_busy': min(kept.values()) < LEAST_KEPT,
+        'machine': busy,
+    }
 
 
 def _diagnose(bag: Path, clean: Path, model: Path, out: Path) -> dict[str, Any]:
@@ -153,53 +156,3 @@ def _diagnose(bag: Path, clean: Path, model: Path, out: Path) -> dict[str, Any]:
     document = json.loads((out / 'diagnosis.json').read_text(encoding='utf-8'))
     assert isinstance(document, dict)
     return document
-
-
-def _summary(
-    folder: Path, second: Path, corrected: Path, diagnosis: dict[str, Any]
-) -> dict[str, Any]:
-    """What was put in, what was found, and the live errors of the second run, in one document."""
-    session, model = load_session(second), load_model(corrected)
-    correction = Correction.of(model.effects, session.tools[0].sensors, model.frequencies_hz)
-    errors = position_errors(session, CHAINS, correction)
-    figures = {
-        name: {
-            'poses': int(error.size),
-            'position_rmse_m': float(np.sqrt(np.mean(error**2))) if error.size else None,
-            'position_prc95_m': float(np.percentile(error, 95)) if error.size else None,
-        }
-        for name, error in errors.items()
-    }
-    truth = json.loads((folder / 'truth.json').read_text(encoding='utf-8'))
-    return {
-        'data': 'simulated',
-        'truth': truth,
-        'found': [
-            {'name': effect['name'], 'parameters': effect['parameters']}
-            for effect in diagnosis['effects']
-        ],
-        'unexplained': diagnosis['unexplained'],
-        'first_run_held_out': diagnosis['held_out'],
-        'second_run_live': figures,
-        'folder': str(folder),
-    }
-
-
-def _show(summary: dict[str, Any]) -> None:
-    table = Table('', 'poses', 'RMSE mm', 'PRC95 mm', title='second run, live (simulated)')
-    for name in ('before', 'after'):
-        row = summary['second_run_live'][name]
-        cells = [
-            '-' if row[key] is None else f'{1e3 * row[key]:.3f}'
-            for key in ('position_rmse_m', 'position_prc95_m')
-        ]
-        table.add_row(name, str(row['poses']), *cells)
-    console = Console()
-    console.print(table)
-    print(f'put in: {json.dumps(summary["truth"])}')
-    for effect in summary['found']:
-        print(f' found: {json.dumps(effect)}')
-    if not summary['found']:
-        print(' found: no effect of the catalogue')
-    print(f'unexplained: {json.dumps(summary["unexplained"])}')
-    print(f'folder: {summary["folder"]}')

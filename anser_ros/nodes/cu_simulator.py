@@ -26,7 +26,7 @@ from anser_ros.simulation.effect_draw import Drawn, draw
 from anser_ros.simulation.faults import FAULTS, NONE, UNPLUG, FaultInjector
 from anser_ros.simulation.manufacture import manufactured
 from anser_ros.simulation.metal import MetalBody, steel_disc
-from anser_ros.simulation.motion import Approach
+from anser_ros.simulation.motion import Approach, tool_paths
 from anser_ros.simulation.pseudo_port import PseudoPort
 from anser_ros.simulation.sampling import FrontEnd
 from anser_ros.simulation.world import World
@@ -80,6 +80,9 @@ class CuSimulatorParameters:
     optical_noise_m: float = parameter(
         0.0, 'jitter of the optical position, m rms an axis', minimum=0.0, maximum=0.01
     )
+    path_phase_rad: float = parameter(
+        0.0, "phase at which the tools' paths begin; another one is another path", minimum=0.0
+    )
     fault: str = parameter(NONE, 'fault of the line', choices=FAULTS, live=True)
     fault_period_s: float = parameter(
         5.0, 'from one fault to the next, s', minimum=0.1, maximum=3600.0, live=True
@@ -103,7 +106,8 @@ class CuSimulator(AnserNode):
         table = self.parameters
         setup = parse_setup(read_config(table.setup_file))
         channels = parse_channels(read_config(table.channels_file))
-        drawn = draw(table.effect, setup, np.random.default_rng(table.effect_seed or None))
+        rng = np.random.default_rng(table.effect_seed or None)
+        drawn = draw(table.effect, setup, channels, rng)
         if table.effect_file:
             _write_effect(Path(table.effect_file), drawn)
         effects = drawn.effects
@@ -114,7 +118,9 @@ class CuSimulator(AnserNode):
         self._begin_ns = time.monotonic_ns()
         self._stream_begin_s = math.inf
         self._metal = [*_metal(table, lambda: self._stream_begin_s), *drawn.metal]
-        self._world = World(real, board_source(_board(table, real)), metal=self._metal)
+        paths = tool_paths(setup.bodies, table.path_phase_rad)
+        source = board_source(_board(table, real))
+        self._world = World(real, source, paths=paths, metal=self._metal)
         front = FrontEnd(
             table.sample_rate_hz,
             noise_codes=table.noise_codes,
@@ -232,7 +238,7 @@ class CuSimulator(AnserNode):
 
 def _write_effect(path: Path, drawn: Drawn) -> None:
     try:
-        path.write_text(json.dumps({'name': drawn.name, 'parameters': drawn.parameters}))
+        path.write_text(json.dumps(drawn.document()) + '\n')
     except OSError as error:
         raise ParameterError(f'cannot write {path}: {error.strerror}') from error
 

@@ -17,7 +17,7 @@ from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.nominal import nominal_model
 from anser_ros.sessions.evaluation import baseline_flux, track_session
-from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, Session
+from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, Session, noise_of
 from anser_ros.sessions.starting_model import board_of, check_fits
 from anser_ros.tracking.estimate import TrackerSettings
 
@@ -88,9 +88,8 @@ def diagnose_session(
     clean = None
     if baseline is not None and session.reference is not None:
         clean = baseline_flux(baseline, session.reference.sensors)
-    spread = Spread(
-        flux_t=float(np.hypot(DEFAULT_NOISE_T, model.flux_error_t)), noise_t=DEFAULT_NOISE_T
-    )
+    noise_t = noise_of(session.setup) or DEFAULT_NOISE_T
+    spread = Spread(flux_t=float(np.hypot(noise_t, model.flux_error_t)), noise_t=noise_t)
     known = [_corrected(tool, model) for tool in session.tools]
     reference = None if session.reference is None else _corrected(session.reference, model)
     problem = build_problem(known, reference, clean, model, _drawn(session), spread)

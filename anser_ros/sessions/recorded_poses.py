@@ -1,13 +1,16 @@
 """The poses that live trackers published during a recording, against its optical ones."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import BagError
+from anser_ros.fitting.measurements import Measurements
 from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, NANO, Session
 from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages, stamp_ns
 from anser_ros.wire.setup import topic_of
@@ -15,66 +18,108 @@ from anser_ros.wire.setup import topic_of
 Array = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class PublishedPoses:
+    """Poses of one topic: stamps (n,), ns, positions (n, 3), m, quaternions (n, 4), x y z w."""
+
+    stamp_ns: NDArray[np.int64]
+    position: Array
+    quaternion: Array
+
+
+@dataclass(frozen=True)
+class LiveErrors:
+    """Errors of the poses of one sensor or body.
+
+    Attributes
+    ----------
+    position : ndarray, shape (n,)
+        Distance from the optical pose, m, where there is one.
+    orientation : ndarray, shape (n,)
+        Angle, rad: of a coil between the axes, of a body the whole turn.
+    frames : int
+        Frames of the recording in which there could have been a pose.
+    """
+
+    position: Array
+    orientation: Array
+    frames: int
+
+
 def published_poses(
     path: str | os.PathLike[str], topics: Sequence[str]
-) -> dict[str, tuple[NDArray[np.int64], Array]]:
-    """Stamps (n,), ns, and positions (n, 3), m, of each PoseStamped topic of a bag."""
-    rows: dict[str, list[tuple[int, float, float, float]]] = {topic: [] for topic in topics}
+) -> dict[str, PublishedPoses]:
+    """What each PoseStamped topic of a bag carries."""
+    rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in topics}
+    stamps: dict[str, list[int]] = {topic: [] for topic in topics}
     decoder = MessageDecoder()
     for raw in iter_messages(path, Salvage()):
         if raw.topic in rows and raw.type_name == POSE_TYPE:
             message = decoder.decode(raw)
-            place = message.pose.position
-            rows[raw.topic].append((stamp_ns(message), place.x, place.y, place.z))
-    result = {}
+            place, turn = message.pose.position, message.pose.orientation
+            stamps[raw.topic].append(stamp_ns(message))
+            rows[raw.topic].append((place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
+    found = {}
     for topic, values in rows.items():
-        stamps = np.array([row[0] for row in values], dtype=np.int64)
-        result[topic] = (stamps, np.array([row[1:] for row in values]).reshape(-1, 3))
-    return result
+        table = np.array(values, dtype=np.float64).reshape(-1, 7)
+        stamp = np.array(stamps[topic], dtype=np.int64)
+        found[topic] = PublishedPoses(stamp, table[:, :3], table[:, 3:])
+    return found
 
 
-def position_errors(
-    session: Session, chains: Mapping[str, str], correction: Correction
-) -> dict[str, Array]:
-    """Distance of every published pose from the optical one, m, over all sensors, by chain.
+def live_errors(session: Session, namespace: str, correction: Correction) -> dict[str, LiveErrors]:
+    """Errors of everything that the tracker of a namespace published, by sensor and body.
 
     Parameters
     ----------
     session : Session
-        The recording, with the optical poses.
-    chains : mapping
-        Namespace of each chain's topics, by the chain's name.
+        The recording, with optical poses.
+    namespace : str
+        Of the tracker, such as ``/anser``.
     correction : Correction
-        What is known of the clock, the optical frame and the sensors' places: the same truth for
-        every chain.
+        What its model knows of the clock, the optical frame and the sensors.
 
     Raises
     ------
     BagError
         When the recording has no optical poses.
     """
-    topics = {
-        name: {
-            f'{namespace}/{topic_of(sensor)}/pose': (tool, column)
-            for tool in session.tools
-            for column, sensor in enumerate(tool.sensors.name)
-        }
-        for name, namespace in chains.items()
-    }
-    received = published_poses(
-        session.path, [topic for group in topics.values() for topic in group]
-    )
-    errors: dict[str, Array] = {}
-    for name, group in topics.items():
-        parts = []
-        for topic, (tool, column) in group.items():
-            if tool.track is None:
-                raise BagError(f'{session.path}: no optical poses of {tool.body}')
-            stamps, positions = received[topic]
-            time = np.asarray((stamps - session.start_ns) * NANO, dtype=np.float64)
-            track = correction.optical(tool.track)
-            position, rotation, valid = track.at(time, LONGEST_OPTICAL_GAP_S)
-            centres, _ = correction.sensors(tool.sensors).placed(position, rotation)
-            parts.append(np.linalg.norm(positions - centres[:, column], axis=1)[valid])
-        errors[name] = np.concatenate(parts)
+    names = [name for tool in session.tools for name in (*tool.sensors.name, tool.body)]
+    topics = {name: f'{namespace}/{topic_of(name)}/pose' for name in names}
+    received = published_poses(session.path, list(topics.values()))
+    errors = {}
+    for tool in session.tools:
+        for column, name in enumerate(tool.sensors.name):
+            errors[name] = _compared(session, tool, received[topics[name]], correction, column)
+        errors[tool.body] = _compared(session, tool, received[topics[tool.body]], correction, None)
     return errors
+
+
+def _compared(
+    session: Session,
+    tool: Measurements,
+    poses: PublishedPoses,
+    correction: Correction,
+    column: int | None,
+) -> LiveErrors:
+    """Errors of one sensor (by its column), or of the body."""
+    if tool.track is None:
+        raise BagError(f'{session.path}: no optical poses of {tool.body}')
+    time = np.asarray((poses.stamp_ns - session.start_ns) * NANO, dtype=np.float64)
+    track = correction.optical(tool.track)
+    position, rotation, valid = track.at(time, LONGEST_OPTICAL_GAP_S)
+    there = track.at(tool.time, LONGEST_OPTICAL_GAP_S)[2]
+    turned = Rotation.from_quat(poses.quaternion[valid]).as_matrix() if valid.any() else None
+    frames = int(there.sum())
+    if turned is None:
+        return LiveErrors(np.zeros(0), np.zeros(0), frames)
+    if column is None:
+        truth = position[valid]
+        turn = Rotation.from_matrix(rotation[valid].transpose(0, 2, 1) @ turned).magnitude()
+    else:
+        centres, axes = correction.sensors(tool.sensors).placed(position[valid], rotation[valid])
+        truth = centres[:, column]
+        cross = np.linalg.norm(np.cross(turned[:, :, 2], axes[:, column]), axis=1)
+        turn = np.arctan2(cross, np.sum(turned[:, :, 2] * axes[:, column], axis=1))
+    distance = np.linalg.norm(poses.position[valid] - truth, axis=1)
+    return LiveErrors(distance, np.asarray(turn), frames)

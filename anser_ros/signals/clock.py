@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-_TOLERANCE = 1e-4
+FOLLOWED_SHARE = 1e-4
+"""More than two quartz clocks drift apart: how fast the estimate follows a slow device clock."""
 _JUMP_NS = 1_000_000_000
 _STALL_NS = 3_000_000_000
 
@@ -12,8 +13,7 @@ class DeviceClock:
 
     Every arrival is late by an unknown delay that is never negative, so the smallest difference
     seen between arrival and device time is the best estimate of the offset. The estimate may rise
-    by 100 ppm, more than two quartz clocks drift apart, so that it follows a slow device clock and
-    forgets an early outlier.
+    by `FOLLOWED_SHARE`, so that it follows a slow device clock and forgets an early outlier.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class DeviceClock:
         offset = arrival_ns - device_ns
         if self._offset_ns is not None:
             elapsed = device_ns - self._last_device_ns
-            risen = self._offset_ns + _TOLERANCE * max(elapsed, 0.0)
+            risen = self._offset_ns + FOLLOWED_SHARE * max(elapsed, 0.0)
             if (
                 elapsed < 0
                 or risen - offset > _JUMP_NS

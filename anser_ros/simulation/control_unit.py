@@ -177,6 +177,7 @@ class ControlUnit:
             self._state = State.STREAMING
             self._stream_begin, self._sequence = self._sample, 0
             self._dropped, self._lost_before = 0, False
+            self._sampler.drive(self._sample / self.sample_rate_hz)
         elif isinstance(command, Stop):
             self._state = State.IDLE
         elif isinstance(command, Identify):

@@ -11,17 +11,22 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import ParameterError
+from anser_ros.signals.clock import FOLLOWED_SHARE
 from anser_ros.simulation.metal import MetalBody
 from anser_ros.simulation.raw_effects import (
     ChannelCrosstalk,
     ChannelGain,
     CoilWeakens,
     CompressingAmplifier,
+    CrossoverAmplifier,
     GainRipple,
     LateDelivery,
+    LooseSensor,
     RawEffect,
+    SlowClock,
     TiltedSensor,
 )
+from anser_ros.wire.channel_calibration import ChannelCalibration
 from anser_ros.wire.setup import Setup
 
 NONE = 'none'
@@ -34,15 +39,32 @@ class Drawn:
 
     Attributes
     ----------
-    name : effect name of the interfaces, or one that no catalogue has
-    parameters : plain data
+    name : what it is
+    parameters : plain data, named as in the interfaces where they have the effect
     effects, metal : what puts it into the simulation
+    answers : names under which a diagnosis may rightly report it; empty where no catalogue has it
+        and only ``unexplained`` is right
     """
 
     name: str
     parameters: dict[str, Any]
     effects: tuple[RawEffect, ...] = ()
     metal: tuple[MetalBody, ...] = field(default=())
+    answers: tuple[str, ...] = ()
+
+    def document(self) -> dict[str, Any]:
+        """What a file of the truth says."""
+        return {
+            'name': self.name, 'parameters': self.parameters, 'answers': list(self.answers)
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Unit:
+    """What an effect is put into: the sensors with their channels' response."""
+
+    setup: Setup
+    channels: ChannelCalibration
 
 
 def _tool_columns(setup: Setup) -> list[int]:
@@ -59,93 +81,127 @@ def _clusters(setup: Setup) -> list[list[int]]:
     return [columns for columns in places.values() if len(columns) >= 3]
 
 
-def _static_metal(setup: Setup, rng: np.random.Generator) -> Drawn:
+def _static_metal(unit: Unit, rng: np.random.Generator) -> Drawn:
     place = np.array([*rng.uniform(-0.08, 0.08, 2), rng.uniform(-0.12, -0.07)])
     radius = float(rng.uniform(0.03, 0.045))
     body = MetalBody(np.zeros((1, 3)), radius, 5e6, 200.0, _resting(place))
-    return Drawn('static_metal', {'position_m': place.tolist(), 'radius_m': radius}, metal=(body,))
+    parameters = {'position_m': place.tolist(), 'radius_m': radius}
+    return _known('static_metal', parameters, metal=(body,))
 
 
 def _resting(place: NDArray[np.float64]) -> Callable[[float], Any]:
     return lambda time_s: (place, np.eye(3))
 
 
-def _channel_crosstalk(setup: Setup, rng: np.random.Generator) -> Drawn:
-    clusters = _clusters(setup)
-    columns = clusters[rng.integers(len(clusters))] if clusters else _tool_columns(setup)[:2]
+def _known(name: str, parameters: dict[str, Any], *effects: RawEffect, **rest: Any) -> Drawn:
+    """An effect that the interfaces have under the same name."""
+    return Drawn(name, parameters, effects, answers=(name,), **rest)
+
+
+def _channel_crosstalk(unit: Unit, rng: np.random.Generator) -> Drawn:
+    clusters = _clusters(unit.setup)
+    columns = clusters[rng.integers(len(clusters))] if clusters else _tool_columns(unit.setup)[:2]
     count = len(columns)
     matrix = np.eye(count) + rng.uniform(0.01, 0.04, (count, count)) * (1 - np.eye(count))
     matrix[~np.eye(count, dtype=bool)] *= rng.choice([-1.0, 1.0], count * (count - 1))
     rows = tuple(tuple(float(v) for v in row) for row in matrix)
-    channels = [setup.sensors[c].channel for c in columns]
-    return Drawn(
-        'channel_crosstalk',
-        {'channels': channels, 'matrix': [list(row) for row in rows]},
-        (ChannelCrosstalk(tuple(columns), rows),),
-    )
+    channels = [unit.setup.sensors[c].channel for c in columns]
+    parameters = {'channels': channels, 'matrix': [list(row) for row in rows]}
+    return _known('channel_crosstalk', parameters, ChannelCrosstalk(tuple(columns), rows))
 
 
-def _time_offset(setup: Setup, rng: np.random.Generator) -> Drawn:
+def _time_offset(unit: Unit, rng: np.random.Generator) -> Drawn:
     delay = float(rng.uniform(0.015, 0.04))
-    return Drawn('time_offset', {'offset_s': delay}, (LateDelivery(delay),))
+    return _known('time_offset', {'offset_s': delay}, LateDelivery(delay))
 
 
-def _sensor_axis(setup: Setup, rng: np.random.Generator) -> Drawn:
-    column = int(rng.choice(_tool_columns(setup)))
-    sensor = setup.sensors[column]
+def _clock_rate(unit: Unit, rng: np.random.Generator) -> Drawn:
+    slow_ppm = float(rng.uniform(2500.0, 6000.0))
+    # The host follows as far as two quartz clocks may differ; only the rest shows.
+    rate_ppm = 1e6 * FOLLOWED_SHARE - slow_ppm
+    parameters = {'rate_ppm': rate_ppm, 'device_clock_ppm': -slow_ppm}
+    return _known('clock_rate', parameters, SlowClock(-slow_ppm))
+
+
+def _sensor_axis(unit: Unit, rng: np.random.Generator) -> Drawn:
+    column = int(rng.choice(_tool_columns(unit.setup)))
+    sensor = unit.setup.sensors[column]
     across = np.cross(sensor.axis, rng.standard_normal(3))
     tilt_deg = float(rng.uniform(3.0, 8.0))
     turn = Rotation.from_rotvec(np.radians(tilt_deg) * across / np.linalg.norm(across))
     x, y, z = (float(v) for v in turn.apply(sensor.axis))
-    return Drawn(
-        'sensor_axis',
-        {'channel': sensor.channel, 'tilt_deg': tilt_deg, 'axis': [x, y, z]},
-        (TiltedSensor(column, (x, y, z)),),
-    )
+    parameters = {'channel': sensor.channel, 'tilt_deg': tilt_deg, 'axis': [x, y, z]}
+    return _known('sensor_axis', parameters, TiltedSensor(column, (x, y, z)))
 
 
-def _sensor_gain(setup: Setup, rng: np.random.Generator) -> Drawn:
-    column = int(rng.choice(_tool_columns(setup)))
+def _sensor_gain(unit: Unit, rng: np.random.Generator) -> Drawn:
+    column = int(rng.choice(_tool_columns(unit.setup)))
     gain = float(1 + rng.choice([-1, 1]) * rng.uniform(0.01, 0.04))
-    parameters = {'channel': setup.sensors[column].channel, 'gain': gain, 'phase_deg': 0.0}
-    return Drawn('sensor_gain', parameters, (ChannelGain(column, gain),))
+    parameters = {'channel': unit.setup.sensors[column].channel, 'gain': gain, 'phase_deg': 0.0}
+    return _known('sensor_gain', parameters, ChannelGain(column, gain))
 
 
-def _saturation(setup: Setup, rng: np.random.Generator) -> Drawn:
-    column = int(rng.choice(_tool_columns(setup)))
+def _saturation(unit: Unit, rng: np.random.Generator) -> Drawn:
+    column = int(rng.choice(_tool_columns(unit.setup)))
     limit_v = float(rng.uniform(0.8, 1.6))
-    parameters = {'channel': setup.sensors[column].channel, 'limit_v': limit_v}
-    return Drawn('saturation', parameters, (CompressingAmplifier(column, limit_v),))
+    channel = unit.setup.sensors[column].channel
+    # What the tones' mean frequency makes of it; the amplifier sees volts, the higher tones more.
+    volts_per_tesla = unit.channels.areas_m2([channel])[0] * np.mean(unit.setup.frequencies_hz)
+    full_scale_t = float(limit_v / (2 * np.pi * volts_per_tesla))
+    parameters = {'channel': channel, 'full_scale_t': full_scale_t, 'limit_v': limit_v}
+    return _known('saturation', parameters, CompressingAmplifier(column, limit_v))
 
 
-def _coil_drift(setup: Setup, rng: np.random.Generator) -> Drawn:
-    coil = int(rng.integers(len(setup.emitter.coils)))
+def _coil_drift(unit: Unit, rng: np.random.Generator) -> Drawn:
+    coil = int(rng.integers(len(unit.setup.emitter.coils)))
     amount = float(rng.choice([-1, 1]) * rng.uniform(0.01, 0.03))
     tau_s = float(rng.uniform(5.0, 20.0))
     parameters = {'coil': coil, 'amount': amount, 'tau_s': tau_s}
-    return Drawn('coil_drift', parameters, (CoilWeakens(coil, amount, tau_s),))
+    return _known('coil_drift', parameters, CoilWeakens(coil, amount, tau_s))
 
 
-def _gain_ripple(setup: Setup, rng: np.random.Generator) -> Drawn:
+def _loose_contact(unit: Unit, rng: np.random.Generator) -> Drawn:
+    column = int(rng.choice(_tool_columns(unit.setup)))
+    share, period_s = float(rng.uniform(0.04, 0.1)), float(rng.uniform(0.6, 1.2))
+    parameters = {
+        'channels': [unit.setup.sensors[column].channel], 'share': share, 'period_s': period_s
+    }  # fmt: skip
+    effect = LooseSensor(column, share, period_s=period_s)
+    return Drawn('loose_contact', parameters, (effect,), answers=('outliers',))
+
+
+def _gain_ripple(unit: Unit, rng: np.random.Generator) -> Drawn:
     depth, period_s = float(rng.uniform(0.005, 0.02)), float(rng.uniform(1.0, 4.0))
+    parameters = {'depth': depth, 'period_s': period_s}
+    # No catalogue has the swing, but one has a gain's course over time.
     return Drawn(
-        'gain_ripple', {'depth': depth, 'period_s': period_s}, (GainRipple(depth, period_s),)
+        'gain_ripple', parameters, (GainRipple(depth, period_s),), answers=('sensor_gain_drift',)
     )
 
 
-CATALOGUE: dict[str, Callable[[Setup, np.random.Generator], Drawn]] = {
+def _crossover(unit: Unit, rng: np.random.Generator) -> Drawn:
+    column = int(rng.choice(_tool_columns(unit.setup)))
+    dead_v = float(rng.uniform(0.01, 0.03))
+    parameters = {'channel': unit.setup.sensors[column].channel, 'dead_v': dead_v}
+    return Drawn('crossover', parameters, (CrossoverAmplifier(column, dead_v),))
+
+
+CATALOGUE: dict[str, Callable[[Unit, np.random.Generator], Drawn]] = {
     'static_metal': _static_metal,
     'channel_crosstalk': _channel_crosstalk,
     'time_offset': _time_offset,
+    'clock_rate': _clock_rate,
     'sensor_axis': _sensor_axis,
     'sensor_gain': _sensor_gain,
     'saturation': _saturation,
     'coil_drift': _coil_drift,
+    'loose_contact': _loose_contact,
     'gain_ripple': _gain_ripple,
+    'crossover': _crossover,
 }
 
 
-def draw(name: str, setup: Setup, rng: np.random.Generator) -> Drawn:
+def draw(name: str, setup: Setup, channels: ChannelCalibration, rng: np.random.Generator) -> Drawn:
     """Draw the parameters of an effect, and the effect itself when `name` is ``random``.
 
     Raises
@@ -159,4 +215,4 @@ def draw(name: str, setup: Setup, rng: np.random.Generator) -> Drawn:
         name = str(rng.choice(sorted(CATALOGUE)))
     if name not in CATALOGUE:
         raise ParameterError(f'no effect {name!r}; there are: {", ".join(sorted(CATALOGUE))}')
-    return CATALOGUE[name](setup, rng)
+    return CATALOGUE[name](Unit(setup, channels), rng)

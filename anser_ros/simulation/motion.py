@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,6 +42,18 @@ class Lissajous:
         turn = 2 * np.pi * time_s / np.array(self.turn_period_s) + self.phase_rad
         rotation = Rotation.from_rotvec(np.array(self.turn_rad) * np.sin(turn))
         return position, np.asarray(rotation.as_matrix())
+
+
+BODY_PHASE_RAD = 0.7
+"""What a body's path is ahead of that of the body before."""
+
+
+def tool_paths(bodies: Sequence[str], phase_rad: float = 0.0) -> Mapping[str, Path]:
+    """Usual path of each body."""
+    return {
+        body: Lissajous(phase_rad=phase_rad + BODY_PHASE_RAD * rank)
+        for rank, body in enumerate(bodies)
+    }
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 An effect overrides the stage at which it acts. The stages run in the order of the methods: the
 world's fluxes, the coil currents, the voltages of all samples before the converter, the records'
-device time. An effect must not know who looks at the result.
+device time. Times count from when the coils were first driven, s, but for the device's own clock.
+An effect must not know who looks at the result.
 """
 
 from __future__ import annotations
@@ -79,6 +80,23 @@ class CompressingAmplifier(RawEffect):
         compressed = volts.copy()
         compressed[:, self.column] = self.limit_v * np.tanh(volts[:, self.column] / self.limit_v)
         return compressed
+
+
+@dataclass(frozen=True)
+class CrossoverAmplifier(RawEffect):
+    """One sensor's output stage loses what is small: v becomes v - dead * tanh(v / dead).
+
+    No effect of any catalogue: the share that is lost is the larger the weaker all tones are.
+    """
+
+    column: int
+    dead_v: float
+
+    def volts(self, time_s: Array, volts: Array) -> Array:
+        """Take the dead zone off."""
+        crossed = volts.copy()
+        crossed[:, self.column] -= self.dead_v * np.tanh(volts[:, self.column] / self.dead_v)
+        return crossed
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ class FrontEnd:
     full_scale_v, full_scale_a : volts and amperes at code 32768
     noise_codes, current_noise_codes : white noise before the converter, codes rms per sample
     current_drift : share by which the currents fall while the coils warm up
-    warm_up_s : time constant of that
+    warm_up_s : time constant of that, from the first start on
     """
 
     sample_rate_hz: float = 40e3
@@ -74,6 +74,7 @@ class Sampler:
         self._areas = calibration.areas_m2(numbers)[:, None]
         self._delays = calibration.delays_s(numbers)[:, None]
         self._current_delay = calibration.current_delay_s
+        self._driven_from_s: float | None = None
         self.set_frequencies(np.array(world.setup.frequencies_hz))
         self._last: tuple[float, ComplexArray] | None = None
 
@@ -86,6 +87,12 @@ class Sampler:
         # The synthesisers start at phases of their own, and each coil has its own impedance.
         self._start = np.exp(1j * np.arange(1, frequencies_hz.size + 1) ** 2)
         self._last = None
+
+    def drive(self, time_s: float) -> None:
+        """Note that the coils are driven from a time on; only the first one counts."""
+        if self._driven_from_s is None:
+            self._driven_from_s = time_s
+            self._last = None
 
     def codes(self, first_sample: int, count: int) -> NDArray[np.int16]:
         """Converter codes of `count` samples from number `first_sample` since power-up.
@@ -110,24 +117,30 @@ class Sampler:
         signals = basis @ np.vstack([begin.T.real, begin.T.imag, change.T.real, change.T.imag])
         volts, current = signals[:, :-1], signals[:, -1]
         if self._effects:
-            volts = chained_volts(self._effects, time_s, volts)
+            volts = chained_volts(self._effects, time_s - self._start_s, volts)
         return self._convert(volts, current)
+
+    @property
+    def _start_s(self) -> float:
+        """When the coils were first driven; their warming and all effects count from there."""
+        return self._driven_from_s or 0.0
 
     def _phasors(self, time_s: float) -> ComplexArray:
         """Voltages of the sensors and, in the last row, currents; shape (S + 1, K)."""
         flux = self._world.flux(time_s)
         for effect in self._effects:
-            flux = effect.flux(time_s, flux)
+            flux = effect.flux(time_s - self._start_s, flux)
         current = self.current(time_s)
         volts = flux * self._volts_per_tesla * (current / self._nominal_a)
         return np.vstack([volts, current * self._current_response])
 
     def current(self, time_s: float) -> ComplexArray:
         """True coil currents (K,), A."""
-        warm = 1 - np.exp(-time_s / self._front_end.warm_up_s)
+        driven_s = time_s - self._start_s
+        warm = 1 - np.exp(-driven_s / self._front_end.warm_up_s)
         current = self._nominal_a * (1 - self._front_end.current_drift * warm) * self._start
         for effect in self._effects:
-            current = effect.current(time_s, current)
+            current = effect.current(driven_s, current)
         return np.asarray(current)
 
     def _convert(self, volts: Array, current: Array) -> NDArray[np.int16]:

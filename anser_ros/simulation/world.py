@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from anser_ros.physics.dipole import GAUSS_OFFSET, flux_basis
 from anser_ros.simulation.metal import MetalBody
-from anser_ros.simulation.motion import Lissajous, Path, Pose
+from anser_ros.simulation.motion import Path, Pose, tool_paths
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
 
 Array = NDArray[np.float64]
@@ -46,11 +46,7 @@ class World:
         self._metal = tuple(metal)
         tones = np.array(setup.frequencies_hz)
         self._polarisability = [body.polarisability(tones) for body in self._metal]
-        given = dict(paths or {})
-        self._paths: dict[str, Path] = {
-            body: given.get(body) or Lissajous(phase_rad=0.7 * rank)
-            for rank, body in enumerate(setup.bodies)
-        }
+        self._paths: dict[str, Path] = {**tool_paths(setup.bodies), **dict(paths or {})}
         self._groups = _by_body(self.sensors)
         self._local = np.array([s.position_m for s in self.sensors])
         self._local_axes = np.array([s.axis for s in self.sensors])

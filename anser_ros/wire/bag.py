@@ -351,8 +351,9 @@ def read_bag(path: str | os.PathLike[str]) -> Bag:
         collector.add(raw)
     if not collector.setups:
         raise BagError(f'{os.fspath(path)}: the bag has no setup')
+    text = collector.setups[-1]  # acquisition tells rate and noise once its stream is there
     try:
-        setup = parse_setup(collector.setups[0])
+        setup = parse_setup(text)
     except SetupError as error:
         raise BagError(f'{os.fspath(path)}: {error}') from error
     tool, reference = collector.flux_stream('tool'), collector.flux_stream('reference')
@@ -360,6 +361,6 @@ def read_bag(path: str | os.PathLike[str]) -> Bag:
         reasons = ''.join(f'; {text}' for text in list(collector.refused)[:1])
         raise BagError(f'{os.fspath(path)}: the bag has no flux that reads{reasons}')
     return Bag(
-        os.fspath(path), setup, collector.setups[0], tool, reference, collector.pose_streams(),
+        os.fspath(path), setup, text, tool, reference, collector.pose_streams(),
         dict(collector.refused), salvage.lost,
     )  # fmt: skip

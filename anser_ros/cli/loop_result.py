@@ -1,0 +1,138 @@
+"""What a loop gave: truth beside finding, parameters compared, errors of the second run."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from anser_ros.cli.loop_run import AFTER, BEFORE, UNGATED
+from anser_ros.effects.correction import Correction
+from anser_ros.fitting.model import FieldModel
+from anser_ros.sessions.recorded_poses import LiveErrors, live_errors
+from anser_ros.sessions.session import Session
+
+NAMED, PARTLY, SAID = 'named', 'named in part', 'said unexplained'
+MISSED, WRONG = 'missed', 'wrong name'
+SITES = ('channel', 'channels', 'coil', 'coils')
+FIGURES = ('rmse', 'prc95')
+TRACKERS = ('ungated', 'before', 'after')
+
+
+def verdict(truth: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> str:
+    """How right a diagnosis is, in one of the words above; empty for a clean run found clean.
+
+    An effect that has an answer must be named by it, at its place, with nothing else. One that no
+    catalogue has must leave something unexplained: all of it, or a part beside other names.
+    """
+    names = [effect['name'] for effect in diagnosis['effects']]
+    unexplained = diagnosis['unexplained']['fraction'] > 0.0
+    answers = list(truth['answers'])
+    if truth['name'] == 'none':
+        return WRONG if names else ''
+    if answers and names and set(names) <= set(answers):
+        same = all(_same_site(truth['parameters'], e['parameters']) for e in diagnosis['effects'])
+        return NAMED if same else WRONG
+    if not names:
+        return SAID if unexplained else MISSED
+    return PARTLY if unexplained and not answers else WRONG
+
+
+def _same_site(truth: Mapping[str, Any], found: Mapping[str, Any]) -> bool:
+    return all(found[key] == truth[key] for key in SITES if key in truth and key in found)
+
+
+def parameter_errors(truth: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str, Any]:
+    """Each number of the truth that the finding has too: put in, found, difference, 1 sigma.
+
+    Of lists the largest difference counts, of a position the distance.
+    """
+    out: dict[str, Any] = {}
+    for effect in diagnosis['effects']:
+        if effect['name'] not in truth['answers']:
+            continue
+        for key, put_in in truth['parameters'].items():
+            found = effect['parameters'].get(key)
+            if key in SITES or found is None or np.shape(found) != np.shape(put_in):
+                continue
+            difference = np.asarray(found, float) - np.asarray(put_in, float)
+            size = np.linalg.norm if key == 'position_m' else lambda d: np.abs(d).max()
+            out[key] = {
+                'put_in': put_in,
+                'found': found,
+                'error': float(size(difference)),
+                'sigma': effect['uncertainty'].get(key),
+            }
+    return out
+
+
+def second_run(session: Session, corrected: FieldModel, known: FieldModel) -> dict[str, Any]:
+    """Live errors over all sensors and bodies, and the share of frames with a pose, by tracker.
+
+    A tracker with a wrong model withholds the poses that its gate catches, so its error is to be
+    read beside its share; `ungated` says what those poses would have been.
+    """
+    figures = {}
+    for name, namespace, model in (
+        ('ungated', UNGATED, known), ('before', BEFORE, known), ('after', AFTER, corrected)
+    ):  # fmt: skip
+        correction = Correction.of(model.effects, session.tools[0].sensors, model.frequencies_hz)
+        errors = list(live_errors(session, namespace, correction).values())
+        poses, frames = sum(e.position.size for e in errors), sum(e.frames for e in errors)
+        figures[name] = {'published_share': poses / max(frames, 1), **_figures(errors)}
+    return figures
+
+
+def _figures(errors: list[LiveErrors]) -> dict[str, float | None]:
+    out: dict[str, float | None] = {}
+    for key, unit in (('position', 'm'), ('orientation', 'rad')):
+        values = np.concatenate([getattr(error, key) for error in errors])
+        both = (
+            (float(np.sqrt(np.mean(values**2))), float(np.percentile(values, 95)))
+            if values.size
+            else (None, None)
+        )
+        for statistic, value in zip(FIGURES, both, strict=True):
+            out[f'{key}_{statistic}_{unit}'] = value
+    return out
+
+
+def table(rounds: list[dict[str, Any]], console: Console) -> None:
+    """Print a line for every round, and what went wrong with the machine."""
+    out = Table(title='live error of the second run, on another path (simulated)')
+    for heading in ('put in', 'found', 'verdict', 'parameters'):
+        out.add_column(heading, overflow='fold')
+    for heading in ('no gate\nmm', 'before\nmm', 'after\nmm', 'before\ndeg', 'after\ndeg'):
+        out.add_column(heading, justify='right')
+    for heading in ('published\nbefore', 'published\nafter', 'unexplained'):
+        out.add_column(heading, justify='right')
+    for one in rounds:
+        live, hidden = one['second_run_live'], one['too_busy']
+        out.add_row(
+            one['truth']['name'],
+            ', '.join(effect['name'] for effect in one['found']) or '-',
+            'machine too busy' if hidden else one['verdict'],
+            '\n'.join(_parameter(key, value) for key, value in one['parameters'].items()),
+            *(_number(live[n]['position_rmse_m'], 1e3, hidden) for n in TRACKERS),
+            *(_number(live[n]['orientation_rmse_rad'], 57.29578, hidden) for n in TRACKERS[1:]),
+            *(f'{100 * live[n]["published_share"]:.1f} %' for n in TRACKERS[1:]),
+            f'{100 * one["unexplained"]["fraction"]:.2g} %',
+        )
+    console.print(out)
+    for number, one in enumerate(rounds, 1):
+        for name, signs in one['machine'].items():
+            text = '; '.join(signs)
+            console.print(f'round {number}, {name} run: {text}', style='yellow', highlight=False)
+
+
+def _number(value: float | None, scale: float, hidden: bool) -> str:
+    return '-' if value is None or hidden else f'{scale * value:.3f}'
+
+
+def _parameter(key: str, value: Mapping[str, Any]) -> str:
+    error, sigma = value['error'], value['sigma']
+    if np.ndim(value['found']):
+        return f'{key}: off by {error:.2g}'
+    text = f'{key}: {value["put_in"]:.5g} put in, {value["found"]:.5g} found'
+    return text + (f' (1 sigma {sigma:.1g})' if isinstance(sigma, float) else '')

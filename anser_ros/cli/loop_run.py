@@ -1,0 +1,139 @@
+"""One run of the loop: simulated control unit, acquisition, trackers and recorder as processes."""
+
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from anser_ros.cli.demo import BOARD_SEED, NO_GATE, SAMPLE_RATE_HZ, SHARED_TOPICS
+from anser_ros.cli.demo import node_command as node
+from anser_ros.cli.supervisor import Supervisor, tail
+from anser_ros.errors import AnserError, DiagnosisError
+from anser_ros.sessions.recorded_health import last_words
+from anser_ros.wire.bag import read_bag
+
+PATIENCE_S = 180.0
+POLL_S = 0.2
+RATE_HZ = 25.0
+AFTER, BEFORE, UNGATED = '/anser', '/anser/before', '/anser/ungated'
+"""Namespaces of the trackers: with the corrected model, with the model as it was, and with that
+one and no residual gate, whose error shows what a gate is there for."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What is simulated, and who tracks it.
+
+    Attributes
+    ----------
+    folder : Path
+        Gets the bag and the logs.
+    duration_s : float
+        From the first flux on.
+    unit : mapping
+        Parameters of the simulated control unit.
+    served : Path or None
+        Model of the chain whose poses are judged; without it nobody tracks.
+    known : Path or None
+        Model of the trackers beside it.
+    """
+
+    folder: Path
+    duration_s: float
+    unit: Mapping[str, object] = field(default_factory=dict)
+    served: Path | None = None
+    known: Path | None = None
+
+
+def record(run: Run) -> Path:
+    """Record a run; the bag's folder.
+
+    The unit is started when all who listen are there: what drifts begins with its first start,
+    which then is the first frame of every recording and of every tracker.
+
+    Raises
+    ------
+    DiagnosisError
+        When a process ends, or nothing comes.
+    """
+    ports = Path(tempfile.mkdtemp(prefix='anser_loop_'))
+    bag = run.folder / 'bag'
+    try:
+        with Supervisor(run.folder / 'logs') as supervisor:
+            for name, command in _commands(run, ports / 'cu').items():
+                supervisor.start(name, command)
+            listeners = [f'{AFTER}/acquisition', f'{AFTER}/recorder']
+            listeners += [f'{AFTER}/tracker'] if run.served is not None else []
+            listeners += [f'{apart}/tracker' for apart in _beside(run)]
+            _wait(supervisor, run, lambda: _are_ready(bag, listeners), 'the nodes are not ready')
+            supervisor.start('cu_simulator', _unit(run, ports / 'cu'))
+            _wait(supervisor, run, lambda: _has_flux(bag), 'no flux was recorded')
+            end = time.monotonic() + run.duration_s
+            while time.monotonic() < end:
+                _check(supervisor)
+                time.sleep(POLL_S)
+    finally:
+        shutil.rmtree(ports, ignore_errors=True)
+    return bag
+
+
+def _unit(run: Run, port: Path) -> list[str]:
+    return node(
+        'cu_simulator', link=port, metal=False, board_seed=BOARD_SEED,
+        sample_rate_hz=SAMPLE_RATE_HZ, **run.unit,
+    )  # fmt: skip
+
+
+def _commands(run: Run, port: Path) -> dict[str, list[str]]:
+    commands = {
+        'acquisition': node('acquisition', device=port, rate_hz=RATE_HZ),
+        'recorder': node('recorder', directory=run.folder, name='bag'),
+    }
+    if run.served is not None:
+        commands['field_model'] = node('field_model', model_file=run.served, refit=False)
+        commands['tracker'] = node('tracker', model_file=run.served)
+    for namespace, settings in _beside(run).items():
+        words = ['-r', f'__ns:={namespace}']
+        for topic in SHARED_TOPICS:
+            words += ['-r', f'{topic}:={AFTER}/{topic}']
+        name = f'tracker_{namespace.rsplit("/", 1)[-1]}'
+        commands[name] = node('tracker', *words, model_file=run.known, **settings)
+    return commands
+
+
+def _beside(run: Run) -> dict[str, dict[str, object]]:
+    """Namespaces and settings of the trackers with the known model."""
+    return {} if run.known is None else {BEFORE: {}, UNGATED: dict(NO_GATE)}
+
+
+def _wait(supervisor: Supervisor, run: Run, is_there: Callable[[], bool], missing: str) -> None:
+    end = time.monotonic() + PATIENCE_S
+    while not is_there():
+        _check(supervisor)
+        if time.monotonic() > end:
+            raise DiagnosisError(f'{missing}; logs: {run.folder / "logs"}')
+        time.sleep(POLL_S)
+
+
+def _check(supervisor: Supervisor) -> None:
+    ended = supervisor.ended()
+    if ended is not None:
+        raise DiagnosisError(f'{ended.name} ended with {ended.process.returncode}: {tail(ended)}')
+
+
+def _are_ready(bag: Path, names: Sequence[str]) -> bool:
+    """Whether all have spoken, and each tracker has its model."""
+    told = last_words(bag)
+    return all(
+        name.strip('/') in told and ('tracker' not in name or 'dipoles' in told[name.strip('/')])
+        for name in names
+    )
+
+
+def _has_flux(bag: Path) -> bool:
+    try:
+        return read_bag(bag).tool is not None
+    except AnserError:
+        return False

@@ -1,0 +1,59 @@
+"""What the nodes said of themselves in ``/diagnostics`` during a recording."""
+
+import os
+from collections.abc import Mapping
+
+import numpy as np
+
+from anser_ros.errors import BagError
+from anser_ros.sessions.session import Session
+from anser_ros.wire.bag import MessageDecoder, Salvage, iter_messages
+
+TOPIC = '/diagnostics'
+BUSY = {
+    'lags': 'stretches of samples that the simulated unit could not make in time',
+    'dropped_blocks': 'blocks that the simulated unit could not send',
+    'overrun_blocks': 'blocks that the host was too slow to take',
+    'gap_blocks': 'blocks missing in the stream',
+    'windows_lost': 'windows without enough samples',
+    'windows_dropped_samples': 'windows with holes',
+    'frames_skipped': 'frames that the tracker was too slow for',
+    'lost_messages': 'messages that the recorder lost',
+}
+"""Counters that rise when a machine can't keep up, and what they count."""
+
+
+def last_words(path: str | os.PathLike[str]) -> dict[str, Mapping[str, str]]:
+    """The last values of every status, by its name; empty where nothing was recorded yet."""
+    found: dict[str, Mapping[str, str]] = {}
+    decoder = MessageDecoder()
+    try:
+        for raw in iter_messages(path, Salvage()):
+            if raw.topic == TOPIC:
+                for status in decoder.decode(raw).status:
+                    found[status.name] = {item.key: item.value for item in status.values}
+    except BagError:
+        return {}
+    return found
+
+
+def overload(path: str | os.PathLike[str]) -> list[str]:
+    """Signs that the machine was too busy for a recording, in words; empty for a sound one."""
+    signs = []
+    for name, values in last_words(path).items():
+        for key, meaning in BUSY.items():
+            count = int(float(values.get(key) or 0))
+            if count:
+                signs.append(f'{name}: {count} {meaning}')
+    return signs
+
+
+def kept_share(session: Session) -> float:
+    """Share of a recording's tool readings that arrived whole: 1 where no window is missing."""
+    shares = [0.0]
+    for tool in session.tools:
+        if tool.time.size > 1:
+            period = float(np.median(np.diff(tool.time)))
+            expected = 1 + round(float(tool.time[-1] - tool.time[0]) / period)
+            shares.append(float(np.any(tool.valid, axis=1).sum()) / expected)
+    return min(1.0, max(shares))
