@@ -515,6 +515,9 @@ def test_model_error_survives_its_message(rng):
     back = decode_model_error(fields, step, len(data) // step, data, 6, 3)
     np.testing.assert_allclose(back.modes, modes, rtol=1e-6)
     assert back.flux_error_t == pytest.approx(3e-11)
+    assert not back.follows
+    fields, step, data = encode_model_error(ModelError(3e-11, modes, follows=True))
+    assert decode_model_error(fields, step, len(data) // step, data, 6, 3).follows
     fields, step, data = encode_model_error(ModelError(1e-12, np.zeros((0, 6, 3), complex)))
     assert decode_model_error(fields, step, 1, data, 6, 3).modes.shape == (0, 6, 3)
 

@@ -95,7 +95,7 @@ class FieldModelNode(AnserNode):
         self._frozen = False
         self._trouble = ''
         self._stamp_ns = 0
-        self._told: tuple[NDArray[np.complex128] | None, float, int] | None = None
+        self._told: tuple[NDArray[np.complex128] | None, float, int, bool] | None = None
         self._view_s = 0.0
         self._shown = False
         self._refit_s = 0.0
@@ -191,7 +191,7 @@ class FieldModelNode(AnserNode):
             self.count('readings')
             if self._refit is None and self.parameters.baseline_at_start and window.full:
                 self._follow(window.mean())
-            if self._refit is not None and self.parameters.refit and not self._frozen:
+            if self._refit is not None and self._follows:
                 self._update(self._refit, stamp_ns, points.channel, points.flux, points.flags)
         except AnserError as error:
             self._trouble = str(error)
@@ -257,6 +257,11 @@ class FieldModelNode(AnserNode):
     def _frame_id(self) -> str:
         return self._setup.frame_id if self._setup is not None else 'fg'
 
+    @property
+    def _follows(self) -> bool:
+        """Whether every frame of the references is answered by a model of its own."""
+        return self._refit is not None and self.parameters.refit and not self._frozen
+
     # The model and its baseline -----------------------------------------------------------
 
     def _serve(self, model: FieldModel, stamp_ns: int) -> None:
@@ -268,14 +273,20 @@ class FieldModelNode(AnserNode):
         frame_id = self._frame_id
         # The uncertainty goes first, so that a receiver has both when the model comes; where it
         # is the same as before, that one still holds.
-        told, uncertainty = self._told, (model.modes, model.flux_error_t, len(model.positions))
+        told, follows = self._told, self._follows
+        uncertainty = (model.modes, model.flux_error_t, len(model.positions), follows)
         if told is None or told[0] is not uncertainty[0] or told[1:] != uncertainty[1:]:
-            self._errors.publish(self._writer.error(model, frame_id, self._stamp_ns))
+            self._errors.publish(self._writer.error(model, frame_id, self._stamp_ns, follows))
             self._told = uncertainty
         self._models.publish(self._writer.dipoles(model, frame_id, self._stamp_ns))
         if model is not self._model:
             self.count('models')
         self._model = model
+
+    def _tell_following(self) -> None:
+        """Let receivers know, when it has changed, whether frames are answered from now on."""
+        if self._model is not None and self._told is not None and self._told[3] != self._follows:
+            self._serve(self._model, self.get_clock().now().nanoseconds)
 
     def _follow(self, baseline: NDArray[np.complex128]) -> None:
         """Refit from now on to what differs from a baseline, shape (S, K), T."""
@@ -296,6 +307,7 @@ class FieldModelNode(AnserNode):
             self._patches, self._fixed = patches, baseline
         self._refit = LiveRefit(self._base, table, clean, drawing=drawing)
         self._result = None
+        self._tell_following()
         self.count('baselines')
 
     # Services -----------------------------------------------------------------------------
@@ -320,6 +332,7 @@ class FieldModelNode(AnserNode):
 
     def _on_freeze(self, request: Any, response: Any) -> Any:
         self._frozen = bool(request.data)
+        self._tell_following()
         response.success = True
         response.message = 'the model stays as it is' if self._frozen else 'the model may change'
         return response
@@ -337,8 +350,9 @@ class FieldModelNode(AnserNode):
     # What is told -------------------------------------------------------------------------
 
     def on_parameters(self, old: FieldModelParameters, new: FieldModelParameters) -> None:
-        """Go on at the new rate."""
+        """Go on at the new rate, or no longer."""
         self._pace.rate_hz = new.refit_rate_hz
+        self._tell_following()
 
     def status(self) -> Status:
         """Return which model is in force, where it comes from, and what the refit does."""

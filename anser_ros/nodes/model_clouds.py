@@ -73,12 +73,14 @@ class ModelWriter:
         self._told = (model, message)
         return message
 
-    def error(self, model: FieldModel, frame_id: str, stamp_ns: int) -> PointCloud2:
+    def error(
+        self, model: FieldModel, frame_id: str, stamp_ns: int, follows: bool = False
+    ) -> PointCloud2:
         """Return the ``field_model_error`` message."""
         modes = model.modes
         if modes is None:
             modes = np.zeros((0, *model.moments.shape), dtype=complex)
-        packed = encode_model_error(ModelError(float(model.flux_error_t), modes))
+        packed = encode_model_error(ModelError(float(model.flux_error_t), modes, follows))
         return self._maker.message(packed, frame_id, stamp_ns)
 
 

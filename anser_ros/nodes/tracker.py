@@ -5,6 +5,7 @@ A pose is published only while its state is ``ok``; why there is none stands in 
 
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,9 +15,11 @@ from std_msgs.msg import String
 from anser_ros.errors import AnserError, LayoutError, ModelFileError, ParameterError
 from anser_ros.fitting.model import FieldModel
 from anser_ros.nodes import qos
+from anser_ros.nodes.answered_frames import AnsweredFrames
 from anser_ros.nodes.backlog import Backlog, take_waiting
 from anser_ros.nodes.flux_reader import read_flux
-from anser_ros.nodes.model_clouds import NANO, read_dipoles, read_error, stamp_of
+from anser_ros.nodes.model_clouds import NANO, stamp_of
+from anser_ros.nodes.model_intake import GivenModel, ModelIntake
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.pose_output import PoseTopic, transform_message, transform_publisher
@@ -27,11 +30,13 @@ from anser_ros.tracking.estimate import OK, TrackerSettings
 from anser_ros.tracking.seed import Volume
 from anser_ros.tracking.tracker import Tracker
 from anser_ros.tracking.warm_up import warm_up
-from anser_ros.wire.model_error import ModelError
-from anser_ros.wire.points import DipolePoints
+from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import Setup, parse_setup
 
 EARLIEST_DIAGNOSTICS_S = 0.1
+# How often frames that wait for a model are looked at beside the arrival of models.
+WAIT_PERIOD_S = 0.02
+MODEL_DEPTH = 20
 
 
 @dataclass(frozen=True)
@@ -72,6 +77,13 @@ class TrackerParameters:
     stale_after_s: float = parameter(
         0.3, 'a sensor without fluxes for so long is stale, s', minimum=0.02, live=True
     )
+    model_wait_s: float = parameter(
+        0.1,
+        'longest time that a frame waits for the model of its instant while field_model refits, s',
+        minimum=0.0,
+        maximum=1.0,
+        live=True,
+    )
     publish_tf: bool = parameter(True, 'whether /tf is published where tf2_msgs is installed')
 
 
@@ -108,9 +120,11 @@ class TrackerNode(AnserNode):
         self._flux_noise_t = 0.0
         self._tracker: Tracker | None = None
         self._topics: dict[str, PoseTopic] = {}
-        self._dipoles: tuple[int, DipolePoints] | None = None
-        self._error: PointCloud2 | None = None
-        self._error_read: tuple[PointCloud2, int, ModelError] | None = None
+        self._intake = ModelIntake()
+        self._in_force: GivenModel | None = None
+        self._frames = AnsweredFrames[GivenModel, tuple[int, FluxPoints]](
+            self._put_in_force, self._track
+        )
         self._trouble = ''
         self._solve_s = 0.0
         self._backlog = Backlog()
@@ -118,12 +132,15 @@ class TrackerNode(AnserNode):
         self._transforms = transform_publisher(self) if table.publish_tf else None
         warm_up()
         self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
+        models = qos.latched(MODEL_DEPTH)  # while it refits there is one a frame
         # The executor takes topics in this order, so a model finds its uncertainty there.
         self.create_subscription(PointCloud2, 'field_model_error', self._on_error, qos.LATCHED)
-        self.create_subscription(PointCloud2, 'field_model', self._on_model, qos.LATCHED)
+        self.create_subscription(PointCloud2, 'field_model', self._on_model, models)
         self._fluxes = self.create_subscription(
             PointCloud2, 'tool/flux', self._on_flux, qos.STREAM
         )
+        self._wait = self.create_timer(WAIT_PERIOD_S, self._on_wait, clock=self.steady_clock)
+        self._wait.cancel()
 
     # What is subscribed to ----------------------------------------------------------------
 
@@ -149,23 +166,33 @@ class TrackerNode(AnserNode):
         self._use_model()
 
     def _on_model(self, message: PointCloud2) -> None:
+        self._take_model(self._intake.take, message)
+
+    def _on_error(self, message: PointCloud2) -> None:
+        self._take_model(self._intake.take_error, message)
+
+    def _take_model(
+        self, take: Callable[[PointCloud2], GivenModel | None], message: PointCloud2
+    ) -> None:
         try:
-            if stamp_of(message) <= 0:
-                raise LayoutError('the field model has no stamp')
-            points = read_dipoles(message)
+            given = take(message)
         except AnserError as error:
             self._refuse('models_refused', error)
             return
-        self._dipoles = (stamp_of(message), points)
-        self._use_model()
+        if given is not None:
+            self._frames.follows = given.follows
+            self._frames.add_model(given.stamp_ns, given, time.monotonic())
 
-    def _on_error(self, message: PointCloud2) -> None:
-        self._error = message
-        if self._dipoles is not None and stamp_of(message) == self._dipoles[0]:
+    def _put_in_force(self, given: GivenModel) -> None:
+        """Track with another model from now on."""
+        before, self._in_force = self._in_force, given
+        if self._tracker is not None and given.is_same_as(before):
+            self._tracker = self._tracker.renamed(str(given.stamp_ns))
+        else:
             self._use_model()
 
     def _use_model(self) -> None:
-        """Give the tracker the newest field model, once the setup is known too."""
+        """Give the tracker the model in force, once the setup is known too."""
         if self._tracker is None or self._setup is None:
             return
         try:
@@ -179,64 +206,44 @@ class TrackerNode(AnserNode):
     def _model(self, setup: Setup) -> tuple[FieldModel | None, str]:
         """The model in force and its name: the published one, or that of the file."""
         given = self._file_model
-        names, frequencies = setup.emitter_names, setup.frequencies_hz
+        names = setup.emitter_names
         if given is not None and given.emitters != names:
             raise ModelFileError(
                 f'the model file has the emitters {", ".join(given.emitters)}; '
                 f'the setup {", ".join(names)}'
             )
-        if self._dipoles is None:
+        if self._in_force is None:
             return given, self.parameters.model_file
-        stamp_ns, points = self._dipoles
-        if points.moments.shape[1] != len(names):
-            raise LayoutError(
-                f'the field model has {points.moments.shape[1]} emitters, the setup {len(names)}'
-            )
-        model = FieldModel(
-            points.positions, points.directions, points.moments, names, frequencies,
-            flux_error_t=0.0 if given is None else given.flux_error_t,
-            effects=() if given is None else given.effects,
-        )  # fmt: skip
-        error = self._error_of(stamp_ns, *points.moments.shape)
-        if error is not None:
-            modes = error.modes if len(error.modes) else None
-            model = replace(model, flux_error_t=error.flux_error_t, modes=modes)
-        return model, str(stamp_ns)
-
-    def _error_of(self, stamp_ns: int, n_dipoles: int, n_emitters: int) -> ModelError | None:
-        """Return a model's uncertainty: that of its stamp, or the one before that still holds.
-
-        It is read once, so that models that share it share all that is derived from it.
-        """
-        read = self._error_read
-        if self._error is not None and stamp_of(self._error) == stamp_ns:
-            if read is None or read[0] is not self._error:
-                error = read_error(self._error, n_dipoles, n_emitters)
-                read = self._error_read = (self._error, n_dipoles, error)
-            return read[2]
-        holds = read is not None and read[0] is self._error and read[1] == n_dipoles
-        return read[2] if read is not None and holds else None
+        return self._in_force.field_model(setup, given), str(self._in_force.stamp_ns)
 
     def _on_flux(self, message: PointCloud2, info: dict[str, int]) -> None:
-        """Track a frame; one that is late beyond hope gives way to the newest."""
+        """Take a frame; one that is late beyond hope gives way to the newest."""
         received_ns = info.get('received_timestamp') or info.get('source_timestamp') or 0
-        now_ns = time.time_ns()
         self._backlog.arrived(received_ns, stamp_of(message))
-        if received_ns and self._backlog.is_hopeless((now_ns - received_ns) / NANO):
+        if received_ns and self._backlog.is_hopeless((time.time_ns() - received_ns) / NANO):
             waiting = take_waiting(self._fluxes)
             if waiting:
                 self.count('frames_skipped', len(waiting))
                 message = waiting[-1]
-        begin_s = time.perf_counter()
-        self._track(message)
-        self._solve_s = time.perf_counter() - begin_s
-        self._backlog.worked(self._solve_s)
+        frame = self._read(message)
+        if frame is not None:
+            wait_s = self.parameters.model_wait_s
+            self._frames.add_frame(frame[0], frame, time.monotonic(), wait_s)
+            if self._frames.waiting:
+                self._wait.reset()
 
-    def _track(self, message: PointCloud2) -> None:
-        tracker, setup = self._tracker, self._setup
-        if tracker is None or setup is None:
+    def _on_wait(self) -> None:
+        """Go on with frames whose model does not come."""
+        self._frames.work(time.monotonic())
+        if not self._frames.waiting:
+            self._wait.cancel()
+
+    def _read(self, message: PointCloud2) -> tuple[int, FluxPoints] | None:
+        """Stamp and points of a frame that can be tracked, or None for one that is refused."""
+        setup = self._setup
+        if setup is None:
             self.count('fluxes_before_setup')
-            return
+            return None
         if message.is_bigendian:
             self.count('fluxes_big_endian')
         try:
@@ -248,7 +255,19 @@ class TrackerNode(AnserNode):
                 )
             if stamp_of(message) <= 0 or message.header.stamp.nanosec >= NANO:
                 self.count('fluxes_without_stamp')
-            stamp_ns, points = read_flux(message)
+            return read_flux(message)
+        except AnserError as error:
+            self._refuse('fluxes_refused', error)
+            return None
+
+    def _track(self, frame: tuple[int, FluxPoints]) -> None:
+        """Track a frame with the model in force, and publish what is good."""
+        tracker = self._tracker
+        if tracker is None:
+            return
+        begin_s = time.perf_counter()
+        stamp_ns, points = frame
+        try:
             estimates = tracker.update(stamp_ns, points.channel, points.flux, points.flags)
         except AnserError as error:
             self._refuse('fluxes_refused', error)
@@ -264,6 +283,8 @@ class TrackerNode(AnserNode):
             if moved:
                 self._transforms.publish(transform_message(moved))
         self.count('frames')
+        self._solve_s = time.perf_counter() - begin_s
+        self._backlog.worked(self._solve_s)
         if changed and time.monotonic() - self._told_s > EARLIEST_DIAGNOSTICS_S:
             self.publish_diagnostics()
 
@@ -287,7 +308,7 @@ class TrackerNode(AnserNode):
     def status(self) -> Status:
         """Return what the tracker lacks, if anything, and its counters."""
         self._told_s = time.monotonic()
-        tracker = self._tracker
+        tracker, newest = self._tracker, self._intake.newest
         values: dict[str, object] = {'frame_time_s': self._solve_s, 'last_refusal': self._trouble}
         values['ready_for'] = self._ready_for()
         if tracker is not None:
@@ -299,7 +320,8 @@ class TrackerNode(AnserNode):
         values |= {
             'dipoles': len(tracker.model.positions),
             'emitters': len(tracker.model.emitters),
-            'model_stamp_ns': '' if self._dipoles is None else self._dipoles[0],
+            'model_stamp_ns': '' if newest is None else newest.stamp_ns,
+            'models_late': self._frames.late,
         }
         good = sum(
             t.estimate is not None and t.estimate.state == OK for t in self._topics.values()
@@ -319,9 +341,9 @@ class TrackerNode(AnserNode):
         tracker = self._tracker
         if tracker is None or tracker.model is None:
             return ''
-        if self._dipoles is None and self.count_publishers('field_model'):
+        if self._intake.newest is None and self.count_publishers('field_model'):
             return ''
-        if self._error is None and self.count_publishers('field_model_error'):
+        if not self._intake.has_error and self.count_publishers('field_model_error'):
             return ''
         if not all(topic.is_matched(self) for topic in self._topics.values()):
             return ''

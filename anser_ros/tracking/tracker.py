@@ -6,6 +6,7 @@ frame's solve, and a warm solve that misses the gate is repeated without any gue
 """
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,6 +136,14 @@ class Tracker:
         other = Tracker.__new__(Tracker)
         other.__dict__.update(self.__dict__)
         other._use(model, model_id)
+        return other
+
+    def renamed(self, model_id: str) -> 'Tracker':
+        """The same tracker whose model has another name: one that was found anew, but the same."""
+        other = Tracker.__new__(Tracker)
+        other.__dict__.update(self.__dict__)
+        if self._scene is not None:
+            other._scene = replace(self._scene, model_id=model_id)
         return other
 
     def with_settings(self, settings: TrackerSettings) -> 'Tracker':

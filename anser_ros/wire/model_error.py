@@ -1,11 +1,12 @@
 """The byte layout of a field model's uncertainty, which travels beside the model.
 
 A point for every dipole that a mode moves: ``mode`` and ``dipole`` uint16, ``flux_error`` float32
-(T, the same in all points: what the model leaves unexplained), then ``m<k>_re``, ``m<k>_im``
-float32 (A m^2). The moments are wrong by the sum of all modes, each times an independent unit
-normal number. The message has the stamp of the ``field_model`` message that it belongs to,
-and holds for later models of that size until there is another one: the uncertainty changes less
-often than the field. A receiver that does without it still has the field.
+(T: what the model leaves unexplained) and ``follows`` uint32 (1 while every frame of
+``reference/flux`` is answered by a model of its stamp), both the same in all points; then
+``m<k>_re``, ``m<k>_im`` float32 (A m^2). The moments are wrong by the sum of all modes, each times
+an independent unit normal number. The message has the stamp of the ``field_model`` message that
+it belongs to, and holds for later models of that size until there is another one: the uncertainty
+changes less often than the field. A receiver that does without it still has the field.
 """
 
 from collections.abc import Sequence
@@ -15,20 +16,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import LayoutError
-from anser_ros.wire.points import FLOAT32, UINT16, PointFieldTuple
+from anser_ros.wire.points import FLOAT32, UINT16, UINT32, PointFieldTuple
 
 ComplexArray = NDArray[np.complex128]
 
 MOST_VALUES = 50_000_000
-_HEAD = [('mode', '<u2'), ('dipole', '<u2'), ('flux_error', '<f4')]
+_HEAD = [('mode', '<u2'), ('dipole', '<u2'), ('flux_error', '<f4'), ('follows', '<u4')]
 
 
 @dataclass(frozen=True)
 class ModelError:
-    """Unexplained flux (T) and modes (R, N, K), complex, A m^2; R may be 0."""
+    """Unexplained flux (T) and modes (R, N, K), complex, A m^2; R may be 0.
+
+    ``follows`` says whether the model follows the references: each of their frames has its own.
+    """
 
     flux_error_t: float
     modes: ComplexArray
+    follows: bool = False
 
 
 def _layout(n_emitters: int) -> tuple[list[PointFieldTuple], 'np.dtype[np.void]']:
@@ -36,10 +41,11 @@ def _layout(n_emitters: int) -> tuple[list[PointFieldTuple], 'np.dtype[np.void]'
         ('mode', 0, UINT16, 1),
         ('dipole', 2, UINT16, 1),
         ('flux_error', 4, FLOAT32, 1),
+        ('follows', 8, UINT32, 1),
     ]
     for k in range(n_emitters):
-        fields.append((f'm{k}_re', 8 + 8 * k, FLOAT32, 1))
-        fields.append((f'm{k}_im', 12 + 8 * k, FLOAT32, 1))
+        fields.append((f'm{k}_re', 12 + 8 * k, FLOAT32, 1))
+        fields.append((f'm{k}_im', 16 + 8 * k, FLOAT32, 1))
     return fields, np.dtype([*_HEAD, ('m', '<f4', 2 * n_emitters)])
 
 
@@ -60,6 +66,7 @@ def encode_model_error(error: ModelError) -> tuple[list[PointFieldTuple], int, b
         mode, dipole = np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.intp)
     out = np.zeros(mode.size, dtype=record)
     out['mode'], out['dipole'], out['flux_error'] = mode, dipole, error.flux_error_t
+    out['follows'] = error.follows
     if modes.shape[0]:
         chosen = modes[mode, dipole]
         out['m'][:, 0::2], out['m'][:, 1::2] = chosen.real, chosen.imag
@@ -102,4 +109,4 @@ def decode_model_error(
     modes = np.zeros((count, n_dipoles, n_emitters), dtype=np.complex128)
     if count:
         modes[points['mode'], points['dipole']] = moments
-    return ModelError(flux_error, modes)
+    return ModelError(flux_error, modes, bool(points['follows'][0]))

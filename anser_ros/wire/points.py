@@ -21,7 +21,7 @@ SATURATED = 1
 STALE = 2
 DROPPED = 4
 
-UINT16, FLOAT32, FLOAT64 = 4, 7, 8
+UINT16, UINT32, FLOAT32, FLOAT64 = 4, 6, 7, 8
 _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 
 

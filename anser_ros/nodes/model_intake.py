@@ -1,0 +1,121 @@
+"""What arrives on ``field_model`` and ``field_model_error``, brought together."""
+
+from dataclasses import dataclass, replace
+
+from sensor_msgs.msg import PointCloud2
+
+from anser_ros.errors import LayoutError
+from anser_ros.fitting.model import FieldModel
+from anser_ros.nodes.model_clouds import read_dipoles, read_error, stamp_of
+from anser_ros.wire.model_error import ModelError
+from anser_ros.wire.points import DipolePoints
+from anser_ros.wire.setup import Setup
+
+
+@dataclass(frozen=True)
+class GivenModel:
+    """A model as it came; ``error`` is None where nobody tells its uncertainty."""
+
+    stamp_ns: int
+    data: bytes
+    points: DipolePoints
+    error: ModelError | None
+
+    @property
+    def follows(self) -> bool:
+        """Whether every frame of the references is answered by a model of its stamp."""
+        return self.error is not None and self.error.follows
+
+    def is_same_as(self, other: 'GivenModel | None') -> bool:
+        """Whether only the stamp differs."""
+        return other is not None and self.points is other.points and self.error is other.error
+
+    def field_model(self, setup: Setup, file_model: FieldModel | None) -> FieldModel:
+        """Return the model for a setup, with the effects of the model file.
+
+        Raises
+        ------
+        LayoutError
+            When it has other emitters than the setup.
+        """
+        points, count = self.points, len(setup.emitter_names)
+        if points.moments.shape[1] != count:
+            raise LayoutError(
+                f'the field model has {points.moments.shape[1]} emitters, the setup {count}'
+            )
+        model = FieldModel(
+            points.positions, points.directions, points.moments, setup.emitter_names,
+            setup.frequencies_hz,
+            flux_error_t=0.0 if file_model is None else file_model.flux_error_t,
+            effects=() if file_model is None else file_model.effects,
+        )  # fmt: skip
+        if self.error is None:
+            return model
+        modes = self.error.modes if len(self.error.modes) else None
+        return replace(model, flux_error_t=self.error.flux_error_t, modes=modes)
+
+
+class ModelIntake:
+    """Reads models; what is the same as before is not read again.
+
+    So models that share their dipoles or their uncertainty share all that is derived from them.
+
+    Attributes
+    ----------
+    newest : GivenModel or None
+    """
+
+    def __init__(self) -> None:
+        self.newest: GivenModel | None = None
+        self._error: PointCloud2 | None = None
+        self._read: tuple[PointCloud2, int, ModelError] | None = None
+
+    @property
+    def has_error(self) -> bool:
+        """Whether an uncertainty has come."""
+        return self._error is not None
+
+    def take(self, message: PointCloud2) -> GivenModel:
+        """Read a ``field_model`` message.
+
+        Raises
+        ------
+        LayoutError
+            When it is none, or has no stamp.
+        """
+        stamp_ns, newest = stamp_of(message), self.newest
+        if stamp_ns <= 0:
+            raise LayoutError('the field model has no stamp')
+        data = message.data.tobytes()
+        same = newest is not None and newest.data == data
+        points = newest.points if newest is not None and same else read_dipoles(message)
+        return self._joined(stamp_ns, data, points)
+
+    def take_error(self, message: PointCloud2) -> GivenModel | None:
+        """Keep an uncertainty; return the newest model anew where it belongs to that.
+
+        Raises
+        ------
+        LayoutError
+            When it is none of that model.
+        """
+        self._error, newest = message, self.newest
+        if newest is None or stamp_of(message) != newest.stamp_ns:
+            return None
+        return self._joined(newest.stamp_ns, newest.data, newest.points)
+
+    def _joined(self, stamp_ns: int, data: bytes, points: DipolePoints) -> GivenModel:
+        error = self._error_of(stamp_ns, *points.moments.shape)
+        self.newest = GivenModel(stamp_ns, data, points, error)
+        return self.newest
+
+    def _error_of(self, stamp_ns: int, n_dipoles: int, n_emitters: int) -> ModelError | None:
+        """Return a model's uncertainty: that of its stamp, or the one before that still holds."""
+        read = self._read
+        if self._error is not None and stamp_of(self._error) == stamp_ns:
+            if read is None or read[0] is not self._error:
+                error = read_error(self._error, n_dipoles, n_emitters)
+                read = self._read = (self._error, n_dipoles, error)
+            return read[2]
+        holds = read is not None and read[0] is self._error and read[1] == n_dipoles
+        return read[2] if read is not None and holds else None
