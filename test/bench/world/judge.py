@@ -1,6 +1,6 @@
 """Runs calibrate, diagnose and evaluate over boards with a truth, and prints how they did.
 
-    python test/bench/world/judge.py DIR [--only 'b1/s0*'] [--fresh] [--no-diagnose]
+    python test/bench/world/judge.py DIR [--only 'b1/s0*'] [--fresh] [--no-diagnose] [--repo R]
 
 DIR holds what `make.py` writes. Only the commands are used, one at a time. What they write goes to
 ``DIR/runs``, and is not run again unless ``--fresh`` is given; the table goes to ``results.md``.
@@ -11,6 +11,7 @@ import argparse
 import fnmatch
 import json
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -20,31 +21,23 @@ from pathlib import Path
 from scoring import describe, judge_names, true_errors
 
 REPO = Path(__file__).resolve().parents[3]
-LIMIT_S = 600
+LIMIT_S = 1800
 
 
-def command():
-    """The console script."""
-    beside = Path(sys.executable).parent / 'anser'
-    found = str(beside) if beside.exists() else shutil.which('anser')
-    if not found:
-        raise SystemExit('the console script anser is not installed')
-    return found
-
-
-def run(folder, arguments, fresh):
-    """Run a command once; its seconds, or a word why it failed."""
+def run(folder, arguments, fresh, repo=REPO):
+    """Run a command once; the seconds of processor time that it took, or why it failed."""
     note = folder / 'run.json'
     if note.exists() and not fresh:
         return json.loads(note.read_text())
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    one = {f'{name}_NUM_THREADS': '1' for name in ('OPENBLAS', 'OMP', 'NUMBA')}
-    begun = time.monotonic()
+    settings = {f'{name}_NUM_THREADS': '1' for name in ('OPENBLAS', 'OMP', 'NUMBA')}
+    settings['PYTHONPATH'] = str(repo)
+    begun, used = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
     try:
         done = subprocess.run(
-            [command(), *arguments],
-            env={**os.environ, **one},
+            [sys.executable, '-P', '-m', 'anser_ros.cli.main', *arguments],
+            env={**os.environ, **settings},
             capture_output=True,
             text=True,
             timeout=LIMIT_S,
@@ -53,9 +46,11 @@ def run(folder, arguments, fresh):
         result = {'failed': f'exit {done.returncode}: {"".join(error)}' if done.returncode else ''}
     except subprocess.TimeoutExpired:
         result = {'failed': f'took more than {LIMIT_S} s'}
-    result['seconds'] = time.monotonic() - begun
+    result['wall_s'] = time.monotonic() - begun
+    spent = resource.getrusage(resource.RUSAGE_CHILDREN)
+    result['seconds'] = spent.ru_utime + spent.ru_stime - used.ru_utime - used.ru_stime
     head = subprocess.run(
-        ['git', 'log', '-1', '--format=%h'], cwd=REPO, capture_output=True, text=True
+        ['git', 'log', '-1', '--format=%h'], cwd=repo, capture_output=True, text=True
     )
     result['commit'] = head.stdout.strip()
     note.write_text(json.dumps(result) + '\n')
@@ -65,8 +60,8 @@ def run(folder, arguments, fresh):
 class Judge:
     """One folder of boards."""
 
-    def __init__(self, folder, fresh):
-        self.folder, self.fresh = folder, fresh
+    def __init__(self, folder, fresh, repo):
+        self.folder, self.fresh, self.repo = folder, fresh, repo
         self.runs = folder / 'runs'
 
     def model(self, board):
@@ -75,7 +70,7 @@ class Judge:
         model = out / 'model.yaml'
         scan = self.folder / board / 'factory.mcap'
         arguments = ['calibrate', str(scan), '--out', str(model), '--report', str(out / 'report')]
-        done = run(out, arguments, fresh=False)
+        done = run(out, arguments, False, self.repo)
         if done['failed']:
             raise SystemExit(f'{board}: calibrate: {done["failed"]}')
         return model
@@ -85,7 +80,7 @@ class Judge:
         out = self.runs / board / name / label
         bag = self.folder / board / f'{name}.mcap'
         arguments = ['evaluate', str(bag), '--model', str(model), '--out', str(out), *more]
-        done = run(out, arguments, self.fresh)
+        done = run(out, arguments, self.fresh, self.repo)
         if done['failed']:
             return {'failed': done['failed']}
         path = self.folder / board / 'truth' / f'{name}.npz'
@@ -102,7 +97,7 @@ class Judge:
             out = self.runs / board / name / 'diagnosis'
             bag = str(self.folder / board / f'{name}.mcap')
             arguments = ['diagnose', bag, '--model', str(model), '--out', str(out), *scan]
-            done = run(out, arguments, self.fresh)
+            done = run(out, arguments, self.fresh, self.repo)
             summary['diagnosis'] = done
             if not done['failed']:
                 summary['document'] = json.loads((out / 'diagnosis.json').read_text())
@@ -195,12 +190,12 @@ def report(folder):
             table(
                 ['session', 'truth', 'names', 'parameter error ((!) over tolerance)',
                  'flux rms pT', '/ floor', '/ clean', 'position mm (exact), frozen -> after',
-                 'position / clean (held out)', 'unexplained', 's'],
+                 'position / clean (held out)', 'unexplained', 'CPU s'],
                 diagnosed,
             ),
             table(
                 ['session', 'truth', 'frozen mm', 'refit mm', 'refit last 8 s', 'tracked',
-                 'over 3 sigma', 's'],
+                 'over 3 sigma', 'CPU s'],
                 refitted,
             ),
         ]
@@ -214,9 +209,10 @@ def main():
     parser.add_argument('--only', default='*', help="such as 'b1/s0*'")
     parser.add_argument('--fresh', action='store_true', help='run again what was run')
     parser.add_argument('--no-diagnose', action='store_true', help='calibrate and evaluate only')
+    parser.add_argument('--repo', type=Path, default=REPO, help='whose anser_ros is judged')
     args = parser.parse_args()
     folder = args.folder.resolve()
-    judge = Judge(folder, args.fresh)
+    judge = Judge(folder, args.fresh, args.repo.resolve())
     for ledger in sorted(folder.glob('*/truth.json')):
         board = ledger.parent.name
         for name, truth in sorted(json.loads(ledger.read_text()).items()):

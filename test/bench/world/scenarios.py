@@ -12,6 +12,7 @@ ROOM_M = 0.012
 """Least distance between a sphere's surface and a reference coil or the tool's volume."""
 LUMP_T, HEAD_T, HINDRANCE_T = 0.5e-9, 2e-9, 0.3e-9
 """Least field that the kinds of metal make in the volume: what is weaker is no test."""
+MOST_DRAWN = 300
 SHEETS = {'aluminium': 3.6e-8, 'copper': 1.75e-8, 'stainless': 7.2e-7}
 """Resistivity, ohm m."""
 
@@ -67,14 +68,25 @@ def _spot(lab, radius, rng):
     return np.array([*rng.permutation(place), rng.uniform(0.0, 0.2)])
 
 
-def _placed(lab, draw, least_t, tries=2000):
-    """Draw body and way until they are clear of everything, and felt in the volume."""
-    for _ in range(tries):
+def _placed(lab, draw, least_t):
+    """Draw body and way until they are clear of everything, and felt in the volume.
+
+    Where nothing is felt enough (the references leave no room), the strongest drawn is taken.
+    """
+    best, most = None, 0.0
+    for _ in range(MOST_DRAWN):
         body, travel = draw()
-        if _clear(lab, body, travel) and strength(lab, body, travel) > least_t:
-            lab.metals.append((body, travel))
-            return body, travel
-    raise RuntimeError('no clear place for the metal was found')
+        if not _clear(lab, body, travel):
+            continue
+        felt = strength(lab, body, travel)
+        if felt > most:
+            best, most = (body, travel), felt
+        if felt > least_t:
+            break
+    if best is None:
+        raise RuntimeError('no clear place for the metal was found')
+    lab.metals.append(best)
+    return best
 
 
 def static_metal(lab, rng, ferrous=None):
