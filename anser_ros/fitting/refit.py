@@ -30,6 +30,7 @@ from anser_ros.fitting.refit_result import (
     RefitSettings,
 )
 from anser_ros.fitting.refit_scene import build_scene
+from anser_ros.fitting.refit_slots import SLOTS, BodySlots
 from anser_ros.physics.sensor import SensorTable
 
 __all__ = ['LiveRefit', 'Metal', 'RefitResult', 'RefitSettings']
@@ -97,10 +98,9 @@ class LiveRefit:
         self._drift = np.zeros((baseline.size, k))
         for emitter in range(k):
             self._drift[emitter::k, emitter] = np.nan_to_num(turned[:, emitter].real) * scale
-        self._banks: dict[bytes, Bank] = {}
+        self._banks: dict[bytes, tuple[Bank, BodySlots]] = {}
         self._order = FrameOrder(references.channel, self.baseline)
-        self._names = ('nothing', *(prior.name for prior in self._scene.priors))
-        self._assembly = Assembly(model, self._scene.layers)
+        self._assembly = Assembly(model)
 
     @property
     def excitation_source(self) -> str:
@@ -113,7 +113,9 @@ class LiveRefit:
         self._noise = NoiseLevel(settings.flux_noise_t)
         self._average = Average(settings.average_frames)
         self._watch = Watch(len(self.references), settings.hold_frames)
-        self._weights = _fresh_weights(len(self._names))
+        self._weights = _fresh_weights(1 + len(self._scene.priors) + SLOTS)
+        for _, slots in self._banks.values():
+            slots.clear()
         self._last_ns = 0
         self._last_model = self.model
 
@@ -202,7 +204,7 @@ class LiveRefit:
     def _in_use(self) -> NDArray[np.bool_]:
         return np.asarray(~self._watch.excluded)
 
-    def _bank(self) -> Bank:
+    def _bank(self) -> tuple[Bank, BodySlots]:
         """The hypotheses for the coils in use; decomposed again only when those change."""
         key = self._watch.excluded.tobytes()
         if key not in self._banks:
@@ -211,14 +213,17 @@ class LiveRefit:
             rows = (coils[:, None] * k + np.arange(k)).ravel()
             if len(self._banks) >= MOST_BANKS:
                 del self._banks[next(iter(self._banks))]
-            self._banks[key] = Bank(self._scene.priors, rows, self._drift, self._row_noise)
+            scene = self._scene
+            bank = Bank(scene.priors, rows, self._drift, self._row_noise, SLOTS, len(scene.bodies))
+            self._banks[key] = (bank, BodySlots(bank, self._scene))
         return self._banks[key]
 
     def _judged(self, values: Array, noise: float) -> tuple[Bank, Evaluation]:
         """Evaluate the hypotheses, leaving out coils that are at fault, the worst first."""
         while True:
-            bank, coils = self._bank(), np.flatnonzero(self._in_use())
+            (bank, slots), coils = self._bank(), np.flatnonzero(self._in_use())
             used = values[coils]
+            slots.fill(used.reshape(-1, 2), noise)
             seen = bank.evaluate(used.reshape(-1, 2), noise)
             best = int(seen.log_evidence.argmax())
             self._distance, self._residual = bank.left_out(seen, best)
@@ -280,7 +285,7 @@ class LiveRefit:
                 model is not self._last_model,
                 self._healths(),
                 float(np.log(max(1.0 - weights[0], 1e-300)) - np.log(max(weights[0], 1e-300))),
-                dict(zip(self._names, weights.tolist(), strict=True)),
+                dict(zip(bank.names, weights.tolist(), strict=True)),
                 level * self.settings.flux_noise_t,
                 drift,
                 reason,
@@ -294,7 +299,7 @@ class LiveRefit:
 
     def _too_few(self, stamp_ns: int, level: float) -> RefitResult:
         """Back to the calibrated model."""
-        self._weights = _fresh_weights(len(self._names))
+        self._weights = _fresh_weights(len(self._weights))
         self._average.forget()
         count = int(self._in_use().sum())
         need = self.settings.min_references
@@ -336,7 +341,7 @@ class LiveRefit:
         best = 1 + int(weights[1:].argmax())
         values = bank.sources(seen, best) * self.settings.flux_noise_t
         polarisability = values[:, 0] + 1j * values[:, 1]
-        cloud = bank.priors[best - 1].cloud
+        cloud = bank.prior(best).cloud
         power = np.abs(polarisability) ** 2 / cloud.volumes
         if not power.sum() > 0.0:
             return None

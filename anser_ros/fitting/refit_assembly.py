@@ -1,7 +1,7 @@
 """The refitted model: calibrated dipoles, the layer's moments on top, and their uncertainty."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,46 @@ RIVAL = 0.05
 """Probability from which on a second hypothesis adds what it disagrees about."""
 
 
+@dataclass(frozen=True)
+class Geometry:
+    """Dipoles of the calibrated model and of some layers.
+
+    Attributes
+    ----------
+    positions, directions : ndarray, shape (N, 3)
+    layer_rows : mapping of str to ndarray
+        Rows of each layer's dipoles, by the layer's name.
+    """
+
+    positions: Array
+    directions: Array
+    layer_rows: dict[str, NDArray[np.int64]]
+
+    @property
+    def name(self) -> tuple[str, ...]:
+        """The same for the same dipoles."""
+        return tuple(self.layer_rows)
+
+    @classmethod
+    def of(cls, base: FieldModel, layers: Sequence[Layer]) -> 'Geometry':
+        """Put them together; a layer that uses the model's own dipoles adds the others only."""
+        positions, directions = [base.positions], [base.directions]
+        rows: dict[str, NDArray[np.int64]] = {}
+        size = len(base.positions)
+        for layer in layers:
+            own = np.empty(0, dtype=np.int64) if layer.rows is None else layer.rows
+            added = len(layer.positions) - own.size
+            rows[layer.name] = np.concatenate([own, np.arange(size, size + added)])
+            positions.append(layer.positions[own.size :])
+            directions.append(layer.directions[own.size :])
+            size += added
+        return cls(np.concatenate(positions), np.concatenate(directions), rows)
+
+    def rows(self, bank: Bank, hypothesis: int) -> NDArray[np.int64]:
+        """Rows of a hypothesis' layer."""
+        return self.layer_rows[bank.prior(hypothesis).layer.name]
+
+
 class Assembly:
     """Puts refitted models together.
 
@@ -33,32 +73,21 @@ class Assembly:
     ----------
     model : FieldModel
         Calibrated.
-    layers : sequence of Layer
-        All layers that hypotheses may use; the first one is in every refitted model.
     """
 
-    def __init__(self, model: FieldModel, layers: Sequence[Layer]) -> None:
+    def __init__(self, model: FieldModel) -> None:
         self.base = model
-        self.layers = tuple(layers)
         self._modes: dict[tuple[object, ...], ErrorModes] = {}
         self._whole: dict[tuple[object, ...], tuple[int, Uncertainty]] = {}
         self._count = 0
-        self._geometry: dict[int, tuple[Array, Array, list[NDArray[np.int64]]]] = {}
+        self._geometry: Geometry | None = None
 
-    def _place(self, count: int) -> tuple[Array, Array, list[NDArray[np.int64]]]:
-        """Dipoles with the first ``count`` layers, and the rows of each layer among them."""
-        if count not in self._geometry:
-            positions, directions = [self.base.positions], [self.base.directions]
-            rows, size = [], len(self.base.positions)
-            for layer in self.layers[:count]:
-                own = np.empty(0, dtype=np.int64) if layer.rows is None else layer.rows
-                added = len(layer.positions) - own.size
-                rows.append(np.concatenate([own, np.arange(size, size + added)]))
-                positions.append(layer.positions[own.size :])
-                directions.append(layer.directions[own.size :])
-                size += added
-            self._geometry[count] = (np.concatenate(positions), np.concatenate(directions), rows)
-        return self._geometry[count]
+    def _place(self, layers: Sequence[Layer]) -> Geometry:
+        """Dipoles with some layers; the same arrays while these stay the same."""
+        told = self._geometry
+        if told is None or told.name != tuple(layer.name for layer in layers):
+            told = self._geometry = Geometry.of(self.base, layers)
+        return told
 
     def model(
         self,
@@ -90,20 +119,19 @@ class Assembly:
         n_modes : int
         """
         active = [h for h in np.flatnonzero(weights > NEGLIGIBLE).tolist() if h > 0]
-        place = {id(layer): i for i, layer in enumerate(self.layers)}
-        of = {h: place[id(bank.priors[h - 1].layer)] for h in active}
-        positions, directions, rows = self._place(1 + max(of.values(), default=0))
-        moments = np.zeros((len(positions), len(phase)), dtype=complex)
+        layers = {layer.name: layer for layer in (bank.prior(h).layer for h in active)}
+        place = self._place(list(layers.values()))
+        moments = np.zeros((len(place.positions), len(phase)), dtype=complex)
         moments[: len(self.base.moments)] = self.base.moments * (1.0 + drift)
         parts = {h: self._moments(bank, seen, h) * (phase * unit) for h in active}
         for h, part in parts.items():
-            moments[rows[of[h]]] += weights[h] * part
+            moments[place.rows(bank, h)] += weights[h] * part
         scale = phase * unit
-        modes, rest = self._uncertainty(bank, seen, weights, parts, typical, scale, n_modes, rows)
+        modes, rest = self._uncertainty(bank, seen, weights, parts, typical, scale, n_modes, place)
         return replace(
             self.base,
-            positions=positions,
-            directions=directions,
+            positions=place.positions,
+            directions=place.directions,
             moments=moments,
             modes=modes,
             flux_error_t=rest,
@@ -118,33 +146,33 @@ class Assembly:
         typical: float,
         scale: ComplexArray,
         n_modes: int,
-        rows: list[NDArray[np.int64]],
+        place: Geometry,
     ) -> Uncertainty:
         """All modes and the rest; the same array for a while, so that receivers keep theirs."""
         ranked = sorted(parts, key=lambda h: -float(weights[h]))
         rival = next((h for h in ranked[1:] if float(weights[h]) > RIVAL), None)
         steps = max(0, round(np.log(max(typical, 1.0)) / (2.0 * np.log(INFLATION_STEP))))
         level = bank.error_level(seen, ranked[0]) if ranked else None
-        key = (bank.rows.tobytes(), tuple(ranked[:1]), rival, level, steps, len(rows))
+        names = tuple(bank.prior(h).name for h in ranked[:1] + ([] if rival is None else [rival]))
+        key = (bank.rows.tobytes(), names, level, steps, place.name)
         self._count += 1
         kept = self._whole.get(key)
         if kept is not None and self._count - kept[0] < KEEP_FRAMES:
             return kept[1]
-        size = 1 + max(int(r.max(initial=-1)) for r in rows)
-        size = max(size, len(self.base.positions))
+        size = len(place.positions)
         shape = (size, len(scale))
         modes = [] if self.base.modes is None else [_padded(self.base.modes, size)]
         rest = 0.0
         if ranked and level is not None:
             own = np.zeros((n_modes, *shape), dtype=complex)
-            place = self._rows_of(bank, ranked[0], rows)
+            rows = place.rows(bank, ranked[0])
             errors = self._error(bank, ranked[0], level, n_modes - 1)
-            own[: len(errors.moments), place] = errors.moments * (INFLATION_STEP**steps * scale)
+            own[: len(errors.moments), rows] = errors.moments * (INFLATION_STEP**steps * scale)
             rest = errors.rest * INFLATION_STEP**steps * float(np.abs(scale[0]))
             if rival is not None:
                 part = np.sqrt(weights[ranked[0]] * weights[rival])
-                own[-1, place] += part * parts[ranked[0]]
-                own[-1, self._rows_of(bank, rival, rows)] -= part * parts[rival]
+                own[-1, rows] += part * parts[ranked[0]]
+                own[-1, place.rows(bank, rival)] -= part * parts[rival]
             modes.append(own)
         flux_error = float(np.hypot(self.base.flux_error_t, rest))
         whole = (np.concatenate(modes) if modes else None, flux_error)
@@ -153,12 +181,6 @@ class Assembly:
         self._whole[key] = (self._count, whole)
         return whole
 
-    def _rows_of(
-        self, bank: Bank, hypothesis: int, rows: list[NDArray[np.int64]]
-    ) -> NDArray[np.int64]:
-        layer = bank.priors[hypothesis - 1].layer
-        return rows[next(i for i, own in enumerate(self.layers) if own is layer)]
-
     @staticmethod
     def _moments(bank: Bank, seen: Evaluation, hypothesis: int) -> ComplexArray:
         parts = bank.moments(seen, hypothesis)
@@ -166,7 +188,7 @@ class Assembly:
 
     def _error(self, bank: Bank, hypothesis: int, level: ErrorLevel, count: int) -> ErrorModes:
         """A hypothesis' own error, in noise units."""
-        key = (bank.rows.tobytes(), hypothesis, level, count)
+        key = (bank.rows.tobytes(), bank.prior(hypothesis).name, level, count)
         if key not in self._modes:
             if len(self._modes) >= MOST_MODES:
                 del self._modes[next(iter(self._modes))]

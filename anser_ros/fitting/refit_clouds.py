@@ -22,6 +22,10 @@ LAYER_RATIO = 1.45
 SPACING_PER_DEPTH = 0.7
 """Lateral spacing of a layer's sources over its depth."""
 
+BODY_SPACING = 0.6
+BODY_RADIUS = 0.45
+"""Lattice of compact bodies and their radius, in halves of the board: neighbours overlap."""
+
 
 @dataclass(frozen=True)
 class Region:
@@ -148,6 +152,34 @@ def _centred(reach: float, spacing: float) -> Array:
     """Lattice over -reach..reach, symmetric about 0."""
     count = int(reach / spacing)
     return np.asarray(spacing * np.arange(-count, count + 1))
+
+
+def bodies(region: Region) -> tuple[Cloud, ...]:
+    """Compact bodies on a lattice around the middle of the tracked volume, and in its outer part.
+
+    A cloud over a whole region expects as much metal everywhere; one piece of metal beside or over
+    the volume is told far better by a ball of sources where it is. Below the board the layers do
+    as well.
+    """
+    half = region.half
+    side = BODY_SPACING * (np.arange(8) - 3.5)
+    height = BODY_SPACING * (np.arange(6) - 0.5)
+    unit = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing='ij'), axis=-1).reshape(-1, 3)
+    unit = unit[(unit**2).sum(axis=1) <= 2]
+    # The centre first, then its six neighbours, then the twelve at the edges.
+    unit = unit[np.argsort((unit**2).sum(axis=1), kind='stable')]
+    ball = BODY_RADIUS * half / math.sqrt(2.0) * unit
+    out = []
+    for x, y, z in np.stack(np.meshgrid(side, side, height, indexing='ij'), -1).reshape(-1, 3):
+        across = max(abs(x), abs(y))
+        if (across < 0.75 and z < 1.25) or (across < 1.2 and z < 0.0):
+            continue
+        centre = np.array([region.centre[0] + x * half, region.centre[1] + y * half, z * half])
+        name = 'body at ' + ', '.join(f'{1e3 * c:.0f}' for c in centre) + ' mm'
+        volume = (BODY_RADIUS * half) ** 3 * 4.0 / 3.0 * math.pi / len(ball)
+        volumes = np.full(len(ball), volume)
+        out.append(Cloud(name, BODY_RADIUS * half, True, centre + ball, volumes))
+    return tuple(out)
 
 
 def default_clouds(region: Region) -> tuple[Cloud, ...]:

@@ -32,6 +32,8 @@ FAULT_ODDS = 100.0
 
 Metal that the clouds describe badly reaches 70 in recordings; faults that matter begin at 100.
 """
+SEEN = 10.0
+"""Log odds, by the other coils alone, from which on a compact body counts as seen by them."""
 AGREES = 2.5
 """Left-out chi-square per degree of freedom below which an excluded coil agrees again."""
 RETRY_FRAMES = 25
@@ -72,7 +74,10 @@ def fault_odds(bank: Bank, seen: Evaluation, coils: NDArray[np.int64]) -> float:
         size = float((residual**2).sum())
         likelihood = -0.5 * size / FAULT_SCALES**2 - residual.size * np.log(FAULT_SCALES)
         broad += log_sum(likelihood) - float(np.log(len(FAULT_SCALES)))
-    return float(log_sum(others) + broad - log_sum(seen.log_evidence))
+    # A body that only these coils see is no better an explanation than their fault.
+    unseen = bank.is_slot & (others < others[0] + SEEN)
+    well = np.where(unseen, -np.inf, seen.log_evidence)
+    return float(log_sum(others) + broad - log_sum(well))
 
 
 def find_faults(
@@ -170,8 +175,8 @@ class Watch:
         level = OUTSTANDING**2 * max(float(np.median(power)), freedom)
         out = by_power[: MOST_AT_ONCE + 1]
         out = out[power[out] > level]
-        if 1 < len(out) <= min(MOST_AT_ONCE, len(power) // 3):
-            sets += [np.sort(out[:count]) for count in range(2, len(out) + 1)]
+        if 0 < len(out) <= min(MOST_AT_ONCE, len(power) // 3):
+            sets += [np.sort(out[:count]) for count in range(1, len(out) + 1)]
         if not sets:
             return []
         alarm = (float(chi2[order[0]]) / freedom, len(out))

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from scipy.linalg import cholesky
 
 from anser_ros.fitting.model import FieldModel
-from anser_ros.fitting.refit_clouds import Region
+from anser_ros.fitting.refit_clouds import Cloud, Region
 from anser_ros.fitting.refit_excitation import Excitation
 from anser_ros.fitting.refit_references import vector_basis
 from anser_ros.physics.dipole import flux_basis
 
 Array = NDArray[np.float64]
 
+BELOW, AROUND = 'below', 'around'
 RIDGE = 1e-5
 """Damping of the layer's fit relative to its largest singular value."""
 MOST_OWN = 200
@@ -29,6 +30,8 @@ GOOD_ENOUGH = 0.012
 """Relative rms misfit, over the tracked volume, up to which the model's own dipoles are used."""
 SHALLOW = (12, 1.3, 0.15)
 DEEP = (7, 2.5, 1.0)
+CLEAR = 0.35
+"""Samples nearer to a body's sources than this part of its radius don't count."""
 INNER = 0.83
 """Dipoles along a side, half size and depth of a lattice, the last two in halves of the board."""
 
@@ -39,12 +42,15 @@ class Layer:
 
     Attributes
     ----------
+    name : str
+        The same for the same dipoles.
     rows : ndarray of int, shape (Q,), or None
         The calibrated model's own dipoles that take part of the change; they are the layer's first
         Q. None when all of the layer is added to the model.
     positions, directions : ndarray, shape (N, 3)
-    inverse : ndarray, shape (N, 3P)
-        From field samples (T, point by point) to moments (A m^2).
+    inverse : ndarray, shape (N, 3P), or None
+        From field samples (T, point by point) to moments (A m^2); None where the dipoles are the
+        sources themselves, three a source.
     points : ndarray, shape (P, 3)
         Where the field is sampled, m.
     metric : ndarray, shape (N, N)
@@ -55,23 +61,26 @@ class Layer:
         Field components per unit moment at the samples in the middle of the volume.
     """
 
+    name: str
     rows: NDArray[np.int64] | None
     positions: Array
     directions: Array
-    inverse: Array
+    inverse: Array | None
     points: Array
     metric: Array
     middle: Array
 
     def project(self, sources: Array) -> Array:
         """Moments of the layer per unit moment of each source's component, shape (N, 3M)."""
+        if self.inverse is None:
+            return np.eye(3 * len(sources))
         return np.asarray(self.inverse @ _field_rows(self.points, sources))
 
     def misfit(self, sources: Array) -> float:
         """Relative rms error of the field that the layer makes in place of the sources."""
         field = _field_rows(self.points, sources)
         made = _component_rows(self.points, self.positions, self.directions) @ (
-            self.inverse @ field
+            self.project(sources)
         )
         return float(np.linalg.norm(made - field) / np.linalg.norm(field))
 
@@ -92,6 +101,7 @@ def _component_rows(points: Array, positions: Array, directions: Array) -> Array
 
 
 def _build(
+    name: str,
     rows: NDArray[np.int64] | None,
     positions: Array,
     directions: Array,
@@ -103,12 +113,49 @@ def _build(
     scale = np.linalg.norm(basis, axis=0)
     u, s, vt = np.linalg.svd(basis / scale, full_matrices=False)
     inverse = (vt.T * (s / (s**2 + (RIDGE * s[0]) ** 2))) @ u.T / scale[:, None]
+    metric = _metric(basis, pose_weight(points, excitation))
+    middle = basis[_middle(points, half)]
+    return Layer(name, rows, positions, directions, inverse, points, metric, middle)
+
+
+def pose_weight(points: Array, excitation: Excitation) -> Array:
+    """How far an error of the field moves a pose at each point (P,), in some unit."""
     weight = points[:, 2] / np.linalg.norm(excitation.field(points), axis=(1, 2))
-    weighted = basis * np.repeat(weight / weight.mean(), 3)[:, None]
+    return np.asarray(weight / weight.mean())
+
+
+def _metric(basis: Array, weight: Array) -> Array:
+    weighted = basis * np.repeat(weight, 3)[:, None]
     gram = weighted.T @ weighted
     gram[np.diag_indices_from(gram)] += 1e-12 * np.diag(gram)
-    middle = np.repeat((points[:, 2] > 0.5 * half) & (points[:, 2] < half), 3)
-    return Layer(rows, positions, directions, inverse, points, cholesky(gram), basis[middle])
+    return np.asarray(cholesky(gram))
+
+
+def _middle(points: Array, half: float) -> NDArray[np.bool_]:
+    return np.repeat((points[:, 2] > 0.5 * half) & (points[:, 2] < half), 3)
+
+
+def body_layer(region: Region, weight: Array, cloud: Cloud) -> Layer:
+    """A compact body's own sources as dipoles: exact wherever the body is.
+
+    Parameters
+    ----------
+    region : Region
+    weight : ndarray, shape (P,)
+        `pose_weight` at ``region.samples()``.
+    cloud : Cloud
+        The body's sources.
+    """
+    points = region.samples()
+    away = np.linalg.norm(points[:, None] - cloud.positions, axis=2).min(axis=1)
+    clear = away > CLEAR * cloud.standoff_m
+    points = points[clear]
+    positions = np.repeat(cloud.positions, 3, axis=0)
+    directions = np.tile(np.eye(3), (len(cloud.positions), 1))
+    basis = _component_rows(points, positions, directions)
+    metric = _metric(basis, weight[clear])
+    middle = basis[_middle(points, region.half)]
+    return Layer(cloud.name, None, positions, directions, None, points, metric, middle)
 
 
 def _lattice(region: Region, across: int, extent: float, depth: float) -> Array:
@@ -141,11 +188,11 @@ def bottom_layer(
     rows = np.flatnonzero(upright & low)
     if 64 <= rows.size <= MOST_OWN:
         own = np.concatenate([model.positions[rows], deep])
-        layer = _build(rows, own, _upright(own), points, excitation, region.half)
+        layer = _build(BELOW, rows, own, _upright(own), points, excitation, region.half)
         if layer.misfit(sources) <= GOOD_ENOUGH:
             return layer
     positions = np.concatenate([_lattice(region, *SHALLOW), deep])
-    return _build(None, positions, _upright(positions), points, excitation, region.half)
+    return _build(BELOW, None, positions, _upright(positions), points, excitation, region.half)
 
 
 def box_layer(region: Region, excitation: Excitation) -> Layer:
@@ -171,4 +218,4 @@ def box_layer(region: Region, excitation: Excitation) -> Layer:
     # Near the faces the field of what is just outside has more detail than the box can make.
     points = region.samples(part=INNER)
     axes = np.concatenate(directions)
-    return _build(None, stacked, axes, points, excitation, region.half)
+    return _build(AROUND, None, stacked, axes, points, excitation, region.half)

@@ -41,7 +41,7 @@ def error_modes(bank: Bank, hypothesis: int, level: ErrorLevel, count: int) -> E
     count : int
         Modes R.
     """
-    layer = bank.priors[hypothesis - 1].layer
+    layer = bank.prior(hypothesis).layer
     draws = []
     for part in range(2):
         error = bank.error_draws(hypothesis, level.noise, level.strengths[part], part)

@@ -99,6 +99,10 @@ class Bank:
         Reading that one deviation of each emitter's drift makes, in noise units.
     noise : ndarray, shape (all readings,), optional
         Noise of each reading over the others' (1 where not given).
+    slots : int
+        Hypotheses more that can be put in later, one after the other in the same place.
+    among : int
+        How many hypotheses those in the slots are chosen from: each is as much less likely.
     """
 
     def __init__(
@@ -107,30 +111,69 @@ class Bank:
         rows: NDArray[np.int64],
         drift: Array,
         noise: Array | None = None,
+        slots: int = 0,
+        among: int = 0,
     ) -> None:
-        self.priors = tuple(priors)
+        self.priors: list[CloudPrior | None] = [*priors, *[None] * slots]
         self.rows = rows
         self.width = drift.shape[1]
         self._all_drift = drift
         self.drift = drift[rows]
         self._all_noise = np.ones(len(drift)) if noise is None else noise
         self._row_noise = self._all_noise[rows]
-        whitening = _whitening(self.drift, self._row_noise)
-        spectra, bases = [np.zeros(len(rows))], [whitening]
-        for prior in self.priors:
-            block = prior.covariance[np.ix_(rows, rows)]
-            values, vectors = eigh(whitening.T @ block @ whitening, driver='evd')
-            spectra.append(np.maximum(values, 0.0))
-            bases.append(whitening @ vectors)
-        self.spectra = np.array(spectra)
-        self.bases = np.array(bases)
+        self.whitening = _whitening(self.drift, self._row_noise)
+        count, n = 1 + len(self.priors), len(rows)
+        self.spectra, self.bases = np.zeros((count, n)), np.zeros((count, n, n))
         # The two large products of every frame wait for memory, not for arithmetic; single
         # precision is 1e-7 of a reading that is at most 1e6 noise deviations.
-        turned = self.bases.swapaxes(1, 2).reshape(-1, len(rows))
-        self._analysis = np.ascontiguousarray(turned, dtype=np.float32)
+        self._analysis = np.zeros((count * n, n), dtype=np.float32)
+        self._prior = np.full(count, -np.inf)
+        self._chosen = -float(np.log(max(among / max(slots, 1), 1.0)))
+        self.is_slot = np.arange(count) >= count - slots
+        self._set(0, self.whitening)
+        for hypothesis, prior in enumerate(priors, start=1):
+            self._decompose(hypothesis, prior)
         self._synthesis: dict[int, NDArray[np.float32]] = {}
         self._blocks: dict[tuple[float, int, int], Array] = {}
         self._tables: dict[float, tuple[Array, Array]] = {}
+
+    def _set(self, hypothesis: int, basis: Array) -> None:
+        n = len(self.rows)
+        self.bases[hypothesis] = basis
+        self._analysis[hypothesis * n : (hypothesis + 1) * n] = basis.T
+        self._prior[hypothesis] = self._chosen if self.is_slot[hypothesis] else 0.0
+
+    def _decompose(self, hypothesis: int, prior: CloudPrior) -> None:
+        block = prior.covariance[np.ix_(self.rows, self.rows)]
+        values, vectors = eigh(self.whitening.T @ block @ self.whitening, driver='evd')
+        self.spectra[hypothesis] = np.maximum(values, 0.0)
+        self._set(hypothesis, self.whitening @ vectors)
+
+    def vacate(self, hypothesis: int) -> None:
+        """Empty a slot."""
+        self.priors[hypothesis - 1] = None
+        self._prior[hypothesis] = -np.inf
+
+    def occupy(self, hypothesis: int, prior: CloudPrior) -> None:
+        """Put a prior in a slot; what was there is forgotten."""
+        self._decompose(hypothesis, prior)
+        self.priors[hypothesis - 1] = prior
+        self._synthesis.pop(hypothesis, None)
+        self._tables.clear()
+        for key in [key for key in self._blocks if key[1] == hypothesis]:
+            del self._blocks[key]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What each hypothesis says."""
+        slots = (f'slot {i}' if p is None else p.name for i, p in enumerate(self.priors))
+        return ('nothing', *slots)
+
+    def prior(self, hypothesis: int) -> CloudPrior:
+        """The prior of a hypothesis that is not 0 and not an empty slot."""
+        prior = self.priors[hypothesis - 1]
+        assert prior is not None
+        return prior
 
     def precision(self, noise: float) -> tuple[Array, Array]:
         """Inverse variances (H, A, n) and log determinants (H, A) at a noise level."""
@@ -155,6 +198,7 @@ class Bank:
         projected = projected.reshape(len(self.bases), -1, 2)
         curve = -0.5 * (precision @ projected**2 + log_det[:, :, None])
         evidence, strength = _over_strengths(curve)
+        evidence += self._prior
         return Evaluation(projected, evidence, curve, strength, noise)
 
     def coefficients(self, seen: Evaluation, hypothesis: int) -> Array:
@@ -165,7 +209,7 @@ class Bank:
 
     def _to_moments(self, hypothesis: int) -> NDArray[np.float32]:
         if hypothesis not in self._synthesis:
-            transfer = self.priors[hypothesis - 1].transfer[:, self.rows]
+            transfer = self.prior(hypothesis).transfer[:, self.rows]
             self._synthesis[hypothesis] = (transfer @ self.bases[hypothesis]).astype(np.float32)
         return self._synthesis[hypothesis]
 
@@ -192,7 +236,7 @@ class Bank:
     def sources(self, seen: Evaluation, hypothesis: int) -> Array:
         """Posterior mean polarisability (M, 2) of a cloud's sources, in noise units."""
         weights = self.bases[hypothesis] @ self.coefficients(seen, hypothesis)
-        return np.asarray(self.priors[hypothesis - 1].coupling[self.rows].T @ weights)
+        return np.asarray(self.prior(hypothesis).coupling[self.rows].T @ weights)
 
     def left_out(self, seen: Evaluation, hypothesis: int) -> tuple[Array, Array]:
         """How far each coil's readings are from what all others predict.
@@ -249,6 +293,10 @@ class Bank:
         rows = (coils[:, None] * self.width + np.arange(self.width)).ravel()
         curve, residuals = np.empty_like(seen.curve), []
         for h, basis in enumerate(self.bases[:, rows]):
+            if not np.isfinite(self._prior[h]):
+                curve[h] = 0.0
+                residuals.append(np.zeros((len(rows), 2)))
+                continue
             weighted = precision[h][:, None, :] * basis
             block = weighted @ basis.T
             q = weighted @ seen.projected[h]
@@ -258,6 +306,7 @@ class Bank:
             best = curve[h].argmax(axis=0)
             residuals.append(r[best, :, [0, 1]].T)
         evidence, _ = _over_strengths(curve)
+        evidence += self._prior
         return evidence, residuals[int(evidence.argmax())].reshape(len(coils), self.width, 2)
 
     def distance(
@@ -293,7 +342,7 @@ class Bank:
             strength = int(seen.strength[hypothesis, part].argmax())
             cross, block = shared, own
             if hypothesis > 0:
-                prior = self.priors[hypothesis - 1].covariance
+                prior = self.prior(hypothesis).covariance
                 cross = cross + STRENGTHS[strength] * prior[np.ix_(rows, self.rows)]
                 block = block + STRENGTHS[strength] * prior[np.ix_(rows, rows)]
             seen_by = cross @ basis
@@ -316,7 +365,7 @@ class Bank:
         posterior's error (Matheron's rule; Wilson et al., JMLR 22 (2021) 105).
         """
         precision, _ = self.precision(noise)
-        prior, root = self.priors[hypothesis - 1], np.sqrt(STRENGTHS[strength])
+        prior, root = self.prior(hypothesis), np.sqrt(STRENGTHS[strength])
         count = prior.draw_readings.shape[1]
         drawn = noise * _noise_draws(count, self.drift, self._row_noise, part)
         readings = root * prior.draw_readings[self.rows] + drawn

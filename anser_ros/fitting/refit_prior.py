@@ -55,6 +55,8 @@ class Response:
 
 UPRIGHT = Response('upright', 1.0, 1.0, 0.0)
 ORIENTED = Response('oriented', 1.0, 0.0, 0.25)
+BODY = Response('', 1.0, 0.0, 0.5)
+"""Dense pieces that drive each other answer in any direction."""
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from anser_ros.fitting.model import FieldModel
-from anser_ros.fitting.refit_clouds import Cloud, Region, default_clouds
+from anser_ros.fitting.refit_clouds import Cloud, Region, bodies, default_clouds
 from anser_ros.fitting.refit_excitation import Excitation, FieldFunction, excitation_for
-from anser_ros.fitting.refit_layer import Layer, bottom_layer, box_layer
+from anser_ros.fitting.refit_layer import (
+    Layer,
+    body_layer,
+    bottom_layer,
+    box_layer,
+    pose_weight,
+)
 from anser_ros.fitting.refit_prior import (
+    BODY,
     ORIENTED,
     UPRIGHT,
     CloudPrior,
@@ -17,8 +25,10 @@ from anser_ros.fitting.refit_prior import (
     build_prior,
 )
 from anser_ros.fitting.refit_result import RefitSettings
+from anser_ros.fitting.refit_search import COARSE, body_factor
 from anser_ros.physics.sensor import SensorTable
 
+Array = NDArray[np.float64]
 Hypothesis = tuple[Cloud, Response, Layer]
 
 MOST_ORIENTED = 1000
@@ -38,6 +48,14 @@ class Scene:
     hypotheses : tuple of (Cloud, Response, Layer)
     priors : tuple of CloudPrior
     frequencies_hz : tuple of float
+    bodies : tuple of Cloud
+        Compact bodies that may be put in as further hypotheses.
+    factors : tuple of ndarray
+        What `refit_search` needs of each.
+    references : SensorTable
+    settings : RefitSettings
+    weight : ndarray, shape (P,)
+        `pose_weight` of the region's samples.
     """
 
     excitation: Excitation
@@ -46,13 +64,33 @@ class Scene:
     hypotheses: tuple[Hypothesis, ...]
     priors: tuple[CloudPrior, ...]
     frequencies_hz: tuple[float, ...]
+    bodies: tuple[Cloud, ...]
+    factors: tuple[NDArray[np.float32], ...]
+    references: SensorTable
+    settings: RefitSettings
+    weight: Array
 
     def moved(self, references: SensorTable, settings: RefitSettings) -> 'Scene':
         """The scene for references that are elsewhere."""
         priors = _priors(
             self.hypotheses, references, self.excitation, self.frequencies_hz, settings
         )
-        return replace(self, priors=priors)
+        factors = _factors(self.bodies, references, self.excitation)
+        return replace(self, priors=priors, factors=factors, references=references)
+
+    def body_prior(self, body: int) -> CloudPrior:
+        """The full hypothesis of a compact body; the same whenever it is asked for."""
+        cloud = self.bodies[body]
+        return build_prior(
+            cloud,
+            BODY,
+            body_layer(self.region, self.weight, cloud),
+            self.references,
+            self.excitation.field(cloud.positions),
+            np.array(self.frequencies_hz),
+            self.settings.survey,
+            np.random.default_rng([self.settings.seed, body]),
+        )
 
 
 def build_scene(
@@ -68,7 +106,30 @@ def build_scene(
     box = box_layer(region, excitation)
     hypotheses = _hypotheses(clouds, bottom, box)
     priors = _priors(hypotheses, references, excitation, model.frequencies_hz, settings)
-    return Scene(excitation, region, (bottom, box), hypotheses, priors, model.frequencies_hz)
+    around = bodies(region)
+    return Scene(
+        excitation,
+        region,
+        (bottom, box),
+        hypotheses,
+        priors,
+        model.frequencies_hz,
+        around,
+        _factors(around, references, excitation),
+        references,
+        settings,
+        pose_weight(region.samples(), excitation),
+    )
+
+
+def _factors(
+    around: Sequence[Cloud], references: SensorTable, excitation: Excitation
+) -> tuple[NDArray[np.float32], ...]:
+    places = np.concatenate([cloud.positions[:COARSE] for cloud in around])
+    fields = excitation.field(places).reshape(len(around), COARSE, -1, 3)
+    return tuple(
+        body_factor(cloud, references, field) for cloud, field in zip(around, fields, strict=True)
+    )
 
 
 def _hypotheses(clouds: Sequence[Cloud], bottom: Layer, box: Layer) -> tuple[Hypothesis, ...]:
