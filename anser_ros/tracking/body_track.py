@@ -7,7 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.tracking import estimate as states
-from anser_ros.tracking.coil_track import NANO, RARE, CoilResult
+from anser_ros.tracking.coil_track import (
+    MOST_STEPS,
+    NANO,
+    RARE,
+    SUSPICIOUS_JUMP_M,
+    CoilResult,
+)
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.rigid import (
     BodyCoils,
@@ -17,6 +23,7 @@ from anser_ros.tracking.rigid import (
     start_from_coils,
     start_from_grid,
 )
+from anser_ros.tracking.rotations import rotation_between, rotation_of_vector
 from anser_ros.tracking.scene import Scene
 from anser_ros.tracking.uncertainty import bounded_inverse, chi2_limit
 
@@ -36,14 +43,32 @@ class BodyTrack:
 
     good: BodySolution | None = None
     good_ns: int = 0
+    before: tuple[int, BodySolution] | None = None
     left_out: frozenset[int] = frozenset()
     again_ns: int = 0
     noise: NoiseScale = field(default_factory=NoiseScale)
 
     def forget(self) -> None:
         """Drop the warm start."""
-        self.good = None
+        self.good = self.before = None
         self.left_out = frozenset()
+
+    def expected(self, stamp_ns: int) -> Start | None:
+        """Where the body is if it moves on as it did between its last two good poses."""
+        if self.good is None:
+            return None
+        position, rotation = self.good.position, self.good.rotation
+        if self.before is None:
+            return position, rotation
+        before_ns, old = self.before
+        steps = (stamp_ns - self.good_ns) / max(self.good_ns - before_ns, 1)
+        if not 0.0 < steps <= MOST_STEPS:
+            return position, rotation
+        turn = rotation_between(old.rotation, rotation)
+        return (
+            position + steps * (position - old.position),
+            rotation_of_vector(steps * turn) @ rotation,
+        )
 
 
 @dataclass(frozen=True)
@@ -151,6 +176,12 @@ def track_body(
     fit = fits[0]
     result = _judge(track, name, stamp_ns, fit, fits[1:], coils, scene, settings)
     if result.state == states.OK:
+        last, track.before = track.good, None
+        if (
+            last is not None
+            and math.dist(last.position, fit.solution.position) < SUSPICIOUS_JUMP_M
+        ):
+            track.before = (track.good_ns, last)
         track.good, track.good_ns = fit.solution, stamp_ns
         track.noise.add(fit.ratio)
         left_out = frozenset(used.tolist()) - frozenset(fit.used.tolist())
@@ -171,7 +202,8 @@ def _from_good(
     """The fit near the last good pose, when there is one that passes the gate."""
     if track.good is None or (stamp_ns - track.good_ns) * NANO > settings.warm_age_s:
         return []
-    start = (track.good.position, track.good.rotation)
+    start = track.expected(stamp_ns)
+    assert start is not None
     if track.left_out and stamp_ns < track.again_ns:
         kept = np.array([i for i in used if int(i) not in track.left_out], dtype=np.int64)
         if len(kept) > 1 and coils.subset(kept).observable:

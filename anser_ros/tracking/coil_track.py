@@ -27,6 +27,8 @@ THOROUGH_EVERY = 4
 """A long distortion gets a scan after growing pauses; every so many of them tries all starts."""
 CHANGED = 3.0
 """A suspect's chi-square that changes by this factor calls for a scan before its time."""
+MOST_STEPS = 2.5
+"""Motion is carried on for so many of the last step's durations."""
 WHITENING_REACH_M = 3e-3
 WHITENING_REACH = 0.05
 """Move (m) and turn (chord of the axes) up to which the model's error at a pose is reused."""
@@ -43,6 +45,7 @@ class CoilTrack:
 
     good: CoilSolution | None = None
     good_ns: int = 0
+    before: tuple[int, Array, Array] | None = None
     suspect: CoilSolution | None = None
     failures: int = 0
     retry_ns: int = 0
@@ -52,8 +55,23 @@ class CoilTrack:
 
     def forget(self) -> None:
         """Drop the warm start."""
-        self.good = self.suspect = None
+        self.good = self.suspect = self.before = None
         self.failures = 0
+
+    def expected(self, stamp_ns: int) -> tuple[Array, Array] | None:
+        """Where the sensor is if it moves on as it did between its last two good poses."""
+        if self.good is None:
+            return None
+        position, axis = self.good.position, self.good.axis
+        if self.before is None:
+            return position, axis
+        before_ns, old_position, old_axis = self.before
+        steps = (stamp_ns - self.good_ns) / max(self.good_ns - before_ns, 1)
+        if not 0.0 < steps <= MOST_STEPS:
+            return position, axis
+        turned = axis + steps * (axis - old_axis)
+        turned /= math.sqrt(float(turned @ turned))
+        return position + steps * (position - old_position), turned
 
 
 @dataclass(frozen=True)
@@ -135,7 +153,10 @@ def _cold(track: CoilTrack, frame: _Frame) -> list[CoilSolution]:
     if scene.modes is None:
         return found
     near = [s for s in found if s.chi2 <= 100.0 * limit or s is found[0]]
-    return sorted((_descend(track, frame, s) for s in near), key=lambda solution: solution.chi2)
+    return sorted(
+        (_descend(track, frame, s.position, s.axis) for s in near),
+        key=lambda solution: solution.chi2,
+    )
 
 
 def track_coil(
@@ -148,7 +169,8 @@ def track_coil(
     settings: TrackerSettings,
 ) -> CoilResult:
     """Estimate a sensor's pose from one frame's fluxes, shape (2K,), finite, T."""
-    signal = float(np.sqrt(np.mean((flux / scene.sigma) ** 2)))
+    loudness = flux / scene.sigma
+    signal = math.sqrt(float(loudness @ loudness) / loudness.size)
     if signal < settings.min_signal:
         reason = f'flux is {signal:.2g} times the noise'
         return CoilResult(no_pose(name, stamp_ns, states.NO_SIGNAL, scene.model_id, reason), None)
@@ -157,7 +179,7 @@ def track_coil(
     if solution is not None:
         return _finish(track, frame, solution, [], False)
     if track.suspect is not None and stamp_ns < track.retry_ns:
-        solution = _descend(track, frame, track.suspect)
+        solution = _descend(track, frame, track.suspect.position, track.suspect.axis)
         verdict = _judge(track, frame, solution, [])
         change = solution.chi2 / max(track.suspect.chi2, 1e-300)
         if verdict.state != states.OK and 1.0 / CHANGED < change < CHANGED:
@@ -176,6 +198,11 @@ def _finish(
     """Judge a solution and remember it as good or suspect."""
     verdict = _judge(track, frame, solution, rivals)
     if verdict.state == states.OK:
+        last = track.good
+        moved = last is not None and math.dist(last.position, solution.position)
+        track.before = None
+        if last is not None and moved < SUSPICIOUS_JUMP_M:
+            track.before = (track.good_ns, last.position, last.axis)
         track.good, track.good_ns = solution, frame.stamp_ns
         track.suspect, track.failures = None, 0
         track.noise.add(verdict.chi2)
@@ -186,15 +213,15 @@ def _finish(
     return CoilResult(verdict, solution, cold)
 
 
-def _descend(track: CoilTrack, frame: _Frame, start: CoilSolution) -> CoilSolution:
+def _descend(track: CoilTrack, frame: _Frame, position: Array, axis: Array) -> CoilSolution:
     scene = frame.scene
-    weights = _whitening(track, scene, start.position, start.axis, frame.length)
+    weights = _whitening(track, scene, position, axis, frame.length)
     return solve_coil(
         scene.field,
         frame.flux,
         weights,
-        start.position,
-        start.axis,
+        position,
+        axis,
         scene.low,
         scene.high,
         frame.length,
@@ -203,10 +230,11 @@ def _descend(track: CoilTrack, frame: _Frame, start: CoilSolution) -> CoilSoluti
 
 def _from_good(track: CoilTrack, frame: _Frame) -> CoilSolution | None:
     """Solution near the last good pose; None when there is none that a scan need not confirm."""
-    start = track.good
-    if start is None or (frame.stamp_ns - track.good_ns) * NANO > frame.settings.warm_age_s:
+    start, expected = track.good, track.expected(frame.stamp_ns)
+    old = (frame.stamp_ns - track.good_ns) * NANO > frame.settings.warm_age_s
+    if start is None or expected is None or old:
         return None
-    solution = _descend(track, frame, start)
+    solution = _descend(track, frame, *expected)
     jump = math.dist(solution.position, start.position)
     if solution.chi2 > frame.limit or not solution.converged or jump > SUSPICIOUS_JUMP_M:
         return None
@@ -225,7 +253,7 @@ def _judge(
         solution.normal, solution.axis, settings.roll_variance / scale
     )
     sigma = math.sqrt(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
-    residual = float(np.sqrt(np.mean(solution.residual**2)))
+    residual = math.sqrt(float(solution.residual @ solution.residual) / solution.residual.size)
     state, reason = states.OK, ''
     if not solution.chi2 <= frame.limit:
         state = states.RESIDUAL

@@ -14,6 +14,10 @@ from anser_ros.physics.dipole import GAUSS_OFFSET, fill_field_and_gradient
 
 LARGEST_MOVE_M = 0.04
 LARGEST_TURN = 0.6
+FIRST_DAMPING = 1e-8
+"""Next to nothing: most starts are so near that the plain step ends within the noise."""
+LEAST_RAISED = 1e-3
+"""Damping after a step that failed."""
 CONVERGED_CHI2 = 1e-6
 """Fall of chi-square below which a step is not worth another one (a thousandth of a sigma)."""
 
@@ -75,18 +79,16 @@ def _whiten(flux, model, jacobian, whitening, residual, white):  # type: ignore[
             for i in range(6):
                 white[i + 1, k] = w * jacobian[i, k]
         return chi2
+    # The factor is lower triangular. Columns outside, so that the inner loop runs along rows.
     for k in range(width):
-        total = 0.0
-        for j in range(width):
-            total += whitening[k, j] * residual[j]
-        white[0, k] = total
-        chi2 += total * total
-    for i in range(6):
-        for k in range(width):
-            total = 0.0
-            for j in range(width):
-                total += whitening[k, j] * jacobian[i, j]
-            white[i + 1, k] = total
+        for i in range(7):
+            white[i, k] = 0.0
+        for j in range(k + 1):
+            w = whitening[k, j]
+            white[0, k] += w * residual[j]
+            for i in range(6):
+                white[i + 1, k] += w * jacobian[i, j]
+        chi2 += white[0, k] * white[0, k]
     return chi2
 
 
@@ -214,7 +216,7 @@ def descend(  # type: ignore[no-untyped-def]
 
     fill_coil(position, axis, length, positions, directions, moments, basis, model, jacobian)
     chi2 = _whiten(flux, model, jacobian, whitening, residual, white)
-    used, damping, growth, converged = 1, 1e-4, 2.0, False
+    used, damping, growth, converged = 1, FIRST_DAMPING, 2.0, False
     while used < budget and not converged:
         fill_tangent(axis, tangent)
         _normal_equations(white, tangent, full, normal, gradient)
@@ -227,6 +229,10 @@ def descend(  # type: ignore[no-untyped-def]
                 continue
             _limit(step)
             promised = _promised(normal, gradient, step)
+            negligible = promised < CONVERGED_CHI2 + 1e-9 * chi2
+            if negligible:
+                converged = True
+                break
             _advance(position, axis, tangent, step, low, high, trial_position, trial_axis)
             fill_coil(
                 trial_position, trial_axis, length, positions, directions, moments, basis, model,
@@ -234,24 +240,19 @@ def descend(  # type: ignore[no-untyped-def]
             )  # fmt: skip
             used += 1
             trial = _whiten(flux, model, jacobian, whitening, trial_residual, trial_white)
-            negligible = promised < CONVERGED_CHI2 + 1e-9 * chi2
-            if trial <= chi2 or negligible:
-                if trial <= chi2:
-                    gain = (chi2 - trial) / max(promised, 1e-300)
-                    damping *= max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
-                    growth = 2.0
-                    converged = negligible or chi2 - trial < CONVERGED_CHI2 + 1e-9 * chi2
-                    chi2 = trial
-                    position[:] = trial_position
-                    axis[:] = trial_axis
-                    residual[:] = trial_residual
-                    white, trial_white = trial_white, white
-                    accepted = True
-                else:
-                    converged = True
-                    break
+            if trial <= chi2:
+                gain = (chi2 - trial) / max(promised, 1e-300)
+                damping *= max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
+                growth = 2.0
+                converged = chi2 - trial < CONVERGED_CHI2 + 1e-9 * chi2
+                chi2 = trial
+                position[:] = trial_position
+                axis[:] = trial_axis
+                residual[:] = trial_residual
+                white, trial_white = trial_white, white
+                accepted = True
             else:
-                damping *= growth
+                damping = max(damping * growth, LEAST_RAISED)
                 growth *= 2.0
                 if damping > 1e12:
                     return chi2, used, False

@@ -23,6 +23,8 @@ from anser_ros.tracking.solve import Array, RealField
 MAX_EVALUATIONS = 30
 LARGEST_MOVE_M = 0.04
 LARGEST_TURN = 0.6
+FIRST_DAMPING = 1e-8
+LEAST_RAISED = 1e-3
 CONVERGED_CHI2 = 1e-6
 PARALLEL = 0.05
 """Sine of the angle between axes below which all coils of a tool count as parallel."""
@@ -209,28 +211,29 @@ def solve_body(
 
     r, turn = np.array(position, dtype=np.float64), np.array(rotation, dtype=np.float64)
     residual, white, jacobian, chi2 = evaluate(r, turn)
-    used, damping, converged = 1, 1e-4, False
+    used, damping, converged = 1, FIRST_DAMPING, False
     normal, gradient = _inner(jacobian, jacobian, common), _inner(jacobian, white, common)[:, 0]
     while used < budget and not converged and damping < 1e10:
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-300), gradient)
         move, angle = math.sqrt(step[:3] @ step[:3]), math.sqrt(step[3:] @ step[3:])
         step *= min(1.0, LARGEST_MOVE_M / (move + 1e-30), LARGEST_TURN / (angle + 1e-30))
         promised = float(step @ (2.0 * gradient - normal @ step))
+        if promised < CONVERGED_CHI2 + 1e-9 * chi2:
+            converged = True
+            break
         new_r = np.minimum(np.maximum(r + step[:3], low), high)
         new_turn = rotation_of_vector(step[3:]) @ turn
         trial = evaluate(new_r, new_turn)
         used += 1
-        negligible = promised < CONVERGED_CHI2 + 1e-9 * chi2
         if trial[3] <= chi2:
             fall = chi2 - trial[3]
-            converged = negligible or fall < CONVERGED_CHI2 + 1e-9 * chi2
+            converged = fall < CONVERGED_CHI2 + 1e-9 * chi2
             damping *= 0.1 if fall > 0.5 * promised else 0.5
             r, turn, (residual, white, jacobian, chi2) = new_r, new_turn, trial
             normal = _inner(jacobian, jacobian, common)
             gradient = _inner(jacobian, white, common)[:, 0]
         else:
-            converged = negligible
-            damping = max(5.0 * damping, 1e-6)
+            damping = max(5.0 * damping, LEAST_RAISED)
     coil_chi2 = (white.reshape(count, width) ** 2).sum(axis=1)
     turn = nearest_rotation(turn)
     return BodySolution(r, turn, chi2, normal, residual, coil_chi2, used, converged)
