@@ -23,6 +23,7 @@ ARGUMENTS = {
     'simulate': ('false', 'whether a simulated control unit takes the place of the real one'),
     'record': ('true', 'whether a bag is recorded'),
     'directory': ('recordings', 'folder of the bags'),
+    'watch': ('false', 'whether what the model lacks is told live in /diagnostics'),
     'openigtlink': ('false', 'whether poses are served to 3D Slicer'),
     'rviz': ('false', 'whether RViz is started'),
 }
@@ -70,6 +71,7 @@ def generate_launch_description():
                     node('field_model', model_file=value('model')),
                     node('tracker'),
                     node('recorder', 'record', directory=value('directory')),
+                    node('watcher', 'watch', model_file=value('model')),
                     node('openigtlink', 'openigtlink'),
                 ]
             ),

@@ -128,3 +128,16 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip('the folder of recorded sessions is not beside the repository')
     return SHARED
+
+
+@pytest.fixture(scope='session')
+def effects_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a model calibrated once on the factory scan of the shared sessions, or skip."""
+    scan = SHARED / 'sessions' / 'effects' / 'factory.mcap'
+    if not scan.is_file():
+        pytest.skip('the folder of recorded sessions is not beside the repository')
+    from anser_ros.cli.main import main
+
+    model = tmp_path_factory.mktemp('effects') / 'model.yaml'
+    assert main(['calibrate', str(scan), '--out', str(model)]) == 0
+    return model

@@ -26,6 +26,7 @@ NODES = {
     'openigtlink': 'serves the poses to 3D Slicer as OpenIGTLink',
     'cu_simulator': 'a control unit behind a pseudo-terminal',
     'monitor': 'a live table of sensors, rates and latencies',
+    'watcher': 'names live, in /diagnostics, what the model lacks',
 }
 EXIT_OK = 0
 EXIT_DEFECT = 1

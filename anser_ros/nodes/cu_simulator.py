@@ -121,6 +121,7 @@ class CuSimulator(AnserNode):
         paths = tool_paths(setup.bodies, table.path_phase_rad)
         source = board_source(_board(table, real))
         self._world = World(real, source, paths=paths, metal=self._metal)
+        self._world.flux(0.0)  # loads the kernels now, not while samples are due
         front = FrontEnd(
             table.sample_rate_hz,
             noise_codes=table.noise_codes,

@@ -90,9 +90,9 @@ def diagnose_session(
         clean = baseline_flux(baseline, session.reference.sensors)
     noise_t = noise_of(session.setup) or DEFAULT_NOISE_T
     spread = Spread(flux_t=float(np.hypot(noise_t, model.flux_error_t)), noise_t=noise_t)
-    known = [_corrected(tool, model) for tool in session.tools]
-    reference = None if session.reference is None else _corrected(session.reference, model)
-    problem = build_problem(known, reference, clean, model, _drawn(session), spread)
+    known = [corrected(tool, model) for tool in session.tools]
+    reference = None if session.reference is None else corrected(session.reference, model)
+    problem = build_problem(known, reference, clean, model, drawn(session), spread)
     found = diagnose(problem, model, progress=progress)
     say = progress or (lambda text: None)
     say('tracking the held-out part')
@@ -107,7 +107,7 @@ def diagnose_session(
     )
 
 
-def _corrected(measurements: Measurements, model: FieldModel) -> Measurements:
+def corrected(measurements: Measurements, model: FieldModel) -> Measurements:
     """The measurements as the effects that the model already knows leave them."""
     correction = Correction.of(model.effects, measurements.sensors, model.frequencies_hz)
     if not correction.terms:
@@ -125,7 +125,7 @@ def _corrected(measurements: Measurements, model: FieldModel) -> Measurements:
     return replace(out, track=track, position=position, rotation=rotation, has_pose=has_pose)
 
 
-def _drawn(session: Session) -> FieldModel | None:
+def drawn(session: Session) -> FieldModel | None:
     """The nominal model, where the setup's geometry makes one."""
     try:
         return nominal_model(board_of(session.setup))

@@ -167,7 +167,8 @@ def _loose_contact(unit: Unit, rng: np.random.Generator) -> Drawn:
         'channels': [unit.setup.sensors[column].channel], 'share': share, 'period_s': period_s
     }  # fmt: skip
     effect = LooseSensor(column, share, period_s=period_s)
-    return Drawn('loose_contact', parameters, (effect,), answers=('outliers',))
+    answers = ('loose_contact', 'outliers')
+    return Drawn('loose_contact', parameters, (effect,), answers=answers)
 
 
 def _gain_ripple(unit: Unit, rng: np.random.Generator) -> Drawn:
@@ -175,7 +176,10 @@ def _gain_ripple(unit: Unit, rng: np.random.Generator) -> Drawn:
     parameters = {'depth': depth, 'period_s': period_s}
     # No catalogue has the swing, but one has a gain's course over time.
     return Drawn(
-        'gain_ripple', parameters, (GainRipple(depth, period_s),), answers=('sensor_gain_drift',)
+        'gain_ripple',
+        parameters,
+        (GainRipple(depth, period_s),),
+        answers=('tool_gain_drift', 'sensor_gain_drift'),
     )
 
 

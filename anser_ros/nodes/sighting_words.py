@@ -1,0 +1,57 @@
+"""A sighting in words, for an operator who reads /diagnostics."""
+
+from typing import Any
+
+import numpy as np
+
+from anser_ros.fitting.model import EffectRecord
+from anser_ros.sessions.watch import Sighting
+
+SITES = ('channel', 'channels', 'coil', 'coils', 'body')
+MOST_TEXT = 60
+
+
+def words_of(seen: Sighting) -> str:
+    """One line for an operator."""
+    size = f'residual {1e12 * seen.flux_rms_t:.0f} pT, {seen.excess**0.5:.1f} x the expected one'
+    if seen.findings:
+        named = '; '.join(f'{title_of(record)}: {figures_of(record)}' for record in seen.findings)
+        return f'{named}; {size}, {seen.excess_left**0.5:.1f} x with it corrected'
+    if seen.is_clear:
+        return f'all as the model says; {size}'
+    cause = seen.remark or 'no effect that is known explains it'
+    depends = f', it depends on {", ".join(seen.depends_on)}' if seen.depends_on else ''
+    return f'{size}; {cause}{depends}'
+
+
+def title_of(record: EffectRecord) -> str:
+    """Name of an effect and where it sits."""
+    sites = [
+        f'{key} {plain_text(record.parameters[key])}' for key in SITES if key in record.parameters
+    ]
+    return f'{record.name} ({", ".join(sites)})' if sites else record.name
+
+
+def figures_of(record: EffectRecord) -> str:
+    """Parameters that fit into a line."""
+    parts = [
+        f'{key} {text}'
+        for key, value in record.parameters.items()
+        if key not in SITES and len(text := plain_text(value)) <= MOST_TEXT
+    ]
+    return ', '.join(parts) or 'found'
+
+
+def plain_text(value: Any) -> str:
+    """A parameter as an operator reads it: numbers short, lists and mappings without quotes."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, complex):
+        return f'{value:.4g}'
+    if isinstance(value, (bool, int, np.integer)) or value is None:
+        return str(value)
+    if isinstance(value, (float, np.floating)):
+        return f'{value:.5g}'
+    if isinstance(value, dict):
+        return ', '.join(f'{key} {plain_text(item)}' for key, item in value.items())
+    return '[' + ' '.join(plain_text(item) for item in value) + ']'

@@ -1,0 +1,250 @@
+"""Watches live for what the field model lacks, and names it in /diagnostics."""
+
+import queue
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from numpy.typing import NDArray
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
+
+from anser_ros.errors import AnserError
+from anser_ros.fitting.model import EffectRecord
+from anser_ros.nodes import qos
+from anser_ros.nodes.flux_reader import read_flux
+from anser_ros.nodes.model_clouds import NANO
+from anser_ros.nodes.node import AnserNode, Level, Status, main
+from anser_ros.nodes.parameters import parameter
+from anser_ros.nodes.sighting_words import figures_of, plain_text, title_of, words_of
+from anser_ros.sessions.evaluation import baseline_flux
+from anser_ros.sessions.session import Session, load_session, sensor_table
+from anser_ros.sessions.sliding_window import SlidingWindow
+from anser_ros.sessions.starting_model import NOMINAL, model_for
+from anser_ros.sessions.watch import Sighting, Watch
+from anser_ros.wire.setup import Setup, parse_setup, topic_of
+
+POLL_S = 0.2
+FILLED = 0.5
+"""Share of the window that must be there before the first look."""
+SILENCE_S = 2.0
+
+
+@dataclass(frozen=True)
+class WatcherParameters:
+    """Parameters of the watcher."""
+
+    model_file: str = parameter(
+        NOMINAL, "the tracker's model: a file, or nominal for that of the setup's own geometry"
+    )
+    baseline_file: str = parameter(
+        '', 'distortion-free recording of the same board; without one the references have no say'
+    )
+    window_s: float = parameter(20.0, 'how far back it looks, s', minimum=5.0, maximum=120.0)
+    frames: int = parameter(100, 'flux frames it looks at', minimum=40, maximum=400)
+    period_s: float = parameter(
+        5.0, 'least time from one look to the next, s', minimum=0.1, maximum=600.0, live=True
+    )
+    cpu_share: float = parameter(
+        0.2, 'most of one processor that it takes on average', minimum=0.01, maximum=1.0, live=True
+    )
+
+
+@dataclass(frozen=True)
+class Task:
+    """One look: at what, and with whom."""
+
+    watch: Watch
+    session: Session
+    first_ns: int
+
+
+class Watcher(AnserNode):
+    """Subscribes to fluxes and optical poses, and publishes ``/diagnostics`` alone.
+
+    The diagnosis runs in a thread of its own; after each look it rests until its share of the
+    processor is kept.
+    """
+
+    NAME = 'watcher'
+    PARAMETERS = WatcherParameters
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        table = self.parameters
+        self._baseline_bag = load_session(table.baseline_file) if table.baseline_file else None
+        self._setup_text = ''
+        self._window: SlidingWindow | None = None
+        self._watch: Watch | None = None
+        self._sighting: Sighting | None = None
+        self._trouble = ''
+        self._known: dict[str, EffectRecord] = {}
+        self._pose_subscriptions: dict[str, Any] = {}
+        self._heard_s = 0.0
+        self._next_s = 0.0
+        self._look_s = 0.0
+        self._busy = False
+        self._tasks: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
+        self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
+        self.create_subscription(PointCloud2, 'tool/flux', self._on_tool, qos.STREAM)
+        self.create_subscription(PointCloud2, 'reference/flux', self._on_reference, qos.STREAM)
+        self.create_timer(POLL_S, self._begin_look, clock=self.steady_clock)
+        work = self._guard(self._take_look)
+        self._thread = threading.Thread(target=self._work, args=(work,), daemon=True)
+        self._thread.start()
+
+    # What is subscribed to ----------------------------------------------------------------
+
+    def _on_setup(self, message: String) -> None:
+        if message.data == self._setup_text:
+            return
+        try:
+            setup = parse_setup(message.data)
+            # An empty window has a session's setup already, and a model must fit that.
+            session = Session('live', setup, 0, (), None)
+            model = model_for(self.parameters.model_file, session)
+            clean = self._clean(setup)
+        except AnserError as error:
+            self._refuse('setups_refused', error)
+            return
+        self._setup_text, self._trouble = message.data, ''
+        self._window = SlidingWindow(setup, self.parameters.window_s, self.parameters.frames)
+        self._watch = Watch(model, clean)
+        self._sighting, self._known = None, {}
+        for body in setup.bodies:
+            if body not in self._pose_subscriptions:
+                self._pose_subscriptions[body] = self.create_subscription(
+                    PoseStamped, f'/optical/{topic_of(body)}/pose', self._taker(body), qos.STREAM
+                )
+
+    def _clean(self, setup: Setup) -> NDArray[np.complex128] | None:
+        if self._baseline_bag is None or not setup.reference_sensors:
+            return None
+        return baseline_flux(self._baseline_bag, sensor_table(setup.reference_sensors))
+
+    def _taker(self, body: str) -> Callable[[PoseStamped], None]:
+        def take(message: PoseStamped) -> None:
+            if self._window is not None:
+                p, q = message.pose.position, message.pose.orientation
+                stamp = message.header.stamp
+                pose = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+                self._window.take_pose(body, stamp.sec * NANO + stamp.nanosec, pose)
+
+        return take
+
+    def _on_tool(self, message: PointCloud2) -> None:
+        if self._window is not None:
+            self._take(message, self._window.take_tool)
+
+    def _on_reference(self, message: PointCloud2) -> None:
+        if self._window is not None:
+            self._take(message, self._window.take_reference)
+
+    def _take(self, message: PointCloud2, take: Callable[..., None]) -> None:
+        try:
+            take(*read_flux(message))
+        except AnserError as error:
+            self._refuse('fluxes_refused', error)
+            return
+        self._heard_s = time.monotonic()
+        self.count('frames')
+
+    def _refuse(self, counter: str, error: AnserError) -> None:
+        self._trouble = str(error)
+        self.warn(counter, str(error))
+
+    # Looking ------------------------------------------------------------------------------
+
+    def _begin_look(self) -> None:
+        """Hand the window to the thread when it is due and the thread is free."""
+        now_s, window, watch = time.monotonic(), self._window, self._watch
+        if self._busy or window is None or watch is None or now_s < self._next_s:
+            return
+        if window.span_s < FILLED * self.parameters.window_s or self._is_silent(now_s):
+            return
+        session = window.session()
+        if session is not None:
+            self._busy = True
+            self._next_s = now_s + self.parameters.period_s
+            self._tasks.put(Task(watch, session, window.first_ns))
+
+    def _work(self, take_look: Callable[[Task], None]) -> None:
+        while (task := self._tasks.get()) is not None:
+            began_s = time.thread_time()
+            take_look(task)
+            self._look_s = time.thread_time() - began_s
+            rest_s = self._look_s * (1.0 / self.parameters.cpu_share - 1.0)
+            self._next_s = max(self._next_s, time.monotonic() + rest_s)
+            self._busy = False
+
+    def _take_look(self, task: Task) -> None:
+        self.count('looks')
+        try:
+            sighting = task.watch.look(task.session, task.first_ns)
+        except AnserError as error:
+            self._refuse('looks_refused', error)
+            self._sighting = None
+            return
+        if task.watch is self._watch:
+            self._trouble = ''
+            self._sighting = sighting
+            self._known |= {title_of(record): record for record in sighting.findings}
+
+    def close(self) -> None:
+        """End the thread after the look that it is at."""
+        self._tasks.put(None)
+
+    # What is told -------------------------------------------------------------------------
+
+    def _is_silent(self, now_s: float) -> bool:
+        return now_s - self._heard_s > SILENCE_S
+
+    def status(self) -> Status:
+        """Return what is there, in one line, with its figures."""
+        window, seen = self._window, self._sighting
+        values: dict[str, object] = {'look_cpu_s': self._look_s, 'last_refusal': self._trouble}
+        if window is None or self._watch is None:
+            return Status('', Level.WARN, self._trouble or 'no setup yet', values)
+        values |= {'searches': self._watch.searches, 'restarts': window.restarts}
+        if self._is_silent(time.monotonic()):
+            return Status('', Level.WARN, 'no fluxes', values)
+        if seen is None:
+            state = self._trouble or f'gathers, {window.span_s:.0f} s so far'
+            return Status('', Level.OK, state, values)
+        values |= {
+            'compared_with': seen.truth,
+            'frames_compared': seen.frames,
+            'flux_rms_t': seen.flux_rms_t,
+            'excess': seen.excess,
+            'excess_left': seen.excess_left,
+            'findings': ', '.join(title_of(record) for record in seen.findings),
+            'depends_on': ', '.join(seen.depends_on),
+        }
+        return Status('', Level.OK if seen.is_clear else Level.WARN, words_of(seen), values)
+
+    def part_statuses(self) -> list[Status]:
+        """Return a line for everything that was found since the setup came."""
+        seen = self._sighting
+        there = {} if seen is None else {title_of(record): record for record in seen.findings}
+        statuses = []
+        for title, record in self._known.items():
+            if title in there:
+                record = there[title]
+                values = {
+                    **{key: plain_text(value) for key, value in record.parameters.items()},
+                    **{f'{k}_sigma': plain_text(value) for k, value in record.uncertainty.items()},
+                    **{key: plain_text(value) for key, value in record.evidence.items()},
+                }
+                statuses.append(Status(title, Level.WARN, figures_of(record), values))
+            else:
+                statuses.append(Status(title, Level.OK, 'gone'))
+        return statuses
+
+
+if __name__ == '__main__':
+    sys.exit(main(Watcher))

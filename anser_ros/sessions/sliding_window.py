@@ -1,0 +1,130 @@
+"""The last seconds of a running system, as the session that a recording of them would be."""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.sessions.session import NANO, Session, session_of
+from anser_ros.wire.bag import Bag, FluxStream, PoseStream
+from anser_ros.wire.points import FluxPoints
+from anser_ros.wire.setup import Setup
+
+LIVE = 'live'
+MARGIN_NS = 1_000_000_000
+RESTART_NS = 1_000_000_000
+"""Stamps that run back by more are a replay that begins again, or a clock that was set."""
+
+
+@dataclass
+class _Fluxes:
+    """Readings of one topic: stamp, fluxes (S, K) and flags (S,), all of the same channels."""
+
+    channel: NDArray[np.int64] | None = None
+    rows: deque[tuple[int, NDArray[np.complex128], NDArray[np.int64]]] = field(
+        default_factory=deque
+    )
+
+    def stream(self) -> FluxStream | None:
+        if not self.rows or self.channel is None:
+            return None
+        stamps, flux, flags = zip(*self.rows, strict=True)
+        return FluxStream(np.array(stamps), self.channel, np.array(flags), np.array(flux))
+
+
+class SlidingWindow:
+    """Keeps what came in the last seconds by the stamps, thinned to a number of frames.
+
+    Parameters
+    ----------
+    setup : Setup
+    length_s : float
+    frames : int
+        Most readings of a topic that are kept, spread evenly over the window.
+
+    Attributes
+    ----------
+    first_ns : int
+        Stamp of the first reading of all; 0 before.
+    restarts : int
+        How often time ran backwards, and all was forgotten.
+    """
+
+    def __init__(self, setup: Setup, length_s: float, frames: int) -> None:
+        self._setup = setup
+        self._length_ns = round(length_s / NANO)
+        self._step_ns = self._length_ns // frames
+        self.first_ns, self.restarts = 0, 0
+        self._tool, self._reference = _Fluxes(), _Fluxes()
+        self._poses: dict[str, deque[tuple[int, tuple[float, ...]]]] = {}
+
+    def take_tool(self, stamp_ns: int, points: FluxPoints) -> None:
+        """Add tool fluxes."""
+        self._take(self._tool, stamp_ns, points)
+
+    def take_reference(self, stamp_ns: int, points: FluxPoints) -> None:
+        """Add reference fluxes."""
+        self._take(self._reference, stamp_ns, points)
+
+    def take_pose(self, body: str, stamp_ns: int, pose: Sequence[float]) -> None:
+        """Add an optical pose: x y z in m, then a quaternion x y z w; what is none is left out."""
+        values = np.asarray(pose, dtype=np.float64)
+        if not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1.0) > 1e-3:
+            return
+        rows = self._poses.setdefault(body, deque())
+        if rows and stamp_ns <= rows[-1][0]:
+            if stamp_ns > rows[-1][0] - RESTART_NS:
+                return  # late or twice
+            rows.clear()
+        rows.append((stamp_ns, tuple(values.tolist())))
+        # The poses' clock may be ahead of the fluxes'.
+        while rows[0][0] < stamp_ns - self._length_ns - MARGIN_NS:
+            rows.popleft()
+
+    def _take(self, fluxes: _Fluxes, stamp_ns: int, points: FluxPoints) -> None:
+        channel = np.asarray(points.channel, dtype=np.int64)
+        rows = fluxes.rows
+        if rows and stamp_ns < rows[-1][0] - RESTART_NS:
+            self._forget()
+        elif rows and stamp_ns < rows[-1][0] + self._step_ns:
+            return
+        if fluxes.channel is None or not np.array_equal(channel, fluxes.channel):
+            fluxes.channel = channel
+            rows.clear()
+        self.first_ns = self.first_ns or stamp_ns
+        rows.append((stamp_ns, np.array(points.flux), np.array(points.flags, dtype=np.int64)))
+        while rows[0][0] < stamp_ns - self._length_ns:
+            rows.popleft()
+
+    def _forget(self) -> None:
+        """Begin anew: a replay has begun again, or the clock was set."""
+        self.restarts += 1
+        self.first_ns = 0
+        self._tool.rows.clear()
+        self._reference.rows.clear()
+
+    @property
+    def span_s(self) -> float:
+        """Time between the oldest and the newest reading that is kept."""
+        spans = [f.rows[-1][0] - f.rows[0][0] for f in (self._tool, self._reference) if f.rows]
+        return max(spans, default=0) * NANO
+
+    def session(self) -> Session | None:
+        """What is in the window; None while there are no fluxes.
+
+        Raises
+        ------
+        BagError
+            When the fluxes' number of emitters is not the setup's.
+        """
+        tool, reference = self._tool.stream(), self._reference.stream()
+        if tool is None and reference is None:
+            return None
+        optical = {}
+        for body, rows in self._poses.items():
+            values = np.array([pose for _, pose in rows])
+            stamps = np.array([stamp for stamp, _ in rows])
+            optical[body] = PoseStream(stamps, values[:, :3], values[:, 3:])
+        return session_of(Bag(LIVE, self._setup, '', tool, reference, optical))

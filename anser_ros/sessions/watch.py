@@ -1,0 +1,224 @@
+"""A light diagnosis of the last seconds: is there anything that the model lacks, and what is it?
+
+A look costs little while all is well, and while what was found last still explains what is seen;
+only something new starts a search.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.diagnosis.diagnose import diagnose
+from anser_ros.diagnosis.prepare import FEWEST_FRAMES, build_problem
+from anser_ros.diagnosis.problem import Problem, State, evaluate
+from anser_ros.diagnosis.search import SearchSettings
+from anser_ros.diagnosis.whitening import Spread
+from anser_ros.effects.effect import Term
+from anser_ros.fitting.measurements import Measurements
+from anser_ros.fitting.model import EffectRecord, FieldModel
+from anser_ros.sessions.diagnosis import DEFAULT_NOISE_T, corrected, drawn
+from anser_ros.sessions.session import NANO, Session, noise_of
+from anser_ros.tracking.estimate import OK, TrackerSettings
+from anser_ros.tracking.tracker import Tracker
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+OPTICAL, RIGID, REFERENCES = 'optical poses', 'rigidity of the tools', 'references alone'
+LIGHT = SearchSettings(most_effects=2, finalists=4, iterations=6)
+FREE_POSE_M, FREE_POSE_RAD = 0.02, 0.1
+"""A pose that the fluxes themselves gave may be so far off, and says nothing of its own."""
+EXCESS = 1.25
+"""Mean square of the whitened residuals from which something is there."""
+SAME = 1.3
+"""Factor within which the same residual says that nothing has changed."""
+LEAST_SPREAD_M, LEAST_TURN_RAD = 0.01, 0.1
+"""A tool that has moved and turned less shows that something is wrong, but not what."""
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What a look found.
+
+    Attributes
+    ----------
+    truth : str
+        What the fluxes were compared with.
+    frames : int
+        Tool frames that were compared.
+    findings : tuple of EffectRecord
+        What the model lacks; empty when all is well, or when no effect explains it.
+    excess : float
+        Mean square of the residuals in units of what is expected: 1 when all is well.
+    excess_left : float
+        The same with the findings in force.
+    flux_rms_t : float
+        Residual of the tools' fluxes, T a phasor component.
+    depends_on : tuple of str
+        What the unexplained part depends on.
+    remark : str
+        Why nothing is named although something is there.
+    terms : tuple of Term
+        The findings in force.
+    """
+
+    truth: str
+    frames: int = 0
+    findings: tuple[EffectRecord, ...] = ()
+    excess: float = 1.0
+    excess_left: float = 1.0
+    flux_rms_t: float = 0.0
+    depends_on: tuple[str, ...] = ()
+    remark: str = ''
+    terms: tuple[Term, ...] = ()
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether all is as the model says."""
+        return self.excess < EXCESS and not self.findings
+
+
+class Watch:
+    """Looks at one window after the other, and remembers what it found.
+
+    Parameters
+    ----------
+    model : FieldModel
+        With the effects that are corrected already.
+    clean : ndarray, shape (R, K), complex, or None
+        Distortion-free readings of the reference sensors, T; without them the references have no
+        say.
+
+    Attributes
+    ----------
+    searches : int
+        How often something new was searched for.
+    """
+
+    def __init__(self, model: FieldModel, clean: ComplexArray | None = None) -> None:
+        self._model, self._clean = model, clean
+        self._last: Sighting | None = None
+        self.searches = 0
+
+    def look(
+        self, session: Session, first_ns: int, progress: Callable[[str], None] | None = None
+    ) -> Sighting:
+        """Look at a window.
+
+        Parameters
+        ----------
+        session : Session
+            The last seconds.
+        first_ns : int
+            Stamp that the time of the model's own effects counts from.
+        progress : callable, optional
+            Told in words what goes on.
+
+        Raises
+        ------
+        DiagnosisError
+            When there are too few frames to say anything.
+        """
+        began_s = (session.start_ns - first_ns) * NANO
+        tools = [
+            _moved(corrected(_moved(tool, began_s), self._model), -began_s)
+            for tool in session.tools
+        ]
+        truth = OPTICAL
+        if sum(int(tool.has_pose.sum()) for tool in tools) < FEWEST_FRAMES:
+            truth = RIGID
+            tools = [_posed_by_itself(tool, self._model) for tool in tools]
+        problem = self._problem(session, tools, truth)
+        sighting = self._judged(problem, truth, progress)
+        self._last = sighting
+        return sighting
+
+    def _problem(self, session: Session, tools: list[Measurements], truth: str) -> Problem:
+        noise_t = noise_of(session.setup) or DEFAULT_NOISE_T
+        spread = Spread(flux_t=float(np.hypot(noise_t, self._model.flux_error_t)), noise_t=noise_t)
+        if truth == RIGID:
+            spread = replace(spread, position_m=FREE_POSE_M, rotation_rad=FREE_POSE_RAD)
+        reference = session.reference
+        if reference is not None:
+            reference = corrected(reference, self._model)
+        return build_problem(tools, reference, self._clean, self._model, drawn(session), spread)
+
+    def _judged(
+        self, problem: Problem, truth: str, progress: Callable[[str], None] | None
+    ) -> Sighting:
+        plain = evaluate(problem, ())
+        excess, frames = _excess(plain), sum(tool.time.size for tool in problem.tools)
+        seen = Sighting(truth, frames, (), excess, excess, _rms(plain))
+        if excess < EXCESS:
+            return seen
+        last = self._last
+        if last is not None and last.truth == truth and last.excess >= EXCESS:
+            left = _excess(evaluate(problem, last.terms))
+            alike = left < SAME * last.excess_left and SAME * left > last.excess_left
+            if left < EXCESS or (alike and not last.remark):
+                return replace(
+                    last, frames=frames, excess=excess, excess_left=left, flux_rms_t=_rms(plain)
+                )
+        if not _moves(problem):
+            return replace(seen, remark='the tool moves too little to tell what it is')
+        self.searches += 1
+        found = diagnose(problem, self._model, LIGHT, progress)
+        records = tuple(finding.record for finding in found.findings)
+        return replace(
+            seen,
+            findings=records,
+            excess_left=_excess(evaluate(problem, found.terms)),
+            depends_on=found.depends_on,
+            terms=found.terms,
+        )
+
+
+def _moved(measurements: Measurements, seconds: float) -> Measurements:
+    """The same on a time axis that begins so much earlier."""
+    track = measurements.track
+    if track is not None:
+        track = replace(track, time=track.time + seconds)
+    return replace(measurements, time=measurements.time + seconds, track=track)
+
+
+def _posed_by_itself(tool: Measurements, model: FieldModel) -> Measurements:
+    """A rigid tool with the poses that all its coils together give it."""
+    tracker = Tracker(model, tool.sensors, TrackerSettings(gate=np.inf, adaptive=False))
+    count = tool.time.size
+    position, rotation = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
+    has_pose = np.zeros(count, dtype=bool)
+    frames = zip(tool.time.tolist(), tool.flux, tool.flags, strict=True)
+    for row, (time, flux, flags) in enumerate(frames):
+        # Any epoch will do: the frames only have to follow one another.
+        stamp_ns = round((time + 1.0) / NANO)
+        estimates = tracker.update(stamp_ns, tool.sensors.channel, flux, flags)
+        own = next((e for e in estimates if e.name == tool.body and e.state == OK), None)
+        if own is not None and own.rotation is not None:
+            position[row], rotation[row], has_pose[row] = own.position, own.rotation, True
+    return replace(tool, position=position, rotation=rotation, has_pose=has_pose, track=None)
+
+
+def _excess(state: State) -> float:
+    """Mean square of the whitened residuals of the worst part: a tool, or the references."""
+    return max(float(np.sum(part.white**2)) / max(part.count, 1) for part in state.parts)
+
+
+def _rms(state: State) -> float:
+    """Residual of the tools, T a phasor component."""
+    tools = [part for part in state.parts if not part.view.is_reference]
+    squares = sum(float(np.sum(part.white**2)) for part in tools)
+    count = sum(part.count for part in tools)
+    return float(np.sqrt(squares / max(count, 1))) * state.problem.spread.flux_t
+
+
+def _moves(problem: Problem) -> bool:
+    """Whether a tool was at places and in orientations that tell effects apart."""
+    for tool in problem.tools:
+        spread = np.linalg.norm(np.std(tool.position, axis=0))
+        closest = float(np.linalg.norm(tool.rotation.mean(axis=0), -2))
+        turn = np.sqrt(2 * max(0.0, 1.0 - closest))
+        if spread > LEAST_SPREAD_M and turn > LEAST_TURN_RAD:
+            return True
+    return False

@@ -1,0 +1,142 @@
+"""The whole loop: an effect in raw samples, found blind, corrected live; and what it says."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+from conftest import REPO
+from rich.console import Console
+
+from anser_ros.cli.loop_result import (
+    MISSED,
+    NAMED,
+    PARTLY,
+    SAID,
+    WRONG,
+    parameter_errors,
+    table,
+    verdict,
+)
+from anser_ros.cli.main import main
+from anser_ros.effects.registry import all_effects
+from anser_ros.simulation.effect_draw import CATALOGUE, draw
+from anser_ros.wire.channel_calibration import parse_channels
+from anser_ros.wire.config_folder import read_config
+from anser_ros.wire.setup import parse_setup
+
+GAIN_SEED = 3
+
+
+@pytest.mark.timeout(180)
+def test_an_effect_is_found_and_the_next_run_is_better(domain, tmp_path, capsys):
+    """Over a pseudo-terminal, DDS, bags and model files, each node in its own process."""
+    arguments = ['--effect', 'sensor_gain', '--seed', str(GAIN_SEED), '--duration', '10']
+    baseline = REPO / 'bags' / 'factory.mcap'
+    arguments += ['--baseline', str(baseline), '--out', str(tmp_path), '--json']
+    assert main(['loop', *arguments]) == 0, capsys.readouterr().err
+    document = json.loads(capsys.readouterr().out)
+    (found,) = document['rounds']
+    if found['too_busy']:
+        pytest.skip(f'the machine is too busy for a stream in real time: {found["machine"]}')
+    assert [effect['name'] for effect in found['found']] == [found['truth']['name']]
+    assert found['verdict'] == NAMED
+    gain = found['parameters']['gain']
+    assert gain['error'] < 1e-3 < 0.1 * abs(gain['put_in'] - 1.0) + 1e-3
+    live = found['second_run_live']
+    assert live['after']['position_rmse_m'] < 0.5 * live['ungated']['position_rmse_m']
+    assert live['after']['orientation_rmse_rad'] < live['ungated']['orientation_rmse_rad']
+    assert live['after']['published_share'] > live['before']['published_share']
+    held = found['first_run_held_out']
+    assert held['flux_rms_after_t'] < 0.2 * held['flux_rms_before_t']
+
+
+def diagnosis(*effects, unexplained=0.0):
+    found = [
+        {'name': name, 'parameters': parameters, 'uncertainty': {}} for name, parameters in effects
+    ]
+    return {'effects': found, 'unexplained': {'fraction': unexplained, 'depends_on': []}}
+
+
+GAIN = {'name': 'sensor_gain', 'answers': ['sensor_gain'], 'parameters': {'channel': 3}}
+STRANGE = {'name': 'crossover', 'answers': [], 'parameters': {'channel': 3}}
+NOTHING = {'name': 'none', 'answers': [], 'parameters': {}}
+
+
+@pytest.mark.parametrize(
+    ('truth', 'found', 'said'),
+    [
+        (GAIN, diagnosis(('sensor_gain', {'channel': 3})), NAMED),
+        (GAIN, diagnosis(('sensor_gain', {'channel': 4})), WRONG),
+        (GAIN, diagnosis(('sensor_gain', {'channel': 3}), ('pickup', {})), WRONG),
+        (GAIN, diagnosis(('sensor_gain', {'channel': 4}), unexplained=0.5), WRONG),
+        (GAIN, diagnosis(unexplained=1.0), SAID),
+        (GAIN, diagnosis(), MISSED),
+        (STRANGE, diagnosis(unexplained=1.0), SAID),
+        (STRANGE, diagnosis(('sensor_gain', {'channel': 3}), unexplained=0.2), PARTLY),
+        (STRANGE, diagnosis(('sensor_gain', {'channel': 3})), WRONG),
+        (NOTHING, diagnosis(), ''),
+        (NOTHING, diagnosis(('sensor_gain', {'channel': 3})), WRONG),
+    ],
+)
+def test_a_diagnosis_is_judged_by_name_and_place(truth, found, said):
+    assert verdict(truth, found) == said
+
+
+def test_parameters_are_compared_where_both_have_them():
+    truth = {
+        'answers': ['static_metal'],
+        'parameters': {'position_m': [0.0, 0.1, -0.1], 'radius_m': 0.03, 'channel': 1},
+    }
+    effect = {
+        'name': 'static_metal',
+        'parameters': {'position_m': [0.003, 0.1, -0.104], 'channel': 1},
+        'uncertainty': {'position_m': [1e-3] * 3},
+    }
+    compared = parameter_errors(truth, {'effects': [effect, {**effect, 'name': 'pickup'}]})
+    assert set(compared) == {'position_m'}
+    assert compared['position_m']['error'] == pytest.approx(0.005)
+
+
+def test_every_answer_is_an_effect_that_can_be_found():
+    setup = parse_setup(read_config('demo_setup.yaml'))
+    channels = parse_channels(read_config('demo_channels.yaml'))
+    answers = {}
+    for name in CATALOGUE:
+        answers[name] = draw(name, setup, channels, np.random.default_rng(1)).answers
+        assert set(answers[name]) <= set(all_effects()), name
+    assert [name for name, known in answers.items() if not known] != [], 'none is a surprise'
+
+
+def test_a_busy_machine_is_told_and_no_figure_shown():
+    figures = {'position_rmse_m': 0.001234, 'orientation_rmse_rad': 0.01, 'published_share': 1.0}
+    one = {
+        'truth': GAIN, 'found': [], 'verdict': NAMED, 'too_busy': True,
+        'parameters': {'gain': {'put_in': 1.02, 'found': 1.019, 'error': 1e-3, 'sigma': 1e-4}},
+        'unexplained': {'fraction': 0.0},
+        'second_run_live': dict.fromkeys(('ungated', 'before', 'after'), figures),
+        'machine': {'first': ['anser/cu_simulator: 9 lags']},
+    }  # fmt: skip
+    for busy in (True, False):
+        console = Console(record=True, width=200, file=io.StringIO())
+        table([{**one, 'too_busy': busy}], console)
+        text = console.export_text()
+        assert ('1.234' in text) is not busy
+        assert ('machine too busy' in text) is busy
+        assert 'gain: 1.02 put in, 1.019 found' in text
+        assert 'round 1, first run: anser/cu_simulator: 9 lags' in text
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['--effect', 'gremlin'], "no effect 'gremlin'"),
+        (['--duration', '3'], 'must be 10 to 600 s'),
+        (['--seed', '0'], 'at least 1'),
+    ],
+)
+def test_wrong_arguments_are_refused_in_a_line(tmp_path, capsys, arguments, message):
+    assert main(['loop', *arguments, '--out', str(tmp_path)]) == 2
+    text = capsys.readouterr().err
+    assert message in text and text.count('\n') == 1
+    assert not any(tmp_path.iterdir())

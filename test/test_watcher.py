@@ -1,0 +1,263 @@
+"""The watch over the last seconds: what it finds, on what, and that its word goes out again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import REPO, spin_until
+
+from anser_ros.cli.main import main
+from anser_ros.errors import DiagnosisError
+from anser_ros.fitting.model import EffectRecord
+from anser_ros.sessions import watch as watching
+from anser_ros.sessions.evaluation import baseline_flux
+from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.session import load_session
+from anser_ros.sessions.sliding_window import SlidingWindow
+from anser_ros.sessions.watch import OPTICAL, RIGID, Watch
+from anser_ros.wire.bag import read_bag
+from anser_ros.wire.bag_writer import SessionWriter
+from anser_ros.wire.points import FluxPoints, encode_flux
+
+MODEL = REPO / 'config' / 'demo_model.yaml'
+MOVING, FACTORY = (REPO / 'bags' / f'{name}.mcap' for name in ('moving', 'factory'))
+CHANNEL, GAIN = 4, 0.97
+SECOND_NS = 1_000_000_000
+
+
+def points(stream, row, gain=1.0):
+    factor = np.where(stream.channel == CHANNEL, gain, 1.0)[:, None]
+    nothing = np.full((stream.channel.size, 3), np.nan)
+    return FluxPoints(
+        stream.channel, stream.flags[row], stream.flux[row] * factor, nothing, nothing
+    )
+
+
+def filled(bag, *, gain=1.0, optical=True, length_s=20.0, frames=100, shift_ns=0, window=None):
+    """A window into which a bag was played."""
+    window = window or SlidingWindow(bag.setup, length_s, frames)
+    for row, stamp in enumerate(bag.tool.stamp_ns.tolist()):
+        window.take_tool(stamp + shift_ns, points(bag.tool, row, gain))
+    for row, stamp in enumerate(bag.reference.stamp_ns.tolist()):
+        window.take_reference(stamp + shift_ns, points(bag.reference, row))
+    if optical:
+        for body, track in bag.optical.items():
+            rows = zip(track.stamp_ns.tolist(), track.position, track.quaternion, strict=True)
+            for stamp, position, quaternion in rows:
+                window.take_pose(body, stamp + shift_ns, (*position, *quaternion))
+    return window
+
+
+@pytest.fixture(scope='module')
+def moving():
+    return read_bag(MOVING)
+
+
+@pytest.fixture
+def watch(moving):
+    session = load_session(MOVING)
+    clean = baseline_flux(load_session(FACTORY), session.reference.sensors)
+    return Watch(load_model(MODEL), clean)
+
+
+class TestWindow:
+    def test_keeps_so_many_frames_of_so_many_seconds(self, moving):
+        window = filled(moving, length_s=4.0, frames=20)
+        session = window.session()
+        (tool,) = session.tools
+        assert 18 <= tool.time.size <= 21 and np.diff(tool.time).min() > 0.19
+        assert window.span_s == pytest.approx(4.0, abs=0.25)
+        assert tool.has_pose.all()
+        assert window.first_ns == moving.tool.stamp_ns[0] < session.start_ns
+        rows = np.isin(moving.tool.stamp_ns, session.start_ns + np.round(1e9 * tool.time))
+        assert np.array_equal(tool.flux, moving.tool.flux[rows])
+
+    def test_begins_anew_when_time_runs_back(self, moving):
+        window = filled(moving)
+        filled(moving, window=window, shift_ns=-30 * SECOND_NS)
+        assert window.restarts == 1
+        assert window.first_ns == moving.tool.stamp_ns[0] - 30 * SECOND_NS
+        assert window.session().tools[0].has_pose.all()
+
+    def test_what_is_late_or_no_pose_is_left_out(self, moving):
+        window = filled(moving)
+        size = window.session().tools[0].time.size
+        stamp = int(moving.tool.stamp_ns[-1])
+        window.take_tool(stamp - SECOND_NS // 2, points(moving.tool, 0))
+        window.take_pose('tool_a', stamp + SECOND_NS, (np.nan, 0, 0, 0, 0, 0, 1))
+        window.take_pose('tool_a', stamp + SECOND_NS, (0, 0, 0, 0, 0, 0, 0.5))
+        session = window.session()
+        assert session.tools[0].time.size == size
+        assert session.tools[0].track.time.size == moving.optical['tool_a'].stamp_ns.size
+
+    def test_other_channels_begin_anew(self, moving):
+        window = filled(moving, optical=False)
+        fewer = replace(
+            points(moving.tool, 0), channel=moving.tool.channel[:4],
+            flux=moving.tool.flux[0][:4], flags=moving.tool.flags[0][:4],
+        )  # fmt: skip
+        window.take_tool(int(moving.tool.stamp_ns[-1]) + SECOND_NS, fewer)
+        assert window.session().tools[0].time.size == 1
+
+    def test_nothing_yet(self, moving):
+        assert SlidingWindow(moving.setup, 5.0, 50).session() is None
+
+
+class TestWatch:
+    @pytest.mark.parametrize('truth', [OPTICAL, RIGID])
+    def test_all_is_well(self, moving, watch, truth):
+        window = filled(moving, optical=truth == OPTICAL)
+        seen = watch.look(window.session(), window.first_ns)
+        assert seen.truth == truth and seen.is_clear and seen.findings == ()
+        assert 0.7 < seen.excess < 1.2 and watch.searches == 0
+
+    @pytest.mark.parametrize('truth', [OPTICAL, RIGID])
+    def test_a_gain_is_named_once_and_cleared(self, moving, watch, truth):
+        optical = truth == OPTICAL
+        window = filled(moving, gain=GAIN, optical=optical)
+        for _ in range(2):
+            seen = watch.look(window.session(), window.first_ns)
+            (found,) = seen.findings
+            assert seen.truth == truth and not seen.is_clear
+            assert found.name == 'sensor_gain' and found.parameters['channel'] == CHANNEL
+            assert found.parameters['gain'] == pytest.approx(GAIN, abs=1e-3)
+            assert seen.excess > 100 and seen.excess_left < 1.25
+        assert watch.searches == 1, 'what explains the residual still is not searched for again'
+        window = filled(moving, optical=optical, window=window, shift_ns=30 * SECOND_NS)
+        assert watch.look(window.session(), window.first_ns).is_clear
+
+    def test_a_tool_at_rest_shows_that_but_not_what(self, moving, watch):
+        tool = moving.tool
+        still = replace(tool, flux=np.broadcast_to(tool.flux[:1], tool.flux.shape))
+        at_rest = replace(moving, optical={}, tool=still)
+        window = filled(at_rest, gain=0.9, optical=False)
+        seen = watch.look(window.session(), window.first_ns)
+        assert seen.excess > 10 and seen.findings == () and not seen.is_clear
+        assert 'moves too little' in seen.remark and watch.searches == 0
+
+    def test_too_few_frames_are_refused(self, moving, watch):
+        window = filled(moving, length_s=1.0, frames=20)
+        with pytest.raises(DiagnosisError, match='at least 30 frames'):
+            watch.look(window.session(), window.first_ns)
+
+    def test_an_effect_that_the_model_corrects_is_none(self, moving):
+        window = filled(moving, gain=GAIN)
+        parameters = {'channel': CHANNEL, 'gain': GAIN, 'phase_deg': 0.0}
+        known = EffectRecord('sensor_gain', parameters)
+        model = replace(load_model(MODEL), effects=(known,))
+        assert Watch(model).look(window.session(), window.first_ns).is_clear
+
+    def test_what_nothing_explains_is_not_given_a_name(self, moving, watch, monkeypatch):
+        monkeypatch.setattr(
+            watching, 'LIGHT', replace(watching.LIGHT, most_effects=0)
+        )  # a catalogue that knows nothing
+        window = filled(moving, gain=GAIN)
+        seen = watch.look(window.session(), window.first_ns)
+        assert seen.findings == () and not seen.is_clear and seen.excess_left > 100
+        assert seen.depends_on
+
+
+def write_changing(path, bag, rounds):
+    """A bag of several rounds of a session, the first with a wrong gain."""
+    length = int(bag.tool.stamp_ns[-1] - bag.tool.stamp_ns[0]) + SECOND_NS // 25
+    with SessionWriter(path) as writer:
+        writer.write_setup(bag.setup_text, int(bag.tool.stamp_ns[0]))
+        for number in range(rounds):
+            for row, stamp in enumerate(bag.tool.stamp_ns.tolist()):
+                cloud = points(bag.tool, row, GAIN if number == 0 else 1.0)
+                fields, step, data = encode_flux(cloud)
+                count = cloud.channel.size
+                shifted = stamp + number * length
+                writer.write_flux('/anser/tool/flux', shifted, fields, step, count, data)
+            for body, track in bag.optical.items():
+                rows = zip(track.stamp_ns.tolist(), track.position, track.quaternion, strict=True)
+                for stamp, position, quaternion in rows:
+                    writer.write_pose(
+                        f'/optical/{body}/pose', stamp + number * length, position, quaternion
+                    )
+    return path
+
+
+class Heard:
+    """What the watcher says in /diagnostics: level, message and values of each of its lines."""
+
+    def __init__(self, ros):
+        from diagnostic_msgs.msg import DiagnosticArray
+
+        from anser_ros.nodes import qos
+
+        self.node = ros.create_node('listener')
+        self.lines = {}
+        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._take, qos.EVENTS)
+
+    def _take(self, message):
+        for status in message.status:
+            if status.name.startswith('anser/watcher'):
+                values = {item.key: item.value for item in status.values}
+                self.lines[status.name] = (status.level[0], status.message, values)
+
+    def until(self, condition, timeout_s=100.0):
+        return spin_until(self.node, lambda: condition(self.lines), timeout_s)
+
+
+@pytest.mark.timeout(240)
+def test_over_dds_a_finding_is_raised_and_cleared(ros, start, moving, tmp_path):
+    bag = write_changing(tmp_path / 'changing.mcap', moving, rounds=4)
+    heard = Heard(ros)
+    watcher = start(
+        'watcher', '--ros-args', '-p', f'model_file:={MODEL}', '-p', 'window_s:=5.0',
+        '-p', 'period_s:=0.5', '-p', 'cpu_share:=1.0',
+    )  # fmt: skip
+    start('replay', bag, '--rate', '2', '--loop', '--wait', '30')
+    title = f'anser/watcher: sensor_gain (channel {CHANNEL})'
+
+    def is_raised(lines):
+        return lines.get(title, (0,))[0] == 1
+
+    assert heard.until(is_raised), f'{heard.lines}\n{watcher.output}'
+    _, message, values = heard.lines[title]
+    assert abs(float(values['gain']) - GAIN) < 2e-3 and 'gain' in message
+    assert float(values['gain_sigma']) < 1e-3 and 'summary' in values
+    own = heard.lines['anser/watcher']
+    assert own[0] == 1 and own[1].startswith('sensor_gain (channel 4)')
+    assert own[2]['compared_with'] == OPTICAL
+
+    def is_cleared(lines):
+        return lines[title][:2] == (0, 'gone') and lines['anser/watcher'][0] == 0
+
+    assert heard.until(is_cleared), f'{heard.lines}\n{watcher.output}'
+    assert 'all as the model says' in heard.lines['anser/watcher'][1]
+    published = {
+        name for name, _ in heard.node.get_publisher_names_and_types_by_node('watcher', '/anser')
+    }
+    assert published <= {'/diagnostics', '/rosout', '/parameter_events'}, 'it only speaks there'
+    assert watcher.interrupt() == 0
+
+
+@pytest.mark.timeout(300)
+def test_over_dds_on_a_session_that_this_package_did_not_make(ros, start, shared, effects_model):
+    folder = shared / 'sessions' / 'effects'
+    heard = Heard(ros)
+    watcher = start(
+        'watcher', '--ros-args', '-p', f'model_file:={effects_model}',
+        '-p', f'baseline_file:={folder / "factory.mcap"}', '-p', 'cpu_share:=1.0',
+    )  # fmt: skip
+    start('replay', folder / 's04.mcap', '--rate', '4', '--loop', '--wait', '30')
+    title = 'anser/watcher: static_metal'
+    assert heard.until(lambda lines: lines.get(title, (0,))[0] == 1), (
+        f'{heard.lines}\n{watcher.output}'
+    )
+    place = [float(v) for v in heard.lines[title][2]['position_m'].strip('[]').split()]
+    assert np.linalg.norm(np.subtract(place, (0.0986, 0.0193, -0.0835))) < 0.015
+
+
+def test_a_baseline_that_is_none_is_refused(start):
+    """Said in one line, before anything runs."""
+    watcher = start('watcher', '--ros-args', '-p', 'baseline_file:=nowhere.mcap')
+    assert watcher.popen.wait(60) == 2
+    assert 'no such bag' in watcher.output
+
+
+def test_the_verb_is_listed(capsys):
+    assert main(['--help']) == 0
+    assert 'watcher' in capsys.readouterr().out
