@@ -253,13 +253,14 @@ def test_coils_on_a_patch_take_part_where_the_pose_says(make):
 
 
 def test_what_is_no_patch_is_refused(make):
-    from anser_ros.nodes.patches import Patches, parse_patches
+    from anser_ros.nodes.patches import Patches
+    from anser_ros.sessions.patches import parse_patches
 
     assert parse_patches(['a=/x', 'b=/y']) == {'a': '/x', 'b': '/y'}
     for wrong in (['a'], ['=x'], ['a='], ['a=x', 'a=y']):
         with pytest.raises(ParameterError, match='no new body=topic'):
             parse_patches(wrong)
-    patches = Patches(anser_world().references.select([0]), 8, 'fg')
+    patches = Patches(anser_world().references.select([0]), np.empty((0, 8), complex), 'fg')
     with pytest.raises(FrameError, match="in 'camera', not 'fg'"):
         patches.take_pose('fg', pose_message(1, [0, 0, 0], 'camera'))
     with pytest.raises(FrameError, match='is no pose'):

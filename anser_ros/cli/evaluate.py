@@ -13,6 +13,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from anser_ros.sessions.evaluation import Evaluation, PoseSeries, metrics, track_session
+from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.tracking.estimate import TrackerSettings
@@ -38,6 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--baseline', help='distortion-free recording of the same board')
     parser.add_argument(
         '--refit', action='store_true', help='let the model follow the reference sensors'
+    )
+    parser.add_argument(
+        '--patch',
+        action='append',
+        default=[],
+        metavar='BODY=TOPIC',
+        help='body that carries reference coils too, and the topic of its poses in the bag',
     )
     parser.add_argument(
         '--in-phase', action='store_true', help="use in-phase fluxes only, the article's way"
@@ -68,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
             baseline=baseline,
             refit=args.refit,
             in_phase=args.in_phase,
+            patches=parse_patches(args.patch),
             progress=lambda share: bar.update(task, completed=share),
         )
     document = to_document(evaluation)

@@ -24,17 +24,17 @@ from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.nominal import nominal_model
 from anser_ros.fitting.refit import LiveRefit, RefitResult
 from anser_ros.fitting.refit_change import MOST_RATE_HZ, Pace
-from anser_ros.fitting.refit_patches import PoseError, clean_reading
 from anser_ros.nodes import qos
 from anser_ros.nodes.flux_reader import read_flux
 from anser_ros.nodes.metal_view import centroid_message, metal_markers
 from anser_ros.nodes.model_clouds import ModelWriter
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
-from anser_ros.nodes.patches import Patches, joined, parse_patches
+from anser_ros.nodes.patches import Patches
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.sessions.evaluation import baseline_flux
 from anser_ros.sessions.model_file import load_model, save_model
+from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session, sensor_table
 from anser_ros.sessions.starting_model import NOMINAL, board_of
 from anser_ros.wire.setup import Setup, parse_setup
@@ -109,7 +109,6 @@ class FieldModelNode(AnserNode):
         self.create_subscription(PointCloud2, 'reference/flux', self._on_flux, qos.STREAM)
         self._patch_topics = parse_patches(table.patches)
         self._patches: Patches | None = None
-        self._fixed = np.empty((0, 0), dtype=np.complex128)
         for body, topic in self._patch_topics.items():
             self.create_subscription(PoseStamped, topic, self._pose_taker(body), qos.STREAM)
         if self._patch_topics:
@@ -165,7 +164,8 @@ class FieldModelNode(AnserNode):
         if self._patches is None:
             return
         try:
-            self._patches.take_flux(*read_flux(message))
+            stamp_ns, points = read_flux(message)
+            self._patches.take_flux(stamp_ns, points.channel, points.flux, points.flags)
         except AnserError as error:
             self._trouble = str(error)
             self.warn('patch_fluxes_refused', str(error))
@@ -215,16 +215,12 @@ class FieldModelNode(AnserNode):
             if self._model is not None:
                 self._serve(self._model, stamp_ns)
             return
-        begin_s, baseline = time.monotonic(), None
-        if self._patches is not None:
+        begin_s = time.monotonic()
+        if self._patches is None:
+            self._result = refit.update(stamp_ns, channels, flux, flags)
+        else:
             refit = self._with_patches(self._patches, refit, stamp_ns)
-            placed = self._patches.frame(stamp_ns, refit.model)
-            fixed = np.isin(channels, self._patches.coils.channel, invert=True)
-            channels = np.concatenate([channels[fixed], self._patches.coils.channel])
-            flux = np.concatenate([flux[fixed], placed.flux])
-            flags = np.concatenate([flags[fixed], np.zeros(len(placed.flux), dtype=np.int64)])
-            baseline = np.concatenate([self._fixed, placed.baseline])
-        self._result = refit.update(stamp_ns, channels, flux, flags, baseline)
+            self._result = self._patches.update(refit, stamp_ns, channels, flux, flags)
         self.count('refits')
         self._serve(self._result.model, stamp_ns)
         self._refit_s = time.monotonic() - begin_s
@@ -232,7 +228,7 @@ class FieldModelNode(AnserNode):
 
     def _with_patches(self, patches: Patches, refit: LiveRefit, stamp_ns: int) -> LiveRefit:
         """Take over the refit for the patches' new places once it has been worked out."""
-        moved = patches.moved_refit(refit, stamp_ns, self._fixed)
+        moved = patches.moved_refit(refit, stamp_ns)
         if moved is None:
             return refit
         self._refit = moved
@@ -296,16 +292,15 @@ class FieldModelNode(AnserNode):
             drawing = board_of(self._setup).field
         except SetupError:  # an emitter that can't be drawn: its own dipoles have to do
             drawing = None
-        table, clean, self._patches = self._references, baseline, None
         bodies = tuple(self._patch_topics)
-        moving = [s for s in self._setup.tool_sensors if s.body in bodies]
+        moving = tuple(s for s in self._setup.tool_sensors if s.body in bodies)
+        self._patches = None
         if moving:
-            patches = Patches(sensor_table(tuple(moving)), baseline.shape[1], self._frame_id)
-            start = patches.start_table()
-            table = joined(table, start)
-            clean = np.concatenate([baseline, clean_reading(self._base, start, PoseError())[0]])
-            self._patches, self._fixed = patches, baseline
-        self._refit = LiveRefit(self._base, table, clean, drawing=drawing)
+            patches = Patches(sensor_table(moving), baseline, self._frame_id)
+            self._refit = patches.started(self._base, self._references, drawing=drawing)
+            self._patches = patches
+        else:
+            self._refit = LiveRefit(self._base, self._references, baseline, drawing=drawing)
         self._result = None
         self._tell_following()
         self.count('baselines')

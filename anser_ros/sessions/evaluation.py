@@ -19,6 +19,7 @@ from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.refit import LiveRefit
 from anser_ros.fitting.refit_change import Pace
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.sessions.patches import PatchFollower
 from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, NANO, Session, noise_of
 from anser_ros.sessions.starting_model import check_fits, drawing_of
 from anser_ros.tracking.tracker import PoseEstimate, Tracker, TrackerSettings
@@ -108,6 +109,7 @@ def track_session(
     refit: bool = False,
     in_phase: bool = False,
     progress: Progress | None = None,
+    patches: dict[str, str] | None = None,
 ) -> Evaluation:
     """Track every tool sensor and body of a session at every frame.
 
@@ -124,6 +126,8 @@ def track_session(
         Whether only in-phase fluxes and moments are used (the article's way).
     progress : callable, optional
         Called with the finished share, 0 to 1.
+    patches : dict of str to str, optional
+        Bodies that carry further reference coils, each with the topic of its poses in the bag.
 
     Raises
     ------
@@ -142,7 +146,7 @@ def track_session(
     wanted = settings or TrackerSettings()
     noise_t = max(wanted.flux_noise_t, noise_of(session.setup))
     tracker = Tracker(model, sensors, replace(wanted, flux_noise_t=noise_t))
-    follower = _follower(session, model, baseline) if refit else None
+    follower = _follower(session, model, baseline, patches or {}) if refit else None
     pace = Pace()
     estimates: dict[str, list[PoseEstimate]] = {}
     frames = list(_frames(session))
@@ -150,6 +154,9 @@ def track_session(
     for count, (stamp, tools, reference_frame) in enumerate(frames):
         stamp_ns = session.start_ns + round(stamp / NANO)
         reference = session.reference
+        channels, flux, flags = _tool_frame(tools)
+        if isinstance(follower, PatchFollower) and tools:
+            follower.take_flux(stamp_ns, channels, flux, flags)
         due = follower is not None and reference_frame is not None and pace.is_due(stamp_ns)
         if due and follower is not None and reference is not None:
             result = follower.update(
@@ -160,9 +167,6 @@ def track_session(
             )
             tracker = tracker.with_model(result.model)
         if tools:
-            channels = np.concatenate([tool.sensors.channel for tool, _ in tools])
-            flux = np.concatenate([tool.flux[frame] for tool, frame in tools])
-            flags = np.concatenate([tool.flags[frame] for tool, frame in tools])
             if in_phase:
                 flux = flux.real.astype(complex)
             for estimate in tracker.update(stamp_ns, channels, flux, flags):
@@ -185,7 +189,22 @@ def _all_sensors(session: Session) -> SensorTable:
     )
 
 
-def _follower(session: Session, model: FieldModel, baseline: Session | None) -> LiveRefit:
+def _tool_frame(
+    tools: list[tuple[Measurements, int]],
+) -> tuple[NDArray[np.int64], NDArray[np.complex128], NDArray[np.int64]]:
+    """Channels, fluxes and flags of all bodies in one frame; nothing where there are none."""
+    if not tools:
+        return np.empty(0, np.int64), np.empty((0, 0), np.complex128), np.empty(0, np.int64)
+    return (
+        np.concatenate([tool.sensors.channel for tool, _ in tools]),
+        np.concatenate([tool.flux[frame] for tool, frame in tools]),
+        np.concatenate([tool.flags[frame] for tool, frame in tools]),
+    )
+
+
+def _follower(
+    session: Session, model: FieldModel, baseline: Session | None, patches: dict[str, str]
+) -> LiveRefit | PatchFollower:
     if session.reference is None:
         raise BagError(f'{session.path}: a refit needs reference fluxes, the session has none')
     if baseline is None:
@@ -193,6 +212,8 @@ def _follower(session: Session, model: FieldModel, baseline: Session | None) -> 
     check_fits(model, baseline)
     sensors = session.reference.sensors
     clean = baseline_flux(baseline, sensors)
+    if patches:
+        return PatchFollower(session, model, clean, patches)
     return LiveRefit(model, sensors, clean, drawing=drawing_of(session.setup))
 
 

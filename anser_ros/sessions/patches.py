@@ -1,0 +1,102 @@
+"""Patches of a recorded session: reference coils that move, followed as the live node does."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import BagError, ParameterError
+from anser_ros.fitting.model import FieldModel
+from anser_ros.fitting.refit_patches import PatchCoils
+from anser_ros.fitting.refit_result import RefitResult
+from anser_ros.sessions.recorded_poses import PublishedPoses, published_poses
+from anser_ros.sessions.session import Session, sensor_table
+from anser_ros.sessions.starting_model import drawing_of
+from anser_ros.tracking.rotations import rotation_of_quaternion
+
+ComplexArray = NDArray[np.complex128]
+
+
+def parse_patches(entries: Sequence[str]) -> dict[str, str]:
+    """Topic of every patch's body from entries ``body=topic``.
+
+    Raises
+    ------
+    ParameterError
+        When an entry is not of that form or a body appears twice.
+    """
+    topics: dict[str, str] = {}
+    for entry in entries:
+        body, _, topic = entry.partition('=')
+        if not body or not topic or body in topics:
+            raise ParameterError(f'patches: {entry!r} is no new body=topic')
+        topics[body] = topic
+    return topics
+
+
+class PatchFollower:
+    """A refit with the coils of patches, whose poses lie in the session's own bag.
+
+    The live node works a refit for new places out beside its callbacks and goes on without the
+    patches meanwhile; here that takes no time.
+
+    Parameters
+    ----------
+    session : Session
+    model : FieldModel
+    fixed : ndarray, shape (R, K), complex
+        Baseline of the fixed references, T.
+    topics : dict of str to str
+        From `parse_patches`.
+
+    Raises
+    ------
+    BagError
+        When the setup has no coils on such a body, or the bag no poses on such a topic.
+    """
+
+    def __init__(
+        self, session: Session, model: FieldModel, fixed: ComplexArray, topics: dict[str, str]
+    ) -> None:
+        assert session.reference is not None
+        moving = tuple(s for s in session.setup.tool_sensors if s.body in topics)
+        for body in topics:
+            if body not in {s.body for s in moving}:
+                raise BagError(f'{session.path}: the setup has no coils on the body {body}')
+        found = published_poses(session.path, list(topics.values()))
+        for topic, poses in found.items():
+            if poses.stamp_ns.size == 0:
+                raise BagError(f'{session.path}: no pose on the topic {topic}')
+        self._poses: dict[str, PublishedPoses] = {b: found[t] for b, t in topics.items()}
+        self._patches = PatchCoils(sensor_table(moving), fixed)
+        drawing = drawing_of(session.setup)
+        self._refit = self._patches.started(model, session.reference.sensors, drawing=drawing)
+
+    def take_flux(
+        self,
+        stamp_ns: int,
+        channels: NDArray[np.int64],
+        flux: ComplexArray,
+        flags: NDArray[np.int64],
+    ) -> None:
+        """Keep the fluxes of the patches' coils among the tools'."""
+        self._patches.take_flux(stamp_ns, channels, flux, flags)
+
+    def update(
+        self,
+        stamp_ns: int,
+        channels: NDArray[np.int64],
+        flux: ComplexArray,
+        flags: NDArray[np.int64],
+    ) -> RefitResult:
+        """Refit to a frame of the references, with the newest pose of every patch."""
+        for body, poses in self._poses.items():
+            last = int(np.searchsorted(poses.stamp_ns, stamp_ns, side='right')) - 1
+            if last >= 0:
+                rotation = rotation_of_quaternion(poses.quaternion[last])
+                self._patches.put(body, int(poses.stamp_ns[last]), poses.position[last], rotation)
+        now, known = self._patches.where(stamp_ns)
+        if known.any() and self._patches.must_rebuild(now):
+            self._refit = self._patches.rebuilt(self._refit, now)
+            self._patches.settle(now)
+        return self._patches.update(self._refit, stamp_ns, channels, flux, flags)
