@@ -1,13 +1,17 @@
 """The replay as a process: what arrives, in what order and when, and what of a bad bag is left."""
 
 import signal
+import sys
 import time
+from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import spin_until
+from conftest import Process, spin_until
 
 from anser_ros.wire import cdr
+from anser_ros.wire.bag import Salvage, iter_messages
 from anser_ros.wire.bag_writer import BagWriter, SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
 
@@ -175,3 +179,58 @@ def test_nobody_listens(ros, tmp_path):
     assert node.exit_code == 0 and node.counters['no_listeners'] == 1
     node.close()
     node.destroy_node()
+
+
+BAGS = Path(__file__).resolve().parents[1] / 'bags'
+# Somebody else's node: it knows nothing of this package, and has a queue as most have.
+OUTSIDER = """
+import signal, sys
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+
+rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+ending, stamps = [], {topic: set() for topic in sys.argv[1:]}
+signal.signal(signal.SIGINT, lambda *_: ending.append(1))
+node = rclpy.create_node('outsider')
+for topic, got in stamps.items():
+    take = lambda m, got=got: got.add((m.header.stamp.sec, m.header.stamp.nanosec))
+    node.create_subscription(PoseStamped, f'/anser/{topic}/pose', take, 10)
+executor = SingleThreadedExecutor()
+executor.add_node(node)
+while not ending:
+    executor.spin_once(timeout_sec=0.05)
+print(*map(len, stamps.values()))
+"""
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize('first', ['replay', 'nodes'])
+def test_all_started_in_the_same_moment_lose_no_frame(start, domain, tmp_path, first):
+    """Nodes, replay and somebody who counts the poses of some sensors, with no wait in between.
+
+    The board of the bag is not the drawn one, so the gate stands open: poses are only counted.
+    """
+    topics = ('tool_a_0/x', 'tool_a_2/z', 'tool_a')
+
+    def nodes():
+        start('field_model')
+        start('tracker', '--ros-args', '-p', 'gate:=1e5', '-p', 'max_sigma_m:=1.0')
+        return start('recorder', '--ros-args', '-p', f'directory:={tmp_path}', '-p', 'name:=bag')
+
+    recorder = nodes() if first == 'nodes' else None
+    play = start('replay', BAGS / 'moving.mcap', '--rate', '0')
+    outsider = Process([sys.executable, '-c', OUTSIDER, *topics], tmp_path / 'outsider.log')
+    try:
+        recorder = recorder or nodes()
+        assert play.popen.wait(90) == 0, play.output
+        time.sleep(0.5)  # the last poses are on their way
+        assert outsider.interrupt() == 0
+        assert outsider.output.split() == ['200'] * 3, play.output
+    finally:
+        outsider.kill_group()
+    assert recorder.interrupt() == 0
+    counts = Counter(m.topic for m in iter_messages(str(tmp_path / 'bag'), Salvage()))
+    for topic in ('tool/flux', 'reference/flux', 'tool_a/pose', 'tool_a_1/y/pose'):
+        assert counts[f'/anser/{topic}'] == 200, topic

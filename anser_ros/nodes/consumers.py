@@ -21,7 +21,7 @@ REFRESH_EVERY = 50
 
 
 class Consumers:
-    """The nodes that subscribe to a topic.
+    """The nodes that subscribe to topics.
 
     Parameters
     ----------
@@ -32,23 +32,29 @@ class Consumers:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._clients: dict[str, Any] = {}
-        self._listeners: dict[str, set[str]] = {}
+        self._listeners: dict[tuple[str, ...], set[str]] = {}
         self._silent: set[str] = set()
         self._calls = 0
         self._given_up = threading.Event()
 
-    def wait(self, topic: str) -> None:
-        """Wait until all listeners of a topic have handled what was published."""
+    def wait(self, *topics: str, attempts: int = ATTEMPTS) -> None:
+        """Wait until all listeners of the topics have handled what was published.
+
+        Parameters
+        ----------
+        topics : fully qualified names
+        attempts : how often one who is silent is asked, before the next is gone on without it
+        """
         if self._calls % REFRESH_EVERY == 0:
             self._listeners.clear()
         self._calls += 1
-        if topic not in self._listeners:
-            self._listeners[topic] = self._find(topic)
-        waiting = {name: self._ask(name) for name in self._listeners[topic]}
+        if topics not in self._listeners:
+            self._listeners[topics] = set().union(*map(self._find, topics))
+        waiting = {name: self._ask(name) for name in self._listeners[topics]}
         for name, answered in waiting.items():
-            if not self._answers(name, answered):
+            if not self._answers(name, answered, attempts):
                 self._silent.add(name)
-                self._listeners[topic].discard(name)
+                self._listeners[topics].discard(name)
 
     def give_up(self) -> None:
         """End every wait."""
@@ -77,9 +83,9 @@ class Consumers:
         future.add_done_callback(lambda _future: answered.set())
         return answered
 
-    def _answers(self, name: str, answered: threading.Event) -> bool:
+    def _answers(self, name: str, answered: threading.Event, attempts: int) -> bool:
         """Wait for a listener's answer; it is asked again, for an answer can miss a new client."""
-        for _ in range(ATTEMPTS):
+        for _ in range(attempts):
             end_s = time.monotonic() + REPLY_TIMEOUT_S
             while time.monotonic() < end_s:
                 if answered.wait(POLL_S):

@@ -52,6 +52,12 @@ class PoseTopic:
         self.states: Counter[str] = Counter()
         self.tally = Tally()
 
+    @property
+    def listeners(self) -> int:
+        """How many subscriptions get what is published now."""
+        both = self._pose, self._uncertain
+        return sum(publisher.get_subscription_count() for publisher in both)
+
     def is_matched(self, node: Any) -> bool:
         """Whether everybody who subscribes to the topics would get what is published now."""
         return all(

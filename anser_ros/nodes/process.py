@@ -18,12 +18,16 @@ from rclpy.utilities import remove_ros_args
 
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.nodes import parameter_files, parameters
+from anser_ros.wire.config_folder import config_path
 
 if TYPE_CHECKING:
     from anser_ros.nodes.node import AnserNode
 
 # How long a signal may go unnoticed by an idle node.
 SPIN_SLICE_S = 0.1
+# Where Fast DDS looks for profiles; the user's own ones hold.
+PROFILE_VARIABLES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
+PROFILES = 'fastdds.xml'
 ENDING = (signal.SIGINT, signal.SIGTERM)
 # How long a busy one may take to notice it.
 NOTICE_S = 1.5
@@ -41,6 +45,7 @@ def main(node_class: 'type[AnserNode]', argv: Sequence[str] | None = None) -> in
     try:
         own = _parse(node_class, _without_ros(arguments))
         signals = _Signals()
+        _announce_often()
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         return _run(node_class, own, arguments, signals)
     except AnserError as error:
@@ -53,6 +58,12 @@ def main(node_class: 'type[AnserNode]', argv: Sequence[str] | None = None) -> in
         return 1
     finally:
         rclpy.try_shutdown()
+
+
+def _announce_often() -> None:
+    """Let the middleware announce nodes more often, so that they find each other at once."""
+    if not any(os.environ.get(variable) for variable in PROFILE_VARIABLES):
+        os.environ[PROFILE_VARIABLES[0]] = str(config_path(PROFILES))
 
 
 def _without_ros(arguments: Sequence[str]) -> list[str]:

@@ -2,8 +2,9 @@
 
 The graph shows who subscribes to the fluxes and to the poses that the setup promises, and which of
 the nodes that work on fluxes are running. ``/diagnostics`` tells whether the tracker has the
-setup, its model, and everybody connected who wants its poses (``ready_for``), and that its model
-is the one that ``field_model`` serves.
+setup, its model, and everybody connected who wants its poses (``ready_for``), how many those are
+(``pose_listeners``: it may not know yet whom the replay knows), and that its model is the one that
+``field_model`` serves. Who begins to listen later than that can't be waited for.
 """
 
 import hashlib
@@ -12,17 +13,21 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.node import Node
 
 from anser_ros.errors import SetupError
 from anser_ros.nodes import qos
+from anser_ros.nodes.node import AnserNode
 from anser_ros.wire.setup import parse_setup, topic_of
 
 TRACKER, FIELD_MODEL = 'tracker', 'field_model'
 # They take what there is, and nobody waits for them alone.
 PASSIVE = ('recorder', 'openigtlink', 'monitor')
-SETTLE_S = 0.7
-"""The graph must not have changed for so long; a recorder looks for new topics more often."""
+LOOK_S = 3.3
+"""Least time to look for others: nodes that are not ours announce themselves a few times at their
+start and then every three seconds, and who joins in between does not know them before."""
+SETTLE_S = 1.0
+"""The graph must not have changed for so long: ours announce themselves twice as often, and a
+recorder looks for new topics more often still."""
 PATIENCE_S = 8.0
 """The same while somebody is missed who may still be starting."""
 
@@ -45,14 +50,14 @@ class Readiness:
 
     Parameters
     ----------
-    node : Node
+    node : AnserNode
     fluxes : list of Publisher
         What is going to be published.
     setup_text : str
         The setup that has been published; empty where there is none.
     """
 
-    def __init__(self, node: Node, fluxes: list[Any], setup_text: str) -> None:
+    def __init__(self, node: AnserNode, fluxes: list[Any], setup_text: str) -> None:
         self._node, self._fluxes = node, fluxes
         self._namespace = node.get_namespace()
         self._digest = digest_of(setup_text)
@@ -60,7 +65,11 @@ class Readiness:
         try:
             setup = parse_setup(setup_text)
             names = [sensor.name for sensor in setup.tool_sensors]
-            self._poses = [f'{topic_of(name)}/pose' for name in (*names, *setup.bodies)]
+            self._poses = [
+                f'{topic_of(name)}/{kind}'
+                for name in (*names, *setup.bodies)
+                for kind in ('pose', 'pose_with_covariance')
+            ]
         except SetupError:
             pass  # who listens may make more of it
         self._told: dict[str, _Told] = {}
@@ -82,17 +91,20 @@ class Readiness:
         wanted = [self._node.count_subscribers(topic) for topic in self._poses]
         given = [self._node.count_publishers(topic) for topic in self._poses]
         working = self._working_nodes()
-        seen = (listeners, matched, wanted, given, working)
+        reached = self._pose_listeners()
+        seen = (listeners, matched, wanted, given, working, reached)
         if seen != self._seen:
             self._seen, self._since_s = seen, now_s
         quiet_s = now_s - self._since_s
         if not any(matched):
             return 'nobody listens to the fluxes'
         unready = [name for name in working if not self._is_ready(name, listeners)]
+        if TRACKER in (name.rsplit('/', 1)[1] for name in working) and reached < sum(wanted):
+            unready.append('somebody who listens to poses')
         if unready:
             return f'{", ".join(unready)} not ready'
-        if quiet_s < SETTLE_S:
-            return 'others are joining'
+        if quiet_s < SETTLE_S or now_s - self._node.started_s < LOOK_S:
+            return 'others may be joining'
         if quiet_s < PATIENCE_S:
             return self._missed(listeners, matched, wanted, given)
         return ''
@@ -132,6 +144,11 @@ class Readiness:
             )
         )
 
+    def _pose_listeners(self) -> int:
+        """How many subscriptions the tracker reaches; it may not know all who are known here."""
+        told = self._told.get(f'{self._namespace}/{TRACKER}'.strip('/'))
+        return 0 if told is None else int(told.values.get('pose_listeners') or 0)
+
     def _is_ready(self, name: str, listeners: dict[str, tuple[str, ...]]) -> bool:
         told = self._told.get(name.strip('/'))
         # It must have looked at the graph as it is now.
@@ -145,6 +162,11 @@ class Readiness:
         server = self._told.get(name.strip('/').removesuffix(TRACKER) + FIELD_MODEL)
         served = '' if server is None else server.values.get('stamp_ns', '')
         return not served or told.values.get('model_stamp_ns') == served
+
+    @property
+    def poses(self) -> list[str]:
+        """Topics of the poses that are made of the fluxes."""
+        return [self._node.resolve_topic_name(topic) for topic in self._poses]
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         now_s = time.monotonic()

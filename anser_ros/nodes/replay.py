@@ -34,6 +34,9 @@ POLL_S = 0.05
 TELL_AFTER_S = 3.0
 CLOCK_PERIOD_NS = 10_000_000
 LAST_ACK_S = 5.0
+# Who only listens to poses has a queue for some, and is waited for every so many frames.
+ASK_EVERY = 4
+ATTEMPTS_OF_LISTENERS = 2
 
 
 class Replay(AnserNode):
@@ -73,8 +76,11 @@ class Replay(AnserNode):
             '--all', dest='all_topics', action='store_true', help='poses and diagnostics as well'
         )
         parser.add_argument(
-            '--wait', type=float, default=WAIT_S, help='longest wait for listeners, s'
-        )
+            '--wait', type=float, default=WAIT_S,
+            help='longest wait for listeners, s (%(default)g): it begins when all nodes that take '
+            'the fluxes are ready, and all who listen to them or to poses are connected, not '
+            'before it has looked around for 3 s; who starts to listen later misses what is out',
+        )  # fmt: skip
 
     def __init__(
         self,
@@ -99,6 +105,8 @@ class Replay(AnserNode):
         self._lost = ''
         self._done = 0
         self._rounds = 0
+        self._poses: list[str] = []
+        self._frames = 0
         self._ending = threading.Event()
         self._scan()
         self._ticks = self.create_publisher(Clock, '/clock', qos.STREAM)
@@ -170,6 +178,7 @@ class Replay(AnserNode):
         setup = self._publish_latched()
         fluxes = [o for t, o in self._outlets.items() if t.endswith(FLUX_ENDINGS)]
         readiness = Readiness(self, fluxes or list(self._outlets.values()), setup)
+        self._poses = readiness.poses
         began_s, told = time.monotonic(), ''
         while not self._ending.wait(POLL_S):
             waited_s, missing = time.monotonic() - began_s, readiness.missing()
@@ -221,7 +230,14 @@ class Replay(AnserNode):
             self._outlets[message.topic].publish(message.data)
             self._done += 1
             if self._rate == 0.0 and message.topic.endswith(FLUX_ENDINGS):
-                self._consumers.wait(self._outlets[message.topic].topic_name)
+                self._wait_for_consumers(self._outlets[message.topic].topic_name)
+
+    def _wait_for_consumers(self, topic: str) -> None:
+        """Let those who take fluxes, and those who take poses made of them, catch up."""
+        self._consumers.wait(topic)
+        self._frames += 1
+        if self._poses and self._frames % ASK_EVERY == 0:
+            self._consumers.wait(*self._poses, attempts=ATTEMPTS_OF_LISTENERS)
 
     def _messages(self) -> Iterator[RawMessage]:
         """Yield what can be published; bytes that are no message of their type are left out."""

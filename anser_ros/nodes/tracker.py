@@ -311,6 +311,7 @@ class TrackerNode(AnserNode):
         tracker, newest = self._tracker, self._intake.newest
         values: dict[str, object] = {'frame_time_s': self._solve_s, 'last_refusal': self._trouble}
         values['ready_for'] = self._ready_for()
+        values['pose_listeners'] = sum(topic.listeners for topic in self._topics.values())
         if tracker is not None:
             values |= {name: count for name, count in tracker.counters.items() if name != 'frames'}
         if self._setup is None:
@@ -329,6 +330,8 @@ class TrackerNode(AnserNode):
         values['tracked'] = good
         dead = ', '.join(tracker.dead_emitters)
         values['dead_emitters'] = dead
+        # A drift takes no recorded course here: field_model follows it where references tell.
+        values['left_to_references'] = ', '.join(tracker.drifting_effects)
         if dead:
             return Status('', Level.WARN, f'no flux of {dead}', values)
         return Status('', Level.OK, f'{good} of {len(self._topics)} tracked', values)
