@@ -54,8 +54,9 @@ def test_without_metal_the_poses_are_the_frozen_model_s(model):
     assert np.sqrt(np.nanmean(moved**2)) <= 1.03 * np.sqrt(np.nanmean(still**2))
 
 
-@pytest.mark.timeout(120)
-def test_the_nodes_give_the_same_poses(domain, model, followed):
+@pytest.mark.timeout(240)
+@pytest.mark.parametrize('rate', [0.0, 1.0])
+def test_the_nodes_give_the_same_poses(domain, model, followed, rate):
     bag = BAGS / 'metal.mcap'
     session = load_session(bag)
     tool = session.tools[0]
@@ -65,7 +66,7 @@ def test_the_nodes_give_the_same_poses(domain, model, followed):
         list(topics.values()),
         domain=int(os.environ['ROS_DOMAIN_ID']),
         model=model,
-        rate=1.0,
+        rate=rate,
         server=('-p', f'baseline_file:={BAGS / "factory.mcap"}'),
     )
     stamps = session.start_ns + np.round(tool.time * 1e9).astype(np.int64)
@@ -76,8 +77,9 @@ def test_the_nodes_give_the_same_poses(domain, model, followed):
         assert frames.size > 0.9 * stamps.size
         offline = np.array([estimates[frame].position for frame in frames])
         steps.append(np.linalg.norm(live.position - offline, axis=1))
-    # A tool's frame may be solved before the references of the same moment have changed the model.
     steps = np.concatenate(steps)
     print('live minus offline: median', np.nanmedian(steps), '95 %', np.nanpercentile(steps, 95))
-    assert np.nanmedian(steps) < 5e-6
-    assert np.nanpercentile(steps, 95) < 150e-6
+    assert np.nanmedian(steps) < 1e-8
+    # A tracker that waits in vain for a model (a busy machine) goes on with the one before, and
+    # the uncertainty of a change may reach it after its model.
+    assert np.nanpercentile(steps, 95) < (1e-6 if rate == 0.0 else 150e-6)
