@@ -16,6 +16,8 @@ from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = 'anser_ros'
 PORT = '/tmp/anser_cu'
+# The board that config/demo_model.yaml is calibrated on.
+BOARD_SEED = 1
 SHARED_TOPICS = ('setup', 'tool/flux', 'reference/flux')
 ARGUMENTS = {
     'duration': ('30.0', 'time from the first pose on, s; 0 for no end'),
@@ -59,7 +61,7 @@ def generate_launch_description():
             GroupAction(
                 [
                     PushRosNamespace('anser'),
-                    node('cu_simulator', link=PORT, metal=value('metal')),
+                    node('cu_simulator', link=PORT, metal=value('metal'), board_seed=BOARD_SEED),
                     node('acquisition', device=PORT),
                     node('field_model', model_file=model, baseline_at_start=True),
                     node('tracker'),

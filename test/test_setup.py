@@ -61,6 +61,7 @@ def edited(path: tuple, value: object) -> str:
     [
         (('schema',), 'anser_setup/9', 'schema must be'),
         (('flux_unit',), 'uT', 'flux_unit must be T'),
+        (('frame_id',), 'world', "frame_id must be 'fg'"),
         (('flux_rate_hz',), None, 'lacks the key'),
         (('flux_rate_hz',), float('nan'), 'must be finite'),
         (('flux_rate_hz',), 'fast', 'must be a number'),

@@ -22,11 +22,11 @@ from anser_ros.nodes.fault_memory import FAULTS, RecentFaults, device_words
 from anser_ros.nodes.flux_stream import FluxFrame, FluxStream, StreamOptions
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
+from anser_ros.nodes.stream_status import emitter_statuses, sensor_statuses, signal_troubles
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.frames import Hello, Record, SampleBlock, Stop
 from anser_ros.wire.frames import Status as DeviceStatus
-from anser_ros.wire.points import DROPPED, SATURATED, STALE
 from anser_ros.wire.port import DEFAULT_BAUD, Batch, ControlUnitPort, PortState, find_port
 from anser_ros.wire.setup import Setup, dump_setup, parse_setup
 from anser_ros.wire.stream_control import StreamControl
@@ -298,15 +298,16 @@ class Acquisition(AnserNode):
             reason = f': {port.reason}' if port.reason else ''
             words = [f'{port.state.value}{reason}', self._faults.words]
             return Level.ERROR, '; '.join(filter(None, words))
-        if self._faults.words:
-            return self._faults.level, self._faults.words
+        troubles = [(self._faults.level, self._faults.words)] if self._faults.words else []
+        if self._device is not None and self._device.flags:
+            troubles.append((Level.WARN, f'control unit: {device_words(self._device)}'))
+        if self._stream is not None:
+            coils = self._setup.emitter.coils
+            troubles += signal_troubles(coils, self._stream, self._frame, self._sensor_flags)
+        if troubles:
+            return max(level for level, _ in troubles), '; '.join(words for _, words in troubles)
         if frames == 0:
             return Level.WARN, 'no windows yet'
-        if self._stream is not None and self._stream.missing:
-            names = ', '.join(s.name for s in self._stream.missing[:4])
-            return Level.WARN, f'the control unit has no channel for {names}'
-        if self._device is not None and self._device.flags:
-            return Level.WARN, f'control unit: {device_words(self._device)}'
         return Level.OK, 'streaming'
 
     def part_statuses(self) -> list[Status]:
@@ -314,44 +315,10 @@ class Acquisition(AnserNode):
         stream, frame = self._stream, self._frame
         if stream is None or frame is None or len(frame.flags) != len(stream.sensors):
             return []
-        return [*self._emitter_statuses(stream, frame), *self._sensor_statuses(stream, frame)]
-
-    def _emitter_statuses(self, stream: FluxStream, frame: FluxFrame) -> list[Status]:
-        window = frame.window
-        statuses = []
-        for k, coil in enumerate(self._setup.emitter.coils):
-            driven = bool(window.driven[k])
-            statuses.append(
-                Status(
-                    f'emitter {coil.name}',
-                    Level.OK if driven else Level.ERROR,
-                    'driven' if driven else 'no current',
-                    {
-                        'frequency_hz': float(stream.tones_hz[k]),
-                        'current_a': float(abs(window.current[k])),
-                        'nominal_current_a': float(stream.nominal_a[k]),
-                        'current_noise_a': float(window.current_sigma[k]),
-                        'flux_rms_t': _rms(window.flux[:, k]),
-                        'flux_noise_t': _rms(window.sigma[:, k]),
-                    },
-                )
-            )
-        return statuses
-
-    def _sensor_statuses(self, stream: FluxStream, frame: FluxFrame) -> list[Status]:
-        seen = self._sensor_flags
-        if seen is None or len(seen) != len(frame.flags):
-            seen = frame.flags
-        statuses = []
-        for row, sensor in enumerate(stream.sensors):
-            level, message = _sensor_state(int(seen[row]))
-            values = {
-                'channel': sensor.channel,
-                'flux_rms_t': _rms(frame.window.flux[row]),
-                'flux_noise_t': _rms(frame.window.sigma[row]),
-            }
-            statuses.append(Status(sensor.name, level, message, values))
-        return statuses
+        return [
+            *emitter_statuses(self._setup.emitter.coils, stream, frame),
+            *sensor_statuses(stream, frame, self._sensor_flags),
+        ]
 
 
 def _with_noise(setup: Setup, rate_hz: float, frame: FluxFrame) -> Setup:
@@ -361,22 +328,6 @@ def _with_noise(setup: Setup, rate_hz: float, frame: FluxFrame) -> Setup:
         return replace(setup, flux_rate_hz=rate_hz)
     noise_t = float(f'{np.median(sigma):.2g}')
     return replace(setup, flux_rate_hz=rate_hz, extra={**setup.extra, FLUX_NOISE: noise_t})
-
-
-def _sensor_state(flags: int) -> tuple[Level, str]:
-    if flags & STALE:
-        return Level.ERROR, 'stuck: all samples of a window are the same'
-    if flags & SATURATED:
-        return Level.WARN, 'saturated'
-    if flags & DROPPED:
-        return Level.WARN, 'samples lost'
-    return Level.OK, 'ok'
-
-
-def _rms(values: np.ndarray) -> float:
-    """Root mean square of what is finite; 0 when nothing is."""
-    finite = np.abs(values[np.isfinite(values)])
-    return float(np.sqrt(np.mean(finite**2))) if finite.size else 0.0
 
 
 if __name__ == '__main__':

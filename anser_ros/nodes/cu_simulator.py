@@ -23,7 +23,14 @@ from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.control_unit import ControlUnit, Piece
 from anser_ros.simulation.effect_draw import NONE as NO_EFFECT
 from anser_ros.simulation.effect_draw import Drawn, draw
-from anser_ros.simulation.faults import FAULTS, NONE, UNPLUG, FaultInjector
+from anser_ros.simulation.faults import (
+    FAULTS,
+    NONE,
+    OVERRUN,
+    SATURATION,
+    UNPLUG,
+    FaultInjector,
+)
 from anser_ros.simulation.manufacture import manufactured
 from anser_ros.simulation.metal import MetalBody, steel_disc
 from anser_ros.simulation.motion import Approach, tool_paths
@@ -48,9 +55,9 @@ class CuSimulatorParameters:
         'demo_channels.yaml', 'channel calibration: a path, or a file of config/'
     )
     board_seed: int = parameter(
-        1,
-        'of the board, one with the tolerances of a workshop: 1 for that of demo_model.yaml and '
-        'bags/, 0 for one as drawn, which the nominal model fits',
+        0,
+        'of the board: 0 for one as drawn, which the nominal model fits; 1 for that of '
+        'demo_model.yaml and bags/; any other for one with its own tolerances of a workshop',
         minimum=0,
     )
     sample_rate_hz: float = parameter(
@@ -171,6 +178,7 @@ class CuSimulator(AnserNode):
         unit = self._unit
         now_s = self._elapsed_s()
         self._plug(now_s)
+        unit.overload(self._injector.lasts(now_s, SATURATION))
         answers = unit.receive(self._port.read())
         if unit.streaming and self._stream_begin_s == math.inf:
             self._stream_begin_s = now_s
@@ -190,6 +198,10 @@ class CuSimulator(AnserNode):
 
     def _send(self, pieces: list[Piece], now_s: float) -> None:
         arriving = self._injector.apply(pieces, now_s)
+        if self._injector.lasts(now_s, OVERRUN):
+            for _ in filter(lambda piece: piece.is_block, arriving):
+                self._unit.drop()
+            arriving = [piece for piece in arriving if not piece.is_block]
         for _ in range(self._port.write(arriving)):
             self._unit.drop()
             self.count('dropped_blocks')

@@ -121,6 +121,10 @@ class ControlUnit:
         self._dropped += 1
         self._lost_before = True
 
+    def overload(self, is_on: bool) -> None:
+        """Let the first channel's amplifier saturate, or no longer."""
+        self._sampler.is_overloaded = is_on
+
     def skip(self, samples: int) -> None:
         """Let time go by in which the device could not send: whole blocks are lost, not time."""
         block = self._hello.block_samples

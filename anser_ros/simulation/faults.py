@@ -10,15 +10,21 @@ from anser_ros.simulation.control_unit import Piece
 
 NONE = 'none'
 UNPLUG = 'unplug'
-FAULTS = (NONE, 'bad_crc', 'gap', 'garbage', 'wrong_baud', 'silence', UNPLUG)
+OVERRUN = 'overrun'
+SATURATION = 'saturation'
+FAULTS = (
+    NONE, 'bad_crc', 'gap', 'garbage', 'wrong_baud', 'silence', UNPLUG, OVERRUN, SATURATION,
+)  # fmt: skip
 _BURST_BYTES = 700
-_LASTS_S = {'wrong_baud': 2.5, 'silence': 2.5, UNPLUG: 1.0}
+_LASTS_S = {'wrong_baud': 2.5, 'silence': 2.5, UNPLUG: 1.0, OVERRUN: 0.1, SATURATION: 1.0}
 
 
 class FaultInjector:
     """Damages what goes over the line, once every period.
 
-    `bad_crc`, `gap` and `garbage` happen to one block; `wrong_baud`, `silence` and `unplug` last.
+    `bad_crc`, `gap` and `garbage` happen to one block, the others last. `unplug`, `overrun` (the
+    unit has no room for its blocks) and `saturation` (of its first channel) are for the unit and
+    its port to show, while they last.
 
     Parameters
     ----------

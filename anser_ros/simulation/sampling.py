@@ -17,6 +17,10 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 
+OVERLOAD_GAIN = 1e4
+"""Of an amplifier that is at its limits whatever it hears."""
+
+
 @dataclass(frozen=True)
 class FrontEnd:
     """The analogue side of a control unit.
@@ -75,6 +79,7 @@ class Sampler:
         self._delays = calibration.delays_s(numbers)[:, None]
         self._current_delay = calibration.current_delay_s
         self._driven_from_s: float | None = None
+        self.is_overloaded = False
         self.set_frequencies(np.array(world.setup.frequencies_hz))
         self._last: tuple[float, ComplexArray] | None = None
 
@@ -118,6 +123,8 @@ class Sampler:
         volts, current = signals[:, :-1], signals[:, -1]
         if self._effects:
             volts = chained_volts(self._effects, time_s - self._start_s, volts)
+        if self.is_overloaded:
+            volts = volts * np.where(np.arange(volts.shape[1]) == 0, OVERLOAD_GAIN, 1.0)
         return self._convert(volts, current)
 
     @property

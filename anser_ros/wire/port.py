@@ -212,11 +212,10 @@ class ControlUnitPort:
         self.state = PortState.CLOSED
 
     def _read(self, port: serial.SerialBase) -> None:
-        last_byte = period_start = time.monotonic()
-        period_bytes = 0
+        last_byte = last_record = time.monotonic()
+        garbage_bytes = 0
         reader = self._reader
         receive = _receiver(port)
-        period_records = reader.counters.records
         while not self._stopping.is_set():
             while self._commands:
                 port.write(self._commands.popleft())
@@ -226,10 +225,11 @@ class ControlUnitPort:
             now = arrival_ns / 1e9
             if data:
                 last_byte = now
-                period_bytes += len(data)
+                garbage_bytes += len(data)
                 self.counters.received_bytes += len(data)
                 records = reader.feed(data)
                 if records:
+                    last_record, garbage_bytes = now, 0
                     self.state = PortState.RECEIVING
                     self._take(records, arrival_ns)
             elif self._held:
@@ -238,12 +238,10 @@ class ControlUnitPort:
                 self.counters.silence += 1
                 self.state = PortState.SILENT
                 last_byte = now
-            if now - period_start > 1.0:
-                if period_bytes > _GARBAGE_BYTES and reader.counters.records == period_records:
-                    self.counters.wrong_baud += 1
-                    self.state = PortState.WRONG_BAUD
-                period_start, period_bytes = now, 0
-                period_records = reader.counters.records
+            if now - last_record > 1.0 and garbage_bytes > _GARBAGE_BYTES:
+                self.counters.wrong_baud += 1
+                self.state = PortState.WRONG_BAUD
+                last_record, garbage_bytes = now, 0
 
     def _take(self, records: list[Record], arrival_ns: int) -> None:
         """Hold blocks until there are as many as wanted; anything else goes on at once."""

@@ -232,6 +232,12 @@ def parse_setup(text: str) -> Setup:
         raise SetupError(f'setup: schema must be {SCHEMA!r}, got {root.get("schema")!r}')
     if root.get('flux_unit', 'T') != 'T':
         raise SetupError(f'setup: flux_unit must be T, got {root.get("flux_unit")!r}')
+    frame_id = _name(root.get('frame_id', FIELD_GENERATOR), 'frame_id')
+    if frame_id != FIELD_GENERATOR:
+        raise SetupError(
+            f'setup: frame_id must be {FIELD_GENERATOR!r}, the board that all positions are '
+            f'given in, got {frame_id!r}'
+        )
     sensors = _take(root, 'sensors', 'the document')
     if not isinstance(sensors, list) or not sensors:
         raise SetupError('setup: sensors must be a list of at least one sensor')
@@ -245,7 +251,7 @@ def parse_setup(text: str) -> Setup:
     )
     known = ('schema', 'frame_id', 'flux_rate_hz', 'flux_unit', 'emitter', 'sensors')
     return Setup(
-        frame_id=_name(root.get('frame_id', FIELD_GENERATOR), 'frame_id'),
+        frame_id=frame_id,
         flux_rate_hz=_number(
             _take(root, 'flux_rate_hz', 'the document'), 'flux_rate_hz', 1e-3, 1e6
         ),

@@ -1,0 +1,107 @@
+"""What an acquisition says of emitters and sensors: a line each, and what is wrong in words."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from anser_ros.nodes.diagnostics import Level, Status
+from anser_ros.nodes.flux_stream import FluxFrame, FluxStream
+from anser_ros.wire.points import DROPPED, SATURATED, STALE
+from anser_ros.wire.setup import Coil
+
+MOST_NAMES = 4
+STATES = (
+    (STALE, Level.ERROR, 'stuck', 'all samples of a window are the same'),
+    (SATURATED, Level.WARN, 'saturated', ''),
+    (DROPPED, Level.WARN, 'samples lost', ''),
+)
+"""Flag bits of a sensor, the gravest first, with what they mean."""
+
+
+def signal_troubles(
+    coils: Sequence[Coil], stream: FluxStream, frame: FluxFrame | None, flags: np.ndarray | None
+) -> list[tuple[Level, str]]:
+    """What is wrong with the signals, by the names of emitters and sensors.
+
+    Parameters
+    ----------
+    flags : ndarray, shape (S,), or None
+        Flag bits that the sensors had since the last look. Lost samples are not told here: the
+        counters of the line say where they were lost.
+    """
+    found = []
+    if stream.missing:
+        names = _named(sensor.name for sensor in stream.missing)
+        found.append((Level.WARN, f'the control unit has no channel for {names}'))
+    if frame is not None and not frame.window.driven.all():
+        pairs = zip(coils, frame.window.driven, strict=True)
+        names = _named(coil.name for coil, driven in pairs if not driven)
+        found.append((Level.ERROR, f'no current in {names}'))
+    if flags is None or len(flags) != len(stream.sensors):
+        return found
+    for bit, level, word, _ in STATES[:2]:
+        bad = [s.name for s, flag in zip(stream.sensors, flags, strict=True) if flag & bit]
+        if bad:
+            found.append((level, f'{word}: {_named(bad)}'))
+    return found
+
+
+def emitter_statuses(coils: Sequence[Coil], stream: FluxStream, frame: FluxFrame) -> list[Status]:
+    """Amplitude, noise and current of each emitter."""
+    window = frame.window
+    statuses = []
+    for k, coil in enumerate(coils):
+        driven = bool(window.driven[k])
+        statuses.append(
+            Status(
+                f'emitter {coil.name}',
+                Level.OK if driven else Level.ERROR,
+                'driven' if driven else 'no current',
+                {
+                    'frequency_hz': float(stream.tones_hz[k]),
+                    'current_a': float(abs(window.current[k])),
+                    'nominal_current_a': float(stream.nominal_a[k]),
+                    'current_noise_a': float(window.current_sigma[k]),
+                    'flux_rms_t': _rms(window.flux[:, k]),
+                    'flux_noise_t': _rms(window.sigma[:, k]),
+                },
+            )
+        )
+    return statuses
+
+
+def sensor_statuses(
+    stream: FluxStream, frame: FluxFrame, flags: np.ndarray | None
+) -> list[Status]:
+    """State and noise of each sensor, by the flags since the last look."""
+    seen = frame.flags if flags is None or len(flags) != len(frame.flags) else flags
+    statuses = []
+    for row, sensor in enumerate(stream.sensors):
+        level, message = _sensor_state(int(seen[row]))
+        values = {
+            'channel': sensor.channel,
+            'flux_rms_t': _rms(frame.window.flux[row]),
+            'flux_noise_t': _rms(frame.window.sigma[row]),
+        }
+        statuses.append(Status(sensor.name, level, message, values))
+    return statuses
+
+
+def _sensor_state(flags: int) -> tuple[Level, str]:
+    for bit, level, word, why in STATES:
+        if flags & bit:
+            return level, f'{word}: {why}' if why else word
+    return Level.OK, 'ok'
+
+
+def _named(names: Iterable[str]) -> str:
+    """The first few names, and how many more there are."""
+    known = list(names)
+    more = f' and {len(known) - MOST_NAMES} more' if len(known) > MOST_NAMES else ''
+    return ', '.join(known[:MOST_NAMES]) + more
+
+
+def _rms(values: np.ndarray) -> float:
+    """Root mean square of what is finite; 0 when nothing is."""
+    finite = np.abs(values[np.isfinite(values)])
+    return float(np.sqrt(np.mean(finite**2))) if finite.size else 0.0
