@@ -4,7 +4,7 @@ import argparse
 import json
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,12 @@ from anser_ros.measured import (
     Row,
     anser_board,
     hpi_coils,
+    hpi_session,
     magnet_patch,
     magnet_session,
     navion,
     navion_report,
+    navion_session,
 )
 
 Study = Callable[[Path], tuple[list[Row], str]]
@@ -54,6 +56,12 @@ STUDIES: dict[str, Study] = {
     anser_board.NAME: _anser_board,
 }
 """Data set to its rows and the text of its candidates."""
+SESSIONS: dict[str, Callable[[Path, Path], list[Path]]] = {
+    navion.NAME: navion_session.write_sessions,
+    magnet_patch.NAME: magnet_session.write_sessions,
+    hpi_coils.NAME: hpi_session.write_sessions,
+}
+"""Data set to what writes its sessions; one without fluxes has none."""
 SHARED = 'ANSER_SHARED'
 SCHEMA = 'anser_measured/1'
 
@@ -82,6 +90,8 @@ def run(args: argparse.Namespace) -> int:
     shared = shared_folder(args.shared)
     console = Console(stderr=args.json, width=None if os.isatty(1) else 200)
     rows: list[Row] = []
+    if args.bags is not None:
+        _write_bags(args.datasets or STUDIES, shared, args.bags, console)
     for name in args.datasets or STUDIES:
         found, text = STUDIES[name](shared / 'measured' / name)
         rows += found
@@ -90,9 +100,6 @@ def run(args: argparse.Namespace) -> int:
         if args.out is not None:
             args.out.mkdir(parents=True, exist_ok=True)
             (args.out / f'{name}.txt').write_text(text + '\n', encoding='utf-8')
-        if args.bags is not None and name == magnet_patch.NAME:
-            for path in magnet_session.write_sessions(shared / 'measured' / name, args.bags):
-                console.print(f'wrote {path}', highlight=False)
     document = json.dumps(to_document(rows), indent=1)
     if args.out is not None:
         (args.out / 'measured.json').write_text(document + '\n', encoding='utf-8')
@@ -101,6 +108,16 @@ def run(args: argparse.Namespace) -> int:
     else:
         console.print(table(rows))
     return 0
+
+
+def _write_bags(names: Iterable[str], shared: Path, into: Path, console: Console) -> None:
+    """Write the sessions of all data sets that have fluxes, and say so."""
+    for name in names:
+        if name not in SESSIONS:
+            console.print(f'{name}: positions only, no session', highlight=False)
+            continue
+        for path in SESSIONS[name](shared / 'measured' / name, into):
+            console.print(f'wrote {path}', highlight=False)
 
 
 def shared_folder(given: Path | None) -> Path:

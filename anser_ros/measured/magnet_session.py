@@ -13,19 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.measured.magnet_model import Recording
 from anser_ros.measured.magnet_patch import HALF_LENGTH_M, RADIUS_M, file_names, load
-from anser_ros.wire.bag_writer import SessionWriter
-from anser_ros.wire.points import FluxPoints, encode_flux
-from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup, dump_setup
+from anser_ros.measured.session_file import SECOND_NS, vector, write_frames
+from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
 Array = NDArray[np.float64]
 
 BODY = 'patch'
 AXES = 'xyz'
-NS = 1e9
-
-
-def _vector(values: Array) -> tuple[float, float, float]:
-    return (float(values[0]), float(values[1]), float(values[2]))
 
 
 def patch_in_fg(recording: Recording) -> tuple[Array, Array]:
@@ -47,8 +41,8 @@ def setup_of(recording: Recording) -> Setup:
             3 * k + axis,
             f'{BODY}/s{k + 1}/{AXES[axis]}',
             BODY,
-            _vector(place[k]),
-            _vector(turn[k, :, axis] / np.linalg.norm(turn[k, :, axis])),
+            vector(place[k]),
+            vector(turn[k, :, axis] / np.linalg.norm(turn[k, :, axis])),
             0.0,
         )
         for k in range(len(place))
@@ -69,21 +63,10 @@ def write_session(recording: Recording, path: Path) -> None:
         When the file exists already.
     """
     turn, place = patch_in_fg(recording)
-    stamps = np.round(recording.stamp_s * NS).astype(np.int64)
-    count = 3 * recording.field_t.shape[1]
-    moving = np.full((count, 3), np.nan)
-    channel = np.arange(count, dtype=np.int64)
-    with SessionWriter(path) as writer:
-        writer.write_setup(dump_setup(setup_of(recording)), int(stamps[0]))
-        for frame, stamp in enumerate(stamps.tolist()):
-            flux = recording.field_t[frame].reshape(count, 1).astype(np.complex128)
-            points = FluxPoints(channel, np.zeros(count, np.int64), flux, moving, moving)
-            fields, step, data = encode_flux(points)
-            writer.write_flux('/anser/tool/flux', stamp, fields, step, count, data)
-            quaternion = Rotation.from_matrix(turn[frame]).as_quat()
-            writer.write_pose(
-                f'/optical/{BODY}/pose', stamp, place[frame].tolist(), quaternion.tolist()
-            )
+    stamps = np.round(recording.stamp_s * SECOND_NS).astype(np.int64).tolist()
+    flux = recording.field_t.reshape(len(stamps), -1, 1).astype(np.complex128)
+    quaternion = Rotation.from_matrix(turn).as_quat()
+    write_frames(path, setup_of(recording), stamps, flux, {BODY: (place, quaternion)})
 
 
 def write_sessions(folder: Path, into: Path) -> list[Path]:

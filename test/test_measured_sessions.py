@@ -1,0 +1,129 @@
+"""Sessions of measured data: what was measured stands in the bag, in the contract's layout."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_measured_hpi import COIL, MOMENT, helmet
+
+from anser_ros.cli import measured
+from anser_ros.cli.main import main
+from anser_ros.errors import BagError
+from anser_ros.measured import hpi_session, navion_session
+from anser_ros.measured.hpi_coils import HpiData
+from anser_ros.measured.navion_data import NavionData, load
+from anser_ros.measured.navion_plate import PlateData
+from anser_ros.measured.session_file import write_frames
+from anser_ros.sessions.session import load_session
+from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
+
+ROOT = Path(__file__).resolve().parents[1]
+SHARED = Path(os.environ.get('ANSER_SHARED', ROOT.parent / 'shared'))
+NAVION = SHARED / 'measured' / 'navion'
+COILS = tuple(Coil(f'c{k}', (0.1 * k, 0.0, 0.0), 0.0, 1.0 + k) for k in range(3))
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)
+
+
+def plate_data(rng):
+    """Two heights of 2 x 2 sensors."""
+    grid = np.array([[x, y, 0.0] for x in (-0.1, 0.1) for y in (-0.1, 0.1)])
+    field = rng.normal(scale=1e-3, size=(2, 3, 4, 3))
+    coils = PlateData(np.array([-0.05, 0.05]), grid, field)
+    return NavionData((0, 3), coils, np.zeros((2, 8, 4, 3)), np.zeros((8, 3)), np.zeros((2, 4, 3)))
+
+
+class TestFrames:
+    def test_tools_move_and_references_stand_where_they_are(self, tmp_path, rng):
+        sensors = (
+            SensorSpec(4, 'fixed/0', 'fg', (0.1, 0.2, 0.3), (0.0, 0.6, 0.8), 0.0),
+            SensorSpec(2, 'tool/0', 'tool', (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.0),
+        )
+        setup = Setup('fg', 1.0, Emitter('somebody', {}, COILS), sensors)
+        flux = 1e-6 * (rng.normal(size=(2, 2, 3)) + 1j * rng.normal(size=(2, 2, 3)))
+        place, turn = np.array([[0, 0, 0.1], [0, 0, 0.2]]), np.tile([0, 0, 0, 1.0], (2, 1))
+        path = tmp_path / 'frames.mcap'
+        write_frames(path, setup, [10, 20], flux, {'tool': (place, turn)})
+        session = load_session(path)
+        (tool,) = session.tools
+        np.testing.assert_allclose(tool.flux[:, 0], flux[:, 1], rtol=1e-6)
+        np.testing.assert_allclose(session.reference.flux[:, 0], flux[:, 0], rtol=1e-6)
+        np.testing.assert_allclose(tool.position, place)
+        assert session.setup.sensors[0] == sensors[0]
+        with pytest.raises(BagError, match='there already'):
+            write_frames(path, setup, [10], flux)
+
+
+class TestNavion:
+    EMITTER = Emitter('electromagnet', {'current_a': 35.0}, COILS)
+
+    def test_the_plate_is_a_tool_of_many_channels(self, tmp_path, rng):
+        data, path = plate_data(rng), tmp_path / 'plate.mcap'
+        navion_session.write_plate(data, self.EMITTER, path)
+        (tool,) = load_session(path).tools
+        assert tool.flux.shape == (2, 12, 3)
+        # The reading of coil 2 by axis y of sensor 3 at the second height.
+        row = tool.sensors.name.index('plate/s3/y')
+        assert tool.flux[1, row, 2].real == pytest.approx(data.coils.field_t[1, 2, 3, 1], rel=1e-6)
+        centres, axes = tool.placed()
+        np.testing.assert_allclose(centres[1, row], [0.1, 0.1, 0.05])
+        np.testing.assert_allclose(axes[1, row], [0.0, 1.0, 0.0])
+
+    def test_one_sensor_visits_all_places(self, tmp_path, rng):
+        data, path = plate_data(rng), tmp_path / 'sensor.mcap'
+        navion_session.write_sensor(data, self.EMITTER, path)
+        (tool,) = load_session(path).tools
+        assert tool.flux.shape == (8, 3, 3) and tool.has_pose.all()
+        np.testing.assert_allclose(tool.position[6], [0.1, -0.1, 0.05])
+        np.testing.assert_allclose(tool.flux[6].real, data.coils.field_t[1, :, 2].T, rtol=1e-6)
+
+    @pytest.mark.skipif(not NAVION.is_dir(), reason='no shared measured data')
+    def test_the_real_data(self, tmp_path):
+        paths = navion_session.write_sessions(NAVION, tmp_path / 'bags')
+        assert [path.name for path in paths] == ['navion_plate.mcap', 'navion_sensor.mcap']
+        data = load(NAVION)
+        (tool,) = load_session(paths[1]).tools
+        assert tool.time.size == 4 * 121
+        assert np.abs(tool.flux).max() == pytest.approx(np.abs(data.coils.field_t).max(), rel=1e-6)
+
+
+class TestHpi:
+    TONES = np.array([70.0, 72.0])
+
+    def test_magnetometers_are_references_and_coils_emitters(self, tmp_path, monkeypatch):
+        array = helmet(12)
+        places = np.array([COIL, COIL * [-1, 1, 1]])
+        signal = np.array([array.signals(place) @ MOMENT for place in places]).T
+        flux = (signal * (1 + 0.1j))[array.is_magnetometer]
+        data = HpiData(array, signal.T, np.zeros((36, 600)), 600.0, places, places)
+        monkeypatch.setattr(hpi_session, 'phasors', lambda given: (self.TONES, flux))
+        path = tmp_path / 'hpi.mcap'
+        hpi_session.write_session(data, path)
+        session = load_session(path)
+        assert session.tools == () and session.setup.frequencies_hz == (70.0, 72.0)
+        reference = session.reference
+        np.testing.assert_allclose(reference.flux[0], flux, rtol=1e-6)
+        assert len(reference.sensors) == 12
+        # A point at a magnetometer's middle sees what the magnetometer does, to its size.
+        distance = reference.sensors.position - places[0]
+        r = np.linalg.norm(distance, axis=1)[:, None]
+        field = 1e-7 * (3 * distance * (distance @ MOMENT)[:, None] / r**5 - MOMENT / r**3)
+        seen = np.sum(field * reference.sensors.axis, axis=1)
+        np.testing.assert_allclose(reference.flux[0, :, 0].real, seen, rtol=0.1, atol=1e-13)
+
+
+def test_the_command_writes_bags_and_says_what_has_none(tmp_path, monkeypatch, capsys):
+    (tmp_path / 'measured').mkdir()
+    monkeypatch.setattr(
+        measured, 'STUDIES', dict.fromkeys(('navion', 'anser_board'), lambda f: ([], ''))
+    )
+    monkeypatch.setattr(
+        measured, 'SESSIONS', {'navion': lambda folder, into: [into / f'{folder.name}.mcap']}
+    )
+    assert main(['measured', '--shared', str(tmp_path), '--bags', str(tmp_path / 'bags')]) == 0
+    out = capsys.readouterr().out
+    assert 'navion.mcap' in out and 'anser_board: positions only, no session' in out
