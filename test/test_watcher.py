@@ -148,9 +148,8 @@ class TestWatch:
         assert Watch(model).look(window.session(), window.first_ns).is_clear
 
     def test_what_nothing_explains_is_not_given_a_name(self, moving, watch, monkeypatch):
-        monkeypatch.setattr(
-            watching, 'LIGHT', replace(watching.LIGHT, most_effects=0)
-        )  # a catalogue that knows nothing
+        # a catalogue that knows nothing
+        monkeypatch.setattr(watching, 'MOST_EFFECTS', (0,))
         window = filled(moving, gain=GAIN)
         seen = watch.look(window.session(), window.first_ns)
         assert seen.findings == () and not seen.is_clear and seen.excess_left > 100
@@ -208,7 +207,7 @@ def test_over_dds_a_finding_is_raised_and_cleared(ros, start, moving, tmp_path):
         'watcher', '--ros-args', '-p', f'model_file:={MODEL}', '-p', 'window_s:=5.0',
         '-p', 'period_s:=0.5', '-p', 'cpu_share:=1.0',
     )  # fmt: skip
-    start('replay', bag, '--rate', '2', '--loop', '--wait', '30')
+    start('replay', bag, '--rate', '2', '--loop', '--wait', '4')
     title = f'anser/watcher: sensor_gain (channel {CHANNEL})'
 
     def is_raised(lines):
@@ -242,7 +241,7 @@ def test_over_dds_on_a_session_that_this_package_did_not_make(ros, start, shared
         'watcher', '--ros-args', '-p', f'model_file:={effects_model}',
         '-p', f'baseline_file:={folder / "factory.mcap"}', '-p', 'cpu_share:=1.0',
     )  # fmt: skip
-    start('replay', folder / 's04.mcap', '--rate', '4', '--loop', '--wait', '30')
+    start('replay', folder / 's04.mcap', '--rate', '4', '--loop', '--wait', '4')
     title = 'anser/watcher: static_metal'
     assert heard.until(lambda lines: lines.get(title, (0,))[0] == 1), (
         f'{heard.lines}\n{watcher.output}'

@@ -27,7 +27,9 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 OPTICAL, RIGID, REFERENCES = 'optical poses', 'rigidity of the tools', 'references alone'
-LIGHT = SearchSettings(most_effects=2, finalists=4, iterations=6)
+LIGHT = SearchSettings(finalists=4, iterations=6)
+MOST_EFFECTS = (1, 2)
+"""Effects that are searched for, more only where fewer leave something."""
 FREE_POSE_M, FREE_POSE_RAD = 0.02, 0.1
 """A pose that the fluxes themselves gave may be so far off, and says nothing of its own."""
 EXCESS = 1.25
@@ -164,12 +166,16 @@ class Watch:
         if not _moves(problem):
             return replace(seen, remark='the tool moves too little to tell what it is')
         self.searches += 1
-        found = diagnose(problem, self._model, LIGHT, progress)
-        records = tuple(finding.record for finding in found.findings)
+        for most in MOST_EFFECTS:
+            settings = replace(LIGHT, most_effects=most)
+            found = diagnose(problem, self._model, settings, progress)
+            left = _excess(evaluate(problem, found.terms))
+            if left < EXCESS:
+                break
         return replace(
             seen,
-            findings=records,
-            excess_left=_excess(evaluate(problem, found.terms)),
+            findings=tuple(finding.record for finding in found.findings),
+            excess_left=left,
             depends_on=found.depends_on,
             terms=found.terms,
         )
