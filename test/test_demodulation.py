@@ -374,6 +374,20 @@ class TestClock:
         settled = np.array(errors[100:])
         assert np.abs(settled - 200_000).max() < 30_000
 
+    @pytest.mark.parametrize('ppm', [-60.0, 0.0, 60.0])
+    def test_a_busy_host_does_not_move_the_stamps(self, ppm):
+        """Nothing comes in time but for one block in four seconds."""
+        rng = np.random.default_rng(1)
+        clock, errors = DeviceClock(1e6), []
+        for k in range(60_000):
+            true_ns = 10**15 + k * 1_000_000
+            device = k * 1e3 * (1 + 1e-6 * ppm)
+            late_ns = 0.0 if rng.random() < 1 / 4000 else 2e6 + rng.exponential(3e6)
+            clock.observe(device, int(true_ns + 200_000 + late_ns))
+            errors.append(clock.host_ns(device) - true_ns)
+        assert clock.jumps == 0
+        assert np.abs(np.array(errors[30_000:]) - 200_000).max() < 60_000
+
     def test_before_the_first_arrival_there_is_no_time(self):
         assert DeviceClock(1e6).host_ns(5.0) == 0
 

@@ -5,6 +5,7 @@ import math
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -151,7 +152,7 @@ class CuSimulator(AnserNode):
             for body in setup.bodies
         }
         self._frame_id = setup.frame_id
-        self._prepared: list[Piece] = []
+        self._prepared: deque[Piece] = deque()
         self._closing = threading.Event()
         step = self._guard(self._step)
         self._thread = threading.Thread(target=self._run, args=(step,), name='control_unit')
@@ -164,14 +165,20 @@ class CuSimulator(AnserNode):
     def _run(self, step: Any) -> None:
         while not self._closing.is_set():
             step()
-            self._port.wait(max(self._due_s() - self._elapsed_s(), 1e-4))
+            self._port.wait(max(self._next_s() - self._elapsed_s(), 1e-4))
 
     def _elapsed_s(self) -> float:
         return (time.monotonic_ns() - self._begin_ns) / 1e9
 
-    def _due_s(self) -> float:
-        """When the last sample of the prepared stretch is taken, and it can go out."""
-        return self._unit.samples / self._unit.sample_rate_hz + self._delay_s
+    def _due_s(self, samples: int) -> float:
+        """When so many samples have been taken since power-up, and can go out."""
+        return samples / self._unit.sample_rate_hz + self._delay_s
+
+    def _next_s(self) -> float:
+        """When there is something to do again: a block to be sent, or the next ones to be made."""
+        if self._prepared:
+            return self._due_s(self._prepared[0].end_sample)
+        return self._due_s(self._unit.samples) - STRETCH_S
 
     def _step(self) -> None:
         """Send what is due. The next stretch is worked out before its time, so nothing is late."""
@@ -182,19 +189,21 @@ class CuSimulator(AnserNode):
         answers = unit.receive(self._port.read())
         if unit.streaming and self._stream_begin_s == math.inf:
             self._stream_begin_s = now_s
-        self._send(answers, now_s)
-        stretch = round(STRETCH_S * unit.sample_rate_hz)
-        while now_s >= self._due_s() and not self._closing.is_set():
-            self._send(self._prepared, now_s)
+        due = []
+        while self._prepared and self._due_s(self._prepared[0].end_sample) <= now_s:
+            due.append(self._prepared.popleft())
+        self._send([*answers, *due], now_s)
+        if due and due[-1].is_block:
+            taken_s = due[-1].end_sample / unit.sample_rate_hz
             delay_ns = round(1e9 * self._delay_s)  # a simulated one is not the machine's
-            taken_s = unit.samples / unit.sample_rate_hz
             self._unit_clock.observe(taken_s, time.monotonic_ns() - delay_ns)
-            late_s = now_s - self._due_s() - LONGEST_LAG_S
+        if now_s >= self._due_s(unit.samples) - STRETCH_S:
+            late_s = now_s - self._due_s(unit.samples) - LONGEST_LAG_S
             if late_s > 0:
                 # The machine was too busy: samples are lost, as in a device, but time goes on.
                 self.count('lags')
                 unit.skip(int(late_s * unit.sample_rate_hz))
-            self._prepared = unit.advance(stretch)
+            self._prepared.extend(unit.advance(round(STRETCH_S * unit.sample_rate_hz)))
 
     def _send(self, pieces: list[Piece], now_s: float) -> None:
         arriving = self._injector.apply(pieces, now_s)

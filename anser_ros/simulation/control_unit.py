@@ -48,10 +48,12 @@ class Piece:
     ----------
     data : the record
     is_block : whether it carries samples; such a record may be dropped when the pipe is full
+    end_sample : number of samples since power-up after which a block is complete; 0 for others
     """
 
     data: bytes
     is_block: bool = False
+    end_sample: int = 0
 
 
 class ControlUnit:
@@ -169,7 +171,7 @@ class ControlUnit:
             )
             self._lost_before = False
             self._sequence += 1
-            pieces.append(Piece(encode(part), is_block=True))
+            pieces.append(Piece(encode(part), True, begin + (rank + 1) * block))
         return pieces
 
     def _obey(self, record: Record) -> list[Piece]:

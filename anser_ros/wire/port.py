@@ -296,6 +296,8 @@ def _receiver(port: serial.SerialBase) -> Callable[[], bytes]:
 
     pyserial's own read costs several system calls and a byte of its own for every wake-up, which
     at a thousand blocks a second is most of the work. Where there is a descriptor, two will do.
+    A terminal hands out four kilobytes at a time; all that is there is taken before any of it is
+    looked at, so that nothing waits for the work on what came before it.
     """
     try:
         descriptor = port.fileno()
@@ -308,6 +310,11 @@ def _receiver(port: serial.SerialBase) -> Callable[[], bytes]:
         data = os.read(descriptor, _READ_BYTES)
         if not data:
             raise serial.SerialException('the device is gone')
+        while len(data) < _READ_BYTES and select.select([descriptor], [], [], 0.0)[0]:
+            more = os.read(descriptor, _READ_BYTES)
+            if not more:
+                break  # the next read will find it gone
+            data += more
         return data
 
     return receive
