@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,12 @@ from rich.console import Console
 
 from anser_ros.cli.kernels import compile_kernels
 from anser_ros.cli.loop_result import parameter_errors, second_run, table, verdict
-from anser_ros.cli.loop_run import Run, record
+from anser_ros.cli.loop_run import AFTER, Run, record
 from anser_ros.cli.supervisor import Supervisor, tail
 from anser_ros.errors import DiagnosisError, ParameterError
 from anser_ros.sessions.model_file import load_model
-from anser_ros.sessions.recorded_health import kept_share, overload
-from anser_ros.sessions.session import load_session
+from anser_ros.sessions.recorded_health import first_warnings, kept_share, overload
+from anser_ros.sessions.session import NANO, load_session
 from anser_ros.simulation.effect_draw import CATALOGUE, NONE, RANDOM
 from anser_ros.wire.config_folder import config_path
 
@@ -48,6 +49,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--baseline', type=Path, metavar='BAG',
         help="clean recording of the simulator's board; recorded first when not given",
     )  # fmt: skip
+    parser.add_argument(
+        '--watch', action='store_true', help='tell too what the live watcher said in the first run'
+    )
     parser.add_argument('--out', type=Path, default=Path('recordings'), metavar='DIR')
     parser.add_argument('--json', action='store_true', help='print only the result, as JSON')
 
@@ -90,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
         where = f'round {number + 1} of {len(effects)}: '
         found = _round(
             folder / f'{number + 1:02d}', clean, effect, seed + number, args.duration,
-            lambda text, where=where: say.print(where + text),
+            args.watch, lambda text, where=where: say.print(where + text),
         )  # fmt: skip
         document['rounds'].append(found)
         (folder / 'loop.json').write_text(json.dumps(document, indent=1) + '\n', encoding='utf-8')
@@ -103,7 +107,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _round(
-    folder: Path, clean: Path, effect: str, seed: int, duration_s: float, say: Any
+    folder: Path,
+    clean: Path,
+    effect: str,
+    seed: int,
+    duration_s: float,
+    is_watched: bool,
+    say: Callable[[str], None],
 ) -> dict[str, Any]:
     """One effect, from the raw samples to the error of the second run."""
     model, truth_file = config_path('demo_model.yaml'), folder / 'truth.json'
@@ -111,7 +121,8 @@ def _round(
     unit = {'effect': effect, 'effect_seed': seed, 'effect_file': truth_file}
     say(f'{duration_s:g} s with an effect that only truth.json knows')
     noisy = {'optical_noise_m': OPTICAL_NOISE_M, 'seed': 2}
-    first = record(Run(folder / 'first', duration_s, {**unit, **noisy}))
+    watched = {'model_file': model, 'baseline_file': clean} if is_watched else None
+    first = record(Run(folder / 'first', duration_s, {**unit, **noisy}, watched=watched))
     say('diagnosis')
     began_s = time.monotonic()
     diagnosis = _diagnose(first, clean, model, folder / 'diagnosis')
@@ -128,7 +139,8 @@ def _round(
         for name, bag in (('first', first), ('second', second))
         if (signs := overload(bag))
     }
-    kept = {'first': kept_share(load_session(first)), 'second': kept_share(session)}
+    recorded = load_session(first)
+    kept = {'first': kept_share(recorded), 'second': kept_share(session)}
     return {
         'truth': truth,
         'found': diagnosis['effects'],
@@ -137,6 +149,10 @@ def _round(
         'unexplained': diagnosis['unexplained'],
         'first_run_held_out': diagnosis['held_out'],
         'second_run_live': second_run(session, load_model(corrected), load_model(model)),
+        'watcher_said_after_s': {
+            name: NANO * (told_ns - recorded.start_ns)
+            for name, told_ns in first_warnings(first, f'{AFTER}/watcher'.strip('/')).items()
+        },
         'diagnosis_s': took_s,
         'kept_share': kept,
         'too_busy': min(kept.values()) < LEAST_KEPT,

@@ -38,6 +38,8 @@ class Run:
         Model of the chain whose poses are judged; without it nobody tracks.
     known : Path or None
         Model of the trackers beside it.
+    watched : mapping or None
+        Parameters of a watcher; None for none.
     """
 
     folder: Path
@@ -45,6 +47,7 @@ class Run:
     unit: Mapping[str, object] = field(default_factory=dict)
     served: Path | None = None
     known: Path | None = None
+    watched: Mapping[str, object] | None = None
 
 
 def record(run: Run) -> Path:
@@ -66,10 +69,11 @@ def record(run: Run) -> Path:
                 supervisor.start(name, command)
             listeners = [f'{AFTER}/acquisition', f'{AFTER}/recorder']
             listeners += [f'{AFTER}/tracker'] if run.served is not None else []
+            listeners += [f'{AFTER}/watcher'] if run.watched is not None else []
             listeners += [f'{apart}/tracker' for apart in _beside(run)]
-            _wait(supervisor, run, lambda: _are_ready(bag, listeners), 'the nodes are not ready')
+            _wait(supervisor, run, lambda: _unready(bag, listeners))
             supervisor.start('cu_simulator', _unit(run, ports / 'cu'))
-            _wait(supervisor, run, lambda: _has_flux(bag), 'no flux was recorded')
+            _wait(supervisor, run, lambda: _unheard(bag))
             end = time.monotonic() + run.duration_s
             while time.monotonic() < end:
                 _check(supervisor)
@@ -94,6 +98,8 @@ def _commands(run: Run, port: Path) -> dict[str, list[str]]:
     if run.served is not None:
         commands['field_model'] = node('field_model', model_file=run.served, refit=False)
         commands['tracker'] = node('tracker', model_file=run.served)
+    if run.watched is not None:
+        commands['watcher'] = node('watcher', **run.watched)
     for namespace, settings in _beside(run).items():
         words = ['-r', f'__ns:={namespace}']
         for topic in SHARED_TOPICS:
@@ -108,12 +114,13 @@ def _beside(run: Run) -> dict[str, dict[str, object]]:
     return {} if run.known is None else {BEFORE: {}, UNGATED: dict(NO_GATE)}
 
 
-def _wait(supervisor: Supervisor, run: Run, is_there: Callable[[], bool], missing: str) -> None:
+def _wait(supervisor: Supervisor, run: Run, missing: Callable[[], str]) -> None:
+    """Wait until nothing is missing any more."""
     end = time.monotonic() + PATIENCE_S
-    while not is_there():
+    while what := missing():
         _check(supervisor)
         if time.monotonic() > end:
-            raise DiagnosisError(f'{missing}; logs: {run.folder / "logs"}')
+            raise DiagnosisError(f'{what} after {PATIENCE_S:g} s; logs: {run.folder / "logs"}')
         time.sleep(POLL_S)
 
 
@@ -123,17 +130,20 @@ def _check(supervisor: Supervisor) -> None:
         raise DiagnosisError(f'{ended.name} ended with {ended.process.returncode}: {tail(ended)}')
 
 
-def _are_ready(bag: Path, names: Sequence[str]) -> bool:
-    """Whether all have spoken, and each tracker has its model."""
+def _unready(bag: Path, names: Sequence[str]) -> str:
+    """Who has not spoken yet, or is a tracker without a model."""
     told = last_words(bag)
-    return all(
-        name.strip('/') in told and ('tracker' not in name or 'dipoles' in told[name.strip('/')])
+    missing = [
+        name.strip('/')
         for name in names
-    )
+        if name.strip('/') not in told
+        or ('tracker' in name and 'dipoles' not in told[name.strip('/')])
+    ]
+    return f'{", ".join(missing)} not ready' if missing else ''
 
 
-def _has_flux(bag: Path) -> bool:
+def _unheard(bag: Path) -> str:
     try:
-        return read_bag(bag).tool is not None
-    except AnserError:
-        return False
+        return '' if read_bag(bag).tool is not None else 'no tool flux was recorded'
+    except AnserError as error:
+        return f'nothing was recorded: {error}'

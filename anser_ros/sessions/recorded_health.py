@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from anser_ros.sessions.session import Session
 from anser_ros.wire.bag import MessageDecoder, Salvage, iter_messages
 
 TOPIC = '/diagnostics'
+WARN = 1
 BUSY = {
     'lags': 'stretches of samples that the simulated unit could not make in time',
     'dropped_blocks': 'blocks that the simulated unit could not send',
@@ -35,6 +37,25 @@ def last_words(path: str | os.PathLike[str]) -> dict[str, Mapping[str, str]]:
     except BagError:
         return {}
     return found
+
+
+def first_warnings(path: str | os.PathLike[str], part_of: str) -> dict[str, int]:
+    """When each part of a node first warned: names behind ``part_of: ``, log times in ns."""
+    found: dict[str, int] = {}
+    decoder = MessageDecoder()
+    for raw in iter_messages(path, Salvage()):
+        if raw.topic == TOPIC:
+            for status in decoder.decode(raw).status:
+                node, _, name = status.name.partition(': ')
+                if node == part_of and name and _level(status) == WARN:
+                    found.setdefault(name, raw.log_time_ns)
+    return found
+
+
+def _level(status: Any) -> int:
+    """A level: a ``byte``, which some decoders give as bytes."""
+    level = status.level
+    return level[0] if isinstance(level, bytes) else int(level)
 
 
 def overload(path: str | os.PathLike[str]) -> list[str]:
