@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from anser_ros.diagnosis.fit import Fit, misfit
 from anser_ros.diagnosis.problem import Part, Problem, State, evaluate
-from anser_ros.diagnosis.refine import belongs_to
+from anser_ros.diagnosis.refine import METALS, belongs_to
+from anser_ros.diagnosis.whitening import parts
 from anser_ros.effects.effect import Term
+from anser_ros.effects.fluctuation import Fluctuation
 from anser_ros.effects.metal_remainder import REMAINDER
 
 Array = NDArray[np.float64]
@@ -25,6 +27,13 @@ LARGEST_VARIATION = 0.1
 """Share of an effect's power that may vary."""
 LEAST_OF_THE_REST = 0.2
 """An effect that takes off less than this share of what stays unexplained is not named."""
+LARGEST_REMAINDER = 0.01
+"""Share of an effect's power that may stay where it acts, beyond what stays everywhere. Metal is
+exempt: its shape is never known."""
+CLEAR = 6.0
+"""Standard deviations of the noise's power from which a remainder counts."""
+MANY = 3
+"""So many effects of one name stand in for something else that they have in common."""
 
 
 @dataclass(frozen=True)
@@ -39,16 +48,50 @@ class Confirmation:
         Share of that power that refits in parts of the data take off besides.
     share_of_rest : float
         Its power over the power that stays unexplained.
+    remainder : float
+        Share of its power that stays on the channels and emitters that it changes.
+    alike : int
+        Effects of the same name, or on the same single channel, whichever are more.
+    plausible : bool
+        Whether all parameters are in the effect's range.
+    helps : bool
+        Whether it takes something off the tools' residuals, where it acts on tools.
     """
 
     power: float
     variation: float
     share_of_rest: float
+    remainder: float = 0.0
+    alike: int = 1
+    plausible: bool = True
+    helps: bool = True
 
     @property
     def holds(self) -> bool:
         """Whether the effect may be named."""
-        return self.variation < LARGEST_VARIATION and self.share_of_rest > LEAST_OF_THE_REST
+        return (
+            self.variation < LARGEST_VARIATION
+            and self.share_of_rest > LEAST_OF_THE_REST
+            and self.remainder < LARGEST_REMAINDER
+            and self.alike < MANY
+            and self.plausible
+            and self.helps
+        )
+
+    @property
+    def reason(self) -> str:
+        """Why it may not be named, in words."""
+        if not self.plausible:
+            return 'its parameters are none that it can have'
+        if not self.helps:
+            return 'only the references speak for it, the tools against it'
+        if self.variation >= LARGEST_VARIATION:
+            return 'its parameters differ from one part of the data to the next'
+        if self.remainder >= LARGEST_REMAINDER:
+            return 'where it acts, more stays than it could leave'
+        if self.alike >= MANY:
+            return 'with others of its kind it stands in for something that they share'
+        return 'far more stays unexplained than it explains'
 
 
 def confirm(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmation:
@@ -65,8 +108,100 @@ def confirm(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmatio
         _by_value(fit.state, columns, noise, _sensor_of),
     )
     return Confirmation(
-        power, varying / max(power, 1e-300), power / max(left_tools, 1e-3 * fit.state.count)
+        power,
+        varying / max(power, 1e-300),
+        power / max(left_tools, 1e-3 * fit.state.count),
+        0.0
+        if term.effect.name in METALS
+        else _stays(fit.state, columns, noise) / max(power, 1e-300),
+        _crowd(fit, term),
+        _plausible(fit, term),
+        _helps(without, fit.state, columns),
     )
+
+
+def _helps(without: State, with_it: State, columns: Sequence[Array | None]) -> bool:
+    gain, acts = 0.0, False
+    for before, after, column in zip(without.parts, with_it.parts, columns, strict=True):
+        if column is not None and not after.view.is_reference:
+            acts = True
+            gain += float(np.sum(before.white**2) - np.sum(after.white**2))
+    return gain > 0.0 or not acts
+
+
+def _channels(term: Term) -> set[int]:
+    """Channels that a term is about, where they are one or two."""
+    named = {int(term.site['channel'])} if 'channel' in term.site else set()
+    several = term.site.get('channels', ())
+    return named | (set(several) if len(several) <= 2 else set())
+
+
+def _crowd(fit: Fit, term: Term) -> int:
+    """Terms of a fit with the same name, or about the same channel."""
+    terms = [t for t in fit.terms if t.effect is not REMAINDER]
+    alike = sum(t.effect is term.effect for t in terms)
+    about = [sum(c in _channels(t) for t in terms) for c in _channels(term)]
+    return max([alike, *about])
+
+
+def _plausible(fit: Fit, term: Term) -> bool:
+    """Whether the record's values are in the effect's ranges."""
+    index = next(i for i, t in enumerate(fit.terms) if t is term)
+    record = term.effect.record(term, fit.covariance_of(index))
+    for key, (low, high) in term.effect.plausible.items():
+        value = record.parameters.get(key)
+        if value is None or isinstance(value, str):
+            continue
+        numbers = np.asarray(value, dtype=np.float64)
+        if key == 'matrix':
+            numbers = numbers - np.eye(len(numbers))
+        if numbers.size and (numbers.min() < low or numbers.max() > high):
+            return False
+    return True
+
+
+def _stays(state: State, columns: Sequence[Array | None], noise: float) -> float:
+    """Power beyond the noise in the cells that a term changes, less what cells have in common.
+
+    A cell is what one channel reads of one emitter.
+    """
+    own, rest = [], []
+    for part, column in zip(state.parts, columns, strict=True):
+        if part.view.is_reference:
+            continue
+        sensors, emitters = part.view.flux.shape[1:]
+        shape = (-1, 2, sensors, emitters)
+        excess = part.white**2 - noise * (part.whitener.weight > 0)
+        left = excess.reshape(shape).sum(axis=(0, 1))
+        changed = np.zeros((sensors, emitters), dtype=bool)
+        if column is not None:
+            size = np.abs(column).sum(axis=2).reshape(shape).sum(axis=(0, 1))
+            # The pose's marginalisation spreads a trace of every change over all channels.
+            changed = size > 0.1 * size.max()
+        own.append(left[changed])
+        rest.append(left[~changed])
+        spread = noise * np.sqrt(4.0 * part.white.shape[0])
+    acted, others = np.concatenate(own), np.concatenate(rest)
+    if acted.size == 0:
+        return 0.0
+    if others.size < acted.size:
+        # An effect on everything: what single channels keep is not its fault.
+        stays = float(np.median(acted)) * acted.size
+    else:
+        stays = float(acted.sum() - np.median(others) * acted.size)
+    return stays if stays > CLEAR * spread * np.sqrt(acted.size) else 0.0
+
+
+def _checked_open(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmation:
+    """Check a fluctuation: its likelihood speaks for it, unless much stays where it acts."""
+    without = evaluate(problem, [t for t in fit.terms if t is not term])
+    power = max(without.sum_of_squares - fit.state.sum_of_squares, 1e-300)
+    columns = []
+    for part in fit.state.parts:
+        raw = term.effect.directions(term, part.view)
+        columns.append(None if raw is None else parts(raw) * part.whitener.weight[..., None])
+    stays = _stays(fit.state, columns, noise) / power
+    return Confirmation(power, 0.0, np.inf, stays, _crowd(fit, term))
 
 
 def doubtful(problem: Problem, fit: Fit, noise: float) -> list[tuple[Confirmation, Term]]:
@@ -75,6 +210,11 @@ def doubtful(problem: Problem, fit: Fit, noise: float) -> list[tuple[Confirmatio
         (confirm(problem, fit, term, noise), term)
         for term in fit.terms
         if term.effect is not REMAINDER and term.theta.size
+    ]
+    checks += [
+        (_checked_open(problem, fit, term, noise), term)
+        for term in fit.terms
+        if isinstance(term.effect, Fluctuation)
     ]
     bad = [(check, term) for check, term in checks if not check.holds]
     return sorted(bad, key=lambda pair: pair[0].power)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.confirm import Confirmation, doubtful
+from anser_ros.diagnosis.confirm import MANY, Confirmation, doubtful
 from anser_ros.diagnosis.corrected_model import corrected_model
 from anser_ros.diagnosis.fit import Fit, misfit
 from anser_ros.diagnosis.outlying import clean_start, outlying_share, without_outliers
@@ -24,6 +24,8 @@ from anser_ros.diagnosis.structure import (
     noise_t,
     structure_tests,
 )
+from anser_ros.diagnosis.whiteness import whiteness
+from anser_ros.diagnosis.wiring import wiring_faults
 from anser_ros.effects.effect import Effect, Term
 from anser_ros.effects.metal_remainder import REMAINDER
 from anser_ros.effects.registry import all_effects
@@ -31,13 +33,11 @@ from anser_ros.fitting.model import EffectRecord, FieldModel
 
 Array = NDArray[np.float64]
 
-SEARCH_FRAMES, FINAL_FRAMES = 270, 400
-"""Frames a tool that the search and the last fit work on."""
+SEARCH_FRAMES, FINAL_FRAMES, WIRING_FRAMES = 270, 400, 150
+"""Frames a tool that the search, the last fit and the look for wiring faults work on."""
 NOISIER = 1.15
 """Factor from which noise counts as grown."""
 FEWEST_OUTLIERS = 0.004
-TURNED_ROUND = 0.3
-"""A gain within this of -1 is a polarity."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def diagnose(
     """
     how, say = settings or SearchSettings(), progress or (lambda text: None)
     blocks = train_blocks()
-    known = _polarities(problem)
+    known, problem = _wired(problem)
     whole = problem
     problem = clean_start(problem) if not known else problem
     training = problem.in_blocks(blocks)
@@ -135,35 +135,30 @@ def diagnose(
     return _concluded(whole, cleaned, fit, search, refused, model)
 
 
+def _wired(problem: Problem) -> tuple[list[Term], Problem]:
+    """Faults of the wiring, and the problem without channels that hear nothing."""
+    known = wiring_faults(_thinned(problem, WIRING_FRAMES))
+    dead = [
+        c for term in known if term.effect.name == 'dead_channel' for c in term.site['channels']
+    ]
+    good = tuple(
+        mask & ~np.isin(tool.sensors.channel, dead)
+        for tool, mask in zip(problem.tools, problem.good, strict=True)
+    )
+    references = problem.references
+    if references is not None:
+        heard = ~np.isin(references.readings.sensors.channel, dead)
+        valid = references.readings.valid & heard
+        references = replace(references, readings=replace(references.readings, valid=valid))
+    return known, replace(problem, good=good, references=references)
+
+
 def _thinned(problem: Problem, frames: int) -> Problem:
     """About so many frames a tool."""
     most = max((tool.time.size for tool in problem.tools), default=0)
     step = max(1, round(most / frames))
     keep = [np.arange(0, tool.time.size, step) for tool in problem.tools]
     return problem.frames(keep, np.arange(problem.reference_blocks.size))
-
-
-def _polarities(problem: Problem) -> list[Term]:
-    """Channels whose readings are the prediction turned round."""
-    effect = all_effects()['sensor_polarity']
-    state = evaluate(_thinned(problem, 150), ())
-    turned = []
-    for part, tool, good in zip(
-        state.parts, state.problem.tools, state.problem.good, strict=False
-    ):
-        for row, channel in enumerate(tool.sensors.channel.tolist()):
-            use = good[:, row]
-            seen, wanted = tool.flux[use, row].ravel(), part.view.flux[use, row].ravel()
-            power = float(np.sum(np.abs(wanted) ** 2))
-            if power == 0.0:
-                continue
-            gain = complex(np.sum(wanted.conj() * seen) / power)
-            fit = abs(np.sum(wanted.conj() * seen)) / np.sqrt(
-                power * max(float(np.sum(np.abs(seen) ** 2)), 1e-300)
-            )
-            if abs(gain + 1) < TURNED_ROUND and fit > 0.9:
-                turned.append(int(channel))
-    return [Term(effect, {'channels': tuple(turned)})] if turned else []
 
 
 def _confirmed(
@@ -177,7 +172,8 @@ def _confirmed(
             break
         # Metal that is doubtful costs much to fit again and is hardly ever more than a stand-in.
         metal = [pair for pair in bad if pair[1].effect.name in METALS]
-        dropped = metal or bad[:1]
+        crowd = [pair for pair in bad if pair[0].alike >= MANY]
+        dropped = metal or crowd or bad[:1]
         refused += [(term, check) for check, term in dropped]
         gone = [term for _, term in dropped]
         rest = [t for t in fit.terms if not any(t is term or belongs_to(t, term) for term in gone)]
@@ -216,8 +212,11 @@ def _concluded(
 ) -> Diagnosis:
     unseen = cleaned.in_blocks(test_blocks())
     before, after = evaluate(unseen, ()), evaluate(unseen, fit.terms)
-    scale = noise_scale(after)
+    white = whiteness(after)
     expected = cleaned.spread.flux_t
+    # Residuals that are no noise must not make the floor that they are measured by.
+    grown = noise_t(after) > NOISIER * cleaned.spread.noise_t
+    scale = min(noise_scale(after), 1.0) if grown and not white.holds else noise_scale(after)
     floor = min(scale * expected, rms(after))
     tests = tuple(structure_tests(after))
     excess = max(rms(after) ** 2 - floor**2, 0.0)
@@ -230,7 +229,10 @@ def _concluded(
     ]
     findings += _noise_findings(whole, cleaned, after, significant)
     records = [finding.record for finding in findings]
-    depends = tuple(t.variable for t in tests if t.significant) if excess > 0.05 * floor**2 else ()
+    depends: tuple[str, ...] = ()
+    if excess > 0.05 * floor**2:
+        named = [t.variable for t in tests if t.significant]
+        depends = tuple(dict.fromkeys([*(white.depends_on if grown else ()), *named]))
     return Diagnosis(
         findings=tuple(findings),
         flux_rms_before_t=rms(before),
@@ -282,11 +284,12 @@ def _noise_findings(
     share, channels = outlying_share(whole, cleaned)
     effects: dict[str, Effect] = all_effects()
     frames = sum(tool.time.size for tool in whole.tools)
-    if share > FEWEST_OUTLIERS:
+    if share > FEWEST_OUTLIERS and (channels or not significant):
         site = {'fraction': share, 'sigma': float(np.sqrt(share / max(frames, 1)))}
         if channels:
             site['channels'] = tuple(channels)
-        found.append(_plain(effects['outliers'], site, rms(after)))
+        name = 'loose_contact' if channels else 'outliers'
+        found.append(_plain(effects[name], site, rms(after)))
     factor = noise_t(after) / whole.spread.noise_t
     if factor > NOISIER and not significant:
         noisy = _noisy_channels(after)

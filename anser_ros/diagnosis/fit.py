@@ -51,8 +51,8 @@ class Fit:
         return self.covariance[rows, rows]
 
     def held_out(self, folds: int) -> float:
-        """Cross-validated sum of squares, linear about the optimum."""
-        return self.sums.held_out(self.prior, folds)
+        """Cross-validated sum of squares, linear about the optimum, and what freedom cost."""
+        return self.sums.held_out(self.prior, folds) + self.state.penalty
 
 
 def fit_terms(

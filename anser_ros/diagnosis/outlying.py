@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from anser_ros.diagnosis.problem import Problem, State, evaluate
+from anser_ros.effects.fluctuation import Fluctuation
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -20,6 +21,7 @@ frame (ten times as many) is no member of the same distribution; noise passes on
 def find_outliers(state: State) -> tuple[Mask, ...]:
     """Mask (F, S) of outlying readings, one a tool; a frame that stands out is out as a whole."""
     masks = []
+    moves = any(isinstance(term.effect, Fluctuation) for term in state.terms)
     for part, good in zip(state.parts, state.problem.good, strict=False):
         emitters = state.problem.fields.omega.size
         # The residual along the pose's own directions is left in: an optical glitch shows there.
@@ -30,7 +32,8 @@ def find_outliers(state: State) -> tuple[Mask, ...]:
         frames = np.where(good, readings, 0.0).sum(axis=1) / count
         jumps = np.where(good, _by_reading(size, good.shape[1], emitters), 0.0).sum(axis=1) / count
         bad = _stands_out(readings, READING_RATIO) | _stands_out(frames[:, None], FRAME_RATIO)
-        bad |= _stands_out(jumps[:, None], 40.0)
+        if not moves:
+            bad |= _stands_out(jumps[:, None], 40.0)
         masks.append(bad & good)
     return tuple(masks)
 

@@ -127,6 +127,11 @@ class State:
         return float(sum(np.sum(part.white**2) for part in self.parts))
 
     @property
+    def penalty(self) -> float:
+        """What the freedom that fluctuating effects leave to each frame costs."""
+        return float(sum(part.whitener.penalty for part in self.parts))
+
+    @property
     def count(self) -> int:
         """Values that count."""
         return sum(part.count for part in self.parts)
@@ -150,11 +155,19 @@ def evaluate(problem: Problem, terms: Sequence[Term]) -> State:
         view = tool_view(tool, terms, problem.fields)
         residual = parts(np.where(good[..., None], tool.flux - view.flux, 0.0))
         weight = _repeat(good / problem.spread.flux_t, tool.flux.shape[2])
-        whitener = Whitener.of(weight, pose_jacobian(view), problem.spread)
+        jitter = np.repeat([problem.spread.position_m, problem.spread.rotation_rad], 3)
+        pose = pose_jacobian(view) * jitter
+        whitener = Whitener.of(weight, _with_free(pose, terms, view), pose.shape[2])
         found.append(Part(view, residual, whitener, whitener(residual), blocks))
     if problem.references is not None and problem.references.readings.time.size:
         found.append(_reference_part(problem, problem.references, terms))
     return State(problem, tuple(terms), tuple(found))
+
+
+def _with_free(known: Array, terms: Sequence[Term], view: View) -> Array:
+    """Directions (F, n, m) that are known, and those that fluctuating effects leave open."""
+    found = [term.effect.directions(term, view) for term in terms]
+    return np.concatenate([known, *(parts(d) for d in found if d is not None)], axis=2)
 
 
 def _repeat(per_sensor: Array, emitters: int) -> Array:
@@ -183,7 +196,9 @@ def _reference_part(problem: Problem, references: References, terms: Sequence[Te
         gradient += GRADIENT_ERROR * np.abs(alone.flux - references.baseline) * together
     spread = np.sqrt(noise[..., None] ** 2 + survey**2 + gradient**2)
     weight = np.where(good[..., None], 1 / spread, 0.0).reshape(good.shape[0], -1)
-    whitener = Whitener(np.concatenate([weight, weight], axis=1))
+    weight = np.concatenate([weight, weight], axis=1)
+    free = _with_free(np.zeros((*weight.shape, 0)), terms, view)
+    whitener = Whitener.of(weight, free) if free.shape[2] else Whitener(weight)
     return Part(view, residual, whitener, whitener(residual), problem.reference_blocks)
 
 

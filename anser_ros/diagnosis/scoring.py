@@ -186,7 +186,7 @@ class Scorer:
         self.prior = np.concatenate([t.effect.prior(t) for t in terms] or [np.zeros(0)])
         empty: list[Array | None] = [None] * len(state.parts)
         self.sums = block_sums(state, self._active or empty, blocks)
-        self.held_out = self.sums.held_out(self.prior, folds)
+        self.held_out = self.sums.held_out(self.prior, folds) + state.penalty
 
     def score(self, term: 'Term') -> Score | None:
         """Worth of a candidate; None when it touches no value."""
@@ -202,7 +202,8 @@ class Scorer:
         prior = np.where(scale > 0, 1e4 / np.maximum(scale, 1e-300), 1.0)
         full_prior = np.concatenate([self.prior, prior])
         estimate, _ = sums.solve(full_prior)
-        return Score(sums.held_out(full_prior, self.folds), estimate[-width:], own)
+        left = sums.held_out(full_prior, self.folds) + self.state.penalty
+        return Score(left, estimate[-width:], own)
 
     def _beside(self, probe: Columns, own: BlockSums) -> BlockSums:
         active = self.sums

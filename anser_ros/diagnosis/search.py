@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from anser_ros.diagnosis.confirm import doubtful
 from anser_ros.diagnosis.fit import Fit, fit_terms, misfit
+from anser_ros.diagnosis.fluctuating import fluctuation_of, left_over
 from anser_ros.diagnosis.problem import Problem
 from anser_ros.diagnosis.refine import METALS, settled
 from anser_ros.diagnosis.scoring import BlockSums, Score, Scorer
 from anser_ros.diagnosis.structure import noise_scale
 from anser_ros.effects.effect import Effect, Term
+from anser_ros.effects.fluctuation import Fluctuation
 from anser_ros.effects.metal_remainder import REMAINDER
 from anser_ros.effects.moving_metal import MovingMetal
 from anser_ros.effects.registry import all_effects
@@ -35,6 +37,18 @@ the cause, and further effects would only stand in for it."""
 PLAIN_TO_SEE = 5.0
 """An effect whose parameters stand so many times above what it must gain is not tried without."""
 MOST_METALS = 2
+OPEN, OPEN_FINALISTS = 40, 3
+"""Parameters that a fluctuation counts for: more than a constant effect, less than shaped metal;
+and how many of them are tried in full."""
+OTHERS = 2.0
+"""What a fluctuation takes off others, over what values alike would lose."""
+LEAST_OF_EXCESS = 0.4
+"""Share of what is left to explain that a fluctuation, or metal at another place in each block of
+time, must explain."""
+NOTHING_LEFT = 1.04
+"""Misfit over the noise's up to which nothing but noise is left."""
+TOLD_APART = 0.05
+"""A candidate of whose power the fluctuations in force leave less can't be told from them."""
 APART = 0.12
 """Distance (m) from metal in force within which further metal is the same body's."""
 
@@ -138,6 +152,16 @@ def search_effects(
     return search
 
 
+def complexity(term: Term) -> int:
+    """Parameters that are paid for when explanations are compared."""
+    return OPEN if isinstance(term.effect, Fluctuation) else int(term.theta.size)
+
+
+def at_floor(fit: Fit) -> bool:
+    """Whether a fit leaves nothing but noise."""
+    return misfit(fit) < NOTHING_LEFT * max(noise_scale(fit.state) ** 2, 1.0)
+
+
 def worth(gain: float, parameters: int, fit: Fit, how: SearchSettings) -> bool:
     """Whether a gain pays for its parameters, with this fit left."""
     left = max(misfit(fit), 1.0)
@@ -155,21 +179,25 @@ def _round(
     scorer = Scorer(before.state, blocks, how.folds)
     scored = _scored(problem, scorer)
     table = [Candidate(t, s.solution.size, scorer.held_out - s.held_out) for t, s in scored]
+    open_ones = _fluctuating(problem, before, how)
+    table += [Candidate(t, complexity(t), g) for g, t in open_ones]
     starts = _finalists(scored, scorer, how) + _moving(problem, scored, scorer, blocks)
     fitted: list[tuple[float, Fit]] = []
-    for expected, term in sorted(starts, key=lambda pair: -pair[0]):
+    for expected, term in sorted(starts + open_ones, key=lambda pair: -pair[0]):
         if fitted and expected < PROMISING * max(g for g, _ in fitted):
             continue
+        if any(at_floor(f) and complexity(term) > complexity(f.terms[-1]) for _, f in fitted):
+            continue
         fit = fit_terms(problem, [*before.terms, term], blocks, how.iterations)
-        gain = scorer.held_out - fit.held_out(how.folds)
+        gain = scorer.held_out - fit.held_out(how.folds) - _taken_from_others(fit)
         fitted.append((gain, fit))
-        table.append(Candidate(fit.terms[-1], term.theta.size, gain, gain))
+        table.append(Candidate(fit.terms[-1], complexity(term), gain, gain))
     search.rounds.append(sorted(table, key=lambda c: -c.gain))
     if not fitted:
         return None
     gain, best = choose(fitted, how)
     term = best.terms[-1]
-    if not worth(gain, term.theta.size, best, how):
+    if not worth(gain, complexity(term), best, how):
         return None
     if term.effect.name in METALS and gain < REMNANT * search.metal_gain:
         return None
@@ -185,19 +213,58 @@ def _round(
     return best
 
 
+def _taken_from_others(fit: Fit) -> float:
+    """What a new fluctuation's freedom takes off that is some other effect's, still unexplained.
+
+    Along each of its columns a frame loses one value's share of whatever stays.
+    """
+    spread = fit.terms[-1].site.get('_spread')
+    if spread is None:
+        return 0.0
+    frames = int(fit.terms[-1].site.get('_frames', 0))
+    return OTHERS * frames * len(spread) * max(misfit(fit) - 1.0, 0.0)
+
+
 def choose(fitted: Sequence[tuple[float, Fit]], how: SearchSettings) -> tuple[float, Fit]:
-    """The best fit, or a simpler one that is as good within what its parameters could gain."""
+    """The best fit, or a simpler one that is as good within what its parameters could gain.
+
+    Where several leave nothing but noise, the simplest is the explanation.
+    """
     gain, best = max(fitted, key=lambda pair: pair[0])
+    most = complexity(best.terms[-1])
     simpler = [
         (g, f)
         for g, f in fitted
-        if f.terms[-1].theta.size < best.terms[-1].theta.size
-        and gain - g
-        < (10 + 4 * (best.terms[-1].theta.size - f.terms[-1].theta.size)) * max(misfit(best), 1.0)
+        if complexity(f.terms[-1]) < most
+        and gain - g < (10 + 4 * (most - complexity(f.terms[-1]))) * max(misfit(best), 1.0)
+    ]
+    simpler += [
+        (g, f)
+        for g, f in fitted
+        if isinstance(f.terms[-1].effect, Fluctuation)
+        and complexity(f.terms[-1]) < most
+        and at_floor(f)
     ]
     if not simpler:
         return gain, best
-    return min(simpler, key=lambda pair: (pair[1].terms[-1].theta.size, -pair[0]))
+    return min(simpler, key=lambda pair: (complexity(pair[1].terms[-1]), -pair[0]))
+
+
+def _fluctuating(problem: Problem, before: Fit, how: SearchSettings) -> list[tuple[float, Term]]:
+    """The fluctuations that explain most of what is there to explain."""
+    excess = before.state.sum_of_squares - before.state.count
+    found = []
+    for effect in all_effects().values():
+        if not isinstance(effect, Fluctuation):
+            continue
+        for term in effect.candidates(problem.scene):
+            if any(_same(term, other) for other in before.terms):
+                continue
+            likeliest = fluctuation_of(before.state, term)
+            least = max(how.least_gain, LEAST_OF_EXCESS * excess)
+            if likeliest is not None and likeliest[0] > least:
+                found.append(likeliest)
+    return sorted(found, key=lambda pair: -pair[0])[:OPEN_FINALISTS]
 
 
 def _scored(problem: Problem, scorer: Scorer) -> list[tuple[Term, Score]]:
@@ -215,6 +282,8 @@ def _scored(problem: Problem, scorer: Scorer) -> list[tuple[Term, Score]]:
                 continue
             if effect.name in METALS and (moving or metals >= MOST_METALS):
                 continue
+            if left_over(scorer.state, term) < TOLD_APART:
+                continue
             score = scorer.score(term)
             if score is not None:
                 out.append((term, score))
@@ -223,6 +292,8 @@ def _scored(problem: Problem, scorer: Scorer) -> list[tuple[Term, Score]]:
 
 def _same(term: Term, other: Term) -> bool:
     """Whether a candidate is what another term stands for already."""
+    if isinstance(other.effect, Fluctuation) and term.effect.name == other.effect.of.name:
+        return _site(term) == _site(other)
     if term.effect is not other.effect:
         return False
     if term.effect.name == 'static_metal':
@@ -272,7 +343,8 @@ def _moving(
     first, last = np.arange(window), np.arange(blocks.size - window, blocks.size)
     own = [(t, s.own) for t, s in places]
     alone = sum(max(_gain(sums, np.array([i])) for _, sums in own) for i in range(blocks.size))
-    if alone < 1.05 * (scorer.held_out - still) + 100:
+    excess = scorer.state.sum_of_squares - scorer.state.count
+    if alone < max(1.05 * (scorer.held_out - still) + 100, LEAST_OF_EXCESS * excess):
         return []
     ends = []
     for rows in (first, last):
@@ -316,14 +388,17 @@ def _thin_out(
         full = search.fit.held_out(how.folds)
         newest = [t for t in terms if t.effect is not REMAINDER][-1]
         for index, term in enumerate(terms):
-            if term is newest or term.effect is REMAINDER or term.theta.size == 0:
+            fixed = term.theta.size == 0 and not isinstance(term.effect, Fluctuation)
+            if term is newest or term.effect is REMAINDER or fixed:
                 continue
-            if worth(_wald(search.fit, index) / PLAIN_TO_SEE, term.theta.size, search.fit, how):
+            if term.theta.size and worth(
+                _wald(search.fit, index) / PLAIN_TO_SEE, term.theta.size, search.fit, how
+            ):
                 continue
             rest = [t for t in terms if t is not term]
             without = settled(problem, rest, blocks, how.folds, how.iterations)
             gain = without.held_out(how.folds) - full
-            if not worth(gain, term.theta.size, search.fit, how):
+            if not worth(gain, complexity(term), search.fit, how):
                 search.removed.append(term)
                 search.fit = without
                 break

@@ -44,10 +44,7 @@ def parts(values: ComplexArray) -> Array:
 
 def pose_jacobian(view: View) -> Array:
     """Derivative of the flux parts by the body's pose, (F, 2 S K, 6): m, rad about fg's axes."""
-    lever = view.centres - view.position[:, None, :]
-    turn = np.cross(lever[..., :, None], view.d_position, axis=2)
-    turn = turn + np.cross(view.axes[..., :, None], view.d_axis, axis=2)
-    columns = np.concatenate([view.d_position, turn], axis=2)
+    columns = np.concatenate([view.d_position, view.d_turn], axis=2)
     return parts(np.moveaxis(columns, 2, -1))
 
 
@@ -59,29 +56,36 @@ class Whitener:
     ----------
     weight : ndarray, shape (F, n)
         Inverse noise; 0 where a value must not count.
-    basis : ndarray, shape (F, n, 6), or None
-        Weighted pose directions, scaled by the jitter.
-    inner : ndarray, shape (F, 6, 6), or None
+    basis : ndarray, shape (F, n, m), or None
+        Weighted directions along which a frame may move, a standard deviation long.
+    inner : ndarray, shape (F, m, m), or None
         What is taken off between the two projections.
+    penalty : float
+        What -2 log likelihood grows by with the directions beyond the pose's (their log det).
     """
 
     weight: Array
     basis: Array | None = None
     inner: Array | None = None
+    penalty: float = 0.0
 
     @staticmethod
-    def of(weight: Array, jacobian: Array, spread: Spread) -> 'Whitener':
-        """From weights (F, n) and the pose Jacobian (F, n, 6)."""
-        jitter = np.repeat([spread.position_m, spread.rotation_rad], 3)
-        basis = jacobian * jitter * weight[..., None]
-        values, vectors = np.linalg.eigh(basis.transpose(0, 2, 1) @ basis)
+    def of(weight: Array, directions: Array, known: int = 0) -> 'Whitener':
+        """From weights (F, n) and directions (F, n, m), the first ``known`` of them the pose's."""
+        basis = directions * weight[..., None]
+        gram = basis.transpose(0, 2, 1) @ basis
+        values, vectors = np.linalg.eigh(gram)
         values = np.maximum(values, 0.0)
         # (I + A A^T)^(-1/2) = I - A V diag(g) V^T A^T with g = (1 - 1/sqrt(1 + s^2)) / s^2.
         shrink = np.where(
             values > 1e-9, (1 - 1 / np.sqrt(1 + values)) / np.maximum(values, 1e-12), 0.5
         )
         inner = (vectors * shrink[:, None, :]) @ vectors.transpose(0, 2, 1)
-        return Whitener(weight, basis, inner)
+        penalty = 0.0
+        if basis.shape[2] > known:
+            pose = np.eye(known) + gram[:, :known, :known]
+            penalty = float(np.log1p(values).sum() - np.linalg.slogdet(pose)[1].sum())
+        return Whitener(weight, basis, inner, penalty)
 
     def rows(self, frames: NDArray[np.int64]) -> 'Whitener':
         """The whitener of some frames, by index."""
@@ -89,6 +93,15 @@ class Whitener:
         return Whitener(
             self.weight[frames], basis, None if self.inner is None else self.inner[frames]
         )
+
+    def first(self, count: int) -> 'Whitener':
+        """The whitener with the first directions only."""
+        if self.basis is None or count == self.basis.shape[2]:
+            return self
+        if count == 0:
+            return Whitener(self.weight)
+        weight = np.where(self.weight > 0, self.weight, 1.0)
+        return Whitener.of(self.weight, self.basis[..., :count] / weight[..., None], count)
 
     def __call__(self, values: Array) -> Array:
         """Whiten (F, n) or (F, n, q)."""
@@ -98,11 +111,11 @@ class Whitener:
             out = out - self.basis @ (self.inner @ (self.basis.transpose(0, 2, 1) @ out))
         return out[..., 0] if single else out
 
-    def jitter(self, values: Array) -> Array:
-        """Most probable pose error of each frame in units of its prior, from (F, n): (F, 6)."""
+    def moves(self, values: Array) -> Array:
+        """Most probable move of each frame along each direction, in its spread: (F, m)."""
         if self.basis is None:
-            return np.zeros((values.shape[0], 6))
+            return np.zeros((values.shape[0], 0))
         y = values * self.weight
-        normal = self.basis.transpose(0, 2, 1) @ self.basis + np.eye(6)
+        normal = self.basis.transpose(0, 2, 1) @ self.basis + np.eye(self.basis.shape[2])
         right = self.basis.transpose(0, 2, 1) @ y[..., None]
         return np.asarray(np.linalg.solve(normal, right)[..., 0])

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Remedy, Term
+from anser_ros.effects.effect import Remedy, Term, unit_matrix
 from anser_ros.effects.registry import effect_named
 from anser_ros.fitting.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
@@ -22,7 +22,7 @@ ComplexArray = NDArray[np.complex128]
 
 DECOMPRESSION_STEPS = 12
 DRIFTS = ('coil_drift', 'coil_fluctuation')
-"""Effects whose course over time the references can tell."""
+"""Effects whose course over time another session doesn't repeat; the references can tell it."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,11 @@ class Correction:
         """Whether `flux` does anything."""
         return bool(self._with(Remedy.FLUX))
 
+    @property
+    def drifting(self) -> tuple[str, ...]:
+        """Effects that only references, or a recorded course, can correct."""
+        return tuple(term.label for term in self.terms if term.effect.name in DRIFTS)
+
     def sensors(self, table: SensorTable | None = None) -> SensorTable:
         """The sensors (by default those given at the start) as they truly are."""
         out = self.surveyed if table is None else table
@@ -96,6 +101,8 @@ class Correction:
         channels: NDArray[np.generic],
         flux: ComplexArray,
         strengths: ComplexArray | None = None,
+        *,
+        recorded: bool = False,
     ) -> ComplexArray:
         """A frame's fluxes as sound sensors and emitters would have given them.
 
@@ -103,13 +110,15 @@ class Correction:
         ----------
         time : float
             s since the start of the session that the model was diagnosed on; only effects that
-            change with time use it, and only where ``strengths`` is not given.
+            change with time use it, and only where they are ``recorded``.
         channels : ndarray, shape (S,)
         flux : ndarray, shape (S, K), complex
             T. A row with NaN stays NaN.
         strengths : ndarray, shape (K,), complex, optional
-            What the references say about the emitters now (`strengths`); it takes the place of the
-            recorded drift of the emitters that drift.
+            What the references say about the emitters now (`strengths`), for those that drift.
+        recorded : bool
+            Whether the course that a drift took in the diagnosed session holds, because this is
+            that session. Without it and without ``strengths`` a drift is left as it is.
 
         Returns
         -------
@@ -135,24 +144,25 @@ class Correction:
             gain = term.effect.channel_gain(term, number, np.array([time]))
             values = values if gain is None else values / gain[0][:, None]
         for term in reversed(terms):
-            matrix = self._emitters(term, time, strengths)
+            matrix = self._emitters(term, time, strengths, recorded)
             if matrix is not None:
                 values = np.asarray(np.linalg.solve(matrix, values.T).T, dtype=complex)
         out[good] = values
         return out
 
     def _emitters(
-        self, term: Term, time: float, strengths: ComplexArray | None
+        self, term: Term, time: float, strengths: ComplexArray | None, recorded: bool
     ) -> ComplexArray | None:
+        if term.effect.name in DRIFTS:
+            if strengths is not None:
+                coil = int(term.site['coil'])
+                live = unit_matrix(self.omega.size)
+                live[coil, coil] = strengths[coil]
+                return live
+            if not recorded:
+                return None
         matrix = term.effect.emitter_matrix(term, np.array([time]), self.omega)
-        if matrix is None:
-            return None
-        if strengths is not None and term.effect.name in DRIFTS:
-            coil = int(term.site['coil'])
-            live: ComplexArray = matrix[0].copy()
-            live[coil, coil] = strengths[coil]
-            return live
-        return np.asarray(matrix[0])
+        return None if matrix is None else np.asarray(matrix[0])
 
     @staticmethod
     def _decompressed(

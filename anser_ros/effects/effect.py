@@ -119,6 +119,8 @@ class View:
     flux : ndarray, shape (F, S, K), complex
     d_position, d_axis : ndarray, shape (F, S, 3, K), complex
         Derivatives by the sensor's centre (T/m) and by its axis vector (T).
+    d_turn : ndarray, shape (F, S, 3, K), complex
+        Derivative by a turn of the body about its origin, along fg's axes, T/rad.
     dipoles : Dipoles
         The field that the sensors see (static part).
     illumination : Dipoles
@@ -137,6 +139,7 @@ class View:
     flux: ComplexArray
     d_position: ComplexArray
     d_axis: ComplexArray
+    d_turn: ComplexArray
     dipoles: Dipoles
     illumination: Dipoles
     omega: Array
@@ -155,7 +158,7 @@ class View:
         """The frames named by index."""
         each = (
             'time', 'position', 'rotation', 'velocity', 'centres', 'axes', 'linear', 'flux',
-            'd_position', 'd_axis',
+            'd_position', 'd_axis', 'd_turn',
         )  # fmt: skip
         return replace(self, **{name: getattr(self, name)[rows] for name in each})
 
@@ -258,6 +261,10 @@ class Effect:
     def probe(self, term: Term, view: View) -> ComplexArray | None:
         """Linear columns that tell quickly whether the effect is there; by default `columns`."""
         return self.columns(term, view)
+
+    def directions(self, term: Term, view: View) -> ComplexArray | None:
+        """Columns (F, S, K, q), a standard deviation long, along which every frame may move."""
+        return None
 
     def started(self, term: Term, solution: Array) -> Sequence[Term]:
         """Start values for the full fit from the solution of the probe."""

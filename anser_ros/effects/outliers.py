@@ -28,4 +28,11 @@ class Outliers(Effect):
         return Term(self, {'fraction': float(needed(record, 'fraction')), 'sigma': 0.0})
 
 
-EFFECTS = (Outliers(),)
+class LooseContact(Outliers):
+    """As `Outliers`, where always the same channels stand out."""
+
+    name = 'loose_contact'
+    summary = 'single readings of a channel fail now and then'
+
+
+EFFECTS = (Outliers(), LooseContact())

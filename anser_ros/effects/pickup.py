@@ -37,8 +37,11 @@ class Pickup(Effect):
     remedy = Remedy.FLUX
 
     def candidates(self, scene: Scene) -> Sequence[Term]:
-        """Every channel."""
-        return [Term(self, {'channel': c}, np.zeros(2 * scene.emitters)) for c in scene.channels]
+        """Every channel of a tool."""
+        return [self._at(c, scene) for c in scene.tool_channels]
+
+    def _at(self, channel: int, scene: Scene) -> Term:
+        return Term(self, {'channel': channel}, np.zeros(2 * scene.emitters))
 
     def prior(self, term: Term) -> Array:
         """Some tens of nanotesla."""
@@ -85,4 +88,15 @@ class Pickup(Effect):
         return Term(self, {'channel': int(needed(record, 'channel'))}, parts.T.ravel() / UNIT)
 
 
-EFFECTS = (Pickup(),)
+class ReferenceChanged(Pickup):
+    """As `Pickup`, of a reference sensor: it doesn't move, so any lasting change is a constant."""
+
+    name = 'reference_changed'
+    summary = "a reference sensor's reading changed for good: it was moved, turned or picks up"
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """Every reference channel."""
+        return [self._at(c, scene) for c in scene.channels if c not in scene.tool_channels]
+
+
+EFFECTS = (Pickup(), ReferenceChanged())

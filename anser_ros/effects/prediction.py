@@ -58,12 +58,14 @@ def tool_view(body: Measurements, terms: Sequence[Term], fields: Fields) -> View
         dipoles.positions, dipoles.directions, dipoles.moments,
     )  # fmt: skip
     shape = (body.time.size, len(sensors))
+    d_position, d_axis = d_position.reshape(*shape, 3, -1), d_axis.reshape(*shape, 3, -1)
+    lever = (centres - position[:, None, :])[..., :, None]
+    d_turn = np.cross(lever, d_position, axis=2) + np.cross(axes[..., :, None], d_axis, axis=2)
     view = View(
         time=body.time, sensors=sensors, position=position, rotation=rotation, velocity=velocity,
         centres=centres, axes=axes, linear=flux.reshape(*shape, -1),
-        flux=flux.reshape(*shape, -1), d_position=d_position.reshape(*shape, 3, -1),
-        d_axis=d_axis.reshape(*shape, 3, -1), dipoles=dipoles, illumination=fields.illumination,
-        omega=fields.omega, is_reference=False,
+        flux=flux.reshape(*shape, -1), d_position=d_position, d_axis=d_axis, d_turn=d_turn,
+        dipoles=dipoles, illumination=fields.illumination, omega=fields.omega, is_reference=False,
     )  # fmt: skip
     return _measured(_with_motion(view, terms), terms)
 
@@ -95,6 +97,7 @@ def reference_view(
         linear=linear, flux=linear,
         d_position=np.broadcast_to(d_position, (frames, *d_position.shape)),
         d_axis=np.broadcast_to(d_axis, (frames, *d_axis.shape)),
+        d_turn=np.broadcast_to(np.zeros_like(d_axis), (frames, *d_axis.shape)),
         dipoles=base.joined(added), illumination=base, omega=fields.omega, is_reference=True,
     )  # fmt: skip
     return _measured(_with_motion(view, terms), terms)
@@ -153,32 +156,35 @@ def _with_motion(view: View, terms: Sequence[Term]) -> View:
 
 def _measured(view: View, terms: Sequence[Term]) -> View:
     """Emitters, channels, offsets and compression."""
-    linear, d_position, d_axis = view.linear, view.d_position, view.d_axis
-    channels = view.sensors.channel
+    linear, channels = view.linear, view.sensors.channel
+    # The derivatives go the way that the flux goes.
+    slopes = [view.d_position, view.d_axis, view.d_turn]
     for term in terms:
         matrix = term.effect.emitter_matrix(term, view.time, view.omega)
         if matrix is not None:
-            linear = np.einsum('fab,fsb->fsa', _frames(matrix, view), linear)
-            d_position = np.einsum('fab,fsib->fsia', _frames(matrix, view), d_position)
-            d_axis = np.einsum('fab,fsib->fsia', _frames(matrix, view), d_axis)
+            mixed = _frames(matrix, view)
+            linear = np.einsum('fab,fsb->fsa', mixed, linear)
+            slopes = [np.einsum('fab,fsib->fsia', mixed, slope) for slope in slopes]
     for term in terms:
         gain = term.effect.channel_gain(term, channels, view.time)
         if gain is not None:
             linear = linear * gain[..., None]
-            d_position, d_axis = d_position * gain[..., None, None], d_axis * gain[..., None, None]
+            slopes = [slope * gain[..., None, None] for slope in slopes]
     for term in terms:
         mixing = term.effect.channel_matrix(term, channels)
         if mixing is not None:
             linear = np.einsum('st,ftk->fsk', mixing, linear)
-            d_position = np.einsum('st,ftik->fsik', mixing, d_position)
-            d_axis = np.einsum('st,ftik->fsik', mixing, d_axis)
+            slopes = [np.einsum('st,ftik->fsik', mixing, slope) for slope in slopes]
     flux = linear
     for term in terms:
         added = term.effect.offset(term, channels, view.omega.size)
         flux = flux if added is None else flux + added
     for term in terms:
         flux = term.effect.compress(term, channels, flux)
-    return replace(view, linear=linear, flux=flux, d_position=d_position, d_axis=d_axis)
+    d_position, d_axis, d_turn = slopes
+    return replace(
+        view, linear=linear, flux=flux, d_position=d_position, d_axis=d_axis, d_turn=d_turn
+    )
 
 
 def _frames(matrix: ComplexArray, view: View) -> ComplexArray:

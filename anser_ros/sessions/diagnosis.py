@@ -11,12 +11,17 @@ from anser_ros.diagnosis.diagnose import Diagnosis, diagnose
 from anser_ros.diagnosis.prepare import build_problem, test_blocks
 from anser_ros.diagnosis.problem import Problem
 from anser_ros.diagnosis.whitening import Spread
-from anser_ros.effects.correction import Correction
+from anser_ros.effects.correction import DRIFTS, Correction
 from anser_ros.errors import DiagnosisError, SetupError
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.nominal import nominal_model
-from anser_ros.sessions.evaluation import baseline_flux, track_session
+from anser_ros.sessions.evaluation import (
+    FOUND_ON,
+    baseline_flux,
+    drift_recorded,
+    track_session,
+)
 from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, Session, noise_of
 from anser_ros.sessions.starting_model import board_of, check_fits
 from anser_ros.tracking.estimate import TrackerSettings
@@ -90,10 +95,13 @@ def diagnose_session(
         clean = baseline_flux(baseline, session.reference.sensors)
     noise_t = noise_of(session.setup) or DEFAULT_NOISE_T
     spread = Spread(flux_t=float(np.hypot(noise_t, model.flux_error_t)), noise_t=noise_t)
-    known = [corrected(tool, model) for tool in session.tools]
-    reference = None if session.reference is None else corrected(session.reference, model)
+    same = drift_recorded(model, session)
+    known = [corrected(tool, model, recorded=same) for tool in session.tools]
+    reference = session.reference
+    if reference is not None:
+        reference = corrected(reference, model, recorded=same)
     problem = build_problem(known, reference, clean, model, drawn(session), spread)
-    found = diagnose(problem, model, progress=progress)
+    found = _dated(diagnose(problem, model, progress=progress), session.start_ns)
     say = progress or (lambda text: None)
     say('tracking the held-out part')
     unseen = _unseen(session, problem)
@@ -107,8 +115,24 @@ def diagnose_session(
     )
 
 
-def corrected(measurements: Measurements, model: FieldModel) -> Measurements:
-    """The measurements as the effects that the model already knows leave them."""
+def _dated(found: Diagnosis, start_ns: int) -> Diagnosis:
+    """The diagnosis with drifts that say on which session they took their course."""
+    effects = tuple(
+        replace(effect, evidence={**effect.evidence, FOUND_ON: start_ns})
+        if effect.name in DRIFTS and FOUND_ON not in effect.evidence
+        else effect
+        for effect in found.model.effects
+    )
+    return replace(found, model=replace(found.model, effects=effects))
+
+
+def corrected(
+    measurements: Measurements, model: FieldModel, *, recorded: bool = False
+) -> Measurements:
+    """The measurements as the effects that the model already knows leave them.
+
+    ``recorded`` as for `Correction.flux`.
+    """
     correction = Correction.of(model.effects, measurements.sensors, model.frequencies_hz)
     if not correction.terms:
         return measurements
@@ -116,7 +140,9 @@ def corrected(measurements: Measurements, model: FieldModel) -> Measurements:
     if correction.changes_flux:
         channels = measurements.sensors.channel
         rows = zip(measurements.time.tolist(), flux, strict=True)
-        flux = np.array([correction.flux(time, channels, frame) for time, frame in rows])
+        flux = np.array(
+            [correction.flux(time, channels, frame, recorded=recorded) for time, frame in rows]
+        )
     out = replace(measurements, sensors=correction.sensors(), flux=flux)
     if measurements.track is None:
         return out

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.correction import Correction
+from anser_ros.effects.correction import DRIFTS, Correction
 from anser_ros.errors import BagError
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.model import FieldModel
@@ -26,6 +26,9 @@ from anser_ros.tracking.tracker import PoseEstimate, Tracker, TrackerSettings
 
 Array = NDArray[np.float64]
 Progress = Callable[[float], None]
+
+FOUND_ON = 'session_start_ns'
+"""Evidence of a drift: the first stamp of the session on which it took its course."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +148,10 @@ def track_session(
     correction = Correction.of(model.effects, sensors, model.frequencies_hz)
     wanted = settings or TrackerSettings()
     noise_t = max(wanted.flux_noise_t, noise_of(session.setup))
-    tracker = Tracker(model, sensors, replace(wanted, flux_noise_t=noise_t))
+    recorded = not refit and drift_recorded(model, session)
+    tracker = Tracker(
+        model, sensors, replace(wanted, flux_noise_t=noise_t, recorded_drift=recorded)
+    )
     follower = _follower(session, model, baseline, patches or {}) if refit else None
     pace = Pace()
     estimates: dict[str, list[PoseEstimate]] = {}
@@ -175,6 +181,12 @@ def track_session(
             progress((count + 1) / len(frames))
     seconds = (time.perf_counter() - start) / max(len(frames), 1)
     return _compare(session, correction, estimates, seconds)
+
+
+def drift_recorded(model: FieldModel, session: Session) -> bool:
+    """Whether this is the session on which the model's drifts were found."""
+    found = [effect.evidence.get(FOUND_ON) for effect in model.effects if effect.name in DRIFTS]
+    return session.start_ns in found
 
 
 def _all_sensors(session: Session) -> SensorTable:

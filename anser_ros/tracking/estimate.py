@@ -61,6 +61,9 @@ class TrackerSettings:
         How old a good pose may be to start from.
     roll_variance : float
         Variance given to the roll about a single coil's axis, rad^2.
+    recorded_drift : bool
+        Whether an emitter's drift takes the course that the model's effects recorded: only on the
+        session that they were found on, and with a model that doesn't follow the references.
     """
 
     flux_noise_t: float = 60e-12
@@ -73,6 +76,7 @@ class TrackerSettings:
     min_signal: float = 4.0
     warm_age_s: float = 1.0
     roll_variance: float = ROLL_VARIANCE
+    recorded_drift: bool = False
 
     def __post_init__(self) -> None:
         for name in (

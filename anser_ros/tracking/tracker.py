@@ -121,6 +121,13 @@ class Tracker:
         return tuple(self._dead)
 
     @property
+    def drifting_effects(self) -> tuple[str, ...]:
+        """Effects of the model that are left to the references: no recorded course applies."""
+        if self._correction is None or self.settings.recorded_drift:
+            return ()
+        return self._correction.drifting
+
+    @property
     def bodies(self) -> tuple[str, ...]:
         """Bodies that get a 6-DoF pose."""
         return tuple(self._bodies)
@@ -285,7 +292,8 @@ class Tracker:
             return values
         time = (stamp_ns - self._first_ns[0]) * 1e-9
         flux = values.view(np.complex128)
-        sound = self._correction.flux(time, self.sensors.channel, flux)
+        recorded = self.settings.recorded_drift
+        sound = self._correction.flux(time, self.sensors.channel, flux, recorded=recorded)
         return np.ascontiguousarray(sound, dtype=np.complex128).view(np.float64)
 
     def _checked(

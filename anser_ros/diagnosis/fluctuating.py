@@ -1,0 +1,92 @@
+"""How much a parameter fluctuates from frame to frame, and what that explains.
+
+Each frame's parameters are a draw from a normal distribution about zero. Its spread is found by
+expectation-maximisation; the gain is that of -2 log marginal likelihood, so the freedom is paid
+for, and compares with what a constant effect takes off the held-out sum of squares.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.diagnosis.problem import State
+from anser_ros.diagnosis.whitening import parts
+from anser_ros.effects.effect import Term
+from anser_ros.effects.fluctuation import Fluctuation
+
+Array = NDArray[np.float64]
+
+SCALES = np.geomspace(1e-3, 1.0, 7)
+"""Spreads that are tried first, over what the constant effect expects."""
+ROUNDS = 25
+
+
+@dataclass(frozen=True)
+class Open:
+    """Normal equations of each frame: shapes (F, q, q) and (F, q)."""
+
+    normal: Array
+    right: Array
+
+
+def opened(state: State, term: Term) -> Open | None:
+    """Each frame's own normal equations along a fluctuating effect's columns."""
+    effect, normal, right = term.effect, [], []
+    if not isinstance(effect, Fluctuation):
+        return None
+    for part in state.parts:
+        raw = effect.free_columns(term, part.view)
+        if raw is None:
+            continue
+        white = part.whitener(parts(raw))
+        normal.append(white.transpose(0, 2, 1) @ white)
+        right.append(np.einsum('fnq,fn->fq', white, part.white))
+    if not normal:
+        return None
+    found = Open(np.concatenate(normal), np.concatenate(right))
+    return found if np.any(found.normal) else None
+
+
+def gain_of(found: Open, spread: Array) -> float:
+    """What -2 log marginal likelihood falls by with this spread."""
+    inner = np.eye(spread.size) + found.normal * spread[:, None] * spread[None, :]
+    b = found.right * spread
+    taken = np.einsum('fq,fq->', b, np.linalg.solve(inner, b[..., None])[..., 0])
+    return float(taken - np.linalg.slogdet(inner)[1].sum())
+
+
+def fluctuation_of(state: State, term: Term) -> tuple[float, Term] | None:
+    """The gain of a fluctuating effect at its likeliest spread, and the effect with it."""
+    found = opened(state, term)
+    if found is None or not isinstance(term.effect, Fluctuation):
+        return None
+    unit = term.effect.unit_spread(term)
+    gains = [gain_of(found, scale * unit) for scale in SCALES]
+    if max(gains) <= 0.0:
+        return None
+    spread = SCALES[int(np.argmax(gains))] * unit
+    for _ in range(ROUNDS):
+        inverse = np.linalg.inv(found.normal + np.diag(1 / spread**2))
+        mean = np.einsum('fpq,fq->fp', inverse, found.right)
+        variance = np.mean(mean**2 + np.einsum('fqq->fq', inverse), axis=0)
+        spread = np.maximum(np.sqrt(variance), 1e-6 * unit)
+    spread_term = term.effect.spread_out(term, spread)
+    site = {**spread_term.site, '_frames': found.right.shape[0]}
+    return gain_of(found, spread), Term(term.effect, site)
+
+
+def left_over(state: State, term: Term) -> float:
+    """Share of a candidate's power that the fluctuations in force leave it; one without any."""
+    if not any(t.site.get('_spread') is not None for t in state.terms):
+        return 1.0
+    now, before = 0.0, 0.0
+    for part in state.parts:
+        raw = term.effect.probe(term, part.view)
+        if raw is None:
+            continue
+        columns = parts(raw)
+        known = 0 if part.view.is_reference else 6
+        now += float(np.sum(part.whitener(columns) ** 2))
+        before += float(np.sum(part.whitener.first(known)(columns) ** 2))
+    return now / before if before > 0 else 1.0

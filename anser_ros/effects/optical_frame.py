@@ -1,0 +1,149 @@
+"""What else an optical frame may be besides turned and shifted: too large, or on the move."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+    sigmas,
+)
+from anser_ros.fitting.model import EffectRecord
+from anser_ros.physics.pose_track import PoseTrack
+
+
+class OpticalScale(Effect):
+    """theta: scale - 1, and the point of fg that stays where it is (m) times it.
+
+    Optical positions are ``p (1 + e) - c``; a scale comes about the tracker's own origin, which is
+    anywhere, so the shift ``c`` is free.
+    """
+
+    name = 'optical_scale'
+    summary = "the optical tracker's millimetre is too long or too short"
+    units: ClassVar[Mapping[str, str]] = {'scale': '1', 'shift_m': 'm'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+        'scale': (0.9, 1.1),
+        'shift_m': (-0.1, 0.1),
+    }
+    remedy = Remedy.OPTICAL
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """One tracker for all bodies."""
+        return [Term(self, {}, np.zeros(4))] if scene.tools else []
+
+    def prior(self, term: Term) -> Array:
+        """A percent, some millimetres."""
+        return np.array([0.01, 5e-3, 5e-3, 5e-3])
+
+    def amounts(self, term: Term) -> NDArray[np.int64]:
+        """The scale."""
+        return np.array([0])
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """All sensors moved against the scale."""
+        if view.is_reference:
+            return None
+        out = view.columns(4)
+        larger = 1 + term.theta[0]
+        out[..., 0] = -np.einsum('fsik,fi->fsk', view.d_position, view.position) / larger
+        out[..., 1:] = np.moveaxis(view.d_position, 2, -1) / larger
+        return out
+
+    def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
+        """Positions at their true scale."""
+        return replace(track, position=(track.position + term.theta[1:]) / (1 + term.theta[0]))
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Scale and shift."""
+        sigma = sigmas(covariance)
+        return EffectRecord(
+            self.name,
+            {'scale': 1 + float(term.theta[0]), 'shift_m': term.theta[1:].tolist()},
+            {'scale': float(sigma[0]), 'shift_m': sigma[1:].tolist()},
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From scale and shift."""
+        shift = np.asarray(needed(record, 'shift_m'), dtype=np.float64)
+        return Term(self, {}, np.array([float(needed(record, 'scale')) - 1, *shift]))
+
+
+class RegistrationDrift(Effect):
+    """theta: translation (m) at the session's start, and what it grows by (m) to its end."""
+
+    name = 'registration_drift'
+    summary = 'the optical tracker moves steadily'
+    units: ClassVar[Mapping[str, str]] = {
+        'translation_m': 'm',
+        'velocity_m_per_s': 'm/s',
+        'duration_s': 's',
+    }
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+        'translation_m': (-0.05, 0.05),
+        'velocity_m_per_s': (-0.01, 0.01),
+    }
+    remedy = Remedy.OPTICAL
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """One tracker for all bodies."""
+        site = {'_duration': max(scene.duration, 1e-3)}
+        return [Term(self, site, np.zeros(6))] if scene.tools else []
+
+    def prior(self, term: Term) -> Array:
+        """Some millimetres."""
+        return np.full(6, 5e-3)
+
+    def amounts(self, term: Term) -> NDArray[np.int64]:
+        """The growth."""
+        return np.arange(3, 6)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """All sensors moved the other way, from the start and more and more."""
+        if view.is_reference:
+            return None
+        out, back = view.columns(6), -np.moveaxis(view.d_position, 2, -1)
+        share = (view.time / term.site['_duration'])[:, None, None, None]
+        out[..., :3], out[..., 3:] = back, back * share
+        return out
+
+    def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
+        """Positions in fg."""
+        share = (track.time / term.site['_duration'])[:, None]
+        return replace(track, position=track.position - term.theta[:3] - share * term.theta[3:])
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Translation and velocity."""
+        sigma, duration = sigmas(covariance), float(term.site['_duration'])
+        return EffectRecord(
+            self.name,
+            {
+                'translation_m': term.theta[:3].tolist(),
+                'velocity_m_per_s': (term.theta[3:] / duration).tolist(),
+                'duration_s': duration,
+            },
+            {
+                'translation_m': sigma[:3].tolist(),
+                'velocity_m_per_s': (sigma[3:] / duration).tolist(),
+            },
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From translation and velocity."""
+        duration = float(needed(record, 'duration_s'))
+        start = np.asarray(needed(record, 'translation_m'), dtype=np.float64)
+        way = np.asarray(needed(record, 'velocity_m_per_s'), dtype=np.float64) * duration
+        return Term(self, {'_duration': duration}, np.concatenate([start, way]))
+
+
+EFFECTS = (OpticalScale(), RegistrationDrift())

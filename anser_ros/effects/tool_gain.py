@@ -1,0 +1,88 @@
+"""All sensors of a tool share a gain that is off, as behind one amplifier; references don't."""
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    Scene,
+    Term,
+    View,
+    needed,
+)
+from anser_ros.fitting.model import EffectRecord
+
+
+class ToolGain(Effect):
+    """theta: real and imaginary part of (gain - 1)."""
+
+    name = 'tool_gain'
+    summary = "the gain that all of a tool's sensors share is off"
+    units: ClassVar[Mapping[str, str]] = {'channels': '1', 'gain': '1', 'phase_deg': 'deg'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+        'gain': (0.2, 3.0),
+        'phase_deg': (-60.0, 60.0),
+    }
+    remedy = Remedy.FLUX
+
+    def candidates(self, scene: Scene) -> Sequence[Term]:
+        """Every body of two sensors or more."""
+        return [
+            Term(self, {'channels': tuple(int(c) for c in table.channel)}, np.zeros(2))
+            for table in scene.tools
+            if len(table) > 1
+        ]
+
+    def prior(self, term: Term) -> Array:
+        """A gain is within some ten percent of one."""
+        return np.full(2, 0.3)
+
+    def columns(self, term: Term, view: View) -> ComplexArray | None:
+        """The channels' own flux, in phase and turned by a quarter."""
+        rows = np.isin(view.sensors.channel, term.site['channels'])
+        if not rows.any():
+            return None
+        out = view.columns(2)
+        own = view.linear[:, rows] / (1 + complex(*term.theta))
+        out[:, rows] = np.stack([own, 1j * own], axis=-1)
+        return out
+
+    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+        """Diagonal."""
+        own = np.isin(channels, term.site['channels'])
+        return np.diag(np.where(own, 1 + complex(*term.theta), 1.0))
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """Gain and phase."""
+        gain = 1 + complex(*term.theta)
+        turn = np.array([gain.real, gain.imag]) / abs(gain)
+        across = np.array([-turn[1], turn[0]]) / abs(gain)
+        return EffectRecord(
+            self.name,
+            {
+                'channels': list(term.site['channels']),
+                'gain': abs(gain),
+                'phase_deg': float(np.degrees(np.angle(gain))),
+            },
+            {
+                'gain': float(np.sqrt(turn @ covariance @ turn)),
+                'phase_deg': float(np.degrees(np.sqrt(across @ covariance @ across))),
+            },
+        )
+
+    def term(self, record: EffectRecord) -> Term:
+        """From gain and phase."""
+        gain = float(needed(record, 'gain')) * np.exp(
+            1j * np.radians(float(record.parameters.get('phase_deg', 0.0)))
+        )
+        theta = np.array([gain.real - 1, gain.imag])
+        return Term(self, {'channels': tuple(needed(record, 'channels'))}, theta)
+
+
+EFFECTS = (ToolGain(),)

@@ -1,0 +1,89 @@
+"""Plugs in wrong sockets: channels or emitters exchanged, and channels that hear nothing.
+
+None has a parameter to fit; they are seen before the search (`anser_ros.diagnosis.wiring`).
+"""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term, needed, unit_matrix
+from anser_ros.fitting.model import EffectRecord
+
+
+class SwappedChannels(Effect):
+    """``channels`` in order: each is read at the place of the one after it in ``read_as``."""
+
+    name = 'swapped_channels'
+    summary = 'sensors are plugged into each other'
+    units: ClassVar[Mapping[str, str]] = {'channels': '1', 'read_as': '1'}
+    remedy = Remedy.FLUX
+
+    def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
+        """A permutation; channels of which one is missing stay as they are."""
+        row = {int(c): i for i, c in enumerate(channels)}
+        matrix = unit_matrix(channels.size)
+        if not all(c in row for c in term.site['channels']):
+            return matrix
+        for shown, true in zip(term.site['read_as'], term.site['channels'], strict=True):
+            matrix[row[shown]] = 0.0
+            matrix[row[shown], row[true]] = 1.0
+        return matrix
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """True channels, and those that they are read as."""
+        return EffectRecord(self.name, {k: list(term.site[k]) for k in ('channels', 'read_as')})
+
+    def term(self, record: EffectRecord) -> Term:
+        """From the channels."""
+        site = {k: tuple(int(c) for c in needed(record, k)) for k in ('channels', 'read_as')}
+        return Term(self, site)
+
+
+class SwappedCoils(Effect):
+    """As `SwappedChannels`, of emitters."""
+
+    name = 'swapped_coils'
+    summary = 'emitters are plugged into each other'
+    units: ClassVar[Mapping[str, str]] = {'coils': '1', 'read_as': '1'}
+    remedy = Remedy.FLUX
+
+    def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
+        """A permutation."""
+        matrix = unit_matrix(omega.size)
+        for shown, true in zip(term.site['read_as'], term.site['coils'], strict=True):
+            matrix[shown] = 0.0
+            matrix[shown, true] = 1.0
+        return matrix[None]
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """True emitters, and those that they are read as."""
+        return EffectRecord(self.name, {k: list(term.site[k]) for k in ('coils', 'read_as')})
+
+    def term(self, record: EffectRecord) -> Term:
+        """From the emitters."""
+        return Term(
+            self, {k: tuple(int(c) for c in needed(record, k)) for k in ('coils', 'read_as')}
+        )
+
+
+class DeadChannel(Effect):
+    """Channels whose readings are noise; they take no part in anything."""
+
+    name = 'dead_channel'
+    summary = 'a channel hears nothing'
+    units: ClassVar[Mapping[str, str]] = {'channels': '1'}
+    remedy = Remedy.NONE
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """The channels."""
+        return EffectRecord(self.name, {'channels': list(term.site['channels'])})
+
+    def term(self, record: EffectRecord) -> Term:
+        """From the channels."""
+        return Term(self, {'channels': tuple(int(c) for c in needed(record, 'channels'))})
+
+
+EFFECTS = (SwappedChannels(), SwappedCoils(), DeadChannel())

@@ -1,0 +1,61 @@
+"""Effects put into a small session in memory: those of the table are named, others are not.
+
+The whole confusion table, on recorded sessions, is a benchmark (`bench/bench_diagnosis.py`).
+"""
+
+import numpy as np
+import pytest
+from diagnosis_world import World, world
+from injection import CATALOGUE, LISTED, SIZES, UNLISTED, Subject
+
+from anser_ros.diagnosis.diagnose import Diagnosis, diagnose
+
+
+def subject(made: World) -> Subject:
+    return Subject(made.tool, made.reference, made.baseline, made.model, made.model, made.dipoles)
+
+
+def found(names: str, seed: int, size: str = 'medium') -> tuple[Diagnosis, dict]:
+    rng, target, truth = np.random.default_rng(seed), subject(world(seed)), {}
+    every = {**LISTED, **UNLISTED}
+    for injection in sorted((every[n] for n in names.split('+')), key=lambda i: i.stage):
+        truth |= injection.put(target, rng, SIZES[size])
+    return diagnose(target.problem(), target.model), truth
+
+
+@pytest.mark.parametrize(
+    ('names', 'seed'),
+    [('pickup+coil_drift', 1), ('sensor_gain+time_offset', 2)],
+)
+def test_effects_of_the_table_are_named_and_nothing_else(names, seed):
+    result, truth = found(names, seed)
+    assert sorted(f.record.name for f in result.findings) == sorted(truth)
+    for finding in result.findings:
+        wanted, record = truth[finding.record.name], finding.record
+        for key, sigma in record.uncertainty.items():
+            if key in wanted:
+                error = np.asarray(record.parameters[key]) - np.asarray(wanted[key])
+                assert np.all(np.abs(error) < 5 * np.asarray(sigma)), (record.name, key)
+    assert result.flux_rms_after_t < 1.1 * result.flux_rms_floor_t
+    assert result.unexplained == 0.0
+
+
+@pytest.mark.parametrize(
+    ('name', 'called'),
+    [
+        ('coil_steps', 'coil_fluctuation'),
+        ('channels_swapped', 'swapped_channels'),
+    ],
+)
+def test_an_effect_of_no_table_gets_a_name_of_its_own(name, called):
+    result, _ = found(name, 4)
+    assert [f.record.name for f in result.findings] == [called]
+    assert result.flux_rms_after_t < 1.1 * result.flux_rms_floor_t
+
+
+@pytest.mark.parametrize('name', ['quantised', 'channel_lag'])
+def test_what_nothing_describes_stays_unexplained(name):
+    result, _ = found(name, 5)
+    assert not {f.record.name for f in result.findings} & set(CATALOGUE)
+    assert result.unexplained > 0.2
+    assert result.depends_on
