@@ -1,8 +1,10 @@
 """The kernel that whitens by noise and model error does what the plain algebra does."""
 
 import numpy as np
+import pytest
 from tracking_world import certain_model
 
+from anser_ros.errors import TrackingError
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.tracking.error_whitening import error_whitening
 from anser_ros.tracking.solve import whitening_of
@@ -18,10 +20,13 @@ def both(modes, sigma, length):
     laid_out = np.ascontiguousarray(
         np.ascontiguousarray(modes).view(float).swapaxes(0, 1).reshape(len(model.positions), -1)
     )
-    weights = error_whitening(
-        POINT, AXIS, length, model.positions, model.directions, laid_out, sigma
-    )
-    return whitening_of(sigma, flux[:, 0]), weights
+    # Another coil beside it, so that the two are not mixed up.
+    errors, weights = error_whitening(
+        np.stack([POINT + 0.01, POINT]), np.stack([AXIS[::-1], AXIS]), np.array([0.0, length]),
+        model.positions, model.directions, laid_out, sigma,
+    )  # fmt: skip
+    np.testing.assert_allclose(errors[1], flux[:, 0], rtol=1e-9, atol=1e-20)
+    return whitening_of(sigma, flux[:, 0]), weights[1]
 
 
 def test_it_is_the_inverse_factor_of_the_covariance():
@@ -34,14 +39,13 @@ def test_it_is_the_inverse_factor_of_the_covariance():
         np.testing.assert_allclose(kernel, plain, rtol=1e-8, atol=1e-9 * np.abs(plain).max())
 
 
-def test_what_is_not_finite_gives_none():
+def test_what_is_not_finite_is_refused():
     count = len(certain_model().positions)
     modes = np.full((1, count, 8), np.inf + 0j)
     model = certain_model()
     laid_out = np.ascontiguousarray(modes).view(float).swapaxes(0, 1).reshape(count, -1)
-    with np.errstate(all='ignore'):
-        weights = error_whitening(
-            POINT, AXIS, 0.0, model.positions, model.directions,
+    with np.errstate(all='ignore'), pytest.raises(TrackingError, match='finite'):
+        error_whitening(
+            POINT[None], AXIS[None], np.zeros(1), model.positions, model.directions,
             np.ascontiguousarray(laid_out), np.full(16, 60e-12),
         )  # fmt: skip
-    assert weights is None

@@ -23,7 +23,7 @@ WIDTH = FIELD.moments.shape[1]
 TOOL = triaxial_tool()
 COILS = BodyCoils(TOOL.position, TOOL.axis, TOOL.length)
 WEIGHTS = np.full((9, WIDTH), 1 / NOISE_T)
-NOTHING = common_factor(np.zeros((0, 9, WIDTH)), WEIGHTS)
+NOTHING = common_factor(np.zeros((9, 0, WIDTH)), WEIGHTS)
 LOW, HIGH = (corner + sign * 0.03 for corner, sign in zip(Volume().grown(0.03), (-1, 1),
                                                            strict=True))  # fmt: skip
 
@@ -93,9 +93,9 @@ def test_errors_that_all_coils_share_do_not_average_out(rng):
     """The whole model off by one per cent: nine coils know no better than their model."""
     position, rotation = random_pose(rng)
     clean = fluxes(MODEL, TOOL, position, rotation)
-    modes = 0.01 * real(clean)[None]
+    modes = 0.01 * real(clean)[:, None]
     common = common_factor(modes, WEIGHTS)
-    white = (modes * WEIGHTS).reshape(1, -1)
+    white = (modes[:, 0] * WEIGHTS).reshape(1, -1)
     expected = np.linalg.inv(np.eye(white.size) + white.T @ white)
     np.testing.assert_allclose(np.eye(white.size) - common.T @ common, expected, atol=1e-9)
     found = solve(1.01 * clean, *nearby(rng, position, rotation, 1e-3, 0.01), common=common)
@@ -144,4 +144,4 @@ def test_refusals():
     with pytest.raises(TrackingError, match='9 coils'):
         solve(np.zeros((8, 8), complex), np.zeros(3), np.eye(3))
     with pytest.raises(TrackingError, match='must be finite'):
-        common_factor(np.full((1, 9, WIDTH), np.nan), WEIGHTS)
+        common_factor(np.full((9, 1, WIDTH), np.nan), WEIGHTS)

@@ -2,17 +2,20 @@
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.tracking import estimate as states
+from anser_ros.tracking.body_descent import step_to_coils
 from anser_ros.tracking.coil_track import (
     MOST_STEPS,
     NANO,
     RARE,
     SUSPICIOUS_JUMP_M,
     CoilResult,
+    take_errors,
 )
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.rigid import (
@@ -86,28 +89,68 @@ class _Fit:
         return self.solution.converged and self.ratio <= gate**2
 
 
-def _solve(
-    scene: Scene, coils: BodyCoils, flux: Array, used: NDArray[np.int64], start: Start
-) -> _Fit:
-    part = coils.subset(used)
-    position, rotation = start
-    points = part.offsets @ rotation.T + position
-    modes = scene.error_modes(points, part.axes @ rotation.T, part.lengths)
-    inverse_sigma = np.tile(1.0 / scene.sigma, (len(used), 1))
-    if modes is None:
-        modes = np.zeros((0, *inverse_sigma.shape))
-    reach = float(np.linalg.norm(part.offsets, axis=1).max())
+@dataclass(frozen=True)
+class _Frame:
+    """A body's fluxes (S, 2K) in one frame, and what its coils found by themselves."""
+
+    coils: BodyCoils
+    flux: Array
+    single: list[CoilResult]
+    scene: Scene
+
+    @cached_property
+    def inverse_sigma(self) -> Array:
+        """1/T, shape (2K,)."""
+        return 1.0 / self.scene.sigma
+
+    def common(self, used: NDArray[np.int64], start: Start) -> Array:
+        """Errors that some coils share, see `common_factor`.
+
+        They are those that the coils' own solves reckoned with, where these were near.
+        """
+        weights = np.tile(self.inverse_sigma, (len(used), 1))
+        if self.scene.modes is None:
+            return np.zeros((0, weights.size))
+        coils, (position, rotation) = self.coils.subset(used), start
+        points, axes = coils.offsets @ rotation.T + position, coils.axes @ rotation.T
+        known = [self.single[i].error for i in used.tolist()]
+        far = [
+            i for i, error in enumerate(known)
+            if error is None or not error.holds(self.scene, points[i], axes[i])
+        ]  # fmt: skip
+        if far:
+            fresh = take_errors(self.scene, points[far], axes[far], coils.lengths[far])
+            for i, error in zip(far, fresh, strict=True):
+                known[i] = error
+        return common_factor(np.array([e.errors for e in known if e is not None]), weights)
+
+    def nearer(self, start: Start, used: NDArray[np.int64]) -> Start:
+        """A start moved to where the coils' own good poses agree best."""
+        rows = [i for i in used.tolist() if self.single[i].estimate.state == states.OK]
+        coils = self.coils.subset(np.array(rows, dtype=np.int64))
+        if not coils.observable:
+            return start
+        known = [s for s in (self.single[i].solution for i in rows) if s is not None]
+        position, rotation = start[0].copy(), start[1].copy()
+        step_to_coils(
+            position, rotation, coils.offsets, coils.axes, np.array([s.position for s in known]),
+            np.array([s.axis for s in known]), np.array([s.normal for s in known]),
+            self.scene.low - coils.reach, self.scene.high + coils.reach,
+        )  # fmt: skip
+        return position, rotation
+
+
+def _solve(frame: _Frame, used: NDArray[np.int64], start: Start) -> _Fit:
+    part, scene = frame.coils.subset(used), frame.scene
+    weights = np.tile(frame.inverse_sigma, (len(used), 1))
     solution = solve_body(
-        scene.field, part, np.ascontiguousarray(flux[used]), inverse_sigma,
-        common_factor(modes, inverse_sigma), position, rotation, scene.low - reach,
-        scene.high + reach,
+        scene.field, part, np.ascontiguousarray(frame.flux[used]), weights,
+        frame.common(used, start), *start, scene.low - part.reach, scene.high + part.reach,
     )  # fmt: skip
-    return _Fit(solution, used, max(inverse_sigma.size - 6, 1))
+    return _Fit(solution, used, max(weights.size - 6, 1))
 
 
-def _without_disagreeing(
-    fit: _Fit, scene: Scene, coils: BodyCoils, flux: Array, gate: float
-) -> _Fit:
+def _without_disagreeing(fit: _Fit, frame: _Frame, gate: float) -> _Fit:
     """Leave out, one by one, up to a third of the coils while one of them spoils the fit."""
     for _ in range(len(fit.used) // 3):
         if fit.ratio <= gate**2:
@@ -116,17 +159,16 @@ def _without_disagreeing(
         worst = int(np.argmax(misfit))
         others = np.delete(misfit, worst)
         rest = np.delete(fit.used, worst)
-        if len(rest) < 2 or not coils.subset(rest).observable:
+        if len(rest) < 2 or not frame.coils.subset(rest).observable:
             break
         if misfit[worst] < DISAGREES * others.mean():
             break
-        fit = _solve(scene, coils, flux, rest, (fit.solution.position, fit.solution.rotation))
+        fit = _solve(frame, rest, (fit.solution.position, fit.solution.rotation))
     return fit
 
 
-def _cold_starts(
-    scene: Scene, coils: BodyCoils, flux: Array, used: NDArray[np.int64], single: list[CoilResult]
-) -> list[Start]:
+def _cold_starts(frame: _Frame, used: NDArray[np.int64]) -> list[Start]:
+    scene, coils, single = frame.scene, frame.coils, frame.single
     for wanted in (states.OK, states.RESIDUAL):
         rows = [i for i in used if single[i].estimate.state == wanted]
         solutions = [single[i].solution for i in rows]
@@ -142,7 +184,7 @@ def _cold_starts(
                 return [start]
     if any(single[i].estimate.state == states.RESIDUAL for i in used):
         return []
-    return start_from_grid(scene.grid, scene.field, coils.subset(used), flux[used])
+    return start_from_grid(scene.grid, scene.field, coils.subset(used), frame.flux[used])
 
 
 def track_body(
@@ -164,12 +206,12 @@ def track_body(
             (s.estimate.state for i, s in enumerate(single) if not usable[i]), states.STALE
         )
         return no_pose(name, stamp_ns, worst, scene.model_id, reason)
-    fits = _from_good(track, coils, stamp_ns, flux, used, scene, settings)
+    frame = _Frame(coils, flux, single, scene)
+    fits = _from_good(track, stamp_ns, frame, used, settings)
     if not fits:
-        starts = _cold_starts(scene, coils, flux, used, single)
-        fits = [_solve(scene, coils, flux, used, start) for start in starts]
+        fits = [_solve(frame, used, start) for start in _cold_starts(frame, used)]
         fits.sort(key=lambda candidate: candidate.ratio)
-        fits[:1] = [_without_disagreeing(f, scene, coils, flux, settings.gate) for f in fits[:1]]
+        fits[:1] = [_without_disagreeing(f, frame, settings.gate) for f in fits[:1]]
     if not fits:
         reason = 'no coil of this body has a pose to start from'
         return no_pose(name, stamp_ns, states.RESIDUAL, scene.model_id, reason)
@@ -192,11 +234,9 @@ def track_body(
 
 def _from_good(
     track: BodyTrack,
-    coils: BodyCoils,
     stamp_ns: int,
-    flux: Array,
+    frame: _Frame,
     used: NDArray[np.int64],
-    scene: Scene,
     settings: TrackerSettings,
 ) -> list[_Fit]:
     """The fit near the last good pose, when there is one that passes the gate."""
@@ -204,15 +244,15 @@ def _from_good(
         return []
     start = track.expected(stamp_ns)
     assert start is not None
+    start = frame.nearer(start, used)
     if track.left_out and stamp_ns < track.again_ns:
         kept = np.array([i for i in used if int(i) not in track.left_out], dtype=np.int64)
-        if len(kept) > 1 and coils.subset(kept).observable:
-            fit = _solve(scene, coils, flux, kept, start)
+        if len(kept) > 1 and frame.coils.subset(kept).observable:
+            fit = _solve(frame, kept, start)
             if fit.good(settings.gate):
                 return [fit]
     track.again_ns = stamp_ns + round(LEFT_OUT_S / NANO)
-    fit = _solve(scene, coils, flux, used, start)
-    fit = _without_disagreeing(fit, scene, coils, flux, settings.gate)
+    fit = _without_disagreeing(_solve(frame, used, start), frame, settings.gate)
     return [fit] if fit.good(settings.gate) else []
 
 

@@ -2,13 +2,13 @@
 
 import math
 from dataclasses import dataclass, field
+from itertools import repeat
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.errors import TrackingError
 from anser_ros.tracking import estimate as states
-from anser_ros.tracking.error_whitening import error_whitening
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.scene import Scene
 from anser_ros.tracking.seed import solve_cold
@@ -16,6 +16,7 @@ from anser_ros.tracking.solve import CoilSolution, solve_coil, whitening_of
 from anser_ros.tracking.uncertainty import chi2_limit, coil_covariance
 
 Array = NDArray[np.float64]
+Start = tuple[Array, Array]
 
 NANO = 1e-9
 RARE = 0.01
@@ -29,9 +30,55 @@ CHANGED = 3.0
 """A suspect's chi-square that changes by this factor calls for a scan before its time."""
 MOST_STEPS = 2.5
 """Motion is carried on for so many of the last step's durations."""
-WHITENING_REACH_M = 3e-3
-WHITENING_REACH = 0.05
+ERROR_REACH_M = 3e-3
+ERROR_REACH = 0.05
 """Move (m) and turn (chord of the axes) up to which the model's error at a pose is reused."""
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """What the model's uncertainty does to a sensor at a pose.
+
+    Attributes
+    ----------
+    scene : Scene
+    position, axis : ndarray, shape (3,)
+    errors : ndarray, shape (R, 2K)
+        Flux errors of one standard deviation each, T.
+    whitening : ndarray, shape (1, 2K) or (2K, 2K)
+        1/T; see `whitening_of`.
+    """
+
+    scene: Scene
+    position: Array
+    axis: Array
+    errors: Array
+    whitening: Array
+
+    def holds(self, scene: Scene, position: Array, axis: Array) -> bool:
+        """Whether this is still good for a scene and a pose."""
+        own = self.scene
+        if own.modes is not scene.modes:
+            return False
+        if own.sigma is not scene.sigma and not np.array_equal(own.sigma, scene.sigma):
+            return False
+        return scene.modes is None or (
+            math.dist(position, self.position) < ERROR_REACH_M
+            and math.dist(axis, self.axis) < ERROR_REACH
+        )
+
+
+@numba.njit(cache=True, error_model='numpy')
+def carried_on(position, old_position, axis, old_axis, steps):  # type: ignore[no-untyped-def]
+    """Position and unit axis after so many more of the last steps."""
+    new_position, new_axis, norm = np.empty(3), np.empty(3), 0.0
+    for i in range(3):
+        new_position[i] = position[i] + steps * (position[i] - old_position[i])
+        new_axis[i] = axis[i] + steps * (axis[i] - old_axis[i])
+        norm += new_axis[i] * new_axis[i]
+    for i in range(3):
+        new_axis[i] /= math.sqrt(norm)
+    return new_position, new_axis
 
 
 @dataclass
@@ -50,15 +97,14 @@ class CoilTrack:
     failures: int = 0
     retry_ns: int = 0
     noise: NoiseScale = field(default_factory=NoiseScale)
-    whitening: Array | None = None
-    whitening_at: tuple[Scene, Array, Array] | None = None
+    error: PoseErrors | None = None
 
     def forget(self) -> None:
         """Drop the warm start."""
         self.good = self.suspect = self.before = None
         self.failures = 0
 
-    def expected(self, stamp_ns: int) -> tuple[Array, Array] | None:
+    def expected(self, stamp_ns: int) -> Start | None:
         """Where the sensor is if it moves on as it did between its last two good poses."""
         if self.good is None:
             return None
@@ -69,9 +115,8 @@ class CoilTrack:
         steps = (stamp_ns - self.good_ns) / max(self.good_ns - before_ns, 1)
         if not 0.0 < steps <= MOST_STEPS:
             return position, axis
-        turned = axis + steps * (axis - old_axis)
-        turned /= math.sqrt(float(turned @ turned))
-        return position + steps * (position - old_position), turned
+        start: Start = carried_on(position, old_position, axis, old_axis, steps)
+        return start
 
 
 @dataclass(frozen=True)
@@ -97,40 +142,58 @@ class _Frame:
 
 @dataclass(frozen=True)
 class CoilResult:
-    """An estimate with the solution behind it (None where nothing was solved)."""
+    """An estimate with the solution behind it and the errors reckoned with (None: not solved)."""
 
     estimate: PoseEstimate
     solution: CoilSolution | None
     cold: bool = False
+    error: PoseErrors | None = None
+
+
+def take_errors(scene: Scene, points: Array, axes: Array, lengths: Array) -> list[PoseErrors]:
+    """Work out the model's error for sensors (S of them) at some poses, all of them at once."""
+    errors, whitening = scene.error_whitening(points, axes, lengths)
+    return list(map(PoseErrors, repeat(scene), points, axes, errors, whitening))
+
+
+def prepare(
+    tracks: list[CoilTrack],
+    lengths: Array,
+    stamp_ns: int,
+    scene: Scene,
+    settings: TrackerSettings,
+) -> None:
+    """Look up the model's error where all sensors are expected, before they are tracked.
+
+    At once it costs a third of what it does one by one.
+    """
+    if scene.modes is None:
+        return
+    rows, starts = [], []
+    for i, track in enumerate(tracks):
+        expected = track.expected(stamp_ns)
+        if expected is None or (stamp_ns - track.good_ns) * NANO > settings.warm_age_s:
+            continue
+        if track.error is None or not track.error.holds(scene, *expected):
+            rows.append(i)
+            starts.append(expected)
+    if rows:
+        points, axes = (np.array(part) for part in zip(*starts, strict=True))
+        for i, error in zip(rows, take_errors(scene, points, axes, lengths[rows]), strict=True):
+            tracks[i].error = error
 
 
 def _whitening(
     track: CoilTrack, scene: Scene, position: Array, axis: Array, length: float
 ) -> Array:
     """Whitening with the model's error at a pose, reused while the sensor stays near."""
-    if scene.modes is None:
-        if track.whitening_at is None or track.whitening_at[0].sigma is not scene.sigma:
-            track.whitening = whitening_of(scene.sigma)
-            track.whitening_at = (scene, position, axis)
-    else:
-        at = track.whitening_at
-        fresh = (
-            at is not None
-            and at[0].modes is scene.modes
-            and float(np.abs(position - at[1]).max()) < WHITENING_REACH_M
-            and float(np.abs(axis - at[2]).max()) < WHITENING_REACH
-        )
-        if not fresh:
-            field = scene.field
-            weights = error_whitening(
-                position, axis, length, field.positions, field.directions, scene.modes,
-                scene.sigma,
-            )  # fmt: skip
-            if weights is None:
-                raise TrackingError('the model covariance must be finite')
-            track.whitening, track.whitening_at = weights, (scene, position, axis)
-    assert track.whitening is not None
-    return track.whitening
+    if track.error is None or not track.error.holds(scene, position, axis):
+        if scene.modes is None:
+            empty = np.empty((0, scene.sigma.size))
+            track.error = PoseErrors(scene, position, axis, empty, whitening_of(scene.sigma))
+        else:
+            (track.error,) = take_errors(scene, position[None], axis[None], np.array([length]))
+    return track.error.whitening
 
 
 def _cold(track: CoilTrack, frame: _Frame) -> list[CoilSolution]:
@@ -183,7 +246,7 @@ def track_coil(
         verdict = _judge(track, frame, solution, [])
         change = solution.chi2 / max(track.suspect.chi2, 1e-300)
         if verdict.state != states.OK and 1.0 / CHANGED < change < CHANGED:
-            return CoilResult(verdict, solution)
+            return CoilResult(verdict, solution, False, track.error)
     solution, *rivals = _cold(track, frame)
     return _finish(track, frame, solution, rivals, True)
 
@@ -210,7 +273,7 @@ def _finish(
         wait_s = min(FIRST_RETRY_S * 2.0**track.failures, LAST_RETRY_S)
         track.suspect, track.failures = solution, track.failures + 1
         track.retry_ns = frame.stamp_ns + round(wait_s / NANO)
-    return CoilResult(verdict, solution, cold)
+    return CoilResult(verdict, solution, cold, track.error)
 
 
 def _descend(track: CoilTrack, frame: _Frame, position: Array, axis: Array) -> CoilSolution:

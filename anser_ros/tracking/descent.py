@@ -10,7 +10,8 @@ import math
 import numba
 import numpy as np
 
-from anser_ros.physics.dipole import GAUSS_OFFSET, fill_field_and_gradient
+from anser_ros.physics.constants import DIPOLE_CONSTANT
+from anser_ros.physics.dipole import GAUSS_OFFSET
 
 LARGEST_MOVE_M = 0.04
 LARGEST_TURN = 0.6
@@ -20,35 +21,51 @@ LEAST_RAISED = 1e-3
 """Damping after a step that failed."""
 CONVERGED_CHI2 = 1e-6
 """Fall of chi-square below which a step is not worth another one (a thousandth of a sigma)."""
+TRUSTED_CHI2, TRUSTED_MOVE_M, TRUSTED_TURN = 0.03, 50e-6, 1e-3
+"""Fall of chi-square, move and turn up to which a step is taken without a look at where it leads:
+what a sixth of a sigma leaves, of second order, is less than a thousandth of a sigma."""
 
 
 @numba.njit(cache=True, error_model='numpy')
-def fill_coil(point, axis, length, positions, directions, moments, basis, flux, jacobian):  # type: ignore[no-untyped-def]
-    """Write a coil's flux (2K) and its derivatives (6, 2K) by position and free axis vector."""
+def fill_coil_basis(point, axis, length, positions, directions, basis):  # type: ignore[no-untyped-def]
+    """Write what each unit dipole does to a coil into ``basis``, shape (7, N).
+
+    Row 0 holds the flux, rows 1 to 3 its derivatives by the position, rows 4 to 6 those by the
+    free axis vector (the Gauss points move with it). One product with the moments gives all of it.
+    """
     half = length * GAUSS_OFFSET
     count = 1 if half == 0.0 else 2
-    share = 1.0 / count
-    n0, n1, n2 = axis[0], axis[1], axis[2]
-    flux[:] = 0.0
-    jacobian[:] = 0.0
-    at = np.empty(3)
+    scale = DIPOLE_CONSTANT / count
+    nx, ny, nz = axis[0], axis[1], axis[2]
     for s in range(count):
         h = half * (1 - 2 * s)
-        for i in range(3):
-            at[i] = point[i] + h * axis[i]
-        fill_field_and_gradient(at, positions, directions, basis)
-        f = np.dot(basis, moments)
-        for k in range(moments.shape[1]):
-            gx = share * (n0 * f[3, k] + n1 * f[4, k] + n2 * f[5, k])
-            gy = share * (n0 * f[4, k] + n1 * f[6, k] + n2 * f[7, k])
-            gz = share * (n0 * f[5, k] + n1 * f[7, k] + n2 * f[8, k])
-            flux[k] += share * (n0 * f[0, k] + n1 * f[1, k] + n2 * f[2, k])
-            jacobian[0, k] += gx
-            jacobian[1, k] += gy
-            jacobian[2, k] += gz
-            jacobian[3, k] += share * f[0, k] + h * gx
-            jacobian[4, k] += share * f[1, k] + h * gy
-            jacobian[5, k] += share * f[2, k] + h * gz
+        x, y, z = point[0] + h * nx, point[1] + h * ny, point[2] + h * nz
+        for j in range(positions.shape[0]):
+            dx, dy, dz = x - positions[j, 0], y - positions[j, 1], z - positions[j, 2]
+            ux, uy, uz = directions[j, 0], directions[j, 1], directions[j, 2]
+            inv2 = 1.0 / (dx * dx + dy * dy + dz * dz)
+            k3 = scale * inv2 * math.sqrt(inv2)
+            k5 = 3.0 * k3 * inv2
+            du = dx * ux + dy * uy + dz * uz
+            dn = dx * nx + dy * ny + dz * nz
+            nu = nx * ux + ny * uy + nz * uz
+            a, e, q = k5 * du, k5 * dn, k5 * (nu - 5.0 * du * dn * inv2)
+            gx = a * nx + e * ux + q * dx
+            gy = a * ny + e * uy + q * dy
+            gz = a * nz + e * uz + q * dz
+            bx, by, bz = a * dx - k3 * ux, a * dy - k3 * uy, a * dz - k3 * uz
+            if s == 0:
+                basis[0, j] = a * dn - k3 * nu
+                basis[1, j], basis[2, j], basis[3, j] = gx, gy, gz
+                basis[4, j], basis[5, j], basis[6, j] = bx + h * gx, by + h * gy, bz + h * gz
+            else:
+                basis[0, j] += a * dn - k3 * nu
+                basis[1, j] += gx
+                basis[2, j] += gy
+                basis[3, j] += gz
+                basis[4, j] += bx + h * gx
+                basis[5, j] += by + h * gy
+                basis[6, j] += bz + h * gz
 
 
 @numba.njit(cache=True, error_model='numpy')
@@ -65,19 +82,22 @@ def fill_tangent(n, t):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model='numpy')
-def _whiten(flux, model, jacobian, whitening, residual, white):  # type: ignore[no-untyped-def]
-    """Row 0 of ``white``: residual; rows 1 to 6: the flux's derivatives. Returns chi-square."""
+def _whiten(flux, model, whitening, residual, white):  # type: ignore[no-untyped-def]
+    """Row 0 of ``white``: residual; rows 1 to 6: the flux's derivatives. Returns chi-square.
+
+    ``model`` (7, 2K): the modelled flux, then its derivatives.
+    """
     width = flux.shape[0]
     chi2 = 0.0
     for k in range(width):
-        residual[k] = flux[k] - model[k]
+        residual[k] = flux[k] - model[0, k]
     if whitening.shape[0] == 1:
         for k in range(width):
             w = whitening[0, k]
             white[0, k] = w * residual[k]
             chi2 += white[0, k] * white[0, k]
             for i in range(6):
-                white[i + 1, k] = w * jacobian[i, k]
+                white[i + 1, k] = w * model[i + 1, k]
         return chi2
     # The factor is lower triangular. Columns outside, so that the inner loop runs along rows.
     for k in range(width):
@@ -87,7 +107,7 @@ def _whiten(flux, model, jacobian, whitening, residual, white):  # type: ignore[
             w = whitening[k, j]
             white[0, k] += w * residual[j]
             for i in range(6):
-                white[i + 1, k] += w * jacobian[i, j]
+                white[i + 1, k] += w * model[i + 1, j]
         chi2 += white[0, k] * white[0, k]
     return chi2
 
@@ -126,7 +146,7 @@ def _normal_equations(white, tangent, full, normal, gradient):  # type: ignore[n
 
 
 @numba.njit(cache=True, error_model='numpy')
-def _damped_step(normal, gradient, damping, factor, step):  # type: ignore[no-untyped-def]
+def damped_step(normal, gradient, damping, factor, step):  # type: ignore[no-untyped-def]
     """Solve ``(A + damping diag A) step = gradient`` by Cholesky; False when A is not positive."""
     n = gradient.shape[0]
     for i in range(n):
@@ -156,18 +176,25 @@ def _damped_step(normal, gradient, damping, factor, step):  # type: ignore[no-un
 
 
 @numba.njit(cache=True, error_model='numpy')
-def _limit(step):  # type: ignore[no-untyped-def]
-    """Shorten a step to the largest move and turn that the local model is trusted for."""
+def limit_step(step):  # type: ignore[no-untyped-def]
+    """Shorten a step to the largest move and turn that the local model is trusted for.
+
+    Returns whether it is so short that its end need not be looked at.
+    """
     move = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
-    turn = math.sqrt(step[3] ** 2 + step[4] ** 2)
+    turn = 0.0
+    for i in range(3, step.shape[0]):
+        turn += step[i] ** 2
+    turn = math.sqrt(turn)
     part = 1.0
     if move > LARGEST_MOVE_M:
         part = LARGEST_MOVE_M / move
     if turn * part > LARGEST_TURN:
         part = LARGEST_TURN / turn
     if part < 1.0:
-        for i in range(5):
+        for i in range(step.shape[0]):
             step[i] *= part
+    return move < TRUSTED_MOVE_M and turn < TRUSTED_TURN
 
 
 @numba.njit(cache=True, error_model='numpy')
@@ -206,40 +233,40 @@ def descend(  # type: ignore[no-untyped-def]
     Returns chi-square, evaluations used, whether it converged.
     """
     width = flux.shape[0]
-    basis = np.empty((9, positions.shape[0]))
-    model, jacobian = np.empty(width), np.empty((6, width))
+    basis = np.empty((7, positions.shape[0]))
     white, trial_white = np.empty((7, width)), np.empty((7, width))
     trial_residual = np.empty(width)
     tangent, step = np.empty((2, 3)), np.empty(5)
     normal, gradient, factor = np.empty((5, 5)), np.empty(5), np.empty((5, 5))
     trial_position, trial_axis = np.empty(3), np.empty(3)
 
-    fill_coil(position, axis, length, positions, directions, moments, basis, model, jacobian)
-    chi2 = _whiten(flux, model, jacobian, whitening, residual, white)
+    fill_coil_basis(position, axis, length, positions, directions, basis)
+    chi2 = _whiten(flux, np.dot(basis, moments), whitening, residual, white)
     used, damping, growth, converged = 1, FIRST_DAMPING, 2.0, False
     while used < budget and not converged:
         fill_tangent(axis, tangent)
         _normal_equations(white, tangent, full, normal, gradient)
         accepted = False
         while used < budget and not accepted:
-            if not _damped_step(normal, gradient, damping, factor, step):
+            if not damped_step(normal, gradient, damping, factor, step):
                 damping = max(10.0 * damping, 1e-8)
                 if damping > 1e12:
                     return chi2, used, False
                 continue
-            _limit(step)
+            short = limit_step(step)
             promised = _promised(normal, gradient, step)
-            negligible = promised < CONVERGED_CHI2 + 1e-9 * chi2
-            if negligible:
-                converged = True
-                break
             _advance(position, axis, tangent, step, low, high, trial_position, trial_axis)
-            fill_coil(
-                trial_position, trial_axis, length, positions, directions, moments, basis, model,
-                jacobian,
-            )  # fmt: skip
+            negligible = promised < CONVERGED_CHI2 + 1e-9 * chi2
+            if negligible or (short and promised < TRUSTED_CHI2):
+                converged = True
+                chi2 -= promised
+                position[:] = trial_position
+                axis[:] = trial_axis
+                break
+            fill_coil_basis(trial_position, trial_axis, length, positions, directions, basis)
             used += 1
-            trial = _whiten(flux, model, jacobian, whitening, trial_residual, trial_white)
+            model = np.dot(basis, moments)
+            trial = _whiten(flux, model, whitening, trial_residual, trial_white)
             if trial <= chi2:
                 gain = (chi2 - trial) / max(promised, 1e-300)
                 damping *= max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)

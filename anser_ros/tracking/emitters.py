@@ -9,9 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.scene import Scene
-from anser_ros.tracking.seed import build_grid
 from anser_ros.tracking.solve import RealField
 
 FEWEST_EMITTERS = 6
@@ -49,7 +47,6 @@ class ReducedScene:
 def without_dead(
     scene: Scene,
     living: NDArray[np.bool_],
-    settings: TrackerSettings,
     previous: ReducedScene | None = None,
 ) -> ReducedScene:
     """The scene of the living emitters; what has not changed since ``previous`` is kept."""
@@ -62,16 +59,12 @@ def without_dead(
         scene.field.directions,
         np.ascontiguousarray(scene.field.moments[:, kept]),
     )
-    sigma, modes, grid = np.ascontiguousarray(scene.sigma[kept]), scene.modes, None
+    sigma, starts, modes = scene.sigma[kept], scene.starts.anew(), scene.modes
     if same and previous is not None:
-        if previous.whole.modes is scene.modes:
-            modes = previous.scene.modes
-        if previous.whole.grid is scene.grid:
-            grid = previous.scene.grid
-    if modes is not None and modes is scene.modes:
-        by_mode = modes.reshape(len(modes), -1, kept.size)[:, :, kept]
-        modes = np.ascontiguousarray(by_mode.reshape(len(modes), -1))
-    if grid is None:
-        grid = build_grid(field, sigma, settings.volume, settings.grid_spacing_m)
-    reduced = replace(scene, field=field, sigma=sigma, modes=modes, grid=grid)
+        starts = previous.scene.starts.following()
+    if same and previous is not None and previous.whole.modes is modes:
+        modes = previous.scene.modes
+    elif modes is not None:
+        modes = modes.of_components(kept)
+    reduced = replace(scene, field=field, sigma=sigma, modes=modes, starts=starts)
     return ReducedScene(scene, living, reduced)

@@ -6,26 +6,22 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.errors import TrackingError
 from anser_ros.physics.dipole import fill_flux_basis
 
 Array = NDArray[np.float64]
 
 
 @numba.njit(cache=True, error_model='numpy')
-def _fill_whitening(point, axis, length, positions, directions, modes, sigma, factor, out):  # type: ignore[no-untyped-def]
-    """Write the inverse Cholesky factor of ``diag(sigma)^2 + modes^T modes``; False if none."""
+def _fill_whitening(errors, sigma, factor, out):  # type: ignore[no-untyped-def]
+    """Write the inverse Cholesky factor of ``diag(sigma)^2 + E^T E``; False if there is none."""
     width = sigma.shape[0]
-    basis = np.empty((1, positions.shape[0]))
-    fill_flux_basis(point, axis, length, positions, directions, basis)
-    scaled = np.dot(basis, modes).reshape(-1, width)
-    for r in range(scaled.shape[0]):
-        for k in range(width):
-            scaled[r, k] /= sigma[k]
+    scaled = errors / sigma
+    factor[:] = np.dot(scaled.T, scaled)
     for i in range(width):
+        factor[i, i] += 1.0
         for j in range(i + 1):
-            total = 1.0 if i == j else 0.0
-            for r in range(scaled.shape[0]):
-                total += scaled[r, i] * scaled[r, j]
+            total = factor[i, j]
             for k in range(j):
                 total -= factor[i, k] * factor[j, k]
             if i > j:
@@ -49,25 +45,37 @@ def _fill_whitening(point, axis, length, positions, directions, modes, sigma, fa
     return True
 
 
+@numba.njit(cache=True, error_model='numpy')
+def _fill_all(points, axes, lengths, positions, directions, modes, sigma, errors, out):  # type: ignore[no-untyped-def]
+    width = sigma.shape[0]
+    basis, factor = np.empty((points.shape[0], positions.shape[0])), np.empty((width, width))
+    fill_flux_basis(points, axes, lengths, positions, directions, basis)
+    errors[:] = np.dot(basis, modes).reshape(errors.shape)
+    good = True
+    for s in range(points.shape[0]):
+        good &= _fill_whitening(errors[s], sigma, factor, out[s])
+    return good
+
+
 def error_whitening(
-    point: Array,
-    axis: Array,
-    length: float,
+    points: Array,
+    axes: Array,
+    lengths: Array,
     positions: Array,
     directions: Array,
     modes: Array,
     sigma: Array,
-) -> Array | None:
-    """Matrix that turns a coil's flux residual into one of unit covariance.
+) -> tuple[Array, Array]:
+    """What the model's error does to coils, and what makes their residuals of unit covariance.
 
     Parameters
     ----------
-    point, axis : ndarray, shape (3,)
-        Coil centre (m) and unit axis, frame fg.
-    length : float
-        Coil length, m.
+    points, axes : ndarray, shape (S, 3)
+        Coil centres (m) and unit axes, frame fg.
+    lengths : ndarray, shape (S,)
+        Coil lengths, m.
     positions, directions : ndarray, shape (N, 3)
-        The model's dipoles.
+        The dipoles whose moments are uncertain.
     modes : ndarray, shape (N, R 2K)
         Moments' errors of one standard deviation each, A m^2.
     sigma : ndarray, shape (2K,)
@@ -75,14 +83,21 @@ def error_whitening(
 
     Returns
     -------
-    ndarray, shape (2K, 2K), or None
-        1/T, lower triangular; None where the covariance is not finite.
+    errors : ndarray, shape (S, R, 2K)
+        Flux errors of one standard deviation each, T.
+    whitening : ndarray, shape (S, 2K, 2K)
+        1/T, lower triangular.
+
+    Raises
+    ------
+    TrackingError
+        Where the covariance is not finite.
     """
-    width = len(sigma)
-    out, factor = np.empty((width, width)), np.empty((width, width))
-    good = _fill_whitening(
-        np.ascontiguousarray(point[None], dtype=np.float64),
-        np.ascontiguousarray(axis[None], dtype=np.float64),
-        np.array([length]), positions, directions, modes, sigma, factor, out,
-    )  # fmt: skip
-    return out if good else None
+    count, width = len(points), len(sigma)
+    errors = np.empty((count, modes.shape[1] // width, width))
+    whitening = np.empty((count, width, width))
+    if not _fill_all(
+        points, axes, lengths, positions, directions, modes, sigma, errors, whitening
+    ):
+        raise TrackingError('the model covariance must be finite')
+    return errors, whitening

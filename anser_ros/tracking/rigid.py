@@ -5,27 +5,21 @@ errors are common to all coils; they enter as a low-rank part of the residuals' 
 (Woodbury's identity), so coils that share an error don't count as independent.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
 from anser_ros.physics.dipole import flux_jacobian
-from anser_ros.tracking.descent import fill_coil
-from anser_ros.tracking.rotations import nearest_rotation, rotation_of_vector
+from anser_ros.tracking.body_descent import descend_body, fill_common
+from anser_ros.tracking.rotations import nearest_rotation
 from anser_ros.tracking.seed import SeedGrid
 from anser_ros.tracking.solve import Array, RealField
 
 MAX_EVALUATIONS = 30
-LARGEST_MOVE_M = 0.04
-LARGEST_TURN = 0.6
-FIRST_DAMPING = 1e-8
-LEAST_RAISED = 1e-3
-CONVERGED_CHI2 = 1e-6
 PARALLEL = 0.05
 """Sine of the angle between axes below which all coils of a tool count as parallel."""
 
@@ -38,15 +32,22 @@ class BodyCoils:
     axes: Array
     lengths: Array
 
-    @property
+    @cached_property
     def observable(self) -> bool:
         """Whether two coils are not parallel, so that all six degrees of freedom are seen."""
         return len(self.axes) > 1 and bool(
             np.linalg.svd(self.axes, compute_uv=False)[1] > PARALLEL
         )
 
+    @cached_property
+    def reach(self) -> float:
+        """Largest distance of a coil from the tool's origin, m."""
+        return float(np.linalg.norm(self.offsets, axis=1).max())
+
     def subset(self, keep: NDArray[np.generic]) -> 'BodyCoils':
-        """The coils of a mask or index array."""
+        """The coils of a mask or of ascending indices; all of them are these coils themselves."""
+        if len(self.offsets[keep]) == len(self.offsets):
+            return self
         return BodyCoils(
             np.ascontiguousarray(self.offsets[keep]),
             np.ascontiguousarray(self.axes[keep]),
@@ -86,54 +87,12 @@ class BodySolution:
     converged: bool
 
 
-@numba.njit(cache=True, error_model='numpy')
-def _fill_body(  # type: ignore[no-untyped-def]
-    position, rotation, offsets, axes, lengths, flux, inverse_sigma, positions, directions,
-    moments, residual, white, jacobian,
-):  # fmt: skip
-    """Whitened residual (S 2K) and its model derivatives (S 2K, 6) by translation and turn."""
-    width = flux.shape[1]
-    basis = np.empty((9, positions.shape[0]))
-    model, slopes = np.empty(width), np.empty((6, width))
-    arm, point, axis = np.empty(3), np.empty(3), np.empty(3)
-    for s in range(offsets.shape[0]):
-        for i in range(3):
-            arm[i] = 0.0
-            axis[i] = 0.0
-            for j in range(3):
-                arm[i] += rotation[i, j] * offsets[s, j]
-                axis[i] += rotation[i, j] * axes[s, j]
-            point[i] = position[i] + arm[i]
-        fill_coil(point, axis, lengths[s], positions, directions, moments, basis, model, slopes)
-        for k in range(width):
-            w = inverse_sigma[s, k]
-            row = s * width + k
-            residual[s, k] = flux[s, k] - model[k]
-            white[row] = w * residual[s, k]
-            for i in range(3):
-                jacobian[row, i] = w * slopes[i, k]
-            for i in range(3):
-                j, m = (i + 1) % 3, (i + 2) % 3
-                turn = arm[j] * slopes[m, k] - arm[m] * slopes[j, k]
-                turn += axis[j] * slopes[3 + m, k] - axis[m] * slopes[3 + j, k]
-                jacobian[row, 3 + i] = w * turn
-
-
-@numba.njit(cache=True, error_model='numpy')
-def _inner(a, b, common):  # type: ignore[no-untyped-def]
-    """``a^T C^-1 b`` for white ``a``, ``b`` and the covariance I + D^T D, common = H^-1 D."""
-    plain = np.dot(a.T, b)
-    if common.shape[0] > 0:
-        plain -= np.dot(np.dot(common, a).T, np.dot(common, b))
-    return plain
-
-
 def common_factor(modes: Array, inverse_sigma: Array) -> Array:
     """Factor E with ``(I + D^T D)^-1 = I - E^T E`` for whitened modes D.
 
     Parameters
     ----------
-    modes : ndarray, shape (R, S, 2K)
+    modes : ndarray, shape (S, R, 2K)
         Flux errors of one standard deviation each that several coils share, T.
     inverse_sigma : ndarray, shape (S, 2K)
         1/T.
@@ -147,13 +106,10 @@ def common_factor(modes: Array, inverse_sigma: Array) -> Array:
     TrackingError
         When the modes are not finite.
     """
-    white = (modes * inverse_sigma).reshape(len(modes), inverse_sigma.size)
-    if not np.isfinite(white).all():
+    common = np.empty((modes.shape[1], inverse_sigma.size))
+    if not fill_common(modes, inverse_sigma, common):
         raise TrackingError('the model covariance must be finite')
-    if len(white) == 0:
-        return white
-    factor = np.linalg.cholesky(np.eye(len(white)) + white @ white.T)
-    return np.ascontiguousarray(np.linalg.solve(factor, white))
+    return common
 
 
 def solve_body(
@@ -200,43 +156,16 @@ def solve_body(
     if flux.shape != (count, width) or inverse_sigma.shape != flux.shape:
         raise TrackingError(f'{count} coils and {width} components, got flux {flux.shape}')
 
-    def evaluate(r: Array, turn: Array) -> tuple[Array, Array, Array, float]:
-        residual = np.empty((count, width))
-        white, jacobian = np.empty((count * width, 1)), np.empty((count * width, 6))
-        _fill_body(
-            r, turn, coils.offsets, coils.axes, coils.lengths, flux, inverse_sigma,
-            field.positions, field.directions, field.moments, residual, white[:, 0], jacobian,
-        )  # fmt: skip
-        return residual, white, jacobian, float(_inner(white, white, common)[0, 0])
-
     r, turn = np.array(position, dtype=np.float64), np.array(rotation, dtype=np.float64)
-    residual, white, jacobian, chi2 = evaluate(r, turn)
-    used, damping, converged = 1, FIRST_DAMPING, False
-    normal, gradient = _inner(jacobian, jacobian, common), _inner(jacobian, white, common)[:, 0]
-    while used < budget and not converged and damping < 1e10:
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-300), gradient)
-        move, angle = math.sqrt(step[:3] @ step[:3]), math.sqrt(step[3:] @ step[3:])
-        step *= min(1.0, LARGEST_MOVE_M / (move + 1e-30), LARGEST_TURN / (angle + 1e-30))
-        promised = float(step @ (2.0 * gradient - normal @ step))
-        if promised < CONVERGED_CHI2 + 1e-9 * chi2:
-            converged = True
-            break
-        new_r = np.minimum(np.maximum(r + step[:3], low), high)
-        new_turn = rotation_of_vector(step[3:]) @ turn
-        trial = evaluate(new_r, new_turn)
-        used += 1
-        if trial[3] <= chi2:
-            fall = chi2 - trial[3]
-            converged = fall < CONVERGED_CHI2 + 1e-9 * chi2
-            damping *= 0.1 if fall > 0.5 * promised else 0.5
-            r, turn, (residual, white, jacobian, chi2) = new_r, new_turn, trial
-            normal = _inner(jacobian, jacobian, common)
-            gradient = _inner(jacobian, white, common)[:, 0]
-        else:
-            damping = max(5.0 * damping, LEAST_RAISED)
-    coil_chi2 = (white.reshape(count, width) ** 2).sum(axis=1)
-    turn = nearest_rotation(turn)
-    return BodySolution(r, turn, chi2, normal, residual, coil_chi2, used, converged)
+    residual, white = np.empty((count, width)), np.empty((7, count * width))
+    information = np.empty((6, 6))
+    chi2, used, converged = descend_body(
+        r, turn, coils.offsets, coils.axes, coils.lengths, flux, inverse_sigma, common,
+        field.positions, field.directions, field.moments, low, high, budget, residual, white,
+        information,
+    )  # fmt: skip
+    coil_chi2 = (white[0].reshape(count, width) ** 2).sum(axis=1)
+    return BodySolution(r, turn, chi2, information, residual, coil_chi2, used, converged)
 
 
 def start_from_coils(

@@ -17,7 +17,7 @@ from anser_ros.fitting.model import EffectRecord, FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.tracking import estimate as states
 from anser_ros.tracking.body_track import BodyTrack, track_body
-from anser_ros.tracking.coil_track import NANO, CoilResult, CoilTrack, track_coil
+from anser_ros.tracking.coil_track import NANO, CoilResult, CoilTrack, prepare, track_coil
 from anser_ros.tracking.emitters import (
     FEWEST_EMITTERS,
     ReducedScene,
@@ -92,6 +92,7 @@ class Tracker:
         self._effects: tuple[EffectRecord, ...] = ()
         self._correction: Correction | None = None
         self._table = sensors
+        self._find_bodies()
         self._use(model, model_id)
 
     def _use(self, model: FieldModel | None, model_id: str | None) -> None:
@@ -100,8 +101,12 @@ class Tracker:
             if model.effects is not self._effects or self._correction is None:
                 self._correction = Correction.of(model.effects, self.sensors, model.frequencies_hz)
                 self._table = self._correction.sensors()
+                self._find_bodies()
             self._scene, self._effects = scene, model.effects
         self._model = model
+
+    def _find_bodies(self) -> None:
+        """Tell which coils make bodies whose six degrees of freedom they see."""
         table = self._table
         self._bodies: dict[str, tuple[NDArray[np.int64], BodyCoils]] = {}
         for body in self._body_tracks:
@@ -233,18 +238,21 @@ class Tracker:
                 ]
             # An emitter that is off leaks nothing into another's tone either.
             values.view(np.complex128)[:, ~living] = 0.0
-            self._reduced = without_dead(scene, living, self.settings, self._reduced)
+            self._reduced = without_dead(scene, living, self._reduced)
             scene = self._reduced.scene
         # Arithmetic on an infinity only warns; the kind of a bad value is counted as it came.
-        faults = [_fault(row, v, int(b)) for row, v, b in zip(rows, values, bits, strict=True)]
+        faults = _faults(rows, values, bits)
         values[~np.isfinite(values)] = np.nan
         corrected = self._corrected(stamp_ns, values)
         if corrected is not values:
             values = corrected
-            faults = [f or _fault(0, v, 0) for f, v in zip(faults, values, strict=True)]
+            again = _faults(np.zeros_like(rows), values, np.zeros_like(bits))
+            faults = [one or other for one, other in zip(faults, again, strict=True)]
         if living is not None:
             values = np.ascontiguousarray(values[:, np.repeat(living, 2)])
-        results = []
+        results: list[CoilResult] = []
+        tracks = [self._coil_tracks[name] for name in table.name]
+        prepare(tracks, table.length, stamp_ns, scene, self.settings)
         for i, name in enumerate(table.name):
             refusal = faults[i]
             if refusal is not None:
@@ -253,8 +261,7 @@ class Tracker:
                 results.append(CoilResult(bad, None))
                 continue
             result = track_coil(
-                self._coil_tracks[name], name, float(table.length[i]), stamp_ns, values[i], scene,
-                self.settings,
+                tracks[i], name, float(table.length[i]), stamp_ns, values[i], scene, self.settings,
             )  # fmt: skip
             self.counters['cold_starts'] += result.cold
             results.append(result)
@@ -329,6 +336,16 @@ class Tracker:
         return rows, values.view(np.float64), bits
 
 
+def _faults(
+    rows: NDArray[np.int64], values: Array, bits: NDArray[np.int64]
+) -> list[tuple[str, str, str] | None]:
+    """State, reason and kind where a sensor's fluxes must not be used; None for the others."""
+    # A comparison with NaN is false, so this is also what is not finite.
+    sound = ((np.abs(values) < LARGEST_FLUX_T).all(axis=1) & (rows >= 0) & (bits == 0)).tolist()
+    return [None if good else _fault(rows[i], values[i], int(bits[i])) for i, good in
+            enumerate(sound)]  # fmt: skip
+
+
 def _fault(row: int, values: Array, bits: int) -> tuple[str, str, str] | None:
     """State, reason and kind of a sensor whose fluxes must not be used."""
     if row < 0:
@@ -336,7 +353,6 @@ def _fault(row: int, values: Array, bits: int) -> tuple[str, str, str] | None:
     for bit, state in FLAGS:
         if bits & bit:
             return state, f'flagged {state} by the acquisition', state
-    # A comparison with NaN is false, so this is also what is not finite.
     if bool((np.abs(values) < LARGEST_FLUX_T).all()):
         return None
     if np.isfinite(values).all():

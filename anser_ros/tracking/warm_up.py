@@ -10,7 +10,7 @@ from anser_ros.tracking.tracker import Tracker
 
 
 def warm_up() -> None:
-    """Track a small made-up tool for a few frames, with and without model uncertainty."""
+    """Track a small made-up tool for three frames, so that motion is carried on,, with and without model uncertainty."""
     side = np.linspace(-0.1, 0.1, 3)
     x, y = (axis.ravel() for axis in np.meshgrid(side, side))
     positions = np.stack([x, y, np.zeros(9)], axis=1)
@@ -34,5 +34,5 @@ def warm_up() -> None:
         )  # fmt: skip
         flux = model.flux(sensors.position + [0.01, 0.02, 0.15], sensors.axis, sensors.length)
         tracker = Tracker(model, sensors, settings)
-        for stamp_ns in (1, 2):
+        for stamp_ns in (1, 2, 3):
             tracker.update(stamp_ns, sensors.channel, flux)
