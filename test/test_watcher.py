@@ -140,16 +140,17 @@ class TestWatch:
         with pytest.raises(DiagnosisError, match='at least 30 frames'):
             watch.look(window.session(), window.first_ns)
 
-    def test_an_effect_that_the_model_corrects_is_none(self, moving):
-        window = filled(moving, gain=GAIN)
+    @pytest.mark.parametrize('optical', [True, False])
+    def test_an_effect_that_the_model_corrects_is_none(self, moving, optical):
+        window = filled(moving, gain=GAIN, optical=optical)
         parameters = {'channel': CHANNEL, 'gain': GAIN, 'phase_deg': 0.0}
         known = EffectRecord('sensor_gain', parameters)
         model = replace(load_model(MODEL), effects=(known,))
         assert Watch(model).look(window.session(), window.first_ns).is_clear
 
     def test_what_nothing_explains_is_not_given_a_name(self, moving, watch, monkeypatch):
-        # a catalogue that knows nothing
-        monkeypatch.setattr(watching, 'MOST_EFFECTS', (0,))
+        nothing = replace(watching.LIGHT, most_effects=0)  # as if no effect explained it
+        monkeypatch.setattr(watching, 'LIGHT', nothing)
         window = filled(moving, gain=GAIN)
         seen = watch.look(window.session(), window.first_ns)
         assert seen.findings == () and not seen.is_clear and seen.excess_left > 100

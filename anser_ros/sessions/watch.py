@@ -27,9 +27,8 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 OPTICAL, RIGID, REFERENCES = 'optical poses', 'rigidity of the tools', 'references alone'
-LIGHT = SearchSettings(finalists=4, iterations=6)
-MOST_EFFECTS = (1, 2)
-"""Effects that are searched for, more only where fewer leave something."""
+LIGHT = SearchSettings(most_effects=1, finalists=4, iterations=6)
+"""One effect, the strongest: what it leaves is said, and is for the whole diagnosis to find."""
 FREE_POSE_M, FREE_POSE_RAD = 0.02, 0.1
 """A pose that the fluxes themselves gave may be so far off, and says nothing of its own."""
 EXCESS = 1.25
@@ -64,6 +63,8 @@ class Sighting:
         Why nothing is named although something is there.
     terms : tuple of Term
         The findings in force.
+    model : FieldModel or None
+        With the findings; None where there are none.
     """
 
     truth: str
@@ -75,6 +76,7 @@ class Sighting:
     depends_on: tuple[str, ...] = ()
     remark: str = ''
     terms: tuple[Term, ...] = ()
+    model: FieldModel | None = None
 
     @property
     def is_clear(self) -> bool:
@@ -102,6 +104,7 @@ class Watch:
     def __init__(self, model: FieldModel, clean: ComplexArray | None = None) -> None:
         self._model, self._clean = model, clean
         self._last: Sighting | None = None
+        self._left = 1.0  # what the last search left
         self.searches = 0
 
     def look(
@@ -124,60 +127,77 @@ class Watch:
             When there are too few frames to say anything.
         """
         began_s = (session.start_ns - first_ns) * NANO
-        tools = [
-            _moved(corrected(_moved(tool, began_s), self._model), -began_s)
-            for tool in session.tools
-        ]
+        tools = tuple(self._known(tool, began_s) for tool in session.tools)
+        reference = session.reference
+        if reference is not None:
+            reference = self._known(reference, began_s)
+        session = replace(session, tools=tools, reference=reference)
         truth = OPTICAL
         if sum(int(tool.has_pose.sum()) for tool in tools) < FEWEST_FRAMES:
             truth = RIGID
-            tools = [_posed_by_itself(tool, self._model) for tool in tools]
-        problem = self._problem(session, tools, truth)
-        sighting = self._judged(problem, truth, progress)
-        self._last = sighting
-        return sighting
 
-    def _problem(self, session: Session, tools: list[Measurements], truth: str) -> Problem:
+        def problem_with(model: FieldModel) -> Problem:
+            """Where the tools give their own poses, `model` is what they are worked out with."""
+            return self._problem(session, model if truth == RIGID else None)
+
+        self._last = self._judged(problem_with, truth, progress)
+        return self._last
+
+    def _known(self, measurements: Measurements, began_s: float) -> Measurements:
+        """Measurements as the model's own effects, whose time began earlier, leave them."""
+        return _moved(corrected(_moved(measurements, began_s), self._model), -began_s)
+
+    def _problem(self, session: Session, by: FieldModel | None) -> Problem:
         noise_t = noise_of(session.setup) or DEFAULT_NOISE_T
         spread = Spread(flux_t=float(np.hypot(noise_t, self._model.flux_error_t)), noise_t=noise_t)
-        if truth == RIGID:
+        tools = session.tools
+        if by is not None:
+            # The model's own effects are taken off already.
+            by = replace(by, effects=by.effects[len(self._model.effects) :])
+            tools = tuple(_posed_by_itself(tool, by) for tool in tools)
             spread = replace(spread, position_m=FREE_POSE_M, rotation_rad=FREE_POSE_RAD)
-        reference = session.reference
-        if reference is not None:
-            reference = corrected(reference, self._model)
-        return build_problem(tools, reference, self._clean, self._model, drawn(session), spread)
+        return build_problem(
+            tools, session.reference, self._clean, self._model, drawn(session), spread
+        )
 
     def _judged(
-        self, problem: Problem, truth: str, progress: Callable[[str], None] | None
+        self,
+        problem_with: Callable[[FieldModel], Problem],
+        truth: str,
+        progress: Callable[[str], None] | None,
     ) -> Sighting:
+        problem = problem_with(self._model)
         plain = evaluate(problem, ())
         excess, frames = _excess(plain), sum(tool.time.size for tool in problem.tools)
         seen = Sighting(truth, frames, (), excess, excess, _rms(plain))
         if excess < EXCESS:
             return seen
         last = self._last
-        if last is not None and last.truth == truth and last.excess >= EXCESS:
-            left = _excess(evaluate(problem, last.terms))
-            alike = left < SAME * last.excess_left and SAME * left > last.excess_left
-            if left < EXCESS or (alike and not last.remark):
+        if last is not None and last.truth == truth and last.model is not None:
+            # Poses by a model that is wrong are off by more than their errors' first order.
+            again = problem if truth == OPTICAL else problem_with(last.model)
+            left = _excess(evaluate(again, last.terms))
+            if left < max(EXCESS, SAME * self._left):
                 return replace(
                     last, frames=frames, excess=excess, excess_left=left, flux_rms_t=_rms(plain)
                 )
         if not _moves(problem):
             return replace(seen, remark='the tool moves too little to tell what it is')
         self.searches += 1
-        for most in MOST_EFFECTS:
-            settings = replace(LIGHT, most_effects=most)
-            found = diagnose(problem, self._model, settings, progress)
+        found = diagnose(problem, self._model, LIGHT, progress)
+        left = _excess(evaluate(problem, found.terms))
+        if truth == RIGID and found.findings and left >= EXCESS:
+            problem = problem_with(found.model)
+            found = diagnose(problem, self._model, LIGHT, progress)
             left = _excess(evaluate(problem, found.terms))
-            if left < EXCESS:
-                break
+        self._left = left
         return replace(
             seen,
             findings=tuple(finding.record for finding in found.findings),
             excess_left=left,
             depends_on=found.depends_on,
             terms=found.terms,
+            model=found.model,
         )
 
 
