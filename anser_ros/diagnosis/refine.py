@@ -1,54 +1,65 @@
-"""Refines a metal effect: the modes of a cloud of scatterers about it that the data can tell."""
+"""Refines a metal effect: the couplings about it that the data can tell, of a size that they ask.
 
-from collections.abc import Callable, Sequence
+A simple body has few parameters; a real one has more, which a prior holds small: how small is
+chosen by what predicts held-out blocks best. Place and couplings are fitted together, so a place
+is as uncertain as the body's shape leaves it.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.fit import Fit, fit_terms
-from anser_ros.diagnosis.problem import Problem, State
-from anser_ros.diagnosis.scoring import block_sums, joined
-from anser_ros.diagnosis.whitening import parts
+from anser_ros.diagnosis.fit import Fit, fit_terms, misfit
+from anser_ros.diagnosis.problem import Problem, evaluate
+from anser_ros.diagnosis.rich_modes import Known, rich_modes, thinned
+from anser_ros.diagnosis.scoring import joined
+from anser_ros.diagnosis.structure import noise_scale
+from anser_ros.effects.conducting_sheet import sheet_shapes, sheet_spread
 from anser_ros.effects.effect import Term, View
-from anser_ros.effects.metal_remainder import REMAINDER
-from anser_ros.effects.moving_metal import MovingMetal
-from anser_ros.effects.static_metal import BALL
+from anser_ros.effects.metal_body import BODIES, COMPACT, SPACINGS, ball_modes, body_spread
+from anser_ros.effects.metal_path import FreePath
+from anser_ros.effects.metal_remainder import REMAINDER, Couplings, Leftover, Lighting
+from anser_ros.effects.moving_metal import LARGEST, MovingMetal, path_of
+from anser_ros.effects.scattering import Shapes
 
 Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
-class MovingBody:
-    """How richly metal that moves is shaped: points a side and upwards, their spacing (m), modes,
-    prior size of their amplitudes (1e-4 m^3), and how often the modes are chosen anew."""
+class Richness:
+    """How finely metal is shaped: most modes, and knots that a free path may have."""
 
-    side: int
-    height: int
-    spacing: float
     modes: int
-    size: float
-    rounds: int
+    knots: tuple[int, ...]
 
 
-COARSE, FINE = MovingBody(5, 3, 0.04, 60, 0.2, 2), MovingBody(7, 3, 0.03, 110, 0.1, 2)
+COARSE, FINE = Richness(50, (9, 17)), Richness(90, (9, 17, 25))
 AT_REST = ('static_metal', 'conductive_plate')
 METALS = (*AT_REST, 'moving_metal')
-REFINEMENTS = 3
-"""Iterations with a remainder, which is linear."""
 
-SPACING = 0.03
-CLEARANCE = 0.025
-"""Scatterers keep this distance (m) from every sensor."""
-MOST_MODES = 110
-SIZES = (0.01, 0.1, 1.0, 10.0)
-"""Prior sizes that are tried, 1e-4 m^3 a scatterer."""
+RADII = (0.008, 0.012, 0.018, 0.027, 0.04, 0.06, 0.09)
+"""Radii of bodies that are tried, m."""
+PIECES = (0.01, 0.05, 0.2, 1.0)
+"""Sizes of an extended body's pieces that are tried, 1e-4 m^3."""
+SHEET_SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)
+"""Sizes that are tried of what a sheet's couplings lack, as shares of a perfect conductor's."""
+ODD = 0.2
+"""Couplings that a body lacks which is its own mirror image, as a share of others."""
+ROUNDS = 2
+TRIALS = 3
+"""Iterations after which kinds of bodies are compared."""
+AWAY = 2e-3
+"""A centre that the fit moves farther than this (m) asks for new modes."""
+LEFT = 1.02
+"""Misfit over the noise from which a path is given more freedom."""
+PER_PARAMETER = 6.0
 
 
 def belongs_to(remainder: Term, term: Term) -> bool:
     """Whether a term is the remainder of another."""
-    return remainder.effect is REMAINDER and remainder.site['_parent'] is term.site
+    return remainder.effect is REMAINDER and remainder.site['_parent'] == term.seat
 
 
 def settled(
@@ -57,51 +68,122 @@ def settled(
     blocks: NDArray[np.int64],
     folds: int,
     iterations: int,
-    body: MovingBody = COARSE,
+    body: Richness = COARSE,
 ) -> Fit:
-    """The joint fit of all effects, metal with a remainder each.
-
-    Places and sizes are fitted without remainders, which could take their part; with them, they
-    are held. Metal that moves shows its shape by moving, so its path stays free.
-    """
+    """The joint fit of all effects, metal as richly shaped as the data can tell."""
     plain = [term.free() for term in terms if term.effect is not REMAINDER]
-    fit = fit_terms(problem, plain, blocks, iterations)
+    # What moves and has its shape already is shaped anew below.
+    known = any('_body' in term.site for term in plain)
+    fit = fit_terms(problem, plain, blocks, 1 if known else iterations)
     for index, term in enumerate(fit.terms):
         if term.effect.name == 'moving_metal':
-            fit = _shaped(fit, index, problem, blocks, iterations, body)
-    if not any(term.effect.name in AT_REST for term in fit.terms):
-        return fit
-    held = [
-        term.frozen(_place_covariance(fit, i)) if term.effect.name in AT_REST else term
-        for i, term in enumerate(fit.terms)
-    ]
-    refined = fit_terms(problem, held, blocks, 1)
-    for term in refined.terms:
+            fit = _shaped(fit, index, problem, blocks, folds, iterations, body)
+    for index, term in enumerate(fit.terms):
         if term.effect.name in AT_REST:
-            more = remainder_of(refined, term, problem, blocks, folds)
-            if more is not None:
-                refined = fit_terms(problem, [*refined.terms, more], blocks, REFINEMENTS)
-    return refined
+            fit = _with_remainder(fit, index, problem, blocks, folds, iterations, body)
+    return _held(fit, problem, blocks)
 
 
-def _place_covariance(fit: Fit, index: int) -> Array:
-    """Covariance of a metal's parameters, its unknown shape included.
+def _held(fit: Fit, problem: Problem, blocks: NDArray[np.int64]) -> Fit:
+    """The same fit, metal held where it is: what is tried beside it is then cheap to fit."""
+    held = [
+        term.frozen(fit.covariance_of(index)) if term.effect.name in METALS else term
+        for index, term in enumerate(fit.terms)
+    ]
+    if not any(term.effect.name in METALS for term in held):
+        return fit
+    return fit_terms(problem, held, blocks, 1)
 
-    A body of another shape would be placed elsewhere: the way from where a ball fits best to where
-    a point fits best is taken for one standard deviation.
-    """
-    covariance, term = fit.covariance_of(index).copy(), fit.terms[index]
-    if term.effect.name != 'static_metal':
-        return covariance
-    theta = term.theta
-    short = theta[3:].reshape(2, -1)[:, [0, *range(2, BALL.groups)]].ravel()
-    site = {**term.site, '_point': True}
-    point = Term(term.effect, site, np.concatenate([theta[:3], short]))
-    terms = [point if i == index else t for i, t in enumerate(fit.terms)]
-    other = fit_terms(fit.state.problem, terms, np.unique(fit.state.problem.blocks[0]), 4)
-    way = other.terms[index].theta[:3] - theta[:3]
-    covariance[:3, :3] += np.diag(way**2 + np.sum(way**2) / 9)
-    return covariance
+
+def _with_remainder(
+    fit: Fit,
+    index: int,
+    problem: Problem,
+    blocks: NDArray[np.int64],
+    folds: int,
+    iterations: int,
+    body: Richness,
+) -> Fit:
+    """The fit with what one metal at rest leaves, about where it then is."""
+    plain = fit.terms
+    for _ in range(ROUNDS):
+        term = fit.terms[index]
+        centre = _centre(term)
+        own = _couplings(fit, term, plain, _shapes_of(term), blocks, folds, body)
+        if own is None:
+            return fit
+        start = [t if i != index else term for i, t in enumerate(plain)]
+        light = REMAINDER.of(term, Lighting([term, *own], problem.scene.emitters))
+        fit = fit_terms(problem, [*start, *own, light], blocks, iterations)
+        if np.linalg.norm(_centre(fit.terms[index]) - centre) < AWAY:
+            break
+    if term.effect.name == 'static_metal' and _left(fit) > LEFT:
+        more = _couplings(fit, fit.terms[index], fit.terms, _lattices(), blocks, folds, body)
+        if more is not None:
+            held = fit.terms[index].frozen(fit.covariance_of(index))
+            fit = fit_terms(problem, [*_with(fit.terms, index, held), *more], blocks, iterations)
+    return fit
+
+
+def _left(fit: Fit) -> float:
+    """Misfit of the tools over their noise."""
+    tools = [part for part in fit.state.parts if not part.view.is_reference]
+    squares = sum(float(np.sum(part.white**2)) for part in tools)
+    count = sum(part.count for part in tools)
+    return squares / max(count, 1) / noise_scale(fit.state) ** 2
+
+
+def _couplings(
+    fit: Fit,
+    term: Term,
+    beside: Sequence[Term],
+    shapes: Sequence[tuple[Shapes, list[Array]]],
+    blocks: NDArray[np.int64],
+    folds: int,
+    body: Richness,
+) -> list[Term] | None:
+    """The couplings about metal at rest that predict best beside other terms, in a list."""
+    few = thinned(fit.state, blocks)
+    centre = _centre(term)
+    known = (
+        joined([few.design(t) for t in beside]),
+        np.concatenate([t.effect.prior(t) for t in beside]),
+    )
+    best: tuple[float, Leftover] | None = None
+    for kind, spreads in shapes:
+
+        def unit(view: View, modes: Array, kind: Shapes = kind) -> NDArray[np.inexact]:
+            return Couplings(kind, centre, modes).unit(view)
+
+        found = rich_modes(few, known, unit, spreads, blocks, folds, body.modes)
+        if found is not None and (best is None or found[0] < best[0]):
+            best = (found[0], Couplings(kind, centre, found[1]))
+    return None if best is None else [REMAINDER.of(term, best[1])]
+
+
+def _centre(term: Term) -> Array:
+    """Of metal at rest, m."""
+    if term.effect.name == 'conductive_plate':
+        return term.theta[[2, 3, 0]]
+    return term.theta[:3]
+
+
+def _shapes_of(term: Term) -> list[tuple[Shapes, list[Array]]]:
+    """Shapes about metal at rest that tell its place, and the sizes of their couplings."""
+    if term.effect.name == 'conductive_plate':
+        edge = float(term.theta[1])
+        return [(sheet_shapes(edge), [sheet_spread(edge, share) for share in SHEET_SHARES])]
+    return [(BODIES[COMPACT](), _spreads(COMPACT))]
+
+
+def _lattices() -> list[tuple[Shapes, list[Array]]]:
+    return [(BODIES[kind](), _spreads(kind)) for kind in SPACINGS]
+
+
+def _spreads(kind: str) -> list[Array]:
+    if kind == COMPACT:
+        return [body_spread(radius, ODD) for radius in RADII]
+    return [np.full(BODIES[kind]().size, size) for size in PIECES]
 
 
 def _shaped(
@@ -109,105 +191,136 @@ def _shaped(
     index: int,
     problem: Problem,
     blocks: NDArray[np.int64],
+    folds: int,
     iterations: int,
-    body: MovingBody,
+    body: Richness,
 ) -> Fit:
-    """The fit with a richer body for metal that moves."""
+    """The fit with a richer body for metal that moves, and a freer path where that pays."""
     effect = fit.terms[index].effect
     if not isinstance(effect, MovingMetal) or fit.terms[index].site.get('_body') == body:
         return fit
-    lateral = (np.arange(body.side) - (body.side - 1) / 2) * body.spacing
-    upright = (np.arange(body.height) - (body.height - 1) / 2) * body.spacing
-    offsets = np.array([(a, b, c) for a in lateral for b in lateral for c in upright])
-    for _ in range(body.rounds):
+    fit = _bodied(fit, index, problem, blocks, folds, iterations, body)
+    for count in body.knots:
         term = fit.terms[index]
-        single = effect.with_body(term, offsets, np.eye(3 * len(offsets)), 1.0)
-        modes, _ = _modes(fit.state, single, blocks, effect.unit)
-        rich = effect.with_body(term, offsets, modes[:, : body.modes], body.size)
-        rich = replace(rich, site={**rich.site, '_body': body})
-        held = rich.frozen(np.zeros((0, 0)))
-        start = fit_terms(problem, _with(fit.terms, index, held), blocks, 1)
-        fit = fit_terms(
-            problem, _with(start.terms, index, start.terms[index].free()), blocks, iterations
+        path = path_of(term)
+        if misfit(fit) < LEFT * noise_scale(fit.state) ** 2:
+            break
+        if isinstance(path, FreePath) and len(path.knots) >= count:
+            continue
+        time = np.linspace(0.0, problem.scene.duration, 6 * count)
+        freer, course = FreePath.through(
+            np.linspace(0.0, problem.scene.duration, count), time, effect.centres(term, time)
         )
+        trial = _with(fit.terms, index, effect.with_path(term, freer, course))
+        other = fit_terms(problem, trial, blocks, iterations)
+        more = PER_PARAMETER * (freer.count - path.count) * max(misfit(other), 1.0)
+        if fit.held_out(folds) - other.held_out(folds) > more:
+            fit = other
     return fit
+
+
+def _bodied(
+    fit: Fit,
+    index: int,
+    problem: Problem,
+    blocks: NDArray[np.int64],
+    folds: int,
+    iterations: int,
+    body: Richness,
+) -> Fit:
+    """The fit with a richer body for metal that moves.
+
+    A simple body in place of an extended one may have gone astray: where it started counts too.
+    """
+    first = fit.terms[index]
+    if '_body' in first.site:
+        kind = [first.site['_kind']]
+        again = _shaped_as(fit, index, problem, blocks, folds, iterations, body, kind)
+        return again or fit
+    starts, families = [fit], [[COMPACT], [*SPACINGS]]
+    if '_course' in first.site:
+        course = first.site['_course']
+        moved = first.with_theta(np.concatenate([course, first.theta[course.size :]]))
+        held = _with(fit.terms, index, moved.frozen(np.zeros((0, 0))))
+        linear = fit_terms(problem, held, blocks, 1)
+        starts.append(fit_terms(problem, [t.free() for t in linear.terms], blocks, 0))
+    shaped = [
+        other
+        for start in starts
+        for kinds in families
+        if (other := _shaped_as(start, index, problem, blocks, folds, TRIALS, body, kinds))
+    ]
+    if not shaped:
+        return fit
+    best = min(shaped, key=lambda f: f.held_out(folds))
+    kind = [best.terms[index].site['_kind']]
+    again = _shaped_as(best, index, problem, blocks, folds, iterations, body, kind)
+    return again or best
+
+
+def _shaped_as(
+    fit: Fit,
+    index: int,
+    problem: Problem,
+    blocks: NDArray[np.int64],
+    folds: int,
+    iterations: int,
+    body: Richness,
+    kinds: Sequence[str],
+) -> Fit | None:
+    """The fit with the best of some kinds of bodies; None where none is better than nothing."""
+    term = fit.terms[index]
+    effect = term.effect
+    assert isinstance(effect, MovingMetal)
+    bare = _with(fit.terms, index, term.with_theta(_without_amounts(term)))
+    few = thinned(evaluate(problem, bare), blocks)
+    known = _known(fit, index, blocks)
+    best: tuple[float, str, Array] | None = None
+    for kind in kinds:
+
+        def unit(view: View, modes: Array, kind: str = kind) -> NDArray[np.inexact]:
+            return effect.unit(effect.with_body(term, kind, modes, np.ones(modes.shape[1])), view)
+
+        found = rich_modes(few, known, unit, _spreads(kind), blocks, folds, body.modes)
+        if found is not None and (best is None or found[0] < best[0]):
+            best = (found[0], kind, found[1])
+    if best is None:
+        return None
+    _, kind, modes = best
+    spread = np.ones(modes.shape[1])
+    if kind == COMPACT:
+        modes = np.concatenate([ball_modes(), modes], axis=1)
+        spread = np.concatenate([np.full(ball_modes().shape[1], LARGEST), spread])
+    rich = effect.with_body(term, kind, modes, spread)
+    rich = replace(rich, site={**rich.site, '_body': body})
+    start = fit_terms(problem, _with(fit.terms, index, rich.frozen(np.zeros((0, 0)))), blocks, 1)
+    free = _with(start.terms, index, start.terms[index].free())
+    return fit_terms(problem, free, blocks, iterations)
+
+
+def _without_amounts(term: Term) -> Array:
+    theta = term.theta.copy()
+    theta[term.effect.amounts(term)] = 0.0
+    return theta
+
+
+def _known(fit: Fit, index: int, blocks: NDArray[np.int64]) -> Known:
+    """Columns of all terms, of the metal that moves only those of its path."""
+    few = thinned(fit.state, blocks)
+    groups, priors = [], []
+    for i, term in enumerate(fit.terms):
+        columns, prior = few.design(term), term.effect.prior(term)
+        if i == index:
+            count = path_of(term).count
+            columns = [None if c is None else c[..., :count] for c in columns]
+            prior = prior[:count]
+        groups.append(columns)
+        priors.append(prior)
+    return joined(groups), np.concatenate(priors)
 
 
 def _with(terms: Sequence[Term], index: int, term: Term) -> tuple[Term, ...]:
     return tuple(term if i == index else t for i, t in enumerate(terms))
 
 
-def _cloud(term: Term, problem: Problem) -> Array:
-    """Points in fg about metal at rest."""
-    if term.effect.name == 'conductive_plate':
-        z, edge, x, y, _ = term.theta
-        steps = (np.arange(8) - 3.5) * edge / 6
-        points = np.array([(x + a, y + b, z) for a in steps for b in steps])
-    else:
-        lateral, upright = (np.arange(5) - 2) * SPACING, (np.arange(3) - 1) * SPACING
-        points = np.array([(a, b, c) for a in lateral for b in lateral for c in upright])
-        points = points + term.theta[:3]
-    sensors = [tool.placed()[0].reshape(-1, 3)[::7] for tool in problem.tools]
-    if problem.references is not None:
-        sensors.append(problem.references.readings.sensors.position)
-    places = np.concatenate(sensors)
-    nearest = np.array([np.linalg.norm(places - p, axis=1).min() for p in points])
-    return points[nearest > CLEARANCE]
-
-
-def remainder_of(
-    fit: Fit, term: Term, problem: Problem, blocks: NDArray[np.int64], folds: int
-) -> Term | None:
-    """The remainder of a metal term that lowers the held-out misfit most; None when none does."""
-    points = _cloud(term, problem)
-    if points.shape[0] < 8:
-        return None
-    state = fit.state
-    raw = REMAINDER.about(term, points, np.eye(3 * points.shape[0]), 1.0)
-    modes, strength = _modes(state, raw, blocks, REMAINDER.unit)
-    widest = np.flatnonzero(strength * max(SIZES) ** 2 > 1.0)[:MOST_MODES]
-    if widest.size == 0:
-        return None
-    all_modes = REMAINDER.about(term, points, modes[:, widest], 1.0)
-    columns = joined([*(state.design(t) for t in fit.terms), state.design(all_modes)])
-    sums = block_sums(state, columns, blocks)
-    known, count = fit.prior.size, widest.size
-    best: tuple[float, float, int] | None = None
-    for size in SIZES:
-        keep = int(np.count_nonzero(strength[widest] * size**2 > 1.0))
-        if keep == 0:
-            continue
-        rows = np.concatenate(
-            [np.arange(known), known + np.arange(keep), known + count + np.arange(keep)]
-        )
-        prior = np.concatenate([fit.prior, np.full(2 * keep, size)])
-        left = sums.columns(rows).held_out(prior, folds)
-        if best is None or left < best[0]:
-            best = (left, size, keep)
-    if best is None or best[0] >= fit.held_out(folds):
-        return None
-    return REMAINDER.about(term, points, modes[:, : best[2]], best[1])
-
-
-def _modes(
-    state: State,
-    raw: Term,
-    blocks: NDArray[np.int64],
-    unit: Callable[[Term, View], ComplexArray],
-) -> tuple[Array, Array]:
-    """Combinations of scatterers by falling information, (3 n, m), and that information (m,).
-
-    Only the in-phase half of the columns is used: the other half is the same, turned.
-    """
-    count = 3 * raw.site['_offsets'].shape[0]
-    normal = np.zeros((count, count))
-    for part in state.parts:
-        rows = np.flatnonzero(np.isin(part.blocks, blocks))
-        step = max(1, rows.size // 70)
-        few = rows[::step]
-        white = part.whitener.rows(few)(parts(unit(raw, part.view.frames(few))))
-        flat = white.reshape(-1, count)
-        normal += step * (flat.T @ flat)
-    values, vectors = np.linalg.eigh(normal)
-    order = np.argsort(values)[::-1]
-    return vectors[:, order], values[order]
+__all__ = ['COARSE', 'FINE', 'METALS', 'Richness', 'belongs_to', 'settled']

@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 from anser_ros.diagnosis.confirm import doubtful
 from anser_ros.diagnosis.fit import Fit, fit_terms, misfit
 from anser_ros.diagnosis.fluctuating import fluctuation_of, left_over
+from anser_ros.diagnosis.moving_start import moving_starts
 from anser_ros.diagnosis.problem import Problem
 from anser_ros.diagnosis.refine import METALS, settled
-from anser_ros.diagnosis.scoring import BlockSums, Score, Scorer
+from anser_ros.diagnosis.resting import moves_or_rests
+from anser_ros.diagnosis.scoring import Score, Scorer
 from anser_ros.diagnosis.structure import noise_scale
-from anser_ros.effects.effect import Effect, Term
+from anser_ros.effects.effect import Term
 from anser_ros.effects.fluctuation import Fluctuation
 from anser_ros.effects.metal_remainder import REMAINDER
-from anser_ros.effects.moving_metal import MovingMetal
 from anser_ros.effects.registry import all_effects
 
 Array = NDArray[np.float64]
@@ -181,7 +182,7 @@ def _round(
     table = [Candidate(t, s.solution.size, scorer.held_out - s.held_out) for t, s in scored]
     open_ones = _fluctuating(problem, before, how)
     table += [Candidate(t, complexity(t), g) for g, t in open_ones]
-    starts = _finalists(scored, scorer, how) + _moving(problem, scored, scorer, blocks)
+    starts = _finalists(scored, scorer, how) + moving_starts(problem, scored, scorer, blocks)
     fitted: list[tuple[float, Fit]] = []
     for expected, term in sorted(starts + open_ones, key=lambda pair: -pair[0]):
         if fitted and expected < PROMISING * max(g for g, _ in fitted):
@@ -208,6 +209,11 @@ def _round(
         for g, f in fitted
         if f is not best and g > gain - 10 * max(misfit(best), 1.0) - 0.02 * abs(gain)
     ]
+    if term.effect.name == 'moving_metal':
+        return moves_or_rests(
+            problem, blocks, best, fitted, lambda s: _scored(problem, s), gain, how.folds,
+            how.iterations,
+        )  # fmt: skip
     if any(t.effect.name in METALS for t in best.terms):
         return settled(problem, best.terms, blocks, how.folds, how.iterations)
     return best
@@ -325,45 +331,6 @@ def _finalists(
         count[name] = count.get(name, 0) + 1
         out += [(gain, start) for start in term.effect.started(term, score.solution)]
     return out
-
-
-def _moving(
-    problem: Problem,
-    scored: Sequence[tuple[Term, Score]],
-    scorer: Scorer,
-    blocks: NDArray[np.int64],
-) -> list[tuple[float, Term]]:
-    """Expected gain and starts for moving metal: where metal fits best at first and at last."""
-    effect: Effect | None = all_effects().get('moving_metal')
-    places = [(t, s) for t, s in scored if t.effect.name == 'static_metal']
-    if not isinstance(effect, MovingMetal) or not places:
-        return []
-    still = min(s.held_out for _, s in places)
-    window = max(2, blocks.size // 8)
-    first, last = np.arange(window), np.arange(blocks.size - window, blocks.size)
-    own = [(t, s.own) for t, s in places]
-    alone = sum(max(_gain(sums, np.array([i])) for _, sums in own) for i in range(blocks.size))
-    excess = scorer.state.sum_of_squares - scorer.state.count
-    if alone < max(1.05 * (scorer.held_out - still) + 100, LEAST_OF_EXCESS * excess):
-        return []
-    ends = []
-    for rows in (first, last):
-        gains = [_gain(sums, rows) for _, sums in own]
-        ends.append(own[int(np.argmax(gains))])
-    strongest = max(((_gain(ends[0][1], first), 0), (_gain(ends[1][1], last), 1)))[1]
-    alpha = ends[strongest][1].part((first, last)[strongest]).solve(np.full(2, 1e6))[0]
-    duration = problem.scene.duration
-    start, end = ends[0][0].theta[:3], ends[1][0].theta[:3]
-    if np.linalg.norm(end - start) < 0.02:
-        start = start + np.array([0.0, 0.0, -0.05])
-    times = [(0.2 * duration, 0.8 * duration), (0.05 * duration, 0.5 * duration)]
-    return [(alone, effect.starting(start, end, pair, alpha)) for pair in times]
-
-
-def _gain(sums: BlockSums, rows: NDArray[np.int64]) -> float:
-    part = sums.part(rows)
-    estimate, _ = part.solve(np.full(part.size, 1e6))
-    return float(part.right.sum(axis=0) @ estimate)
 
 
 def _wald(fit: Fit, index: int) -> float:

@@ -6,6 +6,7 @@ Inductance Calculations, 1946, ch. 3), R from the sheet resistance, one square a
 M scales with h and R not at all, so one generalised eigenproblem serves all sizes and resistances.
 """
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,9 +14,15 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from anser_ros.effects.dipoles import Dipoles
+from anser_ros.effects.scattering import UNIT, Shapes
 from anser_ros.physics.constants import MU_0
 
 Array = NDArray[np.float64]
+
+FINEST = 7
+"""Half waves along both edges together, at most, of the shapes that a sheet's answer may have."""
+SHAPE_POINTS = 12
+WIDER = 1.06
 
 
 def _strip_distance(aside: Array) -> Array:
@@ -91,3 +98,39 @@ def sheet_sources(
     response = values[:, None] * np.sqrt(area) + sheet_ohm / (1j * omega)
     current = -(vectors @ ((vectors.T @ flux) / response))
     return Dipoles(points, up, current * area)
+
+
+@cache
+def _unit_shapes() -> tuple[Shapes, Array]:
+    """Sines over a square of edge 1 that vanish at its edges, and their wave numbers."""
+    steps = (np.arange(SHAPE_POINTS) + 0.5) / SHAPE_POINTS - 0.5
+    x, y = (axis.ravel() for axis in np.meshgrid(steps, steps, indexing='ij'))
+    numbers = [(m, n) for m in range(1, FINEST) for n in range(1, FINEST) if m + n <= FINEST]
+    functionals = np.zeros((len(numbers), x.size, 3))
+    for i, (m, n) in enumerate(numbers):
+        wave = np.sin(m * np.pi * (x + 0.5)) * np.sin(n * np.pi * (y + 0.5))
+        functionals[i, :, 2] = 2.0 * wave / x.size
+    first, second = np.triu_indices(len(numbers))
+    offsets = np.stack([x, y, np.zeros(x.size)], axis=1)
+    none = np.zeros(0, dtype=np.int64)
+    return Shapes(offsets, functionals, first, second, none), np.pi * np.hypot(
+        *np.array(numbers).T
+    )
+
+
+def sheet_shapes(edge: float) -> Shapes:
+    """Shapes of the field through a square sheet, its edge (m) a little wider than the sheet."""
+    shapes, _ = _unit_shapes()
+    size = WIDER * edge
+    return replace(shapes, offsets=size * shapes.offsets, functionals=size * shapes.functionals)
+
+
+def sheet_spread(edge: float, share: float) -> Array:
+    """Prior size of each coupling, as a share of a perfect conductor's, shape (`Shapes.size`,).
+
+    A perfectly conducting sheet answers a normal field of wave number k with the stream function
+    ``2 / (mu0 k)`` times it.
+    """
+    shapes, waves = _unit_shapes()
+    each = np.sqrt(2 * WIDER * edge / waves)
+    return np.asarray(share / UNIT * each[shapes.first] * each[shapes.second])

@@ -204,6 +204,11 @@ class Term:
         return replace(self, site={k: v for k, v in self.site.items() if k not in held})
 
     @property
+    def seat(self) -> tuple[str, str]:
+        """Name and site: the same for one term whatever its parameters, and held or free."""
+        return self.effect.name, repr({k: v for k, v in self.site.items() if k[0] != '_'})
+
+    @property
     def label(self) -> str:
         """Name and site in words."""
         parts = [f'{key} {_short(value)}' for key, value in self.site.items() if key[0] != '_']

@@ -1,25 +1,30 @@
-"""A piece of metal seen from outside: one polarisability that all emitters illuminate.
+"""A piece of metal seen from outside: what it makes of multipoles, or of pieces on a lattice.
 
-The induced moment at a point is ``alpha B_k / mu0`` with the same alpha (m^3, complex) for every
-emitter k. An extended body is stood for by isotropic scatterers at its centre and on shells about
-it (which span the isotropic multipoles, so that a sphere's true centre fits best), and by the five
-traceless tensors at its centre (for what is longer one way than another).
+Near a body's centre a field is a sum of gradients of solid harmonics; those are the shapes that
+count (`anser_ros.effects.scattering`). The leading block of T (orders 1, 1) is the polarisability,
+and a block of orders l, l' grows as R^(l + l' + 1) with the body's radius R. Where the body is its
+own mirror image about the centre, blocks of odd l + l' vanish, which tells where its centre is.
+A body as large as its distance is no sum of few multipoles: it is a lattice of small pieces.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.dipoles import Dipoles
-from anser_ros.physics.constants import DIPOLE_CONSTANT, MU_0
+from anser_ros.effects.scattering import UNIT, Shapes
 
 Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
-NEGLIGIBLE = 1e-4
-UNIT = 1e-4
-"""Polarisabilities count in 1e-4 m^3; a perfectly conducting ball of 25 mm has -1."""
+RADIUS = 0.025
+"""Of the sphere on which amplitudes are taken, m."""
+HIGHEST = 4
+"""Largest order of a multipole."""
+TOGETHER = 6
+"""Largest sum of two orders that are coupled."""
+FREQUENCY_SLOPE = 0.5
+"""Prior size of d(ln T) / d(ln f); a sphere's parts have slopes between -1/2 and 1."""
 
 
 def _sphere_points() -> tuple[Array, Array]:
@@ -35,126 +40,83 @@ def _sphere_points() -> tuple[Array, Array]:
 
 
 SPHERE_POINTS, SPHERE_WEIGHTS = _sphere_points()
-TRACELESS = np.array(
-    [
-        [[1, 0, 0], [0, -1, 0], [0, 0, 0]],
-        [[1, 0, 0], [0, 1, 0], [0, 0, -2]],
-        [[0, 1, 0], [1, 0, 0], [0, 0, 0]],
-        [[0, 0, 1], [0, 0, 0], [1, 0, 0]],
-        [[0, 0, 0], [0, 0, 1], [0, 1, 0]],
-    ],
-    dtype=np.float64,
-)
 
 
-@dataclass(frozen=True)
-class BodyShape:
-    """Scatterers about a centre, gathered in groups that share one polarisability each.
+def _zonal_gradients(order: int) -> Array:
+    """Gradients of r^l P_l about each of the points' directions, at the points: (n, n, 3)."""
+    t = SPHERE_POINTS @ SPHERE_POINTS.T
+    p = np.polynomial.legendre.Legendre.basis(order)
+    value, slope = p(t), p.deriv()(t)
+    along = (order * value - t * slope)[..., None] * SPHERE_POINTS[None, :, :]
+    return np.asarray(along + slope[..., None] * SPHERE_POINTS[:, None, :])
 
-    Attributes
-    ----------
-    offsets : ndarray, shape (n, 3)
-        From the body's centre, m.
-    tensors : ndarray, shape (g, n, 3, 3)
-        Each group's tensor at every point; group g's moments are ``alpha_g tensors[g] B / mu0``.
+
+def _orders() -> NDArray[np.int64]:
+    """Order of each shape."""
+    return np.repeat(np.arange(1, HIGHEST + 1), 2 * np.arange(1, HIGHEST + 1) + 1)
+
+
+@cache
+def multipoles() -> Shapes:
+    """All orders up to `HIGHEST`; the first three shapes are the mean field along x, y, z."""
+    functionals: list[Array] = [SPHERE_WEIGHTS[:, None] * np.eye(3)[i] for i in range(3)]
+    root = np.sqrt(SPHERE_WEIGHTS)[None, :, None]
+    for order in range(2, HIGHEST + 1):
+        rows = (_zonal_gradients(order) * root).reshape(len(SPHERE_POINTS), -1)
+        _, _, shapes = np.linalg.svd(rows, full_matrices=False)
+        count = 2 * order + 1
+        functionals += list(shapes[:count].reshape(count, -1, 3) * root)
+    orders = _orders()
+    first, second = np.triu_indices(orders.size)
+    keep = orders[first] + orders[second] <= TOGETHER
+    first, second = first[keep], second[keep]
+    dipoles = np.flatnonzero((first < 3) & (second < 3))
+    return Shapes(RADIUS * SPHERE_POINTS, np.array(functionals), first, second, dipoles)
+
+
+def body_spread(radius: float, odd: float) -> Array:
+    """Prior size of each coupling in a body of a radius (m), shape (`Shapes.size`,).
+
+    Couplings that a symmetric body lacks have the share ``odd`` of it.
     """
-
-    offsets: Array
-    tensors: Array
-
-    @property
-    def groups(self) -> int:
-        """Number of complex polarisabilities."""
-        return int(self.tensors.shape[0])
-
-    @staticmethod
-    def ball(radii: tuple[float, ...] = (0.025,)) -> 'BodyShape':
-        """Centre and shells, each isotropic, and the centre's traceless tensors."""
-        offsets = np.concatenate([np.zeros((1, 3))] + [r * SPHERE_POINTS for r in radii])
-        count = offsets.shape[0]
-        groups = [np.zeros((count, 3, 3)) for _ in range(1 + len(radii) + len(TRACELESS))]
-        groups[0][0] = np.eye(3)
-        for shell in range(len(radii)):
-            rows = slice(1 + shell * len(SPHERE_POINTS), 1 + (shell + 1) * len(SPHERE_POINTS))
-            groups[1 + shell][rows] = SPHERE_WEIGHTS[:, None, None] * np.eye(3)
-        for i, tensor in enumerate(TRACELESS):
-            groups[1 + len(radii) + i][0] = tensor
-        return BodyShape(offsets, np.array(groups))
-
-    @staticmethod
-    def point() -> 'BodyShape':
-        """One isotropic scatterer."""
-        return BodyShape(np.zeros((1, 3)), np.eye(3)[None, None])
-
-    @staticmethod
-    def cloud(offsets: Array) -> 'BodyShape':
-        """Independent isotropic scatterers."""
-        count = offsets.shape[0]
-        tensors = np.zeros((count, count, 3, 3))
-        tensors[np.arange(count), np.arange(count)] = np.eye(3)
-        return BodyShape(offsets, tensors)
-
-    def complex_polarisability(self, alpha: Array) -> ComplexArray:
-        """(g,) complex, m^3, from real and imaginary parts in `UNIT` (2 g,)."""
-        parts = alpha.reshape(2, -1) * UNIT
-        return np.asarray(parts[0] + 1j * parts[1])
-
-    def sources(self, centre: Array, alpha: Array, illumination: Dipoles) -> Dipoles:
-        """Induced dipoles of the body at a place (m)."""
-        points = centre + self.offsets
-        field = illumination.field(points)
-        tensors = np.einsum('g,gnij->nij', self.complex_polarisability(alpha), self.tensors)
-        return Dipoles.vectors(points, np.einsum('nij,njk->nik', tensors, field) / MU_0)
-
-    def responses(self, centre: Array, illumination: Dipoles) -> tuple[Array, ComplexArray]:
-        """Scatterers (n, 3) and moments (g, n, 3, K) of a unit polarisability of each group."""
-        points = centre + self.offsets
-        field = illumination.field(points)
-        return points, np.einsum('gnij,njk->gnik', self.tensors, field) * (UNIT / MU_0)
-
-    def total(self, alpha: Array) -> ComplexArray:
-        """The body's whole dipole polarisability, shape (3, 3), m^3."""
-        tensors = self.tensors.sum(axis=1)
-        return np.asarray(np.einsum('g,gij->ij', self.complex_polarisability(alpha), tensors))
+    shapes, orders = multipoles(), _orders()
+    total = orders[shapes.first] + orders[shapes.second]
+    size = 2 * np.pi * radius**3 / UNIT * (radius / RADIUS) ** (total - 2)
+    size *= np.where(total % 2, odd, 1.0)
+    return np.concatenate([size, FREQUENCY_SLOPE * size[shapes.sloped]])
 
 
-def group_flux(
-    points: Array, moments: ComplexArray, centres: Array, axes: Array, lengths: Array
-) -> ComplexArray:
-    """Flux (P, K, g) of scatterers (n, 3) with the moments (g, n, 3, K) of g groups."""
-    sources = Dipoles.vectors(points, np.moveaxis(moments, 0, -1).reshape(len(points), 3, -1))
-    flux = sources.flux(centres, axes, lengths)
-    return flux.reshape(len(centres), -1, moments.shape[0])
+@cache
+def ball_modes() -> Array:
+    """Couplings (`Shapes.size`, 7) of a simple body: a unit polarisability, its five traceless
+    tensors, and the quadrupoles of a ball."""
+    shapes = multipoles()
+    where = {(i, j): n for n, (i, j) in enumerate(zip(shapes.first, shapes.second, strict=True))}
+    modes = np.zeros((shapes.size, 7))
+    diagonal = [where[i, i] for i in range(3)]
+    modes[diagonal, 0] = 1.0
+    modes[diagonal, 1] = [1.0, -1.0, 0.0]
+    modes[diagonal, 2] = [1.0, 1.0, -2.0]
+    for n, pair in enumerate(((0, 1), (0, 2), (1, 2))):
+        modes[where[pair], 3 + n] = np.sqrt(2)
+    modes[[where[i, i] for i in range(3, 8)], 6] = 1.0
+    return modes
 
 
-def scatterer_coupling(points: Array, centres: Array, axes: Array) -> Array:
-    """Flux of unit moments along x, y, z at points that are elsewhere in every frame.
-
-    Parameters
-    ----------
-    points : ndarray, shape (F, n, 3)
-    centres, axes : ndarray, shape (F, S, 3)
-        Sensors, taken as points.
-
-    Returns
-    -------
-    ndarray, shape (F, S, n, 3)
-        T / (A m^2).
-    """
-    d = centres[:, :, None, :] - points[:, None, :, :]
-    r2 = np.einsum('fsni,fsni->fsn', d, d)
-    inverse3 = DIPOLE_CONSTANT / (r2 * np.sqrt(r2))
-    along = np.einsum('fsni,fsi->fsn', d, axes) * (3 * inverse3 / r2)
-    # n . B of a moment m is m . (3 (n.d) d / d^5 - n / d^3).
-    return np.asarray(along[..., None] * d - inverse3[..., None] * axes[:, :, None, :])
+@cache
+def lattice(spacing: float) -> Shapes:
+    """An extended body: pieces that each answer to the field along x, y and z where they are."""
+    lateral, upright = (np.arange(6) - 2.5) * spacing, (np.arange(2) - 0.5) * spacing
+    offsets = np.array([(a, b, c) for a in lateral for b in lateral for c in upright])
+    functionals = np.eye(3 * len(offsets)).reshape(-1, len(offsets), 3)
+    every = np.arange(len(functionals))
+    return Shapes(offsets, functionals, every, every, np.zeros(0, dtype=np.int64))
 
 
-def by_modes(lit: ComplexArray, modes: Array) -> ComplexArray:
-    """Fluxes of single scatterers (..., n) gathered into modes (n, m): (..., m)."""
-    flat = lit.reshape(-1, lit.shape[-1])
-    out = np.zeros((flat.shape[0], modes.shape[1]), dtype=complex)
-    out.real = np.ascontiguousarray(flat.real) @ modes
-    # Emitters drive in phase with their current: the other part is mostly nothing at all.
-    if np.abs(flat.imag).max(initial=0.0) > NEGLIGIBLE * np.abs(flat.real).max(initial=0.0):
-        out.imag = np.ascontiguousarray(flat.imag) @ modes
-    return out.reshape(*lit.shape[:-1], modes.shape[1])
+COMPACT = 'compact'
+SPACINGS = {'extended 20 mm': 0.02, 'extended 35 mm': 0.035, 'extended 55 mm': 0.055}
+BODIES: Mapping[str, Callable[[], Shapes]] = {
+    COMPACT: multipoles,
+    **{name: partial(lattice, spacing) for name, spacing in SPACINGS.items()},
+}
+"""Shapes that a body may be made of, by their name in a record."""

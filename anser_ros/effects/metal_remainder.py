@@ -1,88 +1,162 @@
-"""What a simple metal body leaves: small scatterers about it, a few modes of them.
+"""What a simple metal body or sheet leaves: finer couplings, and light that is not quite known.
 
 Not an effect of its own (no registry holds it): it belongs to the metal that it refines, so that
-the corrected field is as good as the data allow while the metal's own parameters stay few. Each
-point carries a scatterer along x, y and z (the field along the axis makes a moment along it); a
-mode is a fixed combination of all of them, with a complex amplitude.
+the corrected field is as good as the data allow while the metal's own parameters stay few.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
 import numpy as np
+from numpy.typing import NDArray
 
 from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term, View
-from anser_ros.effects.metal_body import UNIT, by_modes
+from anser_ros.effects.scattering import Shapes
 from anser_ros.fitting.model import EffectRecord
-from anser_ros.physics.constants import MU_0
-from anser_ros.physics.dipole import flux_basis
+
+GAIN, ASIDE_M, UP_M = 3e-3, 0.2e-3, 0.4e-3
+"""How well an emitter's field is known where metal is and nothing was measured: as if the emitter
+were so much stronger, or so far away. The far side of the board tells least about its height."""
+STEP_M = 0.5e-3
+
+
+class Leftover(Protocol):
+    """A linear part of a metal's answer, its parameters of unit prior size."""
+
+    @property
+    def count(self) -> int:
+        """Number of real parameters."""
+
+    def columns(self, view: View) -> ComplexArray:
+        """Flux of each parameter, (F, S, K, count)."""
+
+    def sources(self, theta: Array, illumination: Dipoles, omega: Array) -> Dipoles:
+        """Dipoles of all of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Couplings:
+    """Modes: fixed combinations of couplings, each with a complex amplitude.
+
+    Attributes
+    ----------
+    shapes : Shapes
+    centre : ndarray, shape (3,)
+        m.
+    modes : ndarray, shape (shapes.size, m)
+        Of the size that each is expected to have.
+    """
+
+    shapes: Shapes
+    centre: Array
+    modes: Array
+
+    @property
+    def count(self) -> int:
+        """Real, then imaginary parts."""
+        return 2 * int(self.modes.shape[1])
+
+    def unit(self, view: View) -> NDArray[np.inexact]:
+        """Flux of each mode, (F, S, K, m)."""
+        shapes = self.shapes
+        ears = shapes.heard(self.centre, view.centres, view.axes, view.sensors.length)
+        drive = shapes.driven(view.illumination.field(self.centre + shapes.offsets))
+        return shapes.mode_flux(ears, drive, self.modes, view.omega)
+
+    def columns(self, view: View) -> ComplexArray:
+        """Flux of each parameter."""
+        unit = self.unit(view)
+        return np.concatenate([unit, 1j * unit], axis=-1)
+
+    def sources(self, theta: Array, illumination: Dipoles, omega: Array) -> Dipoles:
+        """The modes' sum."""
+        parts = theta.reshape(2, -1)
+        couplings = self.modes @ (parts[0] + 1j * parts[1])
+        return self.shapes.sources(self.centre, couplings, illumination, omega)
+
+
+@dataclass(frozen=True, eq=False)
+class Lighting:
+    """Each emitter's strength and place (x, y, z), as metal sees them.
+
+    Attributes
+    ----------
+    metal : sequence of Term
+        At rest; what answers to the emitters.
+    emitters : int
+    """
+
+    metal: Sequence[Term]
+    emitters: int
+
+    @property
+    def count(self) -> int:
+        """Strength and place of every emitter."""
+        return 4 * self.emitters
+
+    def _answers(self, illumination: Dipoles, omega: Array) -> list[Dipoles]:
+        """What the metal adds when all emitters are a standard deviation off in one way."""
+        places, out = illumination.positions, []
+        for way, size in zip(np.eye(4), (GAIN, ASIDE_M, ASIDE_M, UP_M), strict=True):
+            if way[0]:
+                light = replace(illumination, moments=GAIN * illumination.moments)
+            else:
+                moments = illumination.moments * (size / STEP_M)
+                light = replace(
+                    illumination, positions=places + STEP_M * way[1:], moments=moments
+                ).joined(replace(illumination, moments=-moments))
+            answer = Dipoles.none(self.emitters)
+            for term in self.metal:
+                added = term.effect.sources(term, light, light, omega)
+                answer = answer if added is None else answer.joined(added)
+            out.append(answer)
+        return out
+
+    def columns(self, view: View) -> ComplexArray:
+        """Flux of each parameter."""
+        out = view.columns(self.count)
+        every = np.arange(self.emitters)
+        for way, answer in enumerate(self._answers(view.illumination, view.omega)):
+            flux = view.along(answer.flux(*view.flat))
+            out[:, :, every, way * self.emitters + every] = flux
+        return out
+
+    def sources(self, theta: Array, illumination: Dipoles, omega: Array) -> Dipoles:
+        """All ways together."""
+        shares = theta.reshape(4, self.emitters)
+        out = Dipoles.none(self.emitters)
+        for share, answer in zip(shares, self._answers(illumination, omega), strict=True):
+            out = out.joined(replace(answer, moments=answer.moments * share))
+        return out
 
 
 class MetalRemainder(Effect):
-    """theta: real, then imaginary parts of the modes' amplitudes."""
+    """theta: the parameters of a leftover (`Couplings` or `Lighting`)."""
 
     name = 'metal_remainder'
     summary = 'what a simple metal body leaves'
     remedy = Remedy.FIELD
 
-    def about(self, parent: Term, offsets: Array, modes: Array, size: float) -> Term:
-        """A remainder of a metal effect.
-
-        Parameters
-        ----------
-        parent : Term
-            The metal, at rest.
-        offsets : ndarray, shape (n, 3)
-            Points in fg, m.
-        modes : ndarray, shape (3 n, m)
-            In units of 1e-4 m^3, axis by axis.
-        size : float
-            Prior standard deviation of an amplitude.
-        """
-        site = {
-            'of': parent.effect.name, '_offsets': offsets, '_modes': modes, '_size': size,
-            '_parent': parent.site,
-        }  # fmt: skip
-        return Term(self, site, np.zeros(2 * modes.shape[1]))
-
-    def prior(self, term: Term) -> Array:
-        """As given."""
-        return np.full(term.theta.size, float(term.site['_size']))
-
-    def _amplitudes(self, term: Term) -> ComplexArray:
-        parts = term.theta.reshape(2, -1)
-        return np.asarray(parts[0] + 1j * parts[1])
-
-    def unit(self, term: Term, view: View) -> ComplexArray:
-        """Flux of each mode, (F, S, K, m)."""
-        offsets = term.site['_offsets']
-        frames, sensors, emitters = view.flux.shape
-        centres, axes, lengths = view.flat
-        coupling = np.concatenate(
-            [
-                flux_basis(centres, axes, lengths, offsets, np.broadcast_to(e, offsets.shape))
-                for e in np.eye(3)
-            ],
-            axis=1,
-        )
-        field = view.illumination.field(offsets).transpose(1, 0, 2).reshape(-1, emitters)
-        lit = coupling[:, None, :] * field.T[None]
-        unit = by_modes(lit, term.site['_modes']) * (UNIT / MU_0)
-        return unit.reshape(frames, sensors, emitters, -1)
+    def of(self, parent: Term, leftover: Leftover) -> Term:
+        """A leftover of a metal that is at rest, with parameters of zero."""
+        site = {'of': parent.effect.name, '_parent': parent.seat, '_leftover': leftover}
+        return Term(self, site, np.zeros(leftover.count))
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Linear."""
-        unit = self.unit(term, view)
-        return np.concatenate([unit, 1j * unit], axis=-1)
+        leftover: Leftover = term.site['_leftover']
+        return leftover.columns(view)
 
     def sources(
         self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
-        """The modes' sum."""
+        """The leftover's dipoles."""
         if not np.any(term.theta):
             return None
-        offsets = term.site['_offsets']
-        strength = (term.site['_modes'] @ self._amplitudes(term)).reshape(3, -1).T
-        moments = illumination.field(offsets) * strength[..., None] * (UNIT / MU_0)
-        return Dipoles.vectors(offsets, moments)
+        leftover: Leftover = term.site['_leftover']
+        return leftover.sources(term.theta, illumination, omega)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Size only; the parent's record names the metal."""

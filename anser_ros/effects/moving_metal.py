@@ -1,10 +1,11 @@
-"""A metal object that moves during the session, from one place to another."""
+"""A metal object that moves during the session."""
 
 from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import (
@@ -18,143 +19,108 @@ from anser_ros.effects.effect import (
     needed,
     sigmas,
 )
-from anser_ros.effects.metal_body import (
-    SPHERE_POINTS,
-    SPHERE_WEIGHTS,
-    UNIT,
-    by_modes,
-    scatterer_coupling,
-)
+from anser_ros.effects.metal_body import BODIES, COMPACT, SPACINGS, ball_modes
+from anser_ros.effects.metal_path import FreePath, MetalPath, StraightPath, moving_times
+from anser_ros.effects.scattering import UNIT, Shapes
 from anser_ros.fitting.model import EffectRecord
-from anser_ros.physics.constants import MU_0
 
-NODES = 33
 STEP = 1e-3
-SHORTEST = 0.2
-PATH = 9
-"""Number of parameters of the path, before the polarisabilities."""
-
-
-def progress(theta: Array, time: Array) -> Array:
-    """Share of the way made at each time, 0 to 1."""
-    u = np.clip((time - theta[6]) / max(float(theta[7] - theta[6]), SHORTEST), 0.0, 1.0)
-    return np.asarray(u + theta[8] * u * (1 - u) * (2 * u - 1))
-
-
-def _rates(theta: Array, time: Array) -> tuple[Array, Array, Array]:
-    """Derivative of the progress by start time, end time and ease."""
-    span = max(float(theta[7] - theta[6]), SHORTEST)
-    u = np.clip((time - theta[6]) / span, 0.0, 1.0)
-    going = ((u > 0) & (u < 1)).astype(np.float64)
-    speed = going * (1 + theta[8] * (6 * u - 6 * u**2 - 1)) / span
-    return -(1 - u) * speed, -u * speed, u * (1 - u) * (2 * u - 1)
-
-
-def centre_at(theta: Array, time: Array) -> Array:
-    """Centre of the body at each time, shape (F, 3), m."""
-    return np.asarray(theta[:3] + progress(theta, time)[:, None] * (theta[3:6] - theta[:3]))
-
-
-def simple_body() -> tuple[Array, Array]:
-    """Offsets (n, 3) and modes (3 n, 4): the centre along x, y, z, and an isotropic shell."""
-    offsets = np.concatenate([np.zeros((1, 3)), 0.025 * SPHERE_POINTS])
-    count = offsets.shape[0]
-    modes = np.zeros((3, count, 4))
-    modes[[0, 1, 2], 0, [0, 1, 2]] = 1.0
-    modes[:, 1:, 3] = SPHERE_WEIGHTS
-    return offsets, modes.reshape(3 * count, 4)
+PATH_SAMPLES = 21
+LARGEST = 10.0
+"""Prior size of a simple body's modes, `UNIT`."""
 
 
 class MovingMetal(Effect):
-    """theta: start and end (m), start and end time (s), ease, then the modes' polarisabilities.
+    """theta: the path's parameters, then real and imaginary parts of the modes' amplitudes.
 
-    The centre goes straight from start to end between the two times and rests before and after;
-    the body doesn't turn. An ease of 0 is even speed, of 1 a smooth step. The body is a cloud of
-    scatterers (the field along an axis makes a moment along it) in a few fixed combinations.
+    The body doesn't turn. The site holds the path, the session's times, the modes
+    (`anser_ros.effects.scattering`) and the prior size of each.
     """
 
     name = 'moving_metal'
     summary = 'a metal object moves during the session'
     units: ClassVar[Mapping[str, str]] = {
-        'start_m': 'm', 'end_m': 'm', 't_start_s': 's', 't_end_s': 's', 'ease': '1',
-        'polarizability': 'm^3 (3x3, [re, im])',
+        'start_m': 'm', 'end_m': 'm', 't_start_s': 's', 't_end_s': 's',
+        'path': 's and m', 'polarizability': 'm^3 (3x3, [re, im])',
     }  # fmt: skip
     remedy = Remedy.FIELD
     moving = True
 
-    def starting(self, start: Array, end: Array, times: tuple[float, float], alpha: Array) -> Term:
-        """A term with one isotropic scatterer (re, im in 1e-4 m^3)."""
-        offsets, modes = simple_body()
+    def starting(self, path: MetalPath, course: Array, duration: float, alpha: Array) -> Term:
+        """A simple body on a path with parameters ``course``; alpha: re, im in 1e-4 m^3."""
+        modes = ball_modes()
         amplitudes = np.zeros((2, modes.shape[1]))
-        amplitudes[:, :3] = np.asarray(alpha)[:, None]
-        theta = np.concatenate([start, end, times, [0.5], amplitudes.ravel()])
-        return Term(self, {'_offsets': offsets, '_modes': modes, '_size': 10.0}, theta)
+        amplitudes[:, 0] = alpha
+        site = {
+            '_path': path, '_course': course, '_duration': float(duration), '_kind': COMPACT,
+            '_modes': modes, '_spread': np.full(modes.shape[1], LARGEST),
+        }  # fmt: skip
+        return Term(self, site, np.concatenate([course, amplitudes.ravel()]))
 
-    def with_body(self, term: Term, offsets: Array, modes: Array, size: float) -> Term:
-        """The same path, another body, whose amplitudes (prior ``size``) are still zero."""
-        site = {**term.site, '_offsets': offsets, '_modes': modes, '_size': size}
-        return Term(self, site, np.concatenate([term.theta[:PATH], np.zeros(2 * modes.shape[1])]))
+    def with_body(self, term: Term, kind: str, modes: Array, spread: Array) -> Term:
+        """The same path, another body, whose amplitudes are still zero."""
+        site = {**term.site, '_kind': kind, '_modes': modes, '_spread': spread}
+        amplitudes = np.zeros(2 * modes.shape[1])
+        return Term(self, site, np.concatenate([term.theta[: path_of(term).count], amplitudes]))
+
+    def with_path(self, term: Term, path: MetalPath, course: Array) -> Term:
+        """The same body on another path."""
+        amplitudes = term.theta[path_of(term).count :]
+        return Term(self, {**term.site, '_path': path}, np.concatenate([course, amplitudes]))
 
     def amounts(self, term: Term) -> NDArray[np.int64]:
         """The polarisabilities."""
-        return np.arange(PATH, term.theta.size)
+        return np.arange(path_of(term).count, term.theta.size)
 
     def prior(self, term: Term) -> Array:
         """Anywhere, any time. Frozen metal stays on its path."""
-        path = np.concatenate([np.full(6, 0.1), np.full(2, 10.0), [0.5]])
+        path = path_of(term).prior()
         if term.site.get('_frozen'):
-            path = np.full(PATH, FROZEN)
-        count = term.theta.size - PATH
-        return np.concatenate([path, np.full(count, float(term.site['_size']))])
+            path = np.full(path.size, FROZEN)
+        return np.concatenate([path, term.site['_spread'], term.site['_spread']])
 
     def bounded(self, term: Term) -> Term:
-        """The end comes after the start, and the body never goes back."""
-        theta = term.theta.copy()
-        theta[7] = max(theta[7], theta[6] + SHORTEST)
-        theta[8] = np.clip(theta[8], -0.5, 1.2)
-        return term.with_theta(theta)
+        """The path in its domain."""
+        count = path_of(term).count
+        course = path_of(term).bounded(term.theta[:count])
+        return term.with_theta(np.concatenate([course, term.theta[count:]]))
 
-    def _amplitudes(self, term: Term) -> ComplexArray:
-        parts = term.theta[PATH:].reshape(2, -1)
-        return np.asarray(parts[0] + 1j * parts[1])
+    def _couplings(self, term: Term) -> ComplexArray:
+        parts = term.theta[path_of(term).count :].reshape(2, -1)
+        return np.asarray(term.site['_modes'] @ (parts[0] + 1j * parts[1]))
 
-    def _there(self, term: Term, view: View, shift: Array) -> tuple[Array, ComplexArray]:
-        """Coupling (F, S, 3 n) and driving field (F, K, 3 n) of every scatterer, axis by axis."""
-        theta, offsets = term.theta, term.site['_offsets']
-        nodes = np.linspace(0.0, 1.0, NODES)
-        path = theta[:3] + nodes[:, None] * (theta[3:6] - theta[:3]) + shift
-        grid = path[:, None, :] + offsets
+    def _seen(self, term: Term, view: View, shift: Array) -> tuple[Array, ComplexArray]:
+        """Amplitudes of the sensors (F, S, M) and emitters (F, K, M) about the moving centre.
+
+        The emitters' are interpolated between nodes on the way.
+        """
+        path, shapes = path_of(term), shapes_of(term)
+        course = term.theta[: path.count]
+        nodes, on_way, at = path.nodes(course, view.time)
+        grid = (on_way + shift)[:, None, :] + shapes.offsets
         field = view.illumination.field(grid.reshape(-1, 3)).reshape(*grid.shape, -1)
-        share = np.clip(progress(theta, view.time), 0.0, 1.0) * (NODES - 1)
-        left = np.minimum(share.astype(int), NODES - 2)
-        part = (share - left)[:, None, None, None]
-        at = field[left] * (1 - part) + field[left + 1] * part
-        points = grid[left] * (1 - part[..., 0]) + grid[left + 1] * part[..., 0]
-        coupling = scatterer_coupling(points, view.centres, view.axes)
-        frames, sensors = view.centres.shape[:2]
-        driven = np.transpose(at, (0, 3, 2, 1)).reshape(frames, at.shape[3], -1)
-        flat = np.moveaxis(coupling, 3, 2).reshape(frames, sensors, -1)
-        return flat, (driven * (UNIT / MU_0)).astype(complex)
+        drive = CubicSpline(nodes, shapes.driven(field))(at)
+        centre = path.centre(course, view.time) + shift
+        return shapes.heard(centre, view.centres, view.axes, view.sensors.length), drive
 
     def _sum(self, term: Term, view: View, shift: Array) -> ComplexArray:
         """Flux (F, S, K) of the whole body, moved by a shift."""
-        coupling, driven = self._there(term, view, shift)
-        weights = term.site['_modes'] @ self._amplitudes(term)
-        return np.asarray(coupling @ (driven * weights).transpose(0, 2, 1))
+        seen = self._seen(term, view, shift)
+        return shapes_of(term).flux(*seen, self._couplings(term), view.omega)
 
-    def unit(self, term: Term, view: View) -> ComplexArray:
+    def unit(self, term: Term, view: View) -> NDArray[np.inexact]:
         """Flux of each mode, (F, S, K, m)."""
-        coupling, driven = self._there(term, view, np.zeros(3))
-        lit = coupling[:, :, None, :] * driven[:, None, :, :]
-        return by_modes(lit, term.site['_modes'])
+        seen = self._seen(term, view, np.zeros(3))
+        return shapes_of(term).mode_flux(*seen, term.site['_modes'], view.omega)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """By path (differences, chained) and by polarisability (exact)."""
-        theta = term.theta
+        path = path_of(term)
         unit = self.unit(term, view)
+        out = view.columns(term.theta.size)
         groups = unit.shape[-1]
-        out = view.columns(theta.size)
-        out[..., PATH : PATH + groups], out[..., PATH + groups :] = unit, 1j * unit
+        out[..., path.count : path.count + groups] = unit
+        out[..., path.count + groups :] = 1j * unit
         if term.site.get('_frozen'):
             return out
         by_place = np.stack(
@@ -164,71 +130,98 @@ class MovingMetal(Effect):
             ],
             axis=-1,
         )
-        share = progress(theta, view.time)[:, None, None, None]
-        out[..., :3], out[..., 3:6] = by_place * (1 - share), by_place * share
-        along = by_place @ (theta[3:6] - theta[:3])
-        for i, rate in enumerate(_rates(theta, view.time)):
-            out[..., 6 + i] = along * rate[:, None, None]
+        rates = path.rates(term.theta[: path.count], view.time)
+        out[..., : path.count] = by_place @ rates[:, None]
         return out
 
     def moving_flux(self, term: Term, view: View) -> ComplexArray:
         """What the body adds to a view."""
         return self._sum(term, view, np.zeros(3))
 
-    def _strength(self, term: Term) -> ComplexArray:
-        """Polarisability of each scatterer along each axis, shape (n, 3), m^3."""
-        weights = term.site['_modes'] @ self._amplitudes(term)
-        return np.asarray(weights.reshape(3, -1).T * UNIT)
+    def centres(self, term: Term, time: Array) -> Array:
+        """Where the body is at each time, (F, 3), m."""
+        return path_of(term).centre(term.theta[: path_of(term).count], time)
 
     def sources_at(
         self, term: Term, illumination: Dipoles, omega: Array, time: float
     ) -> Dipoles | None:
         """Induced dipoles with the body where it is."""
-        points = centre_at(term.theta, np.array([time]))[0] + term.site['_offsets']
-        moments = illumination.field(points) * self._strength(term)[..., None] / MU_0
-        return Dipoles.vectors(points, moments)
+        centre = self.centres(term, np.array([time]))[0]
+        return shapes_of(term).sources(centre, self._couplings(term), illumination, omega)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Path, times and whole polarisability."""
-        sigma, total = sigmas(covariance), np.diag(self._strength(term).sum(axis=0))
-        strength = self._strength(term)
+        """Path, times and polarisability."""
+        path, total = path_of(term), shapes_of(term).polarisability(self._couplings(term))
+        course, couplings = term.theta[: path.count], UNIT * self._couplings(term)
+        times = np.linspace(0.0, term.site['_duration'], PATH_SAMPLES)
+        start, end = moving_times(path, course, times)
+        ends = np.array([start, end])
+        at, spread = self.centres(term, ends), self._place_sigma(term, covariance, ends)
+        # Which point of an extended body is its centre, nothing tells.
+        spread = np.hypot(spread, SPACINGS.get(term.site['_kind'], 0.0))
+        straight = not path.knots
+        hidden = np.full(2, 0.0 if straight else float(np.diff(path.knots[:2])[0]) / 2)
+        sigma = np.hypot(sigmas(covariance)[6:8] if straight else 0.0, hidden)
         return EffectRecord(
             self.name,
             {
-                'start_m': term.theta[:3].tolist(),
-                'end_m': term.theta[3:6].tolist(),
-                't_start_s': float(term.theta[6]),
-                't_end_s': float(term.theta[7]),
-                'ease': float(term.theta[8]),
+                'start_m': at[0].tolist(),
+                'end_m': at[1].tolist(),
+                't_start_s': start,
+                't_end_s': end,
+                'path': {
+                    'time_s': times.tolist(),
+                    'position_m': self.centres(term, times).tolist(),
+                },
                 'polarizability': np.stack([total.real, total.imag], axis=-1).tolist(),
-                'scatterers_m': term.site['_offsets'].tolist(),
-                'scatterers_m3': np.stack([strength.real, strength.imag], axis=-1).tolist(),
+                'knots_s': [] if straight else list(path.knots),
+                'course': course.tolist(),
+                'body': term.site['_kind'],
+                'couplings_m3': np.stack([couplings.real, couplings.imag], axis=-1).tolist(),
             },
             {
-                'start_m': sigma[:3].tolist(),
-                'end_m': sigma[3:6].tolist(),
-                't_start_s': float(sigma[6]),
-                't_end_s': float(sigma[7]),
-                'ease': float(sigma[8]),
+                'start_m': spread[0].tolist(),
+                'end_m': spread[1].tolist(),
+                't_start_s': float(sigma[0]),
+                't_end_s': float(sigma[1]),
+                'path': np.hypot(
+                    self._place_sigma(term, covariance, times),
+                    SPACINGS.get(term.site['_kind'], 0.0),
+                ).tolist(),
             },
         )
 
+    def _place_sigma(self, term: Term, covariance: Array, time: Array) -> Array:
+        """Standard deviation of the centre at each time, (F, 3), m."""
+        path = path_of(term)
+        rates = path.rates(term.theta[: path.count], time)
+        block = covariance[: path.count, : path.count]
+        variance = np.einsum('fic,cd,fid->fi', rates, block, rates)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
     def term(self, record: EffectRecord) -> Term:
-        """From path, times and scatterers."""
-        offsets = np.asarray(needed(record, 'scatterers_m'), dtype=np.float64)
-        strength = np.asarray(needed(record, 'scatterers_m3'), dtype=np.float64) / UNIT
-        flat = strength.transpose(1, 0, 2).reshape(-1, 2)
-        theta = np.concatenate(
-            [
-                np.asarray(needed(record, 'start_m'), dtype=np.float64),
-                np.asarray(needed(record, 'end_m'), dtype=np.float64),
-                [float(needed(record, 't_start_s')), float(needed(record, 't_end_s'))],
-                [float(record.parameters.get('ease', 0.0))],
-                flat.T.ravel(),
-            ]
-        )
-        site = {'_offsets': offsets, '_modes': np.eye(flat.shape[0]), '_size': 10.0}
-        return Term(self, site, theta)
+        """From path and couplings."""
+        knots = tuple(float(k) for k in needed(record, 'knots_s'))
+        course = np.asarray(needed(record, 'course'), dtype=np.float64)
+        couplings = np.asarray(needed(record, 'couplings_m3'), dtype=np.float64) / UNIT
+        path = FreePath(knots) if knots else StraightPath()
+        site = {
+            '_path': path, '_kind': str(needed(record, 'body')), '_modes': np.eye(len(couplings)),
+            '_spread': np.full(len(couplings), LARGEST),
+            '_duration': float(needed(record, 'path')['time_s'][-1]),
+        }  # fmt: skip
+        return Term(self, site, np.concatenate([course, couplings.T.ravel()]))
+
+
+def path_of(term: Term) -> MetalPath:
+    """The path that a term's site holds."""
+    path: MetalPath = term.site['_path']
+    return path
+
+
+def shapes_of(term: Term) -> Shapes:
+    """The shapes that a term's body is made of."""
+    return BODIES[term.site['_kind']]()
 
 
 EFFECTS = (MovingMetal(),)

@@ -20,11 +20,11 @@ from anser_ros.effects.effect import (
     needed,
     sigmas,
 )  # fmt: skip
-from anser_ros.effects.metal_body import UNIT, BodyShape, group_flux
+from anser_ros.effects.metal_body import ball_modes, multipoles
+from anser_ros.effects.scattering import UNIT
 from anser_ros.fitting.model import EffectRecord
+from anser_ros.physics.constants import MU_0
 
-BALL = BodyShape.ball()
-POINT = BodyShape.ball(())
 STEP = 1e-3
 CLOSEST = 0.02
 """Metal that is searched keeps this distance (m) from where sensors were."""
@@ -36,11 +36,18 @@ def places(scene: Scene) -> Array:
     high = np.maximum(scene.board[1], scene.working_volume[1])
     size = float(np.max(high[:2] - low[:2]))
     lateral = [np.linspace(low[i] - 0.2 * size, high[i] + 0.2 * size, 7) for i in (0, 1)]
+    around = [np.linspace(low[i] - 0.5 * size, high[i] + 0.5 * size, 5) for i in (0, 1)]
     below = scene.board[0, 2] - size * np.array([0.06, 0.14, 0.24, 0.38, 0.6])
     above = scene.working_volume[1, 2] + size * np.array([0.2, 0.45])
     beside = np.linspace(scene.board[1, 2], scene.working_volume[1, 2], 3)
     grid = [(x, y, z) for z in (*below, *beside, *above) for x, y in product(*lateral)]
-    points = np.array(grid)
+    ring = [
+        (x, y, z)
+        for z in beside
+        for x, y in product(*around)
+        if x in around[0][[0, -1]] or y in around[1][[0, -1]]
+    ]
+    points = np.array(grid + ring)
     inside = np.all(
         (points > scene.working_volume[0] - CLOSEST)
         & (points < scene.working_volume[1] + CLOSEST),
@@ -52,12 +59,11 @@ def places(scene: Scene) -> Array:
     return np.asarray(points[~inside & ~on_board])
 
 
-def _shape(term: Term) -> BodyShape:
-    return POINT if term.site.get('_point') else BALL
-
-
 class StaticMetal(Effect):
-    """theta: centre (m, 3), then real and imaginary parts of the groups' polarisabilities."""
+    """theta: centre (m, 3), then real and imaginary parts of a simple body's modes.
+
+    What the body is besides belongs to its remainder (`anser_ros.effects.metal_remainder`).
+    """
 
     name = 'static_metal'
     summary = 'a metal object stands near the volume'
@@ -70,11 +76,12 @@ class StaticMetal(Effect):
 
     def candidates(self, scene: Scene) -> Sequence[Term]:
         """A grid of places."""
+        modes = 2 * ball_modes().shape[1]
         return [
             Term(
                 self,
                 {'place': tuple(float(v) for v in place)},
-                np.concatenate([place, np.zeros(2 * BALL.groups)]),
+                np.concatenate([place, np.zeros(modes)]),
             )
             for place in places(scene)
         ]
@@ -88,8 +95,18 @@ class StaticMetal(Effect):
         place = FROZEN if term.site.get('_frozen') else 0.1
         return np.concatenate([np.full(3, place), np.full(term.theta.size - 3, 10.0)])
 
+    def _couplings(self, term: Term) -> ComplexArray:
+        parts = term.theta[3:].reshape(2, -1)
+        return np.asarray(ball_modes() @ (parts[0] + 1j * parts[1]))
+
+    def _seen(self, centre: Array, view: View) -> tuple[Array, ComplexArray]:
+        """Amplitudes of the sensors (F, S, M) and of the emitters (K, M) about a centre."""
+        shapes = multipoles()
+        ears = shapes.heard(centre, view.centres, view.axes, view.sensors.length)
+        return ears, shapes.driven(view.illumination.field(centre + shapes.offsets))
+
     def _flux(self, term: Term, centre: Array, view: View) -> ComplexArray:
-        return _shape(term).sources(centre, term.theta[3:], view.illumination).flux(*view.flat)
+        return multipoles().flux(*self._seen(centre, view), self._couplings(term), view.omega)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """By place (differences) and by polarisability (exact)."""
@@ -98,22 +115,22 @@ class StaticMetal(Effect):
         if np.any(alpha) and not term.site.get('_frozen'):
             for i, step in enumerate(STEP * np.eye(3)):
                 more, less = (self._flux(term, centre + s, view) for s in (step, -step))
-                out[..., i] = view.along((more - less) / (2 * STEP))
-        points, moments = _shape(term).responses(centre, view.illumination)
-        unit = group_flux(points, moments, *view.flat).reshape(*view.flux.shape, -1)
+                out[..., i] = (more - less) / (2 * STEP)
+        unit = multipoles().mode_flux(*self._seen(centre, view), ball_modes(), view.omega)
         groups = unit.shape[-1]
         out[..., 3 : 3 + groups], out[..., 3 + groups :] = unit, 1j * unit
         return out
 
     def probe(self, term: Term, view: View) -> ComplexArray | None:
         """One isotropic scatterer."""
-        points, moments = BodyShape.point().responses(term.theta[:3], view.illumination)
-        unit = group_flux(points, moments, *view.flat).reshape(*view.flux.shape, -1)
-        return np.concatenate([unit, 1j * unit], axis=-1)
+        points = term.theta[:3]
+        field = view.illumination.field(points[None])[0] * (UNIT / MU_0)
+        unit = view.along(Dipoles.vectors(points[None], field[None]).flux(*view.flat))
+        return np.stack([unit, 1j * unit], axis=-1)
 
     def started(self, term: Term, solution: Array) -> Sequence[Term]:
-        """The scatterer at the centre, the shell and the tensors nothing yet."""
-        alpha = np.zeros((2, BALL.groups))
+        """The scatterer alone."""
+        alpha = np.zeros((2, ball_modes().shape[1]))
         alpha[:, 0] = solution
         return (term.with_theta(np.concatenate([term.theta[:3], alpha.ravel()])),)
 
@@ -123,11 +140,11 @@ class StaticMetal(Effect):
         """Induced dipoles."""
         if not np.any(term.theta[3:]):
             return None
-        return _shape(term).sources(term.theta[:3], term.theta[3:], illumination)
+        return multipoles().sources(term.theta[:3], self._couplings(term), illumination, omega)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Place and whole polarisability."""
-        total = BALL.total(term.theta[3:])
+        total = multipoles().polarisability(self._couplings(term))
         return EffectRecord(
             self.name,
             {

@@ -34,7 +34,7 @@ DEPENDENCIES = (
 )  # fmt: skip
 DEFAULT_NOISE_T = 60e-12
 ROOM = 2.0
-BULKY = ('groups', 'scatterers_m', 'scatterers_m3')
+BULKY = ('groups', 'knots_s', 'course', 'couplings_m3')
 """Parameters that only a program needs; they stand in the model file."""
 
 

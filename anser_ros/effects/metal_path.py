@@ -1,0 +1,176 @@
+"""Where metal that moves is at each time: straight from rest to rest, or freely along a spline."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+Array = NDArray[np.float64]
+
+SHORTEST = 0.2
+FINE_STEP_S = 0.05
+NODES, NODES_PER_KNOT = 61, 10
+"""Nodes on a path, in which fields are found; between them they are interpolated."""
+NEGLIGIBLE_WAY = 0.02
+"""Share of a way that counts as not yet begun, or as over."""
+
+
+class MetalPath(Protocol):
+    """A path with ``count`` parameters, through ``knots`` (s) where it is free."""
+
+    @property
+    def count(self) -> int:
+        """Number of parameters."""
+
+    @property
+    def knots(self) -> tuple[float, ...]:
+        """Times at which the place is free; none where the path is straight."""
+
+    def centre(self, theta: Array, time: Array) -> Array:
+        """Centre at each time, (F, 3), m."""
+
+    def rates(self, theta: Array, time: Array) -> Array:
+        """Derivative of the centre by the parameters, (F, 3, count)."""
+
+    def nodes(self, theta: Array, time: Array) -> tuple[Array, Array, Array]:
+        """A coordinate (n,) along which fields change smoothly, the centre (n, 3) at some of its
+        values, and the coordinate at each time."""
+
+    def prior(self) -> Array:
+        """Standard deviation of each parameter, (count,)."""
+
+    def bounded(self, theta: Array) -> Array:
+        """Parameters brought back into their domain."""
+
+
+@dataclass(frozen=True)
+class StraightPath:
+    """Parameters: start and end (m), start and end time (s), ease.
+
+    The centre rests, goes straight from start to end between the two times, and rests. An ease of
+    0 is even speed, of 1 a smooth step.
+    """
+
+    count: int = 9
+    knots: tuple[float, ...] = ()
+
+    def progress(self, theta: Array, time: Array) -> Array:
+        """Share of the way made at each time, 0 to 1."""
+        u = np.clip((time - theta[6]) / max(float(theta[7] - theta[6]), SHORTEST), 0.0, 1.0)
+        return np.asarray(u + theta[8] * u * (1 - u) * (2 * u - 1))
+
+    def centre(self, theta: Array, time: Array) -> Array:
+        """Centre at each time, (F, 3), m."""
+        way = theta[3:6] - theta[:3]
+        return np.asarray(theta[:3] + self.progress(theta, time)[:, None] * way)
+
+    def rates(self, theta: Array, time: Array) -> Array:
+        """Derivative of the centre by the parameters, (F, 3, 9)."""
+        span = max(float(theta[7] - theta[6]), SHORTEST)
+        u = np.clip((time - theta[6]) / span, 0.0, 1.0)
+        going = ((u > 0) & (u < 1)).astype(np.float64)
+        speed = going * (1 + theta[8] * (6 * u - 6 * u**2 - 1)) / span
+        share = self.progress(theta, time)
+        out = np.zeros((time.size, 3, 9))
+        for axis in range(3):
+            out[:, axis, axis], out[:, axis, 3 + axis] = 1 - share, share
+        scalar = np.stack([-(1 - u) * speed, -u * speed, u * (1 - u) * (2 * u - 1)], axis=1)
+        out[:, :, 6:9] = (theta[3:6] - theta[:3])[None, :, None] * scalar[:, None, :]
+        return out
+
+    def nodes(self, theta: Array, time: Array) -> tuple[Array, Array, Array]:
+        """The share of the way made."""
+        way = theta[3:6] - theta[:3]
+        share = np.linspace(0.0, 1.0, NODES)
+        made = np.clip(self.progress(theta, time), 0.0, 1.0)
+        return share, theta[:3] + share[:, None] * way, made
+
+    def prior(self) -> Array:
+        """Anywhere, any time."""
+        return np.concatenate([np.full(6, 0.1), np.full(2, 10.0), [0.5]])
+
+    def bounded(self, theta: Array) -> Array:
+        """The end comes after the start, and the body never goes back."""
+        out = theta.copy()
+        out[7] = max(out[7], out[6] + SHORTEST)
+        out[8] = np.clip(out[8], -0.5, 1.0)
+        return out
+
+
+@dataclass(frozen=True)
+class FreePath:
+    """Parameters: the centre (m) at each knot, between which it goes along a natural spline.
+
+    Attributes
+    ----------
+    knots : tuple of float
+        s, ascending, at least three.
+    """
+
+    knots: tuple[float, ...]
+
+    @property
+    def count(self) -> int:
+        """Three a knot."""
+        return 3 * len(self.knots)
+
+    def _weights(self, time: Array) -> Array:
+        """Share of each knot in the centre at each time, (F, n)."""
+        knots = np.array(self.knots)
+        spline = CubicSpline(knots, np.eye(knots.size), bc_type='natural')
+        return np.asarray(spline(np.clip(time, knots[0], knots[-1])))
+
+    def centre(self, theta: Array, time: Array) -> Array:
+        """Centre at each time, (F, 3), m."""
+        return np.asarray(self._weights(time) @ theta.reshape(-1, 3))
+
+    def rates(self, theta: Array, time: Array) -> Array:
+        """Derivative of the centre by the parameters, (F, 3, count)."""
+        weights = self._weights(time)
+        rates = weights[:, None, :, None] * np.eye(3)[None, :, None, :]
+        return np.asarray(rates.reshape(time.size, 3, -1))
+
+    def nodes(self, theta: Array, time: Array) -> tuple[Array, Array, Array]:
+        """The time: a free path may turn back."""
+        count = NODES_PER_KNOT * (len(self.knots) - 1) + 1
+        times = np.linspace(self.knots[0], self.knots[-1], count)
+        return times, self.centre(theta, times), np.clip(time, times[0], times[-1])
+
+    def prior(self) -> Array:
+        """Anywhere."""
+        return np.full(self.count, 0.1)
+
+    def bounded(self, theta: Array) -> Array:
+        """All is allowed."""
+        return theta
+
+    @staticmethod
+    def through(knots: Array, time: Array, centres: Array) -> tuple['FreePath', Array]:
+        """The path nearest to a course (F, 3) at ascending times, and its parameters."""
+        path = FreePath(tuple(float(k) for k in knots))
+        weights = path._weights(time)
+        bend = 1e-3 * np.diff(np.eye(len(knots)), 2, axis=0)
+        normal = weights.T @ weights + bend.T @ bend
+        course = np.linalg.solve(normal, weights.T @ centres)
+        return path, np.asarray(course.ravel(), dtype=np.float64)
+
+
+def way_of(path: MetalPath, theta: Array, time: Array) -> tuple[Array, Array]:
+    """Fine times over those given, and the way made since the first, (T,) each, s and m."""
+    count = max(3, int((time.max() - time.min()) / FINE_STEP_S) + 1)
+    fine = np.linspace(time.min(), time.max(), count)
+    steps = np.linalg.norm(np.diff(path.centre(theta, fine), axis=0), axis=1)
+    return fine, np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def moving_times(path: MetalPath, theta: Array, time: Array) -> tuple[float, float]:
+    """When the way begins and ends, s."""
+    if not path.knots:
+        return float(theta[6]), float(theta[7])
+    fine, way = way_of(path, theta, time)
+    share = way / max(float(way[-1]), 1e-9)
+    first = int(np.searchsorted(share, NEGLIGIBLE_WAY))
+    last = int(np.searchsorted(share, 1 - NEGLIGIBLE_WAY))
+    return float(fine[max(first - 1, 0)]), float(fine[min(last, fine.size - 1)])
