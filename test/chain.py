@@ -136,6 +136,7 @@ def replay_through_nodes(
     model: Path,
     rate: float = 0.0,
     server: tuple[str, ...] = ('-p', 'refit:=false'),
+    tracker: tuple[str, ...] = (),
 ) -> dict[str, ReceivedPoses]:
     """Replay a bag through field_model and tracker, each in its process; poses by topic.
 
@@ -145,6 +146,7 @@ def replay_through_nodes(
     model : file that both nodes load
     rate : of the replay; 0 for as fast as it is taken
     server : parameters of field_model beside its model file
+    tracker : parameters of the tracker beside its model file
     """
     with tempfile.TemporaryDirectory() as folder:
         logs = Path(folder)
@@ -153,7 +155,8 @@ def replay_through_nodes(
         processes = [
             start('field_model', '--ros-args', '-p', file, *server, domain=domain,
                   log=logs / 'field_model.log'),
-            start('tracker', '--ros-args', '-p', file, domain=domain, log=logs / 'tracker.log'),
+            start('tracker', '--ros-args', '-p', file, *tracker, domain=domain,
+                  log=logs / 'tracker.log'),
         ]  # fmt: skip
         try:
             listener.announce(read_bag(bag).setup_text)

@@ -11,6 +11,7 @@ from anser_ros.cli.main import main
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import load_session
+from anser_ros.tracking.estimate import OK
 from anser_ros.wire.setup import topic_of
 
 BAGS = Path(__file__).resolve().parents[1] / 'bags'
@@ -68,18 +69,21 @@ def test_the_nodes_give_the_same_poses(domain, model, followed, rate):
         model=model,
         rate=rate,
         server=('-p', f'baseline_file:={BAGS / "factory.mcap"}'),
+        # How soon the server must answer is a matter of latency, and of the machine: not of this.
+        tracker=('-p', 'model_wait_s:=10.0'),
     )
     stamps = session.start_ns + np.round(tool.time * 1e9).astype(np.int64)
     steps = []
     for name in tool.sensors.name:
         live, estimates = received[topics[name]], followed.sensors[name].estimates
-        frames = np.searchsorted(stamps, live.stamp_ns - 1)
-        assert frames.size > 0.9 * stamps.size
-        offline = np.array([estimates[frame].position for frame in frames])
-        steps.append(np.linalg.norm(live.position - offline, axis=1))
+        good = np.array([estimate.state == OK for estimate in estimates])
+        assert good.mean() > 0.99
+        np.testing.assert_array_equal(np.sort(live.stamp_ns), stamps[good], 'every frame, once')
+        offline = np.array([estimate.position for estimate in estimates])
+        frames = np.searchsorted(stamps, live.stamp_ns)
+        steps.append(np.linalg.norm(live.position - offline[frames], axis=1))
     steps = np.concatenate(steps)
-    print('live minus offline: median', np.nanmedian(steps), '95 %', np.nanpercentile(steps, 95))
-    assert np.nanmedian(steps) < 1e-8
-    # A tracker that waits in vain for a model (a busy machine) goes on with the one before, and
-    # the uncertainty of a change may reach it after its model.
-    assert np.nanpercentile(steps, 95) < (1e-6 if rate == 0.0 else 150e-6)
+    print('live minus offline: median', np.median(steps), '95 %', np.percentile(steps, 95),
+          'over 1e-6 m', int((steps > 1e-6).sum()), 'of', steps.size)  # fmt: skip
+    assert np.median(steps) < 1e-8
+    assert np.percentile(steps, 95) < 1e-6

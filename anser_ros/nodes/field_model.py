@@ -101,8 +101,8 @@ class FieldModelNode(AnserNode):
         self._refit_s = 0.0
         self._pace = Pace(table.refit_rate_hz)
         self._writer = ModelWriter()
-        self._models = self.create_publisher(PointCloud2, 'field_model', qos.LATCHED)
-        self._errors = self.create_publisher(PointCloud2, 'field_model_error', qos.LATCHED)
+        self._models = self.create_publisher(PointCloud2, 'field_model', qos.MODELS)
+        self._errors = self.create_publisher(PointCloud2, 'field_model_error', qos.MODEL_ERRORS)
         self._markers = self.create_publisher(MarkerArray, 'metal', qos.LATCHED)
         self._centroid = self.create_publisher(PointStamped, 'metal/centroid', qos.STREAM)
         self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)

@@ -1,5 +1,6 @@
 """What arrives on ``field_model`` and ``field_model_error``, brought together."""
 
+from collections import deque
 from dataclasses import dataclass, replace
 
 from sensor_msgs.msg import PointCloud2
@@ -10,6 +11,9 @@ from anser_ros.nodes.model_clouds import read_dipoles, read_error, stamp_of
 from anser_ros.wire.model_error import ModelError
 from anser_ros.wire.points import DipolePoints
 from anser_ros.wire.setup import Setup
+
+MOST_EARLY = 32
+"""Uncertainties kept until their models come; the older ones are those whose models got lost."""
 
 
 @dataclass(frozen=True)
@@ -67,13 +71,14 @@ class ModelIntake:
 
     def __init__(self) -> None:
         self.newest: GivenModel | None = None
-        self._error: PointCloud2 | None = None
-        self._read: tuple[PointCloud2, int, ModelError] | None = None
+        self._read: tuple[int, ModelError] | None = None
+        # Uncertainties that came before their models, in the order of their arrival.
+        self._early: deque[PointCloud2] = deque(maxlen=MOST_EARLY)
 
     @property
     def has_error(self) -> bool:
         """Whether an uncertainty has come."""
-        return self._error is not None
+        return self._read is not None or bool(self._early)
 
     def take(self, message: PointCloud2) -> GivenModel:
         """Read a ``field_model`` message.
@@ -99,7 +104,8 @@ class ModelIntake:
         LayoutError
             When it is none of that model.
         """
-        self._error, newest = message, self.newest
+        self._early.append(message)
+        newest = self.newest
         if newest is None or stamp_of(message) != newest.stamp_ns:
             return None
         return self._joined(newest.stamp_ns, newest.data, newest.points)
@@ -111,11 +117,10 @@ class ModelIntake:
 
     def _error_of(self, stamp_ns: int, n_dipoles: int, n_emitters: int) -> ModelError | None:
         """Return a model's uncertainty: that of its stamp, or the one before that still holds."""
+        stamps = [stamp_of(message) for message in self._early]
+        if stamp_ns in stamps:
+            for _ in range(stamps.index(stamp_ns)):
+                self._early.popleft()
+            self._read = n_dipoles, read_error(self._early.popleft(), n_dipoles, n_emitters)
         read = self._read
-        if self._error is not None and stamp_of(self._error) == stamp_ns:
-            if read is None or read[0] is not self._error:
-                error = read_error(self._error, n_dipoles, n_emitters)
-                read = self._read = (self._error, n_dipoles, error)
-            return read[2]
-        holds = read is not None and read[0] is self._error and read[1] == n_dipoles
-        return read[2] if read is not None and holds else None
+        return read[1] if read is not None and read[0] == n_dipoles else None

@@ -36,7 +36,6 @@ from anser_ros.wire.setup import Setup, parse_setup
 EARLIEST_DIAGNOSTICS_S = 0.1
 # How often frames that wait for a model are looked at beside the arrival of models.
 WAIT_PERIOD_S = 0.02
-MODEL_DEPTH = 20
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ class TrackerParameters:
         0.1,
         'longest time that a frame waits for the model of its instant while field_model refits, s',
         minimum=0.0,
-        maximum=1.0,
+        maximum=10.0,
         live=True,
     )
     publish_tf: bool = parameter(True, 'whether /tf is published where tf2_msgs is installed')
@@ -132,10 +131,11 @@ class TrackerNode(AnserNode):
         self._transforms = transform_publisher(self) if table.publish_tf else None
         warm_up()
         self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
-        models = qos.latched(MODEL_DEPTH)  # while it refits there is one a frame
         # The executor takes topics in this order, so a model finds its uncertainty there.
-        self.create_subscription(PointCloud2, 'field_model_error', self._on_error, qos.LATCHED)
-        self.create_subscription(PointCloud2, 'field_model', self._on_model, models)
+        self.create_subscription(
+            PointCloud2, 'field_model_error', self._on_error, qos.MODEL_ERRORS
+        )
+        self.create_subscription(PointCloud2, 'field_model', self._on_model, qos.MODELS)
         self._fluxes = self.create_subscription(
             PointCloud2, 'tool/flux', self._on_flux, qos.STREAM
         )

@@ -10,7 +10,7 @@ from anser_ros.tracking.tracker import Tracker
 
 
 def warm_up() -> None:
-    """Track a small made-up tool for three frames, so that motion is carried on,, with and without model uncertainty."""
+    """Track a small made-up tool until its motion is carried on, with and without uncertainty."""
     side = np.linspace(-0.1, 0.1, 3)
     x, y = (axis.ravel() for axis in np.meshgrid(side, side))
     positions = np.stack([x, y, np.zeros(9)], axis=1)

@@ -105,19 +105,23 @@ def costs(session: Any, model: Any, baseline: Any) -> list[dict[str, Any]]:
     build_s = time.perf_counter() - begin
     trackers = {'frozen': Tracker(model, tool.sensors, TrackerSettings(gate=1e9))}
     trackers['refit'] = Tracker(model, tool.sensors)
-    spent: dict[str, list[float]] = {'update': [], 'frozen': [], 'refit': []}
+    spent: dict[str, list[float]] = {'update': [], 'intake': [], 'frozen': [], 'refit': []}
+    # Processor time: other work on the machine is none of the nodes' business.
+    clock = time.process_time
     for frame in range(len(tool.time)):
         stamp = session.start_ns + round(1e9 * float(tool.time[frame]))
-        begin = time.perf_counter()
+        begin = clock()
         result = refit.update(stamp, reference.sensors.channel, reference.flux[frame])
         points = (result.model.positions, result.model.directions, result.model.moments)
         encode_field_model(DipolePoints(*points))
-        spent['update'].append(time.perf_counter() - begin)
-        trackers['refit'] = trackers['refit'].with_model(result.model)
+        spent['update'].append(clock() - begin)
+        begin = clock()
+        trackers['refit'] = trackers['refit'].with_model(result.model, str(stamp))
+        spent['intake'].append(clock() - begin)
         for name, tracker in trackers.items():
-            begin = time.perf_counter()
+            begin = clock()
             tracker.update(stamp, tool.sensors.channel, tool.flux[frame])
-            spent[name].append(time.perf_counter() - begin)
+            spent[name].append(clock() - begin)
     median = {name: float(1e3 * np.median(values)) for name, values in spent.items()}
     return [
         {'name': 'update, 32 references x 8 emitters, model encoded: median',
@@ -128,6 +132,9 @@ def costs(session: Any, model: Any, baseline: Any) -> list[dict[str, Any]]:
         {'name': "tracker's frame (9 coils and body) while the model is refitted",
          'value': median['refit'], 'unit': 'ms', 'rival': 'frozen model',
          'rival_value': median['frozen']},
+        {'name': 'tracker takes in a new model: median', 'value': median['intake'], 'unit': 'ms'},
+        {'name': 'tracker takes in a new model: mean', 'unit': 'ms',
+         'value': float(1e3 * np.mean(spent['intake']))},
     ]  # fmt: skip
 
 
