@@ -41,6 +41,8 @@ class Subject:
     illumination: Dipoles
 
     def __post_init__(self) -> None:
+        # Where the sensors truly are, whatever becomes of the optical track.
+        self.rotation = self.tool.rotation
         self.centres, self.axes = self.tool.placed()
         self.field = Dipoles(self.model.positions, self.model.directions, self.model.moments)
         self.omega = 2 * np.pi * np.asarray(self.model.frequencies_hz)
@@ -178,7 +180,7 @@ def _across(s: Subject, rows: list[int], turn: np.ndarray) -> None:
     """Turn the axes of some rows in the body; ``turn`` is (3, 3) or (F, 3, 3)."""
     flux = s.tool.flux.copy()
     for row in rows:
-        axes = s.tool.rotation @ turn @ s.tool.sensors.axis[row]
+        axes = s.rotation @ turn @ s.tool.sensors.axis[row]
         flux[:, row] += s.read(s.centres[:, row], axes) - s.clean[:, row]
     s.flux(flux)
 
@@ -186,7 +188,7 @@ def _across(s: Subject, rows: list[int], turn: np.ndarray) -> None:
 def _moved(s: Subject, rows: list[int], offset: np.ndarray) -> None:
     """Move some rows in the body, by (3,) or (F, 3)."""
     flux = s.tool.flux.copy()
-    shift = np.einsum('fij,fj->fi', s.tool.rotation, np.broadcast_to(offset, (s.time.size, 3)))
+    shift = np.einsum('fij,fj->fi', s.rotation, np.broadcast_to(offset, (s.time.size, 3)))
     for row in rows:
         flux[:, row] += s.read(s.centres[:, row] + shift, s.axes[:, row]) - s.clean[:, row]
     s.flux(flux)
@@ -447,7 +449,7 @@ def loose_axis(s: Subject, rng: np.random.Generator, size: float) -> Truth:
 def bending_body(s: Subject, rng: np.random.Generator, size: float) -> Truth:
     """The last cluster gives way under gravity, so it moves with the orientation."""
     rows = sorted(s.clusters())[-1]
-    pull = s.tool.rotation.transpose(0, 2, 1) @ np.array([0.0, 0.0, -1.0])
+    pull = s.rotation.transpose(0, 2, 1) @ np.array([0.0, 0.0, -1.0])
     _moved(s, rows, size * rng.uniform(1e-3, 3e-3) * (pull - pull.mean(axis=0)))
     return {}
 
@@ -463,7 +465,7 @@ def cluster_elsewhere(s: Subject, rng: np.random.Generator, size: float) -> Trut
 def warm_body(s: Subject, rng: np.random.Generator, size: float) -> Truth:
     """The body is longer than it was surveyed."""
     flux, longer = s.tool.flux.copy(), size * _signed(rng, 0.01, 0.03)
-    shift = s.tool.rotation @ s.tool.sensors.position.T * longer
+    shift = s.rotation @ s.tool.sensors.position.T * longer
     flux += s.read(s.centres + shift.transpose(0, 2, 1), s.axes) - s.clean
     s.flux(flux)
     return {}

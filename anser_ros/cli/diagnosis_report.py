@@ -49,18 +49,18 @@ def verdict(document: dict[str, Any]) -> str:
             text += f', and the position error from {1e3 * pair[0]:.3g} to {1e3 * pair[1]:.3g} mm'
         text += '.'
     else:
-        text = (
-            'No effect of the catalogue explains this session better than the model does: the '
-            f'residual on held-out data is {1e12 * after:.0f} pT, the noise '
-            f'{1e12 * held["flux_rms_floor_t"]:.0f} pT.'
+        floor = 1e12 * held['flux_rms_floor_t']
+        text = 'No effect that is known here explains what this session shows: '
+        if document['unexplained']['fraction'] == 0:
+            text = 'The model explains this session, and no effect is needed: '
+        text += (
+            f'the residual on held-out data is {1e12 * after:.0f} pT, the noise {floor:.0f} pT.'
         )
     rest = document['unexplained']
     if rest['fraction'] > 0:
         on = ', '.join(rest['depends_on']) or 'nothing that was looked at'
-        text += (
-            f' {rest["fraction"]:.0%} of the power above the noise stays unexplained; '
-            f'it depends on {on}.'
-        )
+        share = f'{rest["fraction"]:.0%}' if rest['fraction'] >= 0.01 else 'Less than 1%'
+        text += f' {share} of the power above the noise stays unexplained; it depends on {on}.'
     else:
         text += ' Nothing above the noise stays unexplained.'
     return text
@@ -150,6 +150,12 @@ def _held_out(document: dict[str, Any]) -> str:
 
 def _effects(document: dict[str, Any]) -> str:
     if not document['effects']:
+        if document['unexplained']['fraction'] > 0:
+            return (
+                '<p>None is named: what explained something was not the same in all parts of the '
+                'data, or left too much where it acts (see below, refused). Nothing is corrected; '
+                'a wrong correction would be worse than none.</p>'
+            )
         return '<p>None. A clean session passes every test and is not corrected.</p>'
     rows = []
     for effect in document['effects']:
@@ -169,7 +175,7 @@ def _effects(document: dict[str, Any]) -> str:
             ]
         )
     head = ['effect', 'what it is', 'parameters', '1 sigma', 'residual without it, pT',
-            'rivals', 'online']  # fmt: skip
+            'explains nearly as much', 'online']  # fmt: skip
     return _table(head, rows).replace('\n', '<br>')
 
 
@@ -221,13 +227,14 @@ def _candidates(rounds: Sequence[Sequence[Candidate]]) -> str:
 def _left_out(result: SessionDiagnosis) -> str:
     found = result.diagnosis
     rows = [
-        [term.label, f'{check.variation:.0%}', f'{check.share_of_rest:.2g}']
+        [term.label, check.reason, f'{check.variation:.0%}', f'{check.remainder:.1%}']
         for term, check in found.refused
     ]
     text = ''
     if rows:
-        text += '<h2>Refused</h2><p>These explained something, but not the same in all parts.</p>'
-        text += _table(['candidate', 'varies by', 'power over the rest'], rows)
+        text += '<h2>Refused</h2><p>These explained something, but may not be named.</p>'
+        head = ['candidate', 'why', 'varies by', 'leaves where it acts']
+        text += _table(head, rows)
     if found.search.removed:
         names = ', '.join(term.label for term in found.search.removed)
         text += f'<p>Explained away by others: {html.escape(names)}.</p>'

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.fit import Fit, misfit
+from anser_ros.diagnosis.fluctuating import is_of
 from anser_ros.diagnosis.problem import Part, Problem, State, evaluate
 from anser_ros.diagnosis.refine import METALS, belongs_to
 from anser_ros.diagnosis.whitening import parts
@@ -216,8 +217,25 @@ def doubtful(problem: Problem, fit: Fit, noise: float) -> list[tuple[Confirmatio
         for term in fit.terms
         if isinstance(term.effect, Fluctuation)
     ]
+    checks += _unsteady(problem, fit)
     bad = [(check, term) for check, term in checks if not check.holds]
     return sorted(bad, key=lambda pair: pair[0].power)
+
+
+def _unsteady(problem: Problem, fit: Fit) -> list[tuple[Confirmation, Term]]:
+    """Steady effects of a coil or channel that fluctuates besides, by the share that does."""
+    found = []
+    for free in fit.terms:
+        for term in fit.terms:
+            if not is_of(free, term):
+                continue
+            steady = [t for t in fit.terms if t is not free]
+            alone = evaluate(problem, steady).sum_of_squares
+            none = evaluate(problem, [t for t in steady if t is not term]).sum_of_squares
+            power = max(none - alone, 1e-300)
+            share = (alone - fit.state.sum_of_squares) / power
+            found.append((Confirmation(power, 0.0, np.inf, share), term))
+    return found
 
 
 def _extra(normal: Array, right: Array, noise: float) -> float:

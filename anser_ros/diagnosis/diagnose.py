@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from anser_ros.diagnosis.confirm import MANY, Confirmation, doubtful
 from anser_ros.diagnosis.corrected_model import corrected_model
 from anser_ros.diagnosis.fit import Fit, misfit
+from anser_ros.diagnosis.fluctuating import respread
 from anser_ros.diagnosis.outlying import clean_start, outlying_share, without_outliers
 from anser_ros.diagnosis.prepare import test_blocks, train_blocks
 from anser_ros.diagnosis.problem import Part, Problem, State, evaluate
@@ -177,8 +178,11 @@ def _confirmed(
         refused += [(term, check) for check, term in dropped]
         gone = [term for _, term in dropped]
         rest = [t for t in fit.terms if not any(t is term or belongs_to(t, term) for term in gone)]
+        rest = list(respread(fit.state.problem, rest))
         fit = settled(fit.state.problem, rest, blocks, how.folds, how.iterations)
-    return settled(problem, fit.terms, blocks, how.folds, how.iterations, FINE), tuple(refused)
+    return settled(
+        problem, respread(problem, fit.terms), blocks, how.folds, how.iterations, FINE
+    ), tuple(refused)
 
 
 def _tools(state: State) -> list[Part]:

@@ -13,7 +13,7 @@ from anser_ros.effects.effect import Term
 Array = NDArray[np.float64]
 
 ATTEMPTS = 6
-SETTLED = 1e-4
+SETTLED = 1e-5
 """A step that lowers the sum of squares by less than this share ends the fit."""
 
 

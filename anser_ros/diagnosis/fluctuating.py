@@ -5,12 +5,13 @@ expectation-maximisation; the gain is that of -2 log marginal likelihood, so the
 for, and compares with what a constant effect takes off the held-out sum of squares.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.problem import State
+from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.diagnosis.whitening import parts
 from anser_ros.effects.effect import Term
 from anser_ros.effects.fluctuation import Fluctuation
@@ -74,6 +75,26 @@ def fluctuation_of(state: State, term: Term) -> tuple[float, Term] | None:
     spread_term = term.effect.spread_out(term, spread)
     site = {**spread_term.site, '_frames': found.right.shape[0]}
     return gain_of(found, spread), Term(term.effect, site)
+
+
+def is_of(free: Term, steady: Term) -> bool:
+    """Whether a steady effect is about the same coil, channel or frame as a fluctuating one."""
+    if not isinstance(free.effect, Fluctuation) or isinstance(steady.effect, Fluctuation):
+        return False
+    if steady.effect.name == free.effect.of.name:
+        return all(steady.site.get(k) == v for k, v in free.site.items() if k[0] != '_')
+    return any(k in free.site and free.site[k] == steady.site.get(k) for k in ('coil', 'channel'))
+
+
+def respread(problem: Problem, terms: Sequence[Term]) -> tuple[Term, ...]:
+    """The terms with the spread of each fluctuation found anew beside the others."""
+    out = list(terms)
+    for i, term in enumerate(out):
+        if isinstance(term.effect, Fluctuation):
+            rest = [t for t in out if t is not term]
+            found = fluctuation_of(evaluate(problem, rest), term)
+            out[i] = term if found is None else found[1]
+    return tuple(out)
 
 
 def left_over(state: State, term: Term) -> float:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from anser_ros.diagnosis.confirm import doubtful
 from anser_ros.diagnosis.fit import Fit, fit_terms, misfit
-from anser_ros.diagnosis.fluctuating import fluctuation_of, left_over
+from anser_ros.diagnosis.fluctuating import fluctuation_of, is_of, left_over
 from anser_ros.diagnosis.moving_start import moving_starts
 from anser_ros.diagnosis.problem import Problem
 from anser_ros.diagnosis.refine import METALS, settled
@@ -41,6 +41,9 @@ MOST_METALS = 2
 OPEN, OPEN_FINALISTS = 40, 3
 """Parameters that a fluctuation counts for: more than a constant effect, less than shaped metal;
 and how many of them are tried in full."""
+STEADY = 0.8
+"""Share of a fluctuation's gain from which a constant, or a curve, of the same coil or channel is
+tried first: freedom in every frame also takes off what is another effect's."""
 OTHERS = 2.0
 """What a fluctuation takes off others, over what values alike would lose."""
 LEAST_OF_EXCESS = 0.4
@@ -237,6 +240,11 @@ def choose(fitted: Sequence[tuple[float, Fit]], how: SearchSettings) -> tuple[fl
     Where several leave nothing but noise, the simplest is the explanation.
     """
     gain, best = max(fitted, key=lambda pair: pair[0])
+    steady = [
+        (g, f) for g, f in fitted if g > STEADY * gain and is_of(best.terms[-1], f.terms[-1])
+    ]
+    if steady:
+        gain, best = max(steady, key=lambda pair: pair[0])
     most = complexity(best.terms[-1])
     simpler = [
         (g, f)
