@@ -15,14 +15,14 @@ from rich.console import Console
 
 from anser_ros.cli.kernels import compile_kernels
 from anser_ros.cli.loop_result import parameter_errors, second_run, table, verdict
-from anser_ros.cli.loop_run import AFTER, Run, record
+from anser_ros.cli.loop_run import AFTER, Run, World, make_world, record
 from anser_ros.cli.supervisor import Supervisor, tail
+from anser_ros.effects.correction import Correction
 from anser_ros.errors import DiagnosisError, ParameterError
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.recorded_health import first_warnings, kept_share, overload
 from anser_ros.sessions.session import NANO, load_session
 from anser_ros.simulation.effect_draw import CATALOGUE, NONE, RANDOM
-from anser_ros.wire.config_folder import config_path
 
 ALL = 'all'
 CLEAN_S = 6.0
@@ -46,8 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--duration', type=float, default=30.0, metavar='S', help='of the first run'
     )
     parser.add_argument(
-        '--baseline', type=Path, metavar='BAG',
-        help="clean recording of the simulator's board; recorded first when not given",
+        '--clean', type=float, default=CLEAN_S, metavar='S',
+        help='of the clean recording that the references are compared with; 0 for none',
     )  # fmt: skip
     parser.add_argument(
         '--watch', action='store_true', help='tell too what the live watcher said in the first run'
@@ -69,6 +69,8 @@ def run(args: argparse.Namespace) -> int:
     if not 10.0 <= args.duration <= 600.0:
         raise ParameterError(f'--duration must be 10 to 600 s, got {args.duration:g}')
     seed = int(np.random.default_rng().integers(1, 2**31)) if args.seed is None else args.seed
+    if args.clean and not 2.0 <= args.clean <= 600.0:
+        raise ParameterError(f'--clean must be 0 or 2 to 600 s, got {args.clean:g}')
     if seed < 1:
         raise ParameterError(f'--seed must be at least 1, got {seed}')
     effects = [*sorted(CATALOGUE), NONE] if ALL in args.effect else list(args.effect)
@@ -85,15 +87,15 @@ def run(args: argparse.Namespace) -> int:
         failed = compile_kernels(supervisor, say.print, lambda: False)
         if failed is not None:
             raise DiagnosisError(f'no kernels: {tail(failed)}')
-    clean = args.baseline
-    if clean is None:
-        say.print(f'a clean recording, {CLEAN_S:g} s')
-        clean = record(Run(folder / 'clean', CLEAN_S))
+    world, clean = make_world(folder), None
+    if args.clean:
+        say.print(f'a clean recording, {args.clean:g} s')
+        clean = record(Run(folder / 'clean', world.setup, args.clean))
     document: dict[str, Any] = {'data': 'simulated', 'folder': str(folder), 'rounds': []}
     for number, effect in enumerate(effects):
         where = f'round {number + 1} of {len(effects)}: '
         found = _round(
-            folder / f'{number + 1:02d}', clean, effect, seed + number, args.duration,
+            folder / f'{number + 1:02d}', world, clean, effect, seed + number, args.duration,
             args.watch, lambda text, where=where: say.print(where + text),
         )  # fmt: skip
         document['rounds'].append(found)
@@ -108,7 +110,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _round(
     folder: Path,
-    clean: Path,
+    world: World,
+    clean: Path | None,
     effect: str,
     seed: int,
     duration_s: float,
@@ -116,22 +119,32 @@ def _round(
     say: Callable[[str], None],
 ) -> dict[str, Any]:
     """One effect, from the raw samples to the error of the second run."""
-    model, truth_file = config_path('demo_model.yaml'), folder / 'truth.json'
+    model, truth_file = world.model, folder / 'truth.json'
     folder.mkdir()
     unit = {'effect': effect, 'effect_seed': seed, 'effect_file': truth_file}
     say(f'{duration_s:g} s with an effect that only truth.json knows')
     noisy = {'optical_noise_m': OPTICAL_NOISE_M, 'seed': 2}
-    watched = {'model_file': model, 'baseline_file': clean} if is_watched else None
-    first = record(Run(folder / 'first', duration_s, {**unit, **noisy}, watched=watched))
+    watched = None
+    if is_watched:
+        watched = {'model_file': model} | ({'baseline_file': clean} if clean else {})
+    first = record(
+        Run(folder / 'first', world.setup, duration_s, {**unit, **noisy}, watched=watched)
+    )
     say('diagnosis')
     began_s = time.monotonic()
     diagnosis = _diagnose(first, clean, model, folder / 'diagnosis')
     took_s = time.monotonic() - began_s
     corrected = folder / 'diagnosis' / 'model.yaml'
     second_s = SECOND_SHARE * duration_s
+    follows = clean is not None and _drifts(corrected, first)
     say(f'the corrected model is served, {second_s:g} s on another path')
     other = {'path_phase_rad': OTHER_PATH_RAD, 'seed': 3}
-    second = record(Run(folder / 'second', second_s, {**unit, **other}, corrected, model))
+    baseline = clean if follows else None
+    second = record(
+        Run(
+            folder / 'second', world.setup, second_s, {**unit, **other}, corrected, baseline, model
+        )
+    )
     session = load_session(second)
     truth = json.loads(truth_file.read_text(encoding='utf-8'))  # not before all is analysed
     busy = {
@@ -153,6 +166,7 @@ def _round(
             name: NANO * (told_ns - recorded.start_ns)
             for name, told_ns in first_warnings(first, f'{AFTER}/watcher'.strip('/')).items()
         },
+        'follows_references': follows,
         'diagnosis_s': took_s,
         'kept_share': kept,
         'too_busy': min(kept.values()) < LEAST_KEPT,
@@ -160,12 +174,20 @@ def _round(
     }
 
 
-def _diagnose(bag: Path, clean: Path, model: Path, out: Path) -> dict[str, Any]:
+def _drifts(model_file: Path, session: Path) -> bool:
+    """Whether a model has effects whose course only the references can tell, another time."""
+    model, sensors = load_model(model_file), load_session(session).tools[0].sensors
+    return bool(Correction.of(model.effects, sensors, model.frequencies_hz).drifting)
+
+
+def _diagnose(bag: Path, clean: Path | None, model: Path, out: Path) -> dict[str, Any]:
     """Run the diagnosis in a process of its own, which knows the bags and the model alone."""
     command = [
         sys.executable, '-P', '-m', 'anser_ros.cli.main', 'diagnose', str(bag),
-        '--model', str(model), '--baseline', str(clean), '--out', str(out),
+        '--model', str(model), '--out', str(out),
     ]  # fmt: skip
+    if clean is not None:
+        command += ['--baseline', str(clean)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise DiagnosisError(f'the diagnosis failed: {done.stderr.strip()[-500:]}')

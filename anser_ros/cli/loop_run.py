@@ -4,15 +4,18 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from anser_ros.cli.demo import BOARD_SEED, NO_GATE, SAMPLE_RATE_HZ, SHARED_TOPICS
 from anser_ros.cli.demo import node_command as node
 from anser_ros.cli.supervisor import Supervisor, tail
-from anser_ros.errors import AnserError, DiagnosisError
+from anser_ros.errors import AnserError, DiagnosisError, SetupError
+from anser_ros.sessions.model_file import load_model, save_model
 from anser_ros.sessions.recorded_health import last_words
 from anser_ros.wire.bag import read_bag
+from anser_ros.wire.config_folder import config_path, read_config
+from anser_ros.wire.setup import dump_setup, parse_setup
 
 PATIENCE_S = 180.0
 POLL_S = 0.2
@@ -20,6 +23,43 @@ RATE_HZ = 25.0
 AFTER, BEFORE, UNGATED = '/anser', '/anser/before', '/anser/ungated'
 """Namespaces of the trackers: with the corrected model, with the model as it was, and with that
 one and no residual gate, whose error shows what a gate is there for."""
+
+
+TONES_HZ = tuple(5025.0 + 100.0 * mark for mark in (0, 1, 4, 9, 15, 22, 32, 34))
+"""Marks of a Golomb ruler (no two pairs are equally far apart) in steps of 100 Hz: where a channel
+compresses, the third-order products of the tones, also those that the converter's rate of 20 kHz
+folds back, then fall between the tones, whole cycles of a 20 ms window away."""
+
+
+@dataclass(frozen=True)
+class World:
+    """What all runs of a loop share: files of the setup and of the model known at first."""
+
+    setup: Path
+    model: Path
+
+
+def make_world(folder: Path) -> World:
+    """Write the demo's setup and model with the loop's tones, which a field without metal ignores.
+
+    Raises
+    ------
+    SetupError
+        When the demo's setup has another number of coils than there are tones.
+    """
+    setup = parse_setup(read_config('demo_setup.yaml'))
+    if len(setup.emitter.coils) != len(TONES_HZ):
+        raise SetupError(f'the loop has {len(TONES_HZ)} tones, the setup another number of coils')
+    coils = tuple(
+        replace(coil, frequency_hz=tone)
+        for coil, tone in zip(setup.emitter.coils, TONES_HZ, strict=True)
+    )
+    world = World(folder / 'setup.yaml', folder / 'model.yaml')
+    own = replace(setup, emitter=replace(setup.emitter, coils=coils))
+    world.setup.write_text(dump_setup(own), encoding='utf-8')
+    model = load_model(config_path('demo_model.yaml'))
+    save_model(world.model, replace(model, frequencies_hz=TONES_HZ))
+    return world
 
 
 @dataclass(frozen=True)
@@ -30,12 +70,16 @@ class Run:
     ----------
     folder : Path
         Gets the bag and the logs.
+    setup : Path
+        Document of the unit and of everybody else.
     duration_s : float
         From the first flux on.
     unit : mapping
         Parameters of the simulated control unit.
     served : Path or None
         Model of the chain whose poses are judged; without it nobody tracks.
+    baseline : Path or None
+        Clean recording; with it the served model follows the references.
     known : Path or None
         Model of the trackers beside it.
     watched : mapping or None
@@ -43,9 +87,11 @@ class Run:
     """
 
     folder: Path
+    setup: Path
     duration_s: float
     unit: Mapping[str, object] = field(default_factory=dict)
     served: Path | None = None
+    baseline: Path | None = None
     known: Path | None = None
     watched: Mapping[str, object] | None = None
 
@@ -85,18 +131,21 @@ def record(run: Run) -> Path:
 
 def _unit(run: Run, port: Path) -> list[str]:
     return node(
-        'cu_simulator', link=port, metal=False, board_seed=BOARD_SEED,
+        'cu_simulator', link=port, setup_file=run.setup, metal=False, board_seed=BOARD_SEED,
         sample_rate_hz=SAMPLE_RATE_HZ, **run.unit,
     )  # fmt: skip
 
 
 def _commands(run: Run, port: Path) -> dict[str, list[str]]:
     commands = {
-        'acquisition': node('acquisition', device=port, rate_hz=RATE_HZ),
+        'acquisition': node('acquisition', device=port, setup_file=run.setup, rate_hz=RATE_HZ),
         'recorder': node('recorder', directory=run.folder, name='bag'),
     }
     if run.served is not None:
-        commands['field_model'] = node('field_model', model_file=run.served, refit=False)
+        follows: dict[str, object] = {'refit': False}
+        if run.baseline is not None:
+            follows = {'refit': True, 'baseline_file': run.baseline}
+        commands['field_model'] = node('field_model', model_file=run.served, **follows)
         commands['tracker'] = node('tracker', model_file=run.served)
     if run.watched is not None:
         commands['watcher'] = node('watcher', **run.watched)

@@ -3,6 +3,9 @@
 The amplifier sees the sum of all tones, v(t), and gives fs tanh(v / fs), or its first two terms
 v - v^3 / (3 fs^2). The cube takes ``(S / 2 - |V_k|^2 / 4) / fs^2`` of tone k away, where S is the
 sum of the squared amplitudes of all tones, of independent phases: the other tones count twice.
+
+What the amplifier sees is either the flux, as behind an integrator, or the voltage that it
+induces, in which a tone counts in proportion to its frequency.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,6 +31,8 @@ UNIT = 1e12
 POINTS, GENERATOR = 1021, 331
 """Size and generator of the lattice of phases (Korobov)."""
 SHAPES = ('cubic', 'tanh')
+FLUX, VOLTAGE = 'flux', 'voltage'
+"""What the amplifier may see."""
 
 
 def third_order(flux: ComplexArray) -> ComplexArray:
@@ -63,16 +68,21 @@ class Saturation(Effect):
         'channel': '1',
         'full_scale_t': 'T',
         'shape': 'name of the curve',
+        'sees': 'flux or voltage',
+        'tone_weights': '1',
     }
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'full_scale_t': (1e-8, 1e-3)}
     remedy = Remedy.FLUX
 
     def candidates(self, scene: Scene) -> Sequence[Term]:
         """Every channel of a tool; references don't see signals of different size."""
+        weights = {FLUX: np.ones(scene.emitters), VOLTAGE: scene.omega / scene.omega.mean()}
         return [
-            Term(self, {'channel': c, 'shape': shape}, np.zeros(1))
+            Term(self, {'channel': c, 'shape': shape, 'sees': sees, '_weights': w}, np.zeros(1))
             for c in scene.tool_channels
             for shape in SHAPES
+            for sees, w in weights.items()
+            if sees == FLUX or not np.allclose(w, 1.0)
         ]
 
     def prior(self, term: Term) -> Array:
@@ -84,23 +94,26 @@ class Saturation(Effect):
         row = view.row(term.site['channel'])
         if row is None:
             return None
-        out, own = view.columns(1), view.linear[:, row]
+        weights = term.site['_weights']
+        out, own = view.columns(1), view.linear[:, row] * weights
         if term.theta[0] <= 0:
-            out[:, row, :, 0] = UNIT * third_order(own)
+            out[:, row, :, 0] = UNIT * third_order(own) / weights
         else:
             step = 0.01 * term.theta[0]
             more = compressed(own, UNIT * (term.theta[0] + step), term.site['shape'])
             less = compressed(own, UNIT * (term.theta[0] - step), term.site['shape'])
-            out[:, row, :, 0] = (more - less) / (2 * step)
+            out[:, row, :, 0] = (more - less) / (2 * step) / weights
         return out
 
     def compress(
         self, term: Term, channels: NDArray[np.int64], flux: ComplexArray
     ) -> ComplexArray:
         """The channel behind its amplifier."""
-        out = flux.copy()
+        out, weights = flux.copy(), term.site['_weights']
         for row in np.flatnonzero(channels == term.site['channel']):
-            out[:, row] = compressed(flux[:, row], UNIT * float(term.theta[0]), term.site['shape'])
+            seen = flux[:, row] * weights
+            out[:, row] = compressed(seen, UNIT * float(term.theta[0]), term.site['shape'])
+            out[:, row] /= weights
         return out
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
@@ -108,21 +121,24 @@ class Saturation(Effect):
         value = max(float(term.theta[0]), 1e-9)
         full_scale = 1 / np.sqrt(UNIT * value)
         relative = 0.5 * float(np.sqrt(covariance[0, 0])) / value
-        return EffectRecord(
-            self.name,
-            {
-                'channel': term.site['channel'],
-                'full_scale_t': float(full_scale),
-                'shape': term.site['shape'],
-            },
-            {'full_scale_t': float(full_scale * relative)},
-        )
+        parameters = {
+            'channel': term.site['channel'],
+            'full_scale_t': float(full_scale),
+            'shape': term.site['shape'],
+            'sees': term.site['sees'],
+            'tone_weights': np.asarray(term.site['_weights']).tolist(),
+        }
+        return EffectRecord(self.name, parameters, {'full_scale_t': float(full_scale * relative)})
 
     def term(self, record: EffectRecord) -> Term:
         """From the full scale."""
         full_scale = float(needed(record, 'full_scale_t'))
-        shape = str(record.parameters.get('shape', SHAPES[0]))
-        site = {'channel': int(needed(record, 'channel')), 'shape': shape}
+        site = {
+            'channel': int(needed(record, 'channel')),
+            'shape': str(record.parameters.get('shape', SHAPES[0])),
+            'sees': str(record.parameters.get('sees', FLUX)),
+            '_weights': np.asarray(record.parameters.get('tone_weights', 1.0), dtype=np.float64),
+        }
         return Term(self, site, np.array([1 / (UNIT * full_scale**2)]))
 
 

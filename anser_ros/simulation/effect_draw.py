@@ -143,7 +143,7 @@ def _sensor_gain(unit: Unit, rng: np.random.Generator) -> Drawn:
 
 def _saturation(unit: Unit, rng: np.random.Generator) -> Drawn:
     column = int(rng.choice(_tool_columns(unit.setup)))
-    limit_v = float(rng.uniform(0.8, 1.6))
+    limit_v = float(rng.uniform(2.0, 4.0))
     channel = unit.setup.sensors[column].channel
     # What the tones' mean frequency makes of it; the amplifier sees volts, the higher tones more.
     volts_per_tesla = unit.channels.areas_m2([channel])[0] * np.mean(unit.setup.frequencies_hz)
