@@ -226,6 +226,14 @@ def test_parameters_out_of_range(tmp_path, arguments, capsys):
     assert 'must be positive' in text
 
 
+def test_a_cut_scan_is_said_to_be_cut(tmp_path, capsys):
+    whole = FACTORY.read_bytes()
+    cut = tmp_path / 'cut.mcap'
+    cut.write_bytes(whole[: len(whole) * 3 // 4])
+    calibrate(cut, '--out', tmp_path / 'm.yaml')
+    assert f'{cut}: the bag breaks off after' in capsys.readouterr().err
+
+
 def test_options_raise_typed_errors():
     parser = argparse.ArgumentParser()
     command.add_arguments(parser)

@@ -170,6 +170,16 @@ def test_bad_usage_is_one_clear_line(start, arguments, said):
     assert said in process.output and 'Traceback' not in process.output
 
 
+def test_a_bag_of_other_topics_is_refused(start, tmp_path):
+    bag = BagWriter(tmp_path / 'other.mcap')
+    chat = bag.add_topic('/chat', 'std_msgs/msg/String', 'string data\n')
+    bag.write(chat, START_NS, b'\0\1\0\0\3\0\0\0hi\0')
+    bag.close()
+    process = start('replay', tmp_path / 'other.mcap')
+    assert process.popen.wait(20) == 2
+    assert 'neither a setup nor fluxes that could be replayed' in process.output
+
+
 def test_nobody_listens(ros, tmp_path):
     """It waits for listeners, and plays for the record when none comes."""
     from anser_ros.nodes import replay

@@ -68,6 +68,9 @@ def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
     sessions = [load_session(path) for path in args.sessions]
     check_same_board(sessions)
+    for path, session in zip(args.sessions, sessions, strict=True):
+        if session.lost:
+            print(f'anser calibrate: {path}: {session.lost}', file=sys.stderr)
     with progress_bar() as progress:
         calibration = calibrate_sessions(sessions, _options(args), progress)
     document = to_document(calibration)

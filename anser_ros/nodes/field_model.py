@@ -363,7 +363,7 @@ class FieldModelNode(AnserNode):
             'emitters': len(model.emitters),
             'flux_error_t': float(model.flux_error_t),
             'modes': 0 if model.modes is None else len(model.modes),
-            'frozen': self._frozen,
+            'freeze': self._frozen,
             'refit_time_s': self._refit_s,
         }
         if self._trouble:
@@ -372,7 +372,7 @@ class FieldModelNode(AnserNode):
 
     def _activity(self, values: dict[str, object]) -> str:
         if self._frozen:
-            return 'frozen'
+            return 'held as it is: freeze was called'
         if self._refit is None or not self.parameters.refit:
             return 'constant' if not self.parameters.refit else 'constant, no baseline yet'
         result = self._result

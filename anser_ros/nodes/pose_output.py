@@ -113,16 +113,22 @@ class PoseTopic:
             self._full.pose.covariance = self.estimate.covariance.ravel()
             self._uncertain.publish(self._full)
 
+    def state(self, stale_after_s: float) -> tuple[str, str]:
+        """Return the state as it is now, silence included, and its reason."""
+        if self.estimate is None:
+            return STALE, 'no fluxes yet'
+        silent_s = time.monotonic() - self.tally.latest_s
+        if silent_s > stale_after_s:
+            return STALE, f'no fluxes for {silent_s:.1f} s'
+        return self.estimate.state, self.estimate.reason
+
     def status(self, stale_after_s: float) -> Status:
         """Return the line of ``/diagnostics`` and begin a new interval."""
         tally, self.tally = self.tally, Tally(latest_s=self.tally.latest_s)
         estimate = self.estimate
+        state, reason = self.state(stale_after_s)
         if estimate is None:
-            return Status(self.name, Level.STALE, STALE, {'reason': 'no fluxes yet'})
-        silent_s = time.monotonic() - tally.latest_s
-        state, reason = estimate.state, estimate.reason
-        if silent_s > stale_after_s:
-            state, reason = STALE, f'no fluxes for {silent_s:.1f} s'
+            return Status(self.name, Level.STALE, state, {'reason': reason})
         seconds = max(time.monotonic() - tally.begin_s, 1e-3)
         values: dict[str, object] = {
             'state': state,

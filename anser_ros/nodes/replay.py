@@ -14,7 +14,7 @@ from rclpy.duration import Duration
 from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
 
-from anser_ros.errors import AnserError, ParameterError
+from anser_ros.errors import AnserError, BagError, ParameterError
 from anser_ros.nodes import qos
 from anser_ros.nodes.consumers import Consumers
 from anser_ros.nodes.definitions import message_class
@@ -137,6 +137,9 @@ class Replay(AnserNode):
                 counts[message.topic] += 1
                 if counts[message.topic] == 1:
                     self._announce(message)
+        wanted = any(topic.endswith(('/setup', *FLUX_ENDINGS)) for topic in self._outlets)
+        if not wanted and not self._all_topics:
+            raise BagError(f'{self._bag}: neither a setup nor fluxes that could be replayed')
         self._total = sum(counts[topic] for topic in self._outlets)
         self._lost = salvage.lost
         if self._lost:

@@ -3,6 +3,7 @@
 A pose is published only while its state is ``ok``; why there is none stands in ``/diagnostics``.
 """
 
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -36,6 +37,10 @@ from anser_ros.wire.setup import Setup, parse_setup
 EARLIEST_DIAGNOSTICS_S = 0.1
 # How often frames that wait for a model are looked at beside the arrival of models.
 WAIT_PERIOD_S = 0.02
+# Fluxes whose stamps are further from the host's clock are a recording's.
+LIVE_WITHIN_S = 60.0
+# How long a refusal or skipped frames count as news.
+TROUBLE_TOLD_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -124,7 +129,7 @@ class TrackerNode(AnserNode):
         self._frames = AnsweredFrames[GivenModel, tuple[int, FluxPoints]](
             self._put_in_force, self._track
         )
-        self._trouble = ''
+        self._trouble, self._trouble_s = '', -math.inf
         self._solve_s = 0.0
         self._backlog = Backlog()
         self._told_s = 0.0
@@ -219,11 +224,15 @@ class TrackerNode(AnserNode):
     def _on_flux(self, message: PointCloud2, info: dict[str, int]) -> None:
         """Take a frame; one that is late beyond hope gives way to the newest."""
         received_ns = info.get('received_timestamp') or info.get('source_timestamp') or 0
-        self._backlog.arrived(received_ns, stamp_of(message))
-        if received_ns and self._backlog.is_hopeless((time.time_ns() - received_ns) / NANO):
+        now_ns, stamp_ns = time.time_ns(), stamp_of(message)
+        self._backlog.arrived(received_ns, stamp_ns)
+        # Nobody steers by a recording that is played: it is worked off whole.
+        live = abs(now_ns - stamp_ns) < LIVE_WITHIN_S * NANO
+        if live and received_ns and self._backlog.is_hopeless((now_ns - received_ns) / NANO):
             waiting = take_waiting(self._fluxes)
             if waiting:
                 self.count('frames_skipped', len(waiting))
+                self._say_trouble('frames skipped: they come faster than they can be tracked')
                 message = waiting[-1]
         frame = self._read(message)
         if frame is not None:
@@ -296,8 +305,11 @@ class TrackerNode(AnserNode):
     # What is told -------------------------------------------------------------------------
 
     def _refuse(self, counter: str, error: AnserError) -> None:
-        self._trouble = str(error)
+        self._say_trouble(str(error))
         self.warn(counter, str(error))
+
+    def _say_trouble(self, words: str) -> None:
+        self._trouble, self._trouble_s = words, time.monotonic()
 
     def on_parameters(self, old: TrackerParameters, new: TrackerParameters) -> None:
         """Track on with the new settings, from where the tools were."""
@@ -324,9 +336,8 @@ class TrackerNode(AnserNode):
             'model_stamp_ns': '' if newest is None else newest.stamp_ns,
             'models_late': self._frames.late,
         }
-        good = sum(
-            t.estimate is not None and t.estimate.state == OK for t in self._topics.values()
-        )
+        stale_after_s = self.parameters.stale_after_s
+        good = sum(topic.state(stale_after_s)[0] == OK for topic in self._topics.values())
         values['tracked'] = good
         dead = ', '.join(tracker.dead_emitters)
         values['dead_emitters'] = dead
@@ -334,7 +345,10 @@ class TrackerNode(AnserNode):
         values['left_to_references'] = ', '.join(tracker.drifting_effects)
         if dead:
             return Status('', Level.WARN, f'no flux of {dead}', values)
-        return Status('', Level.OK, f'{good} of {len(self._topics)} tracked', values)
+        tracked = f'{good} of {len(self._topics)} tracked'
+        if time.monotonic() - self._trouble_s < TROUBLE_TOLD_S:
+            return Status('', Level.WARN, f'{tracked}; lately: {self._trouble}', values)
+        return Status('', Level.OK, tracked, values)
 
     def _ready_for(self) -> str:
         """Digest of the setup that no pose will be lost of: all listeners and the model are there.
