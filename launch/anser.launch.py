@@ -69,7 +69,7 @@ def generate_launch_description():
                     ),
                     node('acquisition', device=value('device'), **board),
                     node('field_model', model_file=value('model')),
-                    node('tracker'),
+                    node('tracker', model_file=value('model')),
                     node('recorder', 'record', directory=value('directory')),
                     node('watcher', 'watch', model_file=value('model')),
                     node('openigtlink', 'openigtlink'),

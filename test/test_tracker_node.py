@@ -519,6 +519,16 @@ def test_services_of_the_field_model(server, tmp_path):
     assert server.node.counters['callback_faults'] == 0
 
 
+def test_the_nominal_model_is_no_file(ros):
+    from rclpy.parameter import Parameter
+
+    from anser_ros.nodes.tracker import TrackerNode
+
+    node = TrackerNode(parameter_overrides=[Parameter('model_file', value='nominal')])
+    assert node.status().message == 'no setup yet'
+    node.destroy_node()
+
+
 def test_a_model_file_is_served_at_once_and_must_fit_the_setup(ros, tmp_path):
     from rclpy.parameter import Parameter
 

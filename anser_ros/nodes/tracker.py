@@ -27,6 +27,7 @@ from anser_ros.nodes.pose_output import PoseTopic, transform_message, transform_
 from anser_ros.nodes.readiness import digest_of
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import noise_of, sensor_table
+from anser_ros.sessions.starting_model import NOMINAL
 from anser_ros.tracking.estimate import OK, TrackerSettings
 from anser_ros.tracking.seed import Volume
 from anser_ros.tracking.tracker import Tracker
@@ -48,7 +49,9 @@ class TrackerParameters:
     """Parameters of the tracker."""
 
     model_file: str = parameter(
-        '', 'model whose effects apply, and its field until field_model speaks; empty for none'
+        '',
+        'model whose effects apply, and its field until field_model speaks; empty or nominal for '
+        'none',
     )
     flux_noise_t: float = parameter(
         60e-12, 'noise of a phasor component to start from, T', minimum=1e-15, maximum=1e-3
@@ -118,7 +121,8 @@ class TrackerNode(AnserNode):
         super().__init__(**options)
         table = self.parameters
         self._settings = settings_of(table)
-        self._file_model = load_model(table.model_file) if table.model_file else None
+        has_file = table.model_file not in ('', NOMINAL)
+        self._file_model = load_model(table.model_file) if has_file else None
         self._setup_text = ''
         self._setup: Setup | None = None
         self._flux_noise_t = 0.0
