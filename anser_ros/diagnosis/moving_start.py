@@ -57,13 +57,12 @@ def moving_starts(
     free = effect.starting(path, knots, duration, alpha)
     if np.linalg.norm(end - start) < SHORT_WAY:
         start = start + np.array([0.0, 0.0, -0.05])
-    straight = [
-        effect.starting(
-            StraightPath(), np.concatenate([start, end, times, [0.5]]), duration, alpha
-        )
-        for times in ((0.2 * duration, 0.8 * duration), (0.05 * duration, 0.5 * duration))
+    times = (0.2 * duration, 0.8 * duration)
+    straight = np.concatenate([start, end, times, [0.5]])
+    return [
+        (alone, effect.starting(StraightPath(), straight, duration, alpha)),
+        (alone, free),
     ]
-    return [(alone, term) for term in (*straight, free)]
 
 
 def _smoothest(points: Array, gains: Array) -> NDArray[np.int64]:

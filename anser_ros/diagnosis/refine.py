@@ -29,13 +29,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Richness:
-    """How finely metal is shaped: most modes, and knots that a free path may have."""
+    """How finely metal is shaped: most modes, knots that a free path may have, and the misfit over
+    the noise from which they are tried."""
 
     modes: int
     knots: tuple[int, ...]
+    left: float
 
 
-COARSE, FINE = Richness(50, (9, 17)), Richness(90, (9, 17, 25))
+COARSE, FINE = Richness(50, (17,), 1.3), Richness(90, (17, 25), 1.02)
 AT_REST = ('static_metal', 'conductive_plate')
 METALS = (*AT_REST, 'moving_metal')
 
@@ -53,7 +55,7 @@ TRIALS = 3
 AWAY = 2e-3
 """A centre that the fit moves farther than this (m) asks for new modes."""
 LEFT = 1.02
-"""Misfit over the noise from which a path is given more freedom."""
+"""Misfit of the tools over the noise from which a body at rest may be an extended one."""
 PER_PARAMETER = 6.0
 
 
@@ -203,7 +205,7 @@ def _shaped(
     for count in body.knots:
         term = fit.terms[index]
         path = path_of(term)
-        if misfit(fit) < LEFT * noise_scale(fit.state) ** 2:
+        if misfit(fit) < body.left * noise_scale(fit.state) ** 2:
             break
         if isinstance(path, FreePath) and len(path.knots) >= count:
             continue
@@ -214,8 +216,9 @@ def _shaped(
         trial = _with(fit.terms, index, effect.with_path(term, freer, course))
         other = fit_terms(problem, trial, blocks, iterations)
         more = PER_PARAMETER * (freer.count - path.count) * max(misfit(other), 1.0)
-        if fit.held_out(folds) - other.held_out(folds) > more:
-            fit = other
+        if fit.held_out(folds) - other.held_out(folds) < more:
+            break
+        fit = other
     return fit
 
 
@@ -237,23 +240,25 @@ def _bodied(
         kind = [first.site['_kind']]
         again = _shaped_as(fit, index, problem, blocks, folds, iterations, body, kind)
         return again or fit
-    starts, families = [fit], [[COMPACT], [*SPACINGS]]
+    half = problem.in_blocks(blocks, 2)
+    starts, families = [fit_terms(half, fit.terms, blocks, 0)], [[COMPACT], [*SPACINGS]]
     if '_course' in first.site:
         course = first.site['_course']
         moved = first.with_theta(np.concatenate([course, first.theta[course.size :]]))
         held = _with(fit.terms, index, moved.frozen(np.zeros((0, 0))))
-        linear = fit_terms(problem, held, blocks, 1)
-        starts.append(fit_terms(problem, [t.free() for t in linear.terms], blocks, 0))
+        linear = fit_terms(half, held, blocks, 1)
+        starts.append(fit_terms(half, [t.free() for t in linear.terms], blocks, 0))
     shaped = [
         other
         for start in starts
         for kinds in families
-        if (other := _shaped_as(start, index, problem, blocks, folds, TRIALS, body, kinds))
+        if (other := _shaped_as(start, index, half, blocks, folds, TRIALS, body, kinds))
     ]
     if not shaped:
         return fit
     best = min(shaped, key=lambda f: f.held_out(folds))
     kind = [best.terms[index].site['_kind']]
+    best = fit_terms(problem, best.terms, blocks, 0)
     again = _shaped_as(best, index, problem, blocks, folds, iterations, body, kind)
     return again or best
 

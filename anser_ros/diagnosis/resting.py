@@ -12,6 +12,8 @@ from anser_ros.diagnosis.scoring import Score, Scorer
 from anser_ros.effects.effect import Term
 
 TRIED = 3
+FAR_LESS = 0.25
+"""Metal at rest that explains less than this share by itself is no rival."""
 LEAST_SHARE, LEAST = 0.02, 100.0
 """Metal moves when that explains so much more, as a share of all that it explains, and in units of
 the misfit."""
@@ -48,9 +50,9 @@ def moves_or_rests(
     """
     shaped = settled(problem, moving.terms, blocks, folds, iterations)
     resting = [(g, f) for g, f in fitted if f.terms[-1].effect.name in AT_REST]
-    if not resting:
+    gain, rest = max(resting, key=lambda pair: pair[0], default=(0.0, moving))
+    if gain < FAR_LESS * explained:
         return shaped
-    rest = max(resting, key=lambda pair: pair[0])[1]
     rest = settled(problem, rest.terms, blocks, folds, iterations)
     limit = shaped.held_out(folds) + LEAST_SHARE * explained + LEAST * max(misfit(shaped), 1.0)
     if rest.held_out(folds) < limit:

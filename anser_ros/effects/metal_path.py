@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 SHORTEST = 0.2
 FINE_STEP_S = 0.05
-NODES, NODES_PER_KNOT = 61, 10
+NODES, NODES_PER_KNOT = 41, 6
 """Nodes on a path, in which fields are found; between them they are interpolated."""
 NEGLIGIBLE_WAY = 0.02
 """Share of a way that counts as not yet begun, or as over."""

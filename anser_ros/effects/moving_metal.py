@@ -159,9 +159,7 @@ class MovingMetal(Effect):
         at, spread = self.centres(term, ends), self._place_sigma(term, covariance, ends)
         # Which point of an extended body is its centre, nothing tells.
         spread = np.hypot(spread, SPACINGS.get(term.site['_kind'], 0.0))
-        straight = not path.knots
-        hidden = np.full(2, 0.0 if straight else float(np.diff(path.knots[:2])[0]) / 2)
-        sigma = np.hypot(sigmas(covariance)[6:8] if straight else 0.0, hidden)
+        times_sigma = self._time_sigma(term, covariance, start, end)
         return EffectRecord(
             self.name,
             {
@@ -174,7 +172,7 @@ class MovingMetal(Effect):
                     'position_m': self.centres(term, times).tolist(),
                 },
                 'polarizability': np.stack([total.real, total.imag], axis=-1).tolist(),
-                'knots_s': [] if straight else list(path.knots),
+                'knots_s': list(path.knots),
                 'course': course.tolist(),
                 'body': term.site['_kind'],
                 'couplings_m3': np.stack([couplings.real, couplings.imag], axis=-1).tolist(),
@@ -182,8 +180,8 @@ class MovingMetal(Effect):
             {
                 'start_m': spread[0].tolist(),
                 'end_m': spread[1].tolist(),
-                't_start_s': float(sigma[0]),
-                't_end_s': float(sigma[1]),
+                't_start_s': times_sigma[0],
+                't_end_s': times_sigma[1],
                 'path': np.hypot(
                     self._place_sigma(term, covariance, times),
                     SPACINGS.get(term.site['_kind'], 0.0),
@@ -198,6 +196,28 @@ class MovingMetal(Effect):
         block = covariance[: path.count, : path.count]
         variance = np.einsum('fic,cd,fid->fi', rates, block, rates)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+    def _time_sigma(
+        self, term: Term, covariance: Array, start: float, end: float
+    ) -> tuple[float, float]:
+        """Standard deviation of the times when the way begins and ends, s.
+
+        On a free path a body has left its first place for certain only where it is farther from
+        it than it is known to be anywhere.
+        """
+        path = path_of(term)
+        if not path.knots:
+            first, last = sigmas(covariance)[6:8]
+            return float(first), float(last)
+        time = np.linspace(path.knots[0], path.knots[-1], PATH_SAMPLES * 8)
+        centre = self.centres(term, time)
+        known = 2.0 * np.linalg.norm(self._place_sigma(term, covariance, time), axis=1)
+        gone = np.flatnonzero(np.linalg.norm(centre - centre[0], axis=1) > known)
+        coming = np.flatnonzero(np.linalg.norm(centre - centre[-1], axis=1) > known)
+        knot = 0.5 * (path.knots[1] - path.knots[0])
+        left = float(time[gone[0]]) if gone.size else path.knots[-1]
+        there = float(time[coming[-1]]) if coming.size else path.knots[0]
+        return float(np.hypot(knot, left - start)), float(np.hypot(knot, end - there))
 
     def term(self, record: EffectRecord) -> Term:
         """From path and couplings."""

@@ -53,8 +53,8 @@ class Shapes:
 
     @property
     def local(self) -> bool:
-        """Whether every shape answers to itself alone."""
-        return not self.sloped.size and np.array_equal(self.first, self.second)
+        """Whether the shapes are the field's components at the points, each answering alone."""
+        return len(self.functionals) == 3 * len(self.offsets)
 
     @property
     def size(self) -> int:
@@ -64,6 +64,8 @@ class Shapes:
     def driven(self, field: ComplexArray) -> ComplexArray:
         """Amplitudes (..., K, M) from the fields (..., n, 3, K) at the points."""
         shape = (*field.shape[:-3], -1, field.shape[-1])
+        if self.local:
+            return np.asarray(np.swapaxes(field.reshape(shape), -1, -2))
         flat = self.functionals.reshape(len(self.functionals), -1)
         return np.asarray(np.swapaxes(flat @ field.reshape(shape), -1, -2))
 
@@ -87,8 +89,10 @@ class Shapes:
             coupling = 0.5 * (coupling + dipole_coupling(points, centres - reach, axes))
         else:
             coupling = dipole_coupling(points, centres, axes)
-        flat = self.functionals.reshape(len(self.functionals), -1)
-        return np.asarray(coupling.reshape(*coupling.shape[:-2], -1) @ flat.T)
+        coupling = coupling.reshape(*coupling.shape[:-2], -1)
+        if self.local:
+            return coupling
+        return np.asarray(coupling @ self.functionals.reshape(len(self.functionals), -1).T)
 
     def mode_flux(
         self, ears: Array, drive: ComplexArray, modes: Array, omega: Array
@@ -133,6 +137,8 @@ class Shapes:
 
     def answer(self, drive: ComplexArray, couplings: ComplexArray, omega: Array) -> ComplexArray:
         """Amplitudes (..., K, M) that metal with these couplings makes of a drive (..., K, M)."""
+        if self.local:
+            return drive * (couplings * (UNIT / MU_0))
         count = self.first.size
         out: ComplexArray = drive @ self.matrix(couplings[:count])
         if np.any(couplings[count:]):
