@@ -128,7 +128,7 @@ def _vector(value: Any, where: str) -> Vector:
 
 def _axis(value: Any, where: str) -> Vector:
     vector = np.asarray(_vector(value, where))
-    norm = float(np.linalg.norm(vector))
+    norm = math.hypot(*vector)  # the same to the last bit on every machine
     if abs(norm - 1.0) > AXIS_TOLERANCE:
         raise SetupError(f'setup: {where} must be a unit vector, its length is {norm:.6g}')
     if abs(norm - 1.0) > 1e-12:
