@@ -16,19 +16,15 @@ def subject(made: World) -> Subject:
 
 
 def found(names: str, seed: int, size: str = 'medium') -> tuple[Diagnosis, dict]:
-    rng, target, truth = np.random.default_rng(seed), subject(world(seed)), {}
+    rng, target, truth = np.random.default_rng(seed), subject(world(seed, frames=375)), {}
     every = {**LISTED, **UNLISTED}
     for injection in sorted((every[n] for n in names.split('+')), key=lambda i: i.stage):
         truth |= injection.put(target, rng, SIZES[size])
     return diagnose(target.problem(), target.model), truth
 
 
-@pytest.mark.parametrize(
-    ('names', 'seed'),
-    [('pickup+coil_drift', 1), ('sensor_gain+time_offset', 2)],
-)
-def test_effects_of_the_table_are_named_and_nothing_else(names, seed):
-    result, truth = found(names, seed)
+def test_effects_of_the_table_are_named_and_nothing_else():
+    result, truth = found('pickup+coil_drift', 1)
     assert sorted(f.record.name for f in result.findings) == sorted(truth)
     for finding in result.findings:
         wanted, record = truth[finding.record.name], finding.record

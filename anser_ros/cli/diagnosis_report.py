@@ -108,7 +108,7 @@ def render(result: SessionDiagnosis, document: dict[str, Any], *, session: str, 
         _held_out(document),
         '<h2>Effects</h2>',
         _effects(document),
-        '<h2>Residuals over time</h2>',
+        '<h2>Residuals over time</h2><p>In the pictures 1 is what noise alone would give.</p>',
         _image(_time_line(found.before, found.after)),
         '<h2>Residuals over the volume</h2>',
         _image(_maps(found.before, found.after)),
@@ -187,16 +187,40 @@ def _structure(result: SessionDiagnosis) -> str:
             f'{other.share:.2%}',
             f'{test.share:.2%}',
             f'{test.probability:.2g}',
-            'yes' if test.significant else 'no',
+            'yes' if test.variable in found.depends_on else 'trace' if test.significant else 'no',
         ]
         for test in found.tests_after
         for other in found.tests_before
         if other.variable == test.variable
     ]
     head = ['residual against', 'share before', 'share after', 'chance of that in noise', 'left?']
-    return '<p>Share of the residual power that follows each variable beyond chance.</p>' + _table(
-        head, rows
-    )
+    text = '<p>Share of the residual power that follows each variable beyond chance. A trace is '
+    text += 'plain to see, but too small to matter.</p>'
+    if found.unexplained > 0:
+        text += f'<p>{html.escape(_strongest(found.after))}</p>'
+    return text + _table(head, rows)
+
+
+def _strongest(state: State) -> str:
+    """Where the residual is largest, in words."""
+    said = []
+    parts = _tools(state)
+    emitters = state.problem.fields.omega.size
+    for kind, axis in (('channel', 1), ('emitter', 2)):
+        sizes: dict[int, float] = {}
+        for part in parts:
+            channels = part.view.sensors.channel
+            cells = _rms(part, 0).reshape(2, len(channels), emitters)
+            values = np.sqrt(np.mean(cells**2, axis=(0, 3 - axis)))
+            names = channels.tolist() if kind == 'channel' else range(emitters)
+            for name, value in zip(names, values.tolist(), strict=True):
+                sizes[name] = max(sizes.get(name, 0.0), value)
+        worst = max(sizes, key=lambda name: sizes[name])
+        usual = float(np.median(list(sizes.values())))
+        said.append(
+            f'{kind} {worst} ({sizes[worst]:.1f} times the expected, the median is {usual:.1f}'
+        )
+    return f'It is largest on {") and on ".join(said)}).'
 
 
 def _candidates(rounds: Sequence[Sequence[Candidate]]) -> str:

@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.diagnosis.choice import STEADY, at_floor, choose, complexity, taken_from_others
 from anser_ros.diagnosis.confirm import doubtful
 from anser_ros.diagnosis.fit import Fit, fit_terms, misfit
-from anser_ros.diagnosis.fluctuating import fluctuation_of, is_of, left_over
+from anser_ros.diagnosis.fluctuating import fluctuation_of, left_over
 from anser_ros.diagnosis.moving_start import moving_starts
 from anser_ros.diagnosis.problem import Problem
 from anser_ros.diagnosis.refine import METALS, settled
@@ -38,19 +39,11 @@ the cause, and further effects would only stand in for it."""
 PLAIN_TO_SEE = 5.0
 """An effect whose parameters stand so many times above what it must gain is not tried without."""
 MOST_METALS = 2
-OPEN, OPEN_FINALISTS = 40, 3
-"""Parameters that a fluctuation counts for: more than a constant effect, less than shaped metal;
-and how many of them are tried in full."""
-STEADY = 0.8
-"""Share of a fluctuation's gain from which a constant, or a curve, of the same coil or channel is
-tried first: freedom in every frame also takes off what is another effect's."""
-OTHERS = 2.0
-"""What a fluctuation takes off others, over what values alike would lose."""
+OPEN_FINALISTS = 3
+"""Fluctuations that are tried in full a round."""
 LEAST_OF_EXCESS = 0.4
 """Share of what is left to explain that a fluctuation, or metal at another place in each block of
 time, must explain."""
-NOTHING_LEFT = 1.04
-"""Misfit over the noise's up to which nothing but noise is left."""
 TOLD_APART = 0.05
 """A candidate of whose power the fluctuations in force leave less can't be told from them."""
 APART = 0.12
@@ -108,6 +101,8 @@ class Search:
         Effects that others explained away.
     rivals : dict
         Label of an effect to the candidates that explained as much as it did.
+    close : dict
+        Label of an effect to steady candidates that explained nearly as much when it was taken.
     metal_gain : float
         What the strongest metal took off.
     """
@@ -116,6 +111,7 @@ class Search:
     rounds: list[list[Candidate]] = field(default_factory=list)
     removed: list[Term] = field(default_factory=list)
     rivals: dict[str, list[Candidate]] = field(default_factory=dict)
+    close: dict[str, list[Term]] = field(default_factory=dict)
     metal_gain: float = 0.0
 
 
@@ -149,21 +145,12 @@ def search_effects(
         search.fit = found
         newest = [t for t in found.terms if t.effect is not REMAINDER][-1]
         say(f'{newest.label}: misfit {misfit(found):.4g}')
+        _replace(problem, blocks, search, how)
         _thin_out(problem, blocks, search, how)
         noise = noise_scale(search.fit.state) ** 2
         if len(doubtful(problem, search.fit, noise)) >= MOST_DOUBTFUL:
             break
     return search
-
-
-def complexity(term: Term) -> int:
-    """Parameters that are paid for when explanations are compared."""
-    return OPEN if isinstance(term.effect, Fluctuation) else int(term.theta.size)
-
-
-def at_floor(fit: Fit) -> bool:
-    """Whether a fit leaves nothing but noise."""
-    return misfit(fit) < NOTHING_LEFT * max(noise_scale(fit.state) ** 2, 1.0)
 
 
 def worth(gain: float, parameters: int, fit: Fit, how: SearchSettings) -> bool:
@@ -193,13 +180,13 @@ def _round(
         if any(at_floor(f) and complexity(term) > complexity(f.terms[-1]) for _, f in fitted):
             continue
         fit = fit_terms(problem, [*before.terms, term], blocks, how.iterations)
-        gain = scorer.held_out - fit.held_out(how.folds) - _taken_from_others(fit)
+        gain = scorer.held_out - fit.held_out(how.folds) - taken_from_others(fit)
         fitted.append((gain, fit))
         table.append(Candidate(fit.terms[-1], complexity(term), gain, gain))
     search.rounds.append(sorted(table, key=lambda c: -c.gain))
     if not fitted:
         return None
-    gain, best = choose(fitted, how)
+    gain, best = choose(fitted)
     term = best.terms[-1]
     if not worth(gain, complexity(term), best, how):
         return None
@@ -217,51 +204,14 @@ def _round(
             problem, blocks, best, fitted, lambda s: _scored(problem, s), gain, how.folds,
             how.iterations,
         )  # fmt: skip
+    search.close[term.label] = [
+        f.terms[-1]
+        for g, f in fitted
+        if f is not best and g > STEADY * gain and _steady(f.terms[-1])
+    ]
     if any(t.effect.name in METALS for t in best.terms):
         return settled(problem, best.terms, blocks, how.folds, how.iterations)
     return best
-
-
-def _taken_from_others(fit: Fit) -> float:
-    """What a new fluctuation's freedom takes off that is some other effect's, still unexplained.
-
-    Along each of its columns a frame loses one value's share of whatever stays.
-    """
-    spread = fit.terms[-1].site.get('_spread')
-    if spread is None:
-        return 0.0
-    frames = int(fit.terms[-1].site.get('_frames', 0))
-    return OTHERS * frames * len(spread) * max(misfit(fit) - 1.0, 0.0)
-
-
-def choose(fitted: Sequence[tuple[float, Fit]], how: SearchSettings) -> tuple[float, Fit]:
-    """The best fit, or a simpler one that is as good within what its parameters could gain.
-
-    Where several leave nothing but noise, the simplest is the explanation.
-    """
-    gain, best = max(fitted, key=lambda pair: pair[0])
-    steady = [
-        (g, f) for g, f in fitted if g > STEADY * gain and is_of(best.terms[-1], f.terms[-1])
-    ]
-    if steady:
-        gain, best = max(steady, key=lambda pair: pair[0])
-    most = complexity(best.terms[-1])
-    simpler = [
-        (g, f)
-        for g, f in fitted
-        if complexity(f.terms[-1]) < most
-        and gain - g < (10 + 4 * (most - complexity(f.terms[-1]))) * max(misfit(best), 1.0)
-    ]
-    simpler += [
-        (g, f)
-        for g, f in fitted
-        if isinstance(f.terms[-1].effect, Fluctuation)
-        and complexity(f.terms[-1]) < most
-        and at_floor(f)
-    ]
-    if not simpler:
-        return gain, best
-    return min(simpler, key=lambda pair: (complexity(pair[1].terms[-1]), -pair[0]))
 
 
 def _fluctuating(problem: Problem, before: Fit, how: SearchSettings) -> list[tuple[float, Term]]:
@@ -352,6 +302,34 @@ def _wald(fit: Fit, index: int) -> float:
     use = np.intersect1d(use, term.effect.amounts(term))
     theta, part = term.theta[use], covariance[np.ix_(use, use)]
     return float(theta @ np.linalg.pinv(part, rcond=1e-10, hermitian=True) @ theta)
+
+
+def _steady(term: Term) -> bool:
+    return term.effect.name not in METALS and not isinstance(term.effect, Fluctuation)
+
+
+def _replace(
+    problem: Problem, blocks: NDArray[np.int64], search: Search, how: SearchSettings
+) -> None:
+    """Take a simpler effect for an earlier one where, beside the newest, it is as good.
+
+    What was taken while much was unexplained may have won by parameters that took up another's.
+    """
+    for term in search.fit.terms[:-1]:
+        if not _steady(term):
+            continue
+        for other in search.close.get(term.label, []):
+            spared = complexity(term) - complexity(other)
+            if spared < 0 or any(_same(other, t) for t in search.fit.terms):
+                continue
+            terms = [other if t.label == term.label else t for t in search.fit.terms]
+            fit = settled(problem, terms, blocks, how.folds, how.iterations)
+            loss = fit.held_out(how.folds) - search.fit.held_out(how.folds)
+            if loss < (10 * (spared > 0) + 4 * spared) * max(misfit(fit), 1.0):
+                search.removed.append(term)
+                search.close[other.label] = search.close[term.label]
+                search.fit = fit
+                break
 
 
 def _thin_out(

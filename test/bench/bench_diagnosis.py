@@ -53,8 +53,8 @@ from anser_ros.sessions.session import Session, load_session  # noqa: E402
 from anser_ros.sessions.starting_model import board_of  # noqa: E402
 
 SHARED = Path(os.environ.get('ANSER_SHARED', REPO.parent / 'shared')) / 'sessions' / 'effects'
-REPORTED_SEEDS = (101, 102)
-"""Thresholds were chosen on seeds below 100."""
+REPORTED_SEEDS = (201, 202)
+"""Thresholds were chosen on seeds below 200."""
 PAIRS = 24
 CARRIERS = {
     's04': ('static_metal',),
@@ -182,7 +182,7 @@ def judged(outcome: Outcome, unknown: bool, allowed: set[str]) -> str:
         return 'WRONG'
     if found - wanted:
         return 'new name' if (found - wanted) <= allowed else 'OTHER'
-    if d.unexplained > 0.05 and d.depends_on:
+    if d.depends_on and d.flux_rms_after_t > 1.1 * d.flux_rms_floor_t:
         return 'said'
     if d.flux_rms_after_t < 1.1 * 60.4e-12:
         return 'unseen'
