@@ -28,9 +28,6 @@ LARGEST_VARIATION = 0.1
 """Share of an effect's power that may vary."""
 LEAST_OF_THE_REST = 0.2
 """An effect that takes off less than this share of what stays unexplained is not named."""
-LARGEST_REMAINDER = 0.01
-"""Share of an effect's power that may stay where it acts, beyond what stays everywhere. Metal is
-exempt: its shape is never known."""
 CLEAR = 6.0
 """Standard deviations of the noise's power from which a remainder counts."""
 MANY = 3
@@ -50,7 +47,10 @@ class Confirmation:
     share_of_rest : float
         Its power over the power that stays unexplained.
     remainder : float
-        Share of its power that stays on the channels and emitters that it changes.
+        Share of its power that stays on the channels and emitters that it changes, beyond what
+        stays everywhere. Metal is exempt: its shape is never known.
+    inexact : float
+        Largest remainder that the effect may leave.
     alike : int
         Effects of the same name, or on the same single channel, whichever are more.
     plausible : bool
@@ -63,6 +63,7 @@ class Confirmation:
     variation: float
     share_of_rest: float
     remainder: float = 0.0
+    inexact: float = 0.01
     alike: int = 1
     plausible: bool = True
     helps: bool = True
@@ -73,7 +74,7 @@ class Confirmation:
         return (
             self.variation < LARGEST_VARIATION
             and self.share_of_rest > LEAST_OF_THE_REST
-            and self.remainder < LARGEST_REMAINDER
+            and self.remainder < self.inexact
             and self.alike < MANY
             and self.plausible
             and self.helps
@@ -88,7 +89,7 @@ class Confirmation:
             return 'only the references speak for it, the tools against it'
         if self.variation >= LARGEST_VARIATION:
             return 'its parameters differ from one part of the data to the next'
-        if self.remainder >= LARGEST_REMAINDER:
+        if self.remainder >= self.inexact:
             return 'where it acts, more stays than it could leave'
         if self.alike >= MANY:
             return 'with others of its kind it stands in for something that they share'
@@ -115,9 +116,10 @@ def confirm(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmatio
         0.0
         if term.effect.name in METALS
         else _stays(fit.state, columns, noise) / max(power, 1e-300),
-        _crowd(fit, term),
-        _plausible(fit, term),
-        _helps(without, fit.state, columns),
+        inexact=term.effect.inexact,
+        alike=_crowd(fit, term),
+        plausible=_plausible(fit, term),
+        helps=_helps(without, fit.state, columns),
     )
 
 
@@ -202,7 +204,7 @@ def _checked_open(problem: Problem, fit: Fit, term: Term, noise: float) -> Confi
         raw = term.effect.directions(term, part.view)
         columns.append(None if raw is None else parts(raw) * part.whitener.weight[..., None])
     stays = _stays(fit.state, columns, noise) / power
-    return Confirmation(power, 0.0, np.inf, stays, _crowd(fit, term))
+    return Confirmation(power, 0.0, np.inf, stays, alike=_crowd(fit, term))
 
 
 def doubtful(problem: Problem, fit: Fit, noise: float) -> list[tuple[Confirmation, Term]]:

@@ -237,6 +237,8 @@ class Effect:
     plausible : mapping
         Range that a parameter may reasonably have.
     remedy : Remedy
+    inexact : float
+        Share of its power that its model may miss where it is truly there.
     """
 
     name: ClassVar[str] = ''
@@ -245,6 +247,7 @@ class Effect:
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {}
     remedy: ClassVar[Remedy] = Remedy.NONE
     moving: ClassVar[bool] = False
+    inexact: ClassVar[float] = 0.01
 
     # --- search ------------------------------------------------------------------------------
     def candidates(self, scene: Scene) -> Sequence[Term]:
@@ -254,6 +257,10 @@ class Effect:
     def prior(self, term: Term) -> Array:
         """Standard deviation of each parameter before anything is measured, shape (q,)."""
         return np.ones(term.theta.size)
+
+    def anchored(self, term: Term) -> NDArray[np.bool_]:
+        """Parameters whose prior is about zero, (q,); others' is about where a fit starts."""
+        return np.zeros(term.theta.size, dtype=bool)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Derivative of the view's flux by the parameters, (F, S, K, q), or None."""
@@ -287,6 +294,10 @@ class Effect:
     def table(self, term: Term, sensors: SensorTable) -> SensorTable:
         """True sensors from the surveyed ones."""
         return sensors
+
+    def light(self, term: Term, illumination: Dipoles) -> Dipoles:
+        """The emitters' own field as metal sees it, from the one that is known."""
+        return illumination
 
     def sources(
         self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array

@@ -73,6 +73,7 @@ class Saturation(Effect):
     }
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'full_scale_t': (1e-8, 1e-3)}
     remedy = Remedy.FLUX
+    inexact = 0.2  # the curve, and tones that mix into each other's place
 
     def candidates(self, scene: Scene) -> Sequence[Term]:
         """Every channel of a tool; references don't see signals of different size."""
