@@ -21,6 +21,8 @@ from anser_ros.wire.bag_metadata import qos_profile, write_metadata
 from anser_ros.wire.bag_writer import BagWriter
 
 DISCOVERY_PERIOD_S = 0.25
+# How old metadata.yaml may be when the process is killed.
+METADATA_PERIOD_S = 2.0
 # Deep enough for a pause of seconds on a slow disk.
 DEPTH = 2000
 COMMON_TOPICS = ('/diagnostics', '/tf', '/tf_static')
@@ -65,6 +67,7 @@ class Recorder(AnserNode):
         self._topic_subscriptions: dict[str, Any] = {}
         self._error = ''
         self._last_report = ''
+        self._described_s = 0.0
         self.create_service(Trigger, 'recorder/start', self._on_start)
         self.create_service(Trigger, 'recorder/stop', self._on_stop)
         clock = self.steady_clock
@@ -105,7 +108,7 @@ class Recorder(AnserNode):
         return folder
 
     def stop_recording(self) -> str:
-        """End the bag and return the report of its counts and gaps."""
+        """End the bag and return its counts in a line; the log has the gaps of each topic."""
         bag, self._bag = self._bag, None
         if bag is None:
             return 'not recording'
@@ -118,8 +121,8 @@ class Recorder(AnserNode):
         except OSError as error:
             self._error = self._error or _reason(error)
         logs, self._logs = self._logs, {}
-        self._last_report = report(bag.path.parent, bag.record, logs)
-        self.get_logger().info(self._last_report)
+        self._last_report, faults = report(bag.path.parent, bag.record, logs)
+        self.get_logger().info('\n    '.join((self._last_report, *faults)))
         return self._last_report
 
     def close(self) -> None:
@@ -155,6 +158,19 @@ class Recorder(AnserNode):
             self.get_logger().error(f'recording stopped: {self._error}')
             self.stop_recording()
             self.publish_diagnostics()
+            return
+        if time.monotonic() - self._described_s >= METADATA_PERIOD_S:
+            self._describe()
+
+    def _describe(self) -> None:
+        """Write what the running bag holds so far, for whoever finds it after a crash."""
+        if self._bag is None:
+            return
+        self._described_s = time.monotonic()
+        try:
+            write_metadata(self._bag.path, self._bag.record, _ros_distro(), is_closed=False)
+        except OSError as error:  # the next flush will stop the recording
+            self.warn('metadata_errors', _reason(error))
 
     def _discover(self) -> None:
         """Subscribe to what has appeared since the last time."""
@@ -167,10 +183,7 @@ class Recorder(AnserNode):
             elif self._wanted(topic) and len(type_names) == 1:
                 added = self._add(topic, type_names[0]) or added
         if added:
-            try:
-                write_metadata(self._bag.path, self._bag.record, _ros_distro(), is_closed=False)
-            except OSError as error:  # the next flush will stop the recording
-                self.warn('metadata_errors', _reason(error))
+            self._describe()
 
     def _wanted(self, topic: str) -> bool:
         own = self.get_namespace().rstrip('/') + '/'

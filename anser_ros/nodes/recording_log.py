@@ -37,6 +37,18 @@ class TopicLog:
     _intervals_s: list[float] = field(default_factory=list)
     _period_s: float = 0.0
 
+    @property
+    def faults(self) -> str:
+        """What is wrong with the topic, in words; empty when nothing is."""
+        found = []
+        if self.lost:
+            found.append(f'{self.lost} lost')
+        if self.gaps:
+            found.append(f'{self.gaps} gaps up to {self.longest_gap_s:.3g} s')
+        if self.jumps_back:
+            found.append(f'{self.jumps_back} jumps back in time')
+        return ', '.join(found)
+
     def publishers(self, count: int) -> None:
         """Note how many publish the topic now."""
         self.n_publishers = max(self.n_publishers, count)
@@ -75,21 +87,23 @@ class TopicLog:
         self.longest_gap_s = max(self.longest_gap_s, interval_s)
 
 
-def report(folder: Path, record: BagRecord, logs: Mapping[str, TopicLog]) -> str:
-    """Return the counts and gaps of a bag in one line."""
+def report(
+    folder: Path, record: BagRecord, logs: Mapping[str, TopicLog]
+) -> tuple[str, tuple[str, ...]]:
+    """Return the counts of a bag in one short line, and a line for each topic with faults."""
     text = (
         f'{folder}: {record.messages} messages of {len(record.topics)} topics '
         f'in {record.duration_s:.1f} s'
     )
-    troubles = []
-    for name, log in sorted(logs.items()):
-        found = []
-        if log.lost:
-            found.append(f'{log.lost} lost')
-        if log.gaps:
-            found.append(f'{log.gaps} gaps up to {log.longest_gap_s:.3g} s')
-        if log.jumps_back:
-            found.append(f'{log.jumps_back} jumps back in time')
-        if found:
-            troubles.append(f'{name} {", ".join(found)}')
-    return f'{text}; {"; ".join(troubles) or "no gaps"}'
+    faulty = {name: log for name, log in sorted(logs.items()) if log.faults}
+    if not faulty:
+        return f'{text}; no gaps', ()
+    found = [
+        f'{sum(log.lost for log in faulty.values())} messages lost',
+        f'{sum(log.gaps > 0 for log in faulty.values())} topics with gaps',
+        f'{sum(log.jumps_back > 0 for log in faulty.values())} that jump back in time',
+    ]
+    words = ', '.join(word for word in found if not word.startswith('0 '))
+    return f'{text}; {words} (named in the log)', tuple(
+        f'{name} {log.faults}' for name, log in faulty.items()
+    )
