@@ -2,7 +2,6 @@
 
 import contextlib
 import importlib.util
-import itertools
 import os
 import signal
 import subprocess
@@ -23,20 +22,25 @@ if 'AMENT_PREFIX_PATH' not in os.environ and importlib.util.find_spec('ros_wheel
     os.environ['AMENT_PREFIX_PATH'] = sys.prefix
 
 import pytest
+from domain_pool import DomainPool
 
 REPO = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get('ANSER_SHARED', REPO.parent / 'shared'))
 STOP_TIMEOUT_S = 5.0
-# Domains up to 101 leave all of Linux's ephemeral ports alone. Parallel runs begin apart.
-DOMAINS = itertools.cycle(range(1, 101))
-for _ in range(os.getpid() % 100):
-    next(DOMAINS)
+
+
+@pytest.fixture(scope='session')
+def domains() -> Iterator[DomainPool]:
+    """Give the run its pool of domains."""
+    pool = DomainPool()
+    yield pool
+    pool.close()
 
 
 @pytest.fixture
-def domain(monkeypatch: pytest.MonkeyPatch) -> int:
-    """Give the test a ROS domain that no other test of the run has."""
-    number = next(DOMAINS)
+def domain(monkeypatch: pytest.MonkeyPatch, domains: DomainPool) -> int:
+    """Give the test a ROS domain of its own."""
+    number = domains.take()
     monkeypatch.setenv('ROS_DOMAIN_ID', str(number))
     return number
 
