@@ -104,7 +104,7 @@ class Replay(AnserNode):
         self._total = 0
         self._lost = ''
         self._done = 0
-        self._rounds = 0
+        self._passes = 0
         self._poses: list[str] = []
         self._frames = 0
         self._ending = threading.Event()
@@ -116,7 +116,7 @@ class Replay(AnserNode):
 
     def status(self) -> Status:
         """Return how far it is, and what of the bag is lost."""
-        values = {'published': self._done, 'messages': self._total, 'rounds': self._rounds}
+        values = {'published': self._done, 'messages': self._total, 'passes': self._passes}
         if self._lost:
             return Status('', Level.WARN, f'replaying a damaged bag: {self._lost}', values)
         return Status('', Level.OK, 'replaying', values)
@@ -200,11 +200,11 @@ class Replay(AnserNode):
     def _play_guarded(self) -> None:
         try:
             self._wait_for_listeners()
-            while not self._ending.is_set():
-                self._play_once()
-                self._rounds += 1
+            while self._play_once():
+                self._passes += 1
                 if not self._loop:
                     break
+                self._done = 0
             self._finish()
         except AnserError as error:
             self.get_logger().error(str(error))
@@ -214,9 +214,10 @@ class Replay(AnserNode):
                 self.get_logger().error(f'replay failed\n{traceback.format_exc()}')
                 self.stop(1)
 
-    def _play_once(self) -> None:
+    def _play_once(self) -> bool:
+        """Play the bag from its begin; return whether it came to its end."""
         first_ns, began_s, clock_ns = None, time.monotonic(), 0
-        given = dict(self._latched) if self._rounds == 0 else {}
+        given = dict(self._latched) if self._passes == 0 else {}
         for message in self._messages():
             if given.pop(message.topic, None) is not None:
                 continue  # the first of a latched topic is out already
@@ -226,7 +227,7 @@ class Replay(AnserNode):
                 due_s = began_s + (now_ns - first_ns) * 1e-9 / self._rate
                 # Waiting also ends when the node does.
                 if self._ending.wait(max(due_s - time.monotonic(), 0.0)):
-                    return
+                    return False
             if now_ns - clock_ns >= CLOCK_PERIOD_NS or now_ns < clock_ns:
                 clock_ns = now_ns
                 self._publish_clock(now_ns)
@@ -234,6 +235,7 @@ class Replay(AnserNode):
             self._done += 1
             if self._rate == 0.0 and message.topic.endswith(FLUX_ENDINGS):
                 self._wait_for_consumers(self._outlets[message.topic].topic_name)
+        return not self._ending.is_set()
 
     def _wait_for_consumers(self, topic: str) -> None:
         """Let those who take fluxes, and those who take poses made of them, catch up."""
@@ -268,8 +270,15 @@ class Replay(AnserNode):
         left_out = self.counters['messages_left_out']
         lost = f'; lost: {self._lost}' if self._lost else ''
         lost += f'; {left_out} messages that do not decode left out' if left_out else ''
-        self.get_logger().info(f'published {self._done} of {self._total} messages{lost}')
+        self.get_logger().info(f'published {self._played()}{lost}')
         self.stop(0)
+
+    def _played(self) -> str:
+        """How much was published, in words; `_done` counts anew in every pass."""
+        part = f'{self._done} of {self._total} messages'
+        if not self._loop:
+            return part
+        return f'the bag {self._passes} times, and {part} once more'
 
 
 def _message_of(message: RawMessage, kind: type) -> Any:
