@@ -189,7 +189,10 @@ def test_a_port_that_is_not_there_and_a_setup_that_is_none(start, tmp_path, ros)
     listener = Listener(ros)
     start('acquisition', '--ros-args', *_set(device=tmp_path / 'absent'))
     listener.until(lambda: listener.value('open_failures') >= 2)
-    assert listener.states['anser/acquisition'][0] == b'\x02'
+    level, words, _ = listener.states['anser/acquisition']
+    assert level == b'\x02'
+    absent = tmp_path / 'absent'
+    assert words == f'no port: cannot open {absent}: No such file or directory'
     broken = tmp_path / 'broken.yaml'
     broken.write_text('schema: something else')
     process = start('acquisition', '--ros-args', *_set(setup_file=broken))

@@ -136,6 +136,36 @@ def test_commands_reach_the_wire_with_their_tag(wire, port):
     assert record == Record(SetFrequencies(TONES), tag)
 
 
+@pytest.mark.parametrize(
+    ('device', 'why'),
+    [
+        ('/dev/no_such_port', 'No such file or directory'),
+        (__file__, 'it is no serial port'),
+        ('nothing://here', "invalid URL, protocol 'nothing' not known"),
+        ('loop://?unknown=1', "unknown option: 'unknown'"),
+    ],
+)
+def test_why_a_port_does_not_open_is_one_short_line(device, why):
+    port = ControlUnitPort(device)
+    port.start()
+    try:
+        assert wait(lambda: port.counters.open_failures > 0)
+        assert port.reason == f'cannot open {device}: {why}'
+    finally:
+        port.stop()
+
+
+def test_a_port_in_use_says_so(wire, port):
+    other = ControlUnitPort(port.device)
+    assert wait(lambda: port.counters.opens == 1)
+    other.start()
+    try:
+        assert wait(lambda: other.counters.open_failures > 0)
+        assert other.reason == f'cannot open {port.device}: another program uses it'
+    finally:
+        other.stop()
+
+
 def test_unplugged_cable_is_counted_and_the_port_comes_back(wire, port):
     wire.write(encode(HELLO))
     assert receive(port, 1) == [HELLO]
@@ -143,7 +173,7 @@ def test_unplugged_cable_is_counted_and_the_port_comes_back(wire, port):
     assert wait(lambda: port.state is PortState.ABSENT)
     assert port.counters.unplug == 1
     assert wait(lambda: port.counters.open_failures > 1)
-    assert 'cannot open' in port.reason
+    assert port.reason == f'cannot open {port.device}: No such file or directory'
     wire.plug()
     assert wait(lambda: port.counters.opens == 2)
     wire.write(encode(HELLO))

@@ -8,6 +8,7 @@ pauses after an unplugged cable.
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import os
 import queue
@@ -39,13 +40,20 @@ _WRITE_TIMEOUT_S = 0.2
 _SHORTEST_PAYLOAD = 4096
 _GARBAGE_BYTES = 256
 _READ_BYTES = 1 << 16
+OPEN_FAILURES = {
+    errno.EAGAIN: 'another program uses it',
+    errno.EBUSY: 'another program uses it',
+    errno.ENOTTY: 'it is no serial port',
+    errno.EACCES: 'no permission (is the user in its group, often dialout?)',
+}
+"""Words for what the system calls otherwise."""
 
 
 class PortState(Enum):
     """What the port is doing now; the value is the words for an operator."""
 
     CLOSED = 'closed'
-    ABSENT = 'cannot open the port'
+    ABSENT = 'no port'
     WAITING = 'open, nothing received yet'
     RECEIVING = 'receiving records'
     WRONG_BAUD = 'bytes arrive but no records: check the baud rate'
@@ -202,7 +210,7 @@ class ControlUnitPort:
                 # pyserial raises TypeError when the descriptor vanishes between two of its calls
                 if not self._stopping.is_set():
                     self.counters.unplug += 1
-                    self.state, self.reason = PortState.ABSENT, f'unplugged: {error}'
+                    self.state, self.reason = PortState.ABSENT, f'unplugged: {_cause(error)}'
             finally:
                 _close(port)
                 self._hand_over()
@@ -287,8 +295,19 @@ def _open(device: str, baud: int) -> serial.SerialBase:
             write_timeout=_WRITE_TIMEOUT_S,
             exclusive=True,
         )
-    except (serial.SerialException, OSError, ValueError) as error:
-        raise PortError(f'cannot open {device}: {error}') from error
+    except (serial.SerialException, OSError, ValueError, LookupError) as error:
+        # pyserial raises LookupError for options of a URL that it does not know
+        raise PortError(f'cannot open {device}: {_cause(error)}') from error
+
+
+def _cause(error: BaseException) -> str:
+    """Say why in a few words: pyserial quotes the system's words, and itself, several times."""
+    root = error
+    while isinstance(root.__context__, Exception):
+        root = root.__context__
+    if len(root.args) == 2 and isinstance(root.args[0], int):
+        return OPEN_FAILURES.get(root.args[0], str(root.args[1]))
+    return ' '.join(str(root).split()) or type(root).__name__
 
 
 def _receiver(port: serial.SerialBase) -> Callable[[], bytes]:
