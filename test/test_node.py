@@ -285,3 +285,13 @@ class TestGraph:
         (done,) = node.set_parameters([Parameter('depth', value=5)])
         assert not done.successful
         assert node.parameters.rate_hz == 50.0 and node.parameters.depth == 3
+
+
+def test_the_executor_is_the_one_told_of_events_where_rclpy_has_it(monkeypatch):
+    process = pytest.importorskip('anser_ros.nodes.process')
+    experimental = pytest.importorskip('rclpy.experimental')
+    monkeypatch.setattr(experimental, 'EventsExecutor', lambda: 'events')
+    assert process.make_executor() == 'events'
+    monkeypatch.setitem(sys.modules, 'rclpy.experimental', None)
+    monkeypatch.setattr(process, 'SingleThreadedExecutor', lambda: 'waiting')
+    assert process.make_executor() == 'waiting'

@@ -382,13 +382,13 @@ def test_only_live_frames_too_fast_to_solve_are_skipped(tracker, monkeypatch, li
         tracker.stamp_ns = time.time_ns()
     ready(tracker)
     flux = fluxes(certain_model(), SENSORS, *random_pose(rng), rng)
-    node, whole, pause_s = tracker.node, Tracker.update, [0.2]
+    node, whole, pause_s = tracker.node, Tracker.estimates, [0.2]
 
     def slow(self, *arguments):
         time.sleep(pause_s.pop() if pause_s else work_s)
         return whole(self, *arguments)
 
-    monkeypatch.setattr(Tracker, 'update', slow)
+    monkeypatch.setattr(Tracker, 'estimates', slow)
     work_s = 0.0
     for _ in range(20):
         tracker.say_flux(flux)

@@ -148,7 +148,15 @@ class AnserNode(Node):
     def create_subscription(self, msg_type, topic, callback, qos_profile, **options):
         """Subscribe as rclpy does, with the callback guarded."""
         guarded = self._guard(callback)
-        return super().create_subscription(msg_type, topic, guarded, qos_profile, **options)
+
+        @functools.wraps(callback)
+        def unpacked(*args):
+            # The events executor gives message and its information as one pair.
+            if len(args) == 1 and isinstance(args[0], tuple):
+                args = args[0]
+            return guarded(*args)
+
+        return super().create_subscription(msg_type, topic, unpacked, qos_profile, **options)
 
     def create_timer(self, timer_period_sec, callback, *args, **options):
         """Make a timer as rclpy does, with the callback guarded."""

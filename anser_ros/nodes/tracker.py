@@ -280,15 +280,16 @@ class TrackerNode(AnserNode):
             return
         begin_s = time.perf_counter()
         stamp_ns, points = frame
+        estimates, changed = [], False
         try:
-            estimates = tracker.update(stamp_ns, points.channel, points.flux, points.flags)
+            # Each pose goes out before the next is worked on.
+            for estimate in tracker.estimates(stamp_ns, points.channel, points.flux, points.flags):
+                now_ns = self.get_clock().now().nanoseconds
+                changed |= self._topics[estimate.name].take(estimate, now_ns)
+                estimates.append(estimate)
         except AnserError as error:
             self._refuse('fluxes_refused', error)
             return
-        now_ns = self.get_clock().now().nanoseconds
-        changed = False
-        for estimate in estimates:
-            changed |= self._topics[estimate.name].take(estimate, now_ns)
         for estimate in estimates:
             self._topics[estimate.name].publish_covariance()
         if self._transforms is not None:

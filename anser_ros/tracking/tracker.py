@@ -6,6 +6,7 @@ frame's solve, and a warm solve that misses the gate is repeated without any gue
 """
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -182,7 +183,17 @@ class Tracker:
         flux: NDArray[np.generic],
         flags: NDArray[np.generic] | None = None,
     ) -> list[PoseEstimate]:
-        """Estimate all poses from one frame.
+        """Estimate all poses from one frame; arguments and errors are those of `estimates`."""
+        return list(self.estimates(stamp_ns, channels, flux, flags))
+
+    def estimates(
+        self,
+        stamp_ns: int,
+        channels: NDArray[np.generic],
+        flux: NDArray[np.generic],
+        flags: NDArray[np.generic] | None = None,
+    ) -> Iterator[PoseEstimate]:
+        """Estimate the poses of one frame, each given out before the next is worked on.
 
         Parameters
         ----------
@@ -195,21 +206,21 @@ class Tracker:
         flags : ndarray, shape (S,), optional
             Flag bits: 1 saturated, 2 stale, 4 dropped samples.
 
-        Returns
-        -------
-        list of PoseEstimate
-            A row a sensor, then one a rigid body. Empty for a frame that was already seen.
+        Yields
+        ------
+        PoseEstimate
+            One a sensor, then one a rigid body. None for a frame that was already seen.
 
         Raises
         ------
         TrackingError
-            When the stamp is not positive, shapes don't fit, a channel appears twice, or the
-            emitters are not as many as the model's.
+            Before the first estimate: when the stamp is not positive, shapes don't fit, a channel
+            appears twice, or the emitters are not as many as the model's.
         """
         rows, values, bits = self._checked(stamp_ns, channels, flux, flags)
         if stamp_ns == self._last_ns[0]:
             self.counters['duplicates'] += 1
-            return []
+            return
         if stamp_ns < self._last_ns[0]:
             self.counters['time_jumps'] += 1
             self.reset()
@@ -226,16 +237,18 @@ class Tracker:
         living = living_emitters(values.view(np.complex128), (rows >= 0) & (bits == 0))
         self._note_dead(living)
         if scene is None:
-            return [no_pose(n, stamp_ns, states.NO_MODEL, '', 'no field model yet') for n in names]
+            for name in names:
+                yield no_pose(name, stamp_ns, states.NO_MODEL, '', 'no field model yet')
+            return
         if living is not None:
             if living.sum() < FEWEST_EMITTERS:
                 reason = (
                     f'no flux of {", ".join(self._dead)}; {living.sum()} emitters are left, '
                     f'{FEWEST_EMITTERS} needed'
                 )
-                return [
-                    no_pose(n, stamp_ns, states.NO_SIGNAL, scene.model_id, reason) for n in names
-                ]
+                for name in names:
+                    yield no_pose(name, stamp_ns, states.NO_SIGNAL, scene.model_id, reason)
+                return
             # An emitter that is off leaks nothing into another's tone either.
             values.view(np.complex128)[:, ~living] = 0.0
             self._reduced = without_dead(scene, living, self._reduced)
@@ -258,30 +271,28 @@ class Tracker:
             if refusal is not None:
                 self.counters[f'readings_{refusal[2]}'] += 1
                 bad = no_pose(name, stamp_ns, refusal[0], scene.model_id, refusal[1])
-                results.append(CoilResult(bad, None))
-                continue
-            result = track_coil(
-                tracks[i], name, float(table.length[i]), stamp_ns, values[i], scene, self.settings,
-            )  # fmt: skip
-            self.counters['cold_starts'] += result.cold
+                result = CoilResult(bad, None)
+            else:
+                result = track_coil(
+                    tracks[i], name, float(table.length[i]), stamp_ns, values[i], scene,
+                    self.settings,
+                )  # fmt: skip
+                self.counters['cold_starts'] += result.cold
             results.append(result)
-        estimates = [result.estimate for result in results]
+            yield result.estimate
         for body, (members, coils) in self._bodies.items():
             usable = np.array([results[i].solution is not None for i in members])
-            estimates.append(
-                track_body(
-                    self._body_tracks[body],
-                    body,
-                    coils,
-                    stamp_ns,
-                    values[members],
-                    usable,
-                    [results[i] for i in members],
-                    scene,
-                    self.settings,
-                )
+            yield track_body(
+                self._body_tracks[body],
+                body,
+                coils,
+                stamp_ns,
+                values[members],
+                usable,
+                [results[i] for i in members],
+                scene,
+                self.settings,
             )
-        return estimates
 
     def _note_dead(self, living: NDArray[np.bool_] | None) -> None:
         """Keep the names of emitters that are not heard (trackers of other models share them)."""

@@ -47,9 +47,9 @@ import signal, sys, time
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from anser_ros.nodes import qos
+from anser_ros.nodes.process import make_executor
 
 def main():
     output, *topics = sys.argv[1:]
@@ -67,7 +67,7 @@ def main():
         node.create_subscription(PoseStamped, topic, callback, qos.STREAM)
     for index, topic in enumerate(topics):
         subscribe(index, topic)
-    executor = SingleThreadedExecutor()
+    executor = make_executor()
     executor.add_node(node)
     while not ending:
         executor.spin_once(timeout_sec=0.1)
