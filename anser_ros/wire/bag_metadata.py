@@ -106,7 +106,7 @@ def plain_yaml(document: Any) -> str:
 _SafeDumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 
-class _Dumper(_SafeDumper):
+class _Dumper(_SafeDumper):  # type: ignore[misc]
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
