@@ -3,6 +3,8 @@
 DDS confirms what a listener's queue has taken, not what its callbacks have worked off. But every
 node answers parameter requests from the same executor that runs its callbacks, and runs those
 first: an answer to a request that was sent after a message says that the message was handled.
+Of several that wait on one topic it may have handled only the first, so who publishes asks after
+each of them.
 """
 
 import threading

@@ -34,8 +34,6 @@ POLL_S = 0.05
 TELL_AFTER_S = 3.0
 CLOCK_PERIOD_NS = 10_000_000
 LAST_ACK_S = 5.0
-# Who only listens to poses has a queue for some, and is waited for every so many frames.
-ASK_EVERY = 4
 ATTEMPTS_OF_LISTENERS = 2
 
 
@@ -106,7 +104,6 @@ class Replay(AnserNode):
         self._done = 0
         self._passes = 0
         self._poses: list[str] = []
-        self._frames = 0
         self._ending = threading.Event()
         self._scan()
         self._ticks = self.create_publisher(Clock, '/clock', qos.STREAM)
@@ -240,8 +237,9 @@ class Replay(AnserNode):
     def _wait_for_consumers(self, topic: str) -> None:
         """Let those who take fluxes, and those who take poses made of them, catch up."""
         self._consumers.wait(topic)
-        self._frames += 1
-        if self._poses and self._frames % ASK_EVERY == 0:
+        # After every frame: of a topic with several messages waiting, an executor may have worked
+        # off only one when it answers.
+        if self._poses:
             self._consumers.wait(*self._poses, attempts=ATTEMPTS_OF_LISTENERS)
 
     def _messages(self) -> Iterator[RawMessage]:
