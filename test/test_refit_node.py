@@ -9,6 +9,7 @@ from tracking_world import CENTRES_MM, GEOMETRY, TURNED
 
 from anser_ros.errors import FrameError, ParameterError
 from anser_ros.fitting.refit_result import Metal
+from anser_ros.nodes.diagnostics import Level
 from anser_ros.nodes.model_clouds import stamp_of
 from anser_ros.sessions.model_file import save_model
 from anser_ros.wire.points import FluxPoints
@@ -72,7 +73,7 @@ class Rig:
         self.peer.create_subscription(
             PointStamped, 'metal/centroid', self.centroids.append, qos.STREAM
         )
-        self.until(lambda: self.node._centroid.get_subscription_count() > 0)
+        self.until(lambda: self.node._metal._centroid.get_subscription_count() > 0)
         self.cloud, self.stamp_ns = FluxCloud('fg'), FIRST_NS
         self.rng = np.random.default_rng(1)
 
@@ -82,12 +83,11 @@ class Rig:
             assert time.monotonic() < end, self.node.counters
             self.executor.spin_once(timeout_sec=0.02)
 
-    def message(self, channels, flux):
+    def message(self, channels, flux, flags=None):
         count = len(flux)
         nothing = np.full((count, 3), np.nan)
-        points = FluxPoints(
-            np.asarray(channels), np.zeros(count, dtype=int), flux, nothing, nothing
-        )
+        flags = np.zeros(count, dtype=int) if flags is None else flags
+        points = FluxPoints(np.asarray(channels), flags, flux, nothing, nothing)
         return self.cloud.message(points, self.stamp_ns)
 
     def say(self, change, fault=None):
@@ -168,6 +168,86 @@ def test_metal_is_shown_named_and_taken_away_again(make):
     np.testing.assert_array_equal(rig.node._model.moments, calibrated.moments)
 
 
+def test_every_kind_of_bad_flux_has_its_counter_as_in_the_tracker(make):
+    rig = make(refit_rate_hz=1000.0)
+    rig.start()
+    rig.say(0.0)
+    node, channel = rig.node, rig.world.references.channel
+    seen = node.counters.copy()
+    clean = rig.world.baseline + rig.world.noise(rig.rng)
+    state = node.status()
+    assert (state.level, state.message) == (Level.OK, 'frozen')
+
+    def send(flux=clean, flags=None, forward_ns=STEP_NS, **header):
+        rig.stamp_ns += forward_ns
+        message = rig.message(channel[: len(flux)], flux, flags)
+        for name, value in header.items():
+            whole = {'frame_id': message.header, 'nanosec': message.header.stamp, 'sec':
+                     message.header.stamp}.get(name, message)  # fmt: skip
+            setattr(whole, name, value)
+        node._on_flux(message)
+
+    before = node._stamp_ns
+    send(frame_id='world')
+    assert node.status().message.startswith("frozen; lately: fluxes in the frame 'world'")
+    send(nanosec=1_000_000_000)
+    send(sec=0, nanosec=0)
+    send(clean[:, :7])
+    assert 'lately: the model has 8 emitters, the fluxes 7' in node.status().message
+    send(point_step=17)
+    send(height=2)
+    assert node._stamp_ns == before, 'nothing was answered'
+    bad = clean.copy()
+    bad[0, 0], bad[1, 1], bad[2, 2] = np.inf, 1e20, np.nan
+    flags = np.zeros(len(clean), dtype=int)
+    flags[3:7] = 1, 2, 4, 5
+    send(bad, flags)
+    named = {part.name: part.message for part in node.part_statuses()}
+    assert [named[f'ref/{i}'] for i in range(4)] == 3 * ['not finite'] + ['flagged']
+    assert node._result.state == 'frozen'
+    send(clean[:-2])
+    send(clean[:0])
+    send(forward_ns=0)
+    dead = clean.copy()
+    dead[:, 6] = 0.0
+    send(dead)
+    state = node.status()
+    assert (state.level, state.message) == (Level.WARN, 'no flux of coil6')
+    send(forward_ns=3 * 10**9)
+    send(forward_ns=-(10**9))
+    send(is_bigendian=True)
+    new = node.counters - seen
+    total = len(clean)
+    missing, absurd = new.pop('readings_missing'), new.pop('readings_absurd')
+    # The bytes that were called big endian make other channels and absurd numbers.
+    assert missing - 2 - total in range(total + 1) and absurd >= 1
+    for other in ('refits', 'models', 'readings_not_finite'):
+        assert new.pop(other) > 0
+    assert new == {
+        'fluxes_other_frame_id': 1, 'fluxes_without_stamp': 2, 'fluxes_refused': 6,
+        'frames': 7, 'frames_empty': 1, 'duplicates': 1, 'time_jumps': 1, 'time_jumps_forward': 1,
+        'readings_saturated': 2, 'readings_stale': 1, 'readings_dropped': 1,
+        'frames_dead_emitter': 1, 'fluxes_big_endian': 1,
+    }  # fmt: skip
+    node._trouble.say('an old one', time.monotonic() - 11.0)
+    state = node.status()
+    assert 'lately' not in state.message and state.values['last_refusal'] == 'an old one'
+
+
+def test_an_absurd_reading_is_no_baseline(make):
+    from std_msgs.msg import String
+    from std_srvs.srv import Trigger
+
+    rig = make()
+    rig.node._on_setup(String(data=setup_text(rig.world)))
+    for _ in range(12):
+        rig.say(np.where(np.arange(len(rig.world.baseline))[:, None] == 2, 1e15, 0.0))
+    assert rig.node.counters['readings_absurd'] == 12
+    reply = rig.node._on_set_baseline(Trigger.Request(), Trigger.Response())
+    count = len(rig.world.baseline)
+    assert reply.message.startswith(f'baseline of {count - 1} references')
+
+
 def test_every_frame_is_answered_under_its_own_stamp(make):
     from sensor_msgs.msg import PointCloud2
 
@@ -182,7 +262,7 @@ def test_every_frame_is_answered_under_its_own_stamp(make):
         rig.say(0.0)
         answered.append(rig.stamp_ns)
         rig.until(lambda: got and stamp_of(got[-1]) == rig.stamp_ns)
-    assert rig.node.counters['readings_between_refits'] > 0
+    assert rig.node.counters['frames_between_refits'] > 0
     assert rig.node.counters['models'] == models, 'nothing changed, so it is the same model'
     rig.say(rig.world.metal(HEAD))
     rig.until(lambda: stamp_of(got[-1]) == rig.stamp_ns)

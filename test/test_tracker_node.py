@@ -506,7 +506,7 @@ def test_services_of_the_field_model(server, tmp_path):
     for i in range(8):
         points = server.points(clean, channels=references.channel)
         server.reference.publish(server.cloud.message(points, FIRST_NS + i * 40_000_000))
-    server.spin_until(lambda: server.node.counters['readings'] == 8)
+    server.spin_until(lambda: server.node.counters['frames'] == 8)
     reply = call(server, Trigger, 'set_baseline')
     assert reply.success, reply.message
     assert reply.message.startswith('baseline of 8 references')

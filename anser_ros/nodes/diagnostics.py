@@ -10,6 +10,7 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 HARDWARE_ID = 'anser'
+TROUBLE_TOLD_S = 10.0
 
 
 class Level(IntEnum):
@@ -62,6 +63,33 @@ def diagnostic_array(node: str, statuses: Iterable[Status], stamp: Time) -> Diag
         one.values = [KeyValue(key=key, value=text_of(v)) for key, v in status.values.items()]
         message.status.append(one)
     return message
+
+
+class Trouble:
+    """What went wrong last, and whether that is still news.
+
+    Parameters
+    ----------
+    told_s : float
+        How long it is news.
+    """
+
+    def __init__(self, told_s: float = TROUBLE_TOLD_S) -> None:
+        self._told_s = told_s
+        self._at_s = -math.inf
+        self.last = ''
+
+    def say(self, words: str, now_s: float) -> None:
+        """Take what has just gone wrong, at a monotonic time."""
+        self.last, self._at_s = words, now_s
+
+    def recent(self, now_s: float) -> str:
+        """Return what went wrong lately; empty when nothing did."""
+        return self.last if now_s - self._at_s < self._told_s else ''
+
+    def forget(self) -> None:
+        """It is over."""
+        self.last, self._at_s = '', -math.inf
 
 
 class Throttle:

@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PointStamped, PoseStamped
+from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
-from visualization_msgs.msg import MarkerArray
 
 from anser_ros.errors import AnserError, FitError, ModelFileError, SetupError
 from anser_ros.fitting.baseline import ReadingWindow
@@ -25,8 +24,9 @@ from anser_ros.fitting.nominal import nominal_model
 from anser_ros.fitting.refit import LiveRefit, RefitResult
 from anser_ros.fitting.refit_change import MOST_RATE_HZ, Pace
 from anser_ros.nodes import qos
-from anser_ros.nodes.flux_reader import read_flux
-from anser_ros.nodes.metal_view import centroid_message, metal_markers
+from anser_ros.nodes.diagnostics import Trouble
+from anser_ros.nodes.flux_reader import FrameWatch, read_frame
+from anser_ros.nodes.metal_view import MetalView
 from anser_ros.nodes.model_clouds import ModelWriter
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
@@ -38,9 +38,6 @@ from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session, sensor_table
 from anser_ros.sessions.starting_model import NOMINAL, board_of
 from anser_ros.wire.setup import Setup, parse_setup
-
-VIEW_PERIOD_S = 0.2
-"""How often the metal's marker is renewed."""
 
 
 @dataclass(frozen=True)
@@ -93,18 +90,16 @@ class FieldModelNode(AnserNode):
         self._refit: LiveRefit | None = None
         self._result: RefitResult | None = None
         self._frozen = False
-        self._trouble = ''
+        self._trouble = Trouble()
+        self._watch: FrameWatch | None = None
         self._stamp_ns = 0
         self._told: tuple[NDArray[np.complex128] | None, float, int, bool] | None = None
-        self._view_s = 0.0
-        self._shown = False
         self._refit_s = 0.0
         self._pace = Pace(table.refit_rate_hz)
         self._writer = ModelWriter()
         self._models = self.create_publisher(PointCloud2, 'field_model', qos.MODELS)
         self._errors = self.create_publisher(PointCloud2, 'field_model_error', qos.MODEL_ERRORS)
-        self._markers = self.create_publisher(MarkerArray, 'metal', qos.LATCHED)
-        self._centroid = self.create_publisher(PointStamped, 'metal/centroid', qos.STREAM)
+        self._metal = MetalView(self)
         self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
         self.create_subscription(PointCloud2, 'reference/flux', self._on_flux, qos.STREAM)
         self._patch_topics = parse_patches(table.patches)
@@ -128,17 +123,18 @@ class FieldModelNode(AnserNode):
             return
         try:
             setup = parse_setup(message.data)
-            if self._setup is not None and _same_board(setup, self._setup):
+            if self._setup is not None and setup.has_same_board(self._setup):
                 self._setup_text, self._setup = message.data, setup
                 return  # another rate or noise: model and baseline hold
             base = self._starting_model(setup)
         except AnserError as error:
-            self._trouble = str(error)
-            self.warn('setups_refused', str(error))
+            self._refuse('setups_refused', error)
             return
-        self._setup_text, self._setup, self._trouble = message.data, setup, ''
+        self._setup_text, self._setup = message.data, setup
+        self._trouble.forget()
         self._refit = self._result = None
         self._references = sensor_table(setup.reference_sensors)
+        self._watch = FrameWatch(self._references.channel, base.emitters, self.count)
         self._window = ReadingWindow(
             self._references, len(base.emitters), self.parameters.baseline_s
         )
@@ -155,8 +151,7 @@ class FieldModelNode(AnserNode):
             try:
                 self._patches.take_pose(body, message)
             except AnserError as error:
-                self._trouble = str(error)
-                self.warn('patch_poses_refused', str(error))
+                self._refuse('patch_poses_refused', error)
 
         return take
 
@@ -164,11 +159,10 @@ class FieldModelNode(AnserNode):
         if self._patches is None:
             return
         try:
-            stamp_ns, points = read_flux(message)
+            stamp_ns, points = read_frame(message, self._frame_id, self.count)
             self._patches.take_flux(stamp_ns, points.channel, points.flux, points.flags)
         except AnserError as error:
-            self._trouble = str(error)
-            self.warn('patch_fluxes_refused', str(error))
+            self._refuse('patch_fluxes_refused', error)
 
     def _starting_model(self, setup: Setup) -> FieldModel:
         if self._file_model is None:
@@ -181,21 +175,22 @@ class FieldModelNode(AnserNode):
         return self._file_model
 
     def _on_flux(self, message: PointCloud2) -> None:
-        window = self._window
-        if window is None:
-            self.count('readings_before_setup')
+        setup, window, watch = self._setup, self._window, self._watch
+        if setup is None or window is None or watch is None:
+            self.count('fluxes_before_setup')
             return
         try:
-            stamp_ns, points = read_flux(message)
-            window.add(stamp_ns, points.channel, points.flux, points.flags)
-            self.count('readings')
+            stamp_ns, points = read_frame(message, setup.frame_id, self.count)
+            flux = watch.admit(stamp_ns, points)
+            if flux is None:
+                return
+            window.add(stamp_ns, points.channel, flux, points.flags)
             if self._refit is None and self.parameters.baseline_at_start and window.full:
                 self._follow(window.mean())
             if self._refit is not None and self._follows:
-                self._update(self._refit, stamp_ns, points.channel, points.flux, points.flags)
+                self._update(self._refit, stamp_ns, points.channel, flux, points.flags)
         except AnserError as error:
-            self._trouble = str(error)
-            self.warn('readings_refused', str(error))
+            self._refuse('fluxes_refused', error)
 
     def _update(
         self,
@@ -211,7 +206,7 @@ class FieldModelNode(AnserNode):
         tracker knows what to track a frame with, and gives the poses that are found offline.
         """
         if not self._pace.is_due(stamp_ns):
-            self.count('readings_between_refits')
+            self.count('frames_between_refits')
             if self._model is not None:
                 self._serve(self._model, stamp_ns)
             return
@@ -224,7 +219,7 @@ class FieldModelNode(AnserNode):
         self.count('refits')
         self._serve(self._result.model, stamp_ns)
         self._refit_s = time.monotonic() - begin_s
-        self._show_metal(self._result, stamp_ns)
+        self._metal.show(self._result, self._frame_id, stamp_ns)
 
     def _with_patches(self, patches: Patches, refit: LiveRefit, stamp_ns: int) -> LiveRefit:
         """Take over the refit for the patches' new places once it has been worked out."""
@@ -234,20 +229,6 @@ class FieldModelNode(AnserNode):
         self._refit = moved
         self.count('patch_moves')
         return moved
-
-    def _show_metal(self, result: RefitResult, stamp_ns: int) -> None:
-        """Show the operator where the metal is, a few times a second."""
-        now_s = time.monotonic()
-        if result.find is None:
-            if self._shown:
-                self._markers.publish(metal_markers(None, self._frame_id, stamp_ns))
-                self._shown = False
-            return
-        if now_s - self._view_s < VIEW_PERIOD_S or result.metal is None:
-            return
-        self._view_s, self._shown = now_s, True
-        self._markers.publish(metal_markers(result.metal, self._frame_id, stamp_ns))
-        self._centroid.publish(centroid_message(result.metal, self._frame_id, stamp_ns))
 
     @property
     def _frame_id(self) -> str:
@@ -344,6 +325,10 @@ class FieldModelNode(AnserNode):
 
     # What is told -------------------------------------------------------------------------
 
+    def _refuse(self, counter: str, error: AnserError) -> None:
+        self._trouble.say(str(error), time.monotonic())
+        self.warn(counter, str(error))
+
     def on_parameters(self, old: FieldModelParameters, new: FieldModelParameters) -> None:
         """Go on at the new rate, or no longer."""
         self._pace.rate_hz = new.refit_rate_hz
@@ -352,9 +337,9 @@ class FieldModelNode(AnserNode):
     def status(self) -> Status:
         """Return which model is in force, where it comes from, and what the refit does."""
         model = self._model
-        values: dict[str, object] = {'last_refusal': self._trouble}
+        values: dict[str, object] = {'last_refusal': self._trouble.last}
         if model is None:
-            return Status('', Level.WARN, self._trouble or 'no setup yet', values)
+            return Status('', Level.WARN, self._trouble.last or 'no setup yet', values)
         provenance = model.provenance
         values |= {
             'source': provenance.get('source', self.parameters.model_file),
@@ -366,9 +351,15 @@ class FieldModelNode(AnserNode):
             'freeze': self._frozen,
             'refit_time_s': self._refit_s,
         }
-        if self._trouble:
-            return Status('', Level.WARN, self._trouble, values)
-        return Status('', Level.OK, self._activity(values), values)
+        activity = self._activity(values)
+        dead = '' if self._watch is None else ', '.join(self._watch.dead)
+        values['dead_emitters'] = dead
+        if dead:
+            return Status('', Level.WARN, f'no flux of {dead}', values)
+        trouble = self._trouble.recent(time.monotonic())
+        if trouble:
+            return Status('', Level.WARN, f'{activity}; lately: {trouble}', values)
+        return Status('', Level.OK, activity, values)
 
     def _activity(self, values: dict[str, object]) -> str:
         if self._frozen:
@@ -402,13 +393,6 @@ class FieldModelNode(AnserNode):
             )
             for health in self._result.references
         ]
-
-
-def _same_board(one: Setup, other: Setup) -> bool:
-    """Whether two setups have the same emitters and sensors."""
-    return (one.frame_id, one.emitter, one.sensors) == (
-        other.frame_id, other.emitter, other.sensors,
-    )  # fmt: skip
 
 
 if __name__ == '__main__':

@@ -1,17 +1,53 @@
 """The metal that the refit sees, as a marker for the operator."""
 
+import time
+
 import numpy as np
 from geometry_msgs.msg import Point, PointStamped, Pose
+from rclpy.node import Node
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from anser_ros.fitting.refit_result import Metal
+from anser_ros.fitting.refit_result import Metal, RefitResult
+from anser_ros.nodes import qos
 from anser_ros.nodes.model_clouds import NANO
 
 SHOWN = 0.15
 """Sources whose density is at least this part of the strongest one's are shown."""
 MOST_SHOWN = 400
 CENTROID_M = 0.03
+VIEW_PERIOD_S = 0.2
+"""How often the marker is renewed."""
+
+
+class MetalView:
+    """Shows the operator where the metal is, a few times a second: ``metal``, ``metal/centroid``.
+
+    Parameters
+    ----------
+    node : Node
+        Publishes it.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._markers = node.create_publisher(MarkerArray, 'metal', qos.LATCHED)
+        self._centroid = node.create_publisher(PointStamped, 'metal/centroid', qos.STREAM)
+        self._shown_s: float | None = None
+
+    def show(self, result: RefitResult, frame_id: str, stamp_ns: int) -> None:
+        """Show what a refit found, or take away what was shown when it found nothing."""
+        now_s = time.monotonic()
+        if result.find is None:
+            if self._shown_s is not None:
+                self._markers.publish(metal_markers(None, frame_id, stamp_ns))
+                self._shown_s = None
+            return
+        is_due = self._shown_s is None or now_s - self._shown_s >= VIEW_PERIOD_S
+        if not is_due or result.metal is None:
+            return
+        self._shown_s = now_s
+        self._markers.publish(metal_markers(result.metal, frame_id, stamp_ns))
+        self._centroid.publish(centroid_message(result.metal, frame_id, stamp_ns))
 
 
 def centroid_message(metal: Metal, frame_id: str, stamp_ns: int) -> PointStamped:

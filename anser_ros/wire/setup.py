@@ -93,6 +93,11 @@ class Setup:
         """Drive frequencies, Hz, in the order of the flux fields."""
         return tuple(coil.frequency_hz for coil in self.emitter.coils)
 
+    def has_same_board(self, other: 'Setup') -> bool:
+        """Whether two setups have the same emitters and sensors."""
+        ours = (self.frame_id, self.emitter, self.sensors)
+        return ours == (other.frame_id, other.emitter, other.sensors)
+
 
 def topic_of(name: str) -> str:
     """Relative ROS topic stem of a sensor's or body's name.
