@@ -6,6 +6,8 @@ dozen readings determine the change of the whole field. `docs/refit.md` tells th
 figures, and what was tried and left.
 """
 
+import math
+from collections.abc import Callable
 from copy import copy
 
 import numpy as np
@@ -88,6 +90,13 @@ class LiveRefit:
         self._scene = build_scene(model, references, self.settings, drawing)
         self._prepare()
         self.reset()
+        self._warm_up()
+
+    def _warm_up(self) -> None:
+        """Have tables and kernels ready before the first frame."""
+        bank, _ = self._bank()
+        seen = bank.evaluate(np.zeros((len(bank.rows), 2)), 1.0)
+        bank.left_out(seen, int(seen.log_evidence.argmax()))
 
     def _prepare(self) -> None:
         """Work out what depends on the baseline and the references' places."""
@@ -98,6 +107,7 @@ class LiveRefit:
         self._drift = np.zeros((baseline.size, k))
         for emitter in range(k):
             self._drift[emitter::k, emitter] = np.nan_to_num(turned[:, emitter].real) * scale
+        self._to_noise_units = self._scene.excitation.phase.conj() / self.settings.flux_noise_t
         self._banks: dict[bytes, tuple[Bank, BodySlots]] = {}
         self._order = FrameOrder(references.channel, self.baseline)
         self._assembly = Assembly(model)
@@ -180,22 +190,24 @@ class LiveRefit:
             self._average.forget()
         self._last_ns = stamp_ns
         self._watch.note(readable, reasons, self.settings.min_references)
-        usable = np.where(readable[:, None], ordered, np.nan)
+        usable = ordered if readable.all() else np.where(readable[:, None], ordered, np.nan)
         level = self._noise.update(usable)
-        if self._in_use().sum() < self.settings.min_references:
+        if np.count_nonzero(self._in_use()) < self.settings.min_references:
             self._watch.wait(readable)
             return self._too_few(stamp_ns, level)
         if baseline is not None:
             # What is averaged is the change; the clean part moves with the coil.
             ordered = ordered - baseline + self.baseline
-        used = np.where(self._watch.excluded[:, None], np.nan, ordered)
+        excluded = self._watch.excluded
+        used = np.where(excluded[:, None], np.nan, ordered) if excluded.any() else ordered
         mean, frames = self._average.update(used, level * self.settings.flux_noise_t)
-        mean = np.where(np.isfinite(mean), mean, ordered)
-        noise = level / float(np.sqrt(frames))
-        change = (mean - self.baseline) * self._scene.excitation.phase.conj()
-        values = np.stack([change.real, change.imag], axis=2) / self.settings.flux_noise_t
+        if used is not ordered:
+            mean = np.where(np.isfinite(mean), mean, ordered)
+        noise = level / math.sqrt(frames)
+        change = (mean - self.baseline) * self._to_noise_units
+        values = change.view(np.float64).reshape(*change.shape, 2)
         bank, seen = self._judged(values, noise)
-        if self._in_use().sum() < self.settings.min_references:
+        if np.count_nonzero(self._in_use()) < self.settings.min_references:
             return self._too_few(stamp_ns, level)
         result = self._result(stamp_ns, bank, seen, level)
         self._readmit(bank, seen, values, readable, level)
@@ -222,15 +234,15 @@ class LiveRefit:
         """Evaluate the hypotheses, leaving out coils that are at fault, the worst first."""
         while True:
             (bank, slots), coils = self._bank(), np.flatnonzero(self._in_use())
-            used = values[coils]
-            slots.fill(used.reshape(-1, 2), noise)
-            seen = bank.evaluate(used.reshape(-1, 2), noise)
+            used = values[coils].reshape(-1, 2)
+            slots.fill(used, noise)
+            seen = bank.evaluate(used, noise)
             best = int(seen.log_evidence.argmax())
             self._distance, self._residual = bank.left_out(seen, best)
             if len(coils) <= self.settings.min_references:
                 return bank, seen
             loudness = noise * self._row_noise[:: bank.width][coils]
-            power = (used**2).sum(axis=(1, 2)) / loudness**2
+            power = (used.reshape(len(coils), -1) ** 2).sum(axis=1) / loudness**2
             suspects = self._watch.suspects(self._distance, power, 2 * bank.width)
             faulty = health.find_faults(bank, seen, suspects)
             if not faulty.size:
@@ -261,7 +273,7 @@ class LiveRefit:
         weights = np.exp(log_weight - log_weight.max())
         self._weights = weights = weights / weights.sum()
         best = int(weights.argmax())
-        typical = float(np.median(self._distance)) / (2 * bank.width)
+        typical = health.typical(self._distance) / (2 * bank.width)
         mean, variance = bank.drifts(seen, best)
         drift = self.settings.drift * (mean @ np.array([1.0, 1.0j]))
         sure = (np.abs(mean) > DRIFT_SIGMAS * np.sqrt(np.maximum(variance, 1e-30))).any(axis=1)
@@ -319,23 +331,22 @@ class LiveRefit:
             )
         )
 
-    def _healths(self) -> tuple[ReferenceHealth, ...]:
-        count = len(self.references)
-        residual, distance = np.full(count, np.nan), np.full(count, np.nan)
-        if len(self._distance):
-            used = self._in_use()
-            rms = np.sqrt((self._residual**2).mean(axis=(1, 2)))
-            residual[used] = rms * self.settings.flux_noise_t
-            distance[used] = np.sqrt(self._distance / (2 * len(self.model.emitters)))
-        return tuple(
-            map(
-                ReferenceHealth,
-                self.references.name,
-                self._watch.reason,
-                residual.tolist(),
-                distance.tolist(),
-            )
-        )
+    def _healths(self) -> Callable[[], tuple[ReferenceHealth, ...]]:
+        """Works out the references' health in this frame when it is asked for."""
+        distance, residual, used = self._distance, self._residual, self._in_use()
+        reason = self._watch.reason.copy()
+        return lambda: self._judge_references(distance, residual, used, reason)
+
+    def _judge_references(
+        self, distance: Array, residual: Array, used: NDArray[np.bool_], reason: list[str]
+    ) -> tuple[ReferenceHealth, ...]:
+        size, apart = np.full(len(used), np.nan), np.full(len(used), np.nan)
+        if len(distance):
+            rms = np.sqrt((residual**2).mean(axis=(1, 2)))
+            size[used] = rms * self.settings.flux_noise_t
+            apart[used] = np.sqrt(distance / (2 * len(self.model.emitters)))
+        rows = (self.references.name, reason, size.tolist(), apart.tolist())
+        return tuple(map(ReferenceHealth, *rows))
 
     def _metal(self, bank: Bank, seen: Evaluation, weights: Array) -> Metal | None:
         best = 1 + int(weights[1:].argmax())

@@ -123,10 +123,10 @@ class Assembly:
         place = self._place(list(layers.values()))
         moments = np.zeros((len(place.positions), len(phase)), dtype=complex)
         moments[: len(self.base.moments)] = self.base.moments * (1.0 + drift)
-        parts = {h: self._moments(bank, seen, h) * (phase * unit) for h in active}
+        scale = phase * unit
+        parts = {h: bank.moments(seen, h) * scale for h in active}
         for h, part in parts.items():
             moments[place.rows(bank, h)] += weights[h] * part
-        scale = phase * unit
         modes, rest = self._uncertainty(bank, seen, weights, parts, typical, scale, n_modes, place)
         return replace(
             self.base,
@@ -180,11 +180,6 @@ class Assembly:
             del self._whole[next(iter(self._whole))]
         self._whole[key] = (self._count, whole)
         return whole
-
-    @staticmethod
-    def _moments(bank: Bank, seen: Evaluation, hypothesis: int) -> ComplexArray:
-        parts = bank.moments(seen, hypothesis)
-        return np.asarray((parts[:, 0] + 1j * parts[:, 1]).reshape(-1, bank.width))
 
     def _error(self, bank: Bank, hypothesis: int, level: ErrorLevel, count: int) -> ErrorModes:
         """A hypothesis' own error, in noise units."""

@@ -1,9 +1,12 @@
 """Which readings are refitted, how noisy they are, and their average while nothing moves."""
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+
+from anser_ros.fitting.refit_kernels import bend_power
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -58,17 +61,14 @@ class NoiseLevel:
     def update(self, flux: ComplexArray) -> float:
         """Take in one frame, shape (S, K), NaN where unknown; returns noise over nominal."""
         if len(self._previous) == 2:
-            bend = flux - 2.0 * self._previous[1] + self._previous[0]
-            power = np.abs(bend) ** 2 / (12.0 * self.nominal_t**2)
-            power = power[np.isfinite(power).all(axis=1)]
-            if power.size:
-                # The median over coils, so that a coil that jumps does not count.
-                now = float(np.median(power.mean(axis=1)))
-                now = min(now, 4.0 * self._ratio)
+            # The median over coils, so that a coil that jumps does not count.
+            now = bend_power(flux, self._previous[1], self._previous[0])
+            if math.isfinite(now):
+                now = min(now / (12.0 * self.nominal_t**2), 4.0 * self._ratio)
                 self._ratio += (now - self._ratio) / MEMORY_FRAMES
                 self._ratio = min(max(self._ratio, 1.0 / 400.0), 400.0)
         self._previous = [*self._previous[-1:], flux]
-        steps = round(np.log(np.sqrt(self._ratio)) / np.log(STEP))
+        steps = round(0.5 * math.log(self._ratio) / math.log(STEP))
         return float(STEP**steps)
 
     def forget(self) -> None:
@@ -96,11 +96,16 @@ class Average:
             self._mean, self._frames = flux.copy(), 1
             return flux, 1
         step = flux - self._mean
-        power = np.abs(step[np.isfinite(step)]) ** 2
+        parts = np.ascontiguousarray(step).view(np.float64).ravel()
+        power = float(parts @ parts)
+        size, same = step.size, True
+        if not math.isfinite(power):
+            known = np.isfinite(step)
+            power, size = float((np.abs(step[known]) ** 2).sum()), int(known.sum())
+            same = bool((np.isfinite(flux) == np.isfinite(self._mean)).all())
         expected = 2.0 * sigma_t**2 * (1.0 + 1.0 / self._frames)
-        limit = 1.0 + 3.0 / np.sqrt(max(power.size, 1))
-        same = np.isfinite(flux) == np.isfinite(self._mean)
-        if not power.size or power.mean() > limit * expected or not same.all():
+        limit = 1.0 + 3.0 / math.sqrt(max(size, 1))
+        if not size or not same or power > limit * expected * size:
             self._mean, self._frames = flux.copy(), 1
             return flux, 1
         self._frames = min(self._frames + 1, self.longest)

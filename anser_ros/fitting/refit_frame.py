@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import FitError
 from anser_ros.fitting import refit_health as health
+from anser_ros.fitting.refit_kernels import fill_frame
 
 ComplexArray = NDArray[np.complex128]
 
@@ -23,9 +24,11 @@ class FrameOrder:
     """
 
     def __init__(self, channel: NDArray[np.int64], baseline: ComplexArray) -> None:
-        self._place = {int(c): i for i, c in enumerate(channel.tolist())}
+        self._channels: list[int] = channel.tolist()
         self._shape = baseline.shape
         self._has_baseline = np.isfinite(baseline).all(axis=1)
+        self._told: bytes | None = None
+        self._rows = np.empty(0, dtype=np.int64)
 
     def read(
         self,
@@ -48,14 +51,18 @@ class FrameOrder:
                 f'refit: {number.size} channels and {k} emitters need fluxes of that shape and '
                 f'as many flags, got {given.shape} and {marks.shape}'
             )
-        if len(set(number.tolist())) != number.size:
-            raise FitError('refit: a channel appears twice in the frame')
-        place = np.array([self._place.get(c, -1) for c in number.tolist()], dtype=np.int64)
-        known = place >= 0
-        ordered = np.full(self._shape, np.nan, dtype=complex)
-        ordered[place[known]] = given[known]
-        code = np.zeros(count, dtype=np.int64)
-        code[place[known]] = np.where(marks[known] != 0, 2, 1)
-        code[(code == 1) & ~np.isfinite(ordered).all(axis=1)] = 3
-        code[~self._has_baseline] = 4
-        return ordered, np.asarray(code == 1), [_REASONS[c] for c in code.tolist()]
+        told = number.tobytes()
+        if told != self._told:
+            if len(set(number.tolist())) != number.size:
+                raise FitError('refit: a channel appears twice in the frame')
+            row = {c: i for i, c in enumerate(number.tolist())}
+            self._rows = np.array([row.get(c, -1) for c in self._channels], dtype=np.int64)
+            self._told = told
+        ordered = np.empty(self._shape, dtype=np.complex128)
+        code = np.empty(count, dtype=np.int64)
+        fill_frame(
+            np.ascontiguousarray(given, dtype=np.complex128),
+            np.ascontiguousarray(marks, dtype=np.int64),
+            self._rows, self._has_baseline, ordered, code,
+        )  # fmt: skip
+        return ordered, code == 1, [_REASONS[c] for c in code.tolist()]

@@ -8,6 +8,7 @@ returns when it has agreed with the others for a while.
 """
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +44,7 @@ MOST_AT_ONCE = 4
 """Coils that may fail together and be found."""
 
 
-@dataclass(frozen=True)
-class ReferenceHealth:
+class ReferenceHealth(NamedTuple):
     """One reference coil in one frame.
 
     Attributes
@@ -64,6 +64,13 @@ class ReferenceHealth:
     state: str
     residual_t: float
     distance: float
+
+
+def typical(values: Array) -> float:
+    """Median."""
+    ordered = sorted(values.tolist())
+    middle = len(ordered) // 2
+    return float(0.5 * (ordered[middle] + ordered[-1 - middle]))
 
 
 def fault_odds(bank: Bank, seen: Evaluation, coils: NDArray[np.int64]) -> float:
@@ -168,11 +175,13 @@ class Watch:
             Readings a coil.
         """
         self._since += 1
+        level = OUTSTANDING**2 * max(typical(power), freedom)
+        if chi2.max() <= SUSPICIOUS * freedom and power.max() <= level:
+            return []
         order = np.argsort(-chi2)[:3]
         sets = [order[i : i + 1] for i in range(len(order))]
         sets = [s for s in sets if chi2[s[0]] > max(SUSPICIOUS * freedom, 0.5 * chi2[order[0]])]
         by_power = np.argsort(-power)
-        level = OUTSTANDING**2 * max(float(np.median(power)), freedom)
         out = by_power[: MOST_AT_ONCE + 1]
         out = out[power[out] > level]
         if 0 < len(out) <= min(MOST_AT_ONCE, len(power) // 3):

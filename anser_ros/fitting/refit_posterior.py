@@ -21,9 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
+from anser_ros.fitting.refit_kernels import fill_evidence, fill_left_out, fill_products
 from anser_ros.fitting.refit_prior import CloudPrior
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 
 STRENGTHS = 10.0 ** np.arange(-2.0, 11.0, 0.5)
 """Variances of a reading, in noise variances, that the evidence is summed over."""
@@ -46,7 +48,7 @@ class Evaluation:
         Noise in units of the nominal one.
     """
 
-    projected: Array
+    projected: Single
     log_evidence: Array
     curve: Array
     strength: Array
@@ -124,23 +126,25 @@ class Bank:
         self.whitening = _whitening(self.drift, self._row_noise)
         count, n = 1 + len(self.priors), len(rows)
         self.spectra, self.bases = np.zeros((count, n)), np.zeros((count, n, n))
-        # The two large products of every frame wait for memory, not for arithmetic; single
-        # precision is 1e-7 of a reading that is at most 1e6 noise deviations.
         self._analysis = np.zeros((count * n, n), dtype=np.float32)
+        self._drift_seen = np.zeros((count, self.width, n))
         self._prior = np.full(count, -np.inf)
+        self.names: tuple[str, ...] = ('nothing',)
         self._chosen = -float(np.log(max(among / max(slots, 1), 1.0)))
         self.is_slot = np.arange(count) >= count - slots
         self._set(0, self.whitening)
         for hypothesis, prior in enumerate(priors, start=1):
             self._decompose(hypothesis, prior)
-        self._synthesis: dict[int, NDArray[np.float32]] = {}
+        self._name()
+        self._synthesis: dict[int, Single] = {}
         self._blocks: dict[tuple[float, int, int], Array] = {}
-        self._tables: dict[float, tuple[Array, Array]] = {}
+        self._tables: dict[float, tuple[Single, Array]] = {}
 
     def _set(self, hypothesis: int, basis: Array) -> None:
         n = len(self.rows)
         self.bases[hypothesis] = basis
         self._analysis[hypothesis * n : (hypothesis + 1) * n] = basis.T
+        self._drift_seen[hypothesis] = self.drift.T @ basis
         self._prior[hypothesis] = self._chosen if self.is_slot[hypothesis] else 0.0
 
     def _decompose(self, hypothesis: int, prior: CloudPrior) -> None:
@@ -153,21 +157,22 @@ class Bank:
         """Empty a slot."""
         self.priors[hypothesis - 1] = None
         self._prior[hypothesis] = -np.inf
+        self._name()
 
     def occupy(self, hypothesis: int, prior: CloudPrior) -> None:
         """Put a prior in a slot; what was there is forgotten."""
         self._decompose(hypothesis, prior)
         self.priors[hypothesis - 1] = prior
+        self._name()
         self._synthesis.pop(hypothesis, None)
         self._tables.clear()
         for key in [key for key in self._blocks if key[1] == hypothesis]:
             del self._blocks[key]
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """What each hypothesis says."""
+    def _name(self) -> None:
+        """Write down what each hypothesis says."""
         slots = (f'slot {i}' if p is None else p.name for i, p in enumerate(self.priors))
-        return ('nothing', *slots)
+        self.names = ('nothing', *slots)
 
     def prior(self, hypothesis: int) -> CloudPrior:
         """The prior of a hypothesis that is not 0 and not an empty slot."""
@@ -175,12 +180,13 @@ class Bank:
         assert prior is not None
         return prior
 
-    def precision(self, noise: float) -> tuple[Array, Array]:
+    def precision(self, noise: float) -> tuple[Single, Array]:
         """Inverse variances (H, A, n) and log determinants (H, A) at a noise level."""
         if noise not in self._tables:
             variance = STRENGTHS[None, :, None] * self.spectra[:, None, :] + noise**2
             _make_room(self._tables, MOST_TABLES)
-            self._tables[noise] = (1.0 / variance, np.log(variance).sum(axis=2))
+            log_det = np.log(variance).sum(axis=2)
+            self._tables[noise] = ((1.0 / variance).astype(np.float32), log_det)
         return self._tables[noise]
 
     def evaluate(self, readings: Array, noise: float) -> Evaluation:
@@ -194,10 +200,14 @@ class Bank:
             Noise in units of the nominal one.
         """
         precision, log_det = self.precision(noise)
-        projected = (self._analysis @ readings.astype(np.float32)).astype(np.float64)
-        projected = projected.reshape(len(self.bases), -1, 2)
-        curve = -0.5 * (precision @ projected**2 + log_det[:, :, None])
-        evidence, strength = _over_strengths(curve)
+        count, n = self.spectra.shape
+        projected = np.empty((count, n, 2), dtype=np.float32)
+        curve, evidence = np.empty((count, len(STRENGTHS), 2)), np.empty(count)
+        strength = np.empty((count, 2, len(STRENGTHS)))
+        fill_evidence(
+            self._analysis, _rows(readings), precision, log_det, np.isfinite(self._prior),
+            projected, curve, strength, evidence,
+        )  # fmt: skip
         evidence += self._prior
         return Evaluation(projected, evidence, curve, strength, noise)
 
@@ -207,31 +217,26 @@ class Bank:
         shrink = (seen.strength[hypothesis] * STRENGTHS) @ precision[hypothesis]
         return np.asarray(seen.projected[hypothesis] * shrink.T)
 
-    def _to_moments(self, hypothesis: int) -> NDArray[np.float32]:
+    def _to_moments(self, hypothesis: int) -> Single:
         if hypothesis not in self._synthesis:
             transfer = self.prior(hypothesis).transfer[:, self.rows]
             self._synthesis[hypothesis] = (transfer @ self.bases[hypothesis]).astype(np.float32)
         return self._synthesis[hypothesis]
 
-    def moments(self, seen: Evaluation, hypothesis: int) -> Array:
-        """Posterior mean of the layer's moments (N K, 2) in noise units."""
-        coefficients = self.coefficients(seen, hypothesis).astype(np.float32)
-        return np.asarray(self._to_moments(hypothesis) @ coefficients, dtype=np.float64)
-
-    def innovation(self, seen: Evaluation, hypothesis: int) -> Array:
-        """Inverse covariance times the readings, (n, 2), averaged over the strengths."""
-        precision, _ = self.precision(seen.noise)
-        mean = seen.strength[hypothesis] @ precision[hypothesis]
-        return np.asarray(self.bases[hypothesis] @ (seen.projected[hypothesis] * mean.T))
+    def moments(self, seen: Evaluation, hypothesis: int) -> NDArray[np.complex128]:
+        """Posterior mean of the layer's moments (N, K) in noise units."""
+        synthesis = self._to_moments(hypothesis)
+        out = np.empty((len(synthesis), 2))
+        fill_products(synthesis, _rows(self.coefficients(seen, hypothesis)), out)
+        return out.view(np.complex128).reshape(-1, self.width)
 
     def drifts(self, seen: Evaluation, hypothesis: int) -> tuple[Array, Array]:
         """Emitters' drift, mean (K, 2) and variance (K, 2), in prior deviations."""
         precision, _ = self.precision(seen.noise)
-        scale = seen.noise**2
-        mean = self.drift.T @ self.innovation(seen, hypothesis) * scale
-        power = (self.drift.T @ self.bases[hypothesis]) ** 2
-        inverse = seen.strength[hypothesis] @ precision[hypothesis]
-        return mean, scale * (1.0 - scale * (power @ inverse.T))
+        scale, along = seen.noise**2, self._drift_seen[hypothesis]
+        inverse = (seen.strength[hypothesis] @ precision[hypothesis]).T
+        mean = scale * (along @ (seen.projected[hypothesis] * inverse))
+        return mean, scale * (1.0 - scale * (along**2 @ inverse))
 
     def sources(self, seen: Evaluation, hypothesis: int) -> Array:
         """Posterior mean polarisability (M, 2) of a cloud's sources, in noise units."""
@@ -249,17 +254,15 @@ class Bank:
             Measured minus predicted, in noise units.
         """
         precision, _ = self.precision(seen.noise)
-        shape = (-1, self.width, 1)
-        chi2 = np.zeros(len(self.rows) // self.width)
+        n, (real, imaginary) = len(self.rows), seen.strength[hypothesis].argmax(axis=1).tolist()
+        chi2 = np.empty(n // self.width)
         residual = np.empty((len(chi2), self.width, 2))
-        for part in range(2):
-            strength = int(seen.strength[hypothesis, part].argmax())
-            q = self.bases[hypothesis] @ (
-                seen.projected[hypothesis, :, part] * precision[hypothesis, strength]
-            )
-            r = self._block(seen.noise, hypothesis, strength) @ q.reshape(shape)
-            chi2 += (q.reshape(shape) * r)[:, :, 0].sum(axis=1)
-            residual[:, :, part] = r[:, :, 0]
+        fill_left_out(
+            self._analysis[hypothesis * n : (hypothesis + 1) * n], seen.projected[hypothesis],
+            precision[hypothesis, real], precision[hypothesis, imaginary],
+            self._block(seen.noise, hypothesis, real),
+            self._block(seen.noise, hypothesis, imaginary), chi2, residual,
+        )  # fmt: skip
         return chi2, residual
 
     def _block(self, noise: float, hypothesis: int, strength: int) -> Array:
@@ -372,6 +375,11 @@ class Bank:
         gain = (STRENGTHS[strength] * precision[hypothesis, strength])[:, None]
         weights = gain * (self.bases[hypothesis].T @ readings)
         return np.asarray(root * prior.draw_moments - self._to_moments(hypothesis) @ weights)
+
+
+def _rows(columns: Array) -> Single:
+    """Two columns (n, 2) as rows (2, n) for the kernels."""
+    return np.ascontiguousarray(columns.T, dtype=np.float32)
 
 
 def _whitening(drift: Array, noise: Array) -> Array:

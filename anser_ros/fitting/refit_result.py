@@ -107,7 +107,8 @@ class RefitResult:
         One of `STATES`.
     changed : bool
         Whether the model is another one than after the frame before.
-    references : tuple of ReferenceHealth
+    judge : callable
+        Works out `references`.
     log_odds : float
         Natural logarithm of the odds that something has changed.
     weights : mapping of str to float
@@ -127,13 +128,18 @@ class RefitResult:
     model: FieldModel
     state: str
     changed: bool
-    references: tuple[ReferenceHealth, ...]
+    judge: Callable[[], tuple[ReferenceHealth, ...]] = field(repr=False)
     log_odds: float
     weights: dict[str, float]
     noise_t: float
     drift: ComplexArray
     reason: str = ''
     find: Callable[[], Metal | None] | None = field(default=None, repr=False)
+
+    @cached_property
+    def references(self) -> tuple[ReferenceHealth, ...]:
+        """Every reference's health, worked out when first asked for."""
+        return self.judge()
 
     @property
     def left_out(self) -> tuple[str, ...]:

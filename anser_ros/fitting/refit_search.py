@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.fitting.refit_clouds import Cloud
+from anser_ros.fitting.refit_kernels import fill_products, fill_scores
 from anser_ros.fitting.refit_references import vector_basis
 from anser_ros.physics.sensor import SensorTable
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 
 DIRECTIONS = 16
 """Directions of the space of readings that are looked at for each body."""
@@ -32,7 +34,7 @@ def _symmetric() -> Array:
     return out
 
 
-def body_factor(cloud: Cloud, references: SensorTable, excitation: Array) -> NDArray[np.float32]:
+def body_factor(cloud: Cloud, references: SensorTable, excitation: Array) -> Single:
     """Readings of a body's coarse sources, one column a tensor component, mean variance 1.
 
     Parameters
@@ -72,17 +74,17 @@ class BodySearch:
         Variances of a reading that the evidence is summed over.
     """
 
-    factors: tuple[NDArray[np.float32], ...]
+    factors: tuple[Single, ...]
     rows: NDArray[np.int64]
     whitening: Array
     strengths: Array
-    _tables: dict[float, tuple[Array, Array, Array]] = field(default_factory=dict)
+    _tables: dict[float, tuple[Single, Array, Array]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         count = min(DIRECTIONS, self.factors[0].shape[1], len(self.rows))
         stacked = np.empty((len(self.factors), count, len(self.rows)), dtype=np.float32)
         self._power = np.empty((len(self.factors), count))
-        white = np.asarray(self.whitening.T, dtype=np.float32)
+        white = self._white = np.ascontiguousarray(self.whitening.T, dtype=np.float32)
         for body, factor in enumerate(self.factors):
             seen = white @ factor[self.rows]
             values, vectors = np.linalg.eigh(seen.T @ seen)
@@ -92,7 +94,7 @@ class BodySearch:
         self._directions = stacked.reshape(-1, len(self.rows))
         self._left = REMAINDER * float(np.mean((white**2).sum(axis=1)))
 
-    def _table(self, noise: float) -> tuple[Array, Array, Array]:
+    def _table(self, noise: float) -> tuple[Single, Array, Array]:
         """Precisions (L, A, r) and (A,) of the rest, and log determinants (L, A)."""
         if noise not in self._tables:
             self._tables.clear()
@@ -100,7 +102,7 @@ class BodySearch:
             inside = self.strengths[:, None] * self._power[:, None, :] + rest[:, None]
             others = len(self.rows) - inside.shape[2]
             log_det = np.log(inside).sum(axis=2) + others * np.log(rest)
-            self._tables[noise] = (1.0 / inside, 1.0 / rest, log_det)
+            self._tables[noise] = ((1.0 / inside).astype(np.float32), 1.0 / rest, log_det)
         return self._tables[noise]
 
     def scores(self, readings: Array, noise: float) -> Array:
@@ -114,12 +116,9 @@ class BodySearch:
             Noise in units of the nominal one.
         """
         inside, rest, log_det = self._table(noise)
-        white = self.whitening.T @ readings
-        power = (self._directions @ white.astype(np.float32)).astype(np.float64) ** 2
-        power = power.reshape(len(self._power), -1, 2)
-        left = np.maximum((white**2).sum(axis=0) - power.sum(axis=1), 0.0)
-        curve = inside @ power + rest[:, None] * left[:, None, :] + log_det[:, :, None]
-        curve *= -0.5
-        top = curve.max(axis=1)
-        total = np.log(np.exp(curve - top[:, None]).sum(axis=1)) + top
-        return np.asarray(total.sum(axis=1) - 2.0 * np.log(len(self.strengths)))
+        white = np.empty((len(self.rows), 2), dtype=np.float32)
+        fill_products(self._white, np.ascontiguousarray(readings.T, dtype=np.float32), white)
+        white = np.ascontiguousarray(white.T)
+        scores = np.empty(len(self._power))
+        fill_scores(self._directions, white, inside, rest, log_det, scores)
+        return scores
