@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import sys
 import time
@@ -15,6 +16,7 @@ from anser_ros.cli.demo_report import draw, load, summarise
 from anser_ros.cli.main import main
 from anser_ros.cli.supervisor import Supervisor, tail
 from anser_ros.nodes.traces import OpticalTrace, PoseTrace, Traces, targets_of
+from anser_ros.wire.bag import Salvage, iter_messages
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import parse_setup, topic_of
 
@@ -193,11 +195,46 @@ def test_demo_runs_and_reports(start, tmp_path):
     assert running('anser_demo_') == []
 
 
-def test_ctrl_c_ends_the_demo_in_two_seconds(start, tmp_path):
+def test_ctrl_c_ends_the_demo_in_order_and_it_says_how_to_go_on(start, tmp_path, capsys):
     demo = start('demo', '--out', tmp_path)
     demo.wait_for('tracked', 60)
     begin = time.monotonic()
     assert demo.interrupt(signal.SIGINT) == 0, demo.output
     assert time.monotonic() - begin < 2.0
-    assert 'bag:' in demo.output and 'Traceback' not in demo.output
+    (folder,) = tmp_path.glob('demo_*_*')
+    said = re.search(rf'bag: {folder}/bag \((\S+) s, (\d+) messages, complete\)', demo.output)
+    assert said, demo.output
+    salvage = Salvage()
+    assert len(list(iter_messages(folder / 'bag', salvage))) == int(said[2]) and not salvage.lost
+    assert f'draw: anser demo --draw {folder}\n' in demo.output
+    assert f'evaluate: anser evaluate {folder}/bag --model ' in demo.output
+    assert 'Traceback' not in demo.output
     assert running('anser_demo_') == []
+    assert not (folder / 'demo.png').exists()
+    assert main(['demo', '--draw', str(folder)]) == 0
+    assert f'picture: {folder}/demo.png' in capsys.readouterr().out
+    assert (folder / 'demo.png').read_bytes()[:8] == b'\x89PNG\r\n\x1a\n'
+
+
+@pytest.mark.parametrize('after_s', [1.0, 3.5])
+def test_ctrl_c_while_the_nodes_start(start, tmp_path, after_s):
+    demo = start('demo', '--out', tmp_path, '--json')
+    end = time.monotonic() + 20
+    while not list(tmp_path.glob('demo_*_*')):
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    time.sleep(after_s)
+    begin = time.monotonic()
+    assert demo.interrupt(signal.SIGINT) == 0, demo.output
+    assert time.monotonic() - begin < 1.5
+    summary = json.loads(demo.output)
+    assert summary['interrupted']
+    assert summary['bag'] is None or list(Path(summary['bag']).glob('*.mcap'))
+    for log in tmp_path.glob('demo_*/logs/*.log'):
+        assert 'Traceback' not in log.read_text()
+    assert running('anser_demo_') == []
+
+
+def test_what_no_demo_left_is_not_drawn(tmp_path, capsys):
+    assert main(['demo', '--draw', str(tmp_path)]) == 2
+    assert 'holds no demo.npz' in capsys.readouterr().err

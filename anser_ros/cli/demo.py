@@ -20,6 +20,7 @@ from anser_ros.cli.demo_report import FROZEN, MEANINGS, draw, load, summarise
 from anser_ros.cli.kernels import compile_kernels
 from anser_ros.cli.supervisor import Supervisor, tail
 from anser_ros.errors import ParameterError
+from anser_ros.wire.bag_metadata import told
 from anser_ros.wire.config_folder import config_path
 
 PATIENCE_S = 180.0
@@ -33,6 +34,8 @@ METAL_RADIUS_M = 0.1
 # silent near metal and nobody would see the error that it avoids.
 NO_GATE = {'gate': 1e6, 'adaptive': False}
 POLL_S = 0.05
+# What the monitor leaves.
+DATA = 'demo.npz'
 SHARED_TOPICS = ('setup', 'tool/flux', 'reference/flux')
 
 
@@ -48,6 +51,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--rate', type=float, default=50.0, metavar='HZ', help='poses a second')
     parser.add_argument('--no-metal', action='store_true', help='leave the steel disc away')
     parser.add_argument('--no-picture', action='store_true', help='draw nothing at the end')
+    parser.add_argument(
+        '--draw', type=Path, metavar='DIR',
+        help='run nothing: draw the picture of an interrupted demo, from the folder that it left',
+    )  # fmt: skip
     parser.add_argument('--json', action='store_true', help='print only the summary, as JSON')
 
 
@@ -57,8 +64,10 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     ParameterError
-        When the duration or the rate is out of range.
+        When the duration or the rate is out of range, or the folder to draw from holds no demo.
     """
+    if args.draw is not None:
+        return _draw_left(args.draw, args)
     if not 1.0 <= args.duration <= 3600.0:
         raise ParameterError(f'--duration must be 1 to 3600 s, got {args.duration:g}')
     if not 1.0 <= args.rate <= 200.0:
@@ -82,7 +91,6 @@ def _run_in(folder: Path, args: argparse.Namespace, stopped: list[int]) -> int:
     for threads in ('OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
         os.environ.setdefault(threads, '1')
     ports = Path(tempfile.mkdtemp(prefix='anser_demo_'))
-    data = folder / 'demo.npz'
     failed = ''
     try:
         with Supervisor(folder / 'logs') as supervisor:
@@ -93,10 +101,12 @@ def _run_in(folder: Path, args: argparse.Namespace, stopped: list[int]) -> int:
                 print(f'anser demo: no kernels\n{tail(ended)}', file=sys.stderr)
                 return 1
             if stopped:
-                return _report(folder, data, args, interrupted=True)
+                return _report(folder, args, interrupted=True)
             for name, command in _commands(folder, ports / 'cu', args):
                 supervisor.start(name, command)
-            monitor = supervisor.start('monitor', _monitor(data, args), on_terminal=not args.json)
+            monitor = supervisor.start(
+                'monitor', _monitor(folder / DATA, args), on_terminal=not args.json
+            )
             while not stopped:
                 ended = supervisor.ended()
                 if ended is not None:
@@ -110,7 +120,7 @@ def _run_in(folder: Path, args: argparse.Namespace, stopped: list[int]) -> int:
     if failed:
         print(f'anser demo: {failed}\nlogs: {folder / "logs"}', file=sys.stderr)
         return 1
-    return _report(folder, data, args, interrupted=bool(stopped))
+    return _report(folder, args, interrupted=bool(stopped))
 
 
 def _say(text: str, args: argparse.Namespace) -> None:
@@ -118,14 +128,32 @@ def _say(text: str, args: argparse.Namespace) -> None:
         print(text, flush=True)
 
 
-def _report(folder: Path, data: Path, args: argparse.Namespace, *, interrupted: bool) -> int:
-    summary: dict[str, object] = {'bag': str(folder / 'bag'), 'interrupted': interrupted}
+def _draw_left(folder: Path, args: argparse.Namespace) -> int:
+    """Summary and picture of a demo that did not come to them itself."""
+    if not (folder / DATA).is_file():
+        raise ParameterError(f'{folder} holds no {DATA} of a demo that showed poses')
+    return _report(folder, args, interrupted=False)
+
+
+def _report(folder: Path, args: argparse.Namespace, *, interrupted: bool) -> int:
+    bag, data = folder / 'bag', folder / DATA
+    there = bag.is_dir()
+    summary: dict[str, object] = {'bag': str(bag) if there else None, 'interrupted': interrupted}
+    if there:
+        summary |= told(bag)
     results = load(data) if data.is_file() else None
     if results is not None:
         summary |= summarise(results)
-        if not (interrupted or args.no_picture):
+        if interrupted:  # drawing takes longer than who wants to leave likes to wait
+            summary['draw'] = f'anser demo --draw {folder}'
+        elif not args.no_picture:
             draw(results, folder / 'demo.png')
             summary['picture'] = str(folder / 'demo.png')
+    if there and results is not None:
+        summary['evaluate'] = (
+            f'anser evaluate {bag} --model {config_path("demo_model.yaml")} '
+            f'--out {folder / "evaluation"}'
+        )
     if args.json:
         print(json.dumps(summary, indent=1))
     else:
@@ -138,18 +166,26 @@ def _print(summary: dict[str, object]) -> None:
     if isinstance(chains, dict):
         for chain, figures in chains.items():
             print(
-                f'{chain:>7}: {figures["poses"]} poses at {figures["rate_hz"]:.1f} Hz, '
+                f'{chain:>8}: {figures["poses"]} poses at {figures["rate_hz"]:.1f} Hz, '
                 f'error RMSE {1e3 * figures["position_rmse_m"]:.2f} mm, '
                 f'95 % below {1e3 * figures["position_prc95_m"]:.2f} mm, '
                 f'worst {1e3 * figures["position_max_m"]:.2f} mm; '
                 f'latency {1e3 * figures["latency_prc50_s"]:.1f} ms from the middle of a window'
             )
-            print(f'{"":>7}  ({MEANINGS[chain]})')
-    for key in ('bag', 'picture'):
+            print(f'{"":>8}  ({MEANINGS[chain]})')
+    elif summary['interrupted']:
+        print('interrupted before the first pose')
+    if summary['bag'] is None:
+        print(f'{"bag":>8}: none, nothing was recorded')
+    else:
+        is_whole = 'complete' if summary.get('closed') else 'cut off'
+        print(
+            f'{"bag":>8}: {summary["bag"]} ({summary.get("duration_s", 0.0):.1f} s, '
+            f'{summary.get("messages", 0)} messages, {is_whole})'
+        )
+    for key in ('picture', 'draw', 'evaluate'):
         if key in summary:
-            print(f'{key:>7}: {summary[key]}')
-    if summary['interrupted']:
-        print('interrupted: no picture')
+            print(f'{key:>8}: {summary[key]}')
 
 
 def node_command(name: str, /, *words: str, **parameters: object) -> list[str]:

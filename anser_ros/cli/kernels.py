@@ -7,20 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 
-import numpy as np
-
 from anser_ros.cli.supervisor import Child, Supervisor
-from anser_ros.fitting.refit import LiveRefit
-from anser_ros.physics.sensor import SensorTable
-from anser_ros.sessions.model_file import load_model
-from anser_ros.sessions.session import sensor_table
-from anser_ros.sessions.starting_model import board_of
-from anser_ros.simulation.board_source import board_source
-from anser_ros.simulation.metal import steel_disc
-from anser_ros.simulation.motion import Approach
-from anser_ros.simulation.world import World
-from anser_ros.tracking.tracker import Tracker
-from anser_ros.tracking.warm_up import warm_up
 from anser_ros.wire.config_folder import config_path, read_config
 from anser_ros.wire.setup import parse_setup
 
@@ -50,13 +37,27 @@ def compile_kernels(
 
 def main() -> int:
     """Run the demo's world, a tracker and a refit for a few frames."""
+    # Whoever only starts this process needs none of them.
+    import numpy as np
+
+    from anser_ros.fitting.refit import LiveRefit
+    from anser_ros.sessions.model_file import load_model
+    from anser_ros.sessions.session import sensor_table
+    from anser_ros.sessions.starting_model import board_of
+    from anser_ros.simulation.board_source import board_source
+    from anser_ros.simulation.metal import steel_disc
+    from anser_ros.simulation.motion import Approach
+    from anser_ros.simulation.world import World
+    from anser_ros.tracking.tracker import Tracker
+    from anser_ros.tracking.warm_up import warm_up
+
     warm_up()
     setup = parse_setup(read_config('demo_setup.yaml'))
     source = board_source(setup)
     far, near = Approach(), Approach(start_s=-1e3, travel_s=1.0, stay_s=1e6)
     worlds = [World(setup, source, metal=[steel_disc(path)]) for path in (far, near)]
     model = load_model(config_path('demo_model.yaml'))
-    tools: SensorTable = sensor_table(setup.tool_sensors)
+    tools = sensor_table(setup.tool_sensors)
     references = sensor_table(setup.reference_sensors)
     split = len(tools)
     clean = worlds[0].flux(0.0)[split:]

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _PR_SET_PDEATHSIG = 1
-_INTERRUPT_S = 1.2
-_TERMINATE_S = 0.2
+_TERMINATE_S = 1.5
 _TAIL_LINES = 8
 
 
@@ -85,12 +84,11 @@ class Supervisor:
         return next((c for c in self._children if c.process.poll() is not None), None)
 
     def end(self) -> None:
-        """End all: interrupt, then terminate, then kill what does not heed."""
-        for number, patience_s in (
-            (signal.SIGINT, _INTERRUPT_S),
-            (signal.SIGTERM, _TERMINATE_S),
-            (signal.SIGKILL, 1.0),
-        ):
+        """End all: ask to terminate, then kill what does not heed.
+
+        Whoever has files to close has a handler; who is still starting has none, and just ends.
+        """
+        for number, patience_s in ((signal.SIGTERM, _TERMINATE_S), (signal.SIGKILL, 1.0)):
             running = [c for c in self._children if c.process.poll() is None]
             for child in running:
                 _signal_group(child, number)
@@ -116,11 +114,6 @@ def _signal_group(child: Child, number: int) -> None:
 
 
 def _prepare() -> None:
-    """Run in the child: the system kills it when its parent is gone (Linux).
-
-    An interrupt while Python still starts would end in a traceback; it is ignored until the
-    program has a handler of its own.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Run in the child: the system kills it when its parent is gone (Linux)."""
     if sys.platform.startswith('linux'):
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

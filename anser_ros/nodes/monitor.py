@@ -61,7 +61,6 @@ class Monitor(AnserNode):
         self._live: Live | None = None
         if self._console.is_terminal:
             self._live = Live(console=self._console, auto_refresh=False)
-            self._live.start()
         self._setup: Setup | None = None
         self._chains: dict[str, Traces] = {}
         self._optical: dict[str, OpticalTrace] = {}
@@ -145,6 +144,8 @@ class Monitor(AnserNode):
             chain: traces.rows(self._optical, elapsed_s) for chain, traces in self._chains.items()
         }
         if self._live is not None:
+            # It hides the cursor, so only once the node is made and will surely be closed.
+            self._live.start()
             self._live.update(self._table(rows), refresh=True)
         else:
             print(self._line(rows), flush=True)

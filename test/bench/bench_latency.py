@@ -55,7 +55,7 @@ def main():
     output, *topics = sys.argv[1:]
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     ending = []
-    signal.signal(signal.SIGINT, lambda *_: ending.append(1))
+    signal.signal(signal.SIGTERM, lambda *_: ending.append(1))
     node = rclpy.create_node('latency_listener')
     got = []
     def subscribe(index, topic):
