@@ -152,9 +152,25 @@ class TestConsole:
     def test_bad_usage(self, verb, capsys):
         verb(lambda args: 0)
         assert cli.main(['sample', '--bogus']) == 2
-        assert 'unrecognized arguments: --bogus' in capsys.readouterr().err
+        said = 'anser sample: unrecognized arguments: --bogus (usage: anser sample --help)\n'
+        assert capsys.readouterr() == ('', said)
         assert cli.main(['smaple']) == 2
         assert "no command 'smaple'; there are:" in capsys.readouterr().err
+
+    @pytest.mark.parametrize('name', verb_names())
+    def test_every_command_says_in_a_line_what_is_wrong_with_its_arguments(self, name, capsys):
+        assert cli.main([name, '--bogus']) == 2
+        out, said = capsys.readouterr()
+        assert said.startswith(f'anser {name}: ') and said.endswith(
+            f'(usage: anser {name} --help)\n'
+        )
+        assert out == '' and said.count('\n') == 1
+
+    @pytest.mark.parametrize('name', verb_names())
+    def test_every_command_that_writes_says_that_it_makes_folders(self, name, capsys):
+        assert cli.main([name, '--help']) == 0
+        words = ' '.join(capsys.readouterr().out.split())
+        assert 'made if missing' in words or '--out' not in words
 
     def test_help(self, verb, capsys):
         verb(lambda args: 0)

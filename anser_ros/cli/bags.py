@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from anser_ros.cli.output import make_folder
 from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.manufacture import manufactured
 from anser_ros.simulation.metal import steel_disc
@@ -30,7 +31,10 @@ SCAN_ERRORS = Errors(
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument('--setup', type=Path, default=Path('config/demo_setup.yaml'))
-    parser.add_argument('--out', type=Path, default=Path('bags'), metavar='DIR')
+    parser.add_argument(
+        '--out', type=Path, default=Path('bags'), metavar='DIR',
+        help='folder for the bags, made if missing (%(default)s)',
+    )  # fmt: skip
     parser.add_argument('--seed', type=int, default=1)
 
 
@@ -39,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     setup = parse_setup(args.setup.read_text(encoding='utf-8'))
     rng = np.random.default_rng(args.seed)
     source = board_source(manufactured(setup, rng))
-    args.out.mkdir(parents=True, exist_ok=True)
+    make_folder(args.out)
     scan = GridScan()
     scanned = World(setup, source, paths=dict.fromkeys(setup.bodies, scan))
     tall = GridScan(heights_m=SCAN_HEIGHTS_M)

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from anser_ros.cli.calibration_figure import draw_choice
+from anser_ros.cli.output import make_folder, say_written
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.fitting.calibration import Calibration, Options
 from anser_ros.fitting.calibration_document import to_document
@@ -28,8 +29,17 @@ from anser_ros.sessions.session import load_session
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument('sessions', nargs='+', metavar='SESSION', help='bags to learn from')
-    parser.add_argument('--out', required=True, type=Path, help='model file to write')
-    parser.add_argument('--report', type=Path, help='folder for calibration.json and choice.png')
+    parser.add_argument(
+        '--out',
+        required=True,
+        type=Path,
+        help='model file to write; its folder is made if missing',
+    )
+    parser.add_argument(
+        '--report',
+        type=Path,
+        help='folder for calibration.json and choice.png, made if missing',
+    )
     parser.add_argument('--json', action='store_true', help='print calibration.json on stdout')
     parser.add_argument(
         '--force', action='store_true',
@@ -71,12 +81,14 @@ def run(args: argparse.Namespace) -> int:
     for path, session in zip(args.sessions, sessions, strict=True):
         if session.lost:
             print(f'anser calibrate: {path}: {session.lost}', file=sys.stderr)
+    make_folder(args.out.parent)
+    if args.report is not None:
+        make_folder(args.report)
     with progress_bar() as progress:
         calibration = calibrate_sessions(sessions, _options(args), progress)
     document = to_document(calibration)
     text = json.dumps(document, indent=1)
     if args.report is not None:
-        args.report.mkdir(parents=True, exist_ok=True)
         (args.report / 'calibration.json').write_text(text + '\n', encoding='utf-8')
         draw_choice(calibration, args.report / 'choice.png')
     if not calibration.better_than_nominal and not args.force:
@@ -90,6 +102,7 @@ def run(args: argparse.Namespace) -> int:
         print(text)
     else:
         Console().print(_table(calibration, document))
+        say_written(args.out, *(() if args.report is None else (args.report,)))
     return 0
 
 

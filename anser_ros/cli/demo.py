@@ -18,6 +18,7 @@ from pathlib import Path
 
 from anser_ros.cli.demo_report import FROZEN, MEANINGS, draw, load, summarise
 from anser_ros.cli.kernels import compile_kernels
+from anser_ros.cli.output import make_folder
 from anser_ros.cli.supervisor import Supervisor, tail
 from anser_ros.errors import ParameterError
 from anser_ros.wire.bag_metadata import told
@@ -46,7 +47,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--out', type=Path, default=Path('recordings'), metavar='DIR',
-        help='folder that gets a folder with bag, picture and logs',
+        help='folder that gets a folder with bag, picture and logs, made if missing '
+        '(%(default)s)',
     )  # fmt: skip
     parser.add_argument('--rate', type=float, default=50.0, metavar='HZ', help='poses a second')
     parser.add_argument('--no-metal', action='store_true', help='leave the steel disc away')
@@ -78,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
         for number in (signal.SIGINT, signal.SIGTERM)
     }
     folder = args.out / time.strftime('demo_%Y%m%d_%H%M%S')
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     try:
         return _run_in(folder, args, stopped)
     finally:

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from anser_ros.cli.diagnosis_report import render, verdict
+from anser_ros.cli.output import make_folder, say_written
 from anser_ros.fitting.model import EffectRecord, FieldModel
 from anser_ros.sessions.diagnosis import diagnose_session, plain, to_document
 from anser_ros.sessions.model_file import save_model
@@ -25,7 +26,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--model', required=True, help="model file, or 'nominal' for the setup's own geometry"
     )
-    parser.add_argument('--out', required=True, type=Path, help='folder for the results')
+    parser.add_argument(
+        '--out', required=True, type=Path, help='folder for the results, made if missing'
+    )
     parser.add_argument('--baseline', help='distortion-free recording of the same board')
     parser.add_argument('--json', action='store_true', help='print diagnosis.json on stdout')
 
@@ -35,13 +38,13 @@ def run(args: argparse.Namespace) -> int:
     session = load_session(args.session)
     model = model_for(args.model, session)
     baseline = load_session(args.baseline) if args.baseline else None
+    make_folder(args.out)
     console = Console(stderr=True)
     with _progress(console) as say:
         result = diagnose_session(session, model, baseline, say)
         say('writing the report')
         document = to_document(result)
         text = json.dumps(document, indent=1)
-        args.out.mkdir(parents=True, exist_ok=True)
         (args.out / 'diagnosis.json').write_text(text + '\n', encoding='utf-8')
         save_model(args.out / 'model.yaml', _plain_effects(result.diagnosis.model))
         page = render(result, document, session=args.session, model=args.model)
@@ -53,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         _show(document)
         print(verdict(document))
-        print(f'report: {args.out / "report.html"}')
+        say_written(*(args.out / name for name in ('report.html', 'model.yaml', 'diagnosis.json')))
     return 0
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from anser_ros.cli.output import make_folder, say_written
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.fitting.error_map import ErrorMap, learn_error_map
 
@@ -25,7 +26,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'points', type=Path, help=f'CSV with the columns {", ".join((*TRACKED, *TRUE))}'
     )
-    parser.add_argument('--out', required=True, type=Path, help='folder for error_map.json')
+    parser.add_argument(
+        '--out',
+        required=True,
+        type=Path,
+        help='folder for error_map.json, made if missing',
+    )
     parser.add_argument(
         '--apply', type=Path, metavar='POSES', help='CSV to correct, e.g. poses.csv of evaluate'
     )
@@ -35,13 +41,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
     rows, _ = _read(args.points)
+    make_folder(args.out)
     error_map = learn_error_map(
         _columns(rows, TRACKED, args.points), _columns(rows, TRUE, args.points)
     )
     if args.apply is not None:
         poses, names = _read(args.apply)
         corrected = error_map.apply(_columns(poses, TRACKED, args.apply))
-    args.out.mkdir(parents=True, exist_ok=True)
     text = json.dumps(to_document(error_map), indent=1)
     (args.out / 'error_map.json').write_text(text + '\n', encoding='utf-8')
     if args.apply is not None:
@@ -54,6 +60,8 @@ def run(args: argparse.Namespace) -> int:
             f'without, {1e3 * error_map.after_m:.3f} mm with',
             highlight=False,
         )
+        files = ['error_map.json'] + ([] if args.apply is None else ['corrected.csv'])
+        say_written(*(args.out / name for name in files))
     return 0
 
 

@@ -12,6 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
+from anser_ros.cli.output import make_folder, say_written
 from anser_ros.sessions.evaluation import Evaluation, PoseSeries, metrics, track_session
 from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session
@@ -35,7 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--model', required=True, help="model file, or 'nominal' for the setup's own geometry"
     )
-    parser.add_argument('--out', required=True, type=Path, help='folder for the results')
+    parser.add_argument(
+        '--out', required=True, type=Path, help='folder for the results, made if missing'
+    )
     parser.add_argument('--baseline', help='distortion-free recording of the same board')
     parser.add_argument(
         '--refit', action='store_true', help='let the model follow the reference sensors'
@@ -65,6 +68,7 @@ def run(args: argparse.Namespace) -> int:
     session = load_session(args.session)
     model = model_for(args.model, session)
     baseline = load_session(args.baseline) if args.baseline else None
+    make_folder(args.out)
     console = Console(stderr=True)
     columns = (TextColumn('tracking'), BarColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not sys.stderr.isatty()) as bar:
@@ -80,7 +84,6 @@ def run(args: argparse.Namespace) -> int:
             progress=lambda share: bar.update(task, completed=share),
         )
     document = to_document(evaluation)
-    args.out.mkdir(parents=True, exist_ok=True)
     text = json.dumps(document, indent=1)
     (args.out / 'evaluation.json').write_text(text + '\n', encoding='utf-8')
     write_poses(args.out / 'poses.csv', evaluation)
@@ -91,6 +94,7 @@ def run(args: argparse.Namespace) -> int:
         print(text)
     else:
         Console().print(_table(document))
+        say_written(*(args.out / name for name in ('evaluation.json', 'poses.csv', 'bodies.csv')))
     return 0
 
 

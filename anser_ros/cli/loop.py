@@ -16,6 +16,7 @@ from rich.console import Console
 from anser_ros.cli.kernels import compile_kernels
 from anser_ros.cli.loop_result import parameter_errors, second_run, table, verdict
 from anser_ros.cli.loop_run import AFTER, Run, World, make_world, record
+from anser_ros.cli.output import make_folder, say_written
 from anser_ros.cli.supervisor import Supervisor, tail
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import DiagnosisError, ParameterError
@@ -54,7 +55,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--watch', action='store_true', help='tell too what the live watcher said in the first run'
     )
-    parser.add_argument('--out', type=Path, default=Path('recordings'), metavar='DIR')
+    parser.add_argument(
+        '--out', type=Path, default=Path('recordings'), metavar='DIR',
+        help='folder that gets a folder with all results, made if missing (%(default)s)',
+    )  # fmt: skip
     parser.add_argument('--json', action='store_true', help='print only the result, as JSON')
 
 
@@ -85,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     # A system that runs already must not be heard, nor hear what is simulated here.
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % LAST_DOMAIN))
     folder = args.out / time.strftime('loop_%Y%m%d_%H%M%S')
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     say = Console(stderr=True, highlight=False)
     with Supervisor(folder / 'logs') as supervisor:
         failed = compile_kernels(supervisor, say.print, lambda: False)
@@ -108,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps(document, indent=1))
     else:
         table(document['rounds'], Console(width=None if os.isatty(1) else 200))
-        print(f'folder: {folder}')
+        say_written(folder)
     return 0
 
 

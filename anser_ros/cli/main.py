@@ -5,7 +5,6 @@ command is a module of this folder with ``add_arguments(parser)`` and ``run(args
 imported only when it is the one asked for.
 """
 
-import argparse
 import importlib
 import os
 import sys
@@ -15,6 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import NoReturn
 
+from anser_ros.cli.one_line_parser import OneLineParser
 from anser_ros.errors import AnserError
 
 NODES = {
@@ -113,7 +113,7 @@ def run_verb(name: str, arguments: Sequence[str]) -> int:
         os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
         module = importlib.import_module(f'anser_ros.cli.{name}')
         summary = (module.__doc__ or '').strip().split('\n')[0]
-        parser = argparse.ArgumentParser(prog=f'anser {name}', description=summary)
+        parser = OneLineParser(prog=f'anser {name}', description=summary)
         module.add_arguments(parser)
         args = parser.parse_args(arguments)
         return int(module.run(args))
@@ -129,7 +129,7 @@ def run_verb(name: str, arguments: Sequence[str]) -> int:
             return EXIT_DEFECT
         print(f'anser {name}: {error.filename}: {error.strerror}', file=sys.stderr)
         return EXIT_BAD_INPUT
-    except SystemExit as leaving:  # argparse has said why
+    except SystemExit as leaving:  # the parser has said why
         return leaving.code if isinstance(leaving.code, int) else EXIT_BAD_INPUT
     except KeyboardInterrupt:
         print(f'anser {name}: interrupted', file=sys.stderr)

@@ -13,6 +13,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from anser_ros.cli.output import make_folder, say_written
 from anser_ros.errors import ParameterError
 from anser_ros.measured import (
     Row,
@@ -76,8 +77,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help=f'folder with measured/ (${SHARED}, or ../shared of the source)',
     )
-    parser.add_argument('--out', type=Path, help='folder for measured.json and the candidates')
-    parser.add_argument('--bags', type=Path, help='folder for MCAP sessions of the data')
+    parser.add_argument(
+        '--out',
+        type=Path,
+        help='folder for measured.json and the candidates, made if missing',
+    )
+    parser.add_argument(
+        '--bags', type=Path, help='folder for MCAP sessions of the data, made if missing'
+    )
     parser.add_argument('--quiet', action='store_true', help='only the table, no candidates')
     parser.add_argument('--json', action='store_true', help='print measured.json on stdout')
 
@@ -89,6 +96,8 @@ def run(args: argparse.Namespace) -> int:
         raise ParameterError(f'no data set {wrong[0]!r}; there are {", ".join(STUDIES)}')
     shared = shared_folder(args.shared)
     console = Console(stderr=args.json, width=None if os.isatty(1) else 200)
+    for folder in filter(None, (args.out, args.bags)):
+        make_folder(folder)
     rows: list[Row] = []
     if args.bags is not None:
         _write_bags(args.datasets or STUDIES, shared, args.bags, console)
@@ -98,7 +107,6 @@ def run(args: argparse.Namespace) -> int:
         if not args.quiet and not args.json:
             console.print(text, markup=False, highlight=False, soft_wrap=True)
         if args.out is not None:
-            args.out.mkdir(parents=True, exist_ok=True)
             (args.out / f'{name}.txt').write_text(text + '\n', encoding='utf-8')
     document = json.dumps(to_document(rows), indent=1)
     if args.out is not None:
@@ -107,6 +115,8 @@ def run(args: argparse.Namespace) -> int:
         print(document)
     else:
         console.print(table(rows))
+        if args.out is not None:
+            say_written(args.out)
     return 0
 
 

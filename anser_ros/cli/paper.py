@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from anser_ros.cli.output import make_folder, say_written
 from anser_ros.experiments.figures import draw_all
 from anser_ros.experiments.recordings import (
     Recordings,
@@ -30,7 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--sessions', type=Path, help='folder of the recordings; simulated where there is none'
     )
     parser.add_argument(
-        '--out', type=Path, default=Path('out/paper'), help='folder for the report'
+        '--out',
+        type=Path,
+        default=Path('out/paper'),
+        help='folder for the report, made if missing',
     )
     parser.add_argument('--simulate', action='store_true', help='use our own simulator anyway')
     parser.add_argument('--seed', type=int, default=1, help='of our own simulator')
@@ -39,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
+    make_folder(args.out)
     console = Console(stderr=True)
     columns = (TextColumn('{task.description}'), BarColumn(), TimeElapsedColumn())
     with (
@@ -51,7 +56,6 @@ def run(args: argparse.Namespace) -> int:
             recordings, lambda name, share: bar.update(task, description=name, completed=share)
         )
         results = study.run()
-        args.out.mkdir(parents=True, exist_ok=True)
         figures = draw_all(study, args.out)
     write_report(results, figures, args.out / 'paper.md')
     text = json.dumps(results.document(), indent=1)
@@ -60,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
         print(text)
     else:
         Console().print(_table(results))
-        Console().print(f'report: {args.out / "paper.md"}', highlight=False)
+        say_written(args.out / 'paper.md', args.out / 'paper.json')
     return 0
 
 
