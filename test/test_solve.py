@@ -50,7 +50,7 @@ def nearby(rng, position, axis, move=2e-3, turn=0.035):
 def test_kernel_is_the_public_jacobian(rng, length):
     position, axis = pose(rng)
     basis = np.empty((7, len(FIELD.positions)))
-    fill_coil_basis(position, axis, length, FIELD.positions, FIELD.directions, basis)
+    fill_coil_basis(position, axis, length, FIELD.columns, basis)
     flux, *slopes = basis @ FIELD.moments
     value, by_place, by_axis = flux_jacobian(
         position[None], axis[None], np.array([length]), MODEL.positions, MODEL.directions,

@@ -54,8 +54,8 @@ def fill_common(modes, inverse_sigma, common):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model='numpy')
 def fill_body(  # type: ignore[no-untyped-def]
-    position, rotation, offsets, axes, lengths, flux, inverse_sigma, positions, directions,
-    moments, basis, residual, white,
+    position, rotation, offsets, axes, lengths, flux, inverse_sigma, dipoles, moments, basis,
+    residual, white,
 ):  # fmt: skip
     """Write a pose's residual (S, 2K) and ``white`` (7, S 2K).
 
@@ -66,9 +66,8 @@ def fill_body(  # type: ignore[no-untyped-def]
     arms, turned = np.dot(offsets, rotation.T), np.dot(axes, rotation.T)
     for s in range(coils):
         fill_coil_basis(
-            position + arms[s], turned[s], lengths[s], positions, directions,
-            basis[7 * s : 7 * s + 7],
-        )  # fmt: skip
+            position + arms[s], turned[s], lengths[s], dipoles, basis[7 * s : 7 * s + 7]
+        )
     model = np.dot(basis, moments)
     for s in range(coils):
         m = model[7 * s : 7 * s + 7]
@@ -118,21 +117,21 @@ def _turned(vector, rotation):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model='numpy')
 def descend_body(  # type: ignore[no-untyped-def]
-    position, rotation, offsets, axes, lengths, flux, inverse_sigma, common, positions,
-    directions, moments, low, high, budget, residual, white, information,
+    position, rotation, offsets, axes, lengths, flux, inverse_sigma, common, dipoles, moments,
+    low, high, budget, residual, white, information,
 ):  # fmt: skip
     """Move ``position`` and ``rotation`` (in place) to the least chi-square near them.
 
     ``residual``, ``white`` as `fill_body` leaves them at the last look, ``information`` (6, 6).
     Returns chi-square, evaluations used, whether it converged.
     """
-    basis = np.empty((7 * offsets.shape[0], positions.shape[0]))
+    basis = np.empty((7 * offsets.shape[0], dipoles.shape[1]))
     trial_residual, trial_white = np.empty_like(residual), np.empty_like(white)
     step, factor, gradient = np.empty(6), np.empty((6, 6)), np.empty(6)
     trial_position = np.empty(3)
     fill_body(
-        position, rotation, offsets, axes, lengths, flux, inverse_sigma, positions, directions,
-        moments, basis, residual, white,
+        position, rotation, offsets, axes, lengths, flux, inverse_sigma, dipoles, moments, basis,
+        residual, white,
     )  # fmt: skip
     products = _products(white, common)
     chi2, used, damping, converged = products[0, 0], 1, FIRST_DAMPING, False
@@ -154,7 +153,7 @@ def descend_body(  # type: ignore[no-untyped-def]
             return chi2 - promised, used, True
         fill_body(
             trial_position, trial_rotation, offsets, axes, lengths, flux, inverse_sigma,
-            positions, directions, moments, basis, trial_residual, trial_white,
+            dipoles, moments, basis, trial_residual, trial_white,
         )  # fmt: skip
         used += 1
         products = _products(trial_white, common)

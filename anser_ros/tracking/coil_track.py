@@ -30,9 +30,9 @@ CHANGED = 3.0
 """A suspect's chi-square that changes by this factor calls for a scan before its time."""
 MOST_STEPS = 2.5
 """Motion is carried on for so many of the last step's durations."""
-ERROR_REACH_M = 3e-3
 ERROR_REACH = 0.05
-"""Move (m) and turn (chord of the axes) up to which the model's error at a pose is reused."""
+"""Move, as a part of the distance from the nearest uncertain dipole, and turn (chord of the axes)
+up to which the model's error at a pose is reused."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,8 @@ class PoseErrors:
         Flux errors of one standard deviation each, T.
     whitening : ndarray, shape (1, 2K) or (2K, 2K)
         1/T; see `whitening_of`.
+    reach_m : float
+        Move up to which this is still good.
     """
 
     scene: Scene
@@ -54,6 +56,7 @@ class PoseErrors:
     axis: Array
     errors: Array
     whitening: Array
+    reach_m: float
 
     def holds(self, scene: Scene, position: Array, axis: Array) -> bool:
         """Whether this is still good for a scene and a pose."""
@@ -63,7 +66,7 @@ class PoseErrors:
         if own.sigma is not scene.sigma and not np.array_equal(own.sigma, scene.sigma):
             return False
         return scene.modes is None or (
-            math.dist(position, self.position) < ERROR_REACH_M
+            math.dist(position, self.position) < self.reach_m
             and math.dist(axis, self.axis) < ERROR_REACH
         )
 
@@ -152,8 +155,9 @@ class CoilResult:
 
 def take_errors(scene: Scene, points: Array, axes: Array, lengths: Array) -> list[PoseErrors]:
     """Work out the model's error for sensors (S of them) at some poses, all of them at once."""
-    errors, whitening = scene.error_whitening(points, axes, lengths)
-    return list(map(PoseErrors, repeat(scene), points, axes, errors, whitening))
+    errors, whitening, away = scene.error_whitening(points, axes, lengths)
+    reach = (ERROR_REACH * away).tolist()
+    return list(map(PoseErrors, repeat(scene), points, axes, errors, whitening, reach))
 
 
 def prepare(
@@ -190,7 +194,8 @@ def _whitening(
     if track.error is None or not track.error.holds(scene, position, axis):
         if scene.modes is None:
             empty = np.empty((0, scene.sigma.size))
-            track.error = PoseErrors(scene, position, axis, empty, whitening_of(scene.sigma))
+            weights = whitening_of(scene.sigma)
+            track.error = PoseErrors(scene, position, axis, empty, weights, math.inf)
         else:
             (track.error,) = take_errors(scene, position[None], axis[None], np.array([length]))
     return track.error.whitening

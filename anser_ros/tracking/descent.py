@@ -27,45 +27,52 @@ what a sixth of a sigma leaves, of second order, is less than a thousandth of a 
 
 
 @numba.njit(cache=True, error_model='numpy')
-def fill_coil_basis(point, axis, length, positions, directions, basis):  # type: ignore[no-untyped-def]
+def fill_coil_basis(point, axis, length, dipoles, basis):  # type: ignore[no-untyped-def]
     """Write what each unit dipole does to a coil into ``basis``, shape (7, N).
 
     Row 0 holds the flux, rows 1 to 3 its derivatives by the position, rows 4 to 6 those by the
     free axis vector (the Gauss points move with it). One product with the moments gives all of it.
+    ``dipoles`` (6, N): `solve.RealField.columns`. Loops run along its rows and write few arrays
+    each, so that they go through vector registers.
     """
     half = length * GAUSS_OFFSET
     count = 1 if half == 0.0 else 2
     scale = DIPOLE_CONSTANT / count
     nx, ny, nz = axis[0], axis[1], axis[2]
+    px, py, pz = dipoles[0], dipoles[1], dipoles[2]
+    vx, vy, vz = dipoles[3], dipoles[4], dipoles[5]
+    flux, work = basis[0], np.empty((4, dipoles.shape[1]))
+    along, across, away, near = work[0], work[1], work[2], work[3]
     for s in range(count):
         h = half * (1 - 2 * s)
         x, y, z = point[0] + h * nx, point[1] + h * ny, point[2] + h * nz
-        for j in range(positions.shape[0]):
-            dx, dy, dz = x - positions[j, 0], y - positions[j, 1], z - positions[j, 2]
-            ux, uy, uz = directions[j, 0], directions[j, 1], directions[j, 2]
+        for j in range(px.shape[0]):
+            dx, dy, dz = x - px[j], y - py[j], z - pz[j]
+            ux, uy, uz = vx[j], vy[j], vz[j]
             inv2 = 1.0 / (dx * dx + dy * dy + dz * dz)
             k3 = scale * inv2 * math.sqrt(inv2)
             k5 = 3.0 * k3 * inv2
             du = dx * ux + dy * uy + dz * uz
             dn = dx * nx + dy * ny + dz * nz
             nu = nx * ux + ny * uy + nz * uz
-            a, e, q = k5 * du, k5 * dn, k5 * (nu - 5.0 * du * dn * inv2)
-            gx = a * nx + e * ux + q * dx
-            gy = a * ny + e * uy + q * dy
-            gz = a * nz + e * uz + q * dz
-            bx, by, bz = a * dx - k3 * ux, a * dy - k3 * uy, a * dz - k3 * uz
-            if s == 0:
-                basis[0, j] = a * dn - k3 * nu
-                basis[1, j], basis[2, j], basis[3, j] = gx, gy, gz
-                basis[4, j], basis[5, j], basis[6, j] = bx + h * gx, by + h * gy, bz + h * gz
-            else:
-                basis[0, j] += a * dn - k3 * nu
-                basis[1, j] += gx
-                basis[2, j] += gy
-                basis[3, j] += gz
-                basis[4, j] += bx + h * gx
-                basis[5, j] += by + h * gy
-                basis[6, j] += bz + h * gz
+            a = k5 * du
+            along[j], across[j], near[j] = a, k5 * dn, k3
+            away[j] = k5 * (nu - 5.0 * du * dn * inv2)
+            value = a * dn - k3 * nu
+            flux[j] = value if s == 0 else flux[j] + value
+        for i in range(3):
+            n, at = axis[i], point[i] + h * axis[i]
+            places, directions = dipoles[i], dipoles[3 + i]
+            slope, turn = basis[1 + i], basis[4 + i]
+            for j in range(places.shape[0]):
+                d, u = at - places[j], directions[j]
+                g = along[j] * n + across[j] * u + away[j] * d
+                b = along[j] * d - near[j] * u + h * g
+                if s == 0:
+                    slope[j], turn[j] = g, b
+                else:
+                    slope[j] += g
+                    turn[j] += b
 
 
 @numba.njit(cache=True, error_model='numpy')
@@ -224,8 +231,8 @@ def _promised(normal, gradient, step):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model='numpy')
 def descend(  # type: ignore[no-untyped-def]
-    position, axis, length, flux, whitening, positions, directions, moments, low, high, budget,
-    give_up, full, residual,
+    position, axis, length, flux, whitening, dipoles, moments, low, high, budget, give_up, full,
+    residual,
 ):  # fmt: skip
     """Move ``position`` and ``axis`` (in place) to the least chi-square near them.
 
@@ -233,14 +240,14 @@ def descend(  # type: ignore[no-untyped-def]
     Returns chi-square, evaluations used, whether it converged.
     """
     width = flux.shape[0]
-    basis = np.empty((7, positions.shape[0]))
+    basis = np.empty((7, dipoles.shape[1]))
     white, trial_white = np.empty((7, width)), np.empty((7, width))
     trial_residual = np.empty(width)
     tangent, step = np.empty((2, 3)), np.empty(5)
     normal, gradient, factor = np.empty((5, 5)), np.empty(5), np.empty((5, 5))
     trial_position, trial_axis = np.empty(3), np.empty(3)
 
-    fill_coil_basis(position, axis, length, positions, directions, basis)
+    fill_coil_basis(position, axis, length, dipoles, basis)
     chi2 = _whiten(flux, np.dot(basis, moments), whitening, residual, white)
     used, damping, growth, converged = 1, FIRST_DAMPING, 2.0, False
     while used < budget and not converged:
@@ -263,7 +270,7 @@ def descend(  # type: ignore[no-untyped-def]
                 position[:] = trial_position
                 axis[:] = trial_axis
                 break
-            fill_coil_basis(trial_position, trial_axis, length, positions, directions, basis)
+            fill_coil_basis(trial_position, trial_axis, length, dipoles, basis)
             used += 1
             model = np.dot(basis, moments)
             trial = _whiten(flux, model, whitening, trial_residual, trial_white)

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
-from anser_ros.physics.dipole import fill_flux_basis
+from anser_ros.physics.constants import DIPOLE_CONSTANT
+from anser_ros.physics.dipole import GAUSS_OFFSET
 
 Array = NDArray[np.float64]
 
@@ -46,10 +47,39 @@ def _fill_whitening(errors, sigma, factor, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model='numpy')
-def _fill_all(points, axes, lengths, positions, directions, modes, sigma, errors, out):  # type: ignore[no-untyped-def]
+def _fill_couplings(points, axes, lengths, dipoles, basis, away):  # type: ignore[no-untyped-def]
+    """Write each unit dipole's flux in each coil, and each coil's distance from the nearest."""
+    px, py, pz = dipoles[0], dipoles[1], dipoles[2]
+    ux, uy, uz = dipoles[3], dipoles[4], dipoles[5]
+    for p in range(points.shape[0]):
+        nx, ny, nz = axes[p, 0], axes[p, 1], axes[p, 2]
+        half = lengths[p] * GAUSS_OFFSET
+        count = 1 if half == 0.0 else 2
+        scale, row, nearest = DIPOLE_CONSTANT / count, basis[p], np.inf
+        for s in range(count):
+            h = half * (1 - 2 * s)
+            x, y, z = points[p, 0] + h * nx, points[p, 1] + h * ny, points[p, 2] + h * nz
+            for j in range(px.shape[0]):
+                dx, dy, dz = x - px[j], y - py[j], z - pz[j]
+                square = dx * dx + dy * dy + dz * dz
+                inv2 = 1.0 / square
+                inv3 = scale * inv2 * math.sqrt(inv2)
+                du = dx * ux[j] + dy * uy[j] + dz * uz[j]
+                dn = dx * nx + dy * ny + dz * nz
+                nu = nx * ux[j] + ny * uy[j] + nz * uz[j]
+                value = inv3 * (3.0 * du * dn * inv2 - nu)
+                row[j] = value if s == 0 else row[j] + value
+        for j in range(px.shape[0]):
+            dx, dy, dz = points[p, 0] - px[j], points[p, 1] - py[j], points[p, 2] - pz[j]
+            nearest = min(nearest, dx * dx + dy * dy + dz * dz)
+        away[p] = math.sqrt(nearest)
+
+
+@numba.njit(cache=True, error_model='numpy')
+def _fill_all(points, axes, lengths, dipoles, modes, sigma, errors, out, away):  # type: ignore[no-untyped-def]
     width = sigma.shape[0]
-    basis, factor = np.empty((points.shape[0], positions.shape[0])), np.empty((width, width))
-    fill_flux_basis(points, axes, lengths, positions, directions, basis)
+    basis, factor = np.empty((points.shape[0], dipoles.shape[1])), np.empty((width, width))
+    _fill_couplings(points, axes, lengths, dipoles, basis, away)
     errors[:] = np.dot(basis, modes).reshape(errors.shape)
     good = True
     for s in range(points.shape[0]):
@@ -61,11 +91,10 @@ def error_whitening(
     points: Array,
     axes: Array,
     lengths: Array,
-    positions: Array,
-    directions: Array,
+    dipoles: Array,
     modes: Array,
     sigma: Array,
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """What the model's error does to coils, and what makes their residuals of unit covariance.
 
     Parameters
@@ -74,8 +103,8 @@ def error_whitening(
         Coil centres (m) and unit axes, frame fg.
     lengths : ndarray, shape (S,)
         Coil lengths, m.
-    positions, directions : ndarray, shape (N, 3)
-        The dipoles whose moments are uncertain.
+    dipoles : ndarray, shape (6, N)
+        The dipoles whose moments are uncertain: rows of `RealField.columns`.
     modes : ndarray, shape (N, R 2K)
         Moments' errors of one standard deviation each, A m^2.
     sigma : ndarray, shape (2K,)
@@ -87,6 +116,8 @@ def error_whitening(
         Flux errors of one standard deviation each, T.
     whitening : ndarray, shape (S, 2K, 2K)
         1/T, lower triangular.
+    away : ndarray, shape (S,)
+        Distance from the nearest of the dipoles, m.
 
     Raises
     ------
@@ -96,8 +127,7 @@ def error_whitening(
     count, width = len(points), len(sigma)
     errors = np.empty((count, modes.shape[1] // width, width))
     whitening = np.empty((count, width, width))
-    if not _fill_all(
-        points, axes, lengths, positions, directions, modes, sigma, errors, whitening
-    ):
+    away = np.empty(count)
+    if not _fill_all(points, axes, lengths, dipoles, modes, sigma, errors, whitening, away):
         raise TrackingError('the model covariance must be finite')
-    return errors, whitening
+    return errors, whitening, away

@@ -161,8 +161,7 @@ def solve_body(
     information = np.empty((6, 6))
     chi2, used, converged = descend_body(
         r, turn, coils.offsets, coils.axes, coils.lengths, flux, inverse_sigma, common,
-        field.positions, field.directions, field.moments, low, high, budget, residual, white,
-        information,
+        field.columns, field.moments, low, high, budget, residual, white, information,
     )  # fmt: skip
     coil_chi2 = (white[0].reshape(count, width) ** 2).sum(axis=1)
     return BodySolution(r, turn, chi2, information, residual, coil_chi2, used, converged)

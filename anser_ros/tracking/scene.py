@@ -156,16 +156,21 @@ class Scene:
         return float(np.sqrt(np.median(power)))
 
     @cached_property
-    def _uncertain(self) -> tuple[Array, Array]:
-        """Positions and directions of the dipoles whose moments are uncertain."""
+    def _uncertain(self) -> Array:
+        """The dipoles whose moments are uncertain, as in `RealField.columns`."""
         assert self.modes is not None
-        return self.field.positions[self.modes.rows], self.field.directions[self.modes.rows]
+        return self.field.columns.take(self.modes.rows, axis=1)
 
-    def error_whitening(self, points: Array, axes: Array, lengths: Array) -> tuple[Array, Array]:
-        """Flux errors (S, R, 2K), T, and whitening (S, 2K, 2K), 1/T, of coils at some poses."""
+    def error_whitening(
+        self, points: Array, axes: Array, lengths: Array
+    ) -> tuple[Array, Array, Array]:
+        """Flux errors (S, R, 2K), T, and whitening (S, 2K, 2K), 1/T, of coils at some poses.
+
+        The third is their distance (S,) from the nearest dipole that is uncertain, m.
+        """
         assert self.modes is not None
         return error_whitening(
-            points, axes, lengths, *self._uncertain, self.modes.moments, self.sigma
+            points, axes, lengths, self._uncertain, self.modes.moments, self.sigma
         )
 
 

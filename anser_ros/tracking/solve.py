@@ -9,6 +9,7 @@ Optimization, section 10.3); each trial costs one evaluation of the field and of
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +66,11 @@ class RealField:
         if not (np.isfinite(r).all() and np.isfinite(u).all() and np.isfinite(m).all()):
             raise TrackingError('a field model must be finite')
         return cls(r, u, m.view(np.float64))
+
+    @cached_property
+    def columns(self) -> Array:
+        """Coordinates of the positions and of the directions in rows, shape (6, N)."""
+        return np.ascontiguousarray(np.concatenate([self.positions, self.directions], axis=1).T)
 
     @property
     def emitters(self) -> int:
@@ -187,7 +193,7 @@ def solve_coil(
     r, n = np.array(position, dtype=np.float64), np.array(axis, dtype=np.float64)
     normal, residual = np.empty((6, 6)), np.empty(width)
     chi2, used, converged = descend(
-        r, n, length_m, flux, whitening, field.positions, field.directions, field.moments, low,
-        high, budget, give_up, normal, residual,
+        r, n, length_m, flux, whitening, field.columns, field.moments, low, high, budget,
+        give_up, normal, residual,
     )  # fmt: skip
     return CoilSolution(r, n, chi2, normal, residual, used, converged)
