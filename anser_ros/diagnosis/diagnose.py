@@ -224,7 +224,8 @@ def _concluded(
     floor = min(scale * expected, rms(after))
     tests = tuple(structure_tests(after))
     excess = max(rms(after) ** 2 - floor**2, 0.0)
-    significant = excess > 0.03 * floor**2
+    structured = any(test.significant for test in tests)
+    significant = excess > (0.03 if structured else 0.1) * floor**2
     possible = max(rms(before) ** 2 - floor**2, excess)
     findings = [
         _finding(fit, i, term, unseen, search)

@@ -11,7 +11,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.choice import STEADY, at_floor, choose, complexity, taken_from_others
+from anser_ros.diagnosis.choice import (
+    OPEN,
+    STEADY,
+    at_floor,
+    choose,
+    complexity,
+    taken_from_others,
+)
 from anser_ros.diagnosis.confirm import doubtful
 from anser_ros.diagnosis.fit import Fit, fit_terms, misfit
 from anser_ros.diagnosis.fluctuating import fluctuation_of, left_over
@@ -187,6 +194,20 @@ def _round(
     if not fitted:
         return None
     gain, best = choose(fitted)
+
+    def shaped(start: Fit, explained: float) -> Fit:
+        return moves_or_rests(
+            problem, blocks, start, fitted, lambda s: _scored(problem, s), explained, how.folds,
+            how.iterations,
+        )  # fmt: skip
+
+    metal = _metal_beside(best, gain, fitted)
+    if metal is not None:
+        # What bends with dozens of parameters is no match for metal before that has its shape.
+        settled_metal = shaped(metal[1], metal[0])
+        if scorer.held_out - settled_metal.held_out(how.folds) > gain:
+            search.metal_gain = max(search.metal_gain, metal[0])
+            return settled_metal
     term = best.terms[-1]
     if not worth(gain, complexity(term), best, how):
         return None
@@ -200,10 +221,7 @@ def _round(
         if f is not best and g > gain - 10 * max(misfit(best), 1.0) - 0.02 * abs(gain)
     ]
     if term.effect.name == 'moving_metal':
-        return moves_or_rests(
-            problem, blocks, best, fitted, lambda s: _scored(problem, s), gain, how.folds,
-            how.iterations,
-        )  # fmt: skip
+        return shaped(best, gain)
     search.close[term.label] = [
         f.terms[-1]
         for g, f in fitted
@@ -212,6 +230,21 @@ def _round(
     if any(t.effect.name in METALS for t in best.terms):
         return settled(problem, best.terms, blocks, how.folds, how.iterations)
     return best
+
+
+def _metal_beside(
+    best: Fit, gain: float, fitted: Sequence[tuple[float, Fit]]
+) -> tuple[float, Fit] | None:
+    """Moving metal that explains nearly as much as a curve with many parameters."""
+    newest = best.terms[-1]
+    if newest.effect.name in METALS or complexity(newest) < OPEN or at_floor(best):
+        return None
+    metals = [
+        (g, f)
+        for g, f in fitted
+        if f.terms[-1].effect.name == 'moving_metal' and g > PROMISING * gain
+    ]
+    return max(metals, key=lambda pair: pair[0], default=None)
 
 
 def _fluctuating(problem: Problem, before: Fit, how: SearchSettings) -> list[tuple[float, Term]]:
