@@ -370,6 +370,30 @@ def test_a_coupled_body_is_a_sum_of_few_multipoles():
     assert np.linalg.norm(left) < 3e-3 * np.linalg.norm(wanted)
 
 
+@pytest.mark.parametrize('metal', ['static_metal', 'conductive_plate', 'moving_metal'])
+def test_a_coil_that_moved_lights_metal_from_where_it_is(scenery, metal):
+    """The same as metal in a world that has the coil there from the start."""
+    _, problem = scenery
+    tool, fields = problem.tools[0], problem.fields
+    found = {term.effect.name: term for term in _candidates(problem.scene)}
+    body = _in_force(found[metal])
+    coil = found['coil_moved'].with_theta(np.array([0.004, -0.003, 0.002]))
+    alone = tool_view(tool, [body], fields).flux
+    both = tool_view(tool, [coil, body], fields).flux
+
+    def there(before: Dipoles) -> Dipoles:
+        added = coil.effect.sources(coil, before, before, fields.omega)
+        assert added is not None
+        return before.joined(added)
+
+    moved = replace(fields, model=there(fields.model), illumination=there(fields.illumination))
+    np.testing.assert_allclose(both, tool_view(tool, [body], moved).flux, rtol=1e-9, atol=1e-18)
+    k = coil.site['coil']
+    lit_anew = both - tool_view(tool, [coil], fields).flux
+    lit_before = alone - tool_view(tool, [], fields).flux
+    assert np.abs((lit_anew - lit_before)[..., k]).max() > 0.01 * np.abs(lit_before[..., k]).max()
+
+
 def test_leftovers_are_linear_and_belong_to_their_metal(scenery):
     _, problem = scenery
     found = next(t for t in _candidates(problem.scene) if t.effect.name == 'static_metal')

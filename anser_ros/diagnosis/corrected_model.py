@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import Remedy, Term
-from anser_ros.effects.prediction import Fields
+from anser_ros.effects.prediction import Fields, lit
 from anser_ros.fitting.model import EffectRecord, FieldModel
 
 Array = NDArray[np.float64]
@@ -22,9 +22,10 @@ def corrected_model(
     Metal that moves is not baked in: where it is, the live refit finds from the references.
     """
     dipoles = Dipoles(model.positions, model.directions, model.moments)
+    light = lit(terms, fields.illumination)
     for term in terms:
         if term.effect.remedy is Remedy.FIELD and not term.effect.moving:
-            added = term.effect.sources(term, fields.model, fields.illumination, fields.omega)
+            added = term.effect.sources(term, fields.model, light, fields.omega)
             if added is not None:
                 dipoles = dipoles.joined(added)
     if dipoles.positions.shape[0] == model.positions.shape[0]:

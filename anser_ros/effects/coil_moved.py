@@ -48,6 +48,14 @@ class CoilMoved(Effect):
         self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
         """The emitter at its new place, less the one at the old."""
+        return self._shifted(term, base)
+
+    def light(self, term: Term, illumination: Dipoles) -> Dipoles:
+        """What metal sees has moved too."""
+        return illumination.joined(self._shifted(term, illumination))
+
+    @staticmethod
+    def _shifted(term: Term, base: Dipoles) -> Dipoles:
         only = np.zeros_like(base.moments)
         only[:, term.site['coil']] = base.moments[:, term.site['coil']]
         used = np.flatnonzero(np.abs(only).any(axis=1))

@@ -258,10 +258,6 @@ class Effect:
         """Standard deviation of each parameter before anything is measured, shape (q,)."""
         return np.ones(term.theta.size)
 
-    def anchored(self, term: Term) -> NDArray[np.bool_]:
-        """Parameters whose prior is about zero, (q,); others' is about where a fit starts."""
-        return np.zeros(term.theta.size, dtype=bool)
-
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """Derivative of the view's flux by the parameters, (F, S, K, q), or None."""
         return None

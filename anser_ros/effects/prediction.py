@@ -52,6 +52,7 @@ def tool_view(body: Measurements, terms: Sequence[Term], fields: Fields) -> View
         sensors = term.effect.table(term, sensors)
     centres, axes = sensors.placed(position, rotation)
     dipoles = _with_sources(fields.model, terms, fields)
+    light = lit(terms, fields.illumination)
     lengths = np.tile(sensors.length, body.time.size)
     flux, d_position, d_axis = flux_jacobian(
         centres.reshape(-1, 3), axes.reshape(-1, 3), lengths,
@@ -65,7 +66,7 @@ def tool_view(body: Measurements, terms: Sequence[Term], fields: Fields) -> View
         time=body.time, sensors=sensors, position=position, rotation=rotation, velocity=velocity,
         centres=centres, axes=axes, linear=flux.reshape(*shape, -1),
         flux=flux.reshape(*shape, -1), d_position=d_position, d_axis=d_axis, d_turn=d_turn,
-        dipoles=dipoles, illumination=fields.illumination, omega=fields.omega, is_reference=False,
+        dipoles=dipoles, illumination=light, omega=fields.omega, is_reference=False,
     )  # fmt: skip
     return _measured(_with_motion(view, terms), terms)
 
@@ -98,7 +99,8 @@ def reference_view(
         d_position=np.broadcast_to(d_position, (frames, *d_position.shape)),
         d_axis=np.broadcast_to(d_axis, (frames, *d_axis.shape)),
         d_turn=np.broadcast_to(np.zeros_like(d_axis), (frames, *d_axis.shape)),
-        dipoles=base.joined(added), illumination=base, omega=fields.omega, is_reference=True,
+        dipoles=base.joined(added), illumination=lit(terms, base), omega=fields.omega,
+        is_reference=True,
     )  # fmt: skip
     return _measured(_with_motion(view, terms), terms)
 
@@ -134,12 +136,19 @@ def _poses(body: Measurements, terms: Sequence[Term]) -> tuple[Array, Array, Arr
     return position, rotation, np.concatenate([after - before, spin], axis=1) / span
 
 
+def lit(terms: Sequence[Term], illumination: Dipoles) -> Dipoles:
+    """The emitters' own field where metal is, with what the effects do to it."""
+    for term in terms:
+        illumination = term.effect.light(term, illumination)
+    return illumination
+
+
 def _with_sources(
     start: Dipoles, terms: Sequence[Term], fields: Fields, base: Dipoles | None = None
 ) -> Dipoles:
-    out = start
+    out, light = start, lit(terms, fields.illumination)
     for term in terms:
-        added = term.effect.sources(term, base or fields.model, fields.illumination, fields.omega)
+        added = term.effect.sources(term, base or fields.model, light, fields.omega)
         if added is not None:
             out = out.joined(added)
     return out

@@ -102,7 +102,9 @@ class Judge:
             if not done['failed']:
                 summary['document'] = json.loads((out / 'diagnosis.json').read_text())
                 found = out / 'model.yaml'
-                summary['after'] = self.tracked(board, name, 'after', found)
+                effects = {effect['name'] for effect in summary['document']['effects']}
+                live = ['--refit', *scan] if 'moving_metal' in effects else []
+                summary['after'] = self.tracked(board, name, 'after', found, *live)
         target = self.runs / board / name / 'summary.json'
         target.write_text(json.dumps(summary, indent=1) + '\n')
         return summary
