@@ -3,6 +3,7 @@
 import re
 import signal
 import sys
+import threading
 import time
 from collections import Counter
 from pathlib import Path
@@ -14,6 +15,7 @@ from conftest import Process, spin_until
 from anser_ros.wire import cdr
 from anser_ros.wire.bag import Salvage, iter_messages
 from anser_ros.wire.bag_writer import BagWriter, SessionWriter
+from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.points import FluxPoints, encode_flux
 
 START_NS = 1_750_000_000 * 10**9
@@ -114,6 +116,51 @@ def test_as_fast_as_taken_loses_nothing(start, listener, tmp_path):
     assert listener.arrivals[-1] - listener.arrivals[0] < 3.0 * 0.9
 
 
+def test_who_listens_to_poses_may_be_slower_than_the_tracker(ros, start, tmp_path):
+    """A relay stands in for the tracker; the queue of who listens holds five."""
+    from geometry_msgs.msg import PoseStamped
+    from rclpy.executors import SingleThreadedExecutor
+    from sensor_msgs.msg import PointCloud2
+
+    bag, topic, count = tmp_path / 'a.mcap', 'tool_a_0/x/pose', 50
+    with SessionWriter(bag) as session:
+        session.write_setup(read_config('demo_setup.yaml'), START_NS)
+        for n in range(count):
+            session.write_flux('/anser/tool/flux', START_NS + n * PERIOD_NS, *flux_cloud(n))
+    relay, slow = ros.create_node('relay', namespace='anser'), ros.create_node('slow')
+    poses = relay.create_publisher(PoseStamped, topic, 100)
+    relay.create_subscription(
+        PointCloud2, 'tool/flux', lambda m: poses.publish(PoseStamped(header=m.header)), 100
+    )
+    got = []
+
+    def take(message):
+        time.sleep(0.03)
+        got.append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+
+    slow.create_subscription(PoseStamped, f'/anser/{topic}', take, 5)
+    executors = [SingleThreadedExecutor(), SingleThreadedExecutor()]
+    executors[0].add_node(relay)
+    executors[1].add_node(slow)
+    thread = threading.Thread(target=executors[0].spin)
+    thread.start()
+    try:
+        process = start('replay', bag, '--rate', '0')
+        end = time.monotonic() + 30.0
+        while process.popen.poll() is None and time.monotonic() < end:
+            executors[1].spin_once(timeout_sec=0.05)
+        while len(got) < count and time.monotonic() < end:
+            executors[1].spin_once(timeout_sec=0.05)
+            end = min(end, time.monotonic() + 2.0)
+    finally:
+        executors[0].shutdown()
+        thread.join()
+        executors[1].shutdown()
+        relay.destroy_node()
+        slow.destroy_node()
+    assert got == [START_NS + n * PERIOD_NS for n in range(count)], process.output
+
+
 def test_loop_in_another_namespace_ends_at_a_signal(start, listener, tmp_path):
     bag = make_session(tmp_path / 'a.mcap', 10)
     command = ('replay', bag, '--loop', '--rate', '5', '--ros-args', '-r', '__ns:=/other')
@@ -196,6 +243,24 @@ def test_nobody_listens(ros, tmp_path):
     assert node.exit_code == 0 and node.counters['no_listeners'] == 1
     node.close()
     node.destroy_node()
+
+
+def test_a_node_that_is_still_starting_is_waited_for_longer(ros, tmp_path):
+    """A tracker that compiles its kernels is in the graph, and has not said a word yet."""
+    from sensor_msgs.msg import PointCloud2
+
+    from anser_ros.nodes import replay
+
+    starting = ros.create_node('tracker', namespace='anser')
+    starting.create_subscription(PointCloud2, 'tool/flux', lambda _: None, 10)
+    began = time.monotonic()
+    node = replay.Replay(str(make_session(tmp_path / 'a.mcap', 3)), rate=100.0, wait=0.5)
+    assert spin_until(node, lambda: node.exit_code is not None)
+    assert 3.0 <= time.monotonic() - began < 8.0
+    assert node.exit_code == 0 and node.counters['no_listeners'] == 1
+    node.close()
+    node.destroy_node()
+    starting.destroy_node()
 
 
 BAGS = Path(__file__).resolve().parents[1] / 'bags'

@@ -55,6 +55,12 @@ class Readiness:
         What is going to be published.
     setup_text : str
         The setup that has been published; empty where there is none.
+
+    Attributes
+    ----------
+    is_starting : bool
+        Whether :meth:`missing` found a node that has not said a word yet: it may be compiling its
+        kernels for the first time.
     """
 
     def __init__(self, node: AnserNode, fluxes: list[Any], setup_text: str) -> None:
@@ -75,6 +81,7 @@ class Readiness:
         self._told: dict[str, _Told] = {}
         self._seen: object = None
         self._since_s = time.monotonic()
+        self.is_starting = False
         self._subscription = node.create_subscription(
             DiagnosticArray, '/diagnostics', self._on_diagnostics, qos.EVENTS
         )
@@ -95,6 +102,7 @@ class Readiness:
         seen = (listeners, matched, wanted, given, working, reached)
         if seen != self._seen:
             self._seen, self._since_s = seen, now_s
+        self.is_starting = any(name.strip('/') not in self._told for name in working)
         quiet_s = now_s - self._since_s
         if not any(matched):
             return 'nobody listens to the fluxes'

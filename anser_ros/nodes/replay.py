@@ -27,8 +27,10 @@ FLUX_ENDINGS = ('/tool/flux', '/reference/flux')
 # What the nodes that listen will publish themselves.
 OUTPUT_ENDINGS = ('/pose', '/pose_with_covariance', '/field_model')
 OUTPUT_TOPICS = ('/diagnostics', '/tf', '/tf_static', '/clock')
-# A tracker that compiles its kernels for the first time listens late.
 WAIT_S = 30.0
+# So many times as long for a node that is there and starting: on a slow or busy machine it takes a
+# minute or two to compile its kernels for the first time.
+STARTING_FACTOR = 6.0
 POLL_S = 0.05
 # Who is waited for is said after so long.
 TELL_AFTER_S = 3.0
@@ -75,9 +77,10 @@ class Replay(AnserNode):
         )
         parser.add_argument(
             '--wait', type=float, default=WAIT_S,
-            help='longest wait for listeners, s (%(default)g): it begins when all nodes that take '
-            'the fluxes are ready, and all who listen to them or to poses are connected, not '
-            'before it has looked around for 3 s; who starts to listen later misses what is out',
+            help='longest wait for listeners, s (%(default)g; six times as long for a node that '
+            'is still starting): it begins when all nodes that take the fluxes are ready, and all '
+            'who listen to them or to poses are connected, not before it has looked around for '
+            '3 s; who starts to listen later misses what is out',
         )  # fmt: skip
 
     def __init__(
@@ -184,8 +187,8 @@ class Replay(AnserNode):
             waited_s, missing = time.monotonic() - began_s, readiness.missing()
             if not missing:
                 break
-            if waited_s > self._wait_s:
-                self.warn('no_listeners', f'begins after {self._wait_s:g} s although {missing}')
+            if waited_s > self._wait_s * (STARTING_FACTOR if readiness.is_starting else 1.0):
+                self.warn('no_listeners', f'begins after {waited_s:.3g} s although {missing}')
                 break
             if waited_s > TELL_AFTER_S and missing != told:
                 told = missing
