@@ -28,9 +28,9 @@ FLUX_ENDINGS = ('/tool/flux', '/reference/flux')
 OUTPUT_ENDINGS = ('/pose', '/pose_with_covariance', '/field_model')
 OUTPUT_TOPICS = ('/diagnostics', '/tf', '/tf_static', '/clock')
 WAIT_S = 30.0
-# So many times as long for a node that is there and starting: on a slow or busy machine it takes a
-# minute or two to compile its kernels for the first time.
-STARTING_FACTOR = 6.0
+# A node that is there and starting is given so many times that before it counts: on a slow or busy
+# machine it takes a minute or two to compile its kernels for the first time.
+STARTING_FACTOR = 5.0
 POLL_S = 0.05
 # Who is waited for is said after so long.
 TELL_AFTER_S = 3.0
@@ -77,10 +77,10 @@ class Replay(AnserNode):
         )
         parser.add_argument(
             '--wait', type=float, default=WAIT_S,
-            help='longest wait for listeners, s (%(default)g; six times as long for a node that '
-            'is still starting): it begins when all nodes that take the fluxes are ready, and all '
-            'who listen to them or to poses are connected, not before it has looked around for '
-            '3 s; who starts to listen later misses what is out',
+            help='longest wait for listeners, s (%(default)g, and up to five times that before '
+            'while a node is still starting): it begins when all nodes that take the fluxes are '
+            'ready, and all who listen to them or to poses are connected, not before it has '
+            'looked around for 3 s; who starts to listen later misses what is out',
         )  # fmt: skip
 
     def __init__(
@@ -182,12 +182,16 @@ class Replay(AnserNode):
         fluxes = [o for t, o in self._outlets.items() if t.endswith(FLUX_ENDINGS)]
         readiness = Readiness(self, fluxes or list(self._outlets.values()), setup)
         self._poses = readiness.poses
-        began_s, told = time.monotonic(), ''
+        began_s = started_s = time.monotonic()
+        told = ''
         while not self._ending.wait(POLL_S):
-            waited_s, missing = time.monotonic() - began_s, readiness.missing()
+            now_s, missing = time.monotonic(), readiness.missing()
+            waited_s = now_s - began_s
             if not missing:
                 break
-            if waited_s > self._wait_s * (STARTING_FACTOR if readiness.is_starting else 1.0):
+            if readiness.is_starting and waited_s < STARTING_FACTOR * self._wait_s:
+                started_s = now_s
+            if now_s - started_s > self._wait_s:
                 self.warn('no_listeners', f'begins after {waited_s:.3g} s although {missing}')
                 break
             if waited_s > TELL_AFTER_S and missing != told:
