@@ -181,7 +181,7 @@ def test_layers_stand_for_their_clouds_also_between_their_samples(world, parts):
 
 
 def test_a_calibrated_layer_takes_the_change_itself(world, parts):
-    excitation, region, layer, _, _ = parts
+    excitation, region, _, _, _ = parts
     side = np.linspace(-1.3, 1.3, 12) * region.half
     x, y = np.meshgrid(side, side, indexing='ij')
     own = np.stack([x.ravel(), y.ravel(), np.full(x.size, -0.15 * region.half)], axis=1)
