@@ -14,8 +14,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import NoReturn
 
-from anser_ros.cli.one_line_parser import OneLineParser
 from anser_ros.errors import AnserError
+from anser_ros.one_line_parser import OneLineParser
 
 NODES = {
     'acquisition': "samples of a control unit's serial port to fluxes",

@@ -19,6 +19,7 @@ from rclpy.utilities import remove_ros_args
 
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.nodes import parameter_files, parameters
+from anser_ros.one_line_parser import OneLineParser
 from anser_ros.wire.config_folder import config_path
 
 if TYPE_CHECKING:
@@ -78,7 +79,7 @@ def _without_ros(arguments: Sequence[str]) -> list[str]:
 def _parse(node_class: 'type[AnserNode]', arguments: Sequence[str]) -> dict[str, Any]:
     summary = (sys.modules[node_class.__module__].__doc__ or '').strip().split('\n')[0]
     table = parameters.describe(node_class.PARAMETERS)
-    parser = argparse.ArgumentParser(
+    parser = OneLineParser(
         prog=f'anser {node_class.NAME}',
         description=summary,
         epilog=f'parameters (--ros-args -p NAME:=VALUE, or --params-file):\n{table}',

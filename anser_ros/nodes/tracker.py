@@ -3,7 +3,6 @@
 A pose is published only while its state is ``ok``; why there is none stands in ``/diagnostics``.
 """
 
-import math
 import sys
 import time
 from collections.abc import Callable
@@ -13,12 +12,13 @@ from typing import Any
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
-from anser_ros.errors import AnserError, LayoutError, ModelFileError, ParameterError
+from anser_ros.errors import AnserError, ModelFileError, ParameterError
 from anser_ros.fitting.model import FieldModel
 from anser_ros.nodes import qos
 from anser_ros.nodes.answered_frames import AnsweredFrames
 from anser_ros.nodes.backlog import Backlog, take_waiting
-from anser_ros.nodes.flux_reader import read_flux
+from anser_ros.nodes.diagnostics import Trouble
+from anser_ros.nodes.flux_reader import read_frame
 from anser_ros.nodes.model_clouds import NANO, stamp_of
 from anser_ros.nodes.model_intake import GivenModel, ModelIntake
 from anser_ros.nodes.node import AnserNode, Level, Status, main
@@ -40,8 +40,6 @@ EARLIEST_DIAGNOSTICS_S = 0.1
 WAIT_PERIOD_S = 0.02
 # Fluxes whose stamps are further from the host's clock are a recording's.
 LIVE_WITHIN_S = 60.0
-# How long a refusal or skipped frames count as news.
-TROUBLE_TOLD_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -133,7 +131,7 @@ class TrackerNode(AnserNode):
         self._frames = AnsweredFrames[GivenModel, tuple[int, FluxPoints]](
             self._put_in_force, self._track
         )
-        self._trouble, self._trouble_s = '', -math.inf
+        self._trouble = Trouble()
         self._solve_s = 0.0
         self._backlog = Backlog()
         self._told_s = 0.0
@@ -171,7 +169,7 @@ class TrackerNode(AnserNode):
             name: PoseTopic(self, name, setup.frame_id)
             for name in (*sensors.name, *tracker.bodies)
         }
-        self._trouble = ''
+        self._trouble.forget()
         self._use_model()
 
     def _on_model(self, message: PointCloud2) -> None:
@@ -236,7 +234,9 @@ class TrackerNode(AnserNode):
             waiting = take_waiting(self._fluxes)
             if waiting:
                 self.count('frames_skipped', len(waiting))
-                self._say_trouble('frames skipped: they come faster than they can be tracked')
+                self._trouble.say(
+                    'frames skipped: they come faster than they can be tracked', time.monotonic()
+                )
                 message = waiting[-1]
         frame = self._read(message)
         if frame is not None:
@@ -257,18 +257,8 @@ class TrackerNode(AnserNode):
         if setup is None:
             self.count('fluxes_before_setup')
             return None
-        if message.is_bigendian:
-            self.count('fluxes_big_endian')
         try:
-            if message.header.frame_id != setup.frame_id:
-                self.count('fluxes_other_frame_id')
-                raise LayoutError(
-                    f'fluxes in the frame {message.header.frame_id!r}, '
-                    f'the setup is in {setup.frame_id!r}'
-                )
-            if stamp_of(message) <= 0 or message.header.stamp.nanosec >= NANO:
-                self.count('fluxes_without_stamp')
-            return read_flux(message)
+            return read_frame(message, setup.frame_id, self.count)
         except AnserError as error:
             self._refuse('fluxes_refused', error)
             return None
@@ -310,11 +300,8 @@ class TrackerNode(AnserNode):
     # What is told -------------------------------------------------------------------------
 
     def _refuse(self, counter: str, error: AnserError) -> None:
-        self._say_trouble(str(error))
+        self._trouble.say(str(error), time.monotonic())
         self.warn(counter, str(error))
-
-    def _say_trouble(self, words: str) -> None:
-        self._trouble, self._trouble_s = words, time.monotonic()
 
     def on_parameters(self, old: TrackerParameters, new: TrackerParameters) -> None:
         """Track on with the new settings, from where the tools were."""
@@ -326,15 +313,16 @@ class TrackerNode(AnserNode):
         """Return what the tracker lacks, if anything, and its counters."""
         self._told_s = time.monotonic()
         tracker, newest = self._tracker, self._intake.newest
-        values: dict[str, object] = {'frame_time_s': self._solve_s, 'last_refusal': self._trouble}
+        values: dict[str, object] = {'frame_time_s': self._solve_s}
+        values['last_refusal'] = self._trouble.last
         values['ready_for'] = self._ready_for()
         values['pose_listeners'] = sum(topic.listeners for topic in self._topics.values())
         if tracker is not None:
             values |= {name: count for name, count in tracker.counters.items() if name != 'frames'}
         if self._setup is None:
-            return Status('', Level.WARN, self._trouble or 'no setup yet', values)
+            return Status('', Level.WARN, self._trouble.last or 'no setup yet', values)
         if tracker is None or tracker.model is None:
-            return Status('', Level.WARN, self._trouble or 'no field model yet', values)
+            return Status('', Level.WARN, self._trouble.last or 'no field model yet', values)
         values |= {
             'dipoles': len(tracker.model.positions),
             'emitters': len(tracker.model.emitters),
@@ -351,8 +339,9 @@ class TrackerNode(AnserNode):
         if dead:
             return Status('', Level.WARN, f'no flux of {dead}', values)
         tracked = f'{good} of {len(self._topics)} tracked'
-        if time.monotonic() - self._trouble_s < TROUBLE_TOLD_S:
-            return Status('', Level.WARN, f'{tracked}; lately: {self._trouble}', values)
+        trouble = self._trouble.recent(time.monotonic())
+        if trouble:
+            return Status('', Level.WARN, f'{tracked}; lately: {trouble}', values)
         return Status('', Level.OK, tracked, values)
 
     def _ready_for(self) -> str:
