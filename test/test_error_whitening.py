@@ -6,7 +6,7 @@ from tracking_world import certain_model
 
 from anser_ros.errors import TrackingError
 from anser_ros.physics.dipole import flux_basis
-from anser_ros.tracking.error_whitening import error_whitening
+from anser_ros.tracking.error_whitening import error_whitening, source_spacing
 from anser_ros.tracking.solve import RealField, whitening_of
 
 POINT, AXIS = np.array([0.02, -0.05, 0.13]), np.array([0.6, 0.0, 0.8])
@@ -25,12 +25,13 @@ def both(modes, sigma, length):
         np.ascontiguousarray(modes).view(float).swapaxes(0, 1).reshape(len(model.positions), -1)
     )
     # Another coil beside it, so that the two are not mixed up.
-    errors, weights, away = error_whitening(
+    errors, weights, away, among = error_whitening(
         np.stack([POINT + 0.01, POINT]), np.stack([AXIS[::-1], AXIS]), np.array([0.0, length]),
-        columns_of(model), laid_out, sigma,
+        columns_of(model), np.full(len(model.positions), 0.03), laid_out, sigma,
     )  # fmt: skip
     distance = np.linalg.norm(model.positions - POINT, axis=1).min()
     assert away[1] == pytest.approx(distance)
+    assert among[1] == pytest.approx(0.03 / distance)
     np.testing.assert_allclose(errors[1], flux[:, 0], rtol=1e-9, atol=1e-20)
     return whitening_of(sigma, flux[:, 0]), weights[1]
 
@@ -52,6 +53,12 @@ def test_what_is_not_finite_is_refused():
     laid_out = np.ascontiguousarray(modes).view(float).swapaxes(0, 1).reshape(count, -1)
     with np.errstate(all='ignore'), pytest.raises(TrackingError, match='finite'):
         error_whitening(
-            POINT[None], AXIS[None], np.zeros(1), columns_of(model),
+            POINT[None], AXIS[None], np.zeros(1), columns_of(model), np.zeros(count),
             np.ascontiguousarray(laid_out), np.full(16, 60e-12),
         )  # fmt: skip
+
+
+def test_dipoles_are_as_far_apart_as_their_nearest_neighbours_elsewhere():
+    places = np.array([[0, 0, 0.1], [0, 0, 0.1], [0.03, 0, 0.1], [0.03, 0.05, 0.1], [0.03, 0, 0]])
+    np.testing.assert_allclose(source_spacing(places, 0.02), [0.03, 0.03, 0.03, 0.05, 0.0])
+    np.testing.assert_allclose(source_spacing(places[:2], 0.02), 0.0)

@@ -12,7 +12,7 @@ from anser_ros.tracking.body_descent import step_to_coils
 from anser_ros.tracking.coil_track import (
     MOST_STEPS,
     NANO,
-    RARE,
+    SELDOM,
     SUSPICIOUS_JUMP_M,
     CoilResult,
     take_errors,
@@ -269,7 +269,7 @@ def _judge(
     solution = fit.solution
     scale = 1.0
     if settings.adaptive:
-        scale = track.noise.of_frame(fit.ratio, chi2_limit(fit.freedom, RARE) / fit.freedom)
+        scale = track.noise.of_frame(fit.ratio, chi2_limit(fit.freedom, SELDOM) / fit.freedom)
     covariance = scale * bounded_inverse(solution.information)
     sigma = math.sqrt(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
     centre = solution.position + solution.rotation @ coils.subset(fit.used).offsets.mean(axis=0)

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 Start = tuple[Array, Array]
 
 NANO = 1e-9
-RARE = 0.01
+SELDOM = 0.1
 """Probability of a residual that counts as more than this frame's share of noise."""
 SUSPICIOUS_JUMP_M = 0.02
 FIRST_RETRY_S = 0.05
@@ -49,6 +49,9 @@ class PoseErrors:
         1/T; see `whitening_of`.
     reach_m : float
         Move up to which this is still good.
+    among : float
+        Above 1, the sensor is among dipoles that stand for metal and are no description of the
+        field so near to them.
     """
 
     scene: Scene
@@ -57,6 +60,7 @@ class PoseErrors:
     errors: Array
     whitening: Array
     reach_m: float
+    among: float
 
     def holds(self, scene: Scene, position: Array, axis: Array) -> bool:
         """Whether this is still good for a scene and a pose."""
@@ -155,9 +159,10 @@ class CoilResult:
 
 def take_errors(scene: Scene, points: Array, axes: Array, lengths: Array) -> list[PoseErrors]:
     """Work out the model's error for sensors (S of them) at some poses, all of them at once."""
-    errors, whitening, away = scene.error_whitening(points, axes, lengths)
+    errors, whitening, away, among = scene.error_whitening(points, axes, lengths)
     reach = (ERROR_REACH * away).tolist()
-    return list(map(PoseErrors, repeat(scene), points, axes, errors, whitening, reach))
+    rows = points, axes, errors, whitening, reach, among.tolist()
+    return list(map(PoseErrors, repeat(scene), *rows))
 
 
 def prepare(
@@ -195,7 +200,7 @@ def _whitening(
         if scene.modes is None:
             empty = np.empty((0, scene.sigma.size))
             weights = whitening_of(scene.sigma)
-            track.error = PoseErrors(scene, position, axis, empty, weights, math.inf)
+            track.error = PoseErrors(scene, position, axis, empty, weights, math.inf, 0.0)
         else:
             (track.error,) = take_errors(scene, position[None], axis[None], np.array([length]))
     return track.error.whitening
@@ -316,7 +321,7 @@ def _judge(
     ratio = solution.chi2 / freedom
     scale = 1.0
     if settings.adaptive:
-        scale = track.noise.of_frame(ratio, chi2_limit(freedom, RARE) / freedom)
+        scale = track.noise.of_frame(ratio, chi2_limit(freedom, SELDOM) / freedom)
     covariance = scale * coil_covariance(
         solution.normal, solution.axis, settings.roll_variance / scale
     )
@@ -332,6 +337,8 @@ def _judge(
         state, reason = states.AMBIGUOUS, 'the solve did not converge'
     elif sigma > settings.max_sigma_m * settings.leniency(scale):
         state, reason = states.AMBIGUOUS, f'position uncertain by {1e3 * sigma:.3g} mm'
+    elif track.error is not None and track.error.among > 1.0 and math.isfinite(settings.gate):
+        state, reason = states.AMBIGUOUS, 'where there may be metal'
     else:
         margin = settings.margin(ratio)
         for rival in rivals:

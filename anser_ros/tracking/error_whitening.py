@@ -12,6 +12,9 @@ from anser_ros.physics.dipole import GAUSS_OFFSET
 
 Array = NDArray[np.float64]
 
+SAME_PLACE_M = 1e-6
+"""Dipoles nearer to each other are components of one."""
+
 
 @numba.njit(cache=True, error_model='numpy')
 def _fill_whitening(errors, sigma, factor, out):  # type: ignore[no-untyped-def]
@@ -47,15 +50,40 @@ def _fill_whitening(errors, sigma, factor, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model='numpy')
-def _fill_couplings(points, axes, lengths, dipoles, basis, away):  # type: ignore[no-untyped-def]
-    """Write each unit dipole's flux in each coil, and each coil's distance from the nearest."""
+def _fill_spacing(positions, spacing):  # type: ignore[no-untyped-def]
+    for i in range(positions.shape[0]):
+        nearest = np.inf
+        for j in range(positions.shape[0]):
+            dx, dy = positions[i, 0] - positions[j, 0], positions[i, 1] - positions[j, 1]
+            dz = positions[i, 2] - positions[j, 2]
+            square = dx * dx + dy * dy + dz * dz
+            if square > SAME_PLACE_M**2:
+                nearest = min(nearest, square)
+        spacing[i] = math.sqrt(nearest) if nearest < np.inf else 0.0
+
+
+def source_spacing(positions: Array, floor_m: float) -> Array:
+    """How far dipoles in the room where tools may be are from their neighbours, shape (N,).
+
+    Dipoles that stand for metal say nothing about the field between themselves and others of
+    their kind. Those lower than ``floor_m`` are below all tools and get 0.
+    """
+    spacing = np.empty(len(positions))
+    _fill_spacing(np.ascontiguousarray(positions), spacing)
+    spacing[positions[:, 2] < floor_m] = 0.0
+    return spacing
+
+
+@numba.njit(cache=True, error_model='numpy')
+def _fill_couplings(points, axes, lengths, dipoles, spacing, basis, away, among):  # type: ignore[no-untyped-def]
+    """Write each unit dipole's flux in each coil, and how near each coil is to them."""
     px, py, pz = dipoles[0], dipoles[1], dipoles[2]
     ux, uy, uz = dipoles[3], dipoles[4], dipoles[5]
     for p in range(points.shape[0]):
         nx, ny, nz = axes[p, 0], axes[p, 1], axes[p, 2]
         half = lengths[p] * GAUSS_OFFSET
         count = 1 if half == 0.0 else 2
-        scale, row, nearest = DIPOLE_CONSTANT / count, basis[p], np.inf
+        scale, row, nearest, deepest = DIPOLE_CONSTANT / count, basis[p], np.inf, 0.0
         for s in range(count):
             h = half * (1 - 2 * s)
             x, y, z = points[p, 0] + h * nx, points[p, 1] + h * ny, points[p, 2] + h * nz
@@ -71,15 +99,19 @@ def _fill_couplings(points, axes, lengths, dipoles, basis, away):  # type: ignor
                 row[j] = value if s == 0 else row[j] + value
         for j in range(px.shape[0]):
             dx, dy, dz = points[p, 0] - px[j], points[p, 1] - py[j], points[p, 2] - pz[j]
-            nearest = min(nearest, dx * dx + dy * dy + dz * dz)
-        away[p] = math.sqrt(nearest)
+            square = dx * dx + dy * dy + dz * dz
+            nearest = min(nearest, square)
+            deepest = max(deepest, spacing[j] * spacing[j] / square)
+        away[p], among[p] = math.sqrt(nearest), math.sqrt(deepest)
 
 
 @numba.njit(cache=True, error_model='numpy')
-def _fill_all(points, axes, lengths, dipoles, modes, sigma, errors, out, away):  # type: ignore[no-untyped-def]
+def _fill_all(  # type: ignore[no-untyped-def]
+    points, axes, lengths, dipoles, spacing, modes, sigma, errors, out, away, among
+):  # fmt: skip
     width = sigma.shape[0]
     basis, factor = np.empty((points.shape[0], dipoles.shape[1])), np.empty((width, width))
-    _fill_couplings(points, axes, lengths, dipoles, basis, away)
+    _fill_couplings(points, axes, lengths, dipoles, spacing, basis, away, among)
     errors[:] = np.dot(basis, modes).reshape(errors.shape)
     good = True
     for s in range(points.shape[0]):
@@ -92,9 +124,10 @@ def error_whitening(
     axes: Array,
     lengths: Array,
     dipoles: Array,
+    spacing: Array,
     modes: Array,
     sigma: Array,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """What the model's error does to coils, and what makes their residuals of unit covariance.
 
     Parameters
@@ -105,6 +138,8 @@ def error_whitening(
         Coil lengths, m.
     dipoles : ndarray, shape (6, N)
         The dipoles whose moments are uncertain: rows of `RealField.columns`.
+    spacing : ndarray, shape (N,)
+        Their `source_spacing`, m.
     modes : ndarray, shape (N, R 2K)
         Moments' errors of one standard deviation each, A m^2.
     sigma : ndarray, shape (2K,)
@@ -118,6 +153,9 @@ def error_whitening(
         1/T, lower triangular.
     away : ndarray, shape (S,)
         Distance from the nearest of the dipoles, m.
+    among : ndarray, shape (S,)
+        Spacing over distance, of the dipole for which that is largest: above 1 a coil is where
+        the dipoles are no description of the field.
 
     Raises
     ------
@@ -127,7 +165,9 @@ def error_whitening(
     count, width = len(points), len(sigma)
     errors = np.empty((count, modes.shape[1] // width, width))
     whitening = np.empty((count, width, width))
-    away = np.empty(count)
-    if not _fill_all(points, axes, lengths, dipoles, modes, sigma, errors, whitening, away):
+    away, among = np.empty(count), np.empty(count)
+    if not _fill_all(
+        points, axes, lengths, dipoles, spacing, modes, sigma, errors, whitening, away, among
+    ):
         raise TrackingError('the model covariance must be finite')
-    return errors, whitening, away
+    return errors, whitening, away, among

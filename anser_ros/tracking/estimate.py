@@ -27,10 +27,10 @@ STATES = (
 
 USUAL_GATE = 4.0
 
-HIDDEN = 2.0
+HIDDEN = 4.0
 """How much more of a distortion's power goes into the pose than its share of the dimensions.
 
-In recordings with moving metal the error is 1.2 to 1.6 times what the residual alone implies.
+A smooth distortion looks more like a pose than like anything else.
 """
 
 
@@ -185,9 +185,7 @@ class NoiseScale:
         """Variance scale of one frame: the running one, more when the frame's residual asks for
         it.
 
-        ``usual`` is the ratio that noise alone rarely exceeds. A residual above it comes from a
-        bent field, and a smooth distortion looks more like a pose than like anything else.
+        ``usual`` is the ratio that noise of the expected size seldom exceeds. A residual above
+        what is usual for this sensor comes from a bent field.
         """
-        if ratio <= usual * max(self.value, 1.0):
-            return self.value
-        return max(self.value, HIDDEN * ratio)
+        return self.value + HIDDEN * max(0.0, ratio - usual * self.value)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from anser_ros.fitting.model import FieldModel
 from anser_ros.physics.dipole import flux_basis
-from anser_ros.tracking.error_whitening import error_whitening
+from anser_ros.tracking.error_whitening import error_whitening, source_spacing
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.seed import SeedGrid, Volume, build_grid
 from anser_ros.tracking.solve import RealField
@@ -90,15 +90,30 @@ class ErrorModes:
         The dipoles whose moments are uncertain.
     moments : ndarray, shape (M, R' 2K)
         Of the modes that are not zero, A m^2.
+    spacing : ndarray, shape (M,)
+        See `source_spacing`, m.
     """
 
     given: ComplexArray
     rows: NDArray[np.int64]
     moments: Array
+    spacing: Array
 
     @classmethod
-    def of(cls, given: ComplexArray | None) -> 'ErrorModes | None':
-        """Lay out modes; None where there is no uncertainty."""
+    def of(
+        cls, given: ComplexArray | None, positions: Array, floor_m: float
+    ) -> 'ErrorModes | None':
+        """Lay out modes; None where there is no uncertainty.
+
+        Parameters
+        ----------
+        given : ndarray, shape (R, N, K), complex
+            A m^2.
+        positions : ndarray, shape (N, 3)
+            Of the dipoles, m.
+        floor_m : float
+            Height over which dipoles are in the room where tools may be, m.
+        """
         if given is None:
             return None
         there = given != 0.0
@@ -107,7 +122,8 @@ class ErrorModes:
             return None
         rows = np.flatnonzero(there.any(axis=(0, 2)))
         real = np.ascontiguousarray(some[:, rows], dtype=np.complex128).view(np.float64)
-        return cls(given, rows, np.ascontiguousarray(real.swapaxes(0, 1).reshape(rows.size, -1)))
+        moments = np.ascontiguousarray(real.swapaxes(0, 1).reshape(rows.size, -1))
+        return cls(given, rows, moments, source_spacing(positions[rows], floor_m))
 
     def of_components(self, kept: NDArray[np.bool_]) -> 'ErrorModes':
         """The modes' part in some of the 2K flux components."""
@@ -163,14 +179,12 @@ class Scene:
 
     def error_whitening(
         self, points: Array, axes: Array, lengths: Array
-    ) -> tuple[Array, Array, Array]:
-        """Flux errors (S, R, 2K), T, and whitening (S, 2K, 2K), 1/T, of coils at some poses.
-
-        The third is their distance (S,) from the nearest dipole that is uncertain, m.
-        """
-        assert self.modes is not None
+    ) -> tuple[Array, Array, Array, Array]:
+        """What the model's error does to coils at some poses; see `error_whitening`."""
+        modes = self.modes
+        assert modes is not None
         return error_whitening(
-            points, axes, lengths, self._uncertain, self.modes.moments, self.sigma
+            points, axes, lengths, self._uncertain, modes.spacing, modes.moments, self.sigma
         )
 
 
@@ -202,7 +216,8 @@ def build_scene(
         sigma = previous.sigma
     modes = None if previous is None else previous.modes
     if modes is None or modes.given is not model.modes:
-        modes = ErrorModes.of(model.modes)
+        floor_m = 0.5 * settings.volume.low[2]
+        modes = ErrorModes.of(model.modes, field.positions, floor_m)
     name = model_digest(model) if model_id is None else model_id
     low, high = settings.volume.grown(BOX_MARGIN_M)
     starts = Starts(settings.volume, settings.grid_spacing_m)
