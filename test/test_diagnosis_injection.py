@@ -8,7 +8,10 @@ import pytest
 from diagnosis_world import World, world
 from injection import CATALOGUE, LISTED, SIZES, UNLISTED, Subject
 
+from anser_ros.diagnosis.choice import complexity
 from anser_ros.diagnosis.diagnose import Diagnosis, diagnose
+from anser_ros.effects.metal_path import StraightPath
+from anser_ros.effects.registry import all_effects
 
 
 def subject(made: World) -> Subject:
@@ -55,3 +58,12 @@ def test_what_nothing_describes_stays_unexplained(name):
     assert not {f.record.name for f in result.findings} & set(CATALOGUE)
     assert result.unexplained > 0.2
     assert result.depends_on
+
+
+def test_metal_that_moves_is_the_last_resort():
+    """Its shape costs more than what one coil does from frame to frame, whatever it starts as."""
+    effects, problem = all_effects(), world(0, frames=30).problem()
+    course = np.array([0.0, 0.0, -0.1, 0.05, 0.0, -0.1, 0.2, 0.8, 0.5])
+    metal = effects['moving_metal'].starting(StraightPath(), course, 1.2, np.array([-1.0, 0.0]))
+    for name in ('coil_fluctuation', 'sensor_gain_drift', 'static_metal', 'coil_drift', 'pickup'):
+        assert complexity(effects[name].candidates(problem.scene)[0]) < complexity(metal)

@@ -11,7 +11,14 @@ from anser_ros.effects.conducting_sheet import sheet_sources
 from anser_ros.effects.correction import Correction
 from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import Effect, Remedy, Term
-from anser_ros.effects.metal_body import BODIES, body_spread, lattice, multipoles
+from anser_ros.effects.metal_body import (
+    BODIES,
+    ODD,
+    body_spread,
+    centre_sigma,
+    lattice,
+    multipoles,
+)
 from anser_ros.effects.metal_path import FreePath, StraightPath, moving_times
 from anser_ros.effects.metal_remainder import REMAINDER, UP_M, Couplings, Lighting
 from anser_ros.effects.prediction import reference_view, tool_view
@@ -368,6 +375,21 @@ def test_a_coupled_body_is_a_sum_of_few_multipoles():
     solution = np.linalg.solve(normal, unit.T @ wanted.ravel())
     left = unit @ solution - wanted.ravel()
     assert np.linalg.norm(left) < 3e-3 * np.linalg.norm(wanted)
+
+
+def test_the_place_of_metal_is_no_surer_than_its_shape(scenery):
+    """Of a ball's strength, however little the data scatter."""
+    radius = 0.04
+    ball = -2 * np.pi * radius**3 * np.eye(3).astype(complex)
+    assert centre_sigma(ball) == pytest.approx(ODD * radius)
+    _, problem = scenery
+    found = {term.effect.name: term for term in _candidates(problem.scene)}
+    for name, keys in (('static_metal', ['position_m']), ('moving_metal', ['start_m', 'path'])):
+        term = _in_force(found[name])
+        record = term.effect.record(term, np.zeros((term.theta.size, term.theta.size)))
+        total = np.array(record.parameters['polarizability']) @ [1.0, 1.0j]
+        for key in keys:
+            assert np.min(record.uncertainty[key]) >= centre_sigma(total) > 1e-3
 
 
 @pytest.mark.parametrize('metal', ['static_metal', 'conductive_plate', 'moving_metal'])

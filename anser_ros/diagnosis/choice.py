@@ -10,6 +10,8 @@ from anser_ros.effects.fluctuation import Fluctuation
 
 OPEN = 40
 """Parameters that a fluctuation counts for: more than a constant has, less than shaped metal."""
+SHAPED = 60
+"""Parameters that metal that moves counts for at least: it is shaped once it is taken."""
 STEADY = 0.8
 """Share of a fluctuation's gain from which a constant, or a curve, of the same coil or channel is
 tried first: freedom in every frame also takes off what is another effect's."""
@@ -21,7 +23,9 @@ NOTHING_LEFT = 1.04
 
 def complexity(term: Term) -> int:
     """Parameters that are paid for when explanations are compared."""
-    return OPEN if isinstance(term.effect, Fluctuation) else int(term.theta.size)
+    if isinstance(term.effect, Fluctuation):
+        return OPEN
+    return max(int(term.theta.size), SHAPED if term.effect.moving else 0)
 
 
 def at_floor(fit: Fit) -> bool:

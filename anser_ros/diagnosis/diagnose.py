@@ -39,6 +39,9 @@ SEARCH_FRAMES, FINAL_FRAMES, WIRING_FRAMES = 270, 400, 150
 NOISIER = 1.15
 """Factor from which noise counts as grown."""
 FEWEST_OUTLIERS = 0.004
+BESIDE_OUTLIERS = 0.3
+"""Unexplained power over the floor's beside which frames that stand out are still outliers: a
+model that is wrong by a fraction of the noise makes none."""
 
 
 @dataclass(frozen=True)
@@ -232,7 +235,8 @@ def _concluded(
         for i, term in enumerate(fit.terms)
         if term.effect is not REMAINDER
     ]
-    findings += _noise_findings(whole, cleaned, after, significant)
+    few = excess < BESIDE_OUTLIERS * floor**2
+    findings += _noise_findings(whole, cleaned, after, significant, few)
     records = [finding.record for finding in findings]
     depends: tuple[str, ...] = ()
     if excess > 0.05 * floor**2:
@@ -282,14 +286,14 @@ def _finding(fit: Fit, index: int, term: Term, unseen: Problem, search: Search) 
 
 
 def _noise_findings(
-    whole: Problem, cleaned: Problem, after: State, significant: bool
+    whole: Problem, cleaned: Problem, after: State, significant: bool, few: bool
 ) -> list[Finding]:
     found = []
     site: dict[str, object]
     share, channels = outlying_share(whole, cleaned)
     effects: dict[str, Effect] = all_effects()
     frames = sum(tool.time.size for tool in whole.tools)
-    if share > FEWEST_OUTLIERS and (channels or not significant):
+    if share > FEWEST_OUTLIERS and (channels or few):
         site = {'fraction': share, 'sigma': float(np.sqrt(share / max(frames, 1)))}
         if channels:
             site['channels'] = tuple(channels)

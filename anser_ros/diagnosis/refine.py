@@ -18,7 +18,14 @@ from anser_ros.diagnosis.scoring import joined
 from anser_ros.diagnosis.structure import noise_scale
 from anser_ros.effects.conducting_sheet import sheet_shapes, sheet_spread
 from anser_ros.effects.effect import Term, View
-from anser_ros.effects.metal_body import BODIES, COMPACT, SPACINGS, ball_modes, body_spread
+from anser_ros.effects.metal_body import (
+    BODIES,
+    COMPACT,
+    ODD,
+    SPACINGS,
+    ball_modes,
+    body_spread,
+)
 from anser_ros.effects.metal_path import FreePath
 from anser_ros.effects.metal_remainder import REMAINDER, Couplings, Leftover, Lighting
 from anser_ros.effects.moving_metal import LARGEST, MovingMetal, path_of
@@ -47,8 +54,6 @@ PIECES = (0.01, 0.05, 0.2, 1.0)
 """Sizes of an extended body's pieces that are tried, 1e-4 m^3."""
 SHEET_SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)
 """Sizes that are tried of what a sheet's couplings lack, as shares of a perfect conductor's."""
-ODD = 0.2
-"""Couplings that a body lacks which is its own mirror image, as a share of others."""
 ROUNDS = 2
 TRIALS = 3
 """Iterations after which kinds of bodies are compared."""

@@ -54,7 +54,7 @@ def moves_or_rests(
     if gain < FAR_LESS * explained:
         return shaped
     rest = settled(problem, rest.terms, blocks, folds, iterations)
-    limit = shaped.held_out(folds) + LEAST_SHARE * explained + LEAST * max(misfit(shaped), 1.0)
+    limit = _limit(shaped, explained, folds)
     if rest.held_out(folds) < limit:
         return rest
     scorer = Scorer(rest.state, blocks, folds)
@@ -67,6 +67,16 @@ def moves_or_rests(
         tried.add(term.effect.name)
         for start in term.effect.started(term, score.solution):
             both = fit_terms(problem, [*rest.terms, start], blocks, iterations)
-            if both.held_out(folds) < limit:
+            if both.held_out(folds) > limit:
+                continue
+            # What is there besides helps metal that moves as much: like is compared with like.
+            beside = fit_terms(problem, [*shaped.terms, start], blocks, iterations)
+            if both.held_out(folds) < _limit(beside, explained, folds):
                 return rest
     return shaped
+
+
+def _limit(moving: Fit, explained: float, folds: int) -> float:
+    """Held-out sum of squares up to which metal at rest explains as much."""
+    more = LEAST_SHARE * explained + LEAST * max(misfit(moving), 1.0)
+    return moving.held_out(folds) + more

@@ -23,6 +23,9 @@ HIGHEST = 4
 """Largest order of a multipole."""
 TOGETHER = 6
 """Largest sum of two orders that are coupled."""
+ODD = 0.2
+"""Couplings that a body lacks which is its own mirror image, as a share of others; so much of its
+radius its centre may lie beside the symmetric body's."""
 FREQUENCY_SLOPE = 0.5
 """Prior size of d(ln T) / d(ln f); a sphere's parts have slopes between -1/2 and 1."""
 
@@ -84,6 +87,19 @@ def body_spread(radius: float, odd: float) -> Array:
     size = 2 * np.pi * radius**3 / UNIT * (radius / RADIUS) ** (total - 2)
     size *= np.where(total % 2, odd, 1.0)
     return np.concatenate([size, FREQUENCY_SLOPE * size[shapes.sloped]])
+
+
+def centre_sigma(polarisability: NDArray[np.complexfloating]) -> float:
+    """How well the centre of a body of unknown shape is known at best, m.
+
+    Parameters
+    ----------
+    polarisability : ndarray, shape (3, 3)
+        Of the whole body, m^3. Its radius is taken for that of a perfectly conducting ball which
+        is as strong, 2 pi r^3.
+    """
+    strength = float(np.linalg.norm(polarisability)) / np.sqrt(3)
+    return float(ODD * (strength / (2 * np.pi)) ** (1 / 3))
 
 
 @cache

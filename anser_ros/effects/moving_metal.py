@@ -19,7 +19,7 @@ from anser_ros.effects.effect import (
     needed,
     sigmas,
 )
-from anser_ros.effects.metal_body import BODIES, COMPACT, SPACINGS, ball_modes
+from anser_ros.effects.metal_body import BODIES, COMPACT, SPACINGS, ball_modes, centre_sigma
 from anser_ros.effects.metal_path import FreePath, MetalPath, StraightPath, moving_times
 from anser_ros.effects.scattering import UNIT, Shapes
 from anser_ros.fitting.model import EffectRecord
@@ -157,8 +157,9 @@ class MovingMetal(Effect):
         start, end = moving_times(path, course, times)
         ends = np.array([start, end])
         at, spread = self.centres(term, ends), self._place_sigma(term, covariance, ends)
-        # Which point of an extended body is its centre, nothing tells.
-        spread = np.hypot(spread, SPACINGS.get(term.site['_kind'], 0.0))
+        # Which point of a body is its centre, hardly anything tells; of an extended one, nothing.
+        vague = max(centre_sigma(total), SPACINGS.get(term.site['_kind'], 0.0))
+        spread = np.hypot(spread, vague)
         times_sigma = self._time_sigma(term, covariance, start, end)
         return EffectRecord(
             self.name,
@@ -182,10 +183,7 @@ class MovingMetal(Effect):
                 'end_m': spread[1].tolist(),
                 't_start_s': times_sigma[0],
                 't_end_s': times_sigma[1],
-                'path': np.hypot(
-                    self._place_sigma(term, covariance, times),
-                    SPACINGS.get(term.site['_kind'], 0.0),
-                ).tolist(),
+                'path': np.hypot(self._place_sigma(term, covariance, times), vague).tolist(),
             },
         )
 

@@ -20,7 +20,7 @@ from anser_ros.effects.effect import (
     needed,
     sigmas,
 )  # fmt: skip
-from anser_ros.effects.metal_body import ball_modes, multipoles
+from anser_ros.effects.metal_body import ball_modes, centre_sigma, multipoles
 from anser_ros.effects.scattering import UNIT
 from anser_ros.fitting.model import EffectRecord
 from anser_ros.physics.constants import MU_0
@@ -152,7 +152,7 @@ class StaticMetal(Effect):
                 'polarizability': np.stack([total.real, total.imag], axis=-1).tolist(),
                 'groups': (UNIT * term.theta[3:]).tolist(),
             },
-            {'position_m': sigmas(covariance)[:3].tolist()},
+            {'position_m': np.hypot(sigmas(covariance)[:3], centre_sigma(total)).tolist()},
         )
 
     def term(self, record: EffectRecord) -> Term:
