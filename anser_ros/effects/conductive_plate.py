@@ -27,6 +27,10 @@ STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])
 TYPICAL_OHM = 3e-5
 """A millimetre of aluminium."""
 
+HEIGHT, RIM, OHM = 0.005, 0.03, 0.1
+"""How well a sheet is known at best, whose true outline, thickness and bend nobody knows: its
+height and each rim as shares of its edge, and its resistance."""
+
 
 class ConductivePlate(Effect):
     """theta: height z, edge, centre x and y (m), log of the sheet resistance (ohm)."""
@@ -115,7 +119,9 @@ class ConductivePlate(Effect):
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Height, size, centre and resistance."""
         z, edge, x, y, log_ohm = (float(v) for v in term.theta)
-        sigma, ohm = sigmas(covariance), float(np.exp(log_ohm))
+        ohm, rim = float(np.exp(log_ohm)), RIM * edge
+        least = [HEIGHT * edge, np.sqrt(2) * rim, rim / np.sqrt(2), rim / np.sqrt(2), OHM]
+        sigma = np.hypot(sigmas(covariance), least)
         return EffectRecord(
             self.name,
             {'z_m': z, 'edge_m': edge, 'centre_m': [x, y], 'sheet_ohm': ohm},

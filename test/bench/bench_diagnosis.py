@@ -53,8 +53,9 @@ from anser_ros.sessions.session import Session, load_session  # noqa: E402
 from anser_ros.sessions.starting_model import board_of  # noqa: E402
 
 SHARED = Path(os.environ.get('ANSER_SHARED', REPO.parent / 'shared')) / 'sessions' / 'effects'
-REPORTED_SEEDS = (201, 202)
-"""Thresholds were chosen on seeds below 200."""
+REPORTED_SEEDS, EVERY = (203,), 10
+"""Thresholds were chosen on seeds below 200, one rule on a case of 202. Every so many cases of the
+reported ones are run, which takes some minutes; ``--seeds 203`` runs all 202."""
 PAIRS = 24
 CARRIERS = {
     's04': ('static_metal',),
@@ -243,7 +244,7 @@ def rows() -> Iterator[dict[str, Any]]:
         print(f'diagnosis: skipped, {SHARED}/s01.mcap is not there', file=sys.stderr)
         return
     groups: dict[str, list[Outcome]] = {'one': [], 'pair': [], 'carrier': [], 'unlisted': []}
-    for case in cases(REPORTED_SEEDS):
+    for case in list(cases(REPORTED_SEEDS))[::EVERY]:
         outcome = run(*case)
         print('  ' + outcome.line(), file=sys.stderr, flush=True)
         name = case[0]
@@ -251,6 +252,8 @@ def rows() -> Iterator[dict[str, Any]]:
         kind = 'carrier' if case[4] != 's01' else 'pair' if '+' in name else 'one'
         groups['unlisted' if unknown else kind].append(outcome)
     for kind, outcomes in groups.items():
+        if not outcomes:
+            continue
         good = ('exact', 'too small') if kind != 'unlisted' else ('said', 'new name', 'unseen')
         count = sum(o.verdict in good or o.verdict == 'exact' for o in outcomes)
         yield {
