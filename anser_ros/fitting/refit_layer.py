@@ -7,7 +7,7 @@ the calibrated model is such a layer itself, its own dipoles take the change and
 grow at all. Metal beside or over the volume needs dipoles beside and over it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from scipy.linalg import cholesky
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.refit_clouds import Cloud, Region
 from anser_ros.fitting.refit_excitation import Excitation
-from anser_ros.fitting.refit_references import vector_basis
+from anser_ros.fitting.refit_kernels import fill_dipole_tensors
 from anser_ros.physics.dipole import flux_basis
 
 Array = NDArray[np.float64]
@@ -76,12 +76,18 @@ class Layer:
     points: Array
     metric: Array
     middle: Array
+    _projected: dict[bytes, Array] = field(default_factory=dict, repr=False, compare=False)
 
     def project(self, sources: Array) -> Array:
         """Moments of the layer per unit moment of each source's component, shape (N, 3M)."""
         if self.inverse is None:
             return np.eye(3 * len(sources))
-        return np.asarray(self.inverse @ _field_rows(self.points, sources))
+        told = sources.tobytes()
+        if told not in self._projected:
+            # Clouds are asked for in turn, each for all of its responses.
+            self._projected.clear()
+            self._projected[told] = self.inverse @ _field_rows(self.points, sources)
+        return self._projected[told]
 
     def misfit(self, sources: Array, points: Array | None = None) -> float:
         """Relative rms error of the field that the layer makes in place of the sources.
@@ -89,9 +95,9 @@ class Layer:
         At the samples that it was fitted at, or at other points (P, 3).
         """
         at = self.points if points is None else points
-        field = _field_rows(at, sources)
+        wanted = _field_rows(at, sources)
         made = _component_rows(at, self.positions, self.directions) @ self.project(sources)
-        return float(np.linalg.norm(made - field) / np.linalg.norm(field))
+        return float(np.linalg.norm(made - wanted) / np.linalg.norm(wanted))
 
 
 def _axes_at(points: Array) -> tuple[Array, Array]:
@@ -100,8 +106,9 @@ def _axes_at(points: Array) -> tuple[Array, Array]:
 
 def _field_rows(points: Array, sources: Array) -> Array:
     """Field samples per unit moment component, shape (3P, 3M)."""
-    at, axes = _axes_at(points)
-    return vector_basis(at, axes, None, sources).reshape(len(at), -1)
+    out = np.empty((3 * len(points), 3 * len(sources)))
+    fill_dipole_tensors(np.ascontiguousarray(points), np.ascontiguousarray(sources), out)
+    return out
 
 
 def _component_rows(points: Array, positions: Array, directions: Array) -> Array:
