@@ -129,13 +129,11 @@ class Bank:
         self._analysis = np.zeros((count * n, n), dtype=np.float32)
         self._drift_seen = np.zeros((count, self.width, n))
         self._prior = np.full(count, -np.inf)
-        self.names: tuple[str, ...] = ('nothing',)
         self._chosen = -float(np.log(max(among / max(slots, 1), 1.0)))
         self.is_slot = np.arange(count) >= count - slots
         self._set(0, self.whitening)
         for hypothesis, prior in enumerate(priors, start=1):
             self._decompose(hypothesis, prior)
-        self._name()
         self._synthesis: dict[int, Single] = {}
         self._blocks: dict[tuple[float, int, int], Array] = {}
         self._tables: dict[float, tuple[Single, Array]] = {}
@@ -146,6 +144,7 @@ class Bank:
         self._analysis[hypothesis * n : (hypothesis + 1) * n] = basis.T
         self._drift_seen[hypothesis] = self.drift.T @ basis
         self._prior[hypothesis] = self._chosen if self.is_slot[hypothesis] else 0.0
+        self._name()
 
     def _decompose(self, hypothesis: int, prior: CloudPrior) -> None:
         block = prior.covariance[np.ix_(self.rows, self.rows)]
@@ -161,9 +160,8 @@ class Bank:
 
     def occupy(self, hypothesis: int, prior: CloudPrior) -> None:
         """Put a prior in a slot; what was there is forgotten."""
-        self._decompose(hypothesis, prior)
         self.priors[hypothesis - 1] = prior
-        self._name()
+        self._decompose(hypothesis, prior)
         self._synthesis.pop(hypothesis, None)
         self._tables.clear()
         for key in [key for key in self._blocks if key[1] == hypothesis]:
@@ -172,7 +170,7 @@ class Bank:
     def _name(self) -> None:
         """Write down what each hypothesis says."""
         slots = (f'slot {i}' if p is None else p.name for i, p in enumerate(self.priors))
-        self.names = ('nothing', *slots)
+        self.names: tuple[str, ...] = ('nothing', *slots)
 
     def prior(self, hypothesis: int) -> CloudPrior:
         """The prior of a hypothesis that is not 0 and not an empty slot."""
