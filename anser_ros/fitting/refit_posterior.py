@@ -117,8 +117,7 @@ class Bank:
         among: int = 0,
     ) -> None:
         self.priors: list[CloudPrior | None] = [*priors, *[None] * slots]
-        self.rows = rows
-        self.width = drift.shape[1]
+        self.rows, self.width = rows, drift.shape[1]
         self._all_drift = drift
         self.drift = drift[rows]
         self._all_noise = np.ones(len(drift)) if noise is None else noise
