@@ -28,6 +28,7 @@ from anser_ros.diagnosis.structure import (
 from anser_ros.diagnosis.whiteness import whiteness
 from anser_ros.diagnosis.wiring import wiring_faults
 from anser_ros.effects.effect import Effect, Term
+from anser_ros.effects.fluctuation import Fluctuation
 from anser_ros.effects.metal_remainder import REMAINDER
 from anser_ros.effects.registry import all_effects
 from anser_ros.fitting.model import EffectRecord, FieldModel
@@ -293,7 +294,9 @@ def _noise_findings(
     share, channels = outlying_share(whole, cleaned)
     effects: dict[str, Effect] = all_effects()
     frames = sum(tool.time.size for tool in whole.tools)
-    if share > FEWEST_OUTLIERS and (channels or few):
+    # A fluctuation is taken for normal: frames far out along it are its own tails.
+    own_tails = any(isinstance(term.effect, Fluctuation) for term in after.terms)
+    if share > FEWEST_OUTLIERS and (channels or (few and not own_tails)):
         site = {'fraction': share, 'sigma': float(np.sqrt(share / max(frames, 1)))}
         if channels:
             site['channels'] = tuple(channels)

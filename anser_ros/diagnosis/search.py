@@ -51,9 +51,9 @@ OPEN_FINALISTS = 3
 LEAST_OF_EXCESS = 0.4
 """Share of what is left to explain that a fluctuation, or metal at another place in each block of
 time, must explain."""
-LEAST_OF_MODEL_ERROR = 0.3
-"""Share of the power of the field model's own error that a fluctuation must explain: that error is
-alike in neighbouring frames and channels, and any freedom takes some of it."""
+LEAST_OF_NOISE = 0.05
+"""Share of the noise's power that a fluctuation must explain: a field model's own error is alike
+in neighbouring frames and channels, and any freedom takes some of it."""
 TOLD_APART = 0.05
 """A candidate of whose power the fluctuations in force leave less can't be told from them."""
 APART = 0.12
@@ -253,8 +253,7 @@ def _metal_beside(
 def _fluctuating(problem: Problem, before: Fit, how: SearchSettings) -> list[tuple[float, Term]]:
     """The fluctuations that explain most of what is there to explain."""
     excess = before.state.sum_of_squares - before.state.count
-    spread = problem.spread
-    error = before.state.count * (1.0 - (spread.noise_t / spread.flux_t) ** 2)
+    least = max(how.least_gain, LEAST_OF_EXCESS * excess, LEAST_OF_NOISE * before.state.count)
     found = []
     for effect in all_effects().values():
         if not isinstance(effect, Fluctuation):
@@ -263,7 +262,6 @@ def _fluctuating(problem: Problem, before: Fit, how: SearchSettings) -> list[tup
             if any(_same(term, other) for other in before.terms):
                 continue
             likeliest = fluctuation_of(before.state, term)
-            least = max(how.least_gain, LEAST_OF_EXCESS * excess, LEAST_OF_MODEL_ERROR * error)
             if likeliest is not None and likeliest[0] > least:
                 found.append(likeliest)
     return sorted(found, key=lambda pair: -pair[0])[:OPEN_FINALISTS]
