@@ -65,7 +65,7 @@ class TrackerParameters:
         live=True,
     )
     max_sigma_m: float = parameter(
-        0.02, 'largest uncertainty of a pose, m', minimum=1e-5, maximum=1.0, live=True
+        0.01, 'largest uncertainty of a pose, m', minimum=1e-5, maximum=1.0, live=True
     )
     volume_low_m: tuple[float, ...] = parameter(
         (-0.2, -0.2, 0.05), 'lower corner of the box where tools may be, m'

@@ -62,6 +62,11 @@ class PoseErrors:
     reach_m: float
     among: float
 
+    @property
+    def among_metal(self) -> bool:
+        """Whether the sensor is where the dipoles that stand for metal are no description."""
+        return self.among > 1.0
+
     def holds(self, scene: Scene, position: Array, axis: Array) -> bool:
         """Whether this is still good for a scene and a pose."""
         own = self.scene
@@ -155,6 +160,11 @@ class CoilResult:
     solution: CoilSolution | None
     cold: bool = False
     error: PoseErrors | None = None
+
+    @property
+    def usable(self) -> bool:
+        """Whether a body may use the coil: it has a solution, and is not among metal."""
+        return self.solution is not None and not (self.error and self.error.among_metal)
 
 
 def take_errors(scene: Scene, points: Array, axes: Array, lengths: Array) -> list[PoseErrors]:
@@ -337,7 +347,7 @@ def _judge(
         state, reason = states.AMBIGUOUS, 'the solve did not converge'
     elif sigma > settings.max_sigma_m * settings.leniency(scale):
         state, reason = states.AMBIGUOUS, f'position uncertain by {1e3 * sigma:.3g} mm'
-    elif track.error is not None and track.error.among > 1.0 and math.isfinite(settings.gate):
+    elif track.error and track.error.among_metal and math.isfinite(settings.gate):
         state, reason = states.AMBIGUOUS, 'where there may be metal'
     else:
         margin = settings.margin(ratio)

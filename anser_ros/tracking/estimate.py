@@ -72,7 +72,7 @@ class TrackerSettings:
     grid_spacing_m: float = 0.035
     gate: float = USUAL_GATE
     odds: float = 1000.0
-    max_sigma_m: float = 0.02
+    max_sigma_m: float = 0.01
     min_signal: float = 4.0
     warm_age_s: float = 1.0
     roll_variance: float = ROLL_VARIANCE

@@ -281,7 +281,7 @@ class Tracker:
             results.append(result)
             yield result.estimate
         for body, (members, coils) in self._bodies.items():
-            usable = np.array([results[i].solution is not None for i in members])
+            usable = np.array([results[i].usable for i in members])
             yield track_body(
                 self._body_tracks[body],
                 body,
