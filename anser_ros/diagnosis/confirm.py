@@ -115,7 +115,7 @@ def confirm(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmatio
         power / max(left_tools, 1e-3 * fit.state.count),
         0.0
         if term.effect.name in METALS
-        else _stays(fit.state, columns, noise) / max(power, 1e-300),
+        else _stays(fit.state, columns, noise, 1.0) / max(power, 1e-300),
         inexact=term.effect.inexact,
         alike=_crowd(fit, term),
         plausible=_plausible(fit, term),
@@ -163,12 +163,13 @@ def _plausible(fit: Fit, term: Term) -> bool:
     return True
 
 
-def _stays(state: State, columns: Sequence[Array | None], noise: float) -> float:
+def _stays(state: State, columns: Sequence[Array | None], noise: float, expected: float) -> float:
     """Power beyond the noise in the cells that a term changes, less what cells have in common.
 
-    A cell is what one channel reads of one emitter.
+    A cell is what one channel reads of one emitter; ``expected`` is the variance up to which
+    nothing counts that an effect on everything leaves.
     """
-    own, rest = [], []
+    own, rest, counts = [], [], []
     for part, column in zip(state.parts, columns, strict=True):
         if part.view.is_reference:
             continue
@@ -181,15 +182,19 @@ def _stays(state: State, columns: Sequence[Array | None], noise: float) -> float
             size = np.abs(column).sum(axis=2).reshape(shape).sum(axis=(0, 1))
             # The pose's marginalisation spreads a trace of every change over all channels.
             changed = size > 0.1 * size.max()
+        good = (part.whitener.weight > 0).reshape(shape).sum(axis=(0, 1))
         own.append(left[changed])
         rest.append(left[~changed])
+        counts.append(good[changed])
         spread = noise * np.sqrt(4.0 * part.white.shape[0])
-    acted, others = np.concatenate(own), np.concatenate(rest)
+    acted, others, values = (np.concatenate(found) for found in (own, rest, counts))
     if acted.size == 0:
         return 0.0
     if others.size < acted.size:
-        # An effect on everything: what single channels keep is not its fault.
-        stays = float(np.median(acted)) * acted.size
+        # An effect on everything: what single channels keep is not its fault, nor is what the
+        # field model may be wrong by, which is in the expected spread but not in the noise.
+        model = max(expected - noise, 0.0) * float(np.median(values))
+        stays = max(float(np.median(acted)) - model, 0.0) * acted.size
     else:
         stays = float(acted.sum() - np.median(others) * acted.size)
     return stays if stays > CLEAR * spread * np.sqrt(acted.size) else 0.0
@@ -203,7 +208,7 @@ def _checked_open(problem: Problem, fit: Fit, term: Term, noise: float) -> Confi
     for part in fit.state.parts:
         raw = term.effect.directions(term, part.view)
         columns.append(None if raw is None else parts(raw) * part.whitener.weight[..., None])
-    stays = _stays(fit.state, columns, noise) / power
+    stays = _stays(fit.state, columns, noise, noise) / power
     return Confirmation(power, 0.0, np.inf, stays, alike=_crowd(fit, term))
 
 
