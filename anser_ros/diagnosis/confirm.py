@@ -30,6 +30,9 @@ LEAST_OF_THE_REST = 0.2
 """An effect that takes off less than this share of what stays unexplained is not named."""
 CLEAR = 6.0
 """Standard deviations of the noise's power from which a remainder counts."""
+WRONG_BY = 1.3
+"""Variance over the noise's up to which a field model may be wrong, whatever it says: of a board
+beyond what was scanned. It is not held against an effect on everything."""
 MANY = 3
 """So many effects of one name stand in for something else that they have in common."""
 
@@ -115,7 +118,7 @@ def confirm(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmatio
         power / max(left_tools, 1e-3 * fit.state.count),
         0.0
         if term.effect.name in METALS
-        else _stays(fit.state, columns, noise, 1.0) / max(power, 1e-300),
+        else _stays(fit.state, columns, noise, max(1.0, WRONG_BY * noise)) / max(power, 1e-300),
         inexact=term.effect.inexact,
         alike=_crowd(fit, term),
         plausible=_plausible(fit, term),
