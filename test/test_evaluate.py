@@ -5,12 +5,20 @@ import dataclasses
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from anser_ros.cli.evaluate import to_document
 from anser_ros.cli.main import main
-from anser_ros.sessions.evaluation import track_session
+from anser_ros.errors import BagError
+from anser_ros.sessions.evaluation import (
+    Evaluation,
+    RefitSummary,
+    baseline_flux,
+    track_session,
+)
 from anser_ros.sessions.model_file import load_model, save_model
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for
@@ -138,3 +146,21 @@ def test_a_model_of_another_board_is_refused(model, tmp_path, capsys):
     arguments = ['evaluate', str(BAGS / 'moving.mcap'), '--model', str(other)]
     assert main([*arguments, '--out', str(tmp_path)]) == 2
     assert 'other0' in capsys.readouterr().err
+
+
+def test_a_baseline_whose_references_are_elsewhere_is_refused():
+    clean = load_session(BAGS / 'factory.mcap')
+    sensors = clean.reference.sensors
+    assert np.isfinite(baseline_flux(clean, sensors)).all()
+    moved = dataclasses.replace(sensors, position=sensors.position + [0.0, 0.02, 0.0])
+    with pytest.raises(BagError, match='20 mm from where'):
+        baseline_flux(clean, moved)
+
+
+def test_a_refit_says_in_how_many_frames_it_did_what():
+    summary = RefitSummary()
+    for state, out in (('refit', ()), ('refit', ('ref/1',)), ('frozen', ('ref/1',))):
+        summary.add(SimpleNamespace(state=state, left_out=out))
+    document = to_document(Evaluation({}, {}, 0.0, summary))
+    assert document['refit'] == {'states': {'refit': 2, 'frozen': 1}, 'left_out': {'ref/1': 2}}
+    assert 'refit' not in to_document(Evaluation({}, {}, 0.0))

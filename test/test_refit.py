@@ -13,6 +13,7 @@ from refit_world import (
 )
 
 from anser_ros.errors import FitError
+from anser_ros.fitting.baseline import ReadingWindow
 from anser_ros.fitting.refit import LiveRefit, RefitSettings
 
 STEP_NS = 20_000_000
@@ -169,12 +170,66 @@ def test_a_reference_that_fails_is_named_and_left_out(refit, fault, metal):
     run(refit, world, change)
     result = run(refit, world, change, frames=1, start=10, fault=fault)
     assert result.left_out == ('ref/5',)
-    assert result.references[5].state == 'disagrees'
+    assert result.references[5].state == ('silent' if fault is FAULTS['dead'] else 'disagrees')
     if metal:
         before, after, _, _ = errors(world, result.model, HEAD)
         assert after < 0.03 * before
     else:
         assert result.model is world.model
+
+
+@pytest.mark.parametrize('metal', [False, True])
+def test_a_whole_plug_that_is_out_is_left_out(refit, metal):
+    world = anser_world()
+    change = world.metal(HEAD) if metal else 0.0
+    run(refit, world, change)
+
+    def unplugged(flux):
+        flux[:6] = world.noise(np.random.default_rng(3))[:6]
+
+    result = run(refit, world, change, frames=1, start=10, fault=unplugged)
+    assert result.left_out == tuple(world.references.name[:6])
+    assert {health.state for health in result.references[:6]} == {'silent'}
+    if metal:
+        before, after, _, _ = errors(world, result.model, HEAD)
+        assert after < 0.1 * before
+    else:
+        assert result.model is world.model
+
+
+def test_when_all_are_silent_the_calibrated_model_is_in_force(refit):
+    world = anser_world()
+    change = world.metal(HEAD)
+    run(refit, world, change)
+    result = run(refit, world, change, frames=1, start=10, fault=lambda flux: flux.fill(0.0))
+    assert result.state == 'few_references'
+    assert result.model is world.model
+
+
+def test_an_absurd_reading_is_left_out_with_its_reason(refit):
+    world = anser_world()
+    result = run(refit, world, 0.0, fault=lambda flux: flux.__setitem__(4, 1e30))
+    assert result.left_out == ('ref/4',)
+    assert result.references[4].state == 'absurd'
+
+
+def window_of(world, change, frames=12):
+    window = ReadingWindow(world.references, 8, 10.0)
+    rng, none = np.random.default_rng(4), np.zeros(len(world.references), int)
+    for frame in range(frames):
+        flux = world.baseline + change(frame / frames) + world.noise(rng)
+        window.add(1 + frame, world.references.channel, flux, none)
+    return window
+
+
+def test_no_baseline_is_taken_while_metal_moves():
+    world = anser_world()
+    metal = world.metal(HEAD)
+    for at_rest in (0.0, metal):
+        window = window_of(world, lambda share, at_rest=at_rest: at_rest)
+        np.testing.assert_array_equal(window.still_mean(), window.mean())
+    with pytest.raises(FitError, match='metal that moves'):
+        window_of(world, lambda share: share * metal).still_mean()
 
 
 def test_two_that_fail_together_do_not_hide_each_other(refit):

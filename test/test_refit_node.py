@@ -7,7 +7,7 @@ import pytest
 from refit_world import anser_world, metal_block
 from tracking_world import CENTRES_MM, GEOMETRY, TURNED
 
-from anser_ros.errors import FrameError, ParameterError
+from anser_ros.errors import FitError, FrameError, ParameterError
 from anser_ros.fitting.refit_result import Metal
 from anser_ros.nodes.diagnostics import Level
 from anser_ros.nodes.model_clouds import stamp_of
@@ -148,7 +148,7 @@ def test_metal_is_shown_named_and_taken_away_again(make):
     assert status.values['refit_state'] == 'refit'
     assert status.values['references_left_out'] == 'ref/3'
     named = {part.name: part.message for part in rig.node.part_statuses()}
-    assert named['ref/3'] == 'disagrees'
+    assert named['ref/3'] == 'silent'
     assert named['ref/0'] == 'ok'
     assert rig.node._model is not calibrated
     # Frozen, the model stays; the metal goes, and then so does the marker.
@@ -246,6 +246,22 @@ def test_an_absurd_reading_is_no_baseline(make):
     reply = rig.node._on_set_baseline(Trigger.Request(), Trigger.Response())
     count = len(rig.world.baseline)
     assert reply.message.startswith(f'baseline of {count - 1} references')
+
+
+def test_a_baseline_of_too_few_is_refused_and_the_old_one_holds(make):
+    from std_srvs.srv import Trigger
+
+    rig = make()
+    rig.start()
+    refit = rig.node._refit
+    few = np.where(np.arange(len(rig.world.baseline))[:, None] < 3, 0.0, np.nan)
+    for _ in range(20):
+        rig.say(few)
+    state = rig.node.status()
+    assert state.level == Level.WARN and state.message.startswith('few_references: 3 usable')
+    with pytest.raises(FitError, match='3 of 16 reference sensors; 4 are needed'):
+        rig.node._on_set_baseline(Trigger.Request(), Trigger.Response())
+    assert rig.node._refit is refit
 
 
 def test_every_frame_is_answered_under_its_own_stamp(make):

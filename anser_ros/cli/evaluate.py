@@ -94,17 +94,33 @@ def run(args: argparse.Namespace) -> int:
         print(text)
     else:
         Console().print(_table(document))
+        if 'refit' in document:
+            Console().print(_refit_line(document['refit']), highlight=False)
         say_written(*(args.out / name for name in ('evaluation.json', 'poses.csv', 'bodies.csv')))
     return 0
 
 
 def to_document(evaluation: Evaluation) -> dict[str, Any]:
     """The contract's evaluation document."""
-    return {
+    document: dict[str, Any] = {
         'schema': SCHEMA,
         'sensors': {name: metrics(series) for name, series in evaluation.sensors.items()},
         'bodies': {name: metrics(series) for name, series in evaluation.bodies.items()},
     }
+    if evaluation.refit is not None:
+        # Beyond the contract: frames by state, and by the reference sensor that was left out.
+        document['refit'] = {
+            'states': dict(evaluation.refit.states),
+            'left_out': dict(evaluation.refit.left_out),
+        }
+    return document
+
+
+def _refit_line(refit: dict[str, dict[str, int]]) -> str:
+    """What the refit did, in a line."""
+    states = ', '.join(f'{name} in {count} frames' for name, count in refit['states'].items())
+    out = ', '.join(f'{name} in {count}' for name, count in refit['left_out'].items())
+    return f'refit: {states or "no frame"}; left out: {out or "no reference"}'
 
 
 def _rows(series: PoseSeries) -> list[list[Any]]:

@@ -11,6 +11,9 @@ from anser_ros.physics.sensor import SensorTable
 ComplexArray = NDArray[np.complex128]
 
 FEWEST_FRAMES = 3
+CHANGING, FELT = 4.0, 2e-4
+"""Readings that change while a baseline is taken: in units of the noise, and as a share of their
+size (which moves a pose by a hundredth of a millimetre)."""
 MOST_FRAMES = 2000
 
 
@@ -74,6 +77,33 @@ class ReadingWindow:
         while stamp_ns - self._frames[0][0] > self._span_ns:
             self._frames.popleft()
 
+    def still_mean(self) -> ComplexArray:
+        """Mean reading as `mean`, of readings that do not change.
+
+        Raises
+        ------
+        FitError
+            As `mean`, and while the readings change: beyond their noise, which is that of second
+            differences, and by more than a pose would feel.
+        """
+        mean = self.mean()
+        stack = np.stack([frame for _, frame in self._frames])
+        stack = stack[:, np.isfinite(stack).all(axis=(0, 2))]
+        third = len(stack) // 3
+        if third < FEWEST_FRAMES or not stack.size:
+            return mean
+        moved = np.abs(stack[-third:].mean(axis=0) - stack[:third].mean(axis=0))
+        noise = np.abs(np.diff(stack, 2, axis=0)) / np.sqrt(3 * third)
+        beyond = np.sqrt(np.mean(moved**2 / np.maximum((noise**2).mean(axis=0), 1e-300)))
+        size = np.sqrt((np.abs(stack) ** 2).mean(axis=0).sum(axis=1))
+        share = np.sqrt(np.mean((moved**2).sum(axis=1) / np.maximum(size**2, 1e-300)))
+        if beyond > CHANGING and share > FELT:
+            raise FitError(
+                f'the reference readings change by {share:.2%} while a baseline is taken; '
+                'is there metal that moves?'
+            )
+        return mean
+
     def mean(self) -> ComplexArray:
         """Mean reading, shape (S, K), T; NaN for a sensor without a good one in half the frames.
 
@@ -97,3 +127,19 @@ class ReadingWindow:
         mean = np.full(self._shape, np.nan, dtype=np.complex128)
         mean[enough] = total[enough] / count[enough, None]
         return mean
+
+
+def check_enough(baseline: ComplexArray, needed: int) -> int:
+    """Number of sensors that have a baseline, shape (S, K).
+
+    Raises
+    ------
+    FitError
+        When there are fewer than are needed.
+    """
+    count = int(np.isfinite(baseline).all(axis=1).sum())
+    if count < needed:
+        raise FitError(
+            f'a baseline of {count} of {len(baseline)} reference sensors; {needed} are needed'
+        )
+    return count

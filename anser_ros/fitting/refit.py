@@ -184,7 +184,7 @@ class LiveRefit:
         FitError
             When shapes don't fit or a channel appears twice.
         """
-        ordered, readable, reasons = self._order.read(channels, flux, flags)
+        ordered, readable, reasons = self._order.read(channels, flux, flags, baseline)
         if stamp_ns < self._last_ns:
             self._noise.forget()
             self._average.forget()

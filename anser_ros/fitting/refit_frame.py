@@ -9,7 +9,19 @@ from anser_ros.fitting.refit_kernels import fill_frame
 
 ComplexArray = NDArray[np.complex128]
 
-_REASONS = (health.MISSING, health.OK, health.FLAGGED, health.NOT_FINITE, health.NO_BASELINE)
+_REASONS = (
+    health.MISSING,
+    health.OK,
+    health.FLAGGED,
+    health.NOT_FINITE,
+    health.NO_BASELINE,
+    health.SILENT,
+    health.ABSURD,
+)
+QUIET = 0.05
+"""A coil that reads less than this share of its baseline is silent: no metal shields so well."""
+LARGEST_T = 1.0
+"""Component of a flux above which a reading is absurd, T."""
 
 
 class FrameOrder:
@@ -26,7 +38,7 @@ class FrameOrder:
     def __init__(self, channel: NDArray[np.int64], baseline: ComplexArray) -> None:
         self._channels: list[int] = channel.tolist()
         self._shape = baseline.shape
-        self._has_baseline = np.isfinite(baseline).all(axis=1)
+        self._least = _least_power(baseline)
         self._told: bytes | None = None
         self._rows = np.empty(0, dtype=np.int64)
 
@@ -35,8 +47,11 @@ class FrameOrder:
         channels: NDArray[np.generic],
         flux: NDArray[np.generic],
         flags: NDArray[np.generic] | None,
+        baseline: ComplexArray | None = None,
     ) -> tuple[ComplexArray, NDArray[np.bool_], list[str]]:
         """Fluxes (S, K) in the references' order, which can be used, and why others can't.
+
+        ``baseline`` (S, K) are the clean readings of this frame, where coils move.
 
         Raises
         ------
@@ -60,9 +75,16 @@ class FrameOrder:
             self._told = told
         ordered = np.empty(self._shape, dtype=np.complex128)
         code = np.empty(count, dtype=np.int64)
+        least = self._least if baseline is None else _least_power(baseline)
         fill_frame(
             np.ascontiguousarray(given, dtype=np.complex128),
             np.ascontiguousarray(marks, dtype=np.int64),
-            self._rows, self._has_baseline, ordered, code,
+            self._rows, least, LARGEST_T, ordered, code,
         )  # fmt: skip
         return ordered, code == 1, [_REASONS[c] for c in code.tolist()]
+
+
+def _least_power(baseline: ComplexArray) -> NDArray[np.float64]:
+    """Power of a reading below which a coil is silent, shape (S,), T^2; NaN without a baseline."""
+    power = np.asarray((np.abs(baseline) ** 2).sum(axis=1), dtype=np.float64)
+    return np.where(np.isfinite(power), QUIET**2 * power, np.nan)

@@ -22,6 +22,8 @@ FLAGGED = 'flagged'
 NOT_FINITE = 'not finite'
 MISSING = 'missing'
 NO_BASELINE = 'no baseline'
+SILENT = 'silent'
+ABSURD = 'absurd'
 DISAGREES = 'disagrees'
 
 FAULT_SCALES = 10.0 ** np.arange(0.0, 6.1, 0.5)
@@ -52,7 +54,7 @@ class ReferenceHealth(NamedTuple):
     name : str
     state : str
         ``ok``, or why it was left out: ``flagged``, ``not finite``, ``missing``, ``no baseline``,
-        ``disagrees``.
+        ``silent``, ``absurd``, ``disagrees``.
     residual_t : float
         Root mean square of measured minus predicted by all others, T a component; NaN where the
         coil has no reading.

@@ -149,11 +149,12 @@ def bend_power(flux, previous, before):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model='numpy')
-def fill_frame(given, marks, rows, has_baseline, ordered, code):  # type: ignore[no-untyped-def]
+def fill_frame(given, marks, rows, least, largest, ordered, code):  # type: ignore[no-untyped-def]
     """Write a frame's fluxes (S, K) in the references' order, and what each reading is.
 
-    ``rows`` (S,): each reference's row of the frame, -1 for none. ``code``: 0 missing, 1 good,
-    2 flagged, 3 not finite, 4 without a baseline.
+    ``rows`` (S,): each reference's row of the frame, -1 for none. ``least`` (S,): power (T^2)
+    below which a coil hears nothing; NaN without a baseline. ``largest``: of a component, T.
+    ``code``: 0 missing, 1 good, 2 flagged, 3 not finite, 4 without a baseline, 5 silent, 6 absurd.
     """
     for s in range(rows.shape[0]):
         row = rows[s]
@@ -162,14 +163,20 @@ def fill_frame(given, marks, rows, has_baseline, ordered, code):  # type: ignore
             code[s] = 0
         else:
             code[s] = 1
+            power = 0.0
             for k in range(ordered.shape[1]):
                 value = given[row, k]
                 ordered[s, k] = value
+                power += value.real * value.real + value.imag * value.imag
                 if not (math.isfinite(value.real) and math.isfinite(value.imag)):
                     code[s] = 3
+                elif code[s] != 3 and max(abs(value.real), abs(value.imag)) > largest:
+                    code[s] = 6
+            if power < least[s]:
+                code[s] = 5
             if marks[row] != 0:
                 code[s] = 2
-        if not has_baseline[s]:
+        if math.isnan(least[s]):
             code[s] = 4
 
 

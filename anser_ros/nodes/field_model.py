@@ -18,11 +18,12 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from anser_ros.errors import AnserError, FitError, ModelFileError, SetupError
-from anser_ros.fitting.baseline import ReadingWindow
+from anser_ros.fitting.baseline import ReadingWindow, check_enough
 from anser_ros.fitting.model import FieldModel
 from anser_ros.fitting.nominal import nominal_model
-from anser_ros.fitting.refit import LiveRefit, RefitResult
+from anser_ros.fitting.refit import LiveRefit, RefitResult, RefitSettings
 from anser_ros.fitting.refit_change import MOST_RATE_HZ, Pace
+from anser_ros.fitting.refit_result import FEW_REFERENCES, POOR_FIT
 from anser_ros.nodes import qos
 from anser_ros.nodes.diagnostics import Trouble
 from anser_ros.nodes.flux_reader import FrameWatch, read_frame
@@ -186,7 +187,7 @@ class FieldModelNode(AnserNode):
                 return
             window.add(stamp_ns, points.channel, flux, points.flags)
             if self._refit is None and self.parameters.baseline_at_start and window.full:
-                self._follow(window.mean())
+                self._follow(window.still_mean())
             if self._refit is not None and self._follows:
                 self._update(self._refit, stamp_ns, points.channel, flux, points.flags)
         except AnserError as error:
@@ -316,11 +317,11 @@ class FieldModelNode(AnserNode):
     def _on_set_baseline(self, _request: Any, response: Any) -> Any:
         if self._window is None:
             raise FitError('no setup yet')
-        baseline = self._window.mean()
+        baseline = self._window.still_mean()
+        good = check_enough(baseline, RefitSettings().min_references)
         self._follow(baseline)
-        good = int(np.isfinite(baseline).all(axis=1).sum())
-        response.success = True
-        response.message = f'baseline of {good} references over {len(self._window)} frames'
+        done = f'baseline of {good} references over {len(self._window)} frames'
+        response.success, response.message = True, done
         return response
 
     # What is told -------------------------------------------------------------------------
@@ -359,7 +360,8 @@ class FieldModelNode(AnserNode):
         trouble = self._trouble.recent(time.monotonic())
         if trouble:
             return Status('', Level.WARN, f'{activity}; lately: {trouble}', values)
-        return Status('', Level.OK, activity, values)
+        level = Level.WARN if values.get('refit_state') in (FEW_REFERENCES, POOR_FIT) else Level.OK
+        return Status('', level, activity, values)
 
     def _activity(self, values: dict[str, object]) -> str:
         if self._frozen:

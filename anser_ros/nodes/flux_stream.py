@@ -106,6 +106,7 @@ class FluxStream:
         self._cutter = WindowCutter(window, hop, len(hello.channels), rate / hello.tick_hz)
         self.counters = self._cutter.counters
         self.clock = DeviceClock(hello.tick_hz)
+        self._newest: Window | None = None
         self._columns = np.array([columns[s.channel] for s in self.sensors])
         self._split = sum(s.body != FIELD_GENERATOR for s in self.sensors)
         self._tool = _geometry(self.sensors[: self._split])
@@ -132,7 +133,14 @@ class FluxStream:
                 self.counters.windows_lost += 1
         return frames
 
+    def rehearse(self) -> None:
+        """Demodulate the newest window once more for nothing but speed, see `Acquisition`."""
+        if self._newest is not None:
+            fit = self._demodulator.demodulate(self._newest.codes, self._newest.present)
+            self._converter.convert(fit)
+
     def _frame(self, window: Window) -> FluxFrame:
+        self._newest = window
         fit = self._demodulator.demodulate(window.codes, window.present)
         converted = self._converted(fit, window.middle_ticks / self._tick_hz)
         flags = np.where(window.saturated[self._columns], SATURATED, 0)

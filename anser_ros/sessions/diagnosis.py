@@ -105,7 +105,10 @@ def diagnose_session(
     say = progress or (lambda text: None)
     say('tracking the held-out part')
     unseen = _unseen(session, problem)
-    moves = any(term.effect.moving for term in found.terms)
+    # What only the references can follow live: metal that moves, an emitter without a course.
+    moves = any(
+        term.effect.moving or term.effect.name == 'coil_fluctuation' for term in found.terms
+    )
     follow = moves and baseline is not None and session.reference is not None
     floor = max(found.flux_rms_floor_t, 1e-30)
     return SessionDiagnosis(

@@ -5,18 +5,20 @@ article's equation (7): RMSE, mean error, and the 50th and 95th percentile.
 """
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.correction import DRIFTS, Correction
-from anser_ros.errors import BagError
+from anser_ros.errors import BagError, FitError
+from anser_ros.fitting.baseline import check_enough
 from anser_ros.fitting.measurements import Measurements
 from anser_ros.fitting.model import FieldModel
-from anser_ros.fitting.refit import LiveRefit
+from anser_ros.fitting.refit import LiveRefit, RefitResult, RefitSettings
 from anser_ros.fitting.refit_change import Pace
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.sessions.patches import PatchFollower
@@ -27,6 +29,8 @@ from anser_ros.tracking.tracker import PoseEstimate, Tracker, TrackerSettings
 Array = NDArray[np.float64]
 Progress = Callable[[float], None]
 
+SAME_PLACE_M = 0.005
+"""Reference sensors of one setup may be surveyed anew, but are not elsewhere."""
 FOUND_ON = 'session_start_ns'
 """Evidence of a drift: the first stamp of the session on which it took its course."""
 
@@ -49,6 +53,19 @@ class PoseSeries:
         return np.array([estimate.state == 'ok' for estimate in self.estimates], dtype=bool)
 
 
+@dataclass
+class RefitSummary:
+    """In how many frames the refit was in which state, and left out which reference sensor."""
+
+    states: Counter[str] = field(default_factory=Counter)
+    left_out: Counter[str] = field(default_factory=Counter)
+
+    def add(self, result: RefitResult) -> None:
+        """Count one frame's result."""
+        self.states[result.state] += 1
+        self.left_out.update(result.left_out)
+
+
 @dataclass(frozen=True)
 class Evaluation:
     """What tracking gave: a series a sensor and a body, and the wall time a frame took."""
@@ -56,6 +73,7 @@ class Evaluation:
     sensors: dict[str, PoseSeries]
     bodies: dict[str, PoseSeries]
     seconds_per_frame: float
+    refit: RefitSummary | None = None
 
 
 def baseline_flux(baseline: Session, sensors: SensorTable) -> NDArray[np.complex128]:
@@ -76,6 +94,12 @@ def baseline_flux(baseline: Session, sensors: SensorTable) -> NDArray[np.complex
         found = np.flatnonzero(reference.sensors.channel == channel)
         if found.size == 0 or reference.sensors.name[found[0]] != name:
             raise BagError(f'{baseline.path}: the baseline lacks the reference sensor {name}')
+        apart = np.linalg.norm(reference.sensors.position[found[0]] - sensors.position[row])
+        if apart > SAME_PLACE_M:
+            raise BagError(
+                f'{baseline.path}: in the baseline the reference sensor {name} is '
+                f'{1e3 * apart:.0f} mm from where the session has it; is it of another setup?'
+            )
         good = reference.valid[:, found[0]]
         if good.any():
             mean[row] = reference.flux[good, found[0]].mean(axis=0)
@@ -153,7 +177,7 @@ def track_session(
         model, sensors, replace(wanted, flux_noise_t=noise_t, recorded_drift=recorded)
     )
     follower = _follower(session, model, baseline, patches or {}) if refit else None
-    pace = Pace()
+    pace, summary = Pace(), RefitSummary() if refit else None
     estimates: dict[str, list[PoseEstimate]] = {}
     frames = list(_frames(session))
     start = time.perf_counter()
@@ -172,6 +196,8 @@ def track_session(
                 reference.flags[reference_frame],
             )
             tracker = tracker.with_model(result.model)
+            if summary is not None:
+                summary.add(result)
         if tools:
             if in_phase:
                 flux = flux.real.astype(complex)
@@ -180,7 +206,7 @@ def track_session(
         if progress is not None:
             progress((count + 1) / len(frames))
     seconds = (time.perf_counter() - start) / max(len(frames), 1)
-    return _compare(session, correction, estimates, seconds)
+    return replace(_compare(session, correction, estimates, seconds), refit=summary)
 
 
 def drift_recorded(model: FieldModel, session: Session) -> bool:
@@ -224,6 +250,10 @@ def _follower(
     check_fits(model, baseline)
     sensors = session.reference.sensors
     clean = baseline_flux(baseline, sensors)
+    try:
+        check_enough(clean, RefitSettings().min_references)
+    except FitError as error:
+        raise BagError(f'{baseline.path}: {error}') from error
     if patches:
         return PatchFollower(session, model, clean, patches)
     return LiveRefit(model, sensors, clean, drawing=drawing_of(session.setup))

@@ -20,13 +20,15 @@ from pathlib import Path
 
 import numpy as np
 
+from anser_ros.cli.demo import BOARD_SEED
 from anser_ros.cli.supervisor import Child, Supervisor
 from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.control_unit import ControlUnit
+from anser_ros.simulation.manufacture import manufactured
 from anser_ros.simulation.pseudo_port import PseudoPort
 from anser_ros.simulation.world import World
 from anser_ros.wire.channel_calibration import parse_channels
-from anser_ros.wire.config_folder import read_config
+from anser_ros.wire.config_folder import config_path, read_config
 from anser_ros.wire.frames import Start, encode
 from anser_ros.wire.setup import parse_setup, topic_of
 
@@ -89,7 +91,8 @@ class Feeder(threading.Thread):
     def __init__(self, port: PseudoPort, seconds: float) -> None:
         super().__init__(name='feeder', daemon=True)
         setup = parse_setup(read_config('demo_setup.yaml'))
-        world = World(setup, board_source(setup))
+        board = manufactured(setup, np.random.default_rng(BOARD_SEED))
+        world = World(setup, board_source(board))
         self._unit = ControlUnit(world, parse_channels(read_config('demo_channels.yaml')))
         self._port = port
         recorded = ControlUnit(world, parse_channels(read_config('demo_channels.yaml')))
@@ -165,8 +168,8 @@ def run_chain(rate_hz: float, measure_s: float = MEASURE_S) -> Run:
             chain = {
                 name: supervisor.start(name, _command(name, **parameters))
                 for name, parameters in (
-                    ('field_model', {}),
-                    ('tracker', {}),
+                    ('field_model', {'model_file': config_path('demo_model.yaml')}),
+                    ('tracker', {'model_file': config_path('demo_model.yaml')}),
                     ('recorder', {'directory': folder, 'name': 'bag'}),
                     (
                         'acquisition',
