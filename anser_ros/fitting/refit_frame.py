@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from anser_ros.errors import FitError
 from anser_ros.fitting import refit_health as health
 from anser_ros.fitting.refit_kernels import fill_frame
+from anser_ros.physics.sensor import LARGEST_FLUX_T
 
 ComplexArray = NDArray[np.complex128]
 
@@ -20,8 +21,6 @@ _REASONS = (
 )
 QUIET = 0.05
 """A coil that reads less than this share of its baseline is silent: no metal shields so well."""
-LARGEST_T = 1.0
-"""Component of a flux above which a reading is absurd, T."""
 
 
 class FrameOrder:
@@ -79,7 +78,7 @@ class FrameOrder:
         fill_frame(
             np.ascontiguousarray(given, dtype=np.complex128),
             np.ascontiguousarray(marks, dtype=np.int64),
-            self._rows, least, LARGEST_T, ordered, code,
+            self._rows, least, LARGEST_FLUX_T, ordered, code,
         )  # fmt: skip
         return ordered, code == 1, [_REASONS[c] for c in code.tolist()]
 

@@ -12,8 +12,8 @@ from sensor_msgs.msg import PointCloud2
 
 from anser_ros.errors import LayoutError
 from anser_ros.nodes.model_clouds import NANO, layout_of, stamp_of, width_of
+from anser_ros.physics.sensor import LARGEST_FLUX_T
 from anser_ros.tracking.emitters import living_emitters
-from anser_ros.tracking.tracker import LARGEST_FLUX_T
 from anser_ros.wire.points import DROPPED, SATURATED, STALE, FluxPoints, decode_flux
 
 Count = Callable[[str, int], None]

@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+LARGEST_FLUX_T = 1.0
+"""A reading with a component beyond this is absurd, T."""
+
 
 @dataclass(frozen=True)
 class SensorTable:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import TrackingError
 from anser_ros.fitting.model import EffectRecord, FieldModel
-from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.sensor import LARGEST_FLUX_T, SensorTable
 from anser_ros.tracking import estimate as states
 from anser_ros.tracking.body_track import BodyTrack, track_body
 from anser_ros.tracking.coil_track import NANO, CoilResult, CoilTrack, prepare, track_coil
@@ -31,7 +31,6 @@ from anser_ros.tracking.scene import Scene, build_scene
 
 Array = NDArray[np.float64]
 
-LARGEST_FLUX_T = 1.0
 FLAGS = ((1, states.SATURATED), (2, states.STALE), (4, states.DROPPED))
 """Flag bits of a flux point (interfaces, section 3) and the states that they cause."""
 
