@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anser_ros.fitting.dipoles import Dipoles
-from anser_ros.fitting.layouts import Generator
-from anser_ros.fitting.measurements import Measurements
+from anser_ros.calibration.dipole_sites import DipoleSites
+from anser_ros.calibration.layouts import Generator
+from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import SensorTable
 
@@ -24,7 +24,7 @@ class Scene:
     measurements: Measurements
     position: np.ndarray
     rotation: np.ndarray
-    dipoles: Dipoles
+    dipoles: DipoleSites
     moments: np.ndarray
     generator: Generator
 
@@ -51,7 +51,7 @@ def scene(rng, side=9, jitter=1.0, sensors=None, noise=NOISE_T, height=0.14):
     moments = np.zeros((21, 3), dtype=complex)
     for k in range(3):
         moments[7 * k : 7 * k + 7, k] = rng.uniform(0.005, 0.01, 7) * (1.0 + 0.05j)
-    dipoles = Dipoles(positions, directions)
+    dipoles = DipoleSites(positions, directions)
     table = tool() if sensors is None else sensors
     line = np.linspace(-0.1, 0.1, side)
     x, y = np.meshgrid(line, line)

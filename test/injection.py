@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 from anser_ros.diagnosis.prepare import build_problem
 from anser_ros.diagnosis.problem import Problem
 from anser_ros.diagnosis.whitening import Spread
-from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.saturation import compressed
-from anser_ros.fitting.measurements import Measurements
-from anser_ros.fitting.model import FieldModel
+from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import FieldModel
 from anser_ros.physics.pose_track import PoseTrack
 
 NOISE_T = 60e-12

@@ -6,12 +6,12 @@ from functools import cache
 import numpy as np
 from tracking_world import NOISE_T, anser_board
 
-from anser_ros.fitting.model import FieldModel
-from anser_ros.fitting.nominal import nominal_model
-from anser_ros.fitting.refit import LiveRefit, RefitSettings
+from anser_ros.field.model import FieldModel
+from anser_ros.field.nominal import nominal_model
 from anser_ros.physics.board import Board, build_board
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.live_refit import LiveRefit, RefitSettings
 
 
 def reference_ring(count: int, half: float, seed: int = 3) -> SensorTable:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import yaml
 
+from anser_ros.calibration.calibrate import Options, rms
+from anser_ros.calibration.layouts import Layout
 from anser_ros.cli import calibrate as command
 from anser_ros.cli.main import main
 from anser_ros.errors import FitError, ParameterError
-from anser_ros.fitting.calibration import Options, rms
-from anser_ros.fitting.layouts import Layout
 from anser_ros.sessions.calibration import calibrate_sessions, generator_of, nominal_of
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.model_file import load_model

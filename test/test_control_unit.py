@@ -22,6 +22,8 @@ from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.config_folder import config_path, read_config
 from anser_ros.wire.frame_reader import FrameReader
 from anser_ros.wire.frames import (
+    DeviceState,
+    DeviceStatus,
     Hello,
     Identify,
     Reply,
@@ -30,8 +32,6 @@ from anser_ros.wire.frames import (
     SamplesFlag,
     SetFrequencies,
     Start,
-    State,
-    Status,
     Stop,
     encode,
 )
@@ -92,8 +92,8 @@ class TestProtocol:
     def test_says_hello_and_status_once_a_second_even_when_idle(self):
         unit = ControlUnit(world(), CHANNELS)
         payloads = [p for _ in range(300) for p in decode(unit.advance(400))]
-        assert [type(p) for p in payloads] == [Hello, Status] * 3
-        assert payloads[1].state is State.IDLE
+        assert [type(p) for p in payloads] == [Hello, DeviceStatus] * 3
+        assert payloads[1].state is DeviceState.IDLE
 
     def test_streams_between_start_and_stop(self):
         unit = ControlUnit(world(), CHANNELS)
@@ -189,7 +189,7 @@ class TestEffects:
 
     def test_crosstalk(self):
         clean, _ = self.codes()
-        leaky, _ = self.codes(raw_effects.ChannelCrosstalk((3, 5), ((1.0, 0.1), (0.0, 1.0))))
+        leaky, _ = self.codes(raw_effects.RawChannelCrosstalk((3, 5), ((1.0, 0.1), (0.0, 1.0))))
         assert np.abs(leaky[:, 3] - clean[:, 3] - 0.1 * clean[:, 5]).max() <= 1
         assert np.array_equal(np.delete(leaky, 3, 1), np.delete(clean, 3, 1))
 

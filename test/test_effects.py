@@ -7,11 +7,17 @@ import pytest
 from diagnosis_world import world
 
 from anser_ros.diagnosis.refine import belongs_to
-from anser_ros.effects.conducting_sheet import sheet_sources
 from anser_ros.effects.correction import Correction
-from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import Effect, Remedy, Term
-from anser_ros.effects.metal_body import (
+from anser_ros.effects.metal_path import FreePath, StraightPath, moving_times
+from anser_ros.effects.metal_remainder import REMAINDER, UP_M, Couplings, Lighting
+from anser_ros.effects.prediction import reference_view, tool_view
+from anser_ros.effects.registry import all_effects, effect_named
+from anser_ros.effects.saturation import compressed
+from anser_ros.errors import ModelFileError
+from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.model import EffectRecord
+from anser_ros.metal.body import (
     BODIES,
     ODD,
     body_spread,
@@ -19,13 +25,7 @@ from anser_ros.effects.metal_body import (
     lattice,
     multipoles,
 )
-from anser_ros.effects.metal_path import FreePath, StraightPath, moving_times
-from anser_ros.effects.metal_remainder import REMAINDER, UP_M, Couplings, Lighting
-from anser_ros.effects.prediction import reference_view, tool_view
-from anser_ros.effects.registry import all_effects, effect_named
-from anser_ros.effects.saturation import compressed
-from anser_ros.errors import ModelFileError
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.metal.sheet import sheet_sources
 from anser_ros.physics.metal import induced_moments
 
 CONTRACT = {
@@ -113,7 +113,7 @@ def test_an_effect_nobody_wrote_is_refused():
 def test_derivatives_agree_with_differences(scenery):
     _, problem = scenery
     tool, fields = problem.tools[0], problem.fields
-    for start in _candidates(problem.scene):
+    for start in _candidates(problem.apparatus):
         term = _in_force(start)
         view = tool_view(tool, [term], fields)
         columns = term.effect.columns(term, view)
@@ -138,7 +138,7 @@ def test_derivatives_agree_with_differences(scenery):
 def test_reference_derivatives_agree_with_differences(scenery):
     _, problem = scenery
     references = problem.references
-    for start in _candidates(problem.scene):
+    for start in _candidates(problem.apparatus):
         term = _in_force(start)
         if term.effect.name in ('coil_moved', 'saturation'):
             continue
@@ -160,7 +160,7 @@ def test_reference_derivatives_agree_with_differences(scenery):
 
 def test_records_give_the_same_term_back(scenery):
     _, problem = scenery
-    for start in _candidates(problem.scene):
+    for start in _candidates(problem.apparatus):
         term = _in_force(start)
         record = term.effect.record(term, 1e-6 * np.eye(term.theta.size))
         again = term.effect.term(record)
@@ -175,7 +175,7 @@ def test_a_correction_undoes_its_effects(scenery):
     plain = tool_view(tool, [], problem.fields)
     terms = [
         _in_force(t)
-        for t in _candidates(problem.scene)
+        for t in _candidates(problem.apparatus)
         if t.effect.remedy is Remedy.FLUX and 'mutual' not in t.site
     ]
     terms.append(Term(effect_named('sensor_polarity'), {'channels': (1, 4)}))
@@ -295,7 +295,7 @@ def test_a_large_perfect_sheet_is_a_mirror():
 @pytest.mark.parametrize('made', [_moving, _visiting])
 def test_moving_metal_is_where_it_says(scenery, made):
     _, problem = scenery
-    term = made(problem.scene)
+    term = made(problem.apparatus)
     view = tool_view(problem.tools[0], [], problem.fields)
     moved = term.effect.moving_flux(term, view)
     frame = 30
@@ -383,7 +383,7 @@ def test_the_place_of_metal_is_no_surer_than_its_shape(scenery):
     ball = -2 * np.pi * radius**3 * np.eye(3).astype(complex)
     assert centre_sigma(ball) == pytest.approx(ODD * radius)
     _, problem = scenery
-    found = {term.effect.name: term for term in _candidates(problem.scene)}
+    found = {term.effect.name: term for term in _candidates(problem.apparatus)}
     for name, keys in (('static_metal', ['position_m']), ('moving_metal', ['start_m', 'path'])):
         term = _in_force(found[name])
         record = term.effect.record(term, np.zeros((term.theta.size, term.theta.size)))
@@ -397,7 +397,7 @@ def test_a_coil_that_moved_lights_metal_from_where_it_is(scenery, metal):
     """The same as metal in a world that has the coil there from the start."""
     _, problem = scenery
     tool, fields = problem.tools[0], problem.fields
-    found = {term.effect.name: term for term in _candidates(problem.scene)}
+    found = {term.effect.name: term for term in _candidates(problem.apparatus)}
     body = _in_force(found[metal])
     coil = found['coil_moved'].with_theta(np.array([0.004, -0.003, 0.002]))
     alone = tool_view(tool, [body], fields).flux
@@ -418,7 +418,7 @@ def test_a_coil_that_moved_lights_metal_from_where_it_is(scenery, metal):
 
 def test_leftovers_are_linear_and_belong_to_their_metal(scenery):
     _, problem = scenery
-    found = next(t for t in _candidates(problem.scene) if t.effect.name == 'static_metal')
+    found = next(t for t in _candidates(problem.apparatus) if t.effect.name == 'static_metal')
     parent = _in_force(found)
     shapes = multipoles()
     rng = np.random.default_rng(0)
@@ -426,7 +426,7 @@ def test_leftovers_are_linear_and_belong_to_their_metal(scenery):
     view = tool_view(problem.tools[0], [], problem.fields)
     for leftover in (
         Couplings(shapes, parent.theta[:3], modes),
-        Lighting([parent], problem.scene.emitters),
+        Lighting([parent], problem.apparatus.emitters),
     ):
         term = REMAINDER.of(parent, leftover)
         assert belongs_to(term, parent.frozen(np.zeros((0, 0))))
@@ -441,12 +441,12 @@ def test_leftovers_are_linear_and_belong_to_their_metal(scenery):
 def test_lighting_is_an_emitter_that_sits_higher(scenery):
     """A metal that sees one emitter 0.4 mm higher, told by another illumination."""
     _, problem = scenery
-    found = next(t for t in _candidates(problem.scene) if t.effect.name == 'static_metal')
+    found = next(t for t in _candidates(problem.apparatus) if t.effect.name == 'static_metal')
     parent = _in_force(found)
     view = tool_view(problem.tools[0], [], problem.fields)
     light = view.illumination
-    lighting = Lighting([parent], problem.scene.emitters)
-    column = lighting.columns(view)[..., 3 * problem.scene.emitters + 1]
+    lighting = Lighting([parent], problem.apparatus.emitters)
+    column = lighting.columns(view)[..., 3 * problem.apparatus.emitters + 1]
     higher = replace(light, positions=light.positions + [0.0, 0.0, UP_M])
     both = [
         parent.effect.sources(parent, i, i, view.omega).flux(*view.flat) for i in (higher, light)

@@ -2,7 +2,7 @@
 
 from anser_ros.nodes.diagnostics import Level
 from anser_ros.nodes.fault_memory import MEMORY_S, RecentFaults, device_words
-from anser_ros.wire.frames import State, Status, StatusFlag
+from anser_ros.wire.frames import DeviceState, DeviceStatus, StatusFlag
 
 
 def test_a_fault_is_told_with_its_count_and_forgotten_in_time():
@@ -26,6 +26,6 @@ def test_what_stops_the_stream_is_an_error_and_comes_first():
 
 def test_the_device_complains_in_words():
     flags = StatusFlag.OVERRUN | StatusFlag.COIL_OPEN
-    assert device_words(Status(State.STREAMING, flags, 0, 12, 0, 30.0)) == (
+    assert device_words(DeviceStatus(DeviceState.STREAMING, flags, 0, 12, 0, 30.0)) == (
         'coil open, overrun, 12 blocks dropped'
     )

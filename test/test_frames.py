@@ -18,6 +18,8 @@ from anser_ros.wire.frame_reader import FrameReader
 from anser_ros.wire.frames import (
     Channel,
     ChannelKind,
+    DeviceState,
+    DeviceStatus,
     Hello,
     Identify,
     Reply,
@@ -25,8 +27,6 @@ from anser_ros.wire.frames import (
     SampleBlock,
     SetFrequencies,
     Start,
-    State,
-    Status,
     StatusFlag,
     Stop,
     encode,
@@ -55,7 +55,7 @@ def block(sequence: int = 3, n: int = 40, columns: int = 5) -> SampleBlock:
     return SampleBlock(sequence, 1000 * sequence, codes)
 
 
-STATUS = Status(State.STREAMING, StatusFlag(0), 1_000_000, 0, 0, 25.0)
+STATUS = DeviceStatus(DeviceState.STREAMING, StatusFlag(0), 1_000_000, 0, 0, 25.0)
 PAYLOADS = [
     hello(),
     block(),

@@ -23,7 +23,7 @@ from anser_ros.cli.loop_run import TONES_HZ
 from anser_ros.cli.main import main
 from anser_ros.effects.registry import all_effects, effect_named
 from anser_ros.effects.saturation import FLUX, VOLTAGE
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 from anser_ros.simulation.effect_draw import CATALOGUE, draw
 from anser_ros.simulation.raw_effects import CompressingAmplifier
 from anser_ros.wire.channel_calibration import parse_channels

@@ -114,6 +114,6 @@ def test_real_runs_before_the_fit_are_as_known(board):
     assert size['steel_shield'] == pytest.approx(5.21, abs=0.01)
     part = anser_board.study('steel', reported['steel_shield'], board, {})
     assert part.field_share < 0.3
-    analysis = anser_board.Analysis((part,), np.eye(1), {'scale': np.zeros(1)})
+    analysis = anser_board.BoardAnalysis((part,), np.eye(1), {'scale': np.zeros(1)})
     assert len(anser_board.rows(analysis)) == 3
     assert 'correlation of neighbours' in anser_board.tables(analysis)

@@ -9,7 +9,7 @@ import pytest
 
 from anser_ros.cli import measured
 from anser_ros.cli.main import main
-from anser_ros.measured import Row
+from anser_ros.measured import ReportRow
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get('ANSER_SHARED', ROOT.parent / 'shared'))
@@ -23,7 +23,7 @@ def test_unknown_data_set_and_missing_folder(capsys, tmp_path):
 
 
 def test_numbers_that_are_missing_are_null():
-    row = Row('set', 'figure', np.nan, np.float64(1.5), 'mm', None, None, 'nothing')
+    row = ReportRow('set', 'figure', np.nan, np.float64(1.5), 'mm', None, None, 'nothing')
     document = measured.to_document([row])
     assert document['rows'][0]['before'] is None
     assert json.loads(json.dumps(document))['rows'][0]['after'] == 1.5

@@ -19,9 +19,9 @@ from anser_ros.measured.navion_held_out import (
     with_own_pose,
 )
 from anser_ros.measured.navion_plate import (
+    HallSensorErrors,
     Plate,
     PlateData,
-    SensorErrors,
     Sources,
     predict_plane,
     rotation_matrices,
@@ -63,12 +63,12 @@ def made_up_plate(rng: np.random.Generator, sources: Sources, errors: bool) -> P
     grid = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     height = np.array([-0.058, -0.029, 0.0, 0.058])
     plate = Plate(grid)
-    sensors = SensorErrors(np.tile(np.eye(3), (len(grid), 1, 1)), np.zeros_like(grid))
+    sensors = HallSensorErrors(np.tile(np.eye(3), (len(grid), 1, 1)), np.zeros_like(grid))
     states = np.zeros((4, plate.n_state))
     if errors:
         turned = rotation_matrices(rng.normal(0.0, 0.04, grid.shape))
         gained = np.eye(3) + rng.normal(0.0, 0.02, (len(grid), 3, 1)) * np.eye(3)
-        sensors = SensorErrors(gained @ turned, np.zeros_like(grid))
+        sensors = HallSensorErrors(gained @ turned, np.zeros_like(grid))
         states = rng.normal(0.0, 3e-4, states.shape)
         states -= states.mean(axis=0)
     field = [
@@ -136,7 +136,7 @@ class TestFit:
     def test_a_tool_is_tracked_from_a_cold_start(self) -> None:
         sources = made_up_sources()
         data = made_up_plate(np.random.default_rng(5), sources, errors=False)
-        perfect = SensorErrors(np.tile(np.eye(3), (49, 1, 1)), np.zeros((49, 3)))
+        perfect = HallSensorErrors(np.tile(np.eye(3), (49, 1, 1)), np.zeros((49, 3)))
         found = tool_errors(data.field_t[2], sources, perfect, data.grid_m, 0.0)
         position, angle = found.rmse()
         assert position < 3e-3

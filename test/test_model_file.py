@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from anser_ros.errors import ModelFileError
-from anser_ros.fitting.model import EffectRecord, FieldModel, from_document, to_document
+from anser_ros.field.model import EffectRecord, FieldModel, from_document, to_document
 from anser_ros.sessions.model_file import load_model, save_model
 
 

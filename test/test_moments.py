@@ -17,12 +17,11 @@ import pytest
 from calibration_world import JITTER_M, JITTER_RAD, NOISE_T, scene
 from scipy.spatial.transform import Rotation
 
-from anser_ros.errors import FitError
-from anser_ros.fitting.dipoles import basis_rows
-from anser_ros.fitting.factors import GramFactor, TriangularFactor, as_complex, as_real
-from anser_ros.fitting.layouts import Layout, place
-from anser_ros.fitting.moments import MomentFitter
-from anser_ros.fitting.pose_correction import (
+from anser_ros.calibration.dipole_sites import basis_rows
+from anser_ros.calibration.factors import GramFactor, TriangularFactor, as_complex, as_real
+from anser_ros.calibration.layouts import Layout, place
+from anser_ros.calibration.moments import MomentFitter
+from anser_ros.calibration.pose_correction import (
     PoseWhitener,
     Uncertainty,
     frame_blocks,
@@ -33,6 +32,7 @@ from anser_ros.fitting.pose_correction import (
     usable_weights,
     with_pose,
 )
+from anser_ros.errors import FitError
 
 LAYER = Layout('layer', 9, 1.3, 0.0)
 

@@ -17,7 +17,7 @@ import pytest
 from tracking_world import GEOMETRY, anser_board
 
 from anser_ros.errors import FitError, SetupError
-from anser_ros.fitting.nominal import Tolerances, nominal_model
+from anser_ros.field.nominal import Tolerances, nominal_model
 from anser_ros.physics import board as boards
 from anser_ros.physics.board import Board, build_board, spiral_path
 from anser_ros.physics.constants import MU_0

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from calibration_world import scene
 
-from anser_ros.fitting.dipoles import Dipoles
-from anser_ros.fitting.pose_correction import Uncertainty, usable_weights
-from anser_ros.fitting.positions import PositionFitter, position_slopes
-from anser_ros.fitting.sensor_survey import SensorSurveyor, tangents
+from anser_ros.calibration.dipole_sites import DipoleSites
+from anser_ros.calibration.pose_correction import Uncertainty, usable_weights
+from anser_ros.calibration.positions import PositionFitter, position_slopes
+from anser_ros.calibration.sensor_survey import SensorSurveyor, tangents
 from anser_ros.physics.dipole import flux_basis
 
 
@@ -41,13 +41,13 @@ def test_position_slopes_are_differences(rng, length):
 def test_displaced_dipoles_find_back(rng):
     world = scene(rng, jitter=0.0, noise=1e-14)
     rows = np.arange(0, 21, 7)
-    few = Dipoles(world.dipoles.positions[rows], world.dipoles.directions[rows])
+    few = DipoleSites(world.dipoles.positions[rows], world.dipoles.directions[rows])
     flux = flux_basis(
         *(a.reshape(-1, 3) for a in world.measurements.placed()), None,
         few.positions, few.directions,
     ) @ world.moments[rows]  # fmt: skip
     measured = replace(world.measurements, flux=flux.reshape(world.measurements.flux.shape))
-    start = Dipoles(few.positions + rng.uniform(-0.01, 0.01, (3, 3)), few.directions)
+    start = DipoleSites(few.positions + rng.uniform(-0.01, 0.01, (3, 3)), few.directions)
     fit = PositionFitter([measured], [usable_weights(measured)], start, 0.0).fit(most_steps=40)
     assert fit.end_t < 1e-3 * fit.start_t
     assert np.abs(fit.dipoles.positions - few.positions).max() < 1e-5

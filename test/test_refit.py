@@ -13,8 +13,8 @@ from refit_world import (
 )
 
 from anser_ros.errors import FitError
-from anser_ros.fitting.baseline import ReadingWindow
-from anser_ros.fitting.refit import LiveRefit, RefitSettings
+from anser_ros.refit.baseline import ReadingWindow
+from anser_ros.refit.live_refit import LiveRefit, RefitSettings
 
 STEP_NS = 20_000_000
 HEAD = metal_block([0.03, -0.02, -0.11], [0.1, 0.12, 0.06])

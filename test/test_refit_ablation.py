@@ -6,8 +6,8 @@ import numpy as np
 from refit_world import NOISE_T, anser_world, metal_block, volume_points
 
 from anser_ros.experiments.refit_ablation import FREE, FROZEN, SHARED, ablate, plot, spread_out
-from anser_ros.fitting.nominal import nominal_model
-from anser_ros.fitting.refit_free import FreeDipoles
+from anser_ros.field.nominal import nominal_model
+from anser_ros.refit.free import FreeDipoles
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import board_of
 

@@ -5,9 +5,9 @@ import pytest
 from refit_world import anser_world, metal_block, metal_flux, volume_points
 from scipy.stats import multivariate_normal
 
-from anser_ros.fitting.refit_clouds import BODY_RADIUS, Region, bodies
-from anser_ros.fitting.refit_search import REMAINDER, BodySearch, body_factor
 from anser_ros.physics.dipole import flux_basis
+from anser_ros.refit.clouds import BODY_RADIUS, Region, bodies
+from anser_ros.refit.search import REMAINDER, BodySearch, body_factor
 
 BESIDE = metal_block([0.24, 0.03, 0.12], [0.06, 0.06, 0.06])
 STRONG = -6000.0 + 800.0j

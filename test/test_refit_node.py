@@ -8,9 +8,9 @@ from refit_world import anser_world, metal_block
 from tracking_world import CENTRES_MM, GEOMETRY, TURNED
 
 from anser_ros.errors import FitError, FrameError, ParameterError
-from anser_ros.fitting.refit_result import Metal
 from anser_ros.nodes.diagnostics import Level
 from anser_ros.nodes.model_clouds import stamp_of
+from anser_ros.refit.result import Metal
 from anser_ros.sessions.model_file import save_model
 from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup, dump_setup

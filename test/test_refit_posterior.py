@@ -7,16 +7,16 @@ import pytest
 from refit_world import anser_world
 from scipy.stats import multivariate_normal
 
-from anser_ros.fitting import refit_health as health
-from anser_ros.fitting.refit_change import Average, NoiseLevel, Pace
-from anser_ros.fitting.refit_clouds import Region, below, default_clouds, overhead
-from anser_ros.fitting.refit_excitation import excitation_for, region_of
-from anser_ros.fitting.refit_layer import bottom_layer, box_layer
-from anser_ros.fitting.refit_modes import error_modes
-from anser_ros.fitting.refit_patches import PoseError, clean_reading, has_moved
-from anser_ros.fitting.refit_posterior import STRENGTHS, Bank
-from anser_ros.fitting.refit_prior import ORIENTED, UPRIGHT, Response, build_prior
-from anser_ros.fitting.refit_references import SurveyError, survey_variants, vector_basis
+from anser_ros.refit import health
+from anser_ros.refit.change import Average, NoiseLevel, Pace
+from anser_ros.refit.clouds import Region, below, default_clouds, overhead
+from anser_ros.refit.excitation import excitation_for, region_of
+from anser_ros.refit.layer import bottom_layer, box_layer
+from anser_ros.refit.modes import error_modes
+from anser_ros.refit.patches import PoseError, clean_reading, has_moved
+from anser_ros.refit.posterior import STRENGTHS, Bank
+from anser_ros.refit.prior import ORIENTED, UPRIGHT, Response, build_prior
+from anser_ros.refit.references import SurveyError, survey_variants, vector_basis
 
 K = 8
 NOISE = 1.3

@@ -5,7 +5,7 @@ import pytest
 from tracking_world import NOISE_T, certain_model
 
 from anser_ros.errors import TrackingError
-from anser_ros.fitting.nominal import nominal_model
+from anser_ros.field.nominal import nominal_model
 from anser_ros.physics.board import build_board
 from anser_ros.tracking.seed import Volume, build_grid, grid_points, scan, solve_cold
 from anser_ros.tracking.solve import RealField, whitening_of

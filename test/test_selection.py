@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from calibration_world import NOISE_T, scene
 
+from anser_ros.calibration.blocks import FOLDS, fold_of_frames
+from anser_ros.calibration.calibrate import Options, calibrate, rms
+from anser_ros.calibration.error_map import FEWEST_POINTS, IDENTITY, learn_error_map
+from anser_ros.calibration.layout_fit import fit_layout
+from anser_ros.calibration.layouts import Generator, Layout, place
+from anser_ros.calibration.local import Regions
+from anser_ros.calibration.pose_correction import Uncertainty
+from anser_ros.calibration.prior import DrawnBoard, emitter_gains
+from anser_ros.calibration.selection import Selector, choose_layout, thin_frames
 from anser_ros.errors import FitError
-from anser_ros.fitting.blocks import FOLDS, fold_of_frames
-from anser_ros.fitting.calibration import Options, calibrate, rms
-from anser_ros.fitting.error_map import FEWEST_POINTS, IDENTITY, learn_error_map
-from anser_ros.fitting.layout_fit import fit_layout
-from anser_ros.fitting.layouts import Generator, Layout, place
-from anser_ros.fitting.local import Regions
-from anser_ros.fitting.model import FieldModel
-from anser_ros.fitting.pose_correction import Uncertainty
-from anser_ros.fitting.prior import DrawnBoard, emitter_gains
-from anser_ros.fitting.selection import Selector, choose_layout, thin_frames
+from anser_ros.field.model import FieldModel
 
 EMITTERS = ('a', 'b', 'c')
 TONES = (1000.0, 1100.0, 1200.0)

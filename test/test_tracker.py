@@ -15,12 +15,12 @@ from tracking_world import (
 )
 
 from anser_ros.errors import FitError, LayoutError, TrackingError
-from anser_ros.fitting.baseline import ReadingWindow
-from anser_ros.fitting.model import EffectRecord
-from anser_ros.fitting.nominal import nominal_model
+from anser_ros.field.model import EffectRecord
+from anser_ros.field.nominal import nominal_model
 from anser_ros.physics.board import build_board
 from anser_ros.physics.metal import induced_moments, sphere_polarisability
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.baseline import ReadingWindow
 from anser_ros.tracking import estimate as states
 from anser_ros.tracking.estimate import NoiseScale, TrackerSettings
 from anser_ros.tracking.rotations import rotation_of_vector
@@ -403,8 +403,8 @@ def test_swapping_models_keeps_the_warm_starts(rng):
     assert swapped.model is other
     assert tracker.model is MODEL
     far = tracker.with_model(replace(MODEL, moments=0.5 * MODEL.moments))
-    assert far._scene.grid is not tracker._scene.grid, 'another field needs another grid'
-    assert swapped._scene.grid is tracker._scene.grid
+    assert far._context.grid is not tracker._context.grid, 'another field needs another grid'
+    assert swapped._context.grid is tracker._context.grid
 
 
 def test_settings_may_change_on_the_way(rng):

@@ -8,7 +8,7 @@ from conftest import REPO, spin_until
 
 from anser_ros.cli.main import main
 from anser_ros.errors import DiagnosisError
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 from anser_ros.sessions import watch as watching
 from anser_ros.sessions.evaluation import baseline_flux
 from anser_ros.sessions.model_file import load_model

@@ -4,8 +4,8 @@ from functools import cache
 
 import numpy as np
 
-from anser_ros.fitting.model import FieldModel
-from anser_ros.fitting.nominal import nominal_model
+from anser_ros.field.model import FieldModel
+from anser_ros.field.nominal import nominal_model
 from anser_ros.physics.board import Board, build_board
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup

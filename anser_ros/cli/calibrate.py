@@ -13,14 +13,14 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from anser_ros.calibration.calibrate import Calibration, Options
+from anser_ros.calibration.document import to_document
+from anser_ros.calibration.layouts import Layout
+from anser_ros.calibration.pose_correction import Uncertainty
+from anser_ros.calibration.sensor_survey import KINDS
 from anser_ros.cli.calibration_figure import draw_choice
 from anser_ros.cli.output import make_folder, say_written
 from anser_ros.errors import FitError, ParameterError
-from anser_ros.fitting.calibration import Calibration, Options
-from anser_ros.fitting.calibration_document import to_document
-from anser_ros.fitting.layouts import Layout
-from anser_ros.fitting.pose_correction import Uncertainty
-from anser_ros.fitting.sensor_survey import KINDS
 from anser_ros.sessions.calibration import calibrate_sessions, check_same_board
 from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.session import load_session

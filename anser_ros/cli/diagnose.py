@@ -13,7 +13,7 @@ from rich.table import Table
 
 from anser_ros.cli.diagnosis_report import render, verdict
 from anser_ros.cli.output import make_folder, say_written
-from anser_ros.fitting.model import EffectRecord, FieldModel
+from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.sessions.diagnosis import diagnose_session, plain, to_document
 from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.session import load_session

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+from anser_ros.calibration.error_map import ErrorMap, learn_error_map
 from anser_ros.cli.output import make_folder, say_written
 from anser_ros.errors import FitError, ParameterError
-from anser_ros.fitting.error_map import ErrorMap, learn_error_map
 
 SCHEMA = 'anser_error_map/1'
 TRACKED = ('x_m', 'y_m', 'z_m')

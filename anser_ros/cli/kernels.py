@@ -40,7 +40,7 @@ def main() -> int:
     # Whoever only starts this process needs none of them.
     import numpy as np
 
-    from anser_ros.fitting.refit import LiveRefit
+    from anser_ros.refit.live_refit import LiveRefit
     from anser_ros.sessions.model_file import load_model
     from anser_ros.sessions.session import sensor_table
     from anser_ros.sessions.starting_model import board_of

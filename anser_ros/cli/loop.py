@@ -15,7 +15,7 @@ from rich.console import Console
 
 from anser_ros.cli.kernels import compile_kernels
 from anser_ros.cli.loop_result import parameter_errors, second_run, table, verdict
-from anser_ros.cli.loop_run import AFTER, Run, World, make_world, record
+from anser_ros.cli.loop_run import AFTER, LoopFiles, Run, make_world, record
 from anser_ros.cli.output import make_folder, say_written
 from anser_ros.cli.supervisor import Supervisor, tail
 from anser_ros.effects.correction import Correction
@@ -118,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _round(
     folder: Path,
-    world: World,
+    world: LoopFiles,
     clean: Path | None,
     effect: str,
     seed: int,

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from anser_ros.cli.loop_run import AFTER, BEFORE, UNGATED
 from anser_ros.effects.correction import Correction
-from anser_ros.fitting.model import FieldModel
+from anser_ros.field.model import FieldModel
 from anser_ros.sessions.recorded_poses import LiveErrors, live_errors
 from anser_ros.sessions.session import Session
 

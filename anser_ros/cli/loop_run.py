@@ -32,14 +32,14 @@ folds back, then fall between the tones, whole cycles of a 20 ms window away."""
 
 
 @dataclass(frozen=True)
-class World:
+class LoopFiles:
     """What all runs of a loop share: files of the setup and of the model known at first."""
 
     setup: Path
     model: Path
 
 
-def make_world(folder: Path) -> World:
+def make_world(folder: Path) -> LoopFiles:
     """Write the demo's setup and model with the loop's tones, which a field without metal ignores.
 
     Raises
@@ -54,7 +54,7 @@ def make_world(folder: Path) -> World:
         replace(coil, frequency_hz=tone)
         for coil, tone in zip(setup.emitter.coils, TONES_HZ, strict=True)
     )
-    world = World(folder / 'setup.yaml', folder / 'model.yaml')
+    world = LoopFiles(folder / 'setup.yaml', folder / 'model.yaml')
     own = replace(setup, emitter=replace(setup.emitter, coils=coils))
     world.setup.write_text(dump_setup(own), encoding='utf-8')
     model = load_model(config_path('demo_model.yaml'))

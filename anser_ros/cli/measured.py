@@ -16,7 +16,7 @@ from rich.table import Table
 from anser_ros.cli.output import make_folder, say_written
 from anser_ros.errors import ParameterError
 from anser_ros.measured import (
-    Row,
+    ReportRow,
     anser_board,
     hpi_coils,
     hpi_session,
@@ -27,25 +27,25 @@ from anser_ros.measured import (
     navion_session,
 )
 
-Study = Callable[[Path], tuple[list[Row], str]]
+Study = Callable[[Path], tuple[list[ReportRow], str]]
 
 
-def _navion(folder: Path) -> tuple[list[Row], str]:
+def _navion(folder: Path) -> tuple[list[ReportRow], str]:
     analysis = navion_report.analyse(folder)
     return navion.rows(analysis, folder), navion_report.tables(analysis)
 
 
-def _magnet_patch(folder: Path) -> tuple[list[Row], str]:
+def _magnet_patch(folder: Path) -> tuple[list[ReportRow], str]:
     analysis = magnet_patch.analyse(folder)
     return magnet_patch.rows(analysis), magnet_patch.tables(analysis)
 
 
-def _hpi_coils(folder: Path) -> tuple[list[Row], str]:
+def _hpi_coils(folder: Path) -> tuple[list[ReportRow], str]:
     analysis = hpi_coils.analyse(folder)
     return hpi_coils.rows(analysis), hpi_coils.tables(analysis)
 
 
-def _anser_board(folder: Path) -> tuple[list[Row], str]:
+def _anser_board(folder: Path) -> tuple[list[ReportRow], str]:
     analysis = anser_board.analyse(folder)
     return anser_board.rows(analysis), anser_board.tables(analysis)
 
@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
     console = Console(stderr=args.json, width=None if os.isatty(1) else 200)
     for folder in filter(None, (args.out, args.bags)):
         make_folder(folder)
-    rows: list[Row] = []
+    rows: list[ReportRow] = []
     if args.bags is not None:
         _write_bags(args.datasets or STUDIES, shared, args.bags, console)
     for name in args.datasets or STUDIES:
@@ -145,7 +145,7 @@ def shared_folder(given: Path | None) -> Path:
     return folder
 
 
-def to_document(rows: list[Row]) -> dict[str, Any]:
+def to_document(rows: list[ReportRow]) -> dict[str, Any]:
     """The table for machines; a missing number is null."""
 
     def plain(value: Any) -> Any:
@@ -159,7 +159,7 @@ def to_document(rows: list[Row]) -> dict[str, Any]:
     }
 
 
-def table(rows: list[Row]) -> Table:
+def table(rows: list[ReportRow]) -> Table:
     """The table for people."""
     out = Table(title='Measured data: before and after, on data that took no part')
     for heading in ('data set', 'figure', 'before', 'after', 'target', 'met', 'chosen on'):

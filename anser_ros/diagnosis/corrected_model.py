@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import Remedy, Term
 from anser_ros.effects.prediction import Fields, lit
-from anser_ros.fitting.model import EffectRecord, FieldModel
+from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.model import EffectRecord, FieldModel
 
 Array = NDArray[np.float64]
 

@@ -31,7 +31,7 @@ from anser_ros.effects.effect import Effect, Term
 from anser_ros.effects.fluctuation import Fluctuation
 from anser_ros.effects.metal_remainder import REMAINDER
 from anser_ros.effects.registry import all_effects
-from anser_ros.fitting.model import EffectRecord, FieldModel
+from anser_ros.field.model import EffectRecord, FieldModel
 
 Array = NDArray[np.float64]
 
@@ -307,7 +307,9 @@ def _noise_findings(
         noisy = _noisy_channels(after)
         if noisy:
             factor = _factor_of(after, noisy)
-        count = after.count * (len(noisy) or 1) / (len(whole.scene.tool_channels) if noisy else 1)
+        count = (
+            after.count * (len(noisy) or 1) / (len(whole.apparatus.tool_channels) if noisy else 1)
+        )
         site = {'factor': factor, 'sigma': factor / np.sqrt(2 * max(count, 1))}
         if noisy:
             site['channels'] = noisy

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.dipoles import Dipoles
-from anser_ros.fitting.model import FieldModel
+from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import field_basis, flux_basis
 from anser_ros.physics.sensor import SensorTable
 

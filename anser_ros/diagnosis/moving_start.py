@@ -47,7 +47,7 @@ def moving_starts(
     best = int(np.argmax([gains[:, i].max() for i in range(blocks.size)]))
     sums = places[int(np.argmax(gains[:, best]))][1].own
     alpha = sums.part(np.array([best])).solve(np.full(2, 1e6))[0]
-    duration = problem.scene.duration
+    duration = problem.apparatus.duration
     start, end = (
         course[: max(2, blocks.size // 8)].mean(0),
         course[-max(2, blocks.size // 8) :].mean(0),

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from anser_ros.diagnosis.illumination import CleanReferences, board_box, fit_illumination
 from anser_ros.diagnosis.problem import Problem, References
 from anser_ros.diagnosis.whitening import Spread
-from anser_ros.effects.dipoles import Dipoles
-from anser_ros.effects.effect import Scene
+from anser_ros.effects.effect import Apparatus
 from anser_ros.effects.prediction import Fields
 from anser_ros.errors import DiagnosisError
-from anser_ros.fitting.measurements import Measurements
-from anser_ros.fitting.model import FieldModel
+from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 
 Array = NDArray[np.float64]
@@ -88,7 +88,7 @@ def build_problem(
     illumination = fit_illumination(model, drawn, some, clean)
     omega = 2 * np.pi * np.asarray(model.frequencies_hz)
     fields = Fields(Dipoles(model.positions, model.directions, model.moments), illumination, omega)
-    scene = Scene(
+    apparatus = Apparatus(
         tools=tuple(tool.sensors for tool in posed),
         references=None if references is None else references.readings.sensors,
         emitters=omega.size,
@@ -100,7 +100,7 @@ def build_problem(
     )
     blocks = tuple(_numbers(tool.time, edges) for tool in posed)
     good = tuple(tool.valid.copy() for tool in posed)
-    return Problem(posed, blocks, references, reference_blocks, fields, scene, spread, good)
+    return Problem(posed, blocks, references, reference_blocks, fields, apparatus, spread, good)
 
 
 def _numbers(time: Array, edges: Array) -> NDArray[np.int64]:

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.whitening import Spread, Whitener, parts, pose_jacobian
-from anser_ros.effects.effect import Scene, Term, View
+from anser_ros.effects.effect import Apparatus, Term, View
 from anser_ros.effects.prediction import Fields, reference_view, tool_view
-from anser_ros.fitting.measurements import Measurements
+from anser_ros.field.measurements import Measurements
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -52,7 +52,7 @@ class Problem:
     references : References or None
     reference_blocks : ndarray of int, shape (B,)
     fields : Fields
-    scene : Scene
+    apparatus : Apparatus
     spread : Spread
     good : tuple of ndarray of bool, one a tool, shape (F, S)
         Values that take part (valid, and no outliers).
@@ -63,7 +63,7 @@ class Problem:
     references: References | None
     reference_blocks: NDArray[np.int64]
     fields: Fields
-    scene: Scene
+    apparatus: Apparatus
     spread: Spread
     good: tuple[Mask, ...]
 

@@ -16,9 +16,11 @@ from anser_ros.diagnosis.problem import Problem, evaluate
 from anser_ros.diagnosis.rich_modes import Known, rich_modes, thinned
 from anser_ros.diagnosis.scoring import joined
 from anser_ros.diagnosis.structure import noise_scale
-from anser_ros.effects.conducting_sheet import sheet_shapes, sheet_spread
 from anser_ros.effects.effect import Term, View
-from anser_ros.effects.metal_body import (
+from anser_ros.effects.metal_path import FreePath
+from anser_ros.effects.metal_remainder import REMAINDER, Couplings, Leftover, Lighting
+from anser_ros.effects.moving_metal import LARGEST, MovingMetal, path_of
+from anser_ros.metal.body import (
     BODIES,
     COMPACT,
     ODD,
@@ -26,10 +28,8 @@ from anser_ros.effects.metal_body import (
     ball_modes,
     body_spread,
 )
-from anser_ros.effects.metal_path import FreePath
-from anser_ros.effects.metal_remainder import REMAINDER, Couplings, Leftover, Lighting
-from anser_ros.effects.moving_metal import LARGEST, MovingMetal, path_of
-from anser_ros.effects.scattering import Shapes
+from anser_ros.metal.scattering import Shapes
+from anser_ros.metal.sheet import sheet_shapes, sheet_spread
 
 Array = NDArray[np.float64]
 
@@ -120,7 +120,7 @@ def _with_remainder(
         if own is None:
             return fit
         start = [t if i != index else term for i, t in enumerate(plain)]
-        light = REMAINDER.of(term, Lighting([term, *own], problem.scene.emitters))
+        light = REMAINDER.of(term, Lighting([term, *own], problem.apparatus.emitters))
         fit = fit_terms(problem, [*start, *own, light], blocks, iterations)
         if np.linalg.norm(_centre(fit.terms[index]) - centre) < AWAY:
             break
@@ -214,9 +214,9 @@ def _shaped(
             break
         if isinstance(path, FreePath) and len(path.knots) >= count:
             continue
-        time = np.linspace(0.0, problem.scene.duration, 6 * count)
+        time = np.linspace(0.0, problem.apparatus.duration, 6 * count)
         freer, course = FreePath.through(
-            np.linspace(0.0, problem.scene.duration, count), time, effect.centres(term, time)
+            np.linspace(0.0, problem.apparatus.duration, count), time, effect.centres(term, time)
         )
         trial = _with(fit.terms, index, effect.with_path(term, freer, course))
         other = fit_terms(problem, trial, blocks, iterations)

@@ -258,7 +258,7 @@ def _fluctuating(problem: Problem, before: Fit, how: SearchSettings) -> list[tup
     for effect in all_effects().values():
         if not isinstance(effect, Fluctuation):
             continue
-        for term in effect.candidates(problem.scene):
+        for term in effect.candidates(problem.apparatus):
             if any(_same(term, other) for other in before.terms):
                 continue
             likeliest = fluctuation_of(before.state, term)
@@ -269,12 +269,12 @@ def _fluctuating(problem: Problem, before: Fit, how: SearchSettings) -> list[tup
 
 def _scored(problem: Problem, scorer: Scorer) -> list[tuple[Term, Score]]:
     """All candidates that are not in force already, best first."""
-    taken, ours = scorer.state.terms, problem.scene.tool_channels
+    taken, ours = scorer.state.terms, problem.apparatus.tool_channels
     metals = sum(term.effect.name in METALS for term in taken)
     metal, moving = metals > 0, any(term.effect.name == 'moving_metal' for term in taken)
     out = []
     for effect in all_effects().values():
-        for term in effect.candidates(problem.scene):
+        for term in effect.candidates(problem.apparatus):
             if any(_same(term, other) for other in taken):
                 continue
             if metal and term.site.get('channel', ours[0]) not in ours:

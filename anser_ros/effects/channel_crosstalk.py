@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
@@ -20,7 +20,7 @@ from anser_ros.effects.effect import (
     unit_matrix,
 )  # fmt: skip
 from anser_ros.errors import ModelFileError
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 
 
 def _pairs(count: int) -> list[tuple[int, int]]:
@@ -37,11 +37,11 @@ class ChannelCrosstalk(Effect):
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'matrix': (-0.5, 0.5)}
     remedy = Remedy.FLUX
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Clusters as a whole, and pairs of channels of different clusters."""
-        groups = [g for g in scene.clusters() if len(g) <= 4]
+        groups = [g for g in apparatus.clusters() if len(g) <= 4]
         inside = {pair for g in groups if len(g) > 2 for pair in combinations(sorted(g), 2)}
-        pairs = [p for p in combinations(sorted(scene.tool_channels), 2) if p not in inside]
+        pairs = [p for p in combinations(sorted(apparatus.tool_channels), 2) if p not in inside]
         groups += [p for p in pairs if p not in groups][:300]
         return [Term(self, {'channels': g}, np.zeros(len(g) * (len(g) - 1))) for g in groups]
 

@@ -7,18 +7,18 @@ from typing import ClassVar
 import numpy as np
 
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
     sigmas,
 )  # fmt: skip
 from anser_ros.effects.time_offset import flux_rate
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 
 
@@ -34,9 +34,9 @@ class ClockRate(Effect):
     }
     remedy = Remedy.OPTICAL
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """One clock for all bodies."""
-        return [Term(self, {}, np.zeros(2))] if scene.tools else []
+        return [Term(self, {}, np.zeros(2))] if apparatus.tools else []
 
     def prior(self, term: Term) -> Array:
         """A tenth of a second, a few thousand parts per million."""

@@ -7,18 +7,18 @@ from typing import ClassVar
 import numpy as np
 
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
     sigmas,
     unit_matrix,
 )  # fmt: skip
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 
 
 class CoilCrosstalk(Effect):
@@ -38,9 +38,9 @@ class CoilCrosstalk(Effect):
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'eps': (-0.5, 0.5)}
     remedy = Remedy.FLUX
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Every ordered pair, and every pair both ways."""
-        coils = range(scene.emitters)
+        coils = range(apparatus.emitters)
         one_way = [Term(self, {'coils': p}, np.zeros(2)) for p in permutations(coils, 2)]
         both = [
             Term(self, {'coils': p, 'mutual': True}, np.zeros(1)) for p in combinations(coils, 2)

@@ -7,18 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
     sigmas,
     unit_matrix,
 )  # fmt: skip
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 
 PROBED_SHARES = (0.1, 0.5, 2.5)
 """Time constants of the probe, as shares of the session."""
@@ -40,12 +40,12 @@ class CoilDrift(Effect):
     }
     remedy = Remedy.FLUX
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Every emitter."""
-        tau = 0.5 * max(scene.duration, 1.0)
+        tau = 0.5 * max(apparatus.duration, 1.0)
         return [
-            Term(self, {'coil': k, '_duration': scene.duration}, np.array([0.0, np.log(tau)]))
-            for k in range(scene.emitters)
+            Term(self, {'coil': k, '_duration': apparatus.duration}, np.array([0.0, np.log(tau)]))
+            for k in range(apparatus.emitters)
         ]
 
     def amounts(self, term: Term) -> NDArray[np.int64]:

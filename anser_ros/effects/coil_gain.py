@@ -6,17 +6,17 @@ from typing import ClassVar
 import numpy as np
 
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
     unit_matrix,
 )  # fmt: skip
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 
 
 class CoilGain(Effect):
@@ -31,9 +31,9 @@ class CoilGain(Effect):
     }
     remedy = Remedy.FLUX
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Every emitter."""
-        return [Term(self, {'coil': k}, np.zeros(2)) for k in range(scene.emitters)]
+        return [Term(self, {'coil': k}, np.zeros(2)) for k in range(apparatus.emitters)]
 
     def prior(self, term: Term) -> Array:
         """Some ten percent."""

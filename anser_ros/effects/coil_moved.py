@@ -5,19 +5,19 @@ from typing import ClassVar
 
 import numpy as np
 
-from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
     sigmas,
 )  # fmt: skip
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.model import EffectRecord
 
 
 class CoilMoved(Effect):
@@ -29,9 +29,9 @@ class CoilMoved(Effect):
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'shift_m': (-0.03, 0.03)}
     remedy = Remedy.FIELD
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Every emitter."""
-        return [Term(self, {'coil': k}, np.zeros(3)) for k in range(scene.emitters)]
+        return [Term(self, {'coil': k}, np.zeros(3)) for k in range(apparatus.emitters)]
 
     def prior(self, term: Term) -> Array:
         """Some millimetres."""

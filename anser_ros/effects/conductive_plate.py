@@ -6,21 +6,21 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.conducting_sheet import sheet_sources
-from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import (
     FROZEN,
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
     sigmas,
 )  # fmt: skip
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.model import EffectRecord
+from anser_ros.metal.sheet import sheet_sources
 
 MESH = 12
 STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])
@@ -50,12 +50,12 @@ class ConductivePlate(Effect):
     }
     remedy = Remedy.FIELD
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Heights below the board and above the volume, two sizes."""
-        size = float(np.max(scene.board[1, :2] - scene.board[0, :2]))
-        middle = scene.board.mean(axis=0)
-        below = scene.board[0, 2] - size * np.array([0.08, 0.16, 0.26, 0.4, 0.6])
-        above = scene.working_volume[1, 2] + size * np.array([0.25, 0.5])
+        size = float(np.max(apparatus.board[1, :2] - apparatus.board[0, :2]))
+        middle = apparatus.board.mean(axis=0)
+        below = apparatus.board[0, 2] - size * np.array([0.08, 0.16, 0.26, 0.4, 0.6])
+        above = apparatus.working_volume[1, 2] + size * np.array([0.25, 0.5])
         return [
             Term(
                 self,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from anser_ros.effects.effect import Remedy, Term, unit_matrix
 from anser_ros.effects.registry import effect_named
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
 

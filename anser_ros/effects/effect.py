@@ -17,9 +17,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.dipoles import Dipoles
 from anser_ros.errors import ModelFileError
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
 
@@ -42,7 +42,7 @@ class Remedy(Enum):
 
 
 @dataclass(frozen=True)
-class Scene:
+class Apparatus:
     """What a session consists of, as far as effects need it to say where they may sit.
 
     Attributes
@@ -250,7 +250,7 @@ class Effect:
     inexact: ClassVar[float] = 0.01
 
     # --- search ------------------------------------------------------------------------------
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """The effect at every site where it may sit, with parameters of zero."""
         return ()
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import ClassVar
 
 from anser_ros.effects.effect import Array, Effect, Remedy, Term, needed
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 
 
 class ExcessNoise(Effect):

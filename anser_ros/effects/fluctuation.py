@@ -14,11 +14,11 @@ import numpy as np
 
 from anser_ros.effects.coil_gain import CoilGain
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
@@ -29,7 +29,7 @@ from anser_ros.effects.sensor_gain import SensorGain
 from anser_ros.effects.sensor_position import SensorPosition
 from anser_ros.effects.time_offset import TimeOffset
 from anser_ros.effects.tool_gain import ToolGain
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 
 
 class Fluctuation(Effect):
@@ -44,17 +44,17 @@ class Fluctuation(Effect):
     of: ClassVar[Effect]
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'rms': (0.0, 1.0)}
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Every site of the constant effect on emitters and tools."""
         return [
             Term(self, {**term.site, '_constant': term})
-            for term in self.of.candidates(scene)
-            if self._is_tool(term, scene)
+            for term in self.of.candidates(apparatus)
+            if self._is_tool(term, apparatus)
         ]
 
     @staticmethod
-    def _is_tool(term: Term, scene: Scene) -> bool:
-        own = scene.tool_channels
+    def _is_tool(term: Term, apparatus: Apparatus) -> bool:
+        own = apparatus.tool_channels
         return bool(term.site.get('channel', own[0]) in own)
 
     def free_columns(self, term: Term, view: View) -> ComplexArray | None:
@@ -138,9 +138,9 @@ class LooseSensorPosition(Fluctuation):
     units: ClassVar[Mapping[str, str]] = {'channels': '1', 'rms': 'm'}
     of = SensorPosition()
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Every cluster."""
-        return [term for term in super().candidates(scene) if len(term.site['channels']) > 1]
+        return [term for term in super().candidates(apparatus) if len(term.site['channels']) > 1]
 
 
 class StampJitter(Fluctuation):

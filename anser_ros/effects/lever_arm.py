@@ -6,17 +6,17 @@ from typing import ClassVar
 import numpy as np
 
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
     sigmas,
 )  # fmt: skip
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
 
 
@@ -29,10 +29,12 @@ class LeverArm(Effect):
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'offset_m': (-0.03, 0.03)}
     remedy = Remedy.SENSORS
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Every body."""
         return [
-            Term(self, {'body': table.body[0]}, np.zeros(3)) for table in scene.tools if len(table)
+            Term(self, {'body': table.body[0]}, np.zeros(3))
+            for table in apparatus.tools
+            if len(table)
         ]
 
     def prior(self, term: Term) -> Array:

@@ -11,10 +11,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term, View
-from anser_ros.effects.scattering import Shapes
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.model import EffectRecord
+from anser_ros.metal.scattering import Shapes
 
 GAIN, ASIDE_M, UP_M = 3e-3, 0.2e-3, 0.4e-3
 """How well an emitter's field is known where metal is and nothing was measured: as if the emitter

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import (
     FROZEN,
     Array,
@@ -19,10 +18,11 @@ from anser_ros.effects.effect import (
     needed,
     sigmas,
 )
-from anser_ros.effects.metal_body import BODIES, COMPACT, SPACINGS, ball_modes, centre_sigma
 from anser_ros.effects.metal_path import FreePath, MetalPath, StraightPath, moving_times
-from anser_ros.effects.scattering import UNIT, Shapes
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.model import EffectRecord
+from anser_ros.metal.body import BODIES, COMPACT, SPACINGS, ball_modes, centre_sigma
+from anser_ros.metal.scattering import UNIT, Shapes
 
 STEP = 1e-3
 PATH_SAMPLES = 21
@@ -34,7 +34,7 @@ class MovingMetal(Effect):
     """theta: the path's parameters, then real and imaginary parts of the modes' amplitudes.
 
     The body doesn't turn. The site holds the path, the session's times, the modes
-    (`anser_ros.effects.scattering`) and the prior size of each.
+    (`anser_ros.metal.scattering`) and the prior size of each.
     """
 
     name = 'moving_metal'

@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
     sigmas,
 )
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 
 
@@ -38,9 +38,9 @@ class OpticalScale(Effect):
     }
     remedy = Remedy.OPTICAL
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """One tracker for all bodies."""
-        return [Term(self, {}, np.zeros(4))] if scene.tools else []
+        return [Term(self, {}, np.zeros(4))] if apparatus.tools else []
 
     def prior(self, term: Term) -> Array:
         """A percent, some millimetres."""
@@ -95,10 +95,10 @@ class RegistrationDrift(Effect):
     }
     remedy = Remedy.OPTICAL
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """One tracker for all bodies."""
-        site = {'_duration': max(scene.duration, 1e-3)}
-        return [Term(self, site, np.zeros(6))] if scene.tools else []
+        site = {'_duration': max(apparatus.duration, 1e-3)}
+        return [Term(self, site, np.zeros(6))] if apparatus.tools else []
 
     def prior(self, term: Term) -> Array:
         """Some millimetres."""

@@ -6,16 +6,16 @@ from typing import ClassVar
 import numpy as np
 
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
 )  # fmt: skip
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 
 UNIT = 1e-6
 """theta counts microseconds."""
@@ -30,7 +30,7 @@ class PhaseDelay(Effect):
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'delay_s': (-5e-5, 5e-5)}
     remedy = Remedy.FLUX
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """One delay for all channels."""
         return [Term(self, {}, np.zeros(1))]
 

@@ -7,17 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
     sigmas,
 )  # fmt: skip
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 
 UNIT = 1e-9
 """theta counts nanotesla."""
@@ -36,12 +36,12 @@ class Pickup(Effect):
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'rms_t': (0.0, 1e-6)}
     remedy = Remedy.FLUX
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Every channel of a tool."""
-        return [self._at(c, scene) for c in scene.tool_channels]
+        return [self._at(c, apparatus) for c in apparatus.tool_channels]
 
-    def _at(self, channel: int, scene: Scene) -> Term:
-        return Term(self, {'channel': channel}, np.zeros(2 * scene.emitters))
+    def _at(self, channel: int, apparatus: Apparatus) -> Term:
+        return Term(self, {'channel': channel}, np.zeros(2 * apparatus.emitters))
 
     def prior(self, term: Term) -> Array:
         """Some tens of nanotesla."""
@@ -94,9 +94,11 @@ class ReferenceChanged(Pickup):
     name = 'reference_changed'
     summary = "a reference sensor's reading changed for good: it was moved, turned or picks up"
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Every reference channel."""
-        return [self._at(c, scene) for c in scene.channels if c not in scene.tool_channels]
+        return [
+            self._at(c, apparatus) for c in apparatus.channels if c not in apparatus.tool_channels
+        ]
 
 
 EFFECTS = (Pickup(), ReferenceChanged())

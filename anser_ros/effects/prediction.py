@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import Term, View
-from anser_ros.fitting.measurements import Measurements
+from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_jacobian
 from anser_ros.physics.pose_track import PoseTrack
 

@@ -7,17 +7,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
     sigmas,
 )  # fmt: skip
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 
 
@@ -33,9 +33,9 @@ class Registration(Effect):
     }
     remedy = Remedy.OPTICAL
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """One frame for all bodies."""
-        return [Term(self, {}, np.zeros(6))] if scene.tools else []
+        return [Term(self, {}, np.zeros(6))] if apparatus.tools else []
 
     def prior(self, term: Term) -> Array:
         """About a degree, some millimetres."""

@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
 )  # fmt: skip
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 
 UNIT = 1e12
 """theta counts 1/fs^2 in units of 1/uT^2."""
@@ -75,12 +75,15 @@ class Saturation(Effect):
     remedy = Remedy.FLUX
     inexact = 0.2  # the curve, and tones that mix into each other's place
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Every channel of a tool; references don't see signals of different size."""
-        weights = {FLUX: np.ones(scene.emitters), VOLTAGE: scene.omega / scene.omega.mean()}
+        weights = {
+            FLUX: np.ones(apparatus.emitters),
+            VOLTAGE: apparatus.omega / apparatus.omega.mean(),
+        }
         return [
             Term(self, {'channel': c, 'shape': shape, 'sees': sees, '_weights': w}, np.zeros(1))
-            for c in scene.tool_channels
+            for c in apparatus.tool_channels
             for shape in SHAPES
             for sees, w in weights.items()
             if sees == FLUX or not np.allclose(w, 1.0)

@@ -7,11 +7,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
@@ -19,7 +19,7 @@ from anser_ros.effects.effect import (
     sigmas,
 )  # fmt: skip
 from anser_ros.errors import ModelFileError
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
 
 
@@ -37,18 +37,19 @@ class SensorAxis(Effect):
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'tilt_deg': (0.0, 30.0)}
     remedy = Remedy.SENSORS
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Every single tool sensor, and every cluster as a whole."""
         axes = {
             int(c): tuple(float(v) for v in a)
-            for table in scene.tools
+            for table in apparatus.tools
             for c, a in zip(table.channel, table.axis, strict=True)
         }
         terms = [
-            Term(self, {'channel': c, '_axis': axes[c]}, np.zeros(2)) for c in scene.tool_channels
+            Term(self, {'channel': c, '_axis': axes[c]}, np.zeros(2))
+            for c in apparatus.tool_channels
         ]
-        for cluster in scene.clusters():
-            if len(scene.tool_channels) > len(cluster) and len(cluster) > 1:
+        for cluster in apparatus.clusters():
+            if len(apparatus.tool_channels) > len(cluster) and len(cluster) > 1:
                 terms.append(Term(self, {'channels': cluster}, np.zeros(3)))
         return terms
 

@@ -7,17 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
     unit_matrix,
 )  # fmt: skip
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 
 
 class SensorGain(Effect):
@@ -32,9 +32,9 @@ class SensorGain(Effect):
     }
     remedy = Remedy.FLUX
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Every channel, references too."""
-        return [Term(self, {'channel': c}, np.zeros(2)) for c in scene.channels]
+        return [Term(self, {'channel': c}, np.zeros(2)) for c in apparatus.channels]
 
     def prior(self, term: Term) -> Array:
         """A gain is within some ten percent of one."""

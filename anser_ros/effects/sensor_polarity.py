@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term, needed
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 
 
 class SensorPolarity(Effect):

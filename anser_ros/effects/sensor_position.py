@@ -6,17 +6,17 @@ from typing import ClassVar
 import numpy as np
 
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
     sigmas,
 )  # fmt: skip
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
 
 
@@ -29,14 +29,14 @@ class SensorPosition(Effect):
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'offset_m': (-0.03, 0.03)}
     remedy = Remedy.SENSORS
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Single sensors and clusters of bodies that carry more than those."""
         groups: list[tuple[int, ...]] = []
-        for table in scene.tools:
+        for table in apparatus.tools:
             if len(table) > 1:
                 groups += [(int(c),) for c in table.channel]
                 own = {int(c) for c in table.channel}
-                groups += [g for g in scene.clusters() if own > set(g)]
+                groups += [g for g in apparatus.clusters() if own > set(g)]
         return [Term(self, {'channels': group}, np.zeros(3)) for group in groups]
 
     def prior(self, term: Term) -> Array:

@@ -6,16 +6,16 @@ from typing import ClassVar
 import numpy as np
 
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
 )  # fmt: skip
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
 
 UNIT = 1e-4
@@ -35,7 +35,7 @@ class SensorSize(Effect):
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'length_m': (0.0, 0.08)}
     remedy = Remedy.SENSORS
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """All coils of a body together."""
         return [
             Term(
@@ -47,7 +47,7 @@ class SensorSize(Effect):
                 },
                 np.zeros(1),
             )
-            for table in scene.tools
+            for table in apparatus.tools
             if len(table)
         ]
 

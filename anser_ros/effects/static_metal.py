@@ -7,22 +7,22 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.dipoles import Dipoles
 from anser_ros.effects.effect import (
     FROZEN,
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
     sigmas,
 )  # fmt: skip
-from anser_ros.effects.metal_body import ball_modes, centre_sigma, multipoles
-from anser_ros.effects.scattering import UNIT
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.model import EffectRecord
+from anser_ros.metal.body import ball_modes, centre_sigma, multipoles
+from anser_ros.metal.scattering import UNIT
 from anser_ros.physics.constants import MU_0
 
 STEP = 1e-3
@@ -30,16 +30,16 @@ CLOSEST = 0.02
 """Metal that is searched keeps this distance (m) from where sensors were."""
 
 
-def places(scene: Scene) -> Array:
+def places(apparatus: Apparatus) -> Array:
     """Where metal is looked for: a grid about the board and the volume, shape (n, 3), m."""
-    low = np.minimum(scene.board[0], scene.working_volume[0])
-    high = np.maximum(scene.board[1], scene.working_volume[1])
+    low = np.minimum(apparatus.board[0], apparatus.working_volume[0])
+    high = np.maximum(apparatus.board[1], apparatus.working_volume[1])
     size = float(np.max(high[:2] - low[:2]))
     lateral = [np.linspace(low[i] - 0.2 * size, high[i] + 0.2 * size, 7) for i in (0, 1)]
     around = [np.linspace(low[i] - 0.5 * size, high[i] + 0.5 * size, 5) for i in (0, 1)]
-    below = scene.board[0, 2] - size * np.array([0.06, 0.14, 0.24, 0.38, 0.6])
-    above = scene.working_volume[1, 2] + size * np.array([0.2, 0.45])
-    beside = np.linspace(scene.board[1, 2], scene.working_volume[1, 2], 3)
+    below = apparatus.board[0, 2] - size * np.array([0.06, 0.14, 0.24, 0.38, 0.6])
+    above = apparatus.working_volume[1, 2] + size * np.array([0.2, 0.45])
+    beside = np.linspace(apparatus.board[1, 2], apparatus.working_volume[1, 2], 3)
     grid = [(x, y, z) for z in (*below, *beside, *above) for x, y in product(*lateral)]
     ring = [
         (x, y, z)
@@ -49,12 +49,14 @@ def places(scene: Scene) -> Array:
     ]
     points = np.array(grid + ring)
     inside = np.all(
-        (points > scene.working_volume[0] - CLOSEST)
-        & (points < scene.working_volume[1] + CLOSEST),
+        (points > apparatus.working_volume[0] - CLOSEST)
+        & (points < apparatus.working_volume[1] + CLOSEST),
         axis=1,
     )
     on_board = np.all(
-        (points > scene.board[0] - [0, 0, 0.01]) & (points < scene.board[1] + [0, 0, 0.04]), axis=1
+        (points > apparatus.board[0] - [0, 0, 0.01])
+        & (points < apparatus.board[1] + [0, 0, 0.04]),
+        axis=1,
     )
     return np.asarray(points[~inside & ~on_board])
 
@@ -74,7 +76,7 @@ class StaticMetal(Effect):
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'position_m': (-1.0, 1.0)}
     remedy = Remedy.FIELD
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """A grid of places."""
         modes = 2 * ball_modes().shape[1]
         return [
@@ -83,7 +85,7 @@ class StaticMetal(Effect):
                 {'place': tuple(float(v) for v in place)},
                 np.concatenate([place, np.zeros(modes)]),
             )
-            for place in places(scene)
+            for place in places(apparatus)
         ]
 
     def amounts(self, term: Term) -> NDArray[np.int64]:

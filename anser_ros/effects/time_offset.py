@@ -7,16 +7,16 @@ from typing import ClassVar
 import numpy as np
 
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
 )  # fmt: skip
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 
 
@@ -40,9 +40,9 @@ class TimeOffset(Effect):
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'offset_s': (-0.5, 0.5)}
     remedy = Remedy.OPTICAL
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """One offset for all bodies."""
-        return [Term(self, {}, np.zeros(1))] if scene.tools else []
+        return [Term(self, {}, np.zeros(1))] if apparatus.tools else []
 
     def prior(self, term: Term) -> Array:
         """A tenth of a second."""

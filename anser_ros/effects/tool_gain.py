@@ -7,16 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.effect import (
+    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Scene,
     Term,
     View,
     needed,
 )
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 
 
 class ToolGain(Effect):
@@ -31,11 +31,11 @@ class ToolGain(Effect):
     }
     remedy = Remedy.FLUX
 
-    def candidates(self, scene: Scene) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Every body of two sensors or more."""
         return [
             Term(self, {'channels': tuple(int(c) for c in table.channel)}, np.zeros(2))
-            for table in scene.tools
+            for table in apparatus.tools
             if len(table) > 1
         ]
 

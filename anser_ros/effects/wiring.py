@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term, needed, unit_matrix
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 
 
 class SwappedChannels(Effect):

@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.fitting.factors import as_real
-from anser_ros.fitting.measurements import Measurements
-from anser_ros.fitting.model import FieldModel
-from anser_ros.fitting.pose_correction import with_pose
+from anser_ros.calibration.factors import as_real
+from anser_ros.calibration.pose_correction import with_pose
+from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_jacobian
 
 Array = NDArray[np.float64]

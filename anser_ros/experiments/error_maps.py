@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.calibration.error_map import learn_error_map
 from anser_ros.errors import BagError
-from anser_ros.fitting.error_map import learn_error_map
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,7 @@ from matplotlib import pyplot as plt
 from anser_ros.experiments.recordings import HEAD_DISTANCES_CM, MATERIALS, checkerboard
 from anser_ros.experiments.study import Study
 from anser_ros.experiments.tracking_errors import SensorErrors
-from anser_ros.fitting.model import FieldModel
+from anser_ros.field.model import FieldModel
 from anser_ros.sessions.session import Session
 
 Array = NDArray[np.float64]

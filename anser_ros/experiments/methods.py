@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from anser_ros.fitting.calibration import Calibration, Options
-from anser_ros.fitting.dipoles import basis_rows
-from anser_ros.fitting.factors import TriangularFactor, as_complex, as_real
-from anser_ros.fitting.layouts import Layout, place
-from anser_ros.fitting.measurements import Measurements
-from anser_ros.fitting.model import FieldModel
-from anser_ros.fitting.pose_correction import with_pose
-from anser_ros.fitting.prior import emitter_gains
+from anser_ros.calibration.calibrate import Calibration, Options
+from anser_ros.calibration.dipole_sites import basis_rows
+from anser_ros.calibration.factors import TriangularFactor, as_complex, as_real
+from anser_ros.calibration.layouts import Layout, place
+from anser_ros.calibration.pose_correction import with_pose
+from anser_ros.calibration.prior import emitter_gains
+from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import FieldModel
 from anser_ros.sessions.calibration import calibrate_sessions, generator_of
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import NOMINAL, model_for

@@ -1,7 +1,7 @@
 """What the refit owes to what: error against the number of references, and simpler methods.
 
 All methods see the same references and start from the same calibrated model: the frozen model,
-free dipoles for every emitter (`fitting.refit_free`), and the shared polarisability. No gate
+free dipoles for every emitter (`refit.free`), and the shared polarisability. No gate
 refuses a pose here, so that wrong ones count as such.
 """
 
@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.fitting.model import FieldModel
-from anser_ros.fitting.refit import LiveRefit
-from anser_ros.fitting.refit_free import FreeDipoles
+from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.free import FreeDipoles
+from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.sessions.evaluation import baseline_flux
 from anser_ros.sessions.session import NANO, Session
 from anser_ros.sessions.starting_model import drawing_of

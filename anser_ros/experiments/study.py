@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.calibration.calibrate import Calibration
+from anser_ros.calibration.error_map import learn_error_map
 from anser_ros.experiments.bound import position_bound
 from anser_ros.experiments.error_maps import BoardRun, board_folder, board_runs
 from anser_ros.experiments.methods import (
@@ -25,9 +27,7 @@ from anser_ros.experiments.recordings import (
     with_sensors,
 )
 from anser_ros.experiments.tracking_errors import SensorErrors, track
-from anser_ros.fitting.calibration import Calibration
-from anser_ros.fitting.error_map import learn_error_map
-from anser_ros.fitting.model import FieldModel
+from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import MU_0
 from anser_ros.sessions.session import Session
 

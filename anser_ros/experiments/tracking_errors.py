@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.experiments.article import STATISTICS
-from anser_ros.fitting.model import FieldModel
+from anser_ros.field.model import FieldModel
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.session import Session
 

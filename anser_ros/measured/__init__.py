@@ -1,13 +1,13 @@
 """Importers of other people's measurements: each finds what its data contain and scores it.
 
-A module here has a ``NAME`` and a function ``run(shared, rng)`` that returns its `Row` list.
+A module here has a ``NAME`` and a function ``run(shared, rng)`` that returns its `ReportRow` list.
 """
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Row:
+class ReportRow:
     """One line of the table that `anser measured` prints.
 
     Attributes

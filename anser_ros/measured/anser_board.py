@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import FitError
-from anser_ros.measured import Row
+from anser_ros.measured import ReportRow
 from anser_ros.measured.anser_response import (
     EFFECTS,
     Points,
@@ -20,7 +20,7 @@ from anser_ros.measured.anser_response import (
     rigid_columns,
     stack,
 )
-from anser_ros.measured.candidates import Search, grow, search_text
+from anser_ros.measured.candidates import CandidateSearch, grow, search_text
 from anser_ros.physics.board import Board
 from anser_ros.sessions.starting_model import board_of
 from anser_ros.wire.config_folder import read_config
@@ -50,7 +50,7 @@ class RunAnalysis:
     name : str
     residual_m : ndarray, shape (P, 3)
         Reported minus ideal points after rigid alignment.
-    search : Search
+    search : CandidateSearch
         Effects chosen on blocks left out, on this run.
     nested_m : ndarray, shape (P, 3)
         Residual of each block after effects chosen and fitted without it.
@@ -66,7 +66,7 @@ class RunAnalysis:
 
     name: str
     residual_m: Array
-    search: Search
+    search: CandidateSearch
     nested_m: Array
     chosen_in: tuple[tuple[str, ...], ...]
     rigid_m: Array
@@ -81,7 +81,7 @@ class RunAnalysis:
 
 
 @dataclass(frozen=True)
-class Analysis:
+class BoardAnalysis:
     """All runs together.
 
     Attributes
@@ -173,7 +173,7 @@ class BoardFit:
         right = inside.T @ (self._residual[train].ravel() / self._noise)
         return np.asarray(self._residual - matrix @ np.linalg.solve(normal, right))
 
-    def search(self, block: NDArray[np.int64], train: NDArray[np.bool_]) -> Search:
+    def search(self, block: NDArray[np.int64], train: NDArray[np.bool_]) -> CandidateSearch:
         """Choose effects on the blocks inside `train`."""
         blocks = np.unique(block[train])
 
@@ -247,7 +247,7 @@ def load(folder: Path) -> dict[str, Array]:
     return {path.stem: read_points(path) for path in paths}
 
 
-def analyse(folder: Path) -> Analysis:
+def analyse(folder: Path) -> BoardAnalysis:
     """Every run: choice, nested cross-validation, likeness to the others."""
     reported = load(folder)
     board = board_of(parse_setup(read_config('demo_setup.yaml')))
@@ -259,7 +259,7 @@ def analyse(folder: Path) -> Analysis:
         for name, value in reported.items()
     ]
     alike = np.corrcoef([value.ravel() for value in residual.values()])
-    return Analysis(tuple(runs), alike, across_runs(reported, board))
+    return BoardAnalysis(tuple(runs), alike, across_runs(reported, board))
 
 
 def across_runs(reported: dict[str, Array], board: Board) -> dict[str, Array]:
@@ -303,13 +303,13 @@ def _from_others(free: list[Array], left_out: int) -> float:
     return float(np.log(np.mean(left**2) / np.mean(part[:, -1] ** 2)))
 
 
-def run(shared: Path, rng: np.random.Generator) -> list[Row]:
+def run(shared: Path, rng: np.random.Generator) -> list[ReportRow]:
     """Rows of the table; nothing here is random, `rng` is not used."""
     del rng
     return rows(analyse(shared / 'measured' / NAME))
 
 
-def rows(analysis: Analysis) -> list[Row]:
+def rows(analysis: BoardAnalysis) -> list[ReportRow]:
     """Before and after on blocks left out; before is the rigid alignment to the other blocks."""
     out = []
     for part in analysis.runs:
@@ -318,13 +318,13 @@ def rows(analysis: Analysis) -> list[Row]:
         figure = f'{part.name} ({aligned:.2f} mm aligned to all points): held-out points, rms'
         names = ', '.join(part.search.chosen) or 'nothing pays'
         seen = f'{names}: choice saw all blocks, parameters not the scored one'
-        out.append(Row(NAME, figure, before, fitted, 'mm', None, None, seen))
+        out.append(ReportRow(NAME, figure, before, fitted, 'mm', None, None, seen))
         nested = 1e3 * rms_m(part.nested_m)
         blind = 'choice and parameters both without the scored block'
-        out.append(Row(NAME, figure, before, nested, 'mm', None, None, blind))
+        out.append(ReportRow(NAME, figure, before, nested, 'mm', None, None, blind))
         share = 100.0 * part.field_share
         out.append(
-            Row(
+            ReportRow(
                 NAME,
                 f'{part.name}: share of the error that an error of the field can have',
                 np.nan,
@@ -338,7 +338,7 @@ def rows(analysis: Analysis) -> list[Row]:
     return out
 
 
-def tables(analysis: Analysis) -> str:
+def tables(analysis: BoardAnalysis) -> str:
     """Candidates of every run, and what is common to the runs."""
     lines = []
     for part in analysis.runs:

@@ -40,7 +40,7 @@ class Points:
 
 
 @dataclass(frozen=True)
-class Response:
+class BoardResponse:
     """Answers of the tracker to flux errors, sensor upright.
 
     Attributes
@@ -62,7 +62,7 @@ class Response:
         return np.asarray(np.einsum('pik,pk->pi', self.gain, flux_error))
 
 
-def response(board: Board, place_m: Array) -> Response:
+def response(board: Board, place_m: Array) -> BoardResponse:
     """Linearise a least-squares tracker around an upright sensor at each place."""
     field = board.field(place_m)
     ends = [
@@ -72,26 +72,26 @@ def response(board: Board, place_m: Array) -> Response:
     scale = np.array([POSITION_SCALE_M] * 3 + [ANGLE_SCALE_RAD] * 2)
     jacobian = np.concatenate([slope, field[:, :, :2]], axis=2) * scale
     inverse = np.linalg.pinv(jacobian) * scale[:, None]
-    return Response(inverse[:, :3], field[:, :, 2], slope)
+    return BoardResponse(inverse[:, :3], field[:, :, 2], slope)
 
 
-Columns = Callable[[Board, Points, Response], list[Array]]
+Columns = Callable[[Board, Points, BoardResponse], list[Array]]
 
 
-def _each_coil(flux_error: Array, answer: Response) -> list[Array]:
+def _each_coil(flux_error: Array, answer: BoardResponse) -> list[Array]:
     """One column a coil from flux errors (P, K)."""
     return [answer.gain[:, :, k] * flux_error[:, k, None] for k in range(flux_error.shape[1])]
 
 
-def _gain(board: Board, points: Points, answer: Response) -> list[Array]:
+def _gain(board: Board, points: Points, answer: BoardResponse) -> list[Array]:
     return _each_coil(0.01 * answer.flux, answer)
 
 
-def _pickup(board: Board, points: Points, answer: Response) -> list[Array]:
+def _pickup(board: Board, points: Points, answer: BoardResponse) -> list[Array]:
     return _each_coil(np.full_like(answer.flux, 0.01 * np.abs(answer.flux).mean()), answer)
 
 
-def _moved(board: Board, points: Points, answer: Response) -> list[Array]:
+def _moved(board: Board, points: Points, answer: BoardResponse) -> list[Array]:
     return [
         column
         for axis in range(3)
@@ -99,7 +99,7 @@ def _moved(board: Board, points: Points, answer: Response) -> list[Array]:
     ]
 
 
-def _tilted(board: Board, points: Points, answer: Response) -> list[Array]:
+def _tilted(board: Board, points: Points, answer: BoardResponse) -> list[Array]:
     out = []
     for axis in np.eye(3)[:2]:
         turned = replace(board, rotations=_small_turn(1e-2 * axis) @ board.rotations)
@@ -112,16 +112,16 @@ def _small_turn(vector: Array) -> Array:
     return np.asarray(np.eye(3) + np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]))
 
 
-def _quadrature(board: Board, points: Points, answer: Response) -> list[Array]:
+def _quadrature(board: Board, points: Points, answer: BoardResponse) -> list[Array]:
     modulus = np.hypot(answer.flux, QUADRATURE * np.abs(answer.flux).max())
     return _each_coil(np.sign(answer.flux) * modulus - answer.flux, answer)
 
 
-def _saturation(board: Board, points: Points, answer: Response) -> list[Array]:
+def _saturation(board: Board, points: Points, answer: BoardResponse) -> list[Array]:
     return [answer.to(0.05 * answer.flux**3 / np.abs(answer.flux).max() ** 2)]
 
 
-def _crosstalk(board: Board, points: Points, answer: Response) -> list[Array]:
+def _crosstalk(board: Board, points: Points, answer: BoardResponse) -> list[Array]:
     count = answer.flux.shape[1]
     return [
         answer.gain[:, :, k] * (0.01 * answer.flux[:, j])[:, None]
@@ -131,7 +131,7 @@ def _crosstalk(board: Board, points: Points, answer: Response) -> list[Array]:
     ]
 
 
-def _plate(board: Board, points: Points, answer: Response) -> list[Array]:
+def _plate(board: Board, points: Points, answer: BoardResponse) -> list[Array]:
     out = []
     for depth in PLATE_DEPTHS_M:
         below = board.centres - np.array([0.0, 0.0, 2.0 * depth])
@@ -140,17 +140,17 @@ def _plate(board: Board, points: Points, answer: Response) -> list[Array]:
     return out
 
 
-def _spacing(board: Board, points: Points, answer: Response) -> list[Array]:
+def _spacing(board: Board, points: Points, answer: BoardResponse) -> list[Array]:
     larger = replace(board, centres=1.01 * board.centres)
     return [answer.to(larger.field(points.place_m)[:, :, 2] - answer.flux)]
 
 
-def _coil_size(board: Board, points: Points, answer: Response) -> list[Array]:
+def _coil_size(board: Board, points: Points, answer: BoardResponse) -> list[Array]:
     larger = replace(board, shape=1.02 * board.shape)
     return [answer.to(larger.field(points.place_m)[:, :, 2] - answer.flux)]
 
 
-def _sensor_size(board: Board, points: Points, answer: Response) -> list[Array]:
+def _sensor_size(board: Board, points: Points, answer: BoardResponse) -> list[Array]:
     """Mean over a sensor of 10 mm minus the field at its middle: length^2 / 24 times d2/dz2."""
     up = np.array([0.0, 0.0, 5e-3])
     ends = board.field(points.place_m + up) + board.field(points.place_m - up)
@@ -159,7 +159,7 @@ def _sensor_size(board: Board, points: Points, answer: Response) -> list[Array]:
 
 
 def _powers(lowest: int, highest: int) -> Columns:
-    def columns(board: Board, points: Points, answer: Response) -> list[Array]:
+    def columns(board: Board, points: Points, answer: BoardResponse) -> list[Array]:
         x, y = points.grid.T
         terms = [x**i * y ** (n - i) for n in range(lowest, highest + 1) for i in range(n + 1)]
         return [1e-3 * np.outer(term, axis) for term in terms for axis in np.eye(3)]
@@ -167,16 +167,16 @@ def _powers(lowest: int, highest: int) -> Columns:
     return columns
 
 
-def _scale(board: Board, points: Points, answer: Response) -> list[Array]:
+def _scale(board: Board, points: Points, answer: BoardResponse) -> list[Array]:
     return [0.01 * (points.place_m - points.place_m.mean(axis=0))]
 
 
-def _drift(board: Board, points: Points, answer: Response) -> list[Array]:
+def _drift(board: Board, points: Points, answer: BoardResponse) -> list[Array]:
     order = np.linspace(-1.0, 1.0, len(points.grid))
     return [1e-3 * np.outer(order, axis) for axis in np.eye(3)]
 
 
-def _hysteresis(board: Board, points: Points, answer: Response) -> list[Array]:
+def _hysteresis(board: Board, points: Points, answer: BoardResponse) -> list[Array]:
     """A solver that stops early stays on the way from the point before."""
     before = np.vstack([points.place_m[:1], points.place_m[:-1]])
     return [0.02 * (before - points.place_m)]

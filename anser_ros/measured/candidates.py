@@ -23,7 +23,7 @@ WORTH = 0.01
 
 
 @dataclass(frozen=True)
-class Trial:
+class CandidateTrial:
     """One candidate tried on top of others.
 
     Attributes
@@ -51,30 +51,32 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Search:
+class CandidateSearch:
     """What the search chose, and everything it tried."""
 
     chosen: tuple[str, ...]
-    trials: tuple[Trial, ...]
+    trials: tuple[CandidateTrial, ...]
     start: float
     end: float
 
 
 def _compare(
     before: tuple[str, ...], name: str, old: Array, new: Array, chosen: bool = False
-) -> Trial:
+) -> CandidateTrial:
     change = np.log(new / old)
     scatter = float(change.std(ddof=1) / np.sqrt(len(change))) if len(change) > 1 else 0.0
-    return Trial(before, name, float(np.sqrt(new.mean())), float(change.mean()), scatter, chosen)
+    return CandidateTrial(
+        before, name, float(np.sqrt(new.mean())), float(change.mean()), scatter, chosen
+    )
 
 
-def _pays(trial: Trial, clear: float) -> bool:
+def _pays(trial: CandidateTrial, clear: float) -> bool:
     return trial.change < -WORTH and trial.change < -clear * trial.scatter
 
 
 def _simplest(
-    paying: Sequence[tuple[Trial, Array]], sizes: Mapping[str, int]
-) -> tuple[Trial, Array]:
+    paying: Sequence[tuple[CandidateTrial, Array]], sizes: Mapping[str, int]
+) -> tuple[CandidateTrial, Array]:
     """Of those that the blocks cannot tell from the best, the one of the fewest parameters."""
     best = min(paying, key=lambda item: item[0].change)
     alike = [p for p in paying if p[0].change <= best[0].change + best[0].scatter]
@@ -86,7 +88,7 @@ def grow(
     score: Score,
     sizes: Mapping[str, int] | None = None,
     clear: float = CLEAR,
-) -> Search:
+) -> CandidateSearch:
     """Add effects one at a time while they pay on held-out blocks; drop what became idle.
 
     Parameters
@@ -102,12 +104,12 @@ def grow(
 
     Returns
     -------
-    Search
+    CandidateSearch
     """
     chosen: tuple[str, ...] = ()
     power = score(chosen)
     start = float(np.sqrt(power.mean()))
-    trials: list[Trial] = []
+    trials: list[CandidateTrial] = []
     while True:
         tried = [
             (_compare(chosen, name, power, loss), loss)
@@ -125,11 +127,11 @@ def grow(
             break
         chosen, power = (*chosen, best[0].name), best[1]
         chosen, power = _prune(chosen, power, score, trials)
-    return Search(chosen, tuple(trials), start, float(np.sqrt(power.mean())))
+    return CandidateSearch(chosen, tuple(trials), start, float(np.sqrt(power.mean())))
 
 
 def _prune(
-    chosen: tuple[str, ...], power: Array, score: Score, trials: list[Trial]
+    chosen: tuple[str, ...], power: Array, score: Score, trials: list[CandidateTrial]
 ) -> tuple[tuple[str, ...], Array]:
     for name in chosen[:-1]:
         rest = tuple(other for other in chosen if other != name)
@@ -141,7 +143,7 @@ def _prune(
     return chosen, power
 
 
-def search_text(title: str, search: Search, unit: str, scale: float = 1.0) -> str:
+def search_text(title: str, search: CandidateSearch, unit: str, scale: float = 1.0) -> str:
     """Every candidate and its held-out score, as text."""
     lines = [
         f'{title}: held-out residual {scale * search.start:.4g} {unit} at the start, '

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import FitError
-from anser_ros.measured import Row
+from anser_ros.measured import ReportRow
 from anser_ros.measured.hpi_array_errors import (
     START,
     STEPS,
@@ -64,7 +64,7 @@ class HpiData:
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HpiHeldOut:
     """Channels left out, predicted from the others.
 
     Attributes
@@ -87,14 +87,14 @@ class HeldOut:
 
 
 @dataclass(frozen=True)
-class Analysis:
+class HpiAnalysis:
     """Everything of this data set."""
 
     data: HpiData
     tones: Tones
     findings: ChannelFindings
     coils: tuple[CoilData, ...]
-    held_out: HeldOut
+    held_out: HpiHeldOut
     n_leads: tuple[int, ...]
     chip_errors: ChipErrors
     plain_m: Array
@@ -157,7 +157,7 @@ def predict_left_out(data: CoilData, fit: CoilFit) -> Array:
 
 def hold_out(
     array: SquidArray, coils: tuple[CoilData, ...], starts: Array, leads: LeadSearch
-) -> HeldOut:
+) -> HpiHeldOut:
     """Predict each sixth of the channels from the others, for each number of dipoles."""
     fold, count = fold_of(array), len(array.names)
     plain = np.zeros((len(coils), count))
@@ -175,7 +175,7 @@ def hold_out(
                 chain[k, n, out] = predict_left_out(part, fitted)[out]
                 left = (data.signals - chain[k, n])[out] / spread[k, out]
                 loss[k, n, f] = student_loss(left)
-    return HeldOut(plain, chain, loss, spread)
+    return HpiHeldOut(plain, chain, loss, spread)
 
 
 def student_loss(left: Array) -> float:
@@ -203,7 +203,7 @@ def choose_leads(loss: Array) -> int:
     return best
 
 
-def analyse(folder: Path) -> Analysis:
+def analyse(folder: Path) -> HpiAnalysis:
     """Demodulate, examine, choose the leads on channels left out, then the array's own errors."""
     data = load(folder)
     array = data.array
@@ -227,7 +227,7 @@ def analyse(folder: Path) -> Analysis:
     shared = tuple(weigh(array, coils, surveyed, errors, name) for name in STEPS)
     best = max(shared, key=lambda item: item.gain - item.price)
     accepted = best.name if best.gain > best.price else ''
-    return Analysis(
+    return HpiAnalysis(
         data,
         tones,
         findings,
@@ -243,31 +243,31 @@ def analyse(folder: Path) -> Analysis:
     )
 
 
-def relative_error(analysis: Analysis, predicted: Array, kind: NDArray[np.bool_]) -> float:
+def relative_error(analysis: HpiAnalysis, predicted: Array, kind: NDArray[np.bool_]) -> float:
     """Root of the summed squared error over the summed squared signal, %, channels of a kind."""
     keep = kind & ~analysis.findings.noisy
     signals = analysis.findings.signals[:, keep]
     return 100.0 * float(np.linalg.norm(predicted[:, keep] - signals) / np.linalg.norm(signals))
 
 
-def run(shared: Path, rng: np.random.Generator) -> list[Row]:
+def run(shared: Path, rng: np.random.Generator) -> list[ReportRow]:
     """Rows of the table; nothing here is random, `rng` is not used."""
     del rng
     return rows(analyse(shared / 'measured' / NAME))
 
 
-def rows(analysis: Analysis) -> list[Row]:
+def rows(analysis: HpiAnalysis) -> list[ReportRow]:
     """Before and after."""
     return [*_demodulation_rows(analysis), *_place_rows(analysis), *_channel_rows(analysis)]
 
 
-def _demodulation_rows(analysis: Analysis) -> list[Row]:
+def _demodulation_rows(analysis: HpiAnalysis) -> list[ReportRow]:
     found, goal = analysis.findings, TARGET_CORRELATION
     chosen = "nothing fitted to the stored amplitudes but each channel's sign and a scale a kind"
     before, after = float(found.correlation_raw.min()), float(found.correlation.min())
     figure = 'demodulated and stored amplitudes, least |r| of a coil and kind of channel'
     return [
-        Row(
+        ReportRow(
             NAME,
             f'{figure} (before: signs as sampled; after: modulus with sign)',
             before,
@@ -277,7 +277,7 @@ def _demodulation_rows(analysis: Analysis) -> list[Row]:
             bool(after > goal),
             chosen,
         ),
-        Row(
+        ReportRow(
             NAME,
             f'{figure}, in-phase part, noisy channel excluded',
             before,
@@ -290,7 +290,7 @@ def _demodulation_rows(analysis: Analysis) -> list[Row]:
     ]
 
 
-def _place_rows(analysis: Analysis) -> list[Row]:
+def _place_rows(analysis: HpiAnalysis) -> list[ReportRow]:
     digitised = analysis.data.digitised_m
     final = np.array([fit.places_m[0] for fit in analysis.final])
     vendor = distance_mm(analysis.data.vendor_m, digitised)
@@ -302,7 +302,7 @@ def _place_rows(analysis: Analysis) -> list[Row]:
     figure = 'coils to digitised places, rms after rigid alignment'
     chosen = "leads: channels left out; array's errors: likelihood of the signals"
     return [
-        Row(
+        ReportRow(
             NAME,
             f"{figure} (before: vendor's fit; after: lever arm along the coils' axes)",
             vendor,
@@ -312,7 +312,7 @@ def _place_rows(analysis: Analysis) -> list[Row]:
             bool(with_arm <= TARGET_MM),
             f'{chosen}; arm ({_span(1e3 * arms)} mm): the other three coils',
         ),
-        Row(
+        ReportRow(
             NAME,
             f"{figure}, no digitised place used (before: vendor's fit)",
             vendor,
@@ -322,7 +322,9 @@ def _place_rows(analysis: Analysis) -> list[Row]:
             bool(rigid <= TARGET_MM),
             chosen,
         ),
-        Row(NAME, f'{figure}, plain dipole', vendor, plain, 'mm', None, None, 'nothing chosen'),
+        ReportRow(
+            NAME, f'{figure}, plain dipole', vendor, plain, 'mm', None, None, 'nothing chosen'
+        ),
     ]
 
 
@@ -330,7 +332,7 @@ def _span(values: Array) -> str:
     return f'{values.min():.1f} to {values.max():.1f}'
 
 
-def _channel_rows(analysis: Analysis) -> list[Row]:
+def _channel_rows(analysis: HpiAnalysis) -> list[ReportRow]:
     held = analysis.held_out
     chosen_chain = np.array([held.chain[k, n] for k, n in enumerate(analysis.n_leads)])
     kinds = analysis.data.array.is_magnetometer
@@ -340,18 +342,18 @@ def _channel_rows(analysis: Analysis) -> list[Row]:
         before = relative_error(analysis, held.plain, kind)
         after = relative_error(analysis, chosen_chain, kind)
         figure = f'held-out {text}, relative error'
-        out.append(Row(NAME, figure, before, after, '%', None, None, chosen))
+        out.append(ReportRow(NAME, figure, before, after, '%', None, None, chosen))
     quiet = ~analysis.findings.noisy
     middle = [
         float(np.median(np.abs(p - analysis.findings.signals)[:, quiet] / held.spread[:, quiet]))
         for p in (held.chain[:, 0], chosen_chain)
     ]
     figure = 'held-out channels, median residual over its expected spread (before: no leads)'
-    out.append(Row(NAME, figure, middle[0], middle[1], '', None, None, chosen))
+    out.append(ReportRow(NAME, figure, middle[0], middle[1], '', None, None, chosen))
     return out
 
 
-def tables(analysis: Analysis) -> str:
+def tables(analysis: HpiAnalysis) -> str:
     """Wrong channels, candidates, places."""
     lines = [f'{NAME}: tones at {np.round(analysis.tones.frequencies_hz, 3)} Hz']
     lines += analysis.findings.text(analysis.data.array)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from anser_ros.measured.squid_array import ChipErrors, SquidArray, Whitener, whitener
+from anser_ros.measured.squid_array import ChipErrors, SquidArray, SquidWhitener, whitener
 
 Array = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ class CoilFit:
         Mean squared whitened residual of the used channels.
     sigma_m : float
         Standard deviation of the coil's place (root of the covariance's trace), m.
-    white : Whitener
+    white : SquidWhitener
     """
 
     places_m: Array
@@ -70,7 +70,7 @@ class CoilFit:
     log_likelihood: float
     power: float
     sigma_m: float
-    white: Whitener
+    white: SquidWhitener
 
 
 def _design(array: SquidArray, places: Array) -> Array:
@@ -122,7 +122,7 @@ def plain_fit(array: SquidArray, data: CoilData, place: Array) -> Array:
     return np.asarray(matrix @ moment)
 
 
-def student_weight(white: Whitener, left: Array) -> Array:
+def student_weight(white: SquidWhitener, left: Array) -> Array:
     """Weight of each chip, (C,): chips beside a stretch of lead that is not modelled count less.
 
     Student's t of the chip's three residuals together, `FREEDOM` degrees of freedom.
@@ -154,7 +154,7 @@ def fit_coil(
         white = white.weighted(weight)
         right = white.apply(data.signals)
 
-        def misfit(x: Array, white: Whitener = white, right: Array = right) -> Array:
+        def misfit(x: Array, white: SquidWhitener = white, right: Array = right) -> Array:
             return _linear(white.apply(_design(array, SCALE_M * x.reshape(-1, 3))), right)[1]
 
         solution = least_squares(misfit, places.ravel() / SCALE_M, max_nfev=12)

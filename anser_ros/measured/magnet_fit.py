@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import FitError
-from anser_ros.measured.candidates import Search, grow
+from anser_ros.measured.candidates import CandidateSearch, grow
 from anser_ros.measured.magnet_model import (
     EFFECTS,
     Parameters,
@@ -48,7 +48,7 @@ class MagnetFit:
         Their standard deviations, same layout.
     noise_t : float
         Rms residual of a reading that no pose jitter explains, T, degrees of freedom counted.
-    search : Search or None
+    search : CandidateSearch or None
         The choice of the effects, when there was one.
     """
 
@@ -57,7 +57,7 @@ class MagnetFit:
     found: Parameters
     sigma: Parameters
     noise_t: float
-    search: Search | None = None
+    search: CandidateSearch | None = None
 
     def predict(self, recording: Recording) -> Array:
         """Readings (F, S, 3), T."""
@@ -176,7 +176,7 @@ def search(
     noise_t: float,
     jitter: Jitter,
     n_blocks: int = 7,
-) -> Search:
+) -> CandidateSearch:
     """Choose effects on blocks of poses that took no part in each fit.
 
     The effects are small: columns of the plain model are solved once a block, and the power of the

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import FitError
-from anser_ros.measured import Row
+from anser_ros.measured import ReportRow
 from anser_ros.measured.candidates import search_text
 from anser_ros.measured.magnet_fit import Jitter, MagnetFit, fit, search
 from anser_ros.measured.magnet_model import EFFECTS, Recording, Source, cylinder, point_source
@@ -72,7 +72,7 @@ class Lesson:
 
 
 @dataclass(frozen=True)
-class Analysis:
+class MagnetAnalysis:
     """Every file in turn as the one to learn from, and the robot's file."""
 
     lessons: tuple[Lesson, ...]
@@ -238,7 +238,7 @@ def lesson(recordings: dict[str, Recording], learnt_on: str) -> Lesson:
     return Lesson(learnt_on, model, spread, errors)
 
 
-def analyse(folder: Path) -> Analysis:
+def analyse(folder: Path) -> MagnetAnalysis:
     """Everything of this data set."""
     names = file_names(folder)
     recordings = {name: load(folder, name) for name in names}
@@ -249,16 +249,16 @@ def analyse(folder: Path) -> Analysis:
         parts, _ = read_poses(step_path, 'M')
         recording = as_recording('step1', parts, np.zeros(3))
         step = analyse_step(recording, point_source())
-    return Analysis(lessons, step)
+    return MagnetAnalysis(lessons, step)
 
 
-def run(shared: Path, rng: np.random.Generator) -> list[Row]:
+def run(shared: Path, rng: np.random.Generator) -> list[ReportRow]:
     """Rows of the table; nothing here is random, `rng` is not used."""
     del rng
     return rows(analyse(shared / 'measured' / NAME))
 
 
-def rows(analysis: Analysis) -> list[Row]:
+def rows(analysis: MagnetAnalysis) -> list[ReportRow]:
     """Before and after, on files that took no part."""
     out = []
     for part in analysis.lessons:
@@ -275,11 +275,11 @@ def rows(analysis: Analysis) -> list[Row]:
             ):
                 met = bool(after[k] <= goal)
                 figure = f'{text}: {kind} RMSE'
-                out.append(Row(NAME, figure, before[k], after[k], unit, goal, met, chosen))
+                out.append(ReportRow(NAME, figure, before[k], after[k], unit, goal, met, chosen))
     return out + (step_rows(NAME, analysis.step) if analysis.step is not None else [])
 
 
-def tables(analysis: Analysis) -> str:
+def tables(analysis: MagnetAnalysis) -> str:
     """Every candidate, the parameters found, and what gains and weights each bring."""
     lines = []
     for part in analysis.lessons:

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.measured import Row
-from anser_ros.measured.candidates import Search, search_text
+from anser_ros.measured import ReportRow
+from anser_ros.measured.candidates import CandidateSearch, search_text
 from anser_ros.measured.magnet_fit import Jitter, MagnetFit, fit, search
 from anser_ros.measured.magnet_model import Recording, Source
 
@@ -41,14 +41,14 @@ class StepAnalysis:
 
     Attributes
     ----------
-    search : Search
+    search : CandidateSearch
     naive, final : MagnetFit
         A dipole with the patch's place free; the chosen effects with the patch's place free.
     sensors : MagnetFit
         The chosen effects with every sensor's place free.
     """
 
-    search: Search
+    search: CandidateSearch
     naive: MagnetFit
     final: MagnetFit
     sensors: MagnetFit
@@ -83,13 +83,13 @@ def scatter_mm(model: MagnetFit) -> float:
     return 1e3 * float(np.sqrt(np.mean(np.sum((places - places.mean(axis=0)) ** 2, axis=1))))
 
 
-def step_rows(dataset: str, step: StepAnalysis) -> list[Row]:
+def step_rows(dataset: str, step: StepAnalysis) -> list[ReportRow]:
     """Rows of the table."""
     noise = step.final.noise_t
     chosen = f'{", ".join(step.search.chosen)}: chosen and scored on blocks of poses left out'
     sigma = 2.0 * float(np.linalg.norm(step.final.sigma['registration'][:3]))
     return [
-        Row(
+        ReportRow(
             dataset,
             'step1: held-out field residual (noise incl.)',
             1e6 * noise * step.search.start,
@@ -99,7 +99,7 @@ def step_rows(dataset: str, step: StepAnalysis) -> list[Row]:
             None,
             chosen,
         ),
-        Row(
+        ReportRow(
             dataset,
             f'step1: distance of the patch from its stated place (1 sigma {sigma:.2f} mm)',
             shift_mm(step.naive),
@@ -109,7 +109,7 @@ def step_rows(dataset: str, step: StepAnalysis) -> list[Row]:
             None,
             'before: point dipole; after: with the effects above; all poses',
         ),
-        Row(
+        ReportRow(
             dataset,
             'step1: scatter of the single sensors about the stated grid, rms',
             np.nan,

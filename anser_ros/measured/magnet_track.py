@@ -72,7 +72,7 @@ def _grid(place: Array) -> Array:
     return np.asarray(points[gap > NEAREST_M])
 
 
-class Tracker:
+class MagnetTracker:
     """Tracks a magnet before one array.
 
     Parameters
@@ -149,7 +149,7 @@ class Tracker:
 
 def track(recording: Recording, model: MagnetFit, error: ReadingError) -> MagnetTrack:
     """Track every frame; the sensors' stated poses are those of the first frame's grid."""
-    tracker = Tracker(model, error, recording.sensor_m[0], recording.sensor_rotation[0])
+    tracker = MagnetTracker(model, error, recording.sensor_m[0], recording.sensor_rotation[0])
     poses = []
     for frame, reading in enumerate(recording.field_t):
         tracker.move(recording.sensor_m[frame], recording.sensor_rotation[frame])

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import FitError
-from anser_ros.measured import Row
+from anser_ros.measured import ReportRow
 from anser_ros.measured.navion_data import NavionData, inner
 from anser_ros.measured.navion_held_out import chess_even, prediction_error, rms, with_own_pose
 from anser_ros.measured.navion_plate import PlateData, predict_plane
-from anser_ros.measured.navion_report import Analysis, analyse, predict_states
+from anser_ros.measured.navion_report import NavionAnalysis, analyse, predict_states
 from anser_ros.measured.navion_states import fit_slew, join_states
 from anser_ros.measured.navion_tool import ToolErrors, tool_errors
 
@@ -33,14 +33,14 @@ STRICT = 'effects and model: the other heights only; scored on the height left o
 OWN_POSE = 'as above, but pose and bend of the height left out from half its sensors; other half'
 
 
-def run(shared: Path, rng: np.random.Generator) -> list[Row]:
+def run(shared: Path, rng: np.random.Generator) -> list[ReportRow]:
     """Rows of the table; nothing here is random, `rng` is not used."""
     del rng
     folder = shared / 'measured' / NAME if (shared / 'measured').is_dir() else shared / NAME
     return rows(analyse(folder), folder)
 
 
-def rows(analysis: Analysis, folder: Path) -> list[Row]:
+def rows(analysis: NavionAnalysis, folder: Path) -> list[ReportRow]:
     """Before and after, on heights that took no part."""
     return [
         *_field_rows(analysis),
@@ -52,14 +52,14 @@ def rows(analysis: Analysis, folder: Path) -> list[Row]:
 
 def _row(
     figure: str, before: float, after: float, unit: str, target: float | None, chosen_on: str
-) -> Row:
+) -> ReportRow:
     met = None if target is None else bool(after <= target)
-    return Row(NAME, figure, before, after, unit, target, met, chosen_on)
+    return ReportRow(NAME, figure, before, after, unit, target, met, chosen_on)
 
 
 def _over(
     data: NavionData, figure: str, errors: Array, target: tuple[float, float] | None, chosen: str
-) -> list[Row]:
+) -> list[ReportRow]:
     """Two rows, all heights and the inner ones, from errors (2, P, ...), T: before and after."""
     wanted = target or (None, None)
     out = []
@@ -72,7 +72,7 @@ def _over(
     return out
 
 
-def _field_rows(analysis: Analysis) -> list[Row]:
+def _field_rows(analysis: NavionAnalysis) -> list[ReportRow]:
     data, coils = analysis.data, analysis.data.coils
     strict, own = [], []
     for fold in analysis.folds:
@@ -87,7 +87,7 @@ def _field_rows(analysis: Analysis) -> list[Row]:
     ]
 
 
-def _state_rows(analysis: Analysis) -> list[Row]:
+def _state_rows(analysis: NavionAnalysis) -> list[ReportRow]:
     """All three coils on: offsets and what the iron remembers count too."""
     data = analysis.data
     errors = np.zeros((2, *data.terms_t.shape))
@@ -103,7 +103,7 @@ def _state_rows(analysis: Analysis) -> list[Row]:
     return _over(data, 'field of the eight states, component RMSE', errors, None, STRICT)
 
 
-def _tool_rows(analysis: Analysis) -> list[Row]:
+def _tool_rows(analysis: NavionAnalysis) -> list[ReportRow]:
     data, coils = analysis.data, analysis.data.coils
     strict, own = [], []
     for fold in analysis.folds:
@@ -152,7 +152,7 @@ def _pooled(parts: list[ToolErrors]) -> tuple[float, float]:
     return 1e3 * position, math.degrees(angle)
 
 
-def _zero_row(analysis: Analysis, folder: Path) -> Row:
+def _zero_row(analysis: NavionAnalysis, folder: Path) -> ReportRow:
     """The state without current: stored while the supply was still ramping down."""
     data = analysis.data
     series_path = folder / 'navion_timeseries.npz'

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import FitError
-from anser_ros.measured.navion_plate import Plate, PlateData, SensorErrors, Sources
+from anser_ros.measured.navion_plate import HallSensorErrors, Plate, PlateData, Sources
 from anser_ros.measured.navion_system import (
     Estimate,
-    Problem,
+    NavionProblem,
     Solution,
     System,
     Whitened,
@@ -49,7 +49,7 @@ class PlateFit:
     Attributes
     ----------
     sources : Sources
-    errors : SensorErrors
+    errors : HallSensorErrors
     states : ndarray, shape (P, n_state)
         Of the fitted heights.
     weight : ndarray, shape (P, S)
@@ -61,7 +61,7 @@ class PlateFit:
     """
 
     sources: Sources
-    errors: SensorErrors
+    errors: HallSensorErrors
     states: Array
     weight: Array
     log_evidence: float
@@ -72,7 +72,7 @@ class PlateFit:
 
 def _problem(
     data: PlateData, magnet_m: Array, metal_m: Array, effects: frozenset[str], widths: Widths
-) -> Problem:
+) -> NavionProblem:
     plate = Plate(data.grid_m)
     used = np.zeros(plate.n_state, dtype=bool)
     used[:6] = 'registration' in effects
@@ -81,7 +81,7 @@ def _problem(
     sigma = np.repeat([widths.shift_m, widths.tilt_rad, widths.bend_m], [3, 3, plate.n_state - 6])
     places = metal_m.reshape(-1, 3)
     prior = _prior_precision(data, len(magnet_m), places, sigma[index], widths)
-    return Problem(data, plate, magnet_m, places, index, prior, widths)
+    return NavionProblem(data, plate, magnet_m, places, index, prior, widths)
 
 
 def _prior_precision(
@@ -108,7 +108,7 @@ def _prior_precision(
     return precision
 
 
-def _start(problem: Problem, effects: frozenset[str]) -> Estimate:
+def _start(problem: NavionProblem, effects: frozenset[str]) -> Estimate:
     n_planes, n_coils, n_sensors = problem.data.field_t.shape[:3]
     widths = problem.widths
     sensor_width = np.repeat([widths.gain, widths.axis_rad, widths.leak, widths.lever_m], 3)

@@ -46,7 +46,7 @@ class PlateData:
 
 
 @dataclass(frozen=True)
-class SensorErrors:
+class HallSensorErrors:
     """What each sensor adds: a reading is ``matrix @ (R^T B(position + shift))``.
 
     Attributes
@@ -173,7 +173,7 @@ class Plate:
 
 
 def predict_plane(
-    grid_m: Array, height_m: float, sources: Sources, errors: SensorErrors, state: Array | None
+    grid_m: Array, height_m: float, sources: Sources, errors: HallSensorErrors, state: Array | None
 ) -> Array:
     """Predict the readings (K, S, 3), T, of a plate at one height.
 

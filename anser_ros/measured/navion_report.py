@@ -35,18 +35,18 @@ _ONE_OBJECT = 1.0 / 3.0
 
 
 @dataclass(frozen=True)
-class Analysis:
+class NavionAnalysis:
     """Everything that was found, fold by fold."""
 
     data: NavionData
     folds: tuple[Fold, ...]
 
 
-def analyse(folder: Path, tell: Callable[[str], None] = lambda _: None) -> Analysis:
+def analyse(folder: Path, tell: Callable[[str], None] = lambda _: None) -> NavionAnalysis:
     """Leave each height out in turn; `tell` hears of each fold's choice."""
     data = load(folder)
     folds = [run_fold(data.coils, held, tell) for held in range(len(data.plane))]
-    return Analysis(data, tuple(folds))
+    return NavionAnalysis(data, tuple(folds))
 
 
 def predict_states(data: NavionData, fit: PlateFit, known: list[int], height_m: float) -> Array:
@@ -71,7 +71,7 @@ def predict_states(data: NavionData, fit: PlateFit, known: list[int], height_m: 
     return join_states(terms, data.sign)
 
 
-def memory_table(analysis: Analysis) -> str:
+def memory_table(analysis: NavionAnalysis) -> str:
     """Held-out RMSE (mT) of the terms that a linear magnet doesn't have, raw and explained."""
     data = analysis.data
     lines = ['term                      raw    explained (held-out RMSE, mT)']
@@ -91,7 +91,7 @@ def memory_table(analysis: Analysis) -> str:
     return '\n'.join(lines)
 
 
-def tables(analysis: Analysis) -> str:
+def tables(analysis: NavionAnalysis) -> str:
     """Candidates and what each was worth, as text.
 
     The first part lists, for every round, what a candidate adds in log evidence on the heights

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.measured.navion_plate import (
+    HallSensorErrors,
     Plate,
     PlateData,
-    SensorErrors,
     Sources,
     vector_basis,
 )
@@ -68,7 +68,7 @@ class Widths:
 
 
 @dataclass(frozen=True)
-class Problem:
+class NavionProblem:
     """What doesn't change while Gauss-Newton runs.
 
     Attributes
@@ -135,10 +135,10 @@ class Estimate:
         moment = self.moment.reshape(len(position), 3, self.moment.shape[1])
         return Sources(position, moment, len(self.metal))
 
-    def errors(self) -> SensorErrors:
+    def errors(self) -> HallSensorErrors:
         """Sensor errors as they are now."""
         matrix = np.eye(3) + np.einsum('sa,aij->sij', self.sensor[:, :9], GENERATORS)
-        return SensorErrors(matrix, self.sensor[:, 9:])
+        return HallSensorErrors(matrix, self.sensor[:, 9:])
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ class Solution:
 class System:
     """One linearisation: rows are (S, K * P * 3), columns the shared unknowns."""
 
-    def __init__(self, problem: Problem, now: Estimate, moving: bool) -> None:
+    def __init__(self, problem: NavionProblem, now: Estimate, moving: bool) -> None:
         self.problem, self.now = problem, now
         self.n_sensors, self.n_coils, self.n_planes = problem.reading.shape[:3]
         plate, data = problem.plate, problem.data

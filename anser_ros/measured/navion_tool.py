@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.measured.navion_plate import Plate, SensorErrors, Sources, rotation_matrices
+from anser_ros.measured.navion_plate import HallSensorErrors, Plate, Sources, rotation_matrices
 
 Array = NDArray[np.float64]
 
@@ -103,7 +103,7 @@ def _refine(
 def tool_errors(
     reading_t: Array,
     sources: Sources,
-    errors: SensorErrors,
+    errors: HallSensorErrors,
     grid_m: Array,
     height_m: float,
     state: Array | None = None,

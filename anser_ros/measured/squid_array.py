@@ -115,7 +115,7 @@ class SquidArray:
 
 
 @dataclass(frozen=True)
-class Whitener:
+class SquidWhitener:
     """Inverse Cholesky factors of the chips' covariances, and what their channels share.
 
     Attributes
@@ -144,7 +144,7 @@ class Whitener:
         out[self.chips] = np.einsum('cij,cj->ci', self.shared, inverse)
         return out
 
-    def weighted(self, weight: Array) -> 'Whitener':
+    def weighted(self, weight: Array) -> 'SquidWhitener':
         """The same with each chip's covariance divided by its weight (C,)."""
         root = np.sqrt(weight)[:, None, None]
         return replace(self, factors=self.factors * root, shared=self.shared / root**2)
@@ -163,7 +163,7 @@ def whitener(
     predicted: Array,
     errors: ChipErrors,
     used: NDArray[np.bool_],
-) -> Whitener:
+) -> SquidWhitener:
     """Covariance of each chip's channels: noise, gain, place and tilt."""
     chips = array.chips
     variance = noise**2 + (errors.gain * predicted) ** 2
@@ -178,4 +178,4 @@ def whitener(
     inverse = np.linalg.inv(factor) * scale[:, None, :]
     log_det = np.log(np.einsum('cii->ci', inverse))
     keep = used[chips]
-    return Whitener(chips, inverse, shared, -float(np.sum(log_det[keep])))
+    return SquidWhitener(chips, inverse, shared, -float(np.sum(log_det[keep])))

@@ -25,8 +25,7 @@ from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.stream_status import emitter_statuses, sensor_statuses, signal_troubles
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.config_folder import read_config
-from anser_ros.wire.frames import Hello, Record, SampleBlock, Stop
-from anser_ros.wire.frames import Status as DeviceStatus
+from anser_ros.wire.frames import DeviceStatus, Hello, Record, SampleBlock, Stop
 from anser_ros.wire.port import DEFAULT_BAUD, Batch, ControlUnitPort, PortState, find_port
 from anser_ros.wire.setup import Setup, dump_setup, parse_setup
 from anser_ros.wire.stream_control import StreamControl

@@ -3,8 +3,7 @@
 from collections.abc import Mapping
 
 from anser_ros.nodes.diagnostics import Level
-from anser_ros.wire.frames import Status as DeviceStatus
-from anser_ros.wire.frames import StatusFlag
+from anser_ros.wire.frames import DeviceStatus, StatusFlag
 
 MEMORY_S = 5.0
 FAULTS = {

@@ -18,12 +18,8 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from anser_ros.errors import AnserError, FitError, ModelFileError, SetupError
-from anser_ros.fitting.baseline import ReadingWindow, check_enough
-from anser_ros.fitting.model import FieldModel
-from anser_ros.fitting.nominal import nominal_model
-from anser_ros.fitting.refit import LiveRefit, RefitResult, RefitSettings
-from anser_ros.fitting.refit_change import MOST_RATE_HZ, Pace
-from anser_ros.fitting.refit_result import FEW_REFERENCES, POOR_FIT
+from anser_ros.field.model import FieldModel
+from anser_ros.field.nominal import nominal_model
 from anser_ros.nodes import qos
 from anser_ros.nodes.diagnostics import Trouble
 from anser_ros.nodes.flux_reader import FrameWatch, read_frame
@@ -33,6 +29,10 @@ from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.patches import Patches
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.baseline import ReadingWindow, check_enough
+from anser_ros.refit.change import MOST_RATE_HZ, Pace
+from anser_ros.refit.live_refit import LiveRefit, RefitResult, RefitSettings
+from anser_ros.refit.result import FEW_REFERENCES, POOR_FIT
 from anser_ros.sessions.evaluation import baseline_flux
 from anser_ros.sessions.model_file import load_model, save_model
 from anser_ros.sessions.patches import parse_patches

@@ -8,9 +8,9 @@ from rclpy.node import Node
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from anser_ros.fitting.refit_result import Metal, RefitResult
 from anser_ros.nodes import qos
 from anser_ros.nodes.model_clouds import NANO
+from anser_ros.refit.result import Metal, RefitResult
 
 SHOWN = 0.15
 """Sources whose density is at least this part of the strongest one's are shown."""

@@ -7,7 +7,7 @@ import numpy as np
 from sensor_msgs.msg import PointCloud2, PointField
 
 from anser_ros.errors import LayoutError
-from anser_ros.fitting.model import FieldModel
+from anser_ros.field.model import FieldModel
 from anser_ros.wire.model_error import ModelError, decode_model_error, encode_model_error
 from anser_ros.wire.points import (
     DipolePoints,

@@ -11,10 +11,10 @@ from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
 
 from anser_ros.errors import FrameError
-from anser_ros.fitting.refit import LiveRefit
-from anser_ros.fitting.refit_patches import PatchCoils
 from anser_ros.nodes.model_clouds import stamp_of
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.live_refit import LiveRefit
+from anser_ros.refit.patches import PatchCoils
 from anser_ros.tracking.rotations import rotation_of_quaternion
 
 ComplexArray = NDArray[np.complex128]

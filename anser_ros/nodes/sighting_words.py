@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.watch import Sighting
 
 SITES = ('channel', 'channels', 'coil', 'coils', 'body')

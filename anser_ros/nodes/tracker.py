@@ -13,7 +13,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from anser_ros.errors import AnserError, ModelFileError, ParameterError
-from anser_ros.fitting.model import FieldModel
+from anser_ros.field.model import FieldModel
 from anser_ros.nodes import qos
 from anser_ros.nodes.answered_frames import AnsweredFrames
 from anser_ros.nodes.backlog import Backlog, take_waiting

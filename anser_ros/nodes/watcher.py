@@ -15,7 +15,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from anser_ros.errors import AnserError
-from anser_ros.fitting.model import EffectRecord
+from anser_ros.field.model import EffectRecord
 from anser_ros.nodes import qos
 from anser_ros.nodes.flux_reader import read_flux
 from anser_ros.nodes.model_clouds import NANO

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
+from anser_ros.calibration.calibrate import Calibration, Options, calibrate
+from anser_ros.calibration.layouts import Generator
 from anser_ros.errors import AnserError, FitError
-from anser_ros.fitting.calibration import Calibration, Options, calibrate
-from anser_ros.fitting.layouts import Generator
-from anser_ros.fitting.model import FieldModel
+from anser_ros.field.model import FieldModel
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import NOMINAL, model_for
 from anser_ros.wire.setup import Setup

@@ -13,9 +13,9 @@ from anser_ros.diagnosis.problem import Problem
 from anser_ros.diagnosis.whitening import Spread
 from anser_ros.effects.correction import DRIFTS, Correction
 from anser_ros.errors import DiagnosisError, SetupError
-from anser_ros.fitting.measurements import Measurements
-from anser_ros.fitting.model import FieldModel
-from anser_ros.fitting.nominal import nominal_model
+from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import FieldModel
+from anser_ros.field.nominal import nominal_model
 from anser_ros.sessions.evaluation import (
     FOUND_ON,
     baseline_flux,

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from anser_ros.effects.correction import DRIFTS, Correction
 from anser_ros.errors import BagError, FitError
-from anser_ros.fitting.baseline import check_enough
-from anser_ros.fitting.measurements import Measurements
-from anser_ros.fitting.model import FieldModel
-from anser_ros.fitting.refit import LiveRefit, RefitResult, RefitSettings
-from anser_ros.fitting.refit_change import Pace
+from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.baseline import check_enough
+from anser_ros.refit.change import Pace
+from anser_ros.refit.live_refit import LiveRefit, RefitResult, RefitSettings
 from anser_ros.sessions.patches import PatchFollower
 from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, NANO, Session, noise_of
 from anser_ros.sessions.starting_model import check_fits, drawing_of

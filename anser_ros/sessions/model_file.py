@@ -3,7 +3,7 @@
 import os
 
 from anser_ros.errors import ModelFileError
-from anser_ros.fitting.model import FieldModel, from_document, to_document
+from anser_ros.field.model import FieldModel, from_document, to_document
 from anser_ros.wire.model_file import read_document, write_document
 
 

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import BagError, ParameterError
-from anser_ros.fitting.model import FieldModel
-from anser_ros.fitting.refit_patches import PatchCoils
-from anser_ros.fitting.refit_result import RefitResult
+from anser_ros.field.model import FieldModel
+from anser_ros.refit.patches import PatchCoils
+from anser_ros.refit.result import RefitResult
 from anser_ros.sessions.recorded_poses import PublishedPoses, published_poses
 from anser_ros.sessions.session import Session, sensor_table
 from anser_ros.sessions.starting_model import drawing_of

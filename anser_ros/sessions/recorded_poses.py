@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import BagError
-from anser_ros.fitting.measurements import Measurements
+from anser_ros.field.measurements import Measurements
 from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, NANO, Session
 from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages, stamp_ns
 from anser_ros.wire.setup import topic_of

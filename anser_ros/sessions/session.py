@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import BagError
-from anser_ros.fitting.measurements import Measurements
+from anser_ros.field.measurements import Measurements
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.wire.bag import Bag, FluxStream, PoseStream, read_bag
+from anser_ros.wire.bag import Bag, PoseStream, RecordedFluxes, read_bag
 from anser_ros.wire.points import STALE
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
 
@@ -71,7 +71,7 @@ def pose_track(stream: PoseStream, start_ns: int) -> PoseTrack:
 
 
 def _columns(
-    stream: FluxStream, sensors: SensorTable
+    stream: RecordedFluxes, sensors: SensorTable
 ) -> tuple[NDArray[np.complex128], NDArray[np.bool_], NDArray[np.int64]]:
     """Flux (F, S, K), validity and flags (F, S) in the order of the sensor table."""
     flux = np.full((stream.stamp_ns.size, len(sensors), stream.flux.shape[2]), np.nan, complex)
@@ -88,7 +88,7 @@ def _columns(
 
 
 def _tool(
-    stream: FluxStream, sensors: SensorTable, body: str, bag: Bag, start: int
+    stream: RecordedFluxes, sensors: SensorTable, body: str, bag: Bag, start: int
 ) -> Measurements:
     flux, valid, flags = _columns(stream, sensors)
     time = np.asarray((stream.stamp_ns - start) * NANO, dtype=np.float64)
@@ -103,7 +103,7 @@ def _tool(
     )
 
 
-def _reference(stream: FluxStream, sensors: SensorTable, start: int) -> Measurements:
+def _reference(stream: RecordedFluxes, sensors: SensorTable, start: int) -> Measurements:
     flux, valid, flags = _columns(stream, sensors)
     time = np.asarray((stream.stamp_ns - start) * NANO, dtype=np.float64)
     count = time.size

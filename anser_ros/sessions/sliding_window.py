@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.sessions.session import NANO, Session, session_of
-from anser_ros.wire.bag import Bag, FluxStream, PoseStream
+from anser_ros.wire.bag import Bag, PoseStream, RecordedFluxes
 from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import Setup
 
@@ -27,11 +27,11 @@ class _Fluxes:
         default_factory=deque
     )
 
-    def stream(self) -> FluxStream | None:
+    def stream(self) -> RecordedFluxes | None:
         if not self.rows or self.channel is None:
             return None
         stamps, flux, flags = zip(*self.rows, strict=True)
-        return FluxStream(np.array(stamps), self.channel, np.array(flags), np.array(flux))
+        return RecordedFluxes(np.array(stamps), self.channel, np.array(flags), np.array(flux))
 
 
 class SlidingWindow:

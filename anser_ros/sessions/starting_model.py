@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import ModelFileError, SetupError
-from anser_ros.fitting.model import FieldModel
-from anser_ros.fitting.nominal import nominal_model
+from anser_ros.field.model import FieldModel
+from anser_ros.field.nominal import nominal_model
 from anser_ros.physics.board import Board, build_board
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import Session

@@ -16,8 +16,8 @@ from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.diagnosis.search import SearchSettings
 from anser_ros.diagnosis.whitening import Spread
 from anser_ros.effects.effect import Term
-from anser_ros.fitting.measurements import Measurements
-from anser_ros.fitting.model import EffectRecord, FieldModel
+from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.sessions.diagnosis import DEFAULT_NOISE_T, corrected, drawn
 from anser_ros.sessions.session import NANO, Session, noise_of
 from anser_ros.tracking.estimate import OK, TrackerSettings

@@ -19,6 +19,8 @@ from anser_ros.wire.frames import (
     TYPE_OF,
     Channel,
     ChannelKind,
+    DeviceState,
+    DeviceStatus,
     Hello,
     Identify,
     Payload,
@@ -29,8 +31,6 @@ from anser_ros.wire.frames import (
     SamplesFlag,
     SetFrequencies,
     Start,
-    State,
-    Status,
     StatusFlag,
     Stop,
     encode,
@@ -91,7 +91,7 @@ class ControlUnit:
         self._sample = 0
         self._stream_begin = 0
         self._sequence = 0
-        self._state = State.IDLE
+        self._state = DeviceState.IDLE
         self._dropped = 0
         self._lost_before = False
         self._next_hello = 0
@@ -109,7 +109,7 @@ class ControlUnit:
     @property
     def streaming(self) -> bool:
         """Whether it sends samples."""
-        return self._state is State.STREAMING
+        return self._state is DeviceState.STREAMING
 
     def receive(self, data: bytes) -> list[Piece]:
         """Take bytes from the host and return the records that answer."""
@@ -180,12 +180,12 @@ class ControlUnit:
             return []
         code, text, more = ReplyCode.OK, '', []
         if isinstance(command, Start):
-            self._state = State.STREAMING
+            self._state = DeviceState.STREAMING
             self._stream_begin, self._sequence = self._sample, 0
             self._dropped, self._lost_before = 0, False
             self._sampler.drive(self._sample / self.sample_rate_hz)
         elif isinstance(command, Stop):
-            self._state = State.IDLE
+            self._state = DeviceState.IDLE
         elif isinstance(command, Identify):
             more = [self._piece(self._hello)]
         else:
@@ -205,9 +205,9 @@ class ControlUnit:
         self._sampler.set_frequencies(np.array(tones))
         return ReplyCode.OK, ''
 
-    def _status(self) -> Status:
+    def _status(self) -> DeviceStatus:
         refused = self._reader.counters
-        return Status(
+        return DeviceStatus(
             self._state,
             StatusFlag.OVERRUN if self._dropped else StatusFlag(0),
             self._ticks(self._sample),

@@ -14,7 +14,6 @@ from anser_ros.errors import ParameterError
 from anser_ros.signals.clock import FOLLOWED_SHARE
 from anser_ros.simulation.metal import MetalBody
 from anser_ros.simulation.raw_effects import (
-    ChannelCrosstalk,
     ChannelGain,
     CoilWeakens,
     CompressingAmplifier,
@@ -22,6 +21,7 @@ from anser_ros.simulation.raw_effects import (
     GainRipple,
     LateDelivery,
     LooseSensor,
+    RawChannelCrosstalk,
     RawEffect,
     SlowClock,
     TiltedSensor,
@@ -107,7 +107,7 @@ def _channel_crosstalk(unit: Unit, rng: np.random.Generator) -> Drawn:
     rows = tuple(tuple(float(v) for v in row) for row in matrix)
     channels = [unit.setup.sensors[c].channel for c in columns]
     parameters = {'channels': channels, 'matrix': [list(row) for row in rows]}
-    return _known('channel_crosstalk', parameters, ChannelCrosstalk(tuple(columns), rows))
+    return _known('channel_crosstalk', parameters, RawChannelCrosstalk(tuple(columns), rows))
 
 
 def _time_offset(unit: Unit, rng: np.random.Generator) -> Drawn:

@@ -49,7 +49,7 @@ class RawEffect:
 
 
 @dataclass(frozen=True)
-class ChannelCrosstalk(RawEffect):
+class RawChannelCrosstalk(RawEffect):
     """Sensors of one cluster leak into each other.
 
     Attributes

@@ -27,7 +27,7 @@ from anser_ros.tracking.rigid import (
     start_from_grid,
 )
 from anser_ros.tracking.rotations import rotation_between, rotation_of_vector
-from anser_ros.tracking.scene import Scene
+from anser_ros.tracking.solve_context import SolveContext
 from anser_ros.tracking.uncertainty import bounded_inverse, chi2_limit
 
 Array = NDArray[np.float64]
@@ -90,18 +90,18 @@ class _Fit:
 
 
 @dataclass(frozen=True)
-class _Frame:
+class _BodyFrame:
     """A body's fluxes (S, 2K) in one frame, and what its coils found by themselves."""
 
     coils: BodyCoils
     flux: Array
     single: list[CoilResult]
-    scene: Scene
+    context: SolveContext
 
     @cached_property
     def inverse_sigma(self) -> Array:
         """1/T, shape (2K,)."""
-        return 1.0 / self.scene.sigma
+        return 1.0 / self.context.sigma
 
     def common(self, used: NDArray[np.int64], start: Start) -> Array:
         """Errors that some coils share, see `common_factor`.
@@ -109,17 +109,17 @@ class _Frame:
         They are those that the coils' own solves reckoned with, where these were near.
         """
         weights = np.tile(self.inverse_sigma, (len(used), 1))
-        if self.scene.modes is None:
+        if self.context.modes is None:
             return np.zeros((0, weights.size))
         coils, (position, rotation) = self.coils.subset(used), start
         points, axes = coils.offsets @ rotation.T + position, coils.axes @ rotation.T
         known = [self.single[i].error for i in used.tolist()]
         far = [
             i for i, error in enumerate(known)
-            if error is None or not error.holds(self.scene, points[i], axes[i])
+            if error is None or not error.holds(self.context, points[i], axes[i])
         ]  # fmt: skip
         if far:
-            fresh = take_errors(self.scene, points[far], axes[far], coils.lengths[far])
+            fresh = take_errors(self.context, points[far], axes[far], coils.lengths[far])
             for i, error in zip(far, fresh, strict=True):
                 known[i] = error
         return common_factor(np.array([e.errors for e in known if e is not None]), weights)
@@ -135,22 +135,22 @@ class _Frame:
         step_to_coils(
             position, rotation, coils.offsets, coils.axes, np.array([s.position for s in known]),
             np.array([s.axis for s in known]), np.array([s.normal for s in known]),
-            self.scene.low - coils.reach, self.scene.high + coils.reach,
+            self.context.low - coils.reach, self.context.high + coils.reach,
         )  # fmt: skip
         return position, rotation
 
 
-def _solve(frame: _Frame, used: NDArray[np.int64], start: Start) -> _Fit:
-    part, scene = frame.coils.subset(used), frame.scene
+def _solve(frame: _BodyFrame, used: NDArray[np.int64], start: Start) -> _Fit:
+    part, context = frame.coils.subset(used), frame.context
     weights = np.tile(frame.inverse_sigma, (len(used), 1))
     solution = solve_body(
-        scene.field, part, np.ascontiguousarray(frame.flux[used]), weights,
-        frame.common(used, start), *start, scene.low - part.reach, scene.high + part.reach,
+        context.field, part, np.ascontiguousarray(frame.flux[used]), weights,
+        frame.common(used, start), *start, context.low - part.reach, context.high + part.reach,
     )  # fmt: skip
     return _Fit(solution, used, max(weights.size - 6, 1))
 
 
-def _without_disagreeing(fit: _Fit, frame: _Frame, gate: float) -> _Fit:
+def _without_disagreeing(fit: _Fit, frame: _BodyFrame, gate: float) -> _Fit:
     """Leave out, one by one, up to a third of the coils while one of them spoils the fit."""
     for _ in range(len(fit.used) // 3):
         if fit.ratio <= gate**2:
@@ -167,8 +167,8 @@ def _without_disagreeing(fit: _Fit, frame: _Frame, gate: float) -> _Fit:
     return fit
 
 
-def _cold_starts(frame: _Frame, used: NDArray[np.int64]) -> list[Start]:
-    scene, coils, single = frame.scene, frame.coils, frame.single
+def _cold_starts(frame: _BodyFrame, used: NDArray[np.int64]) -> list[Start]:
+    context, coils, single = frame.context, frame.coils, frame.single
     for wanted in (states.OK, states.RESIDUAL):
         rows = [i for i in used if single[i].estimate.state == wanted]
         solutions = [single[i].solution for i in rows]
@@ -184,7 +184,7 @@ def _cold_starts(frame: _Frame, used: NDArray[np.int64]) -> list[Start]:
                 return [start]
     if any(single[i].estimate.state == states.RESIDUAL for i in used):
         return []
-    return start_from_grid(scene.grid, scene.field, coils.subset(used), frame.flux[used])
+    return start_from_grid(context.grid, context.field, coils.subset(used), frame.flux[used])
 
 
 def track_body(
@@ -195,7 +195,7 @@ def track_body(
     flux: Array,
     usable: NDArray[np.bool_],
     single: list[CoilResult],
-    scene: Scene,
+    context: SolveContext,
     settings: TrackerSettings,
 ) -> PoseEstimate:
     """Estimate a body's pose from the fluxes, shape (S, 2K), of its usable coils."""
@@ -205,8 +205,8 @@ def track_body(
         worst = next(
             (s.estimate.state for i, s in enumerate(single) if not usable[i]), states.STALE
         )
-        return no_pose(name, stamp_ns, worst, scene.model_id, reason)
-    frame = _Frame(coils, flux, single, scene)
+        return no_pose(name, stamp_ns, worst, context.model_id, reason)
+    frame = _BodyFrame(coils, flux, single, context)
     fits = _from_good(track, stamp_ns, frame, used, settings)
     if not fits:
         fits = [_solve(frame, used, start) for start in _cold_starts(frame, used)]
@@ -214,9 +214,9 @@ def track_body(
         fits[:1] = [_without_disagreeing(f, frame, settings.gate) for f in fits[:1]]
     if not fits:
         reason = 'no coil of this body has a pose to start from'
-        return no_pose(name, stamp_ns, states.RESIDUAL, scene.model_id, reason)
+        return no_pose(name, stamp_ns, states.RESIDUAL, context.model_id, reason)
     fit = fits[0]
-    result = _judge(track, name, stamp_ns, fit, fits[1:], coils, scene, settings)
+    result = _judge(track, name, stamp_ns, fit, fits[1:], coils, context, settings)
     if result.state == states.OK:
         last, track.before = track.good, None
         if (
@@ -235,7 +235,7 @@ def track_body(
 def _from_good(
     track: BodyTrack,
     stamp_ns: int,
-    frame: _Frame,
+    frame: _BodyFrame,
     used: NDArray[np.int64],
     settings: TrackerSettings,
 ) -> list[_Fit]:
@@ -263,7 +263,7 @@ def _judge(
     fit: _Fit,
     rivals: list[_Fit],
     coils: BodyCoils,
-    scene: Scene,
+    context: SolveContext,
     settings: TrackerSettings,
 ) -> PoseEstimate:
     solution = fit.solution
@@ -300,5 +300,5 @@ def _judge(
                 state, reason = states.AMBIGUOUS, 'another pose would explain the fluxes too'
     return PoseEstimate(
         name, stamp_ns, state, solution.position, solution.rotation[:, 2].copy(),
-        solution.rotation, covariance, sigma, residual, fit.ratio, scene.model_id, reason,
+        solution.rotation, covariance, sigma, residual, fit.ratio, context.model_id, reason,
     )  # fmt: skip

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from anser_ros.tracking import estimate as states
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings, no_pose
-from anser_ros.tracking.scene import Scene
 from anser_ros.tracking.seed import solve_cold
 from anser_ros.tracking.solve import CoilSolution, solve_coil, whitening_of
+from anser_ros.tracking.solve_context import SolveContext
 from anser_ros.tracking.uncertainty import chi2_limit, coil_covariance
 
 Array = NDArray[np.float64]
@@ -41,7 +41,7 @@ class PoseErrors:
 
     Attributes
     ----------
-    scene : Scene
+    context : SolveContext
     position, axis : ndarray, shape (3,)
     errors : ndarray, shape (R, 2K)
         Flux errors of one standard deviation each, T.
@@ -54,7 +54,7 @@ class PoseErrors:
         field so near to them.
     """
 
-    scene: Scene
+    context: SolveContext
     position: Array
     axis: Array
     errors: Array
@@ -67,14 +67,14 @@ class PoseErrors:
         """Whether the sensor is where the dipoles that stand for metal are no description."""
         return self.among > 1.0
 
-    def holds(self, scene: Scene, position: Array, axis: Array) -> bool:
-        """Whether this is still good for a scene and a pose."""
-        own = self.scene
-        if own.modes is not scene.modes:
+    def holds(self, context: SolveContext, position: Array, axis: Array) -> bool:
+        """Whether this is still good for a context and a pose."""
+        own = self.context
+        if own.modes is not context.modes:
             return False
-        if own.sigma is not scene.sigma and not np.array_equal(own.sigma, scene.sigma):
+        if own.sigma is not context.sigma and not np.array_equal(own.sigma, context.sigma):
             return False
-        return scene.modes is None or (
+        return context.modes is None or (
             math.dist(position, self.position) < self.reach_m
             and math.dist(axis, self.axis) < ERROR_REACH
         )
@@ -132,14 +132,14 @@ class CoilTrack:
 
 
 @dataclass(frozen=True)
-class _Frame:
+class _CoilFrame:
     """One sensor's fluxes (2K,) in one frame, and what they are tracked with."""
 
     name: str
     length: float
     stamp_ns: int
     flux: Array
-    scene: Scene
+    context: SolveContext
     settings: TrackerSettings
 
     @property
@@ -167,73 +167,75 @@ class CoilResult:
         return self.solution is not None and not (self.error and self.error.among_metal)
 
 
-def take_errors(scene: Scene, points: Array, axes: Array, lengths: Array) -> list[PoseErrors]:
+def take_errors(
+    context: SolveContext, points: Array, axes: Array, lengths: Array
+) -> list[PoseErrors]:
     """Work out the model's error for sensors (S of them) at some poses, all of them at once."""
-    errors, whitening, away, among = scene.error_whitening(points, axes, lengths)
+    errors, whitening, away, among = context.error_whitening(points, axes, lengths)
     reach = (ERROR_REACH * away).tolist()
     rows = points, axes, errors, whitening, reach, among.tolist()
-    return list(map(PoseErrors, repeat(scene), *rows))
+    return list(map(PoseErrors, repeat(context), *rows))
 
 
 def prepare(
     tracks: list[CoilTrack],
     lengths: Array,
     stamp_ns: int,
-    scene: Scene,
+    context: SolveContext,
     settings: TrackerSettings,
 ) -> None:
     """Look up the model's error where all sensors are expected, before they are tracked.
 
     At once it costs a third of what it does one by one.
     """
-    if scene.modes is None:
+    if context.modes is None:
         return
     rows, starts = [], []
     for i, track in enumerate(tracks):
         expected = track.expected(stamp_ns)
         if expected is None or (stamp_ns - track.good_ns) * NANO > settings.warm_age_s:
             continue
-        if track.error is None or not track.error.holds(scene, *expected):
+        if track.error is None or not track.error.holds(context, *expected):
             rows.append(i)
             starts.append(expected)
     if rows:
         points, axes = (np.array(part) for part in zip(*starts, strict=True))
-        for i, error in zip(rows, take_errors(scene, points, axes, lengths[rows]), strict=True):
+        for i, error in zip(rows, take_errors(context, points, axes, lengths[rows]), strict=True):
             tracks[i].error = error
 
 
 def _whitening(
-    track: CoilTrack, scene: Scene, position: Array, axis: Array, length: float
+    track: CoilTrack, context: SolveContext, position: Array, axis: Array, length: float
 ) -> Array:
     """Whitening with the model's error at a pose, reused while the sensor stays near."""
-    if track.error is None or not track.error.holds(scene, position, axis):
-        if scene.modes is None:
-            empty = np.empty((0, scene.sigma.size))
-            weights = whitening_of(scene.sigma)
-            track.error = PoseErrors(scene, position, axis, empty, weights, math.inf, 0.0)
+    if track.error is None or not track.error.holds(context, position, axis):
+        if context.modes is None:
+            empty = np.empty((0, context.sigma.size))
+            weights = whitening_of(context.sigma)
+            track.error = PoseErrors(context, position, axis, empty, weights, math.inf, 0.0)
         else:
-            (track.error,) = take_errors(scene, position[None], axis[None], np.array([length]))
+            (track.error,) = take_errors(context, position[None], axis[None], np.array([length]))
     return track.error.whitening
 
 
-def _cold(track: CoilTrack, frame: _Frame) -> list[CoilSolution]:
+def _cold(track: CoilTrack, frame: _CoilFrame) -> list[CoilSolution]:
     """All distinct poses in order of chi-square, with the model's error at each in the weights."""
-    scene = frame.scene
+    context = frame.context
     # Far from the truth only the size of the model's error counts, not its pattern.
-    power = float(np.mean((frame.flux / scene.sigma) ** 2))
-    limit = frame.limit * (1.0 + scene.relative_error**2 * power)
+    power = float(np.mean((frame.flux / context.sigma) ** 2))
+    limit = frame.limit * (1.0 + context.relative_error**2 * power)
     found = solve_cold(
-        scene.field,
-        scene.grid,
+        context.field,
+        context.grid,
         frame.flux,
-        whitening_of(scene.sigma),
-        scene.low,
-        scene.high,
+        whitening_of(context.sigma),
+        context.low,
+        context.high,
         frame.length,
         limit,
         thorough=track.failures % THOROUGH_EVERY == 0,
     )
-    if scene.modes is None:
+    if context.modes is None:
         return found
     near = [s for s in found if s.chi2 <= 100.0 * limit or s is found[0]]
     return sorted(
@@ -248,16 +250,18 @@ def track_coil(
     length: float,
     stamp_ns: int,
     flux: Array,
-    scene: Scene,
+    context: SolveContext,
     settings: TrackerSettings,
 ) -> CoilResult:
     """Estimate a sensor's pose from one frame's fluxes, shape (2K,), finite, T."""
-    loudness = flux / scene.sigma
+    loudness = flux / context.sigma
     signal = math.sqrt(float(loudness @ loudness) / loudness.size)
     if signal < settings.min_signal:
         reason = f'flux is {signal:.2g} times the noise'
-        return CoilResult(no_pose(name, stamp_ns, states.NO_SIGNAL, scene.model_id, reason), None)
-    frame = _Frame(name, length, stamp_ns, flux, scene, settings)
+        return CoilResult(
+            no_pose(name, stamp_ns, states.NO_SIGNAL, context.model_id, reason), None
+        )
+    frame = _CoilFrame(name, length, stamp_ns, flux, context, settings)
     solution = _from_good(track, frame)
     if solution is not None:
         return _finish(track, frame, solution, [], False)
@@ -273,7 +277,7 @@ def track_coil(
 
 def _finish(
     track: CoilTrack,
-    frame: _Frame,
+    frame: _CoilFrame,
     solution: CoilSolution,
     rivals: list[CoilSolution],
     cold: bool,
@@ -296,22 +300,22 @@ def _finish(
     return CoilResult(verdict, solution, cold, track.error)
 
 
-def _descend(track: CoilTrack, frame: _Frame, position: Array, axis: Array) -> CoilSolution:
-    scene = frame.scene
-    weights = _whitening(track, scene, position, axis, frame.length)
+def _descend(track: CoilTrack, frame: _CoilFrame, position: Array, axis: Array) -> CoilSolution:
+    context = frame.context
+    weights = _whitening(track, context, position, axis, frame.length)
     return solve_coil(
-        scene.field,
+        context.field,
         frame.flux,
         weights,
         position,
         axis,
-        scene.low,
-        scene.high,
+        context.low,
+        context.high,
         frame.length,
     )
 
 
-def _from_good(track: CoilTrack, frame: _Frame) -> CoilSolution | None:
+def _from_good(track: CoilTrack, frame: _CoilFrame) -> CoilSolution | None:
     """Solution near the last good pose; None when there is none that a scan need not confirm."""
     start, expected = track.good, track.expected(frame.stamp_ns)
     old = (frame.stamp_ns - track.good_ns) * NANO > frame.settings.warm_age_s
@@ -325,7 +329,7 @@ def _from_good(track: CoilTrack, frame: _Frame) -> CoilSolution | None:
 
 
 def _judge(
-    track: CoilTrack, frame: _Frame, solution: CoilSolution, rivals: list[CoilSolution]
+    track: CoilTrack, frame: _CoilFrame, solution: CoilSolution, rivals: list[CoilSolution]
 ) -> PoseEstimate:
     freedom, settings = frame.freedom, frame.settings
     ratio = solution.chi2 / freedom
@@ -358,7 +362,7 @@ def _judge(
                 reason = f'{_millimetres(rival.position)} mm would explain the fluxes too'
     return PoseEstimate(
         frame.name, frame.stamp_ns, state, solution.position, solution.axis, None, covariance,
-        sigma, residual, ratio, frame.scene.model_id, reason,
+        sigma, residual, ratio, frame.context.model_id, reason,
     )  # fmt: skip
 
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.tracking.scene import Scene
 from anser_ros.tracking.solve import RealField
+from anser_ros.tracking.solve_context import SolveContext
 
 FEWEST_EMITTERS = 6
 """One more than a coil's pose has unknowns, so that a residual is left to judge it by."""
@@ -37,34 +37,34 @@ def living_emitters(
 
 @dataclass(frozen=True)
 class ReducedScene:
-    """A scene without its dead emitters, and what it was made from."""
+    """A context without its dead emitters, and what it was made from."""
 
-    whole: Scene
+    whole: SolveContext
     living: NDArray[np.bool_]
-    scene: Scene
+    context: SolveContext
 
 
 def without_dead(
-    scene: Scene,
+    context: SolveContext,
     living: NDArray[np.bool_],
     previous: ReducedScene | None = None,
 ) -> ReducedScene:
-    """The scene of the living emitters; what has not changed since ``previous`` is kept."""
+    """The context of the living emitters; what has not changed since ``previous`` is kept."""
     same = previous is not None and bool((previous.living == living).all())
-    if same and previous is not None and previous.whole is scene:
+    if same and previous is not None and previous.whole is context:
         return previous
     kept = np.repeat(living, 2)
     field = RealField(
-        scene.field.positions,
-        scene.field.directions,
-        np.ascontiguousarray(scene.field.moments[:, kept]),
+        context.field.positions,
+        context.field.directions,
+        np.ascontiguousarray(context.field.moments[:, kept]),
     )
-    sigma, starts, modes = scene.sigma[kept], scene.starts.anew(), scene.modes
+    sigma, starts, modes = context.sigma[kept], context.starts.anew(), context.modes
     if same and previous is not None:
-        starts = previous.scene.starts.following()
+        starts = previous.context.starts.following()
     if same and previous is not None and previous.whole.modes is modes:
-        modes = previous.scene.modes
+        modes = previous.context.modes
     elif modes is not None:
         modes = modes.of_components(kept)
-    reduced = replace(scene, field=field, sigma=sigma, modes=modes, starts=starts)
-    return ReducedScene(scene, living, reduced)
+    reduced = replace(context, field=field, sigma=sigma, modes=modes, starts=starts)
+    return ReducedScene(context, living, reduced)

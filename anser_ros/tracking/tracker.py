@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import TrackingError
-from anser_ros.fitting.model import EffectRecord, FieldModel
+from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.physics.sensor import LARGEST_FLUX_T, SensorTable
 from anser_ros.tracking import estimate as states
 from anser_ros.tracking.body_track import BodyTrack, track_body
@@ -27,7 +27,7 @@ from anser_ros.tracking.emitters import (
 )
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.rigid import BodyCoils
-from anser_ros.tracking.scene import Scene, build_scene
+from anser_ros.tracking.solve_context import SolveContext, build_context
 
 Array = NDArray[np.float64]
 
@@ -86,7 +86,7 @@ class Tracker:
         self._body_tracks = {name: BodyTrack() for name in dict.fromkeys(sensors.body)}
         self._last_ns = [0]
         self._first_ns: list[int] = []
-        self._scene: Scene | None = None
+        self._context: SolveContext | None = None
         self._reduced: ReducedScene | None = None
         self._dead: list[str] = []
         self._effects: tuple[EffectRecord, ...] = ()
@@ -97,12 +97,12 @@ class Tracker:
 
     def _use(self, model: FieldModel | None, model_id: str | None) -> None:
         if model is not None:
-            scene = build_scene(model, self.settings, self._scene, model_id)
+            context = build_context(model, self.settings, self._context, model_id)
             if model.effects is not self._effects or self._correction is None:
                 self._correction = Correction.of(model.effects, self.sensors, model.frequencies_hz)
                 self._table = self._correction.sensors()
                 self._find_bodies()
-            self._scene, self._effects = scene, model.effects
+            self._context, self._effects = context, model.effects
         self._model = model
 
     def _find_bodies(self) -> None:
@@ -154,8 +154,8 @@ class Tracker:
         """The same tracker whose model has another name: one that was found anew, but the same."""
         other = Tracker.__new__(Tracker)
         other.__dict__.update(self.__dict__)
-        if self._scene is not None:
-            other._scene = replace(self._scene, model_id=model_id)
+        if self._context is not None:
+            other._context = replace(self._context, model_id=model_id)
         return other
 
     def with_settings(self, settings: TrackerSettings) -> 'Tracker':
@@ -163,8 +163,8 @@ class Tracker:
         other = Tracker.__new__(Tracker)
         other.__dict__.update(self.__dict__)
         other.settings = settings
-        if self._model is not None and self._scene is not None:
-            model_id, other._scene, other._reduced = self._scene.model_id, None, None
+        if self._model is not None and self._context is not None:
+            model_id, other._context, other._reduced = self._context.model_id, None, None
             other._use(self._model, model_id)
         return other
 
@@ -231,11 +231,11 @@ class Tracker:
         self.counters['frames'] += 1
         if not len(channels):
             self.counters['frames_empty'] += 1
-        scene, table = self._scene, self._table
+        context, table = self._context, self._table
         names = (*table.name, *self._bodies)
         living = living_emitters(values.view(np.complex128), (rows >= 0) & (bits == 0))
         self._note_dead(living)
-        if scene is None:
+        if context is None:
             for name in names:
                 yield no_pose(name, stamp_ns, states.NO_MODEL, '', 'no field model yet')
             return
@@ -246,12 +246,12 @@ class Tracker:
                     f'{FEWEST_EMITTERS} needed'
                 )
                 for name in names:
-                    yield no_pose(name, stamp_ns, states.NO_SIGNAL, scene.model_id, reason)
+                    yield no_pose(name, stamp_ns, states.NO_SIGNAL, context.model_id, reason)
                 return
             # An emitter that is off leaks nothing into another's tone either.
             values.view(np.complex128)[:, ~living] = 0.0
-            self._reduced = without_dead(scene, living, self._reduced)
-            scene = self._reduced.scene
+            self._reduced = without_dead(context, living, self._reduced)
+            context = self._reduced.context
         # Arithmetic on an infinity only warns; the kind of a bad value is counted as it came.
         faults = _faults(rows, values, bits)
         values[~np.isfinite(values)] = np.nan
@@ -264,16 +264,16 @@ class Tracker:
             values = np.ascontiguousarray(values[:, np.repeat(living, 2)])
         results: list[CoilResult] = []
         tracks = [self._coil_tracks[name] for name in table.name]
-        prepare(tracks, table.length, stamp_ns, scene, self.settings)
+        prepare(tracks, table.length, stamp_ns, context, self.settings)
         for i, name in enumerate(table.name):
             refusal = faults[i]
             if refusal is not None:
                 self.counters[f'readings_{refusal[2]}'] += 1
-                bad = no_pose(name, stamp_ns, refusal[0], scene.model_id, refusal[1])
+                bad = no_pose(name, stamp_ns, refusal[0], context.model_id, refusal[1])
                 result = CoilResult(bad, None)
             else:
                 result = track_coil(
-                    tracks[i], name, float(table.length[i]), stamp_ns, values[i], scene,
+                    tracks[i], name, float(table.length[i]), stamp_ns, values[i], context,
                     self.settings,
                 )  # fmt: skip
                 self.counters['cold_starts'] += result.cold
@@ -289,7 +289,7 @@ class Tracker:
                 values[members],
                 usable,
                 [results[i] for i in members],
-                scene,
+                context,
                 self.settings,
             )
 
@@ -331,9 +331,10 @@ class Tracker:
                 f'fluxes (s, k) need s channels and s flags, got {given.shape}, {number.shape} '
                 f'and {marks.shape}'
             )
-        if self._scene is not None and given.shape[1] != self._scene.field.emitters:
+        if self._context is not None and given.shape[1] != self._context.field.emitters:
             raise TrackingError(
-                f'the model has {self._scene.field.emitters} emitters, the fluxes {given.shape[1]}'
+                f'the model has {self._context.field.emitters} emitters, '
+                f'the fluxes {given.shape[1]}'
             )
         place = {channel: i for i, channel in enumerate(number.tolist())}
         if len(place) != number.size:

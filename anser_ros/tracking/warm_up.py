@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from anser_ros.fitting.model import FieldModel
+from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.seed import Volume

@@ -56,7 +56,7 @@ class Salvage:
 
 
 @dataclass(frozen=True)
-class FluxStream:
+class RecordedFluxes:
     """Fluxes of one topic.
 
     Attributes
@@ -91,8 +91,8 @@ class Bag:
     path: str
     setup: Setup
     setup_text: str
-    tool: FluxStream | None
-    reference: FluxStream | None
+    tool: RecordedFluxes | None
+    reference: RecordedFluxes | None
     optical: dict[str, PoseStream]
     refused: dict[str, int] = field(default_factory=dict)
     lost: str = ''
@@ -304,7 +304,7 @@ class _Collector:
         body = raw.topic[len('/optical/') : -len('/pose')]
         self.poses.setdefault(body, []).append((stamp_ns(message), values))
 
-    def flux_stream(self, which: str) -> FluxStream | None:
+    def flux_stream(self, which: str) -> RecordedFluxes | None:
         frames: dict[int, FluxPoints] = {}
         n_emitters = Counter(points.flux.shape[1] for _, points in self.flux[which])
         for stamp, points in self.flux[which]:
@@ -325,7 +325,7 @@ class _Collector:
             points = frames[stamp]
             rows = np.searchsorted(channels, points.channel)
             flux[f, rows], flags[f, rows] = points.flux, points.flags
-        return FluxStream(stamps, channels, flags, flux)
+        return RecordedFluxes(stamps, channels, flags, flux)
 
     def pose_streams(self) -> dict[str, PoseStream]:
         streams = {}

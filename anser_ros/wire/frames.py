@@ -44,7 +44,7 @@ class ChannelKind(IntEnum):
     CURRENT = 1
 
 
-class State(IntEnum):
+class DeviceState(IntEnum):
     """What the control unit is doing."""
 
     IDLE = 0
@@ -141,10 +141,10 @@ class SampleBlock:
 
 
 @dataclass(frozen=True)
-class Status:
+class DeviceStatus:
     """Health of the control unit, sent once a second and when it changes."""
 
-    state: State
+    state: DeviceState
     flags: StatusFlag
     uptime_ticks: int
     dropped_blocks: int
@@ -183,7 +183,7 @@ class SetFrequencies:
     frequencies_hz: tuple[float, ...]
 
 
-Payload = Hello | SampleBlock | Status | Reply | Identify | Start | Stop | SetFrequencies
+Payload = Hello | SampleBlock | DeviceStatus | Reply | Identify | Start | Stop | SetFrequencies
 
 
 @dataclass(frozen=True)
@@ -297,7 +297,7 @@ def _decode_samples(raw: memoryview) -> SampleBlock:
     return SampleBlock(sequence, ticks, codes, flags)
 
 
-def _encode_status(status: Status) -> bytes:
+def _encode_status(status: DeviceStatus) -> bytes:
     return _STATUS.pack(
         status.state,
         0,
@@ -309,9 +309,11 @@ def _encode_status(status: Status) -> bytes:
     )
 
 
-def _decode_status(raw: memoryview) -> Status:
+def _decode_status(raw: memoryview) -> DeviceStatus:
     state, _, flags, uptime, dropped, refused, temperature = _STATUS.unpack_from(raw)
-    return Status(State(state), StatusFlag(flags & 31), uptime, dropped, refused, temperature)
+    return DeviceStatus(
+        DeviceState(state), StatusFlag(flags & 31), uptime, dropped, refused, temperature
+    )
 
 
 def _encode_reply(reply: Reply) -> bytes:
@@ -343,7 +345,7 @@ def _nothing(_: object) -> bytes:
 _LAYOUTS: dict[int, tuple[type, Callable[..., bytes], Callable[[memoryview], Payload]]] = {
     0x01: (Hello, _encode_hello, _decode_hello),
     0x02: (SampleBlock, _encode_samples, _decode_samples),
-    0x03: (Status, _encode_status, _decode_status),
+    0x03: (DeviceStatus, _encode_status, _decode_status),
     0x04: (Reply, _encode_reply, _decode_reply),
     0x81: (Identify, _nothing, lambda raw: Identify()),
     0x82: (Start, _nothing, lambda raw: Start()),

@@ -42,11 +42,11 @@ from injection import (  # noqa: E402
     Truth,
 )
 
+from anser_ros.calibration.calibrate import Options  # noqa: E402
+from anser_ros.calibration.layouts import Layout  # noqa: E402
 from anser_ros.diagnosis.diagnose import Diagnosis, diagnose  # noqa: E402
-from anser_ros.fitting.calibration import Options  # noqa: E402
-from anser_ros.fitting.layouts import Layout  # noqa: E402
-from anser_ros.fitting.model import FieldModel  # noqa: E402
-from anser_ros.fitting.nominal import nominal_model  # noqa: E402
+from anser_ros.field.model import FieldModel  # noqa: E402
+from anser_ros.field.nominal import nominal_model  # noqa: E402
 from anser_ros.sessions.calibration import calibrate_sessions  # noqa: E402
 from anser_ros.sessions.evaluation import baseline_flux  # noqa: E402
 from anser_ros.sessions.session import Session, load_session  # noqa: E402
@@ -139,7 +139,7 @@ def subject(name: str = 's01') -> Subject:
 
 
 def _no_field() -> Any:
-    from anser_ros.effects.dipoles import Dipoles
+    from anser_ros.field.dipoles import Dipoles
 
     return Dipoles.none(len(model().emitters))
 

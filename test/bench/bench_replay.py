@@ -22,7 +22,7 @@ sys.path.insert(0, str(REPO / 'test'))
 
 from chain import replay_through_nodes  # noqa: E402
 
-from anser_ros.fitting.calibration import Options  # noqa: E402
+from anser_ros.calibration.calibrate import Options  # noqa: E402
 from anser_ros.sessions.calibration import calibrate_sessions  # noqa: E402
 from anser_ros.sessions.evaluation import metrics, track_session  # noqa: E402
 from anser_ros.sessions.model_file import load_model, save_model  # noqa: E402

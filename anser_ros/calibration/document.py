@@ -1,0 +1,68 @@
+"""The document that a calibration leaves (interfaces, section 5)."""
+
+from typing import Any
+
+import numpy as np
+
+from anser_ros.calibration.calibrate import Calibration
+from anser_ros.calibration.factors import as_real
+from anser_ros.calibration.held_out import rms
+from anser_ros.calibration.moments import MomentFit
+
+
+def to_document(calibration: Calibration) -> dict[str, Any]:
+    """The contract's calibration document, with further keys of our own.
+
+    Errors are root mean squares of the complex residual's magnitude at the measured poses; the
+    normalised ones are divided by the range of the measured in-phase fluxes (article, equation 8).
+    """
+    held_out = calibration.held_out
+    inside, span = calibration.residuals, calibration.residuals.span_t
+    each = zip(calibration.model.emitters, inside.each_t, held_out.error.T, strict=True)
+    nominal = calibration.nominal_rmse_t
+    return {
+        'schema': 'anser_calibration/1',
+        'n_measurements': calibration.n_measurements,
+        'n_dipoles': len(calibration.model.positions),
+        'flux_rmse_t': inside.rmse_t,
+        'heldout_flux_rmse_t': rms(held_out.error),
+        'heldout_n_rmse_percent': 100.0 * rms(held_out.error) / span,
+        'heldout_n_mae_percent': 100.0 * float(np.abs(held_out.error).mean()) / span,
+        'emitters': [
+            {'name': name, 'flux_rmse_t': float(own), 'heldout_flux_rmse_t': rms(outside)}
+            for name, own, outside in each
+        ],
+        'marginal': {
+            'noise_t': held_out.noise_t,
+            'flux_noise_t': held_out.flux_noise_t,
+            'heldout_component_rmse_t': float(np.sqrt(np.mean(as_real(held_out.left_over) ** 2))),
+            'heldout_chi_square': held_out.chi_square,
+            'flux_error_t': held_out.flux_error_t,
+            'fit_noise_t': calibration.fit.noise_t,
+            'outlier_fraction': _outlier_fraction(calibration.fit),
+        },
+        'choice': {
+            'layout': calibration.layout.describe(),
+            'damping': calibration.damping,
+            'rank': calibration.fit.rank,
+            'condition': calibration.fit.condition,
+            'freedom': calibration.fit.freedom,
+            'alternations': calibration.fit.alternations,
+            'curve': [
+                {
+                    'layout': c.layout.describe(),
+                    'n_dipoles': len(c.dipoles),
+                    'damping': damping,
+                    'heldout_t': score,
+                }
+                for c in calibration.candidates
+                for damping, score in c.curve
+            ],
+        },
+        'nominal_flux_rmse_t': nominal,
+    }
+
+
+def _outlier_fraction(fit: MomentFit) -> float:
+    weights = np.concatenate([w.ravel() for w in fit.weights])
+    return float((weights[weights > 0.0] < 0.25).mean())

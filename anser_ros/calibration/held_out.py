@@ -1,0 +1,156 @@
+"""Held-out error: what a model that never saw a block of space predicts for it.
+
+Two figures for every block. As in the article, the residual at the measured pose, in which the
+pose's own jitter times the field's gradient is the largest part. And the residual with the pose
+marginalised: with the covariance C = sigma^2 I + J S J^T of a frame's readings (J the flux's
+derivatives by the pose, S the pose's jitter), ``r^T C^-1 r`` is the frame's predictive chi-square,
+and ``sigma^2 C^-1 r`` what no pose explains.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.calibration.factors import ComplexArray
+from anser_ros.calibration.layout_fit import LayoutFit
+from anser_ros.calibration.pose_correction import (
+    PoseTerms,
+    PoseWhitener,
+    Uncertainty,
+    frame_blocks,
+    pose_terms,
+    usable_weights,
+    with_pose,
+)
+from anser_ros.field.measurements import Measurements
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Residuals of blocks that took no part in the fit that predicts them.
+
+    Attributes
+    ----------
+    error : ndarray, shape (P, K), complex
+        Measured minus predicted flux of every usable reading at the measured pose, T.
+    left_over : ndarray, shape (P, K), complex
+        The part that no pose explains, T.
+    chi_square : float
+        Mean predictive chi-square a phasor component.
+    noise_t : float
+        The noise that the chi-square was divided by.
+    flux_noise_t : float
+        The flux noise alone, T a component; never more than the imaginary parts leave.
+    flux_error_t : float
+        Standard deviation of the field model's own error a phasor component, noise taken off,
+        in the typical held-out frame.
+    n_dipoles : int
+        Of the model that was tested.
+    """
+
+    error: ComplexArray
+    left_over: ComplexArray
+    chi_square: float
+    noise_t: float
+    flux_noise_t: float
+    flux_error_t: float
+    n_dipoles: int
+
+    @property
+    def score_t(self) -> float:
+        """Root of the mean chi-square in flux: comparable between fits of other noise, T."""
+        return float(self.noise_t * np.sqrt(self.chi_square))
+
+
+def _complex_rows(values: Array, used: NDArray[np.bool_]) -> ComplexArray:
+    return np.ascontiguousarray(values[used]).view(np.complex128)
+
+
+def predict_held_out(
+    measurements: Sequence[Measurements],
+    folds: Sequence[NDArray[np.int64]],
+    fit: Callable[[list[Measurements]], LayoutFit],
+    uncertainty: Uncertainty,
+    noise_t: float | None = None,
+    flux_noise_t: float | None = None,
+) -> HeldOut:
+    """Fit without each fold in turn, from the start, and predict it.
+
+    Parameters
+    ----------
+    measurements : sequence of Measurements
+    folds : sequence of ndarray, shape (F,)
+        Fold of each frame, an array a measurement set.
+    fit : callable
+        Fits a model to measurements, from the start.
+    uncertainty : Uncertainty
+    flux_noise_t : float or None
+        The flux noise alone, to be taken off; by the imaginary parts when not given.
+    noise_t : float or None
+        Noise of a phasor component, T, for weighing noise against jitter and to be taken off;
+        when not given, the smallest that any fold's fit left.
+    """
+    fits = []
+    for fold in np.unique(np.concatenate(list(folds))):
+        train = [m.frames(f != fold) for m, f in zip(measurements, folds, strict=True)]
+        fits.append((int(fold), fit(train)))
+    noise = min(part.fit.noise_t for _, part in fits) if noise_t is None else noise_t
+    quadrature = min(part.fit.quadrature_noise_t for _, part in fits)
+    flux_noise = min(noise, quadrature if flux_noise_t is None else flux_noise_t)
+    tally = _Tally(noise, flux_noise, uncertainty, len(fits[0][1].dipoles))
+    for fold, fitted in fits:
+        for m, f in zip(measurements, folds, strict=True):
+            test = with_pose(m.frames(f == fold))
+            for block in frame_blocks(len(test.time), len(test.sensors)):
+                part = test.frames(block)  # type: ignore[arg-type]
+                terms = pose_terms(part, fitted.dipoles, fitted.fit.moments)
+                tally.add(terms, usable_weights(part))
+    return tally.result()
+
+
+class _Tally:
+    """Gathers held-out residuals."""
+
+    def __init__(
+        self, noise_t: float, flux_noise_t: float, uncertainty: Uncertainty, n_dipoles: int
+    ) -> None:
+        self.flux_noise_t, self.n_dipoles = flux_noise_t, n_dipoles
+        self.noise_t, self.precision = noise_t, uncertainty.pose_precision
+        self.error: list[ComplexArray] = []
+        self.left: list[ComplexArray] = []
+        self.chi: list[Array] = []
+        self.excess: list[Array] = []
+
+    def add(self, terms: PoseTerms, weights: Array) -> None:
+        if terms.residual.shape[0] == 0:
+            return
+        white = PoseWhitener(terms.slope, weights, self.noise_t, self.precision)
+        used = weights > 0.0
+        self.error.append(_complex_rows(terms.residual, used))
+        self.left.append(_complex_rows(white.left_over(terms.residual), used))
+        self.chi.append(white.chi_square(terms.residual))
+        self.excess.append(white.excess_power(terms.residual, self.flux_noise_t))
+
+    def result(self) -> HeldOut:
+        error, left = np.concatenate(self.error), np.concatenate(self.left)
+        components = 2 * error.size
+        # The typical frame: those beyond the edge of what was fitted, and outliers, do not count.
+        excess = float(np.median(np.concatenate(self.excess)))
+        return HeldOut(
+            error=error,
+            left_over=left,
+            chi_square=float(np.concatenate(self.chi).sum()) / components,
+            noise_t=self.noise_t,
+            flux_noise_t=self.flux_noise_t,
+            flux_error_t=float(np.sqrt(max(excess, 0.0))),
+            n_dipoles=self.n_dipoles,
+        )
+
+
+def rms(error: ComplexArray) -> float:
+    """Root of the mean squared magnitude of complex errors."""
+    return float(np.sqrt(np.mean(np.abs(error) ** 2)))

@@ -1,0 +1,130 @@
+"""Where virtual dipoles may be put: layers over the field generator's extent, or on its coils."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.calibration.dipole_sites import DipoleSites
+
+Array = NDArray[np.float64]
+
+UNIT_Z = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Generator:
+    """What a layout needs to know about a field generator.
+
+    Attributes
+    ----------
+    centres : ndarray, shape (K, 3)
+        Coil centres, m, frame fg.
+    turns_deg : ndarray, shape (K,)
+        Their turns about z.
+    side_m : float
+        Outer side of a coil.
+    """
+
+    centres: Array
+    turns_deg: Array
+    side_m: float
+
+    @property
+    def half_extent(self) -> Array:
+        """Half sizes in x and y of the rectangle around all coils, m."""
+        low, high = self._bounds()
+        return np.asarray(np.maximum(high - low, 1e-3) / 2.0)
+
+    @property
+    def middle(self) -> Array:
+        """Centre of that rectangle, and the coils' mean height, m."""
+        low, high = self._bounds()
+        return np.array([*((low + high) / 2.0), self.centres[:, 2].mean()])
+
+    def _bounds(self) -> tuple[Array, Array]:
+        turn = np.deg2rad(self.turns_deg)
+        reach = self.side_m / 2.0 * (np.abs(np.cos(turn)) + np.abs(np.sin(turn)))
+        flat = self.centres[:, :2]
+        return (flat - reach[:, None]).min(axis=0), (flat + reach[:, None]).max(axis=0)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A choice of dipoles in words and numbers.
+
+    Attributes
+    ----------
+    kind : {'layer', 'layer_xyz', 'coils'}
+        A layer of z-dipoles, of dipoles with three free components, or z-dipoles on the coils
+        themselves.
+    count : int
+        DipoleSites along a side of the layer, or of each coil.
+    extension : float
+        Size of the layer as a multiple of the field generator's own.
+    depth_m : float
+        How far below the coils the layer lies.
+    prior : {'none', 'nominal'}
+        What the damping pulls the moments towards: zero, or those of the drawn board.
+    moved : bool
+        Whether the dipoles are moved from there to where they explain the data best.
+    local : bool
+        Whether overlapping regions get moments of their own.
+    """
+
+    kind: str
+    count: int
+    extension: float
+    depth_m: float
+    prior: str = 'none'
+    moved: bool = False
+    local: bool = False
+
+    def describe(self) -> str:
+        """One line for a report."""
+        drawn = ', pulled to the drawn board' if self.prior == 'nominal' else ''
+        drawn += ', positions optimised' if self.moved else ''
+        drawn += ', in overlapping regions' if self.local else ''
+        if self.kind == 'coils':
+            return f'{self.count}x{self.count} z-dipoles on every coil{drawn}'
+        parts = 'z-dipoles' if self.kind == 'layer' else 'three-component dipoles'
+        return (
+            f"{self.count}x{self.count} {parts}, {self.extension:.2f} x the coils' extent, "
+            f'{1e3 * self.depth_m:.1f} mm below{drawn}'
+        )
+
+
+def grid(count: int, half: Array) -> Array:
+    """A lattice of count x count points over -half..half in x and y, shape (count^2, 2)."""
+    steps = np.linspace(-1.0, 1.0, count) if count > 1 else np.zeros(1)
+    x, y = np.meshgrid(steps * half[0], steps * half[1], indexing='ij')
+    return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def place(layout: Layout, generator: Generator) -> DipoleSites:
+    """The dipoles of a layout."""
+    if layout.kind == 'coils':
+        return _on_coils(layout, generator)
+    flat = grid(layout.count, generator.half_extent * layout.extension)
+    middle = generator.middle
+    positions = np.empty((flat.shape[0], 3))
+    positions[:, :2] = flat + middle[:2]
+    positions[:, 2] = middle[2] - layout.depth_m
+    if layout.kind == 'layer':
+        return DipoleSites(positions, np.tile(UNIT_Z, (positions.shape[0], 1)))
+    return DipoleSites(
+        np.repeat(positions, 3, axis=0), np.tile(np.eye(3), (positions.shape[0], 1))
+    )
+
+
+def _on_coils(layout: Layout, generator: Generator) -> DipoleSites:
+    half = np.full(2, generator.side_m / 2.0 * layout.extension)
+    flat = grid(layout.count, half * (1.0 - 1.0 / (2.0 * layout.count)))
+    positions = []
+    for centre, turn in zip(generator.centres, np.deg2rad(generator.turns_deg), strict=True):
+        c, s = np.cos(turn), np.sin(turn)
+        turned = flat @ np.array([[c, s], [-s, c]])
+        height = np.full((flat.shape[0], 1), centre[2] - layout.depth_m)
+        positions.append(np.concatenate([turned + centre[:2], height], axis=1))
+    stacked = np.concatenate(positions)
+    return DipoleSites(stacked, np.tile(UNIT_Z, (stacked.shape[0], 1)))

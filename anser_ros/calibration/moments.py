@@ -1,0 +1,214 @@
+"""Moments of virtual dipoles from fluxes at poses that jitter: errors in variables, by blocks.
+
+Each optical pose is wrong by a few hundredths of a millimetre, and all sensors of the body and all
+emitters see that error together, along six known directions. So the fit alternates between (a) the
+most probable pose of every frame, from all its readings and the pose's prior, and (b) damped least
+squares of the moments at those poses: the article's equation (6) with one matrix and a right-hand
+side for every phasor component. Both steps lower the same sum of squares (block coordinate descent
+on the joint posterior); readings that no pose explains lose weight (Huber, Robust Statistics).
+The matrix is only kept as the triangular factor of its rows so far (Golub and Van Loan, section
+5.3), so millions of rows take no more memory than one block.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows
+from anser_ros.calibration.factors import (
+    GramFactor,
+    Spectrum,
+    TriangularFactor,
+    as_complex,
+    as_real,
+)
+from anser_ros.calibration.pose_correction import (
+    SMALLEST_NOISE_T,
+    Uncertainty,
+    frame_blocks,
+    most_probable_step,
+    moved,
+    outlier_weights,
+    pose_freedom,
+    pose_terms,
+    usable_weights,
+    with_pose,
+)
+from anser_ros.errors import FitError
+from anser_ros.field.measurements import Measurements
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+Progress = Callable[[str, float], None]
+
+CONVERGED = 2e-3
+"""Relative fall of the residual below which another alternation is not worth its time."""
+
+
+@dataclass(frozen=True)
+class MomentFit:
+    """Moments with what their fit left.
+
+    Attributes
+    ----------
+    moments : ndarray, shape (N, K), complex
+        A m^2.
+    measurements : tuple of Measurements
+        At their corrected poses.
+    weights : tuple of ndarray, shape (F, S)
+        Weight of each reading in [0, 1]; 0 where it is unusable.
+    noise_t : float
+        Estimated noise of a phasor component with the degrees of freedom taken off, T; it holds
+        whatever the model can't explain.
+    quadrature_noise_t : float
+        The same of the imaginary parts alone: where nothing turns the phase it is the flux noise,
+        whatever poses and model are wrong by.
+    rank : int
+    freedom : float
+        Effective number of parameters an emitter's component.
+    condition : float
+        Of the column-scaled matrix.
+    alternations : int
+    """
+
+    moments: ComplexArray
+    measurements: tuple[Measurements, ...]
+    weights: tuple[Array, ...]
+    noise_t: float
+    quadrature_noise_t: float
+    rank: int
+    freedom: float
+    condition: float
+    alternations: int
+
+
+@dataclass
+class _State:
+    """One body's measurements as the alternation moves them."""
+
+    measured: Measurements
+    corrected: Measurements
+    offset: Array
+    weights: Array
+    usable: Array
+
+
+class MomentFitter:
+    """Alternates poses and moments; `fit` runs it to its end.
+
+    Parameters
+    ----------
+    measurements : sequence of Measurements
+        One a body and session; reference sensors may be among them (their pose doesn't jitter).
+    dipoles : DipoleSites
+    damping : float
+        Tikhonov's parameter as a part of the largest singular value of the scaled matrix.
+    uncertainty : Uncertainty
+    prior : ndarray, shape (N, K), complex, or None
+        Moments towards which the damping pulls; zero when not given.
+    """
+
+    def __init__(
+        self,
+        measurements: Sequence[Measurements],
+        dipoles: DipoleSites,
+        damping: float,
+        uncertainty: Uncertainty,
+        prior: ComplexArray | None = None,
+    ) -> None:
+        self.dipoles, self.damping, self.uncertainty = dipoles, damping, uncertainty
+        self.prior = None if prior is None else as_real(prior)
+        self.noise_t = self.quadrature_noise_t = uncertainty.flux_t
+        self.states = [self._state(with_pose(m)) for m in measurements]
+        count = sum(int(state.usable.sum()) for state in self.states)
+        if count == 0:
+            raise FitError('no reading has a pose: a fit needs fluxes and poses of the same time')
+        self.emitters = int(self.states[0].measured.flux.shape[2])
+
+    @staticmethod
+    def _state(measured: Measurements) -> _State:
+        usable = usable_weights(measured)
+        offset = np.zeros((len(measured.time), 6))
+        return _State(measured, measured, offset, usable.copy(), usable)
+
+    def start_from(self, corrected: Sequence[tuple[Array, Array]]) -> None:
+        """Begin with known pose offsets (F, 6) and weights (F, S), one pair a body."""
+        for state, (offset, weights) in zip(self.states, corrected, strict=True):
+            state.offset = offset.copy()
+            state.corrected = moved(state.measured, offset)
+            state.weights = weights * state.usable
+
+    def solve(self, exact: bool = True) -> tuple[ComplexArray, Spectrum]:
+        """Moments at the current poses and weights; by QR when ``exact``."""
+        kind = TriangularFactor if exact else GramFactor
+        factor = kind(len(self.dipoles), 2 * self.emitters)
+        for state in self.states:
+            count, sensors = state.weights.shape
+            for block in frame_blocks(count, sensors):
+                part = state.corrected.frames(block)  # type: ignore[arg-type]
+                root = np.sqrt(state.weights[block].reshape(-1, 1))
+                right = as_real(part.flux).reshape(-1, 2 * self.emitters)
+                factor.add(root * basis_rows(part, self.dipoles), root * right)
+        spectrum = factor.spectrum()
+        return as_complex(spectrum.solve(self.damping, self.prior)), spectrum
+
+    def correct(self, moments: ComplexArray, freedom: float) -> float:
+        """Move all poses to their most probable values; returns the new noise estimate, T."""
+        power, turned, count, used = 0.0, 0.0, 0.0, 0.0
+        for state in self.states:
+            precision = self._precision(state)
+            for block in frame_blocks(*state.weights.shape):
+                part = state.corrected.frames(block)  # type: ignore[arg-type]
+                terms = pose_terms(part, self.dipoles, moments)
+                step, left = most_probable_step(
+                    terms, state.weights[block], self.noise_t, precision, state.offset[block]
+                )
+                state.offset[block] += step
+                state.weights[block] = outlier_weights(left, state.usable[block])
+                weight = state.weights[block]
+                power += float((weight[:, :, None] * left**2).sum())
+                turned += float((weight[:, :, None] * left[:, :, 1::2] ** 2).sum())
+                count += float(weight.sum()) * left.shape[2]
+                used += pose_freedom(terms, weight, self.noise_t, precision)
+            state.corrected = moved(state.measured, state.offset)
+        left_over = max(count - used - freedom * 2 * self.emitters, 0.05 * count)
+        halved = max(count / 2.0 - freedom * self.emitters, 0.025 * count)
+        self.quadrature_noise_t = max(float(np.sqrt(turned / halved)), SMALLEST_NOISE_T)
+        return max(float(np.sqrt(power / left_over)), SMALLEST_NOISE_T)
+
+    def _precision(self, state: _State) -> Array:
+        if state.measured.body == 'fg':
+            return Uncertainty(position_m=0.0, rotation_rad=0.0).pose_precision
+        return self.uncertainty.pose_precision
+
+    def fit(
+        self, alternations: int = 5, progress: Progress | None = None, exact: bool = True
+    ) -> MomentFit:
+        """Alternate until the residual no longer falls; ``exact`` has the last solve by QR."""
+        done = 0
+        moments, spectrum = self.solve(exact=False)
+        for done in range(1, alternations + 1):
+            before = self.noise_t
+            self.noise_t = self.correct(moments, spectrum.freedom(self.damping))
+            last = done == alternations or (
+                done > 1 and abs(before - self.noise_t) < CONVERGED * self.noise_t
+            )
+            moments, spectrum = self.solve(exact=exact and last)
+            if progress is not None:
+                progress('moments', done / alternations)
+            if last:
+                break
+        values = spectrum.values
+        return MomentFit(
+            moments=moments,
+            measurements=tuple(state.corrected for state in self.states),
+            weights=tuple(state.weights for state in self.states),
+            noise_t=self.noise_t,
+            quadrature_noise_t=self.quadrature_noise_t,
+            rank=spectrum.rank,
+            freedom=spectrum.freedom(self.damping),
+            condition=float(values[0] / max(values[-1], np.finfo(float).tiny)),
+            alternations=done,
+        )

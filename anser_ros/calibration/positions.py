@@ -1,0 +1,211 @@
+"""Dipole positions fitted together with their moments: variable projection.
+
+The moments are linear and are eliminated at every step (Golub and Pereyra, Inverse Problems 19,
+2003); only the positions are left to a damped Gauss-Newton search. With Kaufman's derivative the
+normal matrix is a product, entry by entry, of two small ones: the Gram matrix of the basis' slopes
+outside the span of the basis, and that of the moments. So nothing grows with the number of
+emitters or of readings.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.calibration.dipole_sites import DipoleSites
+from anser_ros.calibration.factors import ComplexArray, as_complex, as_real
+from anser_ros.calibration.pose_correction import BLOCK_ROWS, frame_blocks
+from anser_ros.field.measurements import Measurements
+from anser_ros.physics.dipole import GAUSS_OFFSET, fill_field_and_gradient, flux_basis
+
+Array = NDArray[np.float64]
+
+MOST_STEPS = 15
+CONVERGED = 1e-3
+"""Relative fall of the sum of squares that is not worth another step."""
+
+
+@numba.njit(cache=True, error_model='numpy')
+def _fill_slopes(points, axes, lengths, positions, directions, out):  # type: ignore[no-untyped-def]
+    basis = np.empty((9, positions.shape[0]))
+    point = np.empty(3)
+    out[:] = 0.0
+    for p in range(points.shape[0]):
+        half = lengths[p] * GAUSS_OFFSET
+        count = 1 if half == 0.0 else 2
+        n0, n1, n2 = axes[p, 0], axes[p, 1], axes[p, 2]
+        for s in range(count):
+            for i in range(3):
+                point[i] = points[p, i] + half * (1 - 2 * s) * axes[p, i]
+            fill_field_and_gradient(point, positions, directions, basis)
+            for j in range(positions.shape[0]):
+                # The field depends on the difference of places: moving the dipole is the negative.
+                out[p, j, 0] -= (n0 * basis[3, j] + n1 * basis[4, j] + n2 * basis[5, j]) / count
+                out[p, j, 1] -= (n0 * basis[4, j] + n1 * basis[6, j] + n2 * basis[7, j]) / count
+                out[p, j, 2] -= (n0 * basis[5, j] + n1 * basis[7, j] + n2 * basis[8, j]) / count
+
+
+def position_slopes(points: Array, axes: Array, lengths: Array, dipoles: DipoleSites) -> Array:
+    """Derivative of the flux basis by the dipoles' positions, shape (P, N, 3), T / (A m^3)."""
+    out = np.empty((points.shape[0], len(dipoles), 3))
+    _fill_slopes(
+        np.ascontiguousarray(points), np.ascontiguousarray(axes), np.ascontiguousarray(lengths),
+        np.ascontiguousarray(dipoles.positions), np.ascontiguousarray(dipoles.directions), out,
+    )  # fmt: skip
+    return out
+
+
+@dataclass(frozen=True)
+class PositionFit:
+    """Optimised dipoles with the damped moments that go with them.
+
+    Attributes
+    ----------
+    dipoles : DipoleSites
+    moments : ndarray, shape (N, K), complex
+        A m^2.
+    start_t, end_t : float
+        Weighted residual of a phasor component before and after, T rms.
+    steps : int
+    """
+
+    dipoles: DipoleSites
+    moments: ComplexArray
+    start_t: float
+    end_t: float
+    steps: int
+
+
+class PositionFitter:
+    """Moves dipoles to lower the damped residual of measurements at fixed (corrected) poses.
+
+    Parameters
+    ----------
+    measurements : sequence of Measurements
+    weights : sequence of ndarray, shape (F, S)
+    dipoles : DipoleSites
+        Start; their directions stay.
+    damping : float
+        As for the moments.
+    prior : ndarray, shape (N, K), complex, or None
+    longest_move_m : float
+        Bound of one step of one dipole.
+    """
+
+    def __init__(
+        self,
+        measurements: Sequence[Measurements],
+        weights: Sequence[Array],
+        dipoles: DipoleSites,
+        damping: float,
+        prior: ComplexArray | None = None,
+        longest_move_m: float = 0.01,
+    ) -> None:
+        self.blocks = [
+            _rows(m.frames(block), w[block])  # type: ignore[arg-type]
+            for m, w in zip(measurements, weights, strict=True)
+            for block in frame_blocks(len(m.time), len(m.sensors), BLOCK_ROWS // 4)
+        ]
+        self.dipoles, self.damping, self.longest = dipoles, damping, longest_move_m
+        parts = self.blocks[0][4].shape[1]
+        self.prior = np.zeros((len(dipoles), parts)) if prior is None else as_real(prior)
+        self.count = sum(float((b[3] ** 2).sum()) for b in self.blocks) * parts
+        self.ridge = self._ridge()
+
+    def _ridge(self) -> Array:
+        """Tikhonov's term (N,), fixed at the start: the aim must not move with the dipoles."""
+        gram, _, _ = self._linear(self.dipoles)
+        diagonal = np.diag(gram)
+        scaled = gram / np.sqrt(np.outer(diagonal, diagonal))
+        return np.asarray(self.damping**2 * np.linalg.eigvalsh(scaled)[-1] * diagonal)
+
+    def _linear(self, dipoles: DipoleSites) -> tuple[Array, Array, float]:
+        size, parts = len(dipoles), self.blocks[0][4].shape[1]
+        gram, right, power = np.zeros((size, size)), np.zeros((size, parts)), 0.0
+        for points, axes, lengths, root, flux in self.blocks:
+            basis = flux_basis(points, axes, lengths, dipoles.positions, dipoles.directions)
+            basis *= root[:, None]
+            gram += basis.T @ basis
+            right += basis.T @ flux
+            power += float((flux**2).sum())
+        return gram, right, power
+
+    def solve(self, dipoles: DipoleSites) -> tuple[Array, float]:
+        """Damped moments (N, 2K), and the damped sum of squares that they leave."""
+        gram, right, power = self._linear(dipoles)
+        normal = gram + np.diag(self.ridge)
+        moments = np.linalg.solve(normal, right + self.ridge[:, None] * self.prior)
+        fixed = float((self.ridge[:, None] * self.prior**2).sum())
+        aim = (moments * (right + self.ridge[:, None] * self.prior)).sum()
+        return np.asarray(moments), max(power + fixed - float(aim), 0.0)
+
+    def _normal(self, dipoles: DipoleSites, moments: Array) -> tuple[Array, Array]:
+        """Kaufman's normal matrix (3N, 3N) and gradient (3N,) of the positions."""
+        size = len(dipoles)
+        inner = np.zeros((3 * size, 3 * size))
+        cross = np.zeros((size, 3 * size))
+        gram = np.zeros((size, size))
+        gradient = np.zeros((size, 3))
+        for points, axes, lengths, root, flux in self.blocks:
+            basis = flux_basis(points, axes, lengths, dipoles.positions, dipoles.directions)
+            basis *= root[:, None]
+            slopes = position_slopes(points, axes, lengths, dipoles) * root[:, None, None]
+            residual = flux - basis @ moments
+            along = np.einsum('pr,nr->pn', residual, moments, optimize=True)
+            gradient += np.einsum('pnc,pn->nc', slopes, along, optimize=True)
+            flat = slopes.reshape(len(points), -1)
+            inner += flat.T @ flat
+            cross += basis.T @ flat
+            gram += basis.T @ basis
+        inner -= cross.T @ np.linalg.solve(gram + np.diag(self.ridge), cross)
+        pairs = np.repeat(np.repeat(moments @ moments.T, 3, axis=0), 3, axis=1)
+        return inner * pairs, gradient.ravel()
+
+    def fit(self, most_steps: int = MOST_STEPS) -> PositionFit:
+        """Levenberg-Marquardt steps until they no longer pay."""
+        dipoles, strength, steps = self.dipoles, 1e-2, 0
+        moments, aim = self.solve(dipoles)
+        start = aim
+        while steps < most_steps:
+            steps += 1
+            normal, gradient = self._normal(dipoles, moments)
+            before = aim
+            for _ in range(6):
+                trial = self._moved(dipoles, normal, gradient, strength)
+                trial_moments, trial_aim = self.solve(trial)
+                if trial_aim < aim:
+                    dipoles, moments, aim = trial, trial_moments, trial_aim
+                    strength = max(strength / 5.0, 1e-9)
+                    break
+                strength *= 5.0
+            if before - aim < CONVERGED * before:
+                break
+        scale = 1.0 / self.count
+        return PositionFit(
+            dipoles, as_complex(moments), float(np.sqrt(start * scale)),
+            float(np.sqrt(aim * scale)), steps,
+        )  # fmt: skip
+
+    def _moved(
+        self, dipoles: DipoleSites, normal: Array, gradient: Array, strength: float
+    ) -> DipoleSites:
+        diagonal = np.diag(normal)
+        floor = 1e-9 * float(diagonal.max())
+        step = np.linalg.solve(
+            normal + np.diag(strength * np.maximum(diagonal, floor) + floor), gradient
+        ).reshape(-1, 3)
+        size = np.linalg.norm(step, axis=1, keepdims=True)
+        step *= np.minimum(1.0, self.longest / np.maximum(size, 1e-12))
+        return DipoleSites(dipoles.positions + step, dipoles.directions)
+
+
+def _rows(measurements: Measurements, weights: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """Points, axes, lengths, root weights and fluxes (P, 2K) of the readings that count."""
+    points, axes = measurements.placed()
+    used = weights > 0.0
+    lengths = np.broadcast_to(measurements.sensors.length, used.shape)[used]
+    root = np.sqrt(weights[used])
+    flux = as_real(measurements.flux[used]) * root[:, None]
+    return points[used], axes[used], np.ascontiguousarray(lengths), root, flux

@@ -1,0 +1,192 @@
+"""Where unknown metal may be: clouds of candidate sources, one a hypothesis.
+
+A cloud fills a region of space with point sources of independent polarisability, each of a
+variance proportional to the volume it stands for: the prior is then white in space and does not
+depend on how finely the region is sampled. The one thing that a cloud asserts is that no metal is
+nearer to the field generator (or to the tracked volume) than its standoff. Which standoff is right
+is told by the evidence, frame by frame (see `refit.posterior`).
+
+The frame ``fg`` has its board at z = 0 with z up towards the patient, so "below" is z < 0.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+LAYER_RATIO = 1.45
+"""Ratio of the depths of neighbouring layers of sources."""
+SPACING_PER_DEPTH = 0.7
+"""Lateral spacing of a layer's sources over its depth."""
+
+BODY_SPACING = 0.6
+BODY_RADIUS = 0.45
+"""Lattice of compact bodies and their radius, in halves of the board: neighbours overlap."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """The board's extent and the space over it where sensors are tracked.
+
+    Attributes
+    ----------
+    centre : ndarray, shape (2,)
+        x and y of the board's middle, m.
+    half : float
+        Half of the board's larger side, m.
+    """
+
+    centre: Array
+    half: float
+
+    @property
+    def floor(self) -> float:
+        """Height over the board, m, from which on tools are tracked."""
+        return 0.3 * self.half
+
+    @property
+    def ceiling(self) -> float:
+        """Height up to which tools are tracked, m."""
+        return 2.0 * self.half
+
+    @property
+    def margin(self) -> float:
+        """How far tools may be outside the board's edge, m."""
+        return 0.15 * self.half
+
+    def samples(self, across: int = 6, up: int = 5, part: float = 1.0) -> Array:
+        """Points of the tracked volume, shape (across^2 up, 3), denser near the board."""
+        side = np.linspace(-part, part, across) * (self.half + self.margin)
+        height = self.floor * (part * self.ceiling / self.floor) ** np.linspace(0.0, 1.0, up)
+        x, y, z = np.meshgrid(side + self.centre[0], side + self.centre[1], height, indexing='ij')
+        return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Candidate sources of one hypothesis.
+
+    Attributes
+    ----------
+    name : str
+    standoff_m : float
+        Distance of the nearest source from the board (or from the tracked volume), m.
+    overhead : bool
+        Whether the sources are around and over the volume, not below the board.
+    positions : ndarray, shape (M, 3)
+        m, frame fg.
+    volumes : ndarray, shape (M,)
+        Volume that each source stands for, m^3.
+    """
+
+    name: str
+    standoff_m: float
+    overhead: bool
+    positions: Array
+    volumes: Array
+
+
+def below(region: Region, standoff: float) -> Cloud:
+    """Layers of sources from ``standoff`` under the board down to more than the board's size."""
+    deepest = max(2.7 * region.half, 3.0 * standoff)
+    count = max(3, 1 + int(math.log(deepest / standoff) / math.log(LAYER_RATIO)))
+    depths = standoff * LAYER_RATIO ** np.arange(count)
+    edges = np.concatenate([depths[:1], (depths[1:] + depths[:-1]) / 2.0, depths[-1:]])
+    positions, volumes = [], []
+    for depth, thickness in zip(depths, np.diff(edges), strict=True):
+        reach = 1.3 * region.half + 0.5 * depth
+        spacing = max(region.half / 6.0, SPACING_PER_DEPTH * depth)
+        across = math.ceil(2.0 * reach / spacing) + 1
+        side = np.linspace(-reach, reach, across)
+        x, y = np.meshgrid(side + region.centre[0], side + region.centre[1], indexing='ij')
+        positions.append(np.stack([x.ravel(), y.ravel(), np.full(x.size, -depth)], axis=1))
+        volumes.append(np.full(x.size, thickness * (side[1] - side[0]) ** 2))
+    return Cloud(
+        f'below {1e3 * standoff:.0f} mm',
+        standoff,
+        False,
+        np.concatenate(positions),
+        np.concatenate(volumes),
+    )
+
+
+def overhead(region: Region, standoff: float) -> Cloud:
+    """Sources beside and over the tracked volume, at least ``standoff`` away from it.
+
+    Shells of growing thickness, each on a lattice as fine as the distance to the volume asks for.
+    """
+    positions, volumes = [], []
+    inner, reach = standoff, standoff + 1.2 * region.half
+    while inner < reach:
+        outer = min(1.9 * inner, reach)
+        spacing = max(0.5 * inner, region.half / 9.0)
+        shell = _shell(region, inner, outer, spacing)
+        positions.append(shell)
+        volumes.append(np.full(len(shell), spacing**3))
+        inner = outer
+    return Cloud(
+        f'around {1e3 * standoff:.0f} mm',
+        standoff,
+        True,
+        np.concatenate(positions),
+        np.concatenate(volumes),
+    )
+
+
+def _shell(region: Region, inner: float, outer: float, spacing: float) -> Array:
+    """Lattice points between two boxes around the tracked volume that are open at the bottom."""
+    side, deep = region.half + region.margin, 0.3 * region.half
+    flat = _centred(side + outer, spacing)
+    height = np.arange(-deep + spacing / 2.0, region.ceiling + outer, spacing)
+    x, y, z = (axis.ravel() for axis in np.meshgrid(flat, flat, height, indexing='ij'))
+    away = np.maximum(np.maximum(np.abs(x), np.abs(y)) - side, z - region.ceiling)
+    points: Array = np.stack([x, y, z], axis=1)[(away >= inner) & (away < outer)]
+    points[:, :2] += region.centre
+    return points
+
+
+def _centred(reach: float, spacing: float) -> Array:
+    """Lattice over -reach..reach, symmetric about 0."""
+    count = int(reach / spacing)
+    return np.asarray(spacing * np.arange(-count, count + 1))
+
+
+def bodies(region: Region) -> tuple[Cloud, ...]:
+    """Compact bodies on a lattice around the middle of the tracked volume, and in its outer part.
+
+    A cloud over a whole region expects as much metal everywhere; one piece of metal beside or over
+    the volume is told far better by a ball of sources where it is. Below the board the layers do
+    as well.
+    """
+    half = region.half
+    side = BODY_SPACING * (np.arange(8) - 3.5)
+    height = BODY_SPACING * (np.arange(6) - 0.5)
+    unit = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing='ij'), axis=-1).reshape(-1, 3)
+    unit = unit[(unit**2).sum(axis=1) <= 2]
+    # The centre first, then its six neighbours, then the twelve at the edges.
+    unit = unit[np.argsort((unit**2).sum(axis=1), kind='stable')]
+    ball = BODY_RADIUS * half / math.sqrt(2.0) * unit
+    out = []
+    for x, y, z in np.stack(np.meshgrid(side, side, height, indexing='ij'), -1).reshape(-1, 3):
+        across = max(abs(x), abs(y))
+        if (across < 0.75 and z < 1.25) or (across < 1.2 and z < 0.0):
+            continue
+        centre = np.array([region.centre[0] + x * half, region.centre[1] + y * half, z * half])
+        name = 'body at ' + ', '.join(f'{1e3 * c:.0f}' for c in centre) + ' mm'
+        volume = (BODY_RADIUS * half) ** 3 * 4.0 / 3.0 * math.pi / len(ball)
+        volumes = np.full(len(ball), volume)
+        out.append(Cloud(name, BODY_RADIUS * half, True, centre + ball, volumes))
+    return tuple(out)
+
+
+def default_clouds(region: Region) -> tuple[Cloud, ...]:
+    """Hypotheses for any board: standoffs in a geometric series, from nearly touching to far."""
+    near = 0.08 * region.half
+    standoffs = near * 1.55 ** np.arange(8)
+    around = region.half * np.array([0.25, 0.5, 0.9])
+    return tuple(below(region, float(s)) for s in standoffs) + tuple(
+        overhead(region, float(s)) for s in around
+    )

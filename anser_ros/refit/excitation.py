@@ -1,0 +1,122 @@
+"""The field that drives the metal: the emitters' own, below and around the board.
+
+A calibrated model is fitted where tools are, over the board. Carried on to below the board it is
+off by tens of percent near the coils, while the coils' drawing gives that field to a percent. So
+the drawing is used where there is one, with strength and phase taken from the calibrated model.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import FitError
+from anser_ros.field.model import FieldModel
+from anser_ros.physics.dipole import field_basis
+from anser_ros.refit.clouds import Region
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+FieldFunction = Callable[[Array], Array]
+"""Field of each emitter at its nominal current: points (P, 3), m, to (P, K, 3), T."""
+
+AGREEMENT = 0.9
+"""Correlation with the calibrated model below which a drawing is not of this board."""
+SEARCH_M = 1.0
+SEARCH_POINTS = 61
+SEARCH_HEIGHT_M = 0.02
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """The driving field, in phase with each emitter's own.
+
+    Attributes
+    ----------
+    source : {'board', 'model'}
+        Where it comes from.
+    strength : ndarray, shape (K,)
+        Factor on ``raw``.
+    phase : ndarray, shape (K,), complex
+        Unit phasor of each emitter's field; readings are turned back by it.
+    raw : callable
+        Field before ``strength``.
+    """
+
+    source: str
+    strength: Array
+    phase: ComplexArray
+    raw: FieldFunction
+
+    def field(self, points: Array) -> Array:
+        """Field at points (P, 3), m, shape (P, K, 3), T."""
+        return np.asarray(self.raw(points) * self.strength[None, :, None])
+
+
+def model_field(model: FieldModel, points: Array) -> ComplexArray:
+    """Field of a model's emitters, shape (P, K, 3), T."""
+    basis = field_basis(points, model.positions, model.directions)
+    return np.asarray(np.einsum('pna,nk->pka', basis, model.moments, optimize=True))
+
+
+def region_of(field: Callable[[Array], NDArray[np.generic]]) -> Region:
+    """Where the board is: the square that 98 % of its field's power over the surface lies in.
+
+    Raises
+    ------
+    FitError
+        When the field is zero or not finite.
+    """
+    side = np.linspace(-SEARCH_M, SEARCH_M, SEARCH_POINTS)
+    x, y = np.meshgrid(side, side, indexing='ij')
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, SEARCH_HEIGHT_M)], axis=1)
+    values = np.abs(field(points)) ** 2
+    power = (values / np.maximum(values.sum(axis=(0, 2)), 1e-300)[None, :, None]).sum(axis=(1, 2))
+    power = power.reshape(x.shape)
+    if not np.isfinite(power).all() or power.sum() <= 0.0:
+        raise FitError('refit: the emitters make no field over the board')
+    edges = []
+    for axis in range(2):
+        line = power.sum(axis=1 - axis)
+        share = (np.cumsum(line) - 0.5 * line) / line.sum()
+        edges.append([np.interp(level, share, side) for level in (0.01, 0.99)])
+    low, high = np.array(edges).T
+    return Region((low + high) / 2.0, float((high - low).max() / 2.0))
+
+
+def excitation_for(model: FieldModel, drawing: FieldFunction | None) -> tuple[Excitation, Region]:
+    """The drawing's field scaled to the model, or the model's own where that is not this board's.
+
+    Raises
+    ------
+    FitError
+        When the drawing has another number of emitters than the model.
+    """
+
+    def own(points: Array) -> ComplexArray:
+        return model_field(model, points)
+
+    region = region_of(own if drawing is None else drawing)
+    points = region.samples()
+    points = points[points[:, 2] > 0.6 * region.half]
+    measured = own(points)
+    if drawing is not None:
+        drawn = drawing(points)
+        if drawn.shape != measured.shape:
+            raise FitError(
+                f'refit: the drawing makes fields {drawn.shape}, the model {measured.shape}'
+            )
+        power = (drawn**2).sum(axis=(0, 2))
+        gain = (drawn * measured).sum(axis=(0, 2)) / np.maximum(power, 1e-300)
+        size = np.sqrt(power * (np.abs(measured) ** 2).sum(axis=(0, 2)))
+        if (np.abs(gain) * power >= AGREEMENT * size).all():
+            return Excitation('board', np.abs(gain), gain / np.abs(gain), drawing), region
+        region = region_of(own)
+    square = (measured**2).sum(axis=(0, 2))
+    phase = np.exp(0.5j * np.angle(square))
+
+    def turned(points: Array) -> Array:
+        return np.asarray((own(points) * phase.conj()[None, :, None]).real)
+
+    return Excitation('model', np.ones(len(phase)), phase, turned), region

@@ -1,0 +1,199 @@
+"""Which references can be believed: each is judged by what all the others say.
+
+A reference that is dead, moved, saturated or unplugged changes alone; metal changes many readings
+at once, in the proportions that the emitters' fields have at one place. So "coil s is at fault" is
+one more hypothesis, with its readings of any size and the metal told by the others alone, and its
+odds against "all is well" come from the same evidence. A coil that is left out is watched, and
+returns when it has agreed with the others for a while.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.refit.posterior import Bank, FrameEvidence, log_sum
+
+Array = NDArray[np.float64]
+
+OK = 'ok'
+FLAGGED = 'flagged'
+NOT_FINITE = 'not finite'
+MISSING = 'missing'
+NO_BASELINE = 'no baseline'
+SILENT = 'silent'
+ABSURD = 'absurd'
+DISAGREES = 'disagrees'
+
+FAULT_SCALES = 10.0 ** np.arange(0.0, 6.1, 0.5)
+"""Sizes of a faulty reading's error, in noise deviations, all as likely."""
+SUSPICIOUS = 2.8
+"""Left-out chi-square per degree of freedom from which on a fault is considered."""
+FAULT_ODDS = 100.0
+"""Logarithm of the odds that a coil is at fault from which on it is left out.
+
+Metal that the clouds describe badly reaches 70 in recordings; faults that matter begin at 100.
+"""
+SEEN = 10.0
+"""Log odds, by the other coils alone, from which on a compact body counts as seen by them."""
+AGREES = 2.5
+"""Left-out chi-square per degree of freedom below which an excluded coil agrees again."""
+RETRY_FRAMES = 25
+OUTSTANDING = 8.0
+"""A change this many times the median coil's is looked at as a possible fault."""
+MOST_AT_ONCE = 4
+"""Coils that may fail together and be found."""
+
+
+class ReferenceHealth(NamedTuple):
+    """One reference coil in one frame.
+
+    Attributes
+    ----------
+    name : str
+    state : str
+        ``ok``, or why it was left out: ``flagged``, ``not finite``, ``missing``, ``no baseline``,
+        ``silent``, ``absurd``, ``disagrees``.
+    residual_t : float
+        Root mean square of measured minus predicted by all others, T a component; NaN where the
+        coil has no reading.
+    distance : float
+        The same in units of its expected size; about 1 for a healthy coil.
+    """
+
+    name: str
+    state: str
+    residual_t: float
+    distance: float
+
+
+def typical(values: Array) -> float:
+    """Median."""
+    ordered = sorted(values.tolist())
+    middle = len(ordered) // 2
+    return float(0.5 * (ordered[middle] + ordered[-1 - middle]))
+
+
+def fault_odds(bank: Bank, seen: FrameEvidence, coils: NDArray[np.int64]) -> float:
+    """Logarithm of the odds that all of some coils in use are at fault, each in its own way."""
+    others, residuals = bank.without(seen, coils)
+    broad = 0.0
+    for residual in residuals:
+        size = float((residual**2).sum())
+        likelihood = -0.5 * size / FAULT_SCALES**2 - residual.size * np.log(FAULT_SCALES)
+        broad += log_sum(likelihood) - float(np.log(len(FAULT_SCALES)))
+    # A body that only these coils see is no better an explanation than their fault.
+    unseen = bank.is_slot & (others < others[0] + SEEN)
+    well = np.where(unseen, -np.inf, seen.log_evidence)
+    return float(log_sum(others) + broad - log_sum(well))
+
+
+def find_faults(
+    bank: Bank, seen: FrameEvidence, suspects: list[NDArray[np.int64]]
+) -> NDArray[np.int64]:
+    """The set of suspects that is most surely at fault; empty when none is."""
+    best, margin = np.empty(0, dtype=np.int64), 0.0
+    for coils in suspects:
+        beyond = fault_odds(bank, seen, coils) - FAULT_ODDS * len(coils)
+        if beyond > margin:
+            best, margin = coils, beyond
+    return best
+
+
+@dataclass
+class ReferenceWatch:
+    """Keeps account of which coils are left out, and for how long.
+
+    Attributes
+    ----------
+    count : int
+        Reference coils S.
+    hold_frames : int
+        Frames for which a coil must be readable and agree before it is used again.
+    """
+
+    count: int
+    hold_frames: int
+    excluded: NDArray[np.bool_] = field(init=False)
+    reason: list[str] = field(init=False)
+    _good: NDArray[np.int64] = field(init=False)
+    _before: tuple[NDArray[np.bool_], list[str], NDArray[np.int64]] | None = field(
+        init=False, default=None
+    )
+    _dismissed: tuple[float, int] = field(init=False, default=(0.0, 0))
+    _since: int = field(init=False, default=0)
+
+    def __post_init__(self) -> None:
+        self.excluded = np.zeros(self.count, dtype=bool)
+        self.reason = [OK] * self.count
+        self._good = np.zeros(self.count, dtype=np.int64)
+
+    def note(self, readable: NDArray[np.bool_], reasons: list[str], least: int = 0) -> None:
+        """Leave out what can't be read; an unreadable coil starts its waiting time again.
+
+        Where fewer than `least` can be read, samples were lost and no coil is at fault: with the
+        next frame all is as it was before.
+        """
+        if self._before is not None:
+            self.excluded, self.reason, self._good = self._before
+            self._before = None
+        if readable.sum() < least:
+            self._before = self.excluded.copy(), self.reason.copy(), self._good.copy()
+        for coil in np.flatnonzero(~readable):
+            self.excluded[coil] = True
+            self.reason[coil] = reasons[coil]
+            self._good[coil] = 0
+
+    def exclude(self, coil: int) -> None:
+        """Leave out a coil that disagrees with the others."""
+        self.excluded[coil], self.reason[coil], self._good[coil] = True, DISAGREES, 0
+
+    def agreed(self, coil: int, agrees: bool) -> None:
+        """Count a frame in which an excluded coil could be compared; it returns in the end."""
+        self._good[coil] = self._good[coil] + 1 if agrees else 0
+        if self._good[coil] >= self.hold_frames:
+            self.excluded[coil], self.reason[coil] = False, OK
+
+    def wait(self, readable: NDArray[np.bool_]) -> None:
+        """Count a frame with too few coils to compare: who was only unreadable returns in time."""
+        for coil in np.flatnonzero(self.excluded & readable):
+            self.agreed(int(coil), self.reason[coil] != DISAGREES)
+
+    def suspects(self, chi2: Array, power: Array, freedom: int) -> list[NDArray[np.int64]]:
+        """Sets of coils in use whose common fault is worth the computation; often none.
+
+        Coils that are far from what the others predict are suspected one by one; several that are
+        wrong at once hide each other, so those whose readings stand out are suspected together.
+        A suspicion that was just dismissed is taken up again when it has grown, or after a while.
+
+        Parameters
+        ----------
+        chi2 : ndarray, shape (S,)
+            Left-out chi-square.
+        power : ndarray, shape (S,)
+            Squared change of each coil's readings, noise units.
+        freedom : int
+            Readings a coil.
+        """
+        self._since += 1
+        level = OUTSTANDING**2 * max(typical(power), freedom)
+        if chi2.max() <= SUSPICIOUS * freedom and power.max() <= level:
+            return []
+        order = np.argsort(-chi2)[:3]
+        sets = [order[i : i + 1] for i in range(len(order))]
+        sets = [s for s in sets if chi2[s[0]] > max(SUSPICIOUS * freedom, 0.5 * chi2[order[0]])]
+        by_power = np.argsort(-power)
+        out = by_power[: MOST_AT_ONCE + 1]
+        out = out[power[out] > level]
+        if 0 < len(out) <= min(MOST_AT_ONCE, len(power) // 3):
+            sets += [np.sort(out[:count]) for count in range(1, len(out) + 1)]
+        if not sets:
+            return []
+        alarm = (float(chi2[order[0]]) / freedom, len(out))
+        worse = alarm[0] > 1.3 * self._dismissed[0] or alarm[1] > self._dismissed[1]
+        if not worse and self._since < RETRY_FRAMES:
+            return []
+        self._since = 0
+        self._dismissed = alarm
+        return sets

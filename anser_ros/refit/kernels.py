@@ -1,0 +1,197 @@
+"""Compiled products of every frame of the refit: each table is read once, in single precision.
+
+A frame's time goes into waiting for the tables, not into arithmetic. Single precision is 1e-7 of a
+reading that is at most 1e6 noise deviations. Sums may be reordered, so that they go through vector
+registers; infinities and NaN keep their meaning.
+"""
+
+import math
+
+import numba
+import numpy as np
+
+from anser_ros.physics.constants import DIPOLE_CONSTANT
+
+FAST = {'reassoc', 'contract', 'nsz'}
+
+
+@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+def fill_products(matrix, columns, out):  # type: ignore[no-untyped-def]
+    """Write a matrix (R, n) times two columns, given as rows (2, n), into ``out`` (R, 2)."""
+    for i in range(matrix.shape[0]):
+        first, second = np.float32(0.0), np.float32(0.0)
+        for j in range(matrix.shape[1]):
+            first += matrix[i, j] * columns[0, j]
+            second += matrix[i, j] * columns[1, j]
+        out[i, 0], out[i, 1] = first, second
+
+
+@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+def _fill_probabilities(curve, probability):  # type: ignore[no-untyped-def]
+    """Write the weights of log likelihoods (A,); returns the logarithm of their mean."""
+    top, total = curve[0], 0.0
+    for a in range(curve.shape[0]):
+        top = max(top, curve[a])
+    for a in range(curve.shape[0]):
+        probability[a] = math.exp(curve[a] - top)
+        total += probability[a]
+    for a in range(curve.shape[0]):
+        probability[a] /= total
+    return top + math.log(total / curve.shape[0])
+
+
+@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+def fill_evidence(  # type: ignore[no-untyped-def]
+    analysis, readings, precision, log_det, there, projected, curve, strength, log_evidence
+):  # fmt: skip
+    """Write what readings (2, n) say about all hypotheses; see `refit.posterior.Evaluation`.
+
+    ``analysis`` (H n, n), ``precision`` (H, A, n), ``log_det`` (H, A); ``there`` (H,) is False for
+    empty slots.
+    """
+    count, strengths, n = precision.shape
+    first, second = np.empty(n, np.float32), np.empty(n, np.float32)
+    for h in range(count):
+        if not there[h]:
+            projected[h], curve[h], strength[h] = 0.0, 0.0, 1.0 / strengths
+            log_evidence[h] = 0.0
+            continue
+        fill_products(analysis[h * n : (h + 1) * n], readings, projected[h])
+        for i in range(n):
+            first[i] = projected[h, i, 0] * projected[h, i, 0]
+            second[i] = projected[h, i, 1] * projected[h, i, 1]
+        for a in range(strengths):
+            real, imaginary = np.float32(0.0), np.float32(0.0)
+            for i in range(n):
+                real += precision[h, a, i] * first[i]
+                imaginary += precision[h, a, i] * second[i]
+            curve[h, a, 0] = -0.5 * (real + log_det[h, a])
+            curve[h, a, 1] = -0.5 * (imaginary + log_det[h, a])
+        log_evidence[h] = _fill_probabilities(curve[h, :, 0], strength[h, 0])
+        log_evidence[h] += _fill_probabilities(curve[h, :, 1], strength[h, 1])
+
+
+@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+def fill_scores(directions, white, inside, rest, log_det, scores):  # type: ignore[no-untyped-def]
+    """Write the approximate log evidence of bodies (L,) from whitened readings (2, n).
+
+    ``directions`` (L r, n); ``inside`` (L, A, r), ``rest`` (A,): precisions; ``log_det`` (L, A).
+    """
+    bodies, strengths, count = inside.shape
+    power, curve = np.empty((count, 2), np.float32), np.empty((2, strengths))
+    probability, total = np.empty(strengths), np.zeros(2)
+    for part in range(2):
+        for i in range(white.shape[1]):
+            total[part] += white[part, i] * white[part, i]
+    for body in range(bodies):
+        fill_products(directions[body * count : (body + 1) * count], white, power)
+        left0, left1 = total[0], total[1]
+        for r in range(count):
+            power[r, 0] *= power[r, 0]
+            power[r, 1] *= power[r, 1]
+            left0 -= power[r, 0]
+            left1 -= power[r, 1]
+        left0, left1 = max(left0, 0.0), max(left1, 0.0)
+        for a in range(strengths):
+            real, imaginary = rest[a] * left0, rest[a] * left1
+            for r in range(count):
+                real += inside[body, a, r] * power[r, 0]
+                imaginary += inside[body, a, r] * power[r, 1]
+            curve[0, a] = -0.5 * (real + log_det[body, a])
+            curve[1, a] = -0.5 * (imaginary + log_det[body, a])
+        scores[body] = _fill_probabilities(curve[0], probability)
+        scores[body] += _fill_probabilities(curve[1], probability)
+
+
+@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+def fill_left_out(  # type: ignore[no-untyped-def]
+    analysis, projected, real_precision, imaginary_precision, real_block, imaginary_block, chi2,
+    residual,
+):  # fmt: skip
+    """Write how far each coil is from what the others predict; see `refit.posterior.Bank`.
+
+    ``analysis`` (n, n): a row an eigenvector; ``projected`` (n, 2); blocks (S, K, K).
+    """
+    n, width = projected.shape[0], real_block.shape[1]
+    weighted = np.zeros((2, n))
+    for i in range(n):
+        real = float(projected[i, 0]) * real_precision[i]
+        imaginary = float(projected[i, 1]) * imaginary_precision[i]
+        for j in range(n):
+            weighted[0, j] += real * analysis[i, j]
+            weighted[1, j] += imaginary * analysis[i, j]
+    for s in range(chi2.shape[0]):
+        chi2[s] = 0.0
+        for part in range(2):
+            block = real_block[s] if part == 0 else imaginary_block[s]
+            own = weighted[part, s * width : (s + 1) * width]
+            for k in range(width):
+                total = 0.0
+                for j in range(width):
+                    total += block[k, j] * own[j]
+                residual[s, k, part] = total
+                chi2[s] += own[k] * total
+
+
+@numba.njit(cache=True, error_model='numpy')
+def bend_power(flux, previous, before):  # type: ignore[no-untyped-def]
+    """Median over coils of the mean squared second difference of fluxes (S, K); NaN for none."""
+    power, count = np.empty(flux.shape[0]), 0
+    for s in range(flux.shape[0]):
+        total = 0.0
+        for k in range(flux.shape[1]):
+            bend = flux[s, k] - 2.0 * previous[s, k] + before[s, k]
+            total += bend.real * bend.real + bend.imag * bend.imag
+        if math.isfinite(total):
+            power[count] = total / flux.shape[1]
+            count += 1
+    return np.median(power[:count]) if count else math.nan
+
+
+@numba.njit(cache=True, error_model='numpy')
+def fill_frame(given, marks, rows, least, largest, ordered, code):  # type: ignore[no-untyped-def]
+    """Write a frame's fluxes (S, K) in the references' order, and what each reading is.
+
+    ``rows`` (S,): each reference's row of the frame, -1 for none. ``least`` (S,): power (T^2)
+    below which a coil hears nothing; NaN without a baseline. ``largest``: of a component, T.
+    ``code``: 0 missing, 1 good, 2 flagged, 3 not finite, 4 without a baseline, 5 silent, 6 absurd.
+    """
+    for s in range(rows.shape[0]):
+        row = rows[s]
+        if row < 0:
+            ordered[s] = complex(math.nan, math.nan)
+            code[s] = 0
+        else:
+            code[s] = 1
+            power = 0.0
+            for k in range(ordered.shape[1]):
+                value = given[row, k]
+                ordered[s, k] = value
+                power += value.real * value.real + value.imag * value.imag
+                if not (math.isfinite(value.real) and math.isfinite(value.imag)):
+                    code[s] = 3
+                elif code[s] != 3 and max(abs(value.real), abs(value.imag)) > largest:
+                    code[s] = 6
+            if power < least[s]:
+                code[s] = 5
+            if marks[row] != 0:
+                code[s] = 2
+        if math.isnan(least[s]):
+            code[s] = 4
+
+
+@numba.njit(cache=True, error_model='numpy')
+def fill_dipole_tensors(points, sources, out):  # type: ignore[no-untyped-def]
+    """Write the field (3P rows, T) of unit moments along x, y and z (3M columns) of sources."""
+    for p in range(points.shape[0]):
+        for m in range(sources.shape[0]):
+            dx, dy = points[p, 0] - sources[m, 0], points[p, 1] - sources[m, 1]
+            dz = points[p, 2] - sources[m, 2]
+            inv2 = 1.0 / (dx * dx + dy * dy + dz * dz)
+            k3 = DIPOLE_CONSTANT * inv2 * math.sqrt(inv2)
+            k5 = 3.0 * k3 * inv2
+            i, j = 3 * p, 3 * m
+            out[i, j], out[i, j + 1], out[i, j + 2] = k5 * dx * dx - k3, k5 * dx * dy, k5 * dx * dz
+            out[i + 1, j], out[i + 1, j + 1] = k5 * dx * dy, k5 * dy * dy - k3
+            out[i + 1, j + 2], out[i + 2, j] = k5 * dy * dz, k5 * dx * dz
+            out[i + 2, j + 1], out[i + 2, j + 2] = k5 * dy * dz, k5 * dz * dz - k3

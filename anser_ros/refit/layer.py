@@ -1,0 +1,240 @@
+"""The equivalent layer: a few dipoles whose field in the tracked volume is that of any cloud.
+
+A field whose sources are all below a plane is also the field of dipoles on that plane (the
+equivalent layer of potential theory; Blakely, Potential Theory in Gravity and Magnetic
+Applications, chapter 3). So the refitted model keeps its size however fine the clouds are. Where
+the calibrated model is such a layer itself, its own dipoles take the change and the model does not
+grow at all. Metal beside or over the volume needs dipoles beside and over it.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cholesky
+
+from anser_ros.field.model import FieldModel
+from anser_ros.physics.dipole import flux_basis
+from anser_ros.refit.clouds import Cloud, Region
+from anser_ros.refit.excitation import Excitation
+from anser_ros.refit.kernels import fill_dipole_tensors
+
+Array = NDArray[np.float64]
+
+BELOW, AROUND = 'below', 'around'
+RIDGE = 1e-5
+"""Damping of the layer's fit relative to its largest singular value."""
+MOST_OWN = 200
+"""A calibrated layer of more dipoles than this is not used as the equivalent layer."""
+GOOD_ENOUGH = 0.05
+"""Relative rms misfit of the nearest cloud, whose sources know nothing of each other, up to which
+the model's own dipoles are used: that of the layer that would be added."""
+SHALLOW = (12, 1.3, 0.15)
+DEEP = (7, 2.5, 1.0)
+"""Dipoles along a side, half size and depth of a lattice, the last two in halves of the board."""
+SAMPLES = (12, 7)
+"""Samples across and up that a layer is fitted at. With half as many across it is right at the
+samples and, of metal that touches the board, 40 % wrong between them."""
+MOST_MIDDLE = 60
+"""Samples in the middle that tell what the uncertainty's modes leave."""
+CLEAR = 0.35
+"""Samples nearer to a body's sources than this part of its radius don't count."""
+INNER = 0.83
+"""Part of the tracked volume that the box is fitted in."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Dipoles that stand for a cloud.
+
+    Attributes
+    ----------
+    name : str
+        The same for the same dipoles.
+    rows : ndarray of int, shape (Q,), or None
+        The calibrated model's own dipoles that take part of the change; they are the layer's first
+        Q. None when all of the layer is added to the model.
+    positions, directions : ndarray, shape (N, 3)
+    inverse : ndarray, shape (N, 3P), or None
+        From field samples (T, point by point) to moments (A m^2); None where the dipoles are the
+        sources themselves, three a source.
+    points : ndarray, shape (P, 3)
+        Where the field is sampled, m.
+    metric : ndarray, shape (N, N)
+        Upper triangle C: ``|C m|`` is what the field of moments m does to poses, an rms over the
+        samples of the field relative to the emitters' own, times the height (an error of the field
+        moves a pose by its size over the field's gradient). Its unit does not matter.
+    middle : ndarray, shape (Q, N)
+        Field components per unit moment at the samples in the middle of the volume.
+    """
+
+    name: str
+    rows: NDArray[np.int64] | None
+    positions: Array
+    directions: Array
+    inverse: Array | None
+    points: Array
+    metric: Array
+    middle: Array
+    _projected: dict[bytes, Array] = field(default_factory=dict, repr=False, compare=False)
+
+    def project(self, sources: Array) -> Array:
+        """Moments of the layer per unit moment of each source's component, shape (N, 3M)."""
+        if self.inverse is None:
+            return np.eye(3 * len(sources))
+        told = sources.tobytes()
+        if told not in self._projected:
+            # Clouds are asked for in turn, each for all of its responses.
+            self._projected.clear()
+            self._projected[told] = self.inverse @ _field_rows(self.points, sources)
+        return self._projected[told]
+
+    def misfit(self, sources: Array, points: Array | None = None) -> float:
+        """Relative rms error of the field that the layer makes in place of the sources.
+
+        At the samples that it was fitted at, or at other points (P, 3).
+        """
+        at = self.points if points is None else points
+        wanted = _field_rows(at, sources)
+        made = _component_rows(at, self.positions, self.directions) @ self.project(sources)
+        return float(np.linalg.norm(made - wanted) / np.linalg.norm(wanted))
+
+
+def _axes_at(points: Array) -> tuple[Array, Array]:
+    return np.repeat(points, 3, axis=0), np.tile(np.eye(3), (len(points), 1))
+
+
+def _field_rows(points: Array, sources: Array) -> Array:
+    """Field samples per unit moment component, shape (3P, 3M)."""
+    out = np.empty((3 * len(points), 3 * len(sources)))
+    fill_dipole_tensors(np.ascontiguousarray(points), np.ascontiguousarray(sources), out)
+    return out
+
+
+def _component_rows(points: Array, positions: Array, directions: Array) -> Array:
+    at, axes = _axes_at(points)
+    return flux_basis(at, axes, None, positions, directions)
+
+
+def _build(
+    name: str,
+    rows: NDArray[np.int64] | None,
+    positions: Array,
+    directions: Array,
+    points: Array,
+    excitation: Excitation,
+    half: float,
+) -> Layer:
+    basis = _component_rows(points, positions, directions)
+    scale = np.linalg.norm(basis, axis=0)
+    u, s, vt = np.linalg.svd(basis / scale, full_matrices=False)
+    inverse = (vt.T * (s / (s**2 + (RIDGE * s[0]) ** 2))) @ u.T / scale[:, None]
+    metric = _metric(basis, pose_weight(points, excitation))
+    middle = basis[_middle(points, half)]
+    return Layer(name, rows, positions, directions, inverse, points, metric, middle)
+
+
+def pose_weight(points: Array, excitation: Excitation) -> Array:
+    """How far an error of the field moves a pose at each point (P,), in some unit."""
+    weight = points[:, 2] / np.linalg.norm(excitation.field(points), axis=(1, 2))
+    return np.asarray(weight / weight.mean())
+
+
+def _metric(basis: Array, weight: Array) -> Array:
+    weighted = basis * np.repeat(weight, 3)[:, None]
+    gram = weighted.T @ weighted
+    gram[np.diag_indices_from(gram)] += 1e-12 * np.diag(gram)
+    return np.asarray(cholesky(gram))
+
+
+def _middle(points: Array, half: float) -> NDArray[np.int64]:
+    """Rows of some samples in the middle of the volume, three a sample."""
+    there = np.flatnonzero((points[:, 2] > 0.5 * half) & (points[:, 2] < half))
+    some = there[:: -(-len(there) // MOST_MIDDLE) or 1]
+    return np.asarray((3 * some[:, None] + np.arange(3)).ravel())
+
+
+def body_layer(region: Region, weight: Array, cloud: Cloud) -> Layer:
+    """A compact body's own sources as dipoles: exact wherever the body is.
+
+    Parameters
+    ----------
+    region : Region
+    weight : ndarray, shape (P,)
+        `pose_weight` at ``region.samples()``.
+    cloud : Cloud
+        The body's sources.
+    """
+    points = region.samples()
+    away = np.linalg.norm(points[:, None] - cloud.positions, axis=2).min(axis=1)
+    clear = away > CLEAR * cloud.standoff_m
+    points = points[clear]
+    positions = np.repeat(cloud.positions, 3, axis=0)
+    directions = np.tile(np.eye(3), (len(cloud.positions), 1))
+    basis = _component_rows(points, positions, directions)
+    metric = _metric(basis, weight[clear])
+    middle = basis[_middle(points, region.half)]
+    return Layer(cloud.name, None, positions, directions, None, points, metric, middle)
+
+
+def _lattice(region: Region, across: int, extent: float, depth: float) -> Array:
+    side = np.linspace(-extent, extent, across) * region.half
+    x, y = np.meshgrid(side + region.centre[0], side + region.centre[1], indexing='ij')
+    return np.stack([x.ravel(), y.ravel(), np.full(x.size, -depth * region.half)], axis=1)
+
+
+def _upright(positions: Array) -> Array:
+    return np.tile([0.0, 0.0, 1.0], (len(positions), 1))
+
+
+def bottom_layer(
+    model: FieldModel, region: Region, excitation: Excitation, sources: Array
+) -> Layer:
+    """The layer for clouds below the board.
+
+    Parameters
+    ----------
+    model : FieldModel
+        Calibrated; its dipoles are used again where they can stand for the sources.
+    region : Region
+    excitation : Excitation
+    sources : ndarray, shape (M, 3)
+        Sources of the cloud that is hardest to stand for, the nearest one.
+    """
+    points, deep = region.samples(*SAMPLES), _lattice(region, *DEEP)
+    upright = np.abs(model.directions[:, 2]) > 0.999
+    low = np.abs(model.positions[:, 2]) < 0.5 * region.half
+    rows = np.flatnonzero(upright & low)
+    if 64 <= rows.size <= MOST_OWN:
+        own = np.concatenate([model.positions[rows], deep])
+        layer = _build(BELOW, rows, own, _upright(own), points, excitation, region.half)
+        if layer.misfit(sources) <= GOOD_ENOUGH:
+            return layer
+    positions = np.concatenate([_lattice(region, *SHALLOW), deep])
+    return _build(BELOW, None, positions, _upright(positions), points, excitation, region.half)
+
+
+def box_layer(region: Region, excitation: Excitation) -> Layer:
+    """Dipoles on the faces of a box around the tracked volume, pointing inwards."""
+    gap = 0.8 * region.half
+    half = region.half + region.margin + gap
+    across = np.linspace(-half, half, 6)
+    faces = [(axis, sign) for axis in range(2) for sign in (-1.0, 1.0)]
+    positions, directions = [], []
+    for axis, sign in faces:
+        up = np.linspace(-gap, region.ceiling + gap, 4)
+        u, v = (a.ravel() for a in np.meshgrid(across, up, indexing='ij'))
+        face = np.empty((u.size, 3))
+        face[:, axis], face[:, 1 - axis], face[:, 2] = sign * half, u, v
+        positions.append(face)
+        directions.append(np.tile(-sign * np.eye(3)[axis], (u.size, 1)))
+    u, v = (a.ravel() for a in np.meshgrid(across, across, indexing='ij'))
+    for height, inwards in ((region.ceiling + gap, -1.0), (-gap, 1.0)):
+        positions.append(np.stack([u, v, np.full(u.size, height)], axis=1))
+        directions.append(inwards * _upright(positions[-1]))
+    stacked = np.concatenate(positions)
+    stacked[:, :2] += region.centre
+    # Near the faces the field of what is just outside has more detail than the box can make.
+    points = region.samples(*SAMPLES, part=INNER)
+    axes = np.concatenate(directions)
+    return _build(AROUND, None, stacked, axes, points, excitation, region.half)

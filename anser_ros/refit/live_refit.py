@@ -1,0 +1,392 @@
+"""Live refit: reference coils make the field model follow metal that moves.
+
+The calibrated model is kept; what is refitted is the change since a distortion-free baseline. All
+emitters illuminate the same metal, so one polarisability a source explains all of them, and a few
+dozen readings determine the change of the whole field. `docs/refit.md` tells the method with its
+figures, and what was tried and left.
+"""
+
+import math
+from collections.abc import Callable
+from copy import copy
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import FitError
+from anser_ros.field.model import FieldModel
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit import health
+from anser_ros.refit.assembly import Assembly
+from anser_ros.refit.change import Average, NoiseLevel
+from anser_ros.refit.excitation import FieldFunction
+from anser_ros.refit.frame import FrameOrder
+from anser_ros.refit.health import ReferenceHealth, ReferenceWatch
+from anser_ros.refit.posterior import Bank, FrameEvidence
+from anser_ros.refit.result import (
+    FEW_REFERENCES,
+    FROZEN,
+    POOR_FIT,
+    REFIT,
+    Metal,
+    RefitResult,
+    RefitSettings,
+)
+from anser_ros.refit.slots import SLOTS, BodySlots
+from anser_ros.refit.tables import build_tables
+
+__all__ = ['LiveRefit', 'Metal', 'RefitResult', 'RefitSettings']
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+MOST_BANKS = 4
+NOTHING = 0.99
+"""Probability of no change from which on the calibrated model is in force."""
+DRIFT_SIGMAS = 5.0
+POOR = 4.0
+"""Typical left-out distance from which on the state is `POOR_FIT`."""
+
+
+class LiveRefit:
+    """Makes a field model follow what reference coils see.
+
+    Parameters
+    ----------
+    model : FieldModel
+        Calibrated without the metal.
+    references : SensorTable
+        The reference coils, places and axes in fg.
+    baseline : ndarray, shape (S, K), complex
+        Their readings without the metal, T; NaN for a coil that has none.
+    settings : RefitSettings, optional
+    drawing : callable, optional
+        Field of the board as drawn (`physics.board.Board.field`): points (P, 3) to (P, K, 3), T.
+        Without it the model's own dipoles drive the metal, which is much less accurate.
+    noise : ndarray, shape (S,), optional
+        Noise of each reference over the nominal one, at least 1; more for coils whose place is
+        only known from a tracker (see `refit.patches`).
+
+    Raises
+    ------
+    FitError
+        When shapes don't fit, a channel appears twice, or there are no references.
+    """
+
+    def __init__(
+        self,
+        model: FieldModel,
+        references: SensorTable,
+        baseline: ComplexArray,
+        settings: RefitSettings | None = None,
+        drawing: FieldFunction | None = None,
+        noise: Array | None = None,
+    ) -> None:
+        self.model = model
+        self.references = references
+        self.settings = settings or RefitSettings()
+        self.baseline = _checked_baseline(model, references, baseline)
+        self._row_noise = _checked_noise(noise, len(references), len(model.emitters))
+        self._tables = build_tables(model, references, self.settings, drawing)
+        self._prepare()
+        self.reset()
+        self._warm_up()
+
+    def _warm_up(self) -> None:
+        """Have tables and kernels ready before the first frame."""
+        bank, _ = self._bank()
+        seen = bank.evaluate(np.zeros((len(bank.rows), 2)), 1.0)
+        bank.left_out(seen, int(seen.log_evidence.argmax()))
+
+    def _prepare(self) -> None:
+        """Work out what depends on the baseline and the references' places."""
+        model, references, baseline = self.model, self.references, self.baseline
+        k = len(model.emitters)
+        turned = self.baseline * self._tables.excitation.phase.conj()
+        scale = self.settings.drift / self.settings.flux_noise_t
+        self._drift = np.zeros((baseline.size, k))
+        for emitter in range(k):
+            self._drift[emitter::k, emitter] = np.nan_to_num(turned[:, emitter].real) * scale
+        self._to_noise_units = self._tables.excitation.phase.conj() / self.settings.flux_noise_t
+        self._banks: dict[bytes, tuple[Bank, BodySlots]] = {}
+        self._order = FrameOrder(references.channel, self.baseline)
+        self._assembly = Assembly(model)
+
+    @property
+    def excitation_source(self) -> str:
+        """``board`` where the drawing drives the metal, ``model`` where the model itself does."""
+        return self._tables.excitation.source
+
+    def reset(self) -> None:
+        """Forget everything seen; the calibrated model is in force again."""
+        settings = self.settings
+        self._noise = NoiseLevel(settings.flux_noise_t)
+        self._average = Average(settings.average_frames)
+        self._watch = ReferenceWatch(len(self.references), settings.hold_frames)
+        self._weights = _fresh_weights(1 + len(self._tables.priors) + SLOTS)
+        for _, slots in self._banks.values():
+            slots.clear()
+        self._last_ns = 0
+        self._last_model = self.model
+
+    def moved(
+        self, references: SensorTable, baseline: ComplexArray, noise: Array | None = None
+    ) -> 'LiveRefit':
+        """The same refit for references that are elsewhere now; what was learnt is kept.
+
+        Parameters
+        ----------
+        references : SensorTable
+            The same coils in the same order.
+        baseline, noise
+            As for the constructor.
+        """
+        if references.name != self.references.name:
+            raise FitError('refit: moved references must be the same coils in the same order')
+        other = copy(self)
+        other.references = references
+        other.baseline = _checked_baseline(self.model, references, baseline)
+        other._row_noise = _checked_noise(noise, len(references), len(self.model.emitters))
+        other._tables = self._tables.moved(references, self.settings)
+        other._prepare()
+        other._average = Average(self.settings.average_frames)
+        return other
+
+    def update(
+        self,
+        stamp_ns: int,
+        channels: NDArray[np.generic],
+        flux: NDArray[np.generic],
+        flags: NDArray[np.generic] | None = None,
+        baseline: ComplexArray | None = None,
+    ) -> RefitResult:
+        """Take in one frame of reference fluxes.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Middle of the demodulation window.
+        channels : ndarray, shape (S,)
+            Channel of each row, in any order; unknown ones are passed over.
+        flux : ndarray, shape (S, K), complex
+            T.
+        flags : ndarray, shape (S,), optional
+            Flag bits; a flagged reading is not used.
+        baseline : ndarray, shape (S, K), complex, optional
+            Clean readings in this frame, in the order of the references, where some of them move.
+
+        Returns
+        -------
+        RefitResult
+
+        Raises
+        ------
+        FitError
+            When shapes don't fit or a channel appears twice.
+        """
+        ordered, readable, reasons = self._order.read(channels, flux, flags, baseline)
+        if stamp_ns < self._last_ns:
+            self._noise.forget()
+            self._average.forget()
+        self._last_ns = stamp_ns
+        self._watch.note(readable, reasons, self.settings.min_references)
+        usable = ordered if readable.all() else np.where(readable[:, None], ordered, np.nan)
+        level = self._noise.update(usable)
+        if np.count_nonzero(self._in_use()) < self.settings.min_references:
+            self._watch.wait(readable)
+            return self._too_few(stamp_ns, level)
+        if baseline is not None:
+            # What is averaged is the change; the clean part moves with the coil.
+            ordered = ordered - baseline + self.baseline
+        excluded = self._watch.excluded
+        used = np.where(excluded[:, None], np.nan, ordered) if excluded.any() else ordered
+        mean, frames = self._average.update(used, level * self.settings.flux_noise_t)
+        if used is not ordered:
+            mean = np.where(np.isfinite(mean), mean, ordered)
+        noise = level / math.sqrt(frames)
+        change = (mean - self.baseline) * self._to_noise_units
+        values = change.view(np.float64).reshape(*change.shape, 2)
+        bank, seen = self._judged(values, noise)
+        if np.count_nonzero(self._in_use()) < self.settings.min_references:
+            return self._too_few(stamp_ns, level)
+        result = self._result(stamp_ns, bank, seen, level)
+        self._readmit(bank, seen, values, readable, level)
+        return result
+
+    def _in_use(self) -> NDArray[np.bool_]:
+        return np.asarray(~self._watch.excluded)
+
+    def _bank(self) -> tuple[Bank, BodySlots]:
+        """The hypotheses for the coils in use; decomposed again only when those change."""
+        key = self._watch.excluded.tobytes()
+        if key not in self._banks:
+            k = len(self.model.emitters)
+            coils = np.flatnonzero(self._in_use())
+            rows = (coils[:, None] * k + np.arange(k)).ravel()
+            if len(self._banks) >= MOST_BANKS:
+                del self._banks[next(iter(self._banks))]
+            tables = self._tables
+            bank = Bank(
+                tables.priors, rows, self._drift, self._row_noise, SLOTS, len(tables.bodies)
+            )
+            self._banks[key] = (bank, BodySlots(bank, self._tables))
+        return self._banks[key]
+
+    def _judged(self, values: Array, noise: float) -> tuple[Bank, FrameEvidence]:
+        """Evaluate the hypotheses, leaving out coils that are at fault, the worst first."""
+        while True:
+            (bank, slots), coils = self._bank(), np.flatnonzero(self._in_use())
+            used = values[coils].reshape(-1, 2)
+            slots.fill(used, noise)
+            seen = bank.evaluate(used, noise)
+            best = int(seen.log_evidence.argmax())
+            self._distance, self._residual = bank.left_out(seen, best)
+            if len(coils) <= self.settings.min_references:
+                return bank, seen
+            loudness = noise * self._row_noise[:: bank.width][coils]
+            power = (used.reshape(len(coils), -1) ** 2).sum(axis=1) / loudness**2
+            suspects = self._watch.suspects(self._distance, power, 2 * bank.width)
+            faulty = health.find_faults(bank, seen, suspects)
+            if not faulty.size:
+                return bank, seen
+            for coil in faulty:
+                self._watch.exclude(int(coils[coil]))
+            self._average.forget()
+
+    def _readmit(
+        self,
+        bank: Bank,
+        seen: FrameEvidence,
+        values: Array,
+        readable: NDArray[np.bool_],
+        level: float,
+    ) -> None:
+        """Let coils return that agree with the others again."""
+        best, k = int(seen.log_evidence.argmax()), bank.width
+        for coil in np.flatnonzero(self._watch.excluded & readable):
+            rows = coil * k + np.arange(k)
+            distance = bank.distance(seen, best, rows, values[coil], level)
+            self._watch.agreed(int(coil), distance < health.AGREES * 2 * k)
+
+    def _result(self, stamp_ns: int, bank: Bank, seen: FrameEvidence, level: float) -> RefitResult:
+        prior = self.settings.persistence * self._weights
+        prior += (1.0 - self.settings.persistence) / len(prior)
+        log_weight = np.log(prior) + seen.log_evidence
+        weights = np.exp(log_weight - log_weight.max())
+        self._weights = weights = weights / weights.sum()
+        best = int(weights.argmax())
+        typical = health.typical(self._distance) / (2 * bank.width)
+        mean, variance = bank.drifts(seen, best)
+        drift = self.settings.drift * (mean @ np.array([1.0, 1.0j]))
+        sure = (np.abs(mean) > DRIFT_SIGMAS * np.sqrt(np.maximum(variance, 1e-30))).any(axis=1)
+        moving = weights[0] < NOTHING
+        if not moving:
+            drift[~sure] = 0.0
+        model, state, reason = self.model, FROZEN, ''
+        if moving or sure.any():
+            phase, unit = self._tables.excitation.phase, self.settings.flux_noise_t
+            model = self._assembly.model(bank, seen, weights, drift, typical, phase, unit,
+                                         self.settings.modes)  # fmt: skip
+            state = REFIT
+        if moving and typical > POOR:
+            state = POOR_FIT
+            reason = f'readings are {np.sqrt(typical):.1f} times as far off as they should be'
+        return self._finish(
+            RefitResult(
+                stamp_ns,
+                model,
+                state,
+                model is not self._last_model,
+                self._healths(),
+                float(np.log(max(1.0 - weights[0], 1e-300)) - np.log(max(weights[0], 1e-300))),
+                dict(zip(bank.names, weights.tolist(), strict=True)),
+                level * self.settings.flux_noise_t,
+                drift,
+                reason,
+                (lambda: self._metal(bank, seen, weights)) if moving else None,
+            )
+        )
+
+    def _finish(self, result: RefitResult) -> RefitResult:
+        self._last_model = result.model
+        return result
+
+    def _too_few(self, stamp_ns: int, level: float) -> RefitResult:
+        """Back to the calibrated model."""
+        self._weights = _fresh_weights(len(self._weights))
+        self._average.forget()
+        count = int(self._in_use().sum())
+        need = self.settings.min_references
+        self._distance = self._residual = np.empty(0)
+        return self._finish(
+            RefitResult(
+                stamp_ns,
+                self.model,
+                FEW_REFERENCES,
+                self.model is not self._last_model,
+                self._healths(),
+                0.0,
+                {},
+                level * self.settings.flux_noise_t,
+                np.zeros(len(self.model.emitters), dtype=complex),
+                f'{count} usable references, {need} are needed',
+            )
+        )
+
+    def _healths(self) -> Callable[[], tuple[ReferenceHealth, ...]]:
+        """Works out the references' health in this frame when it is asked for."""
+        distance, residual, used = self._distance, self._residual, self._in_use()
+        reason = self._watch.reason.copy()
+        return lambda: self._judge_references(distance, residual, used, reason)
+
+    def _judge_references(
+        self, distance: Array, residual: Array, used: NDArray[np.bool_], reason: list[str]
+    ) -> tuple[ReferenceHealth, ...]:
+        size, apart = np.full(len(used), np.nan), np.full(len(used), np.nan)
+        if len(distance):
+            rms = np.sqrt((residual**2).mean(axis=(1, 2)))
+            size[used] = rms * self.settings.flux_noise_t
+            apart[used] = np.sqrt(distance / (2 * len(self.model.emitters)))
+        rows = (self.references.name, reason, size.tolist(), apart.tolist())
+        return tuple(map(ReferenceHealth, *rows))
+
+    def _metal(self, bank: Bank, seen: FrameEvidence, weights: Array) -> Metal | None:
+        best = 1 + int(weights[1:].argmax())
+        values = bank.sources(seen, best) * self.settings.flux_noise_t
+        polarisability = values[:, 0] + 1j * values[:, 1]
+        cloud = bank.prior(best).cloud
+        power = np.abs(polarisability) ** 2 / cloud.volumes
+        if not power.sum() > 0.0:
+            return None
+        centroid = (cloud.positions * power[:, None]).sum(axis=0) / power.sum()
+        return Metal(cloud.positions, polarisability, cloud.volumes, centroid, cloud.standoff_m)
+
+
+def _checked_noise(noise: Array | None, count: int, width: int) -> Array:
+    """Noise of every reading, (S K,), from that of every coil."""
+    given = np.ones(count) if noise is None else np.asarray(noise, dtype=np.float64)
+    if given.shape != (count,) or not (given >= 1.0).all() or not np.isfinite(given).all():
+        raise FitError(f'refit: noise must be {count} finite numbers of at least 1, got {given}')
+    return np.repeat(given, width)
+
+
+def _fresh_weights(count: int) -> Array:
+    weights = np.zeros(count)
+    weights[0] = 1.0
+    return weights
+
+
+def _checked_baseline(
+    model: FieldModel, references: SensorTable, baseline: ComplexArray
+) -> ComplexArray:
+    given = np.asarray(baseline, dtype=np.complex128)
+    if len(references) == 0:
+        raise FitError('refit: there are no reference sensors')
+    if given.shape != (len(references), len(model.emitters)):
+        raise FitError(
+            f'refit: {len(references)} references and {len(model.emitters)} emitters need a '
+            f'baseline of that shape, got {given.shape}'
+        )
+    if len(set(references.channel.tolist())) != len(references):
+        raise FitError('refit: a channel appears twice in the references')
+    return given

@@ -1,0 +1,232 @@
+"""Reference coils on patches that move: their clean reading follows from their pose.
+
+Such a coil has no baseline of its own. What it should read without metal is the calibrated model's
+flux where a tracker says that it is, and the tracker's error becomes noise of that reading, far
+above a fixed coil's. It still tells of strong metal from where no fixed coil can be.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.field.model import FieldModel
+from anser_ros.physics.dipole import flux_jacobian
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.live_refit import LiveRefit
+from anser_ros.refit.result import RefitResult
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+MOVED_M = 3e-3
+TURNED_RAD = 0.03
+"""How far a coil may be from where the refit was worked out for before that is done again."""
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """Standard deviations of a patch's pose (m, rad per axis) and of its coils' gain."""
+
+    position_m: float = 0.15e-3
+    rotation_rad: float = 2e-3
+    gain: float = 0.004
+
+
+def clean_reading(
+    model: FieldModel, coils: SensorTable, error: PoseError
+) -> tuple[ComplexArray, Array]:
+    """What placed coils read without metal, and how uncertain that is.
+
+    Parameters
+    ----------
+    model : FieldModel
+        Calibrated.
+    coils : SensorTable
+        Places and axes in fg.
+    error : PoseError
+
+    Returns
+    -------
+    flux : ndarray, shape (S, K), complex
+        T.
+    sigma : ndarray, shape (S,)
+        Root mean square over the emitters of a component's standard deviation, T.
+    """
+    flux, d_position, d_axis = flux_jacobian(
+        coils.position, coils.axis, coils.length, model.positions, model.directions, model.moments
+    )
+    power = (np.abs(error.gain * flux) ** 2).mean(axis=1)
+    power += (np.abs(error.position_m * d_position) ** 2).sum(axis=1).mean(axis=1)
+    # Turns across the axis only: a turn about it changes nothing.
+    along = np.einsum('sa,sak->sk', coils.axis, d_axis)
+    across = (np.abs(d_axis) ** 2).sum(axis=1) - np.abs(along) ** 2
+    power += error.rotation_rad**2 * across.mean(axis=1)
+    return flux, np.sqrt(power)
+
+
+def has_moved(then: SensorTable, now: SensorTable) -> NDArray[np.bool_]:
+    """Which coils are too far from where they were for what was worked out there, (S,)."""
+    shift = np.linalg.norm(now.position - then.position, axis=1)
+    turn = np.linalg.norm(np.cross(now.axis, then.axis), axis=1)
+    opposite = (now.axis * then.axis).sum(axis=1) < 0.0
+    return np.asarray((shift > MOVED_M) | (turn > TURNED_RAD) | opposite)
+
+
+POSE_AGE_NS = 200_000_000
+FLUX_AGE_NS = 100_000_000
+
+
+@dataclass(frozen=True)
+class Placed:
+    """The patches' coils in one frame.
+
+    Attributes
+    ----------
+    flux : ndarray, shape (S, K), complex
+        T; NaN where pose or flux are missing or stale.
+    baseline : ndarray, shape (S, K), complex
+        What they should read without metal, T.
+    """
+
+    flux: ComplexArray
+    baseline: ComplexArray
+
+
+class PatchCoils:
+    """Keeps the patches' coils where their poses say.
+
+    Parameters
+    ----------
+    coils : SensorTable
+        Places and axes in their bodies' frames.
+    fixed : ndarray, shape (R, K), complex
+        Baseline of the fixed references, T.
+    """
+
+    def __init__(self, coils: SensorTable, fixed: ComplexArray) -> None:
+        self.coils = coils
+        self.fixed = fixed
+        self._poses: dict[str, tuple[int, Array, Array]] = {}
+        self._flux = np.full((len(coils), fixed.shape[1]), np.nan, dtype=np.complex128)
+        self._flux_ns = 0
+        self._built_at: SensorTable | None = None
+
+    def put(self, body: str, stamp_ns: int, position: Array, rotation: Array) -> None:
+        """Keep a body's pose: place (m) and rotation matrix in fg."""
+        self._poses[body] = (stamp_ns, position, rotation)
+
+    def take_flux(
+        self,
+        stamp_ns: int,
+        channels: NDArray[np.int64],
+        flux: ComplexArray,
+        flags: NDArray[np.int64],
+    ) -> None:
+        """Keep the fluxes of the patches' coils among the tools'."""
+        self._flux[:] = np.nan
+        row = {int(c): i for i, c in enumerate(channels.tolist())}
+        for coil, channel in enumerate(self.coils.channel.tolist()):
+            if channel in row and not flags[row[channel]]:
+                self._flux[coil] = flux[row[channel]]
+        self._flux_ns = stamp_ns
+
+    def where(self, stamp_ns: int) -> tuple[SensorTable, NDArray[np.bool_]]:
+        """Coils in fg by the poses of about now, and which of them have such a pose."""
+        position, axis = self.coils.position.copy(), self.coils.axis.copy()
+        known = np.zeros(len(self.coils), dtype=bool)
+        for coil, body in enumerate(self.coils.body):
+            if body not in self._poses:
+                continue
+            pose_ns, place, rotation = self._poses[body]
+            position[coil] = place + rotation @ self.coils.position[coil]
+            axis[coil] = rotation @ self.coils.axis[coil]
+            known[coil] = abs(stamp_ns - pose_ns) < POSE_AGE_NS
+        return self.coils.with_geometry(position, axis), known
+
+    def frame(self, stamp_ns: int, model: FieldModel) -> Placed:
+        """The coils' readings and what they should read at a time."""
+        now, known = self.where(stamp_ns)
+        clean, _ = clean_reading(model, now, PoseError())
+        usable = known & (abs(stamp_ns - self._flux_ns) < FLUX_AGE_NS)
+        if self._built_at is None:
+            usable[:] = False
+        else:
+            usable &= ~has_moved(self._built_at, now)
+        return Placed(np.where(usable[:, None], self._flux, np.nan), clean)
+
+    def must_rebuild(self, now: SensorTable) -> bool:
+        return self._built_at is None or bool(has_moved(self._built_at, now).any())
+
+    def start_table(self) -> SensorTable:
+        """Coils somewhere over the board, for a first refit that leaves them out."""
+        return self.coils.with_geometry(self.coils.position + np.array([0.0, 0.0, 0.3]))
+
+    def update(
+        self,
+        refit: LiveRefit,
+        stamp_ns: int,
+        channels: NDArray[np.int64],
+        flux: ComplexArray,
+        flags: NDArray[np.int64],
+    ) -> RefitResult:
+        """Refit to a frame of the fixed references, and to the patches' coils as they are now."""
+        placed = self.frame(stamp_ns, refit.model)
+        own = self.coils.channel
+        fixed = np.isin(channels, own, invert=True)
+        return refit.update(
+            stamp_ns,
+            np.concatenate([channels[fixed], own]),
+            np.concatenate([flux[fixed], placed.flux]),
+            np.concatenate([flags[fixed], np.zeros(len(own), dtype=np.int64)]),
+            np.concatenate([self.fixed, placed.baseline]),
+        )
+
+    def started(self, model: FieldModel, references: SensorTable, **options: Any) -> LiveRefit:
+        """A first refit, in which the patches' coils have no place yet.
+
+        Parameters
+        ----------
+        model : FieldModel
+        references : SensorTable
+            The fixed ones.
+        options
+            Of `LiveRefit`.
+        """
+        start = self.start_table()
+        clean = np.concatenate([self.fixed, clean_reading(model, start, PoseError())[0]])
+        return LiveRefit(model, joined(references, start), clean, **options)
+
+    def rebuilt(self, refit: LiveRefit, now: SensorTable) -> LiveRefit:
+        """The refit for where the patches are now; `settle` puts it in force."""
+        return _rebuild(refit, now, self.fixed)
+
+    def settle(self, at: SensorTable) -> None:
+        """From now on the refit that was worked out for these places is in force."""
+        self._built_at = at
+
+
+def joined(first: SensorTable, second: SensorTable) -> SensorTable:
+    """Two tables as one."""
+    return SensorTable(
+        channel=np.concatenate([first.channel, second.channel]),
+        name=(*first.name, *second.name),
+        body=(*first.body, *second.body),
+        position=np.concatenate([first.position, second.position]),
+        axis=np.concatenate([first.axis, second.axis]),
+        length=np.concatenate([first.length, second.length]),
+    )
+
+
+def noise_of(sigma: Array, n_fixed: int, nominal_t: float) -> Array:
+    """Noise of all references over the nominal one, the fixed ones' being 1."""
+    return np.concatenate([np.ones(n_fixed), np.hypot(1.0, sigma / nominal_t)])
+
+
+def _rebuild(refit: LiveRefit, now: SensorTable, fixed: ComplexArray) -> LiveRefit:
+    count = len(refit.references) - len(now)
+    table = joined(refit.references.select(np.arange(count)), now)
+    clean, sigma = clean_reading(refit.model, now, PoseError())
+    noise = noise_of(sigma, count, refit.settings.flux_noise_t)
+    return refit.moved(table, np.concatenate([fixed, clean]), noise)

@@ -1,0 +1,257 @@
+"""What one hypothesis predicts: covariance of the references' readings, and the way to the field.
+
+With the excitation B_k(r_j) of emitter k at source j and the coupling G_s(r_j) of coil s, a source
+of the polarisability tensor P_j changes the reading by ``G_s(r_j)^T P_j B_k(r_j)``: the same P_j
+for all emitters. Independent P_j of variance ``a v_j`` (v_j the source's volume) make the readings
+Gaussian with the covariance ``a C``. All that depends on the geometry is computed here, once.
+
+Polarisabilities vary a little with the drive frequency: each source gets a second, independent
+part proportional to log(f_k / f_mean), of `FREQUENCY_SLOPE` times the first one's deviation.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.clouds import Cloud
+from anser_ros.refit.layer import Layer
+from anser_ros.refit.references import SurveyError, survey_variants, vector_basis
+
+Array = NDArray[np.float64]
+
+FREQUENCY_SLOPE = 0.5
+"""Deviation of d(ln p)/d(ln f); a sphere's parts have slopes between -1/2 and 1."""
+N_SAMPLES = 48
+"""Draws from the prior, from which the posterior's uncertainty is made."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """How a source's polarisability tensor is distributed: variances of its independent parts.
+
+    A compact piece answers alike in all directions. A flat piece answers across its face only,
+    and pieces that touch drive each other: in recordings, metal below a board answers differently
+    along the board's normal, plates in yet other ways.
+
+    Attributes
+    ----------
+    name : str
+        Empty for the plain one.
+    isotropic : float
+        Of a multiple of the unit tensor.
+    upright : float
+        Of the component along the board's normal (z).
+    tensor : float
+        Of every component of a symmetric tensor, in an orthonormal basis.
+    """
+
+    name: str = ''
+    isotropic: float = 1.0
+    upright: float = 0.0
+    tensor: float = 0.0
+
+
+UPRIGHT = Response('upright', 1.0, 1.0, 0.0)
+ORIENTED = Response('oriented', 1.0, 0.0, 0.25)
+BODY = Response('', 1.0, 0.0, 0.5)
+"""Dense pieces that drive each other answer in any direction."""
+
+
+@dataclass(frozen=True)
+class CloudPrior:
+    """One hypothesis about the readings.
+
+    Attributes
+    ----------
+    name : str
+    cloud : Cloud
+    layer : Layer
+    coupling : ndarray, shape (S K, M)
+        Covariance of each reading with each source's mean polarisability (a third of the tensor's
+        trace, A m^2 / T), normalised like ``covariance``.
+    tilt : ndarray, shape (K,)
+        `FREQUENCY_SLOPE` times log(f_k / f_mean).
+    covariance : ndarray, shape (S K, S K)
+        Of the readings, survey errors included, normalised to a mean variance of 1.
+    transfer : ndarray, shape (N K, S K)
+        From weighted readings ``covariance^-1 y`` to moments of the layer, dipole by dipole.
+    draw_readings : ndarray, shape (S K, D)
+        Readings, survey errors included, of draws from the normalised prior.
+    draw_moments : ndarray, shape (N K, D)
+        Moments of the layer of the same draws.
+    """
+
+    name: str
+    cloud: Cloud
+    layer: Layer
+    coupling: Array
+    tilt: Array
+    covariance: Array
+    transfer: Array
+    draw_readings: Array
+    draw_moments: Array
+
+
+class _Sources:
+    """A cloud with its excitation and response, and the products that all covariances need."""
+
+    def __init__(self, cloud: Cloud, excitation: Array, response: Response) -> None:
+        self.excitation = excitation
+        self.volumes = cloud.volumes
+        self.response = response
+        self.width = excitation.shape[1]
+        # (M, K, K): scalar products of the emitters' fields at each source.
+        self.likeness = np.einsum('mka,mla->mkl', excitation, excitation)
+
+    def along(self, basis: Array) -> Array:
+        """Readings (R, K, M) of unit isotropic sources, from a basis (R, M, 3)."""
+        return np.asarray(np.einsum('rma,mka->rkm', basis, self.excitation, optimize=True))
+
+    def upright(self, basis: Array) -> Array:
+        """Readings (R, K, M) of unit sources that answer along z only."""
+        return np.asarray(np.einsum('rm,mk->rkm', basis[:, :, 2], self.excitation[:, :, 2]))
+
+    def covariance(self, first: Array, second: Array) -> Array:
+        """Covariance (R1, K, R2, K) of what two sets of rows (R, M, 3) read."""
+        mine, theirs = self.along(first), self.along(second)
+        out = self.response.isotropic * self._product(mine, theirs)
+        if self.response.upright > 0.0:
+            out += self.response.upright * self._product(self.upright(first), self.upright(second))
+        if self.response.tensor > 0.0:
+            # Sum over an orthonormal basis E of symmetric tensors of (u^T E b) (v^T E c):
+            # half of (u.v)(b.c) + (u.c)(v.b).
+            flat = second.reshape(len(second), -1).T
+            for k in range(self.width):
+                for j in range(k, self.width):
+                    weight = np.repeat(self.volumes * self.likeness[:, k, j], 3)
+                    block = (first.reshape(len(first), -1) * weight) @ flat
+                    out[:, k, :, j] += 0.5 * self.response.tensor * block
+                    if j != k:
+                        out[:, j, :, k] += 0.5 * self.response.tensor * block
+                for j in range(self.width):
+                    block = (mine[:, j] * self.volumes) @ theirs[:, k].T
+                    out[:, k, :, j] += 0.5 * self.response.tensor * block
+        return out
+
+    def _product(self, first: Array, second: Array) -> Array:
+        rows = (first * self.volumes).reshape(-1, len(self.volumes))
+        product = rows @ second.reshape(-1, len(self.volumes)).T
+        return np.asarray(product.reshape(*first.shape[:2], *second.shape[:2]))
+
+    def blocks(self, basis: Array) -> Array:
+        """Covariance of each row with itself alone, (R, K, K)."""
+        rows = self.along(basis)
+        alike = (rows * self.volumes) @ rows.swapaxes(1, 2)
+        out = (self.response.isotropic + 0.5 * self.response.tensor) * alike
+        if self.response.upright > 0.0:
+            rows = self.upright(basis)
+            out += self.response.upright * ((rows * self.volumes) @ rows.swapaxes(1, 2))
+        if self.response.tensor > 0.0:
+            size = (basis**2).sum(axis=2) * self.volumes
+            flat = size @ self.likeness.reshape(len(self.volumes), -1)
+            out += 0.5 * self.response.tensor * flat.reshape(out.shape)
+        return np.asarray(out)
+
+    def coupling(self, basis: Array) -> Array:
+        """Covariance (R K, M) of readings with a third of each source's trace."""
+        mean = self.response.isotropic + self.response.tensor / 3.0
+        out = mean * self.along(basis)
+        if self.response.upright > 0.0:
+            out += self.response.upright / 3.0 * self.upright(basis)
+        return np.asarray((out * self.volumes).reshape(-1, len(self.volumes)))
+
+    def draws(self, rng: np.random.Generator, count: int) -> Array:
+        """Random polarisability tensors, (M, 3, 3, D)."""
+        m, response = len(self.volumes), self.response
+        out = np.zeros((m, 3, 3, count))
+        isotropic = np.sqrt(response.isotropic) * rng.standard_normal((m, count))
+        for axis in range(3):
+            out[:, axis, axis] = isotropic
+        out[:, 2, 2] += np.sqrt(response.upright) * rng.standard_normal((m, count))
+        if response.tensor > 0.0:
+            free = np.sqrt(response.tensor) * rng.standard_normal((m, 3, 3, count))
+            out += 0.5 * (free + free.swapaxes(1, 2))
+        return np.asarray(out * np.sqrt(self.volumes)[:, None, None, None])
+
+
+def _frequency_tilt(frequencies_hz: Array) -> Array:
+    logs = np.log(frequencies_hz)
+    return np.asarray(FREQUENCY_SLOPE * (logs - logs.mean()))
+
+
+def build_prior(
+    cloud: Cloud,
+    response: Response,
+    layer: Layer,
+    references: SensorTable,
+    excitation: Array,
+    frequencies_hz: Array,
+    survey: SurveyError,
+    rng: np.random.Generator,
+) -> CloudPrior:
+    """Compute a hypothesis for a set of references.
+
+    Parameters
+    ----------
+    cloud : Cloud
+    response : Response
+    layer : Layer
+    references : SensorTable
+        Places and axes in fg.
+    excitation : ndarray, shape (M, K, 3)
+        Field of the emitters at the sources, T.
+    frequencies_hz : ndarray, shape (K,)
+    survey : SurveyError
+    rng : numpy Generator
+        For the draws.
+    """
+    n_refs, k = len(references), excitation.shape[1]
+    sources = _Sources(cloud, excitation, response)
+    tilt = _frequency_tilt(frequencies_hz)
+    alike = 1.0 + np.outer(tilt, tilt)
+    basis = vector_basis(references.position, references.axis, references.length, cloud.positions)
+    covariance = sources.covariance(basis, basis) * alike[:, None, :]
+    blocks = np.zeros((n_refs, k, k))
+    for variant in survey_variants(references, cloud.positions, survey):
+        blocks += sources.blocks(variant)
+    blocks *= alike
+    for s in range(n_refs):
+        covariance[s, :, s] += blocks[s]
+    covariance = covariance.reshape(n_refs * k, -1)
+    scale = float(np.trace(covariance)) / len(covariance)
+    projected = layer.project(cloud.positions).reshape(len(layer.positions), -1, 3)
+    transfer = sources.covariance(projected, basis) * (alike[:, None, :] / scale)
+    readings, moments = _draws(sources, basis, projected, tilt, rng)
+    errors = rng.standard_normal((n_refs, k, N_SAMPLES))
+    factors = np.linalg.cholesky(blocks + np.eye(k) * 1e-12 * scale)
+    readings = readings + (factors @ errors).reshape(n_refs * k, N_SAMPLES)
+    name = f'{cloud.name}, {response.name}' if response.name else cloud.name
+    return CloudPrior(
+        name,
+        cloud,
+        layer,
+        sources.coupling(basis) / scale,
+        tilt,
+        covariance / scale,
+        transfer.reshape(-1, n_refs * k),
+        readings / np.sqrt(scale),
+        moments / np.sqrt(scale),
+    )
+
+
+def _draws(
+    sources: _Sources, basis: Array, projected: Array, tilt: Array, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Readings (S K, D) and moments of the layer (N K, D) of draws from the prior."""
+    plain, tilted = (sources.draws(rng, N_SAMPLES) for _ in range(2))
+    readings = np.empty((len(basis), sources.width, N_SAMPLES))
+    moments = np.empty((len(projected), sources.width, N_SAMPLES))
+    for k in range(sources.width):
+        tensors = plain + tilt[k] * tilted
+        induced = np.einsum('mabd,mb->mad', tensors, sources.excitation[:, k], optimize=True)
+        induced = induced.reshape(-1, N_SAMPLES)
+        readings[:, k] = basis.reshape(len(basis), -1) @ induced
+        moments[:, k] = projected.reshape(len(projected), -1) @ induced
+    return readings.reshape(-1, N_SAMPLES), moments.reshape(-1, N_SAMPLES)

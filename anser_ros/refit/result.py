@@ -1,0 +1,152 @@
+"""What the live refit is told, and what it reports."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import FitError
+from anser_ros.field.model import FieldModel
+from anser_ros.refit import health
+from anser_ros.refit.health import ReferenceHealth
+from anser_ros.refit.references import SurveyError
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+FROZEN = 'frozen'
+REFIT = 'refit'
+FEW_REFERENCES = 'few_references'
+POOR_FIT = 'poor_fit'
+STATES = (FROZEN, REFIT, FEW_REFERENCES, POOR_FIT)
+"""No change; the model follows one; too few references to know; a change that nothing explains."""
+
+
+@dataclass(frozen=True)
+class RefitSettings:
+    """What the refit may assume; nothing here belongs to a particular board or metal.
+
+    Attributes
+    ----------
+    flux_noise_t : float
+        Noise of a phasor component to start from, T; it is then measured.
+    survey : SurveyError
+        How well the references' places, axes and gains are known.
+    drift : float
+        Standard deviation of an emitter's relative strength against its measured current.
+    min_references : int
+        Coils below which the calibrated model is kept.
+    average_frames : int
+        Most frames that readings are averaged over while they don't change.
+    persistence : float
+        Probability that the hypothesis of one frame still holds in the next.
+    hold_frames : int
+        Frames that a coil which was left out must agree for before it is used again.
+    modes : int
+        Rank of the uncertainty that is handed on with the model.
+    seed : int
+        Of the draws that the uncertainty is made from.
+    """
+
+    flux_noise_t: float = 60e-12
+    survey: SurveyError = field(default_factory=SurveyError)
+    drift: float = 0.003
+    min_references: int = 4
+    average_frames: int = 5
+    persistence: float = 0.98
+    hold_frames: int = 25
+    modes: int = 12
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        for name in ('flux_noise_t', 'min_references', 'average_frames', 'hold_frames'):
+            if not getattr(self, name) > 0:
+                raise FitError(f'refit: {name} must be positive, got {getattr(self, name)}')
+        if not 0.0 < self.persistence < 1.0 or self.drift < 0.0 or self.modes < 1:
+            raise FitError('refit: persistence must be in (0, 1), drift >= 0 and modes >= 1')
+
+
+@dataclass(frozen=True)
+class Metal:
+    """Where the change comes from, as the most likely cloud has it.
+
+    Attributes
+    ----------
+    positions : ndarray, shape (M, 3)
+        m, frame fg.
+    polarisability : ndarray, shape (M,), complex
+        A m^2 / T.
+    volumes : ndarray, shape (M,)
+        Volume that each source stands for, m^3.
+    centroid : ndarray, shape (3,)
+        Mean of the space, weighted by the squared magnitude of the polarisability's density. It
+        leans towards the part of the metal that the emitters reach best.
+    standoff_m : float
+        The cloud's distance from the board.
+    """
+
+    positions: Array
+    polarisability: ComplexArray
+    volumes: Array
+    centroid: Array
+    standoff_m: float
+
+
+@dataclass(frozen=True)
+class RefitResult:
+    """What one frame of the references gave.
+
+    Attributes
+    ----------
+    stamp_ns : int
+    model : FieldModel
+        The model in force; the calibrated one itself while nothing has changed.
+    state : str
+        One of `STATES`.
+    changed : bool
+        Whether the model is another one than after the frame before.
+    judge : callable
+        Works out `references`.
+    log_odds : float
+        Natural logarithm of the odds that something has changed.
+    weights : mapping of str to float
+        Probability of every cloud, and of ``nothing``.
+    noise_t : float
+        Measured noise of the references' phasor components, T.
+    drift : ndarray, shape (K,), complex
+        Relative change of each emitter's strength; where nothing else changes, zero unless it is
+        significant.
+    reason : str
+        Why the state is what it is.
+    find : callable, optional
+        Works out `metal`.
+    """
+
+    stamp_ns: int
+    model: FieldModel
+    state: str
+    changed: bool
+    judge: Callable[[], tuple[ReferenceHealth, ...]] = field(repr=False)
+    log_odds: float
+    weights: dict[str, float]
+    noise_t: float
+    drift: ComplexArray
+    reason: str = ''
+    find: Callable[[], Metal | None] | None = field(default=None, repr=False)
+
+    @cached_property
+    def references(self) -> tuple[ReferenceHealth, ...]:
+        """Every reference's health, worked out when first asked for."""
+        return self.judge()
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """Names of the references that took no part."""
+        return tuple(r.name for r in self.references if r.state != health.OK)
+
+    @cached_property
+    def metal(self) -> Metal | None:
+        """The sources found, worked out when first asked for; None without a change."""
+        return self.find() if self.find is not None else None

@@ -1,0 +1,71 @@
+"""The few compact bodies that are full hypotheses at the moment, chosen frame by frame."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.refit.posterior import STRENGTHS, Bank
+from anser_ros.refit.search import BodySearch
+from anser_ros.refit.tables import RefitTables
+
+Array = NDArray[np.float64]
+
+SLOTS = 3
+"""Compact bodies that are full hypotheses at a time."""
+BETTER = 3.0
+"""Gain of approximate log evidence for which a body takes another's slot."""
+EVERY = 4
+"""Frames from one look at all bodies to the next."""
+PRESENT = 1.15
+"""Power of the readings over the noise's below which no body is looked for."""
+
+
+class BodySlots:
+    """Fills the slots of a bank with the bodies that the readings speak for.
+
+    Parameters
+    ----------
+    bank : Bank
+        Its last `SLOTS` hypotheses are slots.
+    tables : RefitTables
+    """
+
+    def __init__(self, bank: Bank, tables: RefitTables) -> None:
+        self._bank, self._tables = bank, tables
+        self._first = len(bank.priors) - SLOTS + 1
+        self._search = BodySearch(tables.factors, bank.rows, bank.whitening, STRENGTHS[::2])
+        self._bodies: list[int] = []
+        self._wait = 0
+
+    def clear(self) -> None:
+        """Empty the slots."""
+        self._bodies, self._wait = [], 0
+        for slot in range(SLOTS):
+            self._bank.vacate(self._first + slot)
+
+    def fill(self, readings: Array, noise: float) -> None:
+        """Take in one frame; now and then, one body gives way to a better one.
+
+        Parameters
+        ----------
+        readings : ndarray, shape (n, 2)
+            Change since the baseline in nominal noise deviations, real and imaginary part.
+        noise : float
+            Noise in units of the nominal one.
+        """
+        if float((readings**2).mean()) < PRESENT * noise**2:
+            return
+        self._wait -= 1
+        if self._wait > 0:
+            return
+        self._wait = EVERY
+        scores = self._search.scores(readings, noise)
+        order = np.argsort(-scores, kind='stable').tolist()
+        while len(self._bodies) < SLOTS:
+            body = next(b for b in order if b not in self._bodies)
+            self._bank.occupy(self._first + len(self._bodies), self._tables.body_prior(body))
+            self._bodies.append(body)
+        best = next(b for b in order if b not in self._bodies)
+        worst = min(range(SLOTS), key=lambda slot: float(scores[self._bodies[slot]]))
+        if scores[best] > scores[self._bodies[worst]] + BETTER:
+            self._bank.occupy(self._first + worst, self._tables.body_prior(best))
+            self._bodies[worst] = best

@@ -1,0 +1,167 @@
+"""What a refit computes once: the driving field, the layers and what every cloud predicts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.field.model import FieldModel
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.clouds import Cloud, Region, bodies, default_clouds
+from anser_ros.refit.excitation import Excitation, FieldFunction, excitation_for
+from anser_ros.refit.layer import (
+    Layer,
+    body_layer,
+    bottom_layer,
+    box_layer,
+    pose_weight,
+)
+from anser_ros.refit.prior import (
+    BODY,
+    ORIENTED,
+    UPRIGHT,
+    CloudPrior,
+    Response,
+    build_prior,
+)
+from anser_ros.refit.result import RefitSettings
+from anser_ros.refit.search import COARSE, body_factor
+
+Array = NDArray[np.float64]
+Hypothesis = tuple[Cloud, Response, Layer]
+
+MOST_ORIENTED = 1000
+"""A cloud of more sources than this gets no tensors: they cost most where they matter least."""
+
+
+@dataclass(frozen=True)
+class RefitTables:
+    """The pieces.
+
+    Attributes
+    ----------
+    excitation : Excitation
+    region : Region
+    layers : tuple of Layer
+        Below the board, and around the volume.
+    hypotheses : tuple of (Cloud, Response, Layer)
+    priors : tuple of CloudPrior
+    frequencies_hz : tuple of float
+    bodies : tuple of Cloud
+        Compact bodies that may be put in as further hypotheses.
+    factors : tuple of ndarray
+        What `refit.search` needs of each.
+    references : SensorTable
+    settings : RefitSettings
+    weight : ndarray, shape (P,)
+        `pose_weight` of the region's samples.
+    """
+
+    excitation: Excitation
+    region: Region
+    layers: tuple[Layer, ...]
+    hypotheses: tuple[Hypothesis, ...]
+    priors: tuple[CloudPrior, ...]
+    frequencies_hz: tuple[float, ...]
+    bodies: tuple[Cloud, ...]
+    factors: tuple[NDArray[np.float32], ...]
+    references: SensorTable
+    settings: RefitSettings
+    weight: Array
+
+    def moved(self, references: SensorTable, settings: RefitSettings) -> 'RefitTables':
+        """The tables for references that are elsewhere."""
+        priors = _priors(
+            self.hypotheses, references, self.excitation, self.frequencies_hz, settings
+        )
+        factors = _factors(self.bodies, references, self.excitation)
+        return replace(self, priors=priors, factors=factors, references=references)
+
+    def body_prior(self, body: int) -> CloudPrior:
+        """The full hypothesis of a compact body; the same whenever it is asked for."""
+        cloud = self.bodies[body]
+        return build_prior(
+            cloud,
+            BODY,
+            body_layer(self.region, self.weight, cloud),
+            self.references,
+            self.excitation.field(cloud.positions),
+            np.array(self.frequencies_hz),
+            self.settings.survey,
+            np.random.default_rng([self.settings.seed, body]),
+        )
+
+
+def build_tables(
+    model: FieldModel,
+    references: SensorTable,
+    settings: RefitSettings,
+    drawing: FieldFunction | None,
+) -> RefitTables:
+    """Compute the tables; raises `FitError` as `excitation_for` does."""
+    excitation, region = excitation_for(model, drawing)
+    clouds = default_clouds(region)
+    bottom = bottom_layer(model, region, excitation, clouds[0].positions)
+    box = box_layer(region, excitation)
+    hypotheses = _hypotheses(clouds, bottom, box)
+    priors = _priors(hypotheses, references, excitation, model.frequencies_hz, settings)
+    around = bodies(region)
+    return RefitTables(
+        excitation,
+        region,
+        (bottom, box),
+        hypotheses,
+        priors,
+        model.frequencies_hz,
+        around,
+        _factors(around, references, excitation),
+        references,
+        settings,
+        pose_weight(region.samples(), excitation),
+    )
+
+
+def _factors(
+    around: Sequence[Cloud], references: SensorTable, excitation: Excitation
+) -> tuple[NDArray[np.float32], ...]:
+    places = np.concatenate([cloud.positions[:COARSE] for cloud in around])
+    fields = excitation.field(places).reshape(len(around), COARSE, -1, 3)
+    return tuple(
+        body_factor(cloud, references, field) for cloud, field in zip(around, fields, strict=True)
+    )
+
+
+def _hypotheses(clouds: Sequence[Cloud], bottom: Layer, box: Layer) -> tuple[Hypothesis, ...]:
+    """Every cloud with the responses that are worth their time."""
+    out: list[Hypothesis] = []
+    for cloud in clouds:
+        layer = box if cloud.overhead else bottom
+        plain = Response() if cloud.overhead else UPRIGHT
+        out.append((cloud, plain, layer))
+        if len(cloud.positions) <= MOST_ORIENTED:
+            out.append((cloud, ORIENTED, layer))
+    return tuple(out)
+
+
+def _priors(
+    hypotheses: Sequence[Hypothesis],
+    references: SensorTable,
+    excitation: Excitation,
+    frequencies_hz: tuple[float, ...],
+    settings: RefitSettings,
+) -> tuple[CloudPrior, ...]:
+    rng = np.random.default_rng(settings.seed)
+    return tuple(
+        build_prior(
+            cloud,
+            response,
+            layer,
+            references,
+            excitation.field(cloud.positions),
+            np.array(frequencies_hz),
+            settings.survey,
+            rng,
+        )
+        for cloud, response, layer in hypotheses
+    )

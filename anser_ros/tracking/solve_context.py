@@ -1,0 +1,228 @@
+"""A field model made ready for tracking: kernel layout, error model, cold-start grid."""
+
+import hashlib
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.field.model import FieldModel
+from anser_ros.physics.dipole import flux_basis
+from anser_ros.tracking.error_whitening import error_whitening, source_spacing
+from anser_ros.tracking.estimate import TrackerSettings
+from anser_ros.tracking.seed import SeedGrid, Volume, build_grid
+from anser_ros.tracking.solve import RealField
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+BOX_MARGIN_M = 0.1
+"""How far beyond the volume the solver may go, so that a tool there is said to be there."""
+GRID_TOLERANCE = 0.05
+"""Relative change of the field up to which a grid may go on serving as a source of starts."""
+
+
+class Starts:
+    """The cold start's grid in a field: made when it is needed, taken over where it still fits.
+
+    Parameters
+    ----------
+    volume : Volume
+    spacing_m : float
+        Of the grid, m.
+    before : Starts, optional
+        Of the model before. Its grid serves on while the field is nearly the same.
+    """
+
+    def __init__(self, volume: Volume, spacing_m: float, before: 'Starts | None' = None) -> None:
+        self._volume, self._spacing_m = volume, spacing_m
+        self._before = before
+        self._made: tuple[SeedGrid, Array] | None = None
+
+    def following(self) -> 'Starts':
+        """For the next model: with the last grid that was made."""
+        before = self._before if self._made is None else self
+        return Starts(self._volume, self._spacing_m, before)
+
+    def anew(self) -> 'Starts':
+        """For a field that has nothing in common with this one."""
+        return Starts(self._volume, self._spacing_m)
+
+    def landmarks(self, field: RealField) -> tuple[Array, Array]:
+        """Coupling (P, N) of the dipoles with a few points of the volume; field there, (P, 2K)."""
+        sides = [
+            np.linspace(a + 0.15 * (b - a), b - 0.15 * (b - a), 3)
+            for a, b in zip(self._volume.low, self._volume.high, strict=True)
+        ]
+        points = np.stack([side.ravel() for side in np.meshgrid(*sides, indexing='ij')], axis=1)
+        at, axes = np.repeat(points, 3, axis=0), np.tile(np.eye(3), (len(points), 1))
+        basis = flux_basis(at, axes, None, field.positions, field.directions)
+        return basis, basis @ field.moments
+
+    def grid(self, field: RealField, sigma: Array) -> SeedGrid:
+        """Grid of starts in the field."""
+        if self._made is None:
+            flux = self.landmarks(field)[1]
+            made = None if self._before is None else self._before._made
+            if made is not None and made[1].shape == flux.shape:
+                change = np.linalg.norm(flux - made[1], axis=1)
+                if (change <= GRID_TOLERANCE * np.linalg.norm(made[1], axis=1)).all():
+                    self._made = made
+            if self._made is None:
+                grid = build_grid(field, sigma, self._volume, self._spacing_m)
+                self._made = (grid, flux)
+            self._before = None
+        return self._made[0]
+
+
+@dataclass(frozen=True)
+class ErrorModes:
+    """A model's uncertainty, laid out for one product with sensors' coupling to its dipoles.
+
+    Attributes
+    ----------
+    given : ndarray, shape (R, N, K), complex
+        The model's own array that the rest was made from: a model that has the same array has the
+        same modes, and all that sensors derived from them stays good.
+    rows : ndarray of int, shape (M,)
+        The dipoles whose moments are uncertain.
+    moments : ndarray, shape (M, R' 2K)
+        Of the modes that are not zero, A m^2.
+    spacing : ndarray, shape (M,)
+        See `source_spacing`, m.
+    """
+
+    given: ComplexArray
+    rows: NDArray[np.int64]
+    moments: Array
+    spacing: Array
+
+    @classmethod
+    def of(
+        cls, given: ComplexArray | None, positions: Array, floor_m: float
+    ) -> 'ErrorModes | None':
+        """Lay out modes; None where there is no uncertainty.
+
+        Parameters
+        ----------
+        given : ndarray, shape (R, N, K), complex
+            A m^2.
+        positions : ndarray, shape (N, 3)
+            Of the dipoles, m.
+        floor_m : float
+            Height over which dipoles are in the room where tools may be, m.
+        """
+        if given is None:
+            return None
+        there = given != 0.0
+        some = given[there.any(axis=(1, 2))]
+        if not len(some):
+            return None
+        rows = np.flatnonzero(there.any(axis=(0, 2)))
+        real = np.ascontiguousarray(some[:, rows], dtype=np.complex128).view(np.float64)
+        moments = np.ascontiguousarray(real.swapaxes(0, 1).reshape(rows.size, -1))
+        return cls(given, rows, moments, source_spacing(positions[rows], floor_m))
+
+    def of_components(self, kept: NDArray[np.bool_]) -> 'ErrorModes':
+        """The modes' part in some of the 2K flux components."""
+        parts = self.moments.reshape(len(self.rows), -1, kept.size)[:, :, kept]
+        return replace(self, moments=np.ascontiguousarray(parts.reshape(len(self.rows), -1)))
+
+
+@dataclass(frozen=True)
+class SolveContext:
+    """What every solve of a frame shares.
+
+    Attributes
+    ----------
+    field : RealField
+    sigma : ndarray, shape (2K,)
+        Noise and the model's own unexplained part, T.
+    modes : ErrorModes or None
+    starts : Starts
+    low, high : ndarray, shape (3,)
+        Box of the solver, m.
+    model_id : str
+    """
+
+    field: RealField
+    sigma: Array
+    modes: ErrorModes | None
+    starts: Starts
+    low: Array
+    high: Array
+    model_id: str
+
+    @property
+    def grid(self) -> SeedGrid:
+        """Grid of the cold start."""
+        return self.starts.grid(self.field, self.sigma)
+
+    @cached_property
+    def relative_error(self) -> float:
+        """Typical model error by ``modes`` over the field's strength."""
+        if self.modes is None:
+            return 0.0
+        basis, flux = self.starts.landmarks(self.field)
+        error = basis[:, self.modes.rows] @ self.modes.moments
+        error = error.reshape(len(flux), -1, flux.shape[1])
+        power = (error**2).sum(axis=1).mean(axis=1) / (flux**2).mean(axis=1)
+        return float(np.sqrt(np.median(power)))
+
+    @cached_property
+    def _uncertain(self) -> Array:
+        """The dipoles whose moments are uncertain, as in `RealField.columns`."""
+        assert self.modes is not None
+        return self.field.columns.take(self.modes.rows, axis=1)
+
+    def error_whitening(
+        self, points: Array, axes: Array, lengths: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """What the model's error does to coils at some poses; see `error_whitening`."""
+        modes = self.modes
+        assert modes is not None
+        return error_whitening(
+            points, axes, lengths, self._uncertain, modes.spacing, modes.moments, self.sigma
+        )
+
+
+def model_digest(model: FieldModel) -> str:
+    """Eight hexadecimal digits that tell models apart."""
+    digest = hashlib.blake2b(digest_size=4)
+    for array in (model.positions, model.directions, model.moments):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def build_context(
+    model: FieldModel,
+    settings: TrackerSettings,
+    previous: SolveContext | None = None,
+    model_id: str | None = None,
+) -> SolveContext:
+    """Make a model ready; what depends on things that have not changed is kept.
+
+    Raises
+    ------
+    TrackingError
+        When the model's arrays can't be used.
+    """
+    field = RealField.of(model.positions, model.directions, model.moments)
+    variance = settings.flux_noise_t**2 + float(model.flux_error_t) ** 2
+    sigma = np.full(field.moments.shape[1], math.sqrt(variance))
+    if previous is not None and np.array_equal(sigma, previous.sigma):
+        sigma = previous.sigma
+    modes = None if previous is None else previous.modes
+    if modes is None or modes.given is not model.modes:
+        floor_m = 0.5 * settings.volume.low[2]
+        modes = ErrorModes.of(model.modes, field.positions, floor_m)
+    name = model_digest(model) if model_id is None else model_id
+    low, high = settings.volume.grown(BOX_MARGIN_M)
+    starts = Starts(settings.volume, settings.grid_spacing_m)
+    if previous is None:
+        starts.grid(field, sigma)  # the first frame needs it
+    else:
+        starts = previous.starts.following()
+    return SolveContext(field, sigma, modes, starts, low, high, name)
