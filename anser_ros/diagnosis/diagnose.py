@@ -1,5 +1,6 @@
 """The whole loop: residual, effect, correction, and the error before and after on unseen data."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -106,13 +107,55 @@ class Diagnosis:
     terms: tuple[Term, ...] = field(default_factory=tuple)
 
 
+@dataclass(frozen=True)
+class Screened:
+    """A problem as the search starts with it.
+
+    Attributes
+    ----------
+    known : tuple of Term
+        Faults of the wiring, which are plain before any search.
+    whole : Problem
+        All frames, without the channels that hear nothing.
+    start : Problem
+        The same without values that stand out already now.
+    """
+
+    known: tuple[Term, ...]
+    whole: Problem
+    start: Problem
+
+    def training(self, frames: int) -> Problem:
+        """About so many frames a tool of the blocks that effects are chosen and fitted on."""
+        return _thinned(self.start.in_blocks(train_blocks()), frames)
+
+
+@dataclass(frozen=True)
+class Confirmed:
+    """The effects that are the same in all parts of the data.
+
+    Attributes
+    ----------
+    fit : Fit
+        All of them together.
+    cleaned : Problem
+        All frames, without values that stand out with these effects in force.
+    refused : tuple of (Term, Confirmation)
+        Effects that explained something but were not confirmed.
+    """
+
+    fit: Fit
+    cleaned: Problem
+    refused: tuple[tuple[Term, Confirmation], ...]
+
+
 def diagnose(
     problem: Problem,
     model: FieldModel,
     settings: SearchSettings | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
-    """Find what a model lacks.
+    """Find what a model lacks: screen, search, confirm and conclude.
 
     Parameters
     ----------
@@ -125,24 +168,42 @@ def diagnose(
         Told in words what goes on.
     """
     how, say = settings or SearchSettings(), progress or (lambda text: None)
-    blocks = train_blocks()
-    known, problem = _wired(problem)
-    whole = problem
-    problem = clean_start(problem) if not known else problem
-    training = problem.in_blocks(blocks)
-    search = search_effects(_thinned(training, SEARCH_FRAMES), blocks, known, how, say)
+    screened = screen(problem)
+    search = search_screened(screened, how, say)
     say('joint fit')
-    fit, refused = _confirmed(_thinned(training, FINAL_FRAMES), search, blocks, how)
+    confirmed = confirm(screened, search, how)
+    return conclude(screened, search, confirmed, model)
+
+
+def screen(problem: Problem) -> Screened:
+    """Name the faults of the wiring, and leave out dead channels and values that stand out."""
+    known = wiring_faults(_thinned(problem, WIRING_FRAMES))
+    whole = _without_dead(problem, known)
+    return Screened(tuple(known), whole, whole if known else clean_start(whole))
+
+
+def search_screened(
+    screened: Screened, how: SearchSettings, progress: Progress | None = None
+) -> Search:
+    """Search for effects on a part of the training blocks' frames."""
+    say = progress or (lambda text: None)
+    training = screened.training(SEARCH_FRAMES)
+    return search_effects(training, train_blocks(), list(screened.known), how, say)
+
+
+def confirm(screened: Screened, search: Search, how: SearchSettings) -> Confirmed:
+    """Fit what the search found on more frames, and keep what is the same in all parts."""
+    blocks, whole = train_blocks(), screened.whole
+    fit, refused = _settled(screened.training(FINAL_FRAMES), search, blocks, how)
     cleaned = without_outliers(whole, evaluate(whole, fit.terms))
-    if outlying_share(problem, cleaned)[0] > FEWEST_OUTLIERS:
+    if outlying_share(screened.start, cleaned)[0] > FEWEST_OUTLIERS:
         thinned = _thinned(cleaned.in_blocks(blocks), FINAL_FRAMES)
         fit = settled(thinned, fit.terms, blocks, how.folds, how.iterations, FINE)
-    return _concluded(whole, cleaned, fit, search, refused, model)
+    return Confirmed(fit, cleaned, refused)
 
 
-def _wired(problem: Problem) -> tuple[list[Term], Problem]:
-    """Faults of the wiring, and the problem without channels that hear nothing."""
-    known = wiring_faults(_thinned(problem, WIRING_FRAMES))
+def _without_dead(problem: Problem, known: Sequence[Term]) -> Problem:
+    """The problem without the channels that hear nothing."""
     dead = [
         c for term in known if term.effect.name == 'dead_channel' for c in term.site['channels']
     ]
@@ -155,7 +216,7 @@ def _wired(problem: Problem) -> tuple[list[Term], Problem]:
         heard = ~np.isin(references.readings.sensors.channel, dead)
         valid = references.readings.valid & heard
         references = replace(references, readings=replace(references.readings, valid=valid))
-    return known, replace(problem, good=good, references=references)
+    return replace(problem, good=good, references=references)
 
 
 def _thinned(problem: Problem, frames: int) -> Problem:
@@ -166,7 +227,7 @@ def _thinned(problem: Problem, frames: int) -> Problem:
     return problem.frames(keep, np.arange(problem.reference_blocks.size))
 
 
-def _confirmed(
+def _settled(
     problem: Problem, search: Search, blocks: NDArray[np.int64], how: SearchSettings
 ) -> tuple[Fit, tuple[tuple[Term, Confirmation], ...]]:
     """The joint fit of the effects that are the same in all parts of the data."""
@@ -210,14 +271,11 @@ def raw_rms(state: State) -> float:
     return float(np.sqrt(squares / max(count, 1)))
 
 
-def _concluded(
-    whole: Problem,
-    cleaned: Problem,
-    fit: Fit,
-    search: Search,
-    refused: tuple[tuple[Term, Confirmation], ...],
-    model: FieldModel,
+def conclude(
+    screened: Screened, search: Search, confirmed: Confirmed, model: FieldModel
 ) -> Diagnosis:
+    """Judge on the held-out blocks what the effects explain and what they leave."""
+    whole, cleaned, fit = screened.whole, confirmed.cleaned, confirmed.fit
     unseen = cleaned.in_blocks(test_blocks())
     before, after = evaluate(unseen, ()), evaluate(unseen, fit.terms)
     white = whiteness(after)
@@ -256,7 +314,7 @@ def _concluded(
         tests_after=tests,
         model=corrected_model(model, fit.terms, records, cleaned.fields),
         search=search,
-        refused=refused,
+        refused=confirmed.refused,
         before=before,
         after=after,
         terms=fit.terms,
