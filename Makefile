@@ -6,14 +6,17 @@ READY = $(VENV)/.installed-newest
 READY_OLDEST = $(VENV_OLDEST)/.installed-oldest
 # One thread each: two cores are shared with the processes under test.
 ENVIRONMENT = OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1
+# Two processes run the tests, as test/conftest.py shares them out. ARGS='-n 0' has one alone.
+WORKERS = -n 2 --dist loadgroup --no-loadscope-reorder
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-oldest lint format types parameters bench paper loop measured clean
+.PHONY: help demo test test-quick test-oldest lint format types parameters bench paper loop measured clean
 
 help:
 	@echo 'make demo [DURATION=30]  watch a simulated tool being tracked'
 	@echo 'make test                lint, types, tests'
+	@echo 'make test-quick          the same without the tests that start nodes or processes'
 	@echo 'make test-oldest         tests with the oldest dependencies (needs Python 3.12)'
 	@echo 'make bench               speed and accuracy beside rivals, writes bench.json'
 	@echo 'make paper|loop|measured the studies; options with ARGS=...'
@@ -46,11 +49,20 @@ types: $(READY)
 parameters: $(READY)
 	@$(VENV)/bin/python .ci/write_parameters.py
 
-test: lint types
-	$(ENVIRONMENT) $(VENV)/bin/python -m pytest $(ARGS)
+# The types are checked beside the tests. Their words come when the tests have had the last line,
+# and only if something is wrong.
+test: lint
+	@types=$$(mktemp); trap 'rm -f $$types' EXIT; \
+	$(MAKE) --no-print-directory types >$$types 2>&1 & checked=$$!; \
+	$(ENVIRONMENT) $(VENV)/bin/python -m pytest $(WORKERS) $(QUICK) $(ARGS); passed=$$?; \
+	wait $$checked || { cat $$types; exit 1; }; \
+	exit $$passed
+
+test-quick: QUICK = -m 'not processes'
+test-quick: test
 
 test-oldest: $(READY_OLDEST)
-	$(ENVIRONMENT) $(VENV_OLDEST)/bin/python -m pytest $(ARGS)
+	$(ENVIRONMENT) $(VENV_OLDEST)/bin/python -m pytest $(WORKERS) $(ARGS)
 
 bench: $(READY)
 	@$(ENVIRONMENT) $(VENV)/bin/python test/bench/run.py $(ARGS)

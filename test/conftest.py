@@ -1,4 +1,9 @@
-"""A ROS graph of its own for every test, and nothing left running after it."""
+"""A ROS graph of its own for every test, and nothing left running after it.
+
+A test that takes a ROS domain starts nodes: it is marked ``processes``, and so is by hand every
+other test that starts one. A test without the mark that starts a process, or a node in its own
+process, fails: what `make test-quick` leaves out is exactly what is marked.
+"""
 
 import contextlib
 import importlib.util
@@ -15,6 +20,8 @@ from typing import Any
 # All of this must stand in the environment before the first ROS module is imported.
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
+# No number, so that no node starts before its test has taken a domain.
+os.environ['ROS_DOMAIN_ID'] = 'none taken'
 os.environ.setdefault('ROS_LOG_DIR', tempfile.mkdtemp(prefix='anser_ros_log_'))
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 os.environ.setdefault('NUMBA_NUM_THREADS', '1')
@@ -27,6 +34,49 @@ from domain_pool import DomainPool
 REPO = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get('ANSER_SHARED', REPO.parent / 'shared'))
 STOP_TIMEOUT_S = 5.0
+
+
+# What was started since the last test ended; Python tells of each at the moment of its start.
+started: list[str] = []
+
+
+def _note_start(event: str, arguments: tuple[Any, ...]) -> None:
+    if event in ('subprocess.Popen', 'os.fork', 'os.posix_spawn'):
+        started.append(f'{event} {arguments[:2]}')
+
+
+sys.addaudithook(_note_start)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that take a ROS domain, before `-m` chooses among them, and share them out.
+
+    Of two workers one takes the tests with processes, which mostly wait, and the other the files
+    that calculate: so only one set of nodes runs at a time, and a file's fixtures are made once.
+    """
+    for item in items:
+        if 'domain' in getattr(item, 'fixturenames', ()):
+            item.add_marker('processes')
+    if 'PYTEST_XDIST_WORKER' in os.environ:
+        items.sort(key=lambda item: not _has_processes(item))
+        for item in items:
+            group = 'processes' if _has_processes(item) else item.path.stem
+            item.add_marker(pytest.mark.xdist_group(group))
+
+
+def _has_processes(item: pytest.Item) -> bool:
+    return item.get_closest_marker('processes') is not None
+
+
+@pytest.fixture(autouse=True)
+def _starts_are_marked(request: pytest.FixtureRequest) -> Iterator[None]:
+    yield
+    seen = started.copy()
+    started.clear()
+    assert _has_processes(request.node) or not seen, (
+        f'starts a process without @pytest.mark.processes: {seen}'
+    )
 
 
 @pytest.fixture(scope='session')

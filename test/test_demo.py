@@ -39,6 +39,7 @@ def running(mark):
     return found
 
 
+@pytest.mark.processes
 class TestSupervisor:
     def test_ends_all_in_time_even_the_stubborn_and_their_children(self, tmp_path):
         mark = f'mark_{os.getpid()}'

@@ -29,6 +29,7 @@ def test_a_run_begins_anew_with_the_domains_that_it_had_longest_ago(tmp_path):
     assert [pool.take() for _ in range(5)] == [*first, *first[:2]]
 
 
+@pytest.mark.processes
 def test_a_killed_run_gives_its_domains_back(tmp_path):
     script = (
         'import sys, time; from pathlib import Path; from domain_pool import DomainPool\n'

@@ -51,6 +51,7 @@ def overlay(installed, domain):
     }
 
 
+@pytest.mark.processes
 def test_the_ament_index_knows_the_package(installed, monkeypatch):
     from ament_index_python.packages import get_package_prefix, get_package_share_directory
 
@@ -64,6 +65,7 @@ def test_the_ament_index_knows_the_package(installed, monkeypatch):
         assert files == {path.name for path in found.glob('*')} if files else not found.exists()
 
 
+@pytest.mark.processes
 def test_every_command_is_an_executable(installed):
     executables = {path.name for path in (installed / 'lib' / 'anser_ros').iterdir()}
     assert executables == {'anser', *node_names(), *verb_names()}
@@ -186,6 +188,7 @@ class TestConsole:
         assert cli.main(['--version']) == 0
         assert 'anser_ros' in capsys.readouterr().out
 
+    @pytest.mark.processes
     def test_a_reader_that_leaves_early_is_no_error(self):
         """`anser --help | head -1` ends in peace."""
         reading, writing = os.pipe()
