@@ -1,4 +1,4 @@
-"""Plain dipoles with a column of moments for each emitter: what a field is made of."""
+"""Sets of magnetic dipoles with one moment for each emitter, from which fields are summed."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,15 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Dipoles:
-    """N dipoles: positions (m) and unit directions (N, 3), moments (N, K) in A m^2, frame fg."""
+    """A set of N dipoles with one moment for each of K emitters.
+
+    Attributes
+    ----------
+    positions, directions : ndarray, shape (N, 3)
+        Positions (m) and unit directions, frame fg.
+    moments : ndarray, shape (N, K), complex
+        Moments along the directions at each emitter's nominal current, A m^2.
+    """
 
     positions: Array
     directions: Array
@@ -21,13 +29,21 @@ class Dipoles:
 
     @staticmethod
     def none(emitters: int) -> 'Dipoles':
-        """No dipole at all."""
+        """Return the empty set for a number of emitters."""
         empty = np.zeros((0, 3))
         return Dipoles(empty, empty, np.zeros((0, emitters), dtype=complex))
 
     @staticmethod
     def vectors(points: Array, moments: ComplexArray) -> 'Dipoles':
-        """Dipoles with vector moments: points (M, 3), moments (M, 3, K); three rows a point."""
+        """Return dipoles with vector moments, as three rows (x, y, z) a point.
+
+        Parameters
+        ----------
+        points : ndarray, shape (M, 3)
+            Positions, m, frame fg.
+        moments : ndarray, shape (M, 3, K), complex
+            Moment vectors, A m^2, frame fg.
+        """
         count = points.shape[0]
         return Dipoles(
             np.repeat(points, 3, axis=0),
@@ -36,7 +52,7 @@ class Dipoles:
         )
 
     def joined(self, other: 'Dipoles') -> 'Dipoles':
-        """These dipoles and the others."""
+        """Return the union of these dipoles and the others."""
         return Dipoles(
             np.concatenate([self.positions, other.positions]),
             np.concatenate([self.directions, other.directions]),
@@ -44,11 +60,24 @@ class Dipoles:
         )
 
     def field(self, points: Array) -> ComplexArray:
-        """Field of each emitter at each point, shape (P, 3, K), T."""
+        """Return each emitter's field, shape (P, 3, K), T, at points, shape (P, 3), m."""
         basis = field_basis(points, self.positions, self.directions)
         return np.asarray(np.einsum('pnc,nk->pck', basis, self.moments, optimize=True))
 
     def flux(self, points: Array, axes: Array, lengths: Array | None) -> ComplexArray:
-        """Flux density along each sensor's axis, shape (P, K), T."""
+        """Return each emitter's flux density along sensors' axes.
+
+        Parameters
+        ----------
+        points, axes : ndarray, shape (P, 3)
+            Sensor centres (m) and unit axes, frame fg.
+        lengths : ndarray, shape (P,), or None
+            Coil lengths, m; None for point sensors.
+
+        Returns
+        -------
+        ndarray, shape (P, K), complex
+            Flux density, T.
+        """
         basis = flux_basis(points, axes, lengths, self.positions, self.directions)
         return np.asarray(basis @ self.moments)

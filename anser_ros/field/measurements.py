@@ -1,4 +1,4 @@
-"""Measured fluxes of the sensors on one body, with the pose that another instrument gave it."""
+"""Measured fluxes of the sensors on one body with the poses that another instrument gave it."""
 
 from dataclasses import dataclass, replace
 
@@ -14,27 +14,30 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Measurements:
-    """F frames of the S sensors on one body, K emitters.
+    """F frames of the S sensors on one body, with a flux for each of K emitters.
 
     Attributes
     ----------
     body : str
-        ``fg`` for reference sensors; their pose is the identity.
+        Name of the body; ``fg`` for reference sensors, whose pose is the identity.
     sensors : SensorTable
+        The sensors in the order of the second axis of the fluxes.
     time : ndarray, shape (F,)
-        s since the session's first stamp, on the flux clock.
+        Time since the session's first stamp on the clock of the fluxes, s.
     flux : ndarray, shape (F, S, K), complex
-        T; finite only where ``valid``.
+        Flux density along each sensor's axis, T; finite only where ``valid``.
     valid : ndarray of bool, shape (F, S)
         False where the value is missing, not finite or flagged.
     flags : ndarray of int, shape (F, S)
-        The flux messages' flag bits (saturated 1, stale 2, dropped samples 4).
+        Flag bits of the flux messages (saturated 1, stale 2, dropped samples 4).
     position : ndarray, shape (F, 3)
-        m, frame fg; NaN where ``has_pose`` is False.
+        Origin of the body, m, frame fg; NaN where ``has_pose`` is False.
     rotation : ndarray, shape (F, 3, 3)
+        Rotation matrix from the body's frame to fg.
     has_pose : ndarray of bool, shape (F,)
+        Whether the other instrument has a pose at the frame's time.
     track : PoseTrack or None
-        The pose stream itself, on the same time axis, for effects that shift the clocks.
+        The stream of poses on the same time axis, for effects that shift the clocks.
     """
 
     body: str
@@ -54,7 +57,7 @@ class Measurements:
         return np.asarray(self.valid & self.has_pose[:, None])
 
     def frames(self, rows: NDArray[np.generic]) -> 'Measurements':
-        """The frames named by index or mask."""
+        """Return the measurements of the frames given by index or mask."""
         return replace(
             self,
             time=self.time[rows],
@@ -67,7 +70,7 @@ class Measurements:
         )
 
     def sensors_only(self, rows: NDArray[np.generic]) -> 'Measurements':
-        """The sensors named by index or mask."""
+        """Return the measurements of the sensors given by index or mask."""
         return replace(
             self,
             sensors=self.sensors.select(rows),
@@ -77,5 +80,5 @@ class Measurements:
         )
 
     def placed(self) -> tuple[Array, Array]:
-        """Sensor centres and axes in fg, each of shape (F, S, 3)."""
+        """Return the sensors' centres (m) and axes in fg, each of shape (F, S, 3)."""
         return self.sensors.placed(self.position, self.rotation)

@@ -1,4 +1,4 @@
-"""The field model that everything shares: virtual dipoles with moments for each emitter."""
+"""The field model that all rooms share, virtual dipoles with moments for each emitter."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -18,7 +18,19 @@ SCHEMA = 'anser_model/1'
 
 @dataclass(frozen=True)
 class EffectRecord:
-    """One effect that a model corrects: its name and its parameters in SI units."""
+    """One effect that a model corrects.
+
+    Attributes
+    ----------
+    name : str
+        Name of the effect.
+    parameters : mapping
+        Its parameters in SI units unless their names have another unit.
+    uncertainty : mapping
+        Standard deviations of the parameters, under the same keys.
+    evidence : mapping
+        Figures that speak for the effect.
+    """
 
     name: str
     parameters: Mapping[str, Any]
@@ -28,27 +40,35 @@ class EffectRecord:
 
 @dataclass(frozen=True)
 class FieldModel:
-    """Dipoles that stand for the field generator and everything that bends its field.
+    """Virtual dipoles that represent the field generator and all that distorts its field.
 
     Attributes
     ----------
     positions, directions : ndarray, shape (N, 3)
-        m and unit vectors, frame fg. A dipole with three free components takes three rows.
+        Positions (m) and unit vectors, frame fg. A dipole whose three components are free takes
+        three rows.
     moments : ndarray, shape (N, K), complex
-        A m^2 at each emitter's nominal current.
+        Moments at each emitter's nominal current, A m^2.
     emitters : tuple of str, length K
+        Names of the emitters.
     frequencies_hz : tuple of float, length K
+        Their drive frequencies, Hz.
     flux_error_t : float
-        Standard deviation, T a phasor component, of what the model itself leaves unexplained
-        in the volume that it was fitted in (held-out, with noise and pose jitter taken off).
+        Standard deviation of the model's own error, T a phasor component, in the volume that it
+        was fitted in (from held-out data, with noise and pose jitter subtracted).
     modes : ndarray, shape (R, N, K), complex, or None
-        Low-rank factor of the moments' covariance: the field's uncertainty is the sum of the
-        squares of the R fields that these moments make (both parts of a mode vary together).
+        Low-rank factor of the moments' covariance. The variance of the field is the sum of the
+        squares of the R fields of these moments; real and imaginary part of a mode vary together.
     effects : tuple of EffectRecord
         Corrections of measured fluxes, sensors or the optical frame that belong to this model.
         Effects on the field itself are already in the dipoles.
     provenance : mapping
-        Where the model comes from, with its held-out error.
+        How the model was made, with its held-out error.
+
+    Raises
+    ------
+    ModelFileError
+        When the shapes do not fit together or there is no dipole.
     """
 
     positions: Array
@@ -77,7 +97,20 @@ class FieldModel:
             raise ModelFileError(f'model: modes {self.modes.shape} must be (R, {n}, {k})')
 
     def flux(self, points: Array, axes: Array, lengths: Array | None = None) -> ComplexArray:
-        """Flux of each sensor and emitter, T: sensors of shape (..., 3) give (..., K)."""
+        """Return the flux that each sensor has of each emitter.
+
+        Parameters
+        ----------
+        points, axes : ndarray, shape (..., 3)
+            Sensor centres (m) and unit axes, frame fg.
+        lengths : ndarray, shape broadcast to (...), or None
+            Coil lengths, m; None for point sensors.
+
+        Returns
+        -------
+        ndarray, shape (..., K), complex
+            Flux density along the axes, T.
+        """
         flat = points.reshape(-1, 3)
         spans = None if lengths is None else np.broadcast_to(lengths, points.shape[:-1]).ravel()
         basis = flux_basis(flat, axes.reshape(-1, 3), spans, self.positions, self.directions)
@@ -86,7 +119,17 @@ class FieldModel:
     def with_dipoles(
         self, positions: Array, directions: Array, moments: ComplexArray
     ) -> 'FieldModel':
-        """This model with further dipoles added (metal, for example); uncertainty modes keep."""
+        """Return this model with further dipoles, such as those of metal, added.
+
+        The modes of uncertainty stay the same: the added dipoles count as certain.
+
+        Parameters
+        ----------
+        positions, directions : ndarray, shape (M, 3)
+            Positions (m) and unit directions, frame fg.
+        moments : ndarray, shape (M, K), complex
+            Moments, A m^2.
+        """
         modes = self.modes
         if modes is not None:
             pad = np.zeros((modes.shape[0], positions.shape[0], modes.shape[2]), dtype=complex)
@@ -101,7 +144,7 @@ class FieldModel:
 
 
 def to_document(model: FieldModel) -> dict[str, Any]:
-    """The model as plain data, ready for a text file."""
+    """Return the model as plain lists and mappings, ready to be written to a text file."""
     table = np.concatenate(
         [
             model.positions,
@@ -169,7 +212,13 @@ def _effect(item: Any) -> EffectRecord:
 
 
 def from_document(document: Any) -> FieldModel:
-    """The model in a document; raises `ModelFileError` naming the rule that is broken."""
+    """Return the field model that a document of plain data holds.
+
+    Raises
+    ------
+    ModelFileError
+        With the rule that the document breaks.
+    """
     if not isinstance(document, dict) or document.get('schema') != SCHEMA:
         got = document.get('schema') if isinstance(document, dict) else type(document).__name__
         raise ModelFileError(f'model: schema must be {SCHEMA!r}, got {got!r}')

@@ -1,10 +1,10 @@
-"""The nominal field model: a drawn board's Biot-Savart field, expressed by dipoles.
+"""The nominal field model, which expresses the Biot-Savart field of a drawn board by dipoles.
 
-A flat coil's field is that of a magnetised sheet over its area. A few vertical dipoles on that
-area stand for the sheet, as quadrature nodes do for an integral, and two flat ones in the middle
-for the feed-throughs and for the distance of the layers. It needs no measurement, and it is as
-good as the drawing: a real board's copper lies fractions of a millimetre elsewhere and its gains
-differ, so the model carries that uncertainty as modes.
+A flat coil has the field of a magnetised sheet over its area. A few vertical dipoles on that area
+represent the sheet, as the nodes of a quadrature represent an integral; two horizontal dipoles in
+the middle represent the feed-throughs and the distance between the layers. The model needs no
+measurement, and it is as good as the drawing: a real board's copper lies fractions of a millimetre
+elsewhere and the gains of its coils differ. The model carries this uncertainty as modes.
 """
 
 from dataclasses import dataclass
@@ -21,26 +21,40 @@ from anser_ros.physics.tracks import loop_field
 Array = NDArray[np.float64]
 
 LOWEST_M = 0.06
+"""Least height above the copper, m, at which the dipoles have to be right. Closer to the tracks a
+few dipoles cannot follow the field; a smaller value makes the fit coarser everywhere else."""
 FIT_REACH_M = 0.5
-"""The dipoles hold from `LOWEST_M` above the copper on, m, and are fitted as far as this."""
+"""Greatest height, m, of the points that the dipoles are fitted at. Beyond it the field is that
+of the coil's total moment, which the fit has right by then."""
 FEWEST_NODES, MOST_NODES = 4, 9
+"""Vertical dipoles along a side of the coil: the first and the last number that are tried. More
+of them follow the field closer to the copper, and each costs time in tracking."""
 NODE_SPREADS = np.arange(0.6, 0.96, 0.02)
+"""Sizes of the dipoles' lattice that are tried, as a fraction of the coil's. The best is well
+inside the coil, as the outer nodes of a quadrature are, hence nothing up to 1."""
 GOOD_MISFIT = 1.5e-4
+"""Relative misfit (rms of the field vector's error over the field) at which no more dipoles are
+tried. It is far below the 2 % by which a coil's moment differs from its drawing (`Tolerances`)."""
 LARGEST_MISFIT = 1e-2
+"""Relative misfit beyond which the nominal model is refused: half of the tolerance of the gain,
+so that what a model misses is never larger than what the drawing does."""
 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Standard deviations of what a manufactured board differs in from its drawing.
+    """Standard deviations of the differences between a manufactured board and its drawing.
+
+    The defaults are assumptions, not measurements. Larger ones make reported uncertainties larger
+    and let references change the model more.
 
     Attributes
     ----------
     gain : float
-        Relative moment of each coil (turns, shape, current scale).
+        Relative error of each coil's moment (turns, shape, scale of the current).
     shift_m : float
-        Position of each coil along x, y and z, m.
+        Error of each coil's position along x, y and z, m.
     tilt_rad : float
-        Tilt of each coil about its own x and y, rad.
+        Tilt of each coil about its own x and y axes, rad.
     """
 
     gain: float = 0.02
@@ -50,7 +64,7 @@ class Tolerances:
 
 @dataclass(frozen=True)
 class _CoilDipoles:
-    """Dipoles (n, 3) that stand for one coil in its own frame, and how well they do."""
+    """The n dipoles that represent one coil in its own frame, with their relative misfit."""
 
     positions: Array
     directions: Array
@@ -60,7 +74,7 @@ class _CoilDipoles:
 
 
 def _spread_numbers(count: int, base: int) -> Array:
-    """Van der Corput's sequence: evenly spread numbers in (0, 1)."""
+    """Return van der Corput's sequence of a base: evenly spread numbers in (0, 1)."""
     out, index, part = np.zeros(count), np.arange(1, count + 1), 1.0 / base
     while index.any():
         out += part * (index % base)
@@ -69,7 +83,7 @@ def _spread_numbers(count: int, base: int) -> Array:
 
 
 def _points(shape: Array, count: int) -> Array:
-    """Points above a coil, denser near it, m, in its own frame."""
+    """Return points above a coil, denser near it, m, in the coil's frame."""
     top, half = shape[:, 2].max(), np.abs(shape[:, :2]).max()
     height = LOWEST_M * (FIT_REACH_M / LOWEST_M) ** _spread_numbers(count, 2)
     reach = 1.5 * half + height
@@ -103,7 +117,7 @@ def _nodes(shape: Array, count: int, spread: float) -> tuple[Array, Array]:
 
 
 def _coil_dipoles(shape: Array, current_a: float) -> _CoilDipoles:
-    """Fewest nodes, at their best spread, that reproduce a coil's field well."""
+    """Return the fewest nodes, at their best spread, that reproduce a coil's field well."""
     points = _points(shape, 1200)
     train, held = points[:600], points[600:]
     field, truth = loop_field(shape, train, current_a), loop_field(shape, held, current_a)
@@ -128,7 +142,7 @@ def _coil_dipoles(shape: Array, current_a: float) -> _CoilDipoles:
 
 
 def _changes(shape: Array, current_a: float, dipoles: _CoilDipoles, allowed: Tolerances) -> Array:
-    """Moments (6, n) of the field's change by each tolerance, in the coil's own frame."""
+    """Return moments (6, n) of the field's change by each tolerance, in the coil's frame."""
     points = _points(shape, 600)
     nominal = loop_field(shape, points, current_a)
     weight = 1.0 / np.linalg.norm(nominal, axis=1)
@@ -143,24 +157,25 @@ def _changes(shape: Array, current_a: float, dipoles: _CoilDipoles, allowed: Tol
 
 
 def nominal_model(board: Board, tolerances: Tolerances | None = None) -> FieldModel:
-    """Express a drawn board's field by dipoles.
+    """Express the field of a drawn board by dipoles.
 
     Parameters
     ----------
     board : Board
+        The board as drawn.
     tolerances : Tolerances, optional
         How far a real board may be from the drawing; they become the model's ``modes``.
 
     Returns
     -------
     FieldModel
-        Its provenance holds ``heldout_relative_rms`` and ``heldout_relative_max``: the misfit over
-        a coil's own field at points that took no part, from 6 cm above the copper on.
+        Its provenance holds ``heldout_relative_rms`` and ``heldout_relative_max``, the misfit
+        relative to a coil's field at points above `LOWEST_M` that took no part in the fit.
 
     Raises
     ------
     FitError
-        When the dipoles can't reproduce a coil's field to a hundredth.
+        When the dipoles miss the field of a coil by more than `LARGEST_MISFIT`.
     """
     coil = _coil_dipoles(board.shape, board.current_a)
     if not coil.misfit < LARGEST_MISFIT:

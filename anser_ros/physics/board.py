@@ -1,11 +1,11 @@
-"""Emitter boards: their geometry as data, turned into closed current paths.
+"""This module turns the geometry of an emitter board into closed current paths.
 
-How many coils there are, of which kind, and where is data. A *kind* is a rule that draws one coil
-around its own centre. Drawing another board means adding a rule to `KINDS`.
+The number of coils, their kind and their places are data. A *kind* is a function that draws one
+coil around its own centre; a new kind of board needs one more function in `KINDS`.
 
-``winding`` in the geometry says which way a positive current runs, seen from +z: ``ccw`` (moment
-along +z) or ``cw``. Printed spirals wind ``cw`` unless told otherwise, as the Anser board's do:
-its measured in-phase moments are negative; plain loops wind ``ccw``.
+The key ``winding`` of the geometry tells which way a positive current runs, seen from +z: ``ccw``
+(counter-clockwise, moment along +z) or ``cw``. Printed spirals are ``cw`` by default because the
+Anser board's are (its measured in-phase moments are negative); plain loops are ``ccw``.
 """
 
 import math
@@ -22,27 +22,31 @@ from anser_ros.physics.tracks import loop_moment, paths_field
 Array = NDArray[np.float64]
 
 MOST_TRACKS = 20_000
+"""Largest number of straight tracks of one coil. It only bounds the time that a mistyped setup
+can take: the Anser board's coil of 25 turns has 100 tracks."""
 _DIRECTIONS = ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0), (1.0, 0.0))
-"""Way of each track of a turn; the first one runs along +y at the right-hand side."""
+"""Direction (x, y) of the four tracks of a turn; the first runs along +y on the right side."""
 
 
 @dataclass(frozen=True)
 class Board:
-    """K emitter coils of one shape.
+    """A board of K emitter coils that all have the same shape.
 
     Attributes
     ----------
     names : tuple of str, length K
+        Names of the coils.
     frequencies_hz : tuple of float, length K
+        Drive frequencies, Hz.
     shape : ndarray, shape (M, 3)
-        Corners of one coil's closed path around its own centre, m; the last is joined to the
-        first.
+        Corners of one coil's closed path around its own centre, m; the last corner is joined to
+        the first.
     current_a : float
-        Nominal current times the turns that the path stands for, A.
+        Nominal current times the number of turns that the path stands for, A.
     centres : ndarray, shape (K, 3)
-        m, frame fg.
+        Coil centres, m, frame fg.
     rotations : ndarray, shape (K, 3, 3)
-        Each coil's own frame in fg.
+        Rotation matrices from each coil's own frame to fg.
     """
 
     names: tuple[str, ...]
@@ -54,16 +58,27 @@ class Board:
 
     @property
     def paths(self) -> tuple[Array, ...]:
-        """Every coil's corners, m, frame fg."""
+        """Corners of every coil's path, each of shape (M, 3), m, frame fg."""
         pairs = zip(self.rotations, self.centres, strict=True)
         return tuple(self.shape @ turn.T + centre for turn, centre in pairs)
 
     def field(self, points: NDArray[np.generic]) -> Array:
-        """Field (T) of every coil at its nominal current, shape (P, K, 3)."""
+        """Return the field of every coil at its nominal current.
+
+        Parameters
+        ----------
+        points : ndarray, shape (P, 3)
+            Where the field is wanted, m, frame fg.
+
+        Returns
+        -------
+        ndarray, shape (P, K, 3)
+            Flux density, T, frame fg.
+        """
         return paths_field(self.paths, points, np.full(len(self.names), self.current_a))
 
     def moments(self) -> Array:
-        """Magnetic moment of every coil, shape (K, 3), A m^2."""
+        """Return the magnetic moment of every coil, shape (K, 3), A m^2, frame fg."""
         return np.asarray(self.rotations @ loop_moment(self.shape, self.current_a))
 
 
@@ -88,30 +103,32 @@ def _whole(geometry: Mapping[str, Any], key: str, default: int) -> int:
 def spiral_path(
     side_x_m: float, side_y_m: float, pitch_m: float, turns: float, layers: int, thickness_m: float
 ) -> Array:
-    """Corners of a rectangular spiral that winds inwards and outwards on layer after layer.
+    """Return the corners of a rectangular spiral that winds inwards and outwards by turns.
+
+    The first layer winds inwards, the second outwards, and so on.
 
     Parameters
     ----------
     side_x_m, side_y_m : float
-        Outer sides, m, between track centres.
+        Outer sides between the centres of the tracks, m.
     pitch_m : float
-        Distance of neighbouring turns, m.
+        Distance between neighbouring turns, m.
     turns : float
-        Turns of all layers together; each layer gets an equal number of whole quarters.
+        Number of turns of all layers together; each layer gets the same number of quarter turns.
     layers : int
-        Evenly spread from z = 0 down to z = -thickness.
+        Number of copper layers, evenly spaced from z = 0 down to z = -thickness.
     thickness_m : float
-        m.
+        Distance from the top copper layer to the bottom one, m.
 
     Returns
     -------
     ndarray, shape (M, 3)
-        m, around the coil's centre.
+        Corners around the coil's centre, m.
 
     Raises
     ------
     SetupError
-        When the turns don't fit inside the sides, or there are too many.
+        When the turns do not fit inside the sides, or there are more than `MOST_TRACKS` tracks.
     """
     quarters = max(1, round(4 * turns / layers))
     if quarters * layers > MOST_TRACKS:
@@ -125,7 +142,7 @@ def spiral_path(
     drop = thickness_m / (layers - 1) if layers > 1 else 0.0
     corners: list[tuple[float, float, float]] = []
     for j, value in enumerate(insets):
-        # Track j runs along its own line; it begins where the line of the track before it crosses.
+        # Track j begins where its line crosses that of the track before it.
         before = insets[j - 1] if j else insets[0]
         x, y = _crossing(j, before, value, side_x_m, side_y_m)
         layer = j // quarters
@@ -139,22 +156,25 @@ def spiral_path(
 
 
 def _crossing(
-    track: int, before: float, own: float, side_x: float, side_y: float
+    track: int, before: float, inset: float, side_x: float, side_y: float
 ) -> tuple[float, float]:
-    """Where the lines of a track and of the one before it cross; insets in m."""
+    """Return x and y (m) at which a track's line crosses that of the track before it.
+
+    ``inset`` and ``before`` are the distances (m) of the two lines from the coil's outer sides.
+    """
     along_y = _DIRECTIONS[track % 4][0] == 0.0
     right = _DIRECTIONS[track % 4][1] - _DIRECTIONS[(track - 1) % 4][1] > 0
     if along_y:
-        x = 0.5 * side_x - own
+        x = 0.5 * side_x - inset
         y = 0.5 * side_y - before
         return (x, -y) if right else (-x, y)
     x = 0.5 * side_x - before
-    y = 0.5 * side_y - own
+    y = 0.5 * side_y - inset
     return (x, y) if _DIRECTIONS[track % 4][0] < 0 else (-x, -y)
 
 
 def _wound(path: Array, geometry: Mapping[str, Any], default: str) -> Array:
-    """The path in the winding's direction; it is drawn counter-clockwise."""
+    """Return a path that was drawn counter-clockwise in the direction of the winding."""
     winding = geometry.get('winding', default)
     if winding not in ('cw', 'ccw'):
         raise SetupError(f"emitter: winding must be 'cw' or 'ccw', got {winding!r}")
@@ -185,11 +205,12 @@ def _rectangular_loop(geometry: Mapping[str, Any]) -> tuple[Array, float]:
 
 
 def _circular_loop(geometry: Mapping[str, Any]) -> tuple[Array, float]:
+    # With 96 sides a polygon of equal area is off the circle by less than 1/1000 of the radius.
     radius, sides = _number(geometry, 'radius_m'), _whole(geometry, 'sides', 96)
     if not 3 <= sides <= MOST_TRACKS:
         raise SetupError(f'emitter: sides must be from 3 to {MOST_TRACKS}, got {sides}')
     angle = 2 * math.pi * np.arange(sides) / sides
-    # A polygon of the circle's own area has the circle's moment.
+    # A polygon with the area of the circle has its magnetic moment too.
     reach = radius * math.sqrt(2 * math.pi / (sides * math.sin(2 * math.pi / sides)))
     corners = np.stack([reach * np.cos(angle), reach * np.sin(angle), 0 * angle], axis=1)
     return _wound(corners, geometry, 'ccw'), _number(geometry, 'turns', 1.0)
@@ -211,25 +232,28 @@ def build_board(
     rotations_deg: NDArray[np.generic],
     frequencies_hz: Sequence[float],
 ) -> Board:
-    """Draw all coils of an emitter.
+    """Draw all coils of an emitter board.
 
     Parameters
     ----------
     kind : str
         One of `KINDS`.
     geometry : mapping
-        What the kind asks for (``turns``, ``side_m``, ``pitch_m``, ...; SI units), and
-        ``current_a``, 1 A when missing. Further keys are passed over.
+        The dimensions that the kind needs (``turns``, ``side_m``, ``pitch_m``, ...; SI units) and
+        ``current_a``, which is 1 A by default. Other keys are ignored.
     names : sequence of str, length K
+        Names of the coils.
     centres_m : ndarray, shape (K, 3)
-        Frame fg.
+        Coil centres, m, frame fg.
     rotations_deg : ndarray, shape (K,)
-        Turn of each coil about z.
+        Rotation of each coil about z, degrees.
     frequencies_hz : sequence of float, length K
+        Drive frequencies, Hz.
 
     Returns
     -------
     Board
+        The coils as closed current paths.
 
     Raises
     ------

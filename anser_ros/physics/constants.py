@@ -1,4 +1,4 @@
-"""Constants of nature, SI."""
+"""Constants of nature that the field computations share, in SI units."""
 
 import math
 

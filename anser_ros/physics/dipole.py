@@ -1,9 +1,10 @@
-"""Magnetic dipoles: their field, its gradient, and the flux that a finite pick-up coil links.
+"""Field and gradient of magnetic dipoles, and the flux density that a pick-up coil senses.
 
 The field of a dipole m at the offset d is the article's equation (1),
 ``B = mu0/(4 pi) (3 (m . d) d / |d|^5 - m / |d|^3)``; its gradient follows by differentiation and
-is symmetric and traceless outside the source. A coil of length L along its axis n sees the mean of
-``n . B`` over its length; two-point Gauss-Legendre at +-L/(2 sqrt 3) has an error of order L^4.
+is symmetric and traceless outside the source. A coil of length L along its axis n senses the mean
+of ``n . B`` over its length, which two-point Gauss-Legendre quadrature at +-L/(2 sqrt 3) gives
+with an error of order L^4.
 """
 
 import math
@@ -18,12 +19,15 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 GAUSS_OFFSET = 0.5 / math.sqrt(3.0)
-"""Offset of the two Gauss points from a coil's centre, as a part of its length."""
+"""Offset of the two Gauss-Legendre points from a coil's centre, as a fraction of its length."""
 
 
 @numba.njit(cache=True, error_model='numpy')
 def fill_flux_basis(points, axes, lengths, positions, directions, out):  # type: ignore[no-untyped-def]
-    """Write each unit dipole's flux density along each coil's axis into ``out``, shape (P, N)."""
+    """Write each unit dipole's flux density along each coil's axis into ``out``, shape (P, N).
+
+    The arguments are those of `flux_basis` as contiguous arrays; nothing is checked.
+    """
     for p in range(points.shape[0]):
         nx, ny, nz = axes[p, 0], axes[p, 1], axes[p, 2]
         half = lengths[p] * GAUSS_OFFSET
@@ -75,7 +79,10 @@ def fill_field_and_gradient(point, positions, directions, basis):  # type: ignor
 
 @numba.njit(cache=True, error_model='numpy')
 def _fill_flux_jacobian(points, axes, lengths, positions, directions, moments, flux, d_r, d_n):  # type: ignore[no-untyped-def]
-    """``moments``, ``flux``, ``d_r``, ``d_n`` real with the 2K parts (re, im) last."""
+    """Add fluxes and derivatives to ``flux``, ``d_r`` and ``d_n``, as `flux_jacobian` has them.
+
+    These three and ``moments`` are real; their last axis holds the 2K parts (re, im by turns).
+    """
     basis = np.empty((9, positions.shape[0]))
     point = np.empty(3)
     for p in range(points.shape[0]):
@@ -127,28 +134,30 @@ def flux_basis(
     positions: NDArray[np.generic],
     directions: NDArray[np.generic],
 ) -> Array:
-    """Flux density along each sensor's axis per unit dipole: the article's coupling matrix M.
+    """Return the flux density along each sensor's axis for dipoles of unit moment.
+
+    This is the coupling matrix M of the article.
 
     Parameters
     ----------
     points : ndarray, shape (P, 3)
         Sensor centres, m, frame fg.
     axes : ndarray, shape (P, 3)
-        Unit sensitive axes.
+        Unit sensitive axes, frame fg.
     lengths : ndarray, shape (P,), or None
         Coil lengths, m; None or 0 for point sensors.
     positions, directions : ndarray, shape (N, 3)
-        Dipole positions (m) and unit directions.
+        Dipole positions (m) and unit directions, frame fg.
 
     Returns
     -------
     ndarray, shape (P, N)
-        T / (A m^2).
+        Flux density per moment, T / (A m^2).
 
     Raises
     ------
     ValueError
-        When shapes don't fit.
+        When the shapes do not fit together.
     """
     r, n, spans = _sensors(points, axes, lengths)
     q, u = _rows(positions, 3, 'positions'), _rows(directions, 3, 'directions')
@@ -160,7 +169,20 @@ def flux_basis(
 def field_basis(
     points: NDArray[np.generic], positions: NDArray[np.generic], directions: NDArray[np.generic]
 ) -> Array:
-    """Field of each unit dipole at each point, shape (P, N, 3), T / (A m^2)."""
+    """Return the field of dipoles of unit moment.
+
+    Parameters
+    ----------
+    points : ndarray, shape (P, 3)
+        Where the field is wanted, m, frame fg.
+    positions, directions : ndarray, shape (N, 3)
+        Dipole positions (m) and unit directions, frame fg.
+
+    Returns
+    -------
+    ndarray, shape (P, N, 3)
+        Field vectors, frame fg, T / (A m^2).
+    """
     r = _rows(points, 3, 'points')
     unit = np.eye(3)
     columns = [
@@ -172,7 +194,22 @@ def field_basis(
 def dipole_field(
     points: NDArray[np.generic], positions: NDArray[np.generic], moments: NDArray[np.generic]
 ) -> Array:
-    """Field (T), shape (P, 3), of dipoles with vector moments (A m^2), shape (N, 3)."""
+    """Return the sum of the fields of dipoles.
+
+    Parameters
+    ----------
+    points : ndarray, shape (P, 3)
+        Where the field is wanted, m, frame fg.
+    positions : ndarray, shape (N, 3)
+        Dipole positions, m, frame fg.
+    moments : ndarray, shape (N, 3)
+        Moment vectors, A m^2, frame fg.
+
+    Returns
+    -------
+    ndarray, shape (P, 3)
+        Flux density, T, frame fg.
+    """
     vectors = _rows(moments, 3, 'moments')
     return np.asarray(field_basis(points, positions, vectors).sum(axis=1))
 
@@ -180,7 +217,18 @@ def dipole_field(
 def dipole_gradient(
     points: NDArray[np.generic], positions: NDArray[np.generic], moments: NDArray[np.generic]
 ) -> Array:
-    """Gradient ``dB_j / dx_i`` (T/m), shape (P, 3, 3), of dipoles with vector moments (A m^2)."""
+    """Return the gradient of the sum of the fields of dipoles.
+
+    Parameters
+    ----------
+    points, positions, moments
+        As for `dipole_field`.
+
+    Returns
+    -------
+    ndarray, shape (P, 3, 3)
+        ``dB_j / dx_i``, T/m, frame fg.
+    """
     r, q, m = _rows(points, 3, 'points'), _rows(positions, 3, 'positions'), _rows(moments, 3, 'm')
     basis = np.empty((9, q.shape[0]))
     out = np.empty((r.shape[0], 3, 3))
@@ -199,7 +247,7 @@ def flux_jacobian(
     directions: NDArray[np.generic],
     moments: NDArray[np.generic],
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-    """Fluxes and their derivatives by the sensor's position and axis.
+    """Return fluxes with their derivatives by the sensors' positions and axes.
 
     Parameters
     ----------
@@ -211,12 +259,17 @@ def flux_jacobian(
     Returns
     -------
     flux : ndarray, shape (P, K), complex
-        T.
+        Flux density along each sensor's axis, T.
     d_position : ndarray, shape (P, 3, K), complex
-        T / m.
+        Derivative by the sensor's position, T/m.
     d_axis : ndarray, shape (P, 3, K), complex
-        T per unit of the axis vector's components (the axis taken as a free vector; the Gauss
-        points move with it).
+        Derivative by the components of the axis, T. The axis counts as a free vector, not as a
+        unit vector, and the quadrature points move with it.
+
+    Raises
+    ------
+    ValueError
+        When the shapes do not fit together.
     """
     r, n, spans = _sensors(points, axes, lengths)
     q, u = _rows(positions, 3, 'positions'), _rows(directions, 3, 'directions')

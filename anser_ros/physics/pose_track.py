@@ -1,4 +1,4 @@
-"""A body's poses over time, from a tracker with its own clock and rate."""
+"""Poses of one body over time, as another tracker with its own clock and rate reports them."""
 
 from dataclasses import dataclass
 
@@ -11,16 +11,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PoseTrack:
-    """M poses by ascending time.
+    """A sequence of M poses of one body in ascending order of time.
 
     Attributes
     ----------
     time : ndarray, shape (M,)
-        s, ascending, on the clock of the poses' own stamps.
+        Stamps of the poses on the clock that gave them, s, ascending.
     position : ndarray, shape (M, 3)
-        m, frame fg.
+        Origin of the body, m, frame fg.
     quaternion : ndarray, shape (M, 4)
-        x y z w.
+        Rotation from the body's frame to fg, in the order x y z w.
     """
 
     time: Array
@@ -28,21 +28,25 @@ class PoseTrack:
     quaternion: Array
 
     def at(self, time: Array, longest_gap: float) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Poses at other times: positions by linear interpolation, rotations by slerp.
+        """Interpolate the poses at other times.
+
+        Positions are interpolated linearly, rotations by spherical linear interpolation.
 
         Parameters
         ----------
         time : ndarray, shape (F,)
-            s.
+            Times on the clock of the track, s.
         longest_gap : float
-            A time farther than this (s) from the poses on both sides has no pose.
+            Between two poses that are farther apart than this (s) nothing is interpolated.
 
         Returns
         -------
         position : ndarray, shape (F, 3)
+            Origin of the body, m, frame fg.
         rotation : ndarray, shape (F, 3, 3)
+            Rotation matrix from the body's frame to fg.
         valid : ndarray of bool, shape (F,)
-            False where the track doesn't reach or has a gap; the pose there is NaN.
+            False before the first pose, after the last one and in gaps; the pose there is NaN.
         """
         position = np.full((time.size, 3), np.nan)
         rotation = np.full((time.size, 3, 3), np.nan)

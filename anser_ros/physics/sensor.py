@@ -1,4 +1,4 @@
-"""Pick-up coils as a table: which channel, on which body, where, along which axis, how long."""
+"""The table of pick-up coils: their channels, bodies, positions, axes and lengths."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,21 +9,24 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 LARGEST_FLUX_T = 1.0
-"""A reading with a component beyond this is absurd, T."""
+"""A reading with a component beyond this, T, is taken for a fault of the electronics. The emitters
+make microtesla at most, so that any flux density that could be real is far smaller."""
 
 
 @dataclass(frozen=True)
 class SensorTable:
-    """S coils, a row each.
+    """A table of S pick-up coils with one row each.
 
     Attributes
     ----------
-    channel : ndarray, shape (S,)
+    channel : ndarray of int, shape (S,)
+        Channel of the control unit that each coil is connected to.
     name, body : tuple of str, length S
+        Name of each sensor and of the body that it is fixed to (``fg`` for reference sensors).
     position, axis : ndarray, shape (S, 3)
         Centre (m) and unit sensitive axis in the frame of the sensor's body.
     length : ndarray, shape (S,)
-        Coil length along its axis, m; 0 for a point.
+        Length of the coil along its axis, m; 0 for a point sensor.
     """
 
     channel: NDArray[np.int64]
@@ -37,7 +40,7 @@ class SensorTable:
         return len(self.name)
 
     def select(self, rows: Sequence[int] | NDArray[np.generic]) -> 'SensorTable':
-        """The rows named by index or mask, in that order."""
+        """Return the table of the rows given by index or mask, in that order."""
         index = np.arange(len(self))[np.asarray(rows)]
         return SensorTable(
             channel=self.channel[index],
@@ -49,13 +52,13 @@ class SensorTable:
         )
 
     def of_body(self, body: str) -> 'SensorTable':
-        """The rows on one body."""
+        """Return the table of the sensors on one body."""
         return self.select([i for i, name in enumerate(self.body) if name == body])
 
     def with_geometry(
         self, position: Array | None = None, axis: Array | None = None, length: Array | None = None
     ) -> 'SensorTable':
-        """The same sensors with other positions, axes or lengths."""
+        """Return the same sensors with other positions, axes or lengths where these are given."""
         return replace(
             self,
             position=self.position if position is None else position,
@@ -64,18 +67,19 @@ class SensorTable:
         )
 
     def placed(self, position: Array, rotation: Array) -> tuple[Array, Array]:
-        """Centres and axes in fg when the body has a pose.
+        """Return the sensors' centres and axes in fg for given poses of their body.
 
         Parameters
         ----------
         position : ndarray, shape (..., 3)
-            Body origin in fg, m.
+            Origin of the body, m, frame fg.
         rotation : ndarray, shape (..., 3, 3)
-            Body axes in fg (columns).
+            Rotation matrix from the body's frame to fg.
 
         Returns
         -------
         centres, axes : ndarray, shape (..., S, 3)
+            Centres (m) and unit axes, frame fg.
         """
         turned = np.einsum('...ij,sj->...si', rotation, self.position)
         return turned + position[..., None, :], np.einsum('...ij,sj->...si', rotation, self.axis)

@@ -1,10 +1,10 @@
-"""Field of straight current-carrying tracks: the Biot-Savart law, textbook sign.
+"""Field of straight current-carrying tracks by the Biot-Savart law with the textbook sign.
 
 A segment from A to B with the current I flowing from A to B makes, at the offsets ``a = P - A``
 and ``b = P - B``, ``B = mu0 I/(4 pi) (a x b) (|a| + |b|) / (|a| |b| (|a| |b| + a . b))``, which is
-the integral of ``dl x r / r^3`` in closed form (Hanson and Hirshman, Phys. Plasmas 9, 2002). It
-has no cancellation near the segment's extension. Only closed paths have a curl-free field outside
-the copper; a dipole model can fit no other.
+the integral of ``dl x r / r^3`` in closed form (Hanson and Hirshman, Phys. Plasmas 9, 2002). No
+digits cancel at points near the line that extends the segment. Only closed paths have a field
+that is curl-free outside the copper, and only such a field can be fitted by dipoles.
 """
 
 from collections.abc import Sequence
@@ -58,26 +58,26 @@ def segment_field(
     points: NDArray[np.generic],
     current_a: float = 1.0,
 ) -> Array:
-    """Field of straight segments that all carry the same current.
+    """Return the field of straight segments that all carry the same current.
 
     Parameters
     ----------
     starts, ends : ndarray, shape (M, 3)
-        m; the current flows from start to end.
+        Ends of the segments, m; the current flows from start to end.
     points : ndarray, shape (P, 3)
-        m; not on a segment.
+        Where the field is wanted, m; none may lie on a segment.
     current_a : float
-        A.
+        Current, A.
 
     Returns
     -------
     ndarray, shape (P, 3)
-        T.
+        Flux density, T, in the frame of the points.
 
     Raises
     ------
     ValueError
-        When shapes don't fit.
+        When the shapes do not fit together.
     """
     first, last, at = _points(starts, 'starts'), _points(ends, 'ends'), _points(points, 'points')
     if first.shape != last.shape:
@@ -92,14 +92,44 @@ def segment_field(
 def loop_field(
     corners: NDArray[np.generic], points: NDArray[np.generic], current_a: float = 1.0
 ) -> Array:
-    """Field (T), shape (P, 3), of a closed path: from each corner (m), shape (M, 3), to the next,
-    and from the last to the first; `ValueError` when shapes don't fit."""
+    """Return the field of a closed path of straight segments.
+
+    Parameters
+    ----------
+    corners : ndarray, shape (M, 3)
+        The current flows from each corner (m) to the next, and from the last to the first.
+    points : ndarray, shape (P, 3)
+        Where the field is wanted, m; none may lie on the path.
+    current_a : float
+        Current, A.
+
+    Returns
+    -------
+    ndarray, shape (P, 3)
+        Flux density, T, in the frame of the points.
+
+    Raises
+    ------
+    ValueError
+        When an array is not of shape (n, 3).
+    """
     path = _points(corners, 'corners')
     return segment_field(path, np.roll(path, -1, axis=0), points, current_a)
 
 
 def loop_moment(corners: NDArray[np.generic], current_a: float = 1.0) -> Array:
-    """Moment (A m^2), shape (3,), of a closed path: ``I/2`` times the sum of ``r x dr``."""
+    """Return the magnetic moment of a closed path, ``I/2`` times the sum of ``r x dr``.
+
+    Parameters
+    ----------
+    corners, current_a
+        As for `loop_field`.
+
+    Returns
+    -------
+    ndarray, shape (3,)
+        Moment, A m^2.
+    """
     path = _points(corners, 'corners')
     cross = np.cross(path, np.roll(path, -1, axis=0))
     return np.asarray(0.5 * current_a * cross.sum(axis=0))
@@ -108,7 +138,22 @@ def loop_moment(corners: NDArray[np.generic], current_a: float = 1.0) -> Array:
 def paths_field(
     paths: Sequence[NDArray[np.generic]], points: NDArray[np.generic], currents_a: Array
 ) -> Array:
-    """Fields (T), shape (P, K, 3), of K closed paths with their own currents, shape (K,), A."""
+    """Return the fields of K closed paths that each carry a current of their own.
+
+    Parameters
+    ----------
+    paths : sequence of ndarray, shape (M, 3)
+        Corners of each path, m.
+    points : ndarray, shape (P, 3)
+        Where the fields are wanted, m.
+    currents_a : ndarray, shape (K,)
+        Current of each path, A.
+
+    Returns
+    -------
+    ndarray, shape (P, K, 3)
+        Flux density of each path, T.
+    """
     fields = [
         loop_field(path, points, float(i)) for path, i in zip(paths, currents_a, strict=True)
     ]
