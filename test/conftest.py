@@ -37,11 +37,13 @@ STOP_TIMEOUT_S = 5.0
 
 
 # What was started since the last test ended; Python tells of each at the moment of its start.
+# `uname` does not count: the standard library asks it, once, what processor this is.
 started: list[str] = []
 
 
 def _note_start(event: str, arguments: tuple[Any, ...]) -> None:
-    if event in ('subprocess.Popen', 'os.fork', 'os.posix_spawn'):
+    starts = event in ('subprocess.Popen', 'os.fork', 'os.posix_spawn')
+    if starts and arguments[:1] != ('uname',):
         started.append(f'{event} {arguments[:2]}')
 
 
