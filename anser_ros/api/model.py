@@ -1,0 +1,107 @@
+"""The field model as a script sees it: load, save, predict."""
+
+import os
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anser_ros.api.setup import SetupSource, load_setup
+from anser_ros.errors import ParameterError
+from anser_ros.field.model import FieldModel
+from anser_ros.field.nominal import nominal_model
+from anser_ros.sessions.model_file import load_model, save_model
+from anser_ros.sessions.starting_model import board_of
+
+
+@dataclass(frozen=True)
+class Model:
+    """A field model: the field of every emitter, with its uncertainty and known effects.
+
+    Attributes
+    ----------
+    field : FieldModel
+        The dipoles that make the field, their moments and the effects that the model corrects.
+
+    Examples
+    --------
+    >>> from anser_ros import Model
+    >>> model = Model.load('config/demo_model.yaml')
+    >>> model.emitters[:2], model.frequencies_hz[:2]
+    (('coil0', 'coil1'), (6000.0, 6170.0))
+    >>> flux = model.flux([[0.0, 0.0, 0.15]], [[0.0, 0.0, 1.0]])
+    >>> flux.shape, flux.dtype
+    ((1, 8), dtype('complex128'))
+    """
+
+    field: FieldModel
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a model file; raises `ModelFileError` when it is none."""
+        return cls(load_model(path))
+
+    @classmethod
+    def nominal(cls, setup: SetupSource) -> Self:
+        """Make the model of a board exactly as its setup document draws it (Biot-Savart).
+
+        Raises
+        ------
+        SetupError
+            When the setup breaks a rule, or its emitter kind is not one that can be drawn.
+
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from anser_ros import Model
+        >>> len(Model.nominal(Path('config/demo_setup.yaml')).emitters)
+        8
+        """
+        return cls(nominal_model(board_of(load_setup(setup))))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the model file that every command and node loads; raises `ModelFileError`."""
+        save_model(path, self.field)
+
+    @property
+    def emitters(self) -> tuple[str, ...]:
+        """Names of the K emitters, in the order of the flux columns."""
+        return self.field.emitters
+
+    @property
+    def frequencies_hz(self) -> tuple[float, ...]:
+        """Drive frequencies of the emitters, Hz."""
+        return self.field.frequencies_hz
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of the effects that the model corrects, as a diagnosis found them."""
+        return tuple(effect.name for effect in self.field.effects)
+
+    def flux(self, position: ArrayLike, axis: ArrayLike) -> NDArray[np.complex128]:
+        """Predict the flux of point coils.
+
+        Parameters
+        ----------
+        position : array_like, shape (..., 3)
+            Centres of the coils in fg, m.
+        axis : array_like, shape (..., 3)
+            Their sensitive axes in fg, unit vectors.
+
+        Returns
+        -------
+        ndarray, shape (..., K), complex
+            Flux density along the axis, T at each emitter's nominal current.
+
+        Raises
+        ------
+        ParameterError
+            When the two shapes differ, or do not end in 3.
+        """
+        points, axes = np.asarray(position, dtype=float), np.asarray(axis, dtype=float)
+        if points.shape != axes.shape or points.shape[-1:] != (3,):
+            raise ParameterError(
+                f'positions and axes must both be (..., 3), got {points.shape} and {axes.shape}'
+            )
+        return self.field.flux(points, axes)

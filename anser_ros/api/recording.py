@@ -1,0 +1,184 @@
+"""Your own arrays as a session: checked against the setup and written to an MCAP bag."""
+
+import os
+import time as clock
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from anser_ros.api.setup import SetupSource, load_setup
+from anser_ros.errors import ParameterError
+from anser_ros.wire.bag_writer import SessionWriter
+from anser_ros.wire.points import FluxPoints, encode_flux
+from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup, dump_setup, topic_of
+
+Array = NDArray[np.float64]
+
+NANO = 1e-9
+"""Seconds in a nanosecond."""
+QUATERNION_TOLERANCE = 1e-3
+"""How far the length of a quaternion may be from 1. A larger error is no rounding but a mistake,
+such as angles in the place of a quaternion; whoever reads the bag refuses 1e-2."""
+
+
+def write_session(
+    path: str | os.PathLike[str],
+    setup: SetupSource,
+    times: ArrayLike,
+    flux: ArrayLike,
+    poses: Mapping[str, tuple[ArrayLike, ArrayLike, ArrayLike]] | None = None,
+    *,
+    start_ns: int | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write your own arrays as a session that every command reads.
+
+    Parameters
+    ----------
+    path : str or path
+        The ``.mcap`` file to write; its folder is made if missing.
+    setup : Setup, mapping, str or path
+        As for `load_setup`.
+    times : array_like, shape (F,)
+        Middle of each demodulation window, s, ascending, from any origin.
+    flux : array_like, shape (F, S, K), complex
+        Flux density along each coil's axis, T at nominal current: S sensors in the order of
+        ``setup.sensors`` (reference sensors among them), K emitters in the order of the setup's
+        coils. NaN where there is no reading. The bag stores single precision.
+    poses : mapping of str to (times, positions, quaternions), optional
+        Optical poses of bodies: times (M,) in s on the origin of ``times``, positions (M, 3) of
+        the body's origin in fg in m, unit quaternions x y z w (M, 4) from body to fg. Their rate
+        may differ from the fluxes'.
+    start_ns : int, optional
+        Stamp of time 0, ns. By default the present time; a diagnosis tells sessions apart by it.
+    overwrite : bool
+        Whether a file that is there already is replaced.
+
+    Raises
+    ------
+    SetupError
+        When the setup breaks a rule.
+    ParameterError
+        When shapes do not match, times do not ascend, a body is not in the setup, or a quaternion
+        is not of unit length.
+    BagError
+        When the file is there already, or cannot be written.
+
+    Examples
+    --------
+    A board of one loop, and a coil 10 cm above it that rests for five readings:
+
+    >>> import numpy as np
+    >>> from anser_ros import load_session, write_session
+    >>> setup = {
+    ...     'schema': 'anser_setup/1',
+    ...     'flux_rate_hz': 50.0,
+    ...     'emitter': {
+    ...         'kind': 'circular_loop', 'radius_m': 0.05, 'turns': 100, 'current_a': 0.1,
+    ...         'coils': [{'name': 'k0', 'centre_m': [0, 0, 0], 'frequency_hz': 1000}],
+    ...     },
+    ...     'sensors': [
+    ...         {'channel': 0, 'name': 'pen/tip', 'body': 'pen',
+    ...          'position_m': [0, 0, 0], 'axis': [0, 0, 1]},
+    ...     ],
+    ... }
+    >>> times = np.arange(5) / 50.0
+    >>> flux = np.full((5, 1, 1), 2e-6 + 0j)
+    >>> still = np.tile([0.0, 0.0, 0.1], (5, 1)), np.tile([0.0, 0.0, 0.0, 1.0], (5, 1))
+    >>> write_session('own.mcap', setup, times, flux, {'pen': (times, *still)}, overwrite=True)
+    >>> load_session('own.mcap').tools[0].flux.shape
+    (5, 1, 1)
+    """
+    checked = load_setup(setup)
+    seconds, values = _checked_flux(checked, times, flux)
+    tracks = _checked_poses(checked, poses or {})
+    origin = clock.time_ns() if start_ns is None else start_ns
+    stamps = [origin + round(t / NANO) for t in seconds.tolist()]
+    pose_stamps = {
+        body: [origin + round(t / NANO) for t in track[0].tolist()]
+        for body, track in tracks.items()
+    }
+    if min(stamps[0], *(s[0] for s in pose_stamps.values() if s), stamps[0]) <= 0:
+        raise ParameterError('a stamp is not positive: give a larger start_ns')
+    if overwrite:
+        Path(path).unlink(missing_ok=True)
+    with SessionWriter(path, checked.frame_id) as writer:
+        writer.write_setup(dump_setup(checked), stamps[0])
+        for topic, specs in _flux_topics(checked):
+            rows = [checked.sensors.index(spec) for spec in specs]
+            for stamp, frame in zip(stamps, values[:, rows], strict=True):
+                fields, step, data = encode_flux(_points(specs, frame))
+                writer.write_flux(topic, stamp, fields, step, len(specs), data)
+        for body, (_, position, quaternion) in tracks.items():
+            topic = f'/optical/{topic_of(body)}/pose'
+            rows = zip(pose_stamps[body], position.tolist(), quaternion.tolist(), strict=True)
+            for stamp, place, turn in rows:
+                writer.write_pose(topic, stamp, place, turn)
+
+
+def _ascending(times: ArrayLike, what: str) -> Array:
+    seconds = np.asarray(times, dtype=np.float64)
+    if seconds.ndim != 1 or seconds.size == 0 or not np.isfinite(seconds).all():
+        raise ParameterError(f'{what} must be a list of finite numbers, got {seconds.shape}')
+    if not (np.diff(seconds) > 0.0).all():
+        raise ParameterError(f'{what} must ascend')
+    return seconds
+
+
+def _checked_flux(
+    setup: Setup, times: ArrayLike, flux: ArrayLike
+) -> tuple[Array, NDArray[np.complex128]]:
+    seconds = _ascending(times, 'times')
+    values = np.asarray(flux, dtype=np.complex128)
+    wanted = (seconds.size, len(setup.sensors), len(setup.emitter.coils))
+    if values.shape != wanted:
+        raise ParameterError(
+            f'flux must be (times, sensors, coils) = {wanted} by the setup, got {values.shape}'
+        )
+    return seconds, values
+
+
+def _checked_poses(
+    setup: Setup, poses: Mapping[str, tuple[ArrayLike, ArrayLike, ArrayLike]]
+) -> dict[str, tuple[Array, Array, Array]]:
+    checked = {}
+    for body, (times, positions, quaternions) in poses.items():
+        if body not in setup.bodies:
+            raise ParameterError(f'no body {body!r} in the setup: {", ".join(setup.bodies)}')
+        seconds = _ascending(times, f'times of {body}')
+        position = np.asarray(positions, dtype=np.float64)
+        quaternion = np.asarray(quaternions, dtype=np.float64)
+        if position.shape != (seconds.size, 3) or quaternion.shape != (seconds.size, 4):
+            raise ParameterError(
+                f'poses of {body} need positions ({seconds.size}, 3) and quaternions '
+                f'({seconds.size}, 4), got {position.shape} and {quaternion.shape}'
+            )
+        lengths = np.linalg.norm(quaternion, axis=1)
+        if not (np.isfinite(position).all() and (abs(lengths - 1) < QUATERNION_TOLERANCE).all()):
+            raise ParameterError(
+                f'poses of {body} must be finite, with quaternions of unit length'
+            )
+        checked[body] = (seconds, position, quaternion)
+    return checked
+
+
+def _flux_topics(setup: Setup) -> list[tuple[str, tuple[SensorSpec, ...]]]:
+    topics = [
+        ('/anser/tool/flux', setup.tool_sensors),
+        ('/anser/reference/flux', setup.reference_sensors),
+    ]
+    return [(topic, specs) for topic, specs in topics if specs]
+
+
+def _points(specs: tuple[SensorSpec, ...], flux: NDArray[np.complex128]) -> FluxPoints:
+    """One frame's cloud; the place of a sensor that moves is not known to it."""
+    fixed = np.array([spec.body == FIELD_GENERATOR for spec in specs])[:, None]
+    return FluxPoints(
+        channel=np.array([spec.channel for spec in specs]),
+        flags=np.zeros(len(specs), dtype=np.int64),
+        flux=flux,
+        position=np.where(fixed, [spec.position_m for spec in specs], np.nan),
+        axis=np.where(fixed, [spec.axis for spec in specs], np.nan),
+    )

@@ -1,0 +1,159 @@
+"""The public library: its examples run, without ROS, and what it refuses it refuses in words."""
+
+import doctest
+import importlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from conftest import REPO
+
+import anser_ros
+from anser_ros import Model, load_session, load_setup, track, write_session
+from anser_ros.errors import BagError, FitError, ParameterError, SetupError
+
+MODULES = ('calibration', 'diagnosis', 'model', 'recording', 'setup', 'tracking')
+# A meta path hook in whose presence nothing of ROS can be imported.
+NO_ROS = """
+import sys
+
+class Refuses:
+    def find_spec(self, name, path=None, target=None):
+        first = name.split('.')[0]
+        if first in ('rclpy', 'std_srvs', 'ament_index_python') or first.endswith('_msgs'):
+            raise ImportError(f'{name}: there is no ROS here')
+
+sys.meta_path.insert(0, Refuses())
+"""
+SETUP = {
+    'schema': 'anser_setup/1',
+    'flux_rate_hz': 50.0,
+    'emitter': {
+        'kind': 'circular_loop',
+        'radius_m': 0.05,
+        'coils': [
+            {'name': f'k{k}', 'centre_m': [0.1 * k, 0, 0], 'frequency_hz': 1000 + 100 * k}
+            for k in range(2)
+        ],
+    },
+    'sensors': [
+        {'channel': 7, 'name': 'ref', 'body': 'fg', 'position_m': [0, 0, 0.1], 'axis': [0, 0, 1]},
+        {'channel': 3, 'name': 'pen/x', 'body': 'pen', 'position_m': [0, 0, 0], 'axis': [1, 0, 0]},
+    ],
+}
+
+
+@pytest.fixture
+def workshop(tmp_path, monkeypatch):
+    """Stand in a folder with what the examples read, where they may write."""
+    for folder in ('bags', 'config'):
+        (tmp_path / folder).symlink_to(REPO / folder)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize('name', MODULES)
+def test_examples_of_the_docstrings(workshop, name):
+    module = importlib.import_module(f'anser_ros.api.{name}')
+    outcome = doctest.testmod(module, optionflags=doctest.IGNORE_EXCEPTION_DETAIL)
+    assert outcome.failed == 0 and outcome.attempted > 0
+
+
+def test_every_public_name_is_there_and_documented():
+    assert set(anser_ros.__all__) == set(anser_ros._HOMES) <= set(dir(anser_ros))
+    for name in anser_ros.__all__:
+        assert getattr(anser_ros, name).__doc__
+    with pytest.raises(AttributeError, match='no attribute'):
+        _ = anser_ros.nonsense
+
+
+def test_importing_the_package_loads_no_library():
+    code = 'import sys, anser_ros; assert not {"numpy", "scipy", "yaml"} & set(sys.modules)'
+    subprocess.run([sys.executable, '-P', '-c', code], cwd=REPO, check=True)
+
+
+def test_the_library_needs_no_ros(workshop):
+    """As in a notebook on a laptop: every public name, and a session tracked."""
+    code = (
+        f'{NO_ROS}\nimport anser_ros as a\n[getattr(a, n) for n in a.__all__]\n'
+        "m = a.Model.load('config/demo_model.yaml')\n"
+        "a.calibrate(a.load_session('bags/factory.mcap'), dipoles=3, force=True)\n"
+        "print(a.track(a.load_session('bags/moving.mcap'), m).bodies['tool_a'].ok.all())\n"
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, cwd=workshop, check=False
+    )
+    assert (done.stdout, done.returncode) == ('True\n', 0), done.stderr
+
+
+def poses(count, turn=(0.0, 0.0, 0.0, 1.0)):
+    return np.arange(count) / 60.0, np.zeros((count, 3)), np.tile(turn, (count, 1))
+
+
+class TestWriteSession:
+    """Arrays come back from the bag as they went in, to single precision."""
+
+    def test_round_trip(self, tmp_path):
+        rng = np.random.default_rng(1)
+        times = 5.0 + np.arange(4) / 50.0
+        flux = 1e-6 * (rng.normal(size=(4, 2, 2)) + 1j * rng.normal(size=(4, 2, 2)))
+        flux[2, 1] = np.nan
+        given = (times, rng.normal(size=(4, 3)), np.tile([0.0, 0.0, 1.0, 0.0], (4, 1)))
+        write_session(tmp_path / 'a.mcap', SETUP, times, flux, {'pen': given})
+        session = load_session(tmp_path / 'a.mcap')
+        (tool,), reference = session.tools, session.reference
+        assert session.setup == load_setup(SETUP)
+        np.testing.assert_allclose(reference.flux[:, 0], flux[:, 0], rtol=1e-6)
+        np.testing.assert_allclose(tool.flux[:, 0], flux[:, 1], rtol=1e-6)
+        np.testing.assert_allclose(tool.time, times - times[0], atol=1e-9)
+        np.testing.assert_allclose(tool.position, given[1], atol=1e-12)
+        assert tool.valid[:, 0].tolist() == [True, True, False, True]
+
+    def test_refusals(self, tmp_path):
+        path, times, flux = tmp_path / 'a.mcap', np.arange(3), np.zeros((3, 2, 2))
+        for arguments, said in (
+            ((times, flux[:, :1]), r'flux must be \(times, sensors, coils\) = \(3, 2, 2\)'),
+            ((times[::-1], flux), 'times must ascend'),
+            (([], flux[:0]), 'list of finite numbers'),
+            ((times, flux, {'pin': poses(3)}), "no body 'pin' in the setup: pen"),
+            ((times, flux, {'pen': poses(3, (0, 0, 0, 2))}), 'quaternions of unit length'),
+            ((times, flux, {'pen': poses(3)[:2] + poses(2)[2:]}), 'need positions'),
+        ):
+            with pytest.raises(ParameterError, match=said):
+                write_session(path, SETUP, *arguments)
+        with pytest.raises(ParameterError, match='start_ns'):
+            write_session(path, SETUP, times, flux, start_ns=0)
+        assert not path.exists()
+
+    def test_a_bag_is_replaced_only_when_asked(self, tmp_path):
+        path, times, flux = tmp_path / 'a.mcap', np.arange(3), np.zeros((3, 2, 2))
+        write_session(path, SETUP, times, flux)
+        with pytest.raises(BagError, match='is there already'):
+            write_session(path, SETUP, times, flux)
+        write_session(path, SETUP, times[:2], flux[:2], overwrite=True)
+        assert load_session(path).tools[0].time.size == 2
+
+
+def test_a_setup_from_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(SetupError, match=r'none\.yaml'):
+        load_setup(tmp_path / 'none.yaml')
+
+
+def test_a_calibration_of_nothing():
+    with pytest.raises(FitError, match='at least one session'):
+        anser_ros.calibrate([])
+
+
+def test_flux_wants_a_position_for_every_axis():
+    with pytest.raises(ParameterError, match='must both be'):
+        Model.nominal(SETUP).flux([[0.0, 0.0, 0.1]], [0.0, 0.0, 1.0])
+
+
+def test_tracks_are_saved_as_arrays(tmp_path):
+    session = load_session(REPO / 'bags' / 'moving.mcap')
+    result = track(session, Model.load(REPO / 'config' / 'demo_model.yaml'))
+    result.save(tmp_path / 'poses.npz')
+    with np.load(tmp_path / 'poses.npz') as saved:
+        np.testing.assert_array_equal(saved['tool_a:position'], result['tool_a'].position)
+        assert set(saved['tool_a/0/x:state']) == {'ok'}
