@@ -100,11 +100,11 @@ def write_session(
         body: [origin + round(t / NANO) for t in track[0].tolist()]
         for body, track in tracks.items()
     }
-    if min(stamps[0], *(s[0] for s in pose_stamps.values() if s), stamps[0]) <= 0:
+    if min([stamps[0], *(s[0] for s in pose_stamps.values())]) <= 0:
         raise ParameterError('a stamp is not positive: give a larger start_ns')
     if overwrite:
         Path(path).unlink(missing_ok=True)
-    with SessionWriter(path, checked.frame_id) as writer:
+    with SessionWriter(Path(path), checked.frame_id) as writer:
         writer.write_setup(dump_setup(checked), stamps[0])
         for topic, specs in _flux_topics(checked):
             rows = [checked.sensors.index(spec) for spec in specs]
@@ -113,8 +113,8 @@ def write_session(
                 writer.write_flux(topic, stamp, fields, step, len(specs), data)
         for body, (_, position, quaternion) in tracks.items():
             topic = f'/optical/{topic_of(body)}/pose'
-            rows = zip(pose_stamps[body], position.tolist(), quaternion.tolist(), strict=True)
-            for stamp, place, turn in rows:
+            listed = zip(pose_stamps[body], position.tolist(), quaternion.tolist(), strict=True)
+            for stamp, place, turn in listed:
                 writer.write_pose(topic, stamp, place, turn)
 
 
