@@ -68,11 +68,13 @@ def test_every_public_name_is_there_and_documented():
         _ = anser_ros.nonsense
 
 
+@pytest.mark.processes
 def test_importing_the_package_loads_no_library():
     code = 'import sys, anser_ros; assert not {"numpy", "scipy", "yaml"} & set(sys.modules)'
     subprocess.run([sys.executable, '-P', '-c', code], cwd=REPO, check=True)
 
 
+@pytest.mark.processes
 def test_the_library_needs_no_ros(workshop):
     """As in a notebook on a laptop: every public name, and a session tracked."""
     code = (
