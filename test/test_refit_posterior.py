@@ -172,7 +172,9 @@ def test_layers_stand_for_their_clouds_also_between_their_samples(world, parts):
     excitation, region, layer, _, _ = parts
     rng, half = np.random.default_rng(1), region.half
     across = rng.uniform(-half, half, (100, 2)) + region.centre
-    points = np.column_stack([across, rng.uniform(region.floor, 0.83 * region.ceiling, 100)])
+    points = np.column_stack(
+        [across, rng.uniform(region.volume.low[2], 0.83 * region.volume.ceiling, 100)]
+    )
     for cloud in default_clouds(region):
         stand_in = box_layer(region, excitation) if cloud.overhead else layer
         limit = 0.25 if cloud.overhead else 0.04 if cloud.standoff_m < 0.2 * half else 0.01
@@ -203,7 +205,7 @@ def test_clouds_stay_out_of_the_volume_and_weigh_their_volume():
         assert (cloud.volumes > 0).all()
         p = cloud.positions - [*region.centre, 0.0]
         inside = (np.abs(p[:, 0]) < region.half) & (np.abs(p[:, 1]) < region.half)
-        assert not (inside & (p[:, 2] > 0) & (p[:, 2] < region.ceiling)).any()
+        assert not (inside & (p[:, 2] > 0) & (p[:, 2] < region.volume.ceiling)).any()
         if not cloud.overhead:
             assert p[:, 2].max() == pytest.approx(-cloud.standoff_m)
     near, far = overhead(region, 0.04), overhead(region, 0.1)

@@ -5,6 +5,7 @@ import pytest
 from tracking_world import NOISE_T, certain_model, fluxes, random_pose, triaxial_tool
 
 from anser_ros.errors import TrackingError
+from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.rigid import (
     BodyCoils,
     common_factor,
@@ -13,7 +14,7 @@ from anser_ros.tracking.rigid import (
     start_from_grid,
 )
 from anser_ros.tracking.rotations import rotation_between, rotation_of_vector
-from anser_ros.tracking.seed import Volume, build_grid
+from anser_ros.tracking.seed import build_grid
 from anser_ros.tracking.solve import RealField
 from anser_ros.tracking.uncertainty import bounded_inverse
 
@@ -24,7 +25,7 @@ TOOL = triaxial_tool()
 COILS = BodyCoils(TOOL.position, TOOL.axis, TOOL.length)
 WEIGHTS = np.full((9, WIDTH), 1 / NOISE_T)
 NOTHING = common_factor(np.zeros((9, 0, WIDTH)), WEIGHTS)
-LOW, HIGH = (corner + sign * 0.03 for corner, sign in zip(Volume().grown(0.03), (-1, 1),
+LOW, HIGH = (corner + sign * 0.03 for corner, sign in zip(TrackedVolume().grown(0.03), (-1, 1),
                                                            strict=True))  # fmt: skip
 
 
@@ -123,7 +124,7 @@ def test_start_from_the_coils_own_poses(rng):
 
 def test_start_from_the_grid_alone(rng):
     """For few emitters, when no coil has a pose of its own."""
-    grid = build_grid(FIELD, np.full(WIDTH, NOISE_T), Volume(), 0.04)
+    grid = build_grid(FIELD, np.full(WIDTH, NOISE_T), TrackedVolume(), 0.04)
     for _ in range(10):
         position, rotation = random_pose(rng)
         flux = fluxes(MODEL, TOOL, position, rotation, rng)

@@ -7,7 +7,8 @@ from tracking_world import NOISE_T, certain_model
 from anser_ros.errors import TrackingError
 from anser_ros.field.nominal import nominal_model
 from anser_ros.physics.board import build_board
-from anser_ros.tracking.seed import Volume, build_grid, grid_points, scan, solve_cold
+from anser_ros.physics.volume import TrackedVolume
+from anser_ros.tracking.seed import build_grid, grid_points, scan, solve_cold
 from anser_ros.tracking.solve import RealField, whitening_of
 from anser_ros.tracking.uncertainty import chi2_limit
 
@@ -16,7 +17,7 @@ FIELD = RealField.of(MODEL.positions, MODEL.directions, MODEL.moments)
 WIDTH = FIELD.moments.shape[1]
 SIGMA = np.full(WIDTH, NOISE_T)
 WHITENING = whitening_of(SIGMA)
-VOLUME = Volume()
+VOLUME = TrackedVolume()
 LOW, HIGH = VOLUME.grown(0.03)
 GATE = chi2_limit(WIDTH - 5, 1e-9)
 GRID = build_grid(FIELD, SIGMA, VOLUME, 0.035)
@@ -99,7 +100,7 @@ def test_three_emitters_leave_one_coil_ambiguous(rng):
 
 
 def test_grid_covers_the_volume_and_widens_with_height():
-    volume = Volume((-0.1, -0.1, 0.05), (0.1, 0.1, 0.3))
+    volume = TrackedVolume((-0.1, -0.1, 0.05), (0.1, 0.1, 0.3))
     points = grid_points(volume, 0.03)
     assert (points.min(axis=0) == volume.low).all()
     np.testing.assert_allclose(points.max(axis=0), volume.high)
@@ -113,16 +114,16 @@ def test_grid_covers_the_volume_and_widens_with_height():
 
 
 def test_the_box_stays_above_the_boards_plane():
-    low, high = Volume((-0.1, -0.1, 0.02), (0.1, 0.1, 0.3)).grown(0.05)
+    low, high = TrackedVolume((-0.1, -0.1, 0.02), (0.1, 0.1, 0.3)).grown(0.05)
     assert low[2] == pytest.approx(0.01)
     np.testing.assert_allclose(high, [0.15, 0.15, 0.35])
 
 
 def test_refusals():
     with pytest.raises(TrackingError, match='low < high'):
-        Volume((0.0, 0.0, 0.1), (0.1, 0.1, 0.1))
+        TrackedVolume((0.0, 0.0, 0.1), (0.1, 0.1, 0.1))
     with pytest.raises(TrackingError, match='low < high'):
-        Volume((0.0, 0.0, np.nan), (0.1, 0.1, 0.1))
+        TrackedVolume((0.0, 0.0, np.nan), (0.1, 0.1, 0.1))
     with pytest.raises(TrackingError, match='must be positive'):
         grid_points(VOLUME, 0.0)
     with pytest.raises(TrackingError, match='too fine'):

@@ -1,10 +1,21 @@
 """The setup document: what is read, and what is refused with the rule named."""
 
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
 import pytest
 import yaml
 
 from anser_ros.errors import SetupError
+from anser_ros.physics.volume import TrackedVolume
+from anser_ros.refit.clouds import default_clouds
+from anser_ros.refit.excitation import region_of
+from anser_ros.sessions.starting_model import drawing_of
+from anser_ros.sessions.volume import pose_volume, stated_volume
 from anser_ros.wire.setup import dump_setup, parse_setup, topic_of
+
+DEMO = Path(__file__).resolve().parents[1] / 'config' / 'demo_setup.yaml'
 
 
 def document() -> dict:
@@ -103,3 +114,47 @@ def test_names_that_share_a_topic_are_refused():
     root['sensors'].append({**root['sensors'][0], 'channel': 5, 'name': 'tool_a_0/x'})
     with pytest.raises(SetupError, match='topic'):
         parse_setup(yaml.safe_dump(root))
+
+
+@pytest.mark.parametrize(
+    ('volume', 'word'),
+    [
+        ('[]', 'volume must be a mapping'),
+        ('{low_m: [-0.1, -0.1, 0.05]}', "volume lacks the key 'high_m'"),
+        ('{low_m: [-0.1, -0.1], high_m: [0.1, 0.1, 0.3]}', 'volume.low_m must be a list of three'),
+        ('{low_m: [-0.1, 0.1, 0.05], high_m: [0.1, 0.1, 0.3]}', 'must be below volume.high_m'),
+        ('{low_m: [-0.1, -0.1, 0.0], high_m: [0.1, 0.1, 0.3]}', r'low_m\[2\] must be at least'),
+        ('{low_m: [0, 0, 0.1], high_m: [1, 1, 1], floor_m: 1}', 'not floor_m'),
+    ],
+)
+def test_volumes_that_are_none_are_refused(volume, word):
+    with pytest.raises(SetupError, match=word) as caught:
+        parse_setup(f'{DEMO.read_text()}\nvolume: {volume}\n')
+    assert '\n' not in str(caught.value)
+
+
+def test_a_stated_volume_is_read_and_written():
+    text = f'{DEMO.read_text()}\nvolume: {{low_m: [-0.1, -0.12, 0.06], high_m: [0.1, 0.1, 0.3]}}\n'
+    setup, default = parse_setup(text), parse_setup(DEMO.read_text())
+    assert setup.volume == ((-0.1, -0.12, 0.06), (0.1, 0.1, 0.3))
+    assert default.volume is None and not setup.has_same_board(default)
+    assert parse_setup(dump_setup(setup)) == setup
+
+
+def test_without_a_stated_volume_it_follows_from_the_board():
+    """The tracker's box is the refit's with its fringe: to the digit what it always was."""
+    setup = parse_setup(DEMO.read_text())
+    assert pose_volume(setup) == TrackedVolume()
+    region = region_of(drawing_of(setup))
+    np.testing.assert_allclose(region.volume.low, [-0.174, -0.174, 0.045], atol=5e-4)
+    np.testing.assert_allclose(region.volume.high, [0.174, 0.174, 0.302], atol=5e-4)
+    box = ((-0.1, -0.12, 0.06), (0.1, 0.1, 0.3))
+    stated = replace(setup, volume=box)
+    assert pose_volume(stated) == stated_volume(stated) == TrackedVolume(*box)
+    samples = stated_volume(stated).samples()
+    np.testing.assert_allclose([samples.min(axis=0), samples.max(axis=0)], box)
+    around = [c.positions for c in default_clouds(replace(region, stated=stated_volume(stated)))
+              if c.overhead]  # fmt: skip
+    assert not any(stated_volume(stated).contains(p) for p in np.concatenate(around))
+    other = replace(setup, emitter=replace(setup.emitter, kind='somebody'))
+    assert pose_volume(other) == TrackedVolume()

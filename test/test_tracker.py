@@ -20,11 +20,11 @@ from anser_ros.field.nominal import nominal_model
 from anser_ros.physics.board import build_board
 from anser_ros.physics.metal import induced_moments, sphere_polarisability
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit.baseline import ReadingWindow
 from anser_ros.tracking import estimate as states
 from anser_ros.tracking.estimate import NoiseScale, TrackerSettings
 from anser_ros.tracking.rotations import rotation_of_vector
-from anser_ros.tracking.seed import Volume
 from anser_ros.tracking.tracker import Tracker
 from anser_ros.tracking.warm_up import warm_up
 from anser_ros.wire.model_error import ModelError, decode_model_error, encode_model_error
@@ -212,7 +212,7 @@ def test_no_model(rng):
 
 
 def test_outside_the_volume(rng):
-    settings = TrackerSettings(volume=Volume((-0.1, -0.1, 0.08), (0.1, 0.1, 0.2)))
+    settings = TrackerSettings(volume=TrackedVolume((-0.1, -0.1, 0.08), (0.1, 0.1, 0.2)))
     flux = fluxes(MODEL, TOOL, np.array([0.0, 0.0, 0.255]), np.eye(3), rng)
     found = one_frame(Tracker(MODEL, TOOL, settings), flux)
     assert found['tool_a/1/x'].state == states.OUTSIDE_VOLUME

@@ -2,11 +2,14 @@
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from tracking_world import certain_model, fluxes, random_pose, setup_of, triaxial_tool
 
+from anser_ros.errors import ParameterError
+from anser_ros.physics.volume import TrackedVolume
 from anser_ros.sessions.model_file import load_model, save_model
 from anser_ros.tracking.rotations import rotation_of_quaternion
 from anser_ros.tracking.tracker import Tracker
@@ -449,6 +452,25 @@ def test_transforms_where_they_are_installed(tracker, monkeypatch):
     move = frames['tool_a'].transform.translation
     assert np.linalg.norm(np.array([move.x, move.y, move.z]) - position) < 3e-4
     assert frames['tool_a'].header.frame_id == 'fg'
+
+
+def test_the_volume_of_the_setup_holds_unless_a_parameter_says_another(tracker):
+    from anser_ros.nodes.tracker import TrackerParameters, settings_of
+
+    rng, node = np.random.default_rng(8), tracker.node
+    box = ((-0.1, -0.1, 0.2), (0.1, 0.1, 0.3))
+    tracker.say_setup(dump_setup(replace(setup_of(SENSORS, reference_specs()), volume=box)))
+    tracker.say_model(certain_model())
+    tracker.spin_until(lambda: node.counters['models'] >= 1)
+    tracker.say_flux(fluxes(certain_model(), SENSORS, np.array([0.0, 0.0, 0.15]), np.eye(3), rng))
+    wait_frame(tracker, 1)
+    node.publish_diagnostics()
+    tracker.spin_until(lambda: tracker.state('anser/tracker: tool_a') == 'outside_volume')
+    low, high = (-0.1, -0.1, 0.05), (0.1, 0.1, 0.3)
+    node._settings = settings_of(TrackerParameters(volume_low_m=low, volume_high_m=high))
+    assert node._wanted_settings().box == TrackedVolume(low, high)
+    with pytest.raises(ParameterError, match='volume_high_m: three numbers'):
+        settings_of(TrackerParameters(volume_low_m=low))
 
 
 def test_a_wrong_parameter_ends_the_node_with_one_line(start):

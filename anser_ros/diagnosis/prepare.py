@@ -95,7 +95,7 @@ def build_problem(
         omega=omega,
         duration=float(end - start),
         illumination=illumination,
-        working_volume=np.stack([centres.min(axis=0), centres.max(axis=0)]),
+        visited_box=np.stack([centres.min(axis=0), centres.max(axis=0)]),
         board=board_box(drawn or model),
     )
     blocks = tuple(_numbers(tool.time, edges) for tool in posed)

@@ -55,7 +55,7 @@ class ConductivePlate(Effect):
         size = float(np.max(apparatus.board[1, :2] - apparatus.board[0, :2]))
         middle = apparatus.board.mean(axis=0)
         below = apparatus.board[0, 2] - size * np.array([0.08, 0.16, 0.26, 0.4, 0.6])
-        above = apparatus.working_volume[1, 2] + size * np.array([0.25, 0.5])
+        above = apparatus.visited_box[1, 2] + size * np.array([0.25, 0.5])
         return [
             Term(
                 self,

@@ -57,8 +57,9 @@ class Apparatus:
         s.
     illumination : Dipoles
         The emitters' own field, good also beside and below the board.
-    working_volume : ndarray, shape (2, 3)
-        Lower and upper corner of the space in which tool sensors were, m.
+    visited_box : ndarray, shape (2, 3)
+        Lower and upper corner of the box in which tool sensors were during this session, m: what
+        the data can tell about, not where tools may be (that is `physics.volume.TrackedVolume`).
     board : ndarray, shape (2, 3)
         Lower and upper corner of the field generator, m.
     """
@@ -69,7 +70,7 @@ class Apparatus:
     omega: Array
     duration: float
     illumination: Dipoles
-    working_volume: Array
+    visited_box: Array
     board: Array
 
     @property

@@ -32,14 +32,14 @@ CLOSEST = 0.02
 
 def places(apparatus: Apparatus) -> Array:
     """Where metal is looked for: a grid about the board and the volume, shape (n, 3), m."""
-    low = np.minimum(apparatus.board[0], apparatus.working_volume[0])
-    high = np.maximum(apparatus.board[1], apparatus.working_volume[1])
+    low = np.minimum(apparatus.board[0], apparatus.visited_box[0])
+    high = np.maximum(apparatus.board[1], apparatus.visited_box[1])
     size = float(np.max(high[:2] - low[:2]))
     lateral = [np.linspace(low[i] - 0.2 * size, high[i] + 0.2 * size, 7) for i in (0, 1)]
     around = [np.linspace(low[i] - 0.5 * size, high[i] + 0.5 * size, 5) for i in (0, 1)]
     below = apparatus.board[0, 2] - size * np.array([0.06, 0.14, 0.24, 0.38, 0.6])
-    above = apparatus.working_volume[1, 2] + size * np.array([0.2, 0.45])
-    beside = np.linspace(apparatus.board[1, 2], apparatus.working_volume[1, 2], 3)
+    above = apparatus.visited_box[1, 2] + size * np.array([0.2, 0.45])
+    beside = np.linspace(apparatus.board[1, 2], apparatus.visited_box[1, 2], 3)
     grid = [(x, y, z) for z in (*below, *beside, *above) for x, y in product(*lateral)]
     ring = [
         (x, y, z)
@@ -49,8 +49,8 @@ def places(apparatus: Apparatus) -> Array:
     ]
     points = np.array(grid + ring)
     inside = np.all(
-        (points > apparatus.working_volume[0] - CLOSEST)
-        & (points < apparatus.working_volume[1] + CLOSEST),
+        (points > apparatus.visited_box[0] - CLOSEST)
+        & (points < apparatus.visited_box[1] + CLOSEST),
         axis=1,
     )
     on_board = np.all(

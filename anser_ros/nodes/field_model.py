@@ -17,7 +17,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from anser_ros.errors import AnserError, FitError, ModelFileError, SetupError
+from anser_ros.errors import AnserError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.nominal import nominal_model
 from anser_ros.nodes import qos
@@ -37,7 +37,8 @@ from anser_ros.sessions.evaluation import baseline_flux
 from anser_ros.sessions.model_file import load_model, save_model
 from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session, sensor_table
-from anser_ros.sessions.starting_model import NOMINAL, board_of
+from anser_ros.sessions.starting_model import NOMINAL, board_of, drawing_of
+from anser_ros.sessions.volume import stated_volume
 from anser_ros.wire.setup import Setup, parse_setup
 
 
@@ -270,19 +271,22 @@ class FieldModelNode(AnserNode):
         """Refit from now on to what differs from a baseline, shape (S, K), T."""
         if self._base is None or self._references is None or self._setup is None:
             raise FitError('no setup yet')
-        try:
-            drawing = board_of(self._setup).field
-        except SetupError:  # an emitter that can't be drawn: its own dipoles have to do
-            drawing = None
+        # An emitter that can't be drawn: its own dipoles have to do.
+        drawing = drawing_of(self._setup)
+        volume = stated_volume(self._setup)
         bodies = tuple(self._patch_topics)
         moving = tuple(s for s in self._setup.tool_sensors if s.body in bodies)
         self._patches = None
         if moving:
             patches = Patches(sensor_table(moving), baseline, self._frame_id)
-            self._refit = patches.started(self._base, self._references, drawing=drawing)
+            self._refit = patches.started(
+                self._base, self._references, drawing=drawing, volume=volume
+            )
             self._patches = patches
         else:
-            self._refit = LiveRefit(self._base, self._references, baseline, drawing=drawing)
+            self._refit = LiveRefit(
+                self._base, self._references, baseline, drawing=drawing, volume=volume
+            )
         self._result = None
         self._tell_following()
         self.count('baselines')

@@ -25,11 +25,12 @@ from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.pose_output import PoseTopic, transform_message, transform_publisher
 from anser_ros.nodes.readiness import digest_of
+from anser_ros.physics.volume import TrackedVolume
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import noise_of, sensor_table
 from anser_ros.sessions.starting_model import NOMINAL
+from anser_ros.sessions.volume import pose_volume
 from anser_ros.tracking.estimate import OK, TrackerSettings
-from anser_ros.tracking.seed import Volume
 from anser_ros.tracking.tracker import Tracker
 from anser_ros.tracking.warm_up import warm_up
 from anser_ros.wire.points import FluxPoints
@@ -68,10 +69,10 @@ class TrackerParameters:
         0.01, 'largest uncertainty of a pose, m', minimum=1e-5, maximum=1.0, live=True
     )
     volume_low_m: tuple[float, ...] = parameter(
-        (-0.2, -0.2, 0.05), 'lower corner of the box where tools may be, m'
+        (), "lower corner of the box where tools may be, m; empty: the setup's volume"
     )
     volume_high_m: tuple[float, ...] = parameter(
-        (0.2, 0.2, 0.35), 'upper corner of the box where tools may be, m'
+        (), "upper corner of the box where tools may be, m; empty: the setup's volume"
     )
     grid_spacing_m: float = parameter(
         0.035, 'spacing of the cold start at 0.1 m height, m', minimum=0.005, maximum=0.2
@@ -93,15 +94,26 @@ class TrackerParameters:
 
 
 def settings_of(table: TrackerParameters) -> TrackerSettings:
-    """Settings of the core; raises `ParameterError` when a corner is not three numbers."""
-    for name in ('volume_low_m', 'volume_high_m'):
-        if len(getattr(table, name)) != 3:
-            raise ParameterError(f'parameter {name}: three numbers needed')
+    """Settings of the core.
+
+    Raises
+    ------
+    ParameterError
+        When a corner of the volume is not three numbers, or only one of the two is given.
+    TrackingError
+        When the corners make no box.
+    """
     low, high = table.volume_low_m, table.volume_high_m
+    volume = None
+    if low or high:
+        for name in ('volume_low_m', 'volume_high_m'):
+            if len(getattr(table, name)) != 3:
+                raise ParameterError(f'parameter {name}: three numbers needed')
+        volume = TrackedVolume((low[0], low[1], low[2]), (high[0], high[1], high[2]))
     return TrackerSettings(
         flux_noise_t=table.flux_noise_t,
         adaptive=table.adaptive,
-        volume=Volume((low[0], low[1], low[2]), (high[0], high[1], high[2])),
+        volume=volume,
         grid_spacing_m=table.grid_spacing_m,
         gate=table.gate,
         max_sigma_m=table.max_sigma_m,
@@ -124,6 +136,7 @@ class TrackerNode(AnserNode):
         self._setup_text = ''
         self._setup: Setup | None = None
         self._flux_noise_t = 0.0
+        self._volume: TrackedVolume | None = None
         self._tracker: Tracker | None = None
         self._topics: dict[str, PoseTopic] = {}
         self._intake = ModelIntake()
@@ -158,6 +171,7 @@ class TrackerNode(AnserNode):
             setup = parse_setup(message.data)
             sensors = sensor_table(setup.tool_sensors)
             self._flux_noise_t = noise_of(setup)
+            self._volume = pose_volume(setup)
             tracker = Tracker(None, sensors, self._wanted_settings())
         except AnserError as error:
             self._refuse('setups_refused', error)
@@ -293,9 +307,13 @@ class TrackerNode(AnserNode):
             self.publish_diagnostics()
 
     def _wanted_settings(self) -> TrackerSettings:
-        """The settings; the noise that the setup tells counts where it is larger."""
-        noise_t = max(self._settings.flux_noise_t, self._flux_noise_t)
-        return replace(self._settings, flux_noise_t=noise_t)
+        """The settings: the setup's volume where no parameter says another, the larger noise."""
+        settings = self._settings
+        return replace(
+            settings,
+            flux_noise_t=max(settings.flux_noise_t, self._flux_noise_t),
+            volume=settings.volume or self._volume,
+        )
 
     # What is told -------------------------------------------------------------------------
 

@@ -11,9 +11,12 @@ The frame ``fg`` has its board at z = 0 with z up towards the patient, so "below
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+from anser_ros.physics.volume import TrackedVolume
 
 Array = NDArray[np.float64]
 
@@ -29,40 +32,26 @@ BODY_RADIUS = 0.45
 
 @dataclass(frozen=True)
 class Region:
-    """The board's extent and the space over it where sensors are tracked.
+    """The board's extent, and the volume over it in which the field must be right.
 
     Attributes
     ----------
     centre : ndarray, shape (2,)
         x and y of the board's middle, m.
     half : float
-        Half of the board's larger side, m.
+        Half of the board's larger side, m; sizes and spacings of clouds and layers are told in it.
+    stated : TrackedVolume or None
+        The volume as the setup states it; None: the default over such a board.
     """
 
     centre: Array
     half: float
+    stated: TrackedVolume | None = None
 
-    @property
-    def floor(self) -> float:
-        """Height over the board, m, from which on tools are tracked."""
-        return 0.3 * self.half
-
-    @property
-    def ceiling(self) -> float:
-        """Height up to which tools are tracked, m."""
-        return 2.0 * self.half
-
-    @property
-    def margin(self) -> float:
-        """How far tools may be outside the board's edge, m."""
-        return 0.15 * self.half
-
-    def samples(self, across: int = 6, up: int = 5, part: float = 1.0) -> Array:
-        """Points of the tracked volume, shape (across^2 up, 3), denser near the board."""
-        side = np.linspace(-part, part, across) * (self.half + self.margin)
-        height = self.floor * (part * self.ceiling / self.floor) ** np.linspace(0.0, 1.0, up)
-        x, y, z = np.meshgrid(side + self.centre[0], side + self.centre[1], height, indexing='ij')
-        return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+    @cached_property
+    def volume(self) -> TrackedVolume:
+        """Where tools are tracked."""
+        return self.stated or TrackedVolume.over_board(self.centre, self.half)
 
 
 @dataclass(frozen=True)
@@ -138,13 +127,15 @@ def overhead(region: Region, standoff: float) -> Cloud:
 
 def _shell(region: Region, inner: float, outer: float, spacing: float) -> Array:
     """Lattice points between two boxes around the tracked volume that are open at the bottom."""
-    side, deep = region.half + region.margin, 0.3 * region.half
-    flat = _centred(side + outer, spacing)
-    height = np.arange(-deep + spacing / 2.0, region.ceiling + outer, spacing)
-    x, y, z = (axis.ravel() for axis in np.meshgrid(flat, flat, height, indexing='ij'))
-    away = np.maximum(np.maximum(np.abs(x), np.abs(y)) - side, z - region.ceiling)
+    volume, deep = region.volume, 0.3 * region.half
+    side = volume.reach
+    flat = [_centred(reach + outer, spacing) for reach in side.tolist()]
+    height = np.arange(-deep + spacing / 2.0, volume.ceiling + outer, spacing)
+    x, y, z = (axis.ravel() for axis in np.meshgrid(*flat, height, indexing='ij'))
+    beside = np.maximum(np.abs(x) - side[0], np.abs(y) - side[1])
+    away = np.maximum(beside, z - volume.ceiling)
     points: Array = np.stack([x, y, z], axis=1)[(away >= inner) & (away < outer)]
-    points[:, :2] += region.centre
+    points[:, :2] += volume.middle
     return points
 
 

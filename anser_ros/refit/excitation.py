@@ -6,7 +6,7 @@ the drawing is used where there is one, with strength and phase taken from the c
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import field_basis
+from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit.clouds import Region
 
 Array = NDArray[np.float64]
@@ -85,8 +86,12 @@ def region_of(field: Callable[[Array], NDArray[np.generic]]) -> Region:
     return Region((low + high) / 2.0, float((high - low).max() / 2.0))
 
 
-def excitation_for(model: FieldModel, drawing: FieldFunction | None) -> tuple[Excitation, Region]:
+def excitation_for(
+    model: FieldModel, drawing: FieldFunction | None, volume: TrackedVolume | None = None
+) -> tuple[Excitation, Region]:
     """The drawing's field scaled to the model, or the model's own where that is not this board's.
+
+    ``volume`` is the tracked volume as stated; None: the default over the board.
 
     Raises
     ------
@@ -97,9 +102,10 @@ def excitation_for(model: FieldModel, drawing: FieldFunction | None) -> tuple[Ex
     def own(points: Array) -> ComplexArray:
         return model_field(model, points)
 
-    region = region_of(own if drawing is None else drawing)
-    points = region.samples()
-    points = points[points[:, 2] > 0.6 * region.half]
+    region = replace(region_of(own if drawing is None else drawing), stated=volume)
+    points = region.volume.samples()
+    high = points[:, 2] > 0.6 * region.half
+    points = points[high] if high.any() else points
     measured = own(points)
     if drawing is not None:
         drawn = drawing(points)
@@ -112,7 +118,7 @@ def excitation_for(model: FieldModel, drawing: FieldFunction | None) -> tuple[Ex
         size = np.sqrt(power * (np.abs(measured) ** 2).sum(axis=(0, 2)))
         if (np.abs(gain) * power >= AGREEMENT * size).all():
             return Excitation('board', np.abs(gain), gain / np.abs(gain), drawing), region
-        region = region_of(own)
+        region = replace(region_of(own), stated=volume)
     square = (measured**2).sum(axis=(0, 2))
     phase = np.exp(0.5j * np.angle(square))
 

@@ -150,6 +150,8 @@ def _metric(basis: Array, weight: Array) -> Array:
 def _middle(points: Array, half: float) -> NDArray[np.int64]:
     """Rows of some samples in the middle of the volume, three a sample."""
     there = np.flatnonzero((points[:, 2] > 0.5 * half) & (points[:, 2] < half))
+    if not there.size:  # a stated volume may be all above or all below
+        there = np.arange(len(points))
     some = there[:: -(-len(there) // MOST_MIDDLE) or 1]
     return np.asarray((3 * some[:, None] + np.arange(3)).ravel())
 
@@ -161,11 +163,11 @@ def body_layer(region: Region, weight: Array, cloud: Cloud) -> Layer:
     ----------
     region : Region
     weight : ndarray, shape (P,)
-        `pose_weight` at ``region.samples()``.
+        `pose_weight` at ``region.volume.samples()``.
     cloud : Cloud
         The body's sources.
     """
-    points = region.samples()
+    points = region.volume.samples()
     away = np.linalg.norm(points[:, None] - cloud.positions, axis=2).min(axis=1)
     clear = away > CLEAR * cloud.standoff_m
     points = points[clear]
@@ -201,7 +203,7 @@ def bottom_layer(
     sources : ndarray, shape (M, 3)
         Sources of the cloud that is hardest to stand for, the nearest one.
     """
-    points, deep = region.samples(*SAMPLES), _lattice(region, *DEEP)
+    points, deep = region.volume.samples(*SAMPLES), _lattice(region, *DEEP)
     upright = np.abs(model.directions[:, 2]) > 0.999
     low = np.abs(model.positions[:, 2]) < 0.5 * region.half
     rows = np.flatnonzero(upright & low)
@@ -217,24 +219,25 @@ def bottom_layer(
 def box_layer(region: Region, excitation: Excitation) -> Layer:
     """Dipoles on the faces of a box around the tracked volume, pointing inwards."""
     gap = 0.8 * region.half
-    half = region.half + region.margin + gap
-    across = np.linspace(-half, half, 6)
+    volume = region.volume
+    sides = volume.reach + gap
+    across = [np.linspace(-side, side, 6) for side in sides.tolist()]
     faces = [(axis, sign) for axis in range(2) for sign in (-1.0, 1.0)]
     positions, directions = [], []
     for axis, sign in faces:
-        up = np.linspace(-gap, region.ceiling + gap, 4)
-        u, v = (a.ravel() for a in np.meshgrid(across, up, indexing='ij'))
+        up = np.linspace(-gap, volume.ceiling + gap, 4)
+        u, v = (a.ravel() for a in np.meshgrid(across[1 - axis], up, indexing='ij'))
         face = np.empty((u.size, 3))
-        face[:, axis], face[:, 1 - axis], face[:, 2] = sign * half, u, v
+        face[:, axis], face[:, 1 - axis], face[:, 2] = sign * sides[axis], u, v
         positions.append(face)
         directions.append(np.tile(-sign * np.eye(3)[axis], (u.size, 1)))
-    u, v = (a.ravel() for a in np.meshgrid(across, across, indexing='ij'))
-    for height, inwards in ((region.ceiling + gap, -1.0), (-gap, 1.0)):
+    u, v = (a.ravel() for a in np.meshgrid(*across, indexing='ij'))
+    for height, inwards in ((volume.ceiling + gap, -1.0), (-gap, 1.0)):
         positions.append(np.stack([u, v, np.full(u.size, height)], axis=1))
         directions.append(inwards * _upright(positions[-1]))
     stacked = np.concatenate(positions)
-    stacked[:, :2] += region.centre
+    stacked[:, :2] += volume.middle
     # Near the faces the field of what is just outside has more detail than the box can make.
-    points = region.samples(*SAMPLES, part=INNER)
+    points = region.volume.samples(*SAMPLES, part=INNER)
     axes = np.concatenate(directions)
     return _build(AROUND, None, stacked, axes, points, excitation, region.half)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit import health
 from anser_ros.refit.assembly import Assembly
 from anser_ros.refit.change import Average, NoiseLevel
@@ -66,6 +67,8 @@ class LiveRefit:
     noise : ndarray, shape (S,), optional
         Noise of each reference over the nominal one, at least 1; more for coils whose place is
         only known from a tracker (see `refit.patches`).
+    volume : TrackedVolume, optional
+        Where the field must be right; by default the volume over such a board.
 
     Raises
     ------
@@ -81,13 +84,14 @@ class LiveRefit:
         settings: RefitSettings | None = None,
         drawing: FieldFunction | None = None,
         noise: Array | None = None,
+        volume: TrackedVolume | None = None,
     ) -> None:
         self.model = model
         self.references = references
         self.settings = settings or RefitSettings()
         self.baseline = _checked_baseline(model, references, baseline)
         self._row_noise = _checked_noise(noise, len(references), len(model.emitters))
-        self._tables = build_tables(model, references, self.settings, drawing)
+        self._tables = build_tables(model, references, self.settings, drawing, volume)
         self._prepare()
         self.reset()
         self._warm_up()

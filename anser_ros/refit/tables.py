@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit.clouds import Cloud, Region, bodies, default_clouds
 from anser_ros.refit.excitation import Excitation, FieldFunction, excitation_for
 from anser_ros.refit.layer import (
@@ -98,9 +99,10 @@ def build_tables(
     references: SensorTable,
     settings: RefitSettings,
     drawing: FieldFunction | None,
+    volume: TrackedVolume | None = None,
 ) -> RefitTables:
     """Compute the tables; raises `FitError` as `excitation_for` does."""
-    excitation, region = excitation_for(model, drawing)
+    excitation, region = excitation_for(model, drawing, volume)
     clouds = default_clouds(region)
     bottom = bottom_layer(model, region, excitation, clouds[0].positions)
     box = box_layer(region, excitation)
@@ -118,7 +120,7 @@ def build_tables(
         _factors(around, references, excitation),
         references,
         settings,
-        pose_weight(region.samples(), excitation),
+        pose_weight(region.volume.samples(), excitation),
     )
 
 

@@ -24,6 +24,7 @@ from anser_ros.refit.live_refit import LiveRefit, RefitResult, RefitSettings
 from anser_ros.sessions.patches import PatchFollower
 from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, NANO, Session, noise_of
 from anser_ros.sessions.starting_model import check_fits, drawing_of
+from anser_ros.sessions.volume import pose_volume, stated_volume
 from anser_ros.tracking.tracker import PoseEstimate, Tracker, TrackerSettings
 
 Array = NDArray[np.float64]
@@ -174,7 +175,14 @@ def track_session(
     noise_t = max(wanted.flux_noise_t, noise_of(session.setup))
     recorded = not refit and drift_recorded(model, session)
     tracker = Tracker(
-        model, sensors, replace(wanted, flux_noise_t=noise_t, recorded_drift=recorded)
+        model,
+        sensors,
+        replace(
+            wanted,
+            flux_noise_t=noise_t,
+            recorded_drift=recorded,
+            volume=wanted.volume or pose_volume(session.setup),
+        ),
     )
     follower = _follower(session, model, baseline, patches or {}) if refit else None
     pace, summary = Pace(), RefitSummary() if refit else None
@@ -256,7 +264,8 @@ def _follower(
         raise BagError(f'{baseline.path}: {error}') from error
     if patches:
         return PatchFollower(session, model, clean, patches)
-    return LiveRefit(model, sensors, clean, drawing=drawing_of(session.setup))
+    setup = session.setup
+    return LiveRefit(model, sensors, clean, drawing=drawing_of(setup), volume=stated_volume(setup))
 
 
 def _truth(

@@ -12,6 +12,7 @@ from anser_ros.refit.result import RefitResult
 from anser_ros.sessions.recorded_poses import PublishedPoses, published_poses
 from anser_ros.sessions.session import Session, sensor_table
 from anser_ros.sessions.starting_model import drawing_of
+from anser_ros.sessions.volume import stated_volume
 from anser_ros.tracking.rotations import rotation_of_quaternion
 
 ComplexArray = NDArray[np.complex128]
@@ -69,8 +70,13 @@ class PatchFollower:
                 raise BagError(f'{session.path}: no pose on the topic {topic}')
         self._poses: dict[str, PublishedPoses] = {b: found[t] for b, t in topics.items()}
         self._patches = PatchCoils(sensor_table(moving), fixed)
-        drawing = drawing_of(session.setup)
-        self._refit = self._patches.started(model, session.reference.sensors, drawing=drawing)
+        setup = session.setup
+        self._refit = self._patches.started(
+            model,
+            session.reference.sensors,
+            drawing=drawing_of(setup),
+            volume=stated_volume(setup),
+        )
 
     def take_flux(
         self,

@@ -280,7 +280,7 @@ def _judge(
     if not fit.ratio <= settings.gate**2:
         state = states.RESIDUAL
         reason = f'residual {residual:.3g} T is {math.sqrt(fit.ratio):.3g} times the expected one'
-    elif not settings.volume.contains(centre):
+    elif not settings.box.contains(centre):
         state = states.OUTSIDE_VOLUME
         reason = 'at ' + ', '.join(f'{1e3 * v:.1f}' for v in centre) + ' mm'
     elif not solution.converged:

@@ -345,7 +345,7 @@ def _judge(
     if not solution.chi2 <= frame.limit:
         state = states.RESIDUAL
         reason = f'residual {residual:.3g} T is {math.sqrt(ratio):.3g} times the expected one'
-    elif not settings.volume.contains(solution.position):
+    elif not settings.box.contains(solution.position):
         state, reason = states.OUTSIDE_VOLUME, f'at {_millimetres(solution.position)} mm'
     elif not solution.converged:
         state, reason = states.AMBIGUOUS, 'the solve did not converge'
@@ -357,7 +357,7 @@ def _judge(
         margin = settings.margin(ratio)
         for rival in rivals:
             likely = rival.converged and rival.chi2 < solution.chi2 + margin
-            if likely and settings.volume.contains(rival.position):
+            if likely and settings.box.contains(rival.position):
                 state = states.AMBIGUOUS
                 reason = f'{_millimetres(rival.position)} mm would explain the fluxes too'
     return PoseEstimate(

@@ -1,13 +1,13 @@
 """What tracking reports, and what it is told: states, pose estimates, settings."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
-from anser_ros.tracking.seed import Volume
+from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.uncertainty import ROLL_VARIANCE
 
 Array = NDArray[np.float64]
@@ -44,8 +44,8 @@ class TrackerSettings:
         Standard deviation of each phasor component, T, before anything has been tracked.
     adaptive : bool
         Whether each sensor's noise scale follows the residuals of its recent good frames.
-    volume : Volume
-        Where tools may be.
+    volume : TrackedVolume or None
+        Where tools may be; a pose outside is refused. None: the tracker's box over an Anser board.
     grid_spacing_m : float
         Spacing of the cold start's grid at 0.1 m height.
     gate : float
@@ -68,7 +68,7 @@ class TrackerSettings:
 
     flux_noise_t: float = 60e-12
     adaptive: bool = True
-    volume: Volume = field(default_factory=Volume)
+    volume: TrackedVolume | None = None
     grid_spacing_m: float = 0.035
     gate: float = USUAL_GATE
     odds: float = 1000.0
@@ -87,6 +87,11 @@ class TrackerSettings:
                 raise TrackingError(f'setting {name} must be positive and finite, got {value}')
         if not self.odds >= 1 or not self.min_signal >= 0:
             raise TrackingError('settings: odds must be at least 1, min_signal at least 0')
+
+    @property
+    def box(self) -> TrackedVolume:
+        """Where tools may be."""
+        return self.volume or TrackedVolume()
 
     def margin(self, ratio: float) -> float:
         """Chi-square by which a rival must be worse, at a residual power per freedom ``ratio``.

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
 from anser_ros.physics.dipole import fill_field_and_gradient
+from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.projection import descend_projected
 from anser_ros.tracking.solve import Array, CoilSolution, RealField, solve_coil
 
@@ -28,36 +29,6 @@ HOPELESS = 100.0
 
 LAST_RESORT = 5
 """How many times more starts are tried when none of the first ones leads below the gate."""
-
-
-@dataclass(frozen=True)
-class Volume:
-    """Box where tools may be, m, frame fg."""
-
-    low: tuple[float, float, float] = (-0.2, -0.2, 0.05)
-    high: tuple[float, float, float] = (0.2, 0.2, 0.35)
-
-    def __post_init__(self) -> None:
-        box = np.array([self.low, self.high], dtype=np.float64)
-        if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[1] > box[0]).all():
-            raise TrackingError(
-                f'a volume needs low < high in x, y, z, got {self.low}, {self.high}'
-            )
-
-    def contains(self, position: Array) -> bool:
-        """Whether a position (m) lies in the box."""
-        inside = zip(self.low, position.tolist(), self.high, strict=True)
-        return all(low <= value <= high for low, value, high in inside)
-
-    def grown(self, margin_m: float) -> tuple[Array, Array]:
-        """Corners of the box with a margin around it; the floor stays above half its height.
-
-        The field of a flat board is mirrored at its plane, so a solver must not cross it.
-        """
-        low, high = np.array(self.low) - margin_m, np.array(self.high) + margin_m
-        if self.low[2] > 0:
-            low[2] = max(low[2], 0.5 * self.low[2])
-        return low, high
 
 
 @dataclass(frozen=True)
@@ -169,7 +140,7 @@ def _pick(points, cost, axes, apart, count):  # type: ignore[no-untyped-def]
     return chosen[:found]
 
 
-def grid_points(volume: Volume, spacing_m: float) -> Array:
+def grid_points(volume: TrackedVolume, spacing_m: float) -> Array:
     """Points of a grid that covers a volume, shape (G, 3), m.
 
     The field changes over a length that grows with the height, so does the spacing: ``spacing_m``
@@ -201,7 +172,7 @@ def grid_points(volume: Volume, spacing_m: float) -> Array:
 
 
 def build_grid(
-    field: RealField, sigma: Array, volume: Volume, spacing_m: float = 0.025
+    field: RealField, sigma: Array, volume: TrackedVolume, spacing_m: float = 0.025
 ) -> SeedGrid:
     """Precompute the scan of a volume.
 
@@ -210,7 +181,7 @@ def build_grid(
     field : RealField
     sigma : ndarray, shape (2K,)
         Standard deviation of each flux component, T.
-    volume : Volume
+    volume : TrackedVolume
     spacing_m : float
         See `grid_points`.
 

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_basis
+from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.error_whitening import error_whitening, source_spacing
 from anser_ros.tracking.estimate import TrackerSettings
-from anser_ros.tracking.seed import SeedGrid, Volume, build_grid
+from anser_ros.tracking.seed import SeedGrid, build_grid
 from anser_ros.tracking.solve import RealField
 
 Array = NDArray[np.float64]
@@ -29,14 +30,16 @@ class Starts:
 
     Parameters
     ----------
-    volume : Volume
+    volume : TrackedVolume
     spacing_m : float
         Of the grid, m.
     before : Starts, optional
         Of the model before. Its grid serves on while the field is nearly the same.
     """
 
-    def __init__(self, volume: Volume, spacing_m: float, before: 'Starts | None' = None) -> None:
+    def __init__(
+        self, volume: TrackedVolume, spacing_m: float, before: 'Starts | None' = None
+    ) -> None:
         self._volume, self._spacing_m = volume, spacing_m
         self._before = before
         self._made: tuple[SeedGrid, Array] | None = None
@@ -216,11 +219,11 @@ def build_context(
         sigma = previous.sigma
     modes = None if previous is None else previous.modes
     if modes is None or modes.given is not model.modes:
-        floor_m = 0.5 * settings.volume.low[2]
+        floor_m = 0.5 * settings.box.low[2]
         modes = ErrorModes.of(model.modes, field.positions, floor_m)
     name = model_digest(model) if model_id is None else model_id
-    low, high = settings.volume.grown(BOX_MARGIN_M)
-    starts = Starts(settings.volume, settings.grid_spacing_m)
+    low, high = settings.box.grown(BOX_MARGIN_M)
+    starts = Starts(settings.box, settings.grid_spacing_m)
     if previous is None:
         starts.grid(field, sigma)  # the first frame needs it
     else:

@@ -4,8 +4,8 @@ import numpy as np
 
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.estimate import TrackerSettings
-from anser_ros.tracking.seed import Volume
 from anser_ros.tracking.tracker import Tracker
 
 
@@ -26,7 +26,7 @@ def warm_up() -> None:
         axis=np.eye(3),
         length=np.array([0.0, 0.008, 0.0]),
     )
-    settings = TrackerSettings(volume=Volume((-0.1, -0.1, 0.1), (0.1, 0.1, 0.2)))
+    settings = TrackerSettings(volume=TrackedVolume((-0.1, -0.1, 0.1), (0.1, 0.1, 0.2)))
     for uncertainty in (None, modes):
         model = FieldModel(
             positions, directions, moments, names, tuple(1000.0 + k for k in range(9)), 0.0,

@@ -18,6 +18,9 @@ from anser_ros.errors import SetupError
 SCHEMA = 'anser_setup/1'
 FIELD_GENERATOR = 'fg'
 AXIS_TOLERANCE = 1e-3
+LOWEST_VOLUME_M = 1e-3
+"""A tracked volume ends at least so far over the board's copper (z = 0), m: nearer than the copper
+is thick, no model of its field holds, and heights are sampled in a geometric series."""
 
 _NAME = re.compile(r'^[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*$')
 Vector = tuple[float, float, float]
@@ -60,12 +63,17 @@ class SensorSpec:
 
 @dataclass(frozen=True)
 class Setup:
-    """A validated setup document."""
+    """A validated setup document.
+
+    ``volume`` holds the corners, low and high (m, frame fg), of the box in which tools are
+    tracked; None where the document leaves it to the board's size.
+    """
 
     frame_id: str
     flux_rate_hz: float
     emitter: Emitter
     sensors: tuple[SensorSpec, ...]
+    volume: tuple[Vector, Vector] | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -94,9 +102,9 @@ class Setup:
         return tuple(coil.frequency_hz for coil in self.emitter.coils)
 
     def has_same_board(self, other: 'Setup') -> bool:
-        """Whether two setups have the same emitters and sensors."""
-        ours = (self.frame_id, self.emitter, self.sensors)
-        return ours == (other.frame_id, other.emitter, other.sensors)
+        """Whether two setups have the same emitters, sensors and tracked volume."""
+        ours = (self.frame_id, self.emitter, self.sensors, self.volume)
+        return ours == (other.frame_id, other.emitter, other.sensors, other.volume)
 
 
 def topic_of(name: str) -> str:
@@ -211,6 +219,24 @@ def _parse_sensor(item: Any, where: str) -> SensorSpec:
     )
 
 
+def _parse_volume(item: Any) -> tuple[Vector, Vector]:
+    volume = _mapping(item, 'volume')
+    unknown = sorted(set(volume) - {'low_m', 'high_m'})
+    if unknown:
+        raise SetupError(f'setup: volume has low_m and high_m, not {unknown[0]}')
+    low, high = (
+        _vector(_take(volume, key, 'volume'), f'volume.{key}') for key in ('low_m', 'high_m')
+    )
+    if not all(a < b for a, b in zip(low, high, strict=True)):
+        raise SetupError(f'setup: volume.low_m must be below volume.high_m, got {low} and {high}')
+    if low[2] < LOWEST_VOLUME_M:
+        raise SetupError(
+            f'setup: volume.low_m[2] must be at least {LOWEST_VOLUME_M:g} m over the board, '
+            f'got {low[2]:g}'
+        )
+    return low, high
+
+
 def parse_setup(text: str) -> Setup:
     """Read and check a setup document.
 
@@ -254,7 +280,7 @@ def parse_setup(text: str) -> Setup:
     _unique(
         [topic_of(name) for name in [s.name for s in tools] + bodies], 'topic of sensor or body'
     )
-    known = ('schema', 'frame_id', 'flux_rate_hz', 'flux_unit', 'emitter', 'sensors')
+    known = ('schema', 'frame_id', 'flux_rate_hz', 'flux_unit', 'emitter', 'sensors', 'volume')
     return Setup(
         frame_id=frame_id,
         flux_rate_hz=_number(
@@ -262,6 +288,7 @@ def parse_setup(text: str) -> Setup:
         ),
         emitter=_parse_emitter(_take(root, 'emitter', 'the document')),
         sensors=parsed,
+        volume=_parse_volume(root['volume']) if 'volume' in root else None,
         extra={k: v for k, v in root.items() if k not in known},
     )
 
@@ -288,6 +315,8 @@ def dump_setup(setup: Setup) -> str:
         }
         for s in setup.sensors
     ]
+    corners = zip(('low_m', 'high_m'), setup.volume or (), strict=False)
+    volume = {key: list(corner) for key, corner in corners}
     document = {
         'schema': SCHEMA,
         'frame_id': setup.frame_id,
@@ -295,6 +324,7 @@ def dump_setup(setup: Setup) -> str:
         'flux_unit': 'T',
         'emitter': {'kind': setup.emitter.kind, **setup.emitter.geometry, 'coils': coils},
         'sensors': sensors,
+        **({'volume': volume} if volume else {}),
         **setup.extra,
     }
     return yaml.safe_dump(document, sort_keys=False)

@@ -14,7 +14,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tracking_world import NOISE_T, certain_model
 
 from anser_ros.physics.dipole import flux_basis
-from anser_ros.tracking.seed import Volume, build_grid, solve_cold
+from anser_ros.physics.volume import TrackedVolume
+from anser_ros.tracking.seed import build_grid, solve_cold
 from anser_ros.tracking.solve import RealField, solve_coil, whitening_of
 from anser_ros.tracking.uncertainty import chi2_limit
 
@@ -39,7 +40,7 @@ class World:
         self.field = RealField.of(model.positions, model.directions, model.moments)
         width = self.field.moments.shape[1]
         self.whitening = whitening_of(np.full(width, NOISE_T))
-        volume = Volume()
+        volume = TrackedVolume()
         self.low, self.high = volume.grown(0.03)
         self.grid = build_grid(self.field, np.full(width, NOISE_T), volume, 0.035)
         self.gate = chi2_limit(width - 5, GATE_PROBABILITY)

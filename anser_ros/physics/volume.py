@@ -1,0 +1,131 @@
+"""The tracked volume: the box over the board in which tools are tracked.
+
+The refit makes the field right in it, and the tracker gives poses in it. The setup document states
+it (key ``volume``); where it does not, it follows from the board's size, see `over_board`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import TrackingError
+
+Array = NDArray[np.float64]
+
+FLOOR, CEILING, BESIDE = 0.3, 2.0, 0.15
+"""The default volume, in halves of the board's larger side: heights over the board from which and
+up to which tools are tracked, and how far they may be outside the board's edge. On the demo board
+that is 45 to 302 mm high and 347 mm wide. A larger volume spreads the refit's samples over where
+no tool is; tools outside a smaller one are tracked with a field that was fitted elsewhere."""
+FRINGE = 1.15
+"""Factor between the default volume and the box in which the tracker accepts poses. The board's
+size tells only about where tools are, so poses a little outside are accepted with the larger
+uncertainty that the field model has there."""
+FRINGE_STEP_M = 0.01
+"""The widened box is rounded to whole centimetres, so that boards of about the same size have the
+same box."""
+
+
+@dataclass(frozen=True)
+class TrackedVolume:
+    """A box, m, frame fg; the default is the tracker's box over an Anser board.
+
+    Attributes
+    ----------
+    low, high : tuple of three float
+        Corners, low < high in x, y and z.
+
+    Raises
+    ------
+    TrackingError
+        When the corners make no box.
+    """
+
+    low: tuple[float, float, float] = (-0.2, -0.2, 0.05)
+    high: tuple[float, float, float] = (0.2, 0.2, 0.35)
+
+    def __post_init__(self) -> None:
+        box = np.array([self.low, self.high], dtype=np.float64)
+        if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[1] > box[0]).all():
+            raise TrackingError(
+                f'a volume needs low < high in x, y, z, got {self.low}, {self.high}'
+            )
+
+    @classmethod
+    def over_board(cls, centre: Array, half: float) -> 'TrackedVolume':
+        """Return the default volume over a board.
+
+        Parameters
+        ----------
+        centre : ndarray, shape (2,)
+            x and y of the board's middle, m.
+        half : float
+            Half of the board's larger side, m.
+        """
+        x, y = (float(value) for value in centre)
+        reach = half + BESIDE * half
+        return cls((x - reach, y - reach, FLOOR * half), (x + reach, y + reach, CEILING * half))
+
+    def with_fringe(self) -> 'TrackedVolume':
+        """Return the box in which the tracker accepts poses when nobody has stated the volume.
+
+        All lengths, seen from the middle of its footprint on the board, are `FRINGE` times as
+        large. The floor rises with them: nearest to the coils a field model is at its worst.
+        """
+        middle = np.array([*self.middle, 0.0])
+        corners = middle + FRINGE * (np.array([self.low, self.high]) - middle)
+        steps = np.round(corners / FRINGE_STEP_M)
+        steps[0, 2] = max(steps[0, 2], 1.0)  # a small board's floor must stay over its plane
+        (x, y, z), (u, v, w) = np.round(steps * FRINGE_STEP_M, 9).tolist()
+        return TrackedVolume((x, y, z), (u, v, w))
+
+    @property
+    def middle(self) -> Array:
+        """x and y of the box's middle, m, shape (2,)."""
+        return np.array([(a + b) / 2.0 for a, b in zip(self.low[:2], self.high[:2], strict=True)])
+
+    @property
+    def reach(self) -> Array:
+        """Half of the box's sides along x and y, m, shape (2,)."""
+        return np.array([(b - a) / 2.0 for a, b in zip(self.low[:2], self.high[:2], strict=True)])
+
+    @property
+    def ceiling(self) -> float:
+        """Height over the board up to which tools are tracked, m."""
+        return self.high[2]
+
+    def contains(self, position: Array) -> bool:
+        """Return whether a position (m) lies in the box."""
+        inside = zip(self.low, position.tolist(), self.high, strict=True)
+        return all(low <= value <= high for low, value, high in inside)
+
+    def grown(self, margin_m: float) -> tuple[Array, Array]:
+        """Return the corners with a margin around the box; the floor keeps half of its height.
+
+        The field of a flat board is mirrored at its plane, so a solver must not cross it.
+        """
+        low, high = np.array(self.low) - margin_m, np.array(self.high) + margin_m
+        if self.low[2] > 0:
+            low[2] = max(low[2], 0.5 * self.low[2])
+        return low, high
+
+    def samples(self, across: int = 6, up: int = 5, part: float = 1.0) -> Array:
+        """Return points of the box, shape (across^2 up, 3), m, denser near the board.
+
+        Parameters
+        ----------
+        across, up : int
+            Points along x and y, and along z; the heights form a geometric series, so the floor
+            must be positive.
+        part : float
+            Share of the box that the points fill: the sides and the ceiling are scaled by it.
+        """
+        floor = self.low[2]
+        x, y = (
+            np.linspace(-part, part, across) * reach + middle
+            for reach, middle in zip(self.reach, self.middle, strict=True)
+        )
+        height = floor * (part * self.ceiling / floor) ** np.linspace(0.0, 1.0, up)
+        x, y, z = np.meshgrid(x, y, height, indexing='ij')
+        return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)

@@ -1,0 +1,29 @@
+"""The tracked volume of a setup: what its document states, or what follows from its board."""
+
+from anser_ros.errors import FitError
+from anser_ros.physics.volume import TrackedVolume
+from anser_ros.refit.excitation import region_of
+from anser_ros.sessions.starting_model import drawing_of
+from anser_ros.wire.setup import Setup
+
+
+def stated_volume(setup: Setup) -> TrackedVolume | None:
+    """The volume that the setup document states; None where it leaves it to the board."""
+    return None if setup.volume is None else TrackedVolume(*setup.volume)
+
+
+def pose_volume(setup: Setup) -> TrackedVolume:
+    """The box in which poses are accepted.
+
+    It is the stated volume, or else the default volume over the board with its fringe; a board
+    that can't be drawn from the setup gets the box of an Anser board.
+    """
+    stated, drawing = stated_volume(setup), drawing_of(setup)
+    if stated is not None:
+        return stated
+    if drawing is None:
+        return TrackedVolume()
+    try:
+        return region_of(drawing).volume.with_fringe()
+    except FitError:  # a drawing without any field
+        return TrackedVolume()
