@@ -82,7 +82,7 @@ class TrackedVolume:
 
     @property
     def middle(self) -> Array:
-        """x and y of the box's middle, m, shape (2,)."""
+        """The x and y of the middle of the box, m, shape (2,)."""
         return np.array([(a + b) / 2.0 for a, b in zip(self.low[:2], self.high[:2], strict=True)])
 
     @property
