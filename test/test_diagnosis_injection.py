@@ -29,12 +29,15 @@ def found(names: str, seed: int, size: str = 'medium') -> tuple[Diagnosis, dict]
 def test_effects_of_the_table_are_named_and_nothing_else():
     result, truth = found('pickup+coil_drift', 1)
     assert sorted(f.record.name for f in result.findings) == sorted(truth)
+    compared = 0
     for finding in result.findings:
         wanted, record = truth[finding.record.name], finding.record
         for key, sigma in record.uncertainty.items():
             if key in wanted:
                 error = np.asarray(record.parameters[key]) - np.asarray(wanted[key])
                 assert np.all(np.abs(error) < 5 * np.asarray(sigma)), (record.name, key)
+                compared += 1
+    assert compared == 3, 'amount and tau_s of the drift, phasor_t of the pickup'
     assert result.flux_rms_after_t < 1.1 * result.flux_rms_floor_t
     assert result.unexplained == 0.0
 
@@ -56,7 +59,7 @@ def test_an_effect_of_no_table_gets_a_name_of_its_own(name, called):
 def test_what_nothing_describes_stays_unexplained(name):
     result, _ = found(name, 5)
     assert not {f.record.name for f in result.findings} & set(CATALOGUE)
-    assert result.unexplained > 0.2
+    assert result.unexplained > 0.9
     assert result.depends_on
 
 

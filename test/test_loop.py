@@ -31,18 +31,23 @@ from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import parse_setup
 
 GAIN_SEED = 3
+# A stream in real time loses windows where something else needs the machine for a while, and the
+# loop says so. Somebody else is not there twice; code that is too slow is.
+ATTEMPTS = 2
 
 
-@pytest.mark.timeout(180)
+@pytest.mark.timeout(300)
 def test_an_effect_is_found_and_the_next_run_is_better(domain, tmp_path, capsys):
     """Over a pseudo-terminal, DDS, bags and model files, each node in its own process."""
     arguments = ['--effect', 'sensor_gain', '--seed', str(GAIN_SEED), '--duration', '10']
-    arguments += ['--clean', '0', '--out', str(tmp_path), '--json']
-    assert main(['loop', *arguments]) == 0, capsys.readouterr().err
-    document = json.loads(capsys.readouterr().out)
-    (found,) = document['rounds']
-    if found['too_busy']:
-        pytest.skip(f'the machine is too busy for a stream in real time: {found["machine"]}')
+    for attempt in range(ATTEMPTS):
+        out = str(tmp_path / f'{attempt}')
+        assert main(['loop', *arguments, '--clean', '0', '--out', out, '--json']) == 0
+        document = json.loads(capsys.readouterr().out)
+        (found,) = document['rounds']
+        if not found['too_busy']:
+            break
+    assert not found['too_busy'], f'windows were lost every time: {found["machine"]}'
     assert [effect['name'] for effect in found['found']] == [found['truth']['name']]
     assert found['verdict'] == NAMED
     gain = found['parameters']['gain']

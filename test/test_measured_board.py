@@ -59,6 +59,7 @@ def test_every_effect_has_finite_columns(board, where):
         columns = stack(make(board, where, answer))
         assert columns.shape[:2] == (41, 3), name
         assert np.isfinite(columns).all(), name
+        assert (np.abs(columns).max(axis=(0, 1)) > 1e-6).all(), f'{name} has a column of nothing'
 
 
 def test_a_moved_board_coil_is_found_in_made_up_points(board, where):

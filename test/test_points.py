@@ -7,7 +7,10 @@ from hypothesis import strategies as st
 
 from anser_ros.errors import LayoutError
 from anser_ros.wire.points import (
+    DROPPED,
     FLOAT32,
+    SATURATED,
+    STALE,
     DipolePoints,
     FluxPoints,
     decode_field_model,
@@ -34,6 +37,10 @@ def flux_points(sensors: int = 4, emitters: int = 8) -> FluxPoints:
 def assert_same(a: FluxPoints, b: FluxPoints) -> None:
     for name in ('channel', 'flags', 'flux', 'position', 'axis'):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_flag_bits_are_those_that_others_write_and_read():
+    assert (SATURATED, STALE, DROPPED) == (1, 2, 4)
 
 
 def test_flux_layout_is_the_contracts():

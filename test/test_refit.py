@@ -392,7 +392,7 @@ def test_a_change_that_nothing_explains_is_a_state_not_a_confident_model(refit):
     world, rng = anser_world(), np.random.default_rng(8)
     strange = 0.4 * world.baseline * rng.normal(size=world.baseline.shape)
     result = run(refit, world, strange)
-    assert result.state in ('poor_fit', 'few_references') or result.model.flux_error_t > 1e-8
+    assert result.model.flux_error_t > 500 * NOISE_T
 
 
 @pytest.mark.parametrize(

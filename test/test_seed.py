@@ -75,6 +75,7 @@ def test_the_length_of_the_axis_tells_places_apart(rng):
 def test_candidates_are_apart(rng):
     points, axes = poses(rng, 1)
     chosen, found, _ = scan(GRID, fluxes(points, axes)[0], 6)
+    assert len(chosen) == 6
     for i, a in enumerate(chosen):
         for b in chosen[:i]:
             apart = np.linalg.norm(GRID.points[a] - GRID.points[b])

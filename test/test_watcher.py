@@ -230,6 +230,7 @@ def test_over_dds_a_finding_is_raised_and_cleared(ros, start, moving, tmp_path):
     published = {
         name for name, _ in heard.node.get_publisher_names_and_types_by_node('watcher', '/anser')
     }
+    assert '/diagnostics' in published
     assert published <= {'/diagnostics', '/rosout', '/parameter_events'}, 'it only speaks there'
     assert watcher.interrupt() == 0
 
