@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
-from anser_ros.calibration.calibrate import Options, rms
+from anser_ros.calibration.calibrate import Options
+from anser_ros.calibration.held_out import rms
 from anser_ros.calibration.layouts import Layout
 from anser_ros.cli import calibrate as command
 from anser_ros.cli.main import main

@@ -22,16 +22,14 @@ from anser_ros.calibration.factors import GramFactor, TriangularFactor, as_compl
 from anser_ros.calibration.layouts import Layout, place
 from anser_ros.calibration.moments import MomentFitter
 from anser_ros.calibration.pose_correction import (
-    PoseWhitener,
     Uncertainty,
-    frame_blocks,
     most_probable_step,
     moved,
     outlier_weights,
     pose_terms,
-    usable_weights,
-    with_pose,
 )
+from anser_ros.calibration.pose_whitening import PoseWhitener
+from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
 from anser_ros.errors import FitError
 
 LAYER = Layout('layer', 9, 1.3, 0.0)

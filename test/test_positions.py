@@ -7,9 +7,11 @@ import pytest
 from calibration_world import scene
 
 from anser_ros.calibration.dipole_sites import DipoleSites
-from anser_ros.calibration.pose_correction import Uncertainty, usable_weights
+from anser_ros.calibration.pose_correction import Uncertainty
 from anser_ros.calibration.positions import PositionFitter, position_slopes
-from anser_ros.calibration.sensor_survey import SensorSurveyor, tangents
+from anser_ros.calibration.readings import usable_weights
+from anser_ros.calibration.sensor_parameters import tangents
+from anser_ros.calibration.sensor_survey import SensorSurveyor
 from anser_ros.physics.dipole import flux_basis
 
 

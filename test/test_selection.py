@@ -7,14 +7,16 @@ import pytest
 from calibration_world import NOISE_T, scene
 
 from anser_ros.calibration.blocks import FOLDS, fold_of_frames
-from anser_ros.calibration.calibrate import Options, calibrate, rms
+from anser_ros.calibration.calibrate import Options, calibrate
 from anser_ros.calibration.error_map import FEWEST_POINTS, IDENTITY, learn_error_map
+from anser_ros.calibration.held_out import rms
 from anser_ros.calibration.layout_fit import fit_layout
+from anser_ros.calibration.layout_score import LayoutScorer
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.local import Regions
 from anser_ros.calibration.pose_correction import Uncertainty
 from anser_ros.calibration.prior import DrawnBoard, emitter_gains
-from anser_ros.calibration.selection import Selector, choose_layout, thin_frames
+from anser_ros.calibration.selection import choose_layout, thin_frames
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 
@@ -114,13 +116,13 @@ def test_gains_of_the_drawn_board_are_found(world):
 def test_the_choice_is_neither_too_coarse_nor_undamped(world):
     thin = thin_frames([world.measurements])
     folds = fold_of_frames([m.position for m in thin])
-    selector = Selector(
+    scorer = LayoutScorer(
         thin, folds, place(Layout('layer', 10, 1.25, 0.0), world.generator), Uncertainty()
     )
     scores = {}
     for count in (3, 9):
         layout = Layout('layer', count, 1.25, 0.0)
-        scores[count] = selector.score(layout, place(layout, world.generator))
+        scores[count] = scorer.score(layout, place(layout, world.generator))
     assert scores[9].score < 0.5 * scores[3].score
     curve = dict(scores[9].curve)
     assert scores[9].score == min(curve.values())

@@ -1,0 +1,1 @@
+"""From measurements of a board to its field model: moments, dipole positions, and their choice."""

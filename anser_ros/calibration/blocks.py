@@ -1,4 +1,4 @@
-"""Spatial blocks for held-out error: whole frames, in cells of space, dealt to folds."""
+"""Spatial blocks for held-out errors: whole frames in cells of space, dealt to folds."""
 
 from collections.abc import Sequence
 
@@ -10,22 +10,33 @@ from anser_ros.errors import FitError
 Array = NDArray[np.float64]
 
 FOLDS = 5
+"""Number of folds. Each fit then uses four fifths of the readings; more folds cost a fit each."""
 CELLS_ALONG = 5
+"""Cells along the longest direction. They must be larger than the distance over which the errors
+of a fit are alike, or held-out errors are too small; with fewer cells each fold is one place."""
 SMALLEST_SHARE = 0.15
-"""A direction whose extent is a smaller part of the largest one's is not divided."""
+"""A direction is not divided if its extent is a smaller fraction of the longest one's; the cells
+of a flat volume would otherwise hold frames of the same places."""
 
 
 def fold_of_frames(positions: Sequence[Array], folds: int = FOLDS) -> list[NDArray[np.int64]]:
-    """Fold of every frame.
+    """Return the fold of every frame.
 
-    Space is cut into equal cells, five along the longest direction; cell (i, j, k) goes to fold
-    (i + 2 j + 3 k) mod ``folds``, so that a fold is spread over the volume and its cells do not
-    touch. A single point is never held out alone: all frames of a cell go together.
+    Space is cut into equal cells, `CELLS_ALONG` along the longest direction. Cell (i, j, k) goes
+    to fold (i + 2 j + 3 k) mod ``folds``, so that a fold is spread over the volume and its cells
+    do not touch. All frames of a cell are held out together, never a single point.
 
     Parameters
     ----------
     positions : sequence of ndarray, shape (F, 3)
         Body positions, m, one array a body and session.
+    folds : int
+        Number of folds.
+
+    Returns
+    -------
+    list of ndarray of int, shape (F,)
+        Folds of the frames, one array a body and session.
 
     Raises
     ------

@@ -1,24 +1,25 @@
-"""From measurements to a field model: refusals, choice by held-out error, fit, honest figures."""
+"""The calibration of a field model: checks, choice by held-out error, and the final fit."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.calibration.blocks import fold_of_frames
-from anser_ros.calibration.factors import as_real
-from anser_ros.calibration.held_out import HeldOut, predict_held_out, rms
+from anser_ros.calibration.held_out import HeldOut, predict_held_out
 from anser_ros.calibration.layout_fit import LayoutFit, fit_layout
+from anser_ros.calibration.layout_score import LayoutCandidate
 from anser_ros.calibration.layouts import Generator, Layout, place
-from anser_ros.calibration.moments import MomentFit, Progress
-from anser_ros.calibration.pose_correction import Uncertainty, frame_blocks, with_pose
+from anser_ros.calibration.moments import Progress
+from anser_ros.calibration.pose_correction import Uncertainty
 from anser_ros.calibration.prior import DrawnBoard
+from anser_ros.calibration.readings import with_pose
 from anser_ros.calibration.requirements import check_agreement, check_measurements
+from anser_ros.calibration.result import Calibration, provenance, residuals
 from anser_ros.calibration.selection import (
-    WORTH_MANY,
-    LayoutCandidate,
+    COUNTS,
+    LEAST_GAIN_OF_FIXED,
     Selection,
     choose_layout,
     thin_frames,
@@ -32,63 +33,24 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Options:
-    """What a calibration may be told.
+    """Options of a calibration.
 
     Attributes
     ----------
     uncertainty : Uncertainty
+        Flux noise and pose jitter.
     layout : Layout or None
-        The dipoles asked for; chosen by held-out error when not given.
+        Layout of the dipoles; chosen by held-out error by default.
     damping : float or None
-        Likewise.
+        Damping of the moments; chosen by held-out error by default.
     estimate : tuple of str
-        What is found of the sensors together with the field: `sensor_survey.KINDS`.
+        What is estimated of the sensors together with the field, of `sensor_parameters.KINDS`.
     """
 
     uncertainty: Uncertainty = field(default_factory=Uncertainty)
     layout: Layout | None = None
     damping: float | None = None
     estimate: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """A field model with everything that was learnt on the way.
-
-    Attributes
-    ----------
-    model : FieldModel
-    fit : MomentFit
-    held_out : HeldOut
-        Of the chosen layout, every fold fitted from the start.
-    nominal_rmse_t : float or None
-        Residual of the nominal model on the same readings, root mean square of the magnitude.
-    candidates : tuple of LayoutCandidate
-        All that were compared.
-    chosen : LayoutCandidate
-    layout : Layout
-    damping : float
-    n_measurements : int
-        Readings an emitter.
-    residuals : Residuals
-        Of the model on everything it was fitted to.
-    """
-
-    model: FieldModel
-    fit: MomentFit
-    held_out: HeldOut
-    nominal_rmse_t: float | None
-    candidates: tuple[LayoutCandidate, ...]
-    chosen: LayoutCandidate
-    layout: Layout
-    damping: float
-    n_measurements: int
-    residuals: 'Residuals'
-
-    @property
-    def better_than_nominal(self) -> bool:
-        """Whether the held-out error is below the nominal model's, where there is one."""
-        return self.nominal_rmse_t is None or rms(self.held_out.error) < self.nominal_rmse_t
 
 
 def calibrate(
@@ -106,26 +68,30 @@ def calibrate(
     Parameters
     ----------
     measurements : sequence of Measurements
-        One a body and session; the optical poses are the reference.
+        One a body and session; their optical poses are the reference.
     names : sequence of str
-        Session of each.
+        Name of the session of each.
     generator : Generator
-    emitters, frequencies_hz
-        Of the setup.
+        Places of the coils.
+    emitters : tuple of str, length K
+        Names of the emitters.
+    frequencies_hz : tuple of float, length K
+        Drive frequencies, Hz.
     options : Options, optional
+        Uncertainties, and what not to choose.
     nominal : FieldModel, optional
-        What the result must beat on held-out data.
+        The drawn board: a prior of the fit, and compared with its result.
     progress : callable, optional
-        Called with the name of the stage and its finished share.
+        Called with the name of the stage and its finished fraction.
 
     Raises
     ------
     FitError
-        When the measurements can't determine the model.
+        When the measurements cannot determine a model, or one field cannot explain all sessions.
     """
     options = options or Options()
-    asked = 36 if options.layout is None else len(place(options.layout, generator))
-    readings = check_measurements(measurements, asked)
+    needed = COUNTS[0] ** 2 if options.layout is None else len(place(options.layout, generator))
+    readings = check_measurements(measurements, needed)
     posed, effects = _surveyed([with_pose(m) for m in measurements], generator, options)
     thin = thin_frames(posed)
     folds = fold_of_frames([m.position for m in thin])
@@ -163,7 +129,7 @@ def calibrate(
 def _surveyed(
     posed: list[Measurements], generator: Generator, options: Options
 ) -> tuple[list[Measurements], tuple[EffectRecord, ...]]:
-    """The measurements with their sensors as found, and the records that say so."""
+    """Return the measurements with estimated sensors, and the records of the estimates."""
     if not options.estimate:
         return posed, ()
     surveyor = SensorSurveyor(posed, options.estimate, generator, options.uncertainty)
@@ -195,7 +161,7 @@ def _tested(
     nominal: FieldModel | None,
     selection: Selection,
 ) -> HeldOut:
-    """The candidate's held-out error, every fold fitted from the start."""
+    """Return a candidate's held-out error with every fold fitted from the start."""
     fitter = _fitter(candidate, generator, options, nominal)
     reference = selection.reference
     return predict_held_out(
@@ -204,67 +170,7 @@ def _tested(
 
 
 def _better(tested: Sequence[tuple[LayoutCandidate, HeldOut]]) -> tuple[LayoutCandidate, HeldOut]:
-    """The one with the fewest dipoles whose held-out error is the least to within `WORTH_MANY`."""
-    limit = min(held_out.score_t for _, held_out in tested) * (1.0 + WORTH_MANY)
+    """Return the finalist with the fewest dipoles that is as good within `LEAST_GAIN_OF_FIXED`."""
+    limit = min(held_out.score_t for _, held_out in tested) * (1.0 + LEAST_GAIN_OF_FIXED)
     good = [pair for pair in tested if pair[1].score_t <= limit]
     return min(good, key=lambda pair: (pair[1].n_dipoles, pair[1].score_t))
-
-
-@dataclass(frozen=True)
-class Residuals:
-    """What a model leaves of measurements at the measured poses.
-
-    Attributes
-    ----------
-    each_t : ndarray, shape (K,)
-        Root mean square of the complex residual's magnitude, T.
-    span_t : float
-        Range of the measured in-phase fluxes, T.
-    """
-
-    each_t: Array
-    span_t: float
-
-    @property
-    def rmse_t(self) -> float:
-        """Over all emitters, T."""
-        return float(np.sqrt(np.mean(self.each_t**2)))
-
-
-def residuals(measurements: Sequence[Measurements], model: FieldModel) -> Residuals:
-    """Sum up a model's residuals, block by block."""
-    power, count = np.zeros(len(model.emitters)), 0
-    low, high = np.inf, -np.inf
-    for whole in measurements:
-        for block in frame_blocks(len(whole.time), len(whole.sensors)):
-            m = whole.frames(block)  # type: ignore[arg-type]
-            points, axes = m.placed()
-            used = m.usable
-            if not used.any():
-                continue
-            lengths = np.broadcast_to(m.sensors.length, used.shape)[used]
-            error = m.flux[used] - model.flux(points[used], axes[used], lengths)
-            power, count = power + (np.abs(error) ** 2).sum(axis=0), count + len(error)
-            low = min(low, float(m.flux[used].real.min()))
-            high = max(high, float(m.flux[used].real.max()))
-    return Residuals(np.sqrt(power / count), high - low)
-
-
-def provenance(calibration: Calibration, names: Sequence[str]) -> Mapping[str, Any]:
-    """Where the model comes from, for its file."""
-    held_out = calibration.held_out
-    return {
-        'method': 'calibration',
-        'sessions': list(dict.fromkeys(names)),
-        'n_measurements': calibration.n_measurements,
-        'layout': calibration.layout.describe(),
-        'damping': calibration.damping,
-        'rank': calibration.fit.rank,
-        'condition': calibration.fit.condition,
-        'noise_t': calibration.fit.noise_t,
-        'heldout_flux_rmse_t': rms(held_out.error),
-        'heldout_marginal_rmse_t': float(np.sqrt(np.mean(as_real(held_out.left_over) ** 2))),
-        'heldout_chi_square': held_out.chi_square,
-        'flux_error_t': held_out.flux_error_t,
-        'nominal_flux_rmse_t': calibration.nominal_rmse_t,
-    }

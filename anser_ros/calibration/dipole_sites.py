@@ -1,4 +1,4 @@
-"""Virtual dipoles as places, and the matrix that turns their moments into readings."""
+"""Positions and directions of virtual dipoles, and the matrix from their moments to readings."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DipoleSites:
-    """Where virtual dipoles are: positions (m, frame fg) and unit directions, shape (N, 3)."""
+    """Positions (m) and unit directions of N virtual dipoles, shape (N, 3), frame fg."""
 
     positions: Array
     directions: Array
@@ -23,7 +23,15 @@ class DipoleSites:
 
 
 def basis_rows(measurements: Measurements, dipoles: DipoleSites) -> Array:
-    """The article's matrix M at the measurements' poses, shape (F S, N), T / (A m^2)."""
+    """Return the article's matrix M for all readings, shape (F S, N), T / (A m^2).
+
+    Parameters
+    ----------
+    measurements : Measurements
+        F frames of S sensors, each with a pose.
+    dipoles : DipoleSites
+        N dipoles.
+    """
     points, axes = measurements.placed()
     lengths = np.tile(measurements.sensors.length, len(measurements.time))
     return flux_basis(

@@ -1,17 +1,21 @@
-"""The document that a calibration leaves (interfaces, section 5)."""
+"""The document ``calibration.json`` that a calibration writes (see docs/interfaces.md)."""
 
 from typing import Any
 
 import numpy as np
 
-from anser_ros.calibration.calibrate import Calibration
 from anser_ros.calibration.factors import as_real
 from anser_ros.calibration.held_out import rms
 from anser_ros.calibration.moments import MomentFit
+from anser_ros.calibration.result import Calibration
+
+OUTLIER_WEIGHT = 0.25
+"""A reading whose weight fell below this counts as an outlier: its residual is twice as large as
+the one from which on readings lose weight."""
 
 
 def to_document(calibration: Calibration) -> dict[str, Any]:
-    """The contract's calibration document, with further keys of our own.
+    """Return the figures of a calibration as plain data.
 
     Errors are root mean squares of the complex residual's magnitude at the measured poses; the
     normalised ones are divided by the range of the measured in-phase fluxes (article, equation 8).
@@ -29,8 +33,8 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
         'heldout_n_rmse_percent': 100.0 * rms(held_out.error) / span,
         'heldout_n_mae_percent': 100.0 * float(np.abs(held_out.error).mean()) / span,
         'emitters': [
-            {'name': name, 'flux_rmse_t': float(own), 'heldout_flux_rmse_t': rms(outside)}
-            for name, own, outside in each
+            {'name': name, 'flux_rmse_t': float(fitted), 'heldout_flux_rmse_t': rms(outside)}
+            for name, fitted, outside in each
         ],
         'marginal': {
             'noise_t': held_out.noise_t,
@@ -65,4 +69,4 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
 
 def _outlier_fraction(fit: MomentFit) -> float:
     weights = np.concatenate([w.ravel() for w in fit.weights])
-    return float((weights[weights > 0.0] < 0.25).mean())
+    return float((weights[weights > 0.0] < OUTLIER_WEIGHT).mean())

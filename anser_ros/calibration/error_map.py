@@ -1,12 +1,12 @@
-"""A smooth map from tracked to true positions, learnt where the truth is known.
+"""A smooth map from tracked to true positions, learnt where the true positions are known.
 
-The classic calibration of trackers that give poses and no fluxes, and the article's last step of
-distortion compensation (Table V, "compensated and corrected"). The error's three components are
-Gaussian processes of the tracked position with one squared-exponential covariance (Rasmussen and
-Williams, Gaussian Processes for Machine Learning, 2006, chapter 2) on top of a constant or an
-affine trend. Trend, length and noise are chosen by the error in held-out blocks of space. Whether
-a map chosen so helps is asked of further blocks that took no part in the choice; when it does not,
-the map is the identity.
+This is the usual calibration of trackers that give poses and no fluxes, and the article's last
+step of distortion compensation (Table V, "compensated and corrected"). The three components of the
+error are Gaussian processes of the tracked position with one squared-exponential covariance
+(Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, chapter 2) on top of a
+constant or affine trend. Trend, length and noise are chosen by the error in held-out blocks of
+space. Further blocks that took no part in that choice decide whether the map helps; if not, it is
+the identity.
 """
 
 from collections.abc import Sequence
@@ -21,25 +21,31 @@ from anser_ros.errors import FitError
 Array = NDArray[np.float64]
 
 FEWEST_POINTS = 8
+"""Points with both positions below which no map is learnt: an affine trend has four parameters a
+component, and as many points again have to judge it."""
 MOST_POINTS = 500
-"""More points than these are thinned evenly: the map is smooth."""
+"""Points that a map is learnt from at most; more are thinned evenly, because the map is smooth and
+the time grows with the third power of the points."""
 LENGTHS = (0.15, 0.3, 0.6, 1.2, 2.5)
-"""Covariance lengths tried, as a part of the points' largest extent."""
+"""Covariance lengths that are tried, as a fraction of the points' largest extent: from the
+distance between neighbouring blocks to nearly a quadratic trend."""
 NOISES = (0.03, 0.1, 0.3, 1.0)
-"""Noise tried, as a part of the errors' standard deviation about the trend."""
+"""Standard deviations of the noise that are tried, as a fraction of the errors' own: from a map
+that follows nearly every point to one that hardly follows any."""
 TRENDS = (0, 1)
+"""Degrees of the polynomial trend that are tried: a constant shift and an affine map."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A choice of map: polynomial degree of the trend (-1: no map), length (m) and noise (m)."""
+    """The degree of a map's trend (-1 for no map), its covariance length (m) and its noise (m)."""
 
     trend: int
     length_m: float
     noise_m: float
 
     def describe(self) -> str:
-        """One line for a report."""
+        """Return the shape in words for a report."""
         if self.trend < 0:
             return 'no correction'
         trend = 'shift' if self.trend == 0 else 'affine'
@@ -49,22 +55,28 @@ class Shape:
 
 
 IDENTITY = Shape(-1, 0.0, 0.0)
+"""The shape of a map that corrects nothing."""
 
 
 @dataclass(frozen=True)
 class ErrorMap:
-    """A fitted map.
+    """A fitted map from tracked to true positions.
 
     Attributes
     ----------
     shape : Shape
+        The chosen trend, length and noise.
     places : ndarray, shape (M, 3)
-        Tracked positions that it was learnt from, m.
+        Tracked positions that the map was learnt from, m.
     weights : ndarray, shape (M, 3)
-    trend : ndarray, shape (1 or 4, 3), or (0, 3)
+        Weights of the Gaussian process at these positions, m.
+    trend : ndarray, shape (T, 3)
+        Coefficients of the trend (T = 0 for no map, 1 for a shift, 4 for an affine map).
     middle : ndarray, shape (3,)
+        Position from which the affine trend is counted, m.
     before_m, after_m : float
-        Root mean square error without and with a map, in blocks held out of choice and fit.
+        Root mean square error without and with a map in blocks that took part neither in the
+        choice nor in the fit, m.
     tried : tuple of (Shape, float)
         Every shape with its held-out error, m.
     """
@@ -84,7 +96,7 @@ class ErrorMap:
         return self.shape.trend >= 0
 
     def correction(self, tracked: Array) -> Array:
-        """What to add to tracked positions (P, 3), m."""
+        """Return the corrections (P, 3), m, to be added to tracked positions (P, 3), m."""
         if not self.helps:
             return np.zeros_like(tracked)
         out = _trend_columns(tracked - self.middle, self.shape.trend) @ self.trend
@@ -93,7 +105,7 @@ class ErrorMap:
         return np.asarray(out)
 
     def apply(self, tracked: Array) -> Array:
-        """Corrected positions (P, 3), m."""
+        """Return the corrected positions (P, 3), m, of tracked positions (P, 3), m."""
         return np.asarray(tracked + self.correction(tracked))
 
 
@@ -108,7 +120,7 @@ def _covariance(one: Array, other: Array, length: float) -> Array:
 
 
 def _fit(places: Array, errors: Array, shape: Shape, middle: Array) -> tuple[Array, Array]:
-    """Trend coefficients and weights of the Gaussian process on what the trend leaves."""
+    """Return the coefficients of the trend and the weights of the Gaussian process about it."""
     if shape.trend < 0:
         return np.zeros((0, 3)), np.zeros((len(places), 3))
     columns = _trend_columns(places - middle, shape.trend)
@@ -133,14 +145,14 @@ def learn_error_map(
     Parameters
     ----------
     tracked, true : ndarray, shape (M, 3)
-        m, in one frame.
+        Positions, m, in one frame; points that are not finite are left out.
     groups : sequence of int, optional
-        Fold of each point; by blocks of space when not given.
+        Fold of each point; blocks of space by default.
 
     Raises
     ------
     FitError
-        When shapes differ or there are too few points.
+        When the shapes differ or there are fewer than `FEWEST_POINTS` points.
     """
     if tracked.shape != true.shape or tracked.ndim != 2 or tracked.shape[1] != 3:
         raise FitError(
@@ -174,7 +186,7 @@ def _best(tried: Sequence[tuple[Shape, float]]) -> Shape:
 def _nested_rms(
     places: Array, errors: Array, folds: NDArray[np.int64], shapes: Sequence[Shape]
 ) -> float:
-    """Error (m) in each fold of the map whose shape the other folds have chosen."""
+    """Return the error (m, rms) over folds of maps whose shape the other folds have chosen."""
     square = 0.0
     for fold in np.unique(folds):
         rest, test = folds != fold, folds == fold
@@ -198,7 +210,17 @@ def _shapes(places: Array, errors: Array) -> list[Shape]:
 
 
 def held_out_rms(places: Array, errors: Array, folds: NDArray[np.int64], shape: Shape) -> float:
-    """Root mean square error (m) in blocks that a map of this shape has not seen."""
+    """Return the root mean square error (m) of maps of one shape in held-out folds.
+
+    Parameters
+    ----------
+    places, errors : ndarray, shape (M, 3)
+        Tracked positions and true minus tracked positions, m.
+    folds : ndarray of int, shape (M,)
+        Fold of each point.
+    shape : Shape
+        The shape to judge.
+    """
     square = sum(
         _square_error(places, errors, folds != fold, folds == fold, shape)
         for fold in np.unique(folds)

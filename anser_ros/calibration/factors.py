@@ -1,4 +1,4 @@
-"""Least squares of many rows with several right-hand sides, kept as one small matrix."""
+"""Least squares of many rows with several right-hand sides, of which one small matrix is kept."""
 
 from dataclasses import dataclass
 
@@ -9,11 +9,20 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 RIGHT_SCALE = 1e9
-"""Fluxes in nT beside columns near 1e-7 / (0.1 m)^3: numbers of like size in one matrix."""
+"""Factor of the right-hand sides in a Gram matrix. Fluxes are then in nT, of a size with the
+columns (some 1e-7 / (0.1 m)^3 T / (A m^2)); it only avoids numbers of very different size."""
 
 
 class TriangularFactor:
-    """Rows of a least-squares problem, reduced to a triangle as they come."""
+    """A least-squares problem as the triangular factor of its rows, by QR, block after block.
+
+    Parameters
+    ----------
+    unknowns : int
+        Number of columns N of the matrix.
+    right_sides : int
+        Number of right-hand sides M.
+    """
 
     def __init__(self, unknowns: int, right_sides: int) -> None:
         self.unknowns = unknowns
@@ -28,7 +37,7 @@ class TriangularFactor:
         self.triangle = np.asarray(np.linalg.qr(stack, mode='r'))
 
     def spectrum(self) -> 'Spectrum':
-        """Column-scaled singular value decomposition."""
+        """Return the singular value decomposition of the column-scaled problem."""
         n = self.unknowns
         matrix, right = self.triangle[:n, :n], self.triangle[:n, n:]
         scale = np.linalg.norm(matrix, axis=0)
@@ -38,10 +47,11 @@ class TriangularFactor:
 
 
 class GramFactor:
-    """The same problem as inner products: several times faster, half the digits.
+    """The same problem as the inner products of its columns.
 
-    Enough for the passes that only prepare the next one, and for damped fits whose damping is far
-    above rounding; the moments that are kept come from `TriangularFactor`.
+    It is several times faster than `TriangularFactor` and has half the digits. That is enough for
+    rounds that only prepare the next one, and for fits whose damping is far above the rounding;
+    the moments of a final fit come from `TriangularFactor`. The parameters are the same.
     """
 
     def __init__(self, unknowns: int, right_sides: int) -> None:
@@ -56,7 +66,7 @@ class GramFactor:
         self.gram += block.T @ block
 
     def spectrum(self) -> 'Spectrum':
-        """Column-scaled eigenvectors, as the singular value decomposition would give them."""
+        """Return the singular value decomposition of the problem by eigenvectors."""
         n = self.unknowns
         scale = np.sqrt(np.diag(self.gram)[:n])
         scale[scale == 0.0] = 1.0
@@ -70,12 +80,12 @@ class GramFactor:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """A least-squares problem in its singular vectors, from which every damping is cheap.
+    """A least-squares problem in its singular vectors, which make every damping cheap.
 
     Attributes
     ----------
     scale : ndarray, shape (N,)
-        Column norms.
+        Norms by which the columns were divided.
     values : ndarray, shape (R,)
         Singular values of the scaled matrix, descending.
     vectors : ndarray, shape (R, N)
@@ -91,12 +101,12 @@ class Spectrum:
 
     @property
     def rank(self) -> int:
-        """Singular values above rounding."""
+        """Number of singular values above the rounding error."""
         limit = self.values[0] * np.finfo(float).eps * max(self.vectors.shape)
         return int((self.values > limit).sum())
 
     def filter(self, damping: float) -> Array:
-        """Tikhonov's factors ``s / (s^2 + (damping s_0)^2)``; zero below the rank."""
+        """Return Tikhonov's factors ``s / (s^2 + (damping s_0)^2)``, zero beyond the rank."""
         s = self.values
         out = np.zeros_like(s)
         keep = np.arange(s.size) < self.rank
@@ -104,7 +114,7 @@ class Spectrum:
         return out
 
     def solve(self, damping: float, prior: Array | None = None) -> Array:
-        """Unknowns (N, M), pulled towards ``prior`` (N, M) or towards zero."""
+        """Return the unknowns (N, M), which the damping pulls towards ``prior`` (N, M) or zero."""
         projected = self.projected
         if prior is not None:
             start = self.vectors @ (prior * self.scale[:, None])
@@ -114,15 +124,15 @@ class Spectrum:
         return np.asarray(step if prior is None else prior + step)
 
     def freedom(self, damping: float) -> float:
-        """Effective number of parameters, the trace of the influence matrix."""
+        """Return the effective number of parameters, the trace of the influence matrix."""
         return float((self.values * self.filter(damping)).sum())
 
 
 def as_real(values: ComplexArray) -> Array:
-    """Complex (..., K) as real (..., 2K), real and imaginary part by turns."""
+    """Return complex values (..., K) as real ones (..., 2K), real and imaginary by turns."""
     return np.ascontiguousarray(values, dtype=np.complex128).view(np.float64)
 
 
 def as_complex(values: Array) -> ComplexArray:
-    """The inverse of `as_real`."""
+    """Return real values (..., 2K), as `as_real` makes them, as complex ones (..., K)."""
     return np.ascontiguousarray(values).view(np.complex128)

@@ -1,10 +1,10 @@
-"""Held-out error: what a model that never saw a block of space predicts for it.
+"""Held-out errors: how well a model predicts a block of space that it was not fitted to.
 
-Two figures for every block. As in the article, the residual at the measured pose, in which the
-pose's own jitter times the field's gradient is the largest part. And the residual with the pose
-marginalised: with the covariance C = sigma^2 I + J S J^T of a frame's readings (J the flux's
-derivatives by the pose, S the pose's jitter), ``r^T C^-1 r`` is the frame's predictive chi-square,
-and ``sigma^2 C^-1 r`` what no pose explains.
+There are two figures for every block. The first is the residual at the measured pose, as in the
+article; its largest part is the jitter of the pose times the gradient of the field. The second is
+the residual with the pose marginalised: with the covariance C of a frame's readings
+(`pose_whitening`), ``r^T C^-1 r`` is the frame's predictive chi-square, and ``sigma^2 C^-1 r`` is
+the part of the residual that no pose explains.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,15 +15,9 @@ from numpy.typing import NDArray
 
 from anser_ros.calibration.factors import ComplexArray
 from anser_ros.calibration.layout_fit import LayoutFit
-from anser_ros.calibration.pose_correction import (
-    PoseTerms,
-    PoseWhitener,
-    Uncertainty,
-    frame_blocks,
-    pose_terms,
-    usable_weights,
-    with_pose,
-)
+from anser_ros.calibration.pose_correction import PoseTerms, Uncertainty, pose_terms
+from anser_ros.calibration.pose_whitening import PoseWhitener
+from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
 from anser_ros.field.measurements import Measurements
 
 Array = NDArray[np.float64]
@@ -40,16 +34,16 @@ class HeldOut:
     left_over : ndarray, shape (P, K), complex
         The part that no pose explains, T.
     chi_square : float
-        Mean predictive chi-square a phasor component.
+        Mean predictive chi-square of a phasor component.
     noise_t : float
-        The noise that the chi-square was divided by.
+        Noise of a phasor component in the covariance C, T.
     flux_noise_t : float
-        The flux noise alone, T a component; never more than the imaginary parts leave.
+        Flux noise alone, T a component; at most what the imaginary parts leave.
     flux_error_t : float
-        Standard deviation of the field model's own error a phasor component, noise taken off,
-        in the typical held-out frame.
+        Standard deviation of the field model's own error in the median held-out frame, T a
+        phasor component, with the noise subtracted.
     n_dipoles : int
-        Of the model that was tested.
+        Number of dipoles of the model that was tested.
     """
 
     error: ComplexArray
@@ -62,7 +56,7 @@ class HeldOut:
 
     @property
     def score_t(self) -> float:
-        """Root of the mean chi-square in flux: comparable between fits of other noise, T."""
+        """Root of the mean chi-square times the noise, T, which compares fits of other noise."""
         return float(self.noise_t * np.sqrt(self.chi_square))
 
 
@@ -78,21 +72,24 @@ def predict_held_out(
     noise_t: float | None = None,
     flux_noise_t: float | None = None,
 ) -> HeldOut:
-    """Fit without each fold in turn, from the start, and predict it.
+    """Predict each fold by a fit to the other folds.
 
     Parameters
     ----------
     measurements : sequence of Measurements
+        Tool measurements, one a body and session.
     folds : sequence of ndarray, shape (F,)
-        Fold of each frame, an array a measurement set.
+        Fold of each frame, an array for each of the measurements.
     fit : callable
-        Fits a model to measurements, from the start.
+        Fits a model to measurements from the start.
     uncertainty : Uncertainty
-    flux_noise_t : float or None
-        The flux noise alone, to be taken off; by the imaginary parts when not given.
-    noise_t : float or None
-        Noise of a phasor component, T, for weighing noise against jitter and to be taken off;
-        when not given, the smallest that any fold's fit left.
+        Flux noise and pose jitter.
+    noise_t : float, optional
+        Noise of a phasor component, T, that noise and jitter are weighed with and that is
+        subtracted; the smallest residual of any fold's fit by default.
+    flux_noise_t : float, optional
+        Flux noise alone, T a component, that is subtracted; estimated from the imaginary parts by
+        default.
     """
     fits = []
     for fold in np.unique(np.concatenate(list(folds))):
@@ -106,14 +103,14 @@ def predict_held_out(
         for m, f in zip(measurements, folds, strict=True):
             test = with_pose(m.frames(f == fold))
             for block in frame_blocks(len(test.time), len(test.sensors)):
-                part = test.frames(block)  # type: ignore[arg-type]
+                part = test.frames(block)
                 terms = pose_terms(part, fitted.dipoles, fitted.fit.moments)
                 tally.add(terms, usable_weights(part))
     return tally.result()
 
 
 class _Tally:
-    """Gathers held-out residuals."""
+    """Gathers held-out residuals of all folds and sums them up."""
 
     def __init__(
         self, noise_t: float, flux_noise_t: float, uncertainty: Uncertainty, n_dipoles: int
@@ -138,7 +135,7 @@ class _Tally:
     def result(self) -> HeldOut:
         error, left = np.concatenate(self.error), np.concatenate(self.left)
         components = 2 * error.size
-        # The typical frame: those beyond the edge of what was fitted, and outliers, do not count.
+        # The median leaves out outliers and the frames beyond the edge of what was fitted.
         excess = float(np.median(np.concatenate(self.excess)))
         return HeldOut(
             error=error,
@@ -152,5 +149,5 @@ class _Tally:
 
 
 def rms(error: ComplexArray) -> float:
-    """Root of the mean squared magnitude of complex errors."""
+    """Return the root of the mean squared magnitude of complex errors."""
     return float(np.sqrt(np.mean(np.abs(error) ** 2)))

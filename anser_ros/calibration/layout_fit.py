@@ -1,4 +1,4 @@
-"""A layout fitted to measurements: dipoles placed, pulled to the drawn board, moved if asked."""
+"""The fit of a layout: its dipoles are placed, pulled towards the drawn board, moved if asked."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,18 +20,42 @@ from anser_ros.field.model import FieldModel
 Array = NDArray[np.float64]
 
 RICH = Layout('layer', 16, 1.8, 0.0)
-"""The layout at which poses are corrected, for sensors that stay well above the coils."""
+"""The layer that corrects poses for sensors that stay well above the coils. It should represent
+any field of the board better than the candidates that are compared at these poses."""
 RICH_MOST = 22
+"""Dipoles along a side of that layer at most, however low the sensors come; the time of a fit
+grows with the fourth power of it or faster."""
 RICH_SPACING = 0.4
-"""Spacing of that layer's dipoles that is fine enough, as a part of the lowest sensor's height."""
+"""Spacing of that layer's dipoles as a fraction of the lowest sensor's height. A layer whose
+spacing is larger than the height is felt as single dipoles."""
 RICH_DAMPING = 1e-5
+"""Damping of that layer's moments, a fraction of the largest singular value: small, so that the
+field is not biased, and large enough for a fit by inner products."""
 MOVING_DAMPING = 1e-4
+"""Damping of the moments while dipoles are moved, a fraction of the largest singular value. It
+keeps two dipoles that come close together from growing huge moments of opposite sign."""
 MOST_MOVING_ROWS = 6000
+"""Readings by which dipoles are moved at most; the final fit of the moments takes all. Some
+hundred positions need no more, and the time grows in proportion."""
+LEAST_HEIGHT_M = 0.01
+"""Height of the lowest reading at least, m, for recordings in which a sensor touches the board."""
+LEAST_EXTENSION = 1.1
+"""Size of the rich layer at least, as a multiple of the coils' extent."""
 
 
 @dataclass(frozen=True)
 class LayoutFit:
-    """DipoleSites, the moments that they are pulled to (or None), and the fit."""
+    """The dipoles of a fitted layout, the moments that they are pulled to, and the fit.
+
+    Attributes
+    ----------
+    dipoles : DipoleSites
+        N dipoles as placed or moved.
+    prior : ndarray, shape (N, K), complex, or None
+        Moments towards which the damping pulls, A m^2; None for zero.
+    fit : MomentFit
+        The fit of their moments.
+    """
 
     dipoles: DipoleSites
     prior: ComplexArray | None
@@ -39,24 +63,27 @@ class LayoutFit:
 
 
 def lowest_height(measurements: Sequence[Measurements], generator: Generator) -> float:
-    """Height of the lowest reading over the coils, m; at least 1 cm."""
+    """Return the height of the lowest reading over the coils, m, at least `LEAST_HEIGHT_M`."""
     lowest = min(float(np.nanmin(m.placed()[0][..., 2])) for m in measurements if len(m.time))
-    return max(lowest - float(generator.middle[2]), 0.01)
+    return max(lowest - float(generator.middle[2]), LEAST_HEIGHT_M)
 
 
 def rich_layout(measurements: Sequence[Measurements], generator: Generator) -> Layout:
-    """A layer fine enough for the lowest sensor; a smaller one where that takes too many."""
+    """Return a layer that is fine enough for the lowest sensor.
+
+    Where that would take more than `RICH_MOST` dipoles along a side, the layer is smaller.
+    """
     width = 2.0 * float(generator.half_extent.max())
     spacing = RICH_SPACING * lowest_height(measurements, generator)
     count = int(np.clip(np.ceil(width * RICH.extension / spacing) + 1, RICH.count, RICH_MOST))
-    extension = float(np.clip(spacing * (count - 1) / width, 1.1, RICH.extension))
+    extension = float(np.clip(spacing * (count - 1) / width, LEAST_EXTENSION, RICH.extension))
     return replace(RICH, count=count, extension=extension)
 
 
 def placed(
     layout: Layout, generator: Generator, drawn: DrawnBoard | None
 ) -> tuple[DipoleSites, ComplexArray | None]:
-    """A layout's dipoles, and the moments that the damping pulls to."""
+    """Return a layout's dipoles, and the moments towards which the damping pulls."""
     dipoles = place(layout, generator)
     return dipoles, prior_of(layout, dipoles, drawn)
 
@@ -64,7 +91,7 @@ def placed(
 def prior_of(
     layout: Layout, dipoles: DipoleSites, drawn: DrawnBoard | None
 ) -> ComplexArray | None:
-    """The drawn board's moments on these dipoles when the layout is pulled to it."""
+    """Return the drawn board's moments on dipoles, or None if the layout is not pulled to it."""
     return drawn.moments(dipoles) if layout.prior == 'nominal' and drawn is not None else None
 
 
@@ -74,7 +101,19 @@ def optimise_positions(
     dipoles: DipoleSites,
     prior: ComplexArray | None,
 ) -> DipoleSites:
-    """DipoleSites moved to where they explain the measurements best."""
+    """Return dipoles moved to where they explain the measurements best.
+
+    Parameters
+    ----------
+    corrected : sequence of Measurements
+        Measurements at their corrected poses, one a body and session.
+    weights : sequence of ndarray, shape (F, S)
+        Weights of the readings.
+    dipoles : DipoleSites
+        The dipoles to start from.
+    prior : ndarray, shape (N, K), complex, or None
+        Moments towards which the damping pulls, A m^2.
+    """
     rows = sum(m.flux.shape[0] * m.flux.shape[1] for m in corrected)
     step = max(1, -(-rows // MOST_MOVING_ROWS))
     thin = [m.frames(np.arange(0, len(m.time), step)) for m in corrected]
@@ -93,17 +132,22 @@ def fit_layout(
     exact: bool = True,
     progress: Progress | None = None,
 ) -> LayoutFit:
-    """Fit a layout from the start: nothing is taken over from any other fit.
+    """Fit a layout from the start, without using the result of any other fit.
 
     Parameters
     ----------
     measurements : sequence of Measurements
-    layout, damping
-        As chosen.
+        Tool measurements with poses, one a body and session.
+    layout : Layout
+        The layout.
+    damping : float
+        Damping of the moments.
     generator : Generator
+        Places of the coils.
     uncertainty : Uncertainty
-    nominal : FieldModel or None
-        The drawn board, for layouts pulled to it.
+        Flux noise and pose jitter.
+    nominal : FieldModel, optional
+        The drawn board, for layouts that are pulled towards it.
     alternations, exact, progress
         As for `MomentFitter.fit`.
     """

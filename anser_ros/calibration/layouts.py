@@ -1,4 +1,5 @@
-"""Where virtual dipoles may be put: layers over the field generator's extent, or on its coils."""
+"""Layouts of virtual dipoles: layers over the field generator's extent, or dipoles on its
+coils."""
 
 from dataclasses import dataclass
 
@@ -10,20 +11,21 @@ from anser_ros.calibration.dipole_sites import DipoleSites
 Array = NDArray[np.float64]
 
 UNIT_Z = np.array([0.0, 0.0, 1.0])
+"""Direction of the dipoles of a flat layer, the normal of the board."""
 
 
 @dataclass(frozen=True)
 class Generator:
-    """What a layout needs to know about a field generator.
+    """Places and size of the coils of a field generator.
 
     Attributes
     ----------
     centres : ndarray, shape (K, 3)
         Coil centres, m, frame fg.
     turns_deg : ndarray, shape (K,)
-        Their turns about z.
+        Rotation of each coil about z, degrees.
     side_m : float
-        Outer side of a coil.
+        Outer side of a coil, m.
     """
 
     centres: Array
@@ -32,13 +34,13 @@ class Generator:
 
     @property
     def half_extent(self) -> Array:
-        """Half sizes in x and y of the rectangle around all coils, m."""
+        """Half sizes in x and y of the rectangle around all coils, shape (2,), m."""
         low, high = self._bounds()
         return np.asarray(np.maximum(high - low, 1e-3) / 2.0)
 
     @property
     def middle(self) -> Array:
-        """Centre of that rectangle, and the coils' mean height, m."""
+        """Centre of that rectangle at the coils' mean height, shape (3,), m."""
         low, high = self._bounds()
         return np.array([*((low + high) / 2.0), self.centres[:, 2].mean()])
 
@@ -51,25 +53,25 @@ class Generator:
 
 @dataclass(frozen=True)
 class Layout:
-    """A choice of dipoles in words and numbers.
+    """A rule by which dipoles are placed and fitted.
 
     Attributes
     ----------
     kind : {'layer', 'layer_xyz', 'coils'}
-        A layer of z-dipoles, of dipoles with three free components, or z-dipoles on the coils
-        themselves.
+        A layer of z-dipoles, a layer of dipoles with three free components, or z-dipoles on the
+        coils.
     count : int
-        DipoleSites along a side of the layer, or of each coil.
+        Number of dipoles along a side of the layer, or of each coil.
     extension : float
-        Size of the layer as a multiple of the field generator's own.
+        Size of the layer as a multiple of the field generator's.
     depth_m : float
-        How far below the coils the layer lies.
+        Depth of the layer below the coils, m.
     prior : {'none', 'nominal'}
-        What the damping pulls the moments towards: zero, or those of the drawn board.
+        Whether the damping pulls the moments towards zero or towards those of the drawn board.
     moved : bool
-        Whether the dipoles are moved from there to where they explain the data best.
+        Whether the dipoles are then moved to where they explain the data best.
     local : bool
-        Whether overlapping regions get moments of their own.
+        Whether overlapping regions get separate moments.
     """
 
     kind: str
@@ -81,7 +83,7 @@ class Layout:
     local: bool = False
 
     def describe(self) -> str:
-        """One line for a report."""
+        """Return the layout in words for a report."""
         drawn = ', pulled to the drawn board' if self.prior == 'nominal' else ''
         drawn += ', positions optimised' if self.moved else ''
         drawn += ', in overlapping regions' if self.local else ''
@@ -95,14 +97,14 @@ class Layout:
 
 
 def grid(count: int, half: Array) -> Array:
-    """A lattice of count x count points over -half..half in x and y, shape (count^2, 2)."""
+    """Return a lattice of count x count points over -half..half in x and y, shape (count^2, 2)."""
     steps = np.linspace(-1.0, 1.0, count) if count > 1 else np.zeros(1)
     x, y = np.meshgrid(steps * half[0], steps * half[1], indexing='ij')
     return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
 def place(layout: Layout, generator: Generator) -> DipoleSites:
-    """The dipoles of a layout."""
+    """Return the dipoles of a layout over a field generator."""
     if layout.kind == 'coils':
         return _on_coils(layout, generator)
     flat = grid(layout.count, generator.half_extent * layout.extension)

@@ -1,10 +1,10 @@
-"""Local models: overlapping regions with moments of their own, joined smoothly into one layer.
+"""Local models: overlapping regions with separate moments, joined smoothly into one layer.
 
-The article solves smaller problems for sub-regions where one does not do. Here the measured volume
-is split in two along each of its longer sides; every region's moments are fitted to its own
-readings, pulled to the common fit, and a smooth partition of unity blends the regions' fields.
-What is served must be one set of dipoles, so the blended field is expressed by a finer layer at
-last (which also makes it free of sources again, as a blend is not).
+The article solves smaller problems for sub-regions where a single one is not accurate enough. Here
+the measured volume is split in two along each of its longer sides. The moments of every region are
+fitted to the region's readings and pulled towards the common fit, and a smooth partition of unity
+blends the fields of the regions. A field model has one set of dipoles, so the blended field is
+finally expressed by a finer layer. This also makes it free of sources again, which a blend is not.
 """
 
 from collections.abc import Sequence
@@ -15,18 +15,19 @@ from numpy.typing import NDArray
 from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows
 from anser_ros.calibration.factors import GramFactor, as_complex, as_real
 from anser_ros.calibration.moments import MomentFit
-from anser_ros.calibration.pose_correction import frame_blocks
-from anser_ros.calibration.prior import volume_lattice
+from anser_ros.calibration.prior import PROJECTION_DAMPING, volume_lattice
+from anser_ros.calibration.readings import frame_blocks
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_basis
 
 Array = NDArray[np.float64]
 
 OVERLAP = 0.5
-"""Width of the blend between two regions, as a part of the volume's extent."""
+"""Width of the blend between two regions, as a fraction of the volume's extent. With less overlap
+the field changes more abruptly between regions; with more the regions differ less."""
 LONG_SIDE = 0.5
-"""A side shorter than this part of the longest one is not divided."""
-PROJECTION_DAMPING = 1e-6
+"""A side shorter than this fraction of the longest one is not divided: its regions would be flat
+and would not determine the field's change across them."""
 
 
 class Regions:
@@ -35,7 +36,7 @@ class Regions:
     Parameters
     ----------
     points : ndarray, shape (P, 3)
-        m, frame fg.
+        Positions of readings, m, frame fg.
     """
 
     def __init__(self, points: Array) -> None:
@@ -47,7 +48,7 @@ class Regions:
         return int(2**self.divided.size)
 
     def shares(self, points: Array) -> Array:
-        """Share of each region at each point, shape (P, R); they add up to one."""
+        """Return the weight of each region at each point, shape (P, R); a row adds up to one."""
         out = np.ones((len(points), 1))
         for axis in self.divided:
             along = (points[:, axis] - self.middle[axis]) / (OVERLAP * self.extent[axis])
@@ -63,16 +64,26 @@ def join_regions(
     damping: float,
     layer: DipoleSites,
 ) -> NDArray[np.complex128]:
-    """Moments (N', K) of a finer layer that make the regions' blended field.
+    """Return the moments of a finer layer that make the blended field of the regions.
 
     Parameters
     ----------
     measurements : sequence of Measurements
-        At the measured poses; they give the volume.
-    dipoles, fit, damping
-        The common fit, whose poses and weights are kept and to whose moments regions are pulled.
+        Measurements at their measured poses, which determine the volume.
+    dipoles : DipoleSites
+        Dipoles of the common fit.
+    fit : MomentFit
+        The common fit: its poses and weights are kept, and the damping pulls the regions' moments
+        towards its moments.
+    damping : float
+        Damping of the regions' fits.
     layer : DipoleSites
-        The layer to express the field by.
+        The N' dipoles to express the blended field by.
+
+    Returns
+    -------
+    ndarray, shape (N', K), complex
+        Moments, A m^2.
     """
     regions = Regions(
         np.concatenate(
@@ -83,7 +94,7 @@ def join_regions(
     factors = [GramFactor(len(dipoles), common.shape[1]) for _ in range(len(regions))]
     for m, weights in zip(fit.measurements, fit.weights, strict=True):
         for block in frame_blocks(*weights.shape):
-            part = m.frames(block)  # type: ignore[arg-type]
+            part = m.frames(block)
             matrix = basis_rows(part, dipoles)
             right = as_real(part.flux).reshape(len(matrix), -1)
             shares = regions.shares(part.placed()[0].reshape(-1, 3))

@@ -1,13 +1,13 @@
-"""Moments of virtual dipoles from fluxes at poses that jitter: errors in variables, by blocks.
+"""Moments of virtual dipoles from fluxes at poses that jitter (errors in variables).
 
 Each optical pose is wrong by a few hundredths of a millimetre, and all sensors of the body and all
-emitters see that error together, along six known directions. So the fit alternates between (a) the
-most probable pose of every frame, from all its readings and the pose's prior, and (b) damped least
-squares of the moments at those poses: the article's equation (6) with one matrix and a right-hand
-side for every phasor component. Both steps lower the same sum of squares (block coordinate descent
-on the joint posterior); readings that no pose explains lose weight (Huber, Robust Statistics).
-The matrix is only kept as the triangular factor of its rows so far (Golub and Van Loan, section
-5.3), so millions of rows take no more memory than one block.
+emitters share that error along six known directions. The fit therefore alternates between (a) the
+most probable pose of every frame, from all its readings and the prior of the pose, and (b) damped
+least squares of the moments at those poses, which is the article's equation (6) with one matrix
+and a right-hand side for every phasor component. Both steps lower the same sum of squares (block
+coordinate descent on the joint posterior). Readings that no pose explains lose weight (Huber,
+Robust Statistics). Only the triangular factor of the rows so far is kept (Golub and Van Loan,
+section 5.3), so that millions of rows take no more memory than one block.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,15 +27,13 @@ from anser_ros.calibration.factors import (
 from anser_ros.calibration.pose_correction import (
     SMALLEST_NOISE_T,
     Uncertainty,
-    frame_blocks,
     most_probable_step,
     moved,
     outlier_weights,
     pose_freedom,
     pose_terms,
-    usable_weights,
-    with_pose,
 )
+from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 
@@ -44,33 +42,39 @@ ComplexArray = NDArray[np.complex128]
 Progress = Callable[[str, float], None]
 
 CONVERGED = 2e-3
-"""Relative fall of the residual below which another alternation is not worth its time."""
+"""Relative change of the noise estimate below which the alternation ends. A smaller value costs
+rounds that change moments by far less than their uncertainty."""
+LEAST_FREEDOM = 0.05
+"""Degrees of freedom of the residual at least, as a fraction of the phasor components: a bound for
+fits with nearly as many parameters as readings, whose noise would be divided by zero."""
 
 
 @dataclass(frozen=True)
 class MomentFit:
-    """Moments with what their fit left.
+    """Fitted moments with their residual noise and condition.
 
     Attributes
     ----------
     moments : ndarray, shape (N, K), complex
-        A m^2.
+        Moments, A m^2.
     measurements : tuple of Measurements
-        At their corrected poses.
+        The measurements at their corrected poses.
     weights : tuple of ndarray, shape (F, S)
         Weight of each reading in [0, 1]; 0 where it is unusable.
     noise_t : float
-        Estimated noise of a phasor component with the degrees of freedom taken off, T; it holds
-        whatever the model can't explain.
+        Root mean square residual of a phasor component, corrected for the degrees of freedom, T.
+        It holds the flux noise and all that the model cannot explain.
     quadrature_noise_t : float
-        The same of the imaginary parts alone: where nothing turns the phase it is the flux noise,
-        whatever poses and model are wrong by.
+        The same of the imaginary parts alone. Where no metal turns the phase, the field is in
+        phase, and this is the flux noise whatever the errors of poses and model.
     rank : int
+        Numerical rank of the matrix.
     freedom : float
-        Effective number of parameters an emitter's component.
+        Effective number of parameters of each right-hand side.
     condition : float
-        Of the column-scaled matrix.
+        Condition of the column-scaled matrix.
     alternations : int
+        Number of rounds.
     """
 
     moments: ComplexArray
@@ -86,7 +90,7 @@ class MomentFit:
 
 @dataclass
 class _State:
-    """One body's measurements as the alternation moves them."""
+    """One body's measurements with the pose offsets and weights of the present round."""
 
     measured: Measurements
     corrected: Measurements
@@ -96,18 +100,27 @@ class _State:
 
 
 class MomentFitter:
-    """Alternates poses and moments; `fit` runs it to its end.
+    """Alternates between the poses of the frames and the moments of the dipoles.
+
+    `fit` runs the alternation to its end.
 
     Parameters
     ----------
     measurements : sequence of Measurements
-        One a body and session; reference sensors may be among them (their pose doesn't jitter).
+        One a body and session; reference sensors may be among them (their pose does not jitter).
     dipoles : DipoleSites
+        N dipoles.
     damping : float
-        Tikhonov's parameter as a part of the largest singular value of the scaled matrix.
+        Tikhonov's parameter as a fraction of the largest singular value of the scaled matrix.
     uncertainty : Uncertainty
-    prior : ndarray, shape (N, K), complex, or None
-        Moments towards which the damping pulls; zero when not given.
+        Flux noise to begin with, and pose jitter.
+    prior : ndarray, shape (N, K), complex, optional
+        Moments towards which the damping pulls, A m^2; zero by default.
+
+    Raises
+    ------
+    FitError
+        When no reading has a pose.
     """
 
     def __init__(
@@ -133,21 +146,17 @@ class MomentFitter:
         offset = np.zeros((len(measured.time), 6))
         return _State(measured, measured, offset, usable.copy(), usable)
 
-    def start_from(self, corrected: Sequence[tuple[Array, Array]]) -> None:
-        """Begin with known pose offsets (F, 6) and weights (F, S), one pair a body."""
-        for state, (offset, weights) in zip(self.states, corrected, strict=True):
-            state.offset = offset.copy()
-            state.corrected = moved(state.measured, offset)
-            state.weights = weights * state.usable
-
     def solve(self, exact: bool = True) -> tuple[ComplexArray, Spectrum]:
-        """Moments at the current poses and weights; by QR when ``exact``."""
+        """Return the moments (N, K) at the present poses and weights, with their spectrum.
+
+        With ``exact`` they are solved by QR, otherwise by inner products, which is faster.
+        """
         kind = TriangularFactor if exact else GramFactor
         factor = kind(len(self.dipoles), 2 * self.emitters)
         for state in self.states:
             count, sensors = state.weights.shape
             for block in frame_blocks(count, sensors):
-                part = state.corrected.frames(block)  # type: ignore[arg-type]
+                part = state.corrected.frames(block)
                 root = np.sqrt(state.weights[block].reshape(-1, 1))
                 right = as_real(part.flux).reshape(-1, 2 * self.emitters)
                 factor.add(root * basis_rows(part, self.dipoles), root * right)
@@ -155,12 +164,20 @@ class MomentFitter:
         return as_complex(spectrum.solve(self.damping, self.prior)), spectrum
 
     def correct(self, moments: ComplexArray, freedom: float) -> float:
-        """Move all poses to their most probable values; returns the new noise estimate, T."""
+        """Move all poses to their most probable values and return the new noise estimate, T.
+
+        Parameters
+        ----------
+        moments : ndarray, shape (N, K), complex
+            Present moments, A m^2.
+        freedom : float
+            Effective number of parameters of each right-hand side.
+        """
         power, turned, count, used = 0.0, 0.0, 0.0, 0.0
         for state in self.states:
             precision = self._precision(state)
             for block in frame_blocks(*state.weights.shape):
-                part = state.corrected.frames(block)  # type: ignore[arg-type]
+                part = state.corrected.frames(block)
                 terms = pose_terms(part, self.dipoles, moments)
                 step, left = most_probable_step(
                     terms, state.weights[block], self.noise_t, precision, state.offset[block]
@@ -173,8 +190,8 @@ class MomentFitter:
                 count += float(weight.sum()) * left.shape[2]
                 used += pose_freedom(terms, weight, self.noise_t, precision)
             state.corrected = moved(state.measured, state.offset)
-        left_over = max(count - used - freedom * 2 * self.emitters, 0.05 * count)
-        halved = max(count / 2.0 - freedom * self.emitters, 0.025 * count)
+        left_over = max(count - used - freedom * 2 * self.emitters, LEAST_FREEDOM * count)
+        halved = max(count / 2.0 - freedom * self.emitters, LEAST_FREEDOM / 2.0 * count)
         self.quadrature_noise_t = max(float(np.sqrt(turned / halved)), SMALLEST_NOISE_T)
         return max(float(np.sqrt(power / left_over)), SMALLEST_NOISE_T)
 
@@ -186,7 +203,17 @@ class MomentFitter:
     def fit(
         self, alternations: int = 5, progress: Progress | None = None, exact: bool = True
     ) -> MomentFit:
-        """Alternate until the residual no longer falls; ``exact`` has the last solve by QR."""
+        """Alternate until the noise estimate no longer changes.
+
+        Parameters
+        ----------
+        alternations : int
+            Largest number of rounds.
+        progress : callable, optional
+            Called with the name of the stage and its finished fraction.
+        exact : bool
+            Whether the last solution is by QR.
+        """
         done = 0
         moments, spectrum = self.solve(exact=False)
         for done in range(1, alternations + 1):

@@ -1,10 +1,10 @@
-"""Dipole positions fitted together with their moments: variable projection.
+"""Dipole positions fitted together with their moments by variable projection.
 
 The moments are linear and are eliminated at every step (Golub and Pereyra, Inverse Problems 19,
 2003); only the positions are left to a damped Gauss-Newton search. With Kaufman's derivative the
-normal matrix is a product, entry by entry, of two small ones: the Gram matrix of the basis' slopes
-outside the span of the basis, and that of the moments. So nothing grows with the number of
-emitters or of readings.
+normal matrix is a product, entry by entry, of two small matrices: the Gram matrix of the slopes of
+the basis outside the span of the basis, and that of the moments. Its size depends neither on the
+number of emitters nor on that of readings.
 """
 
 from collections.abc import Sequence
@@ -16,15 +16,18 @@ from numpy.typing import NDArray
 
 from anser_ros.calibration.dipole_sites import DipoleSites
 from anser_ros.calibration.factors import ComplexArray, as_complex, as_real
-from anser_ros.calibration.pose_correction import BLOCK_ROWS, frame_blocks
+from anser_ros.calibration.readings import BLOCK_ROWS, frame_blocks
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import GAUSS_OFFSET, fill_field_and_gradient, flux_basis
 
 Array = NDArray[np.float64]
 
 MOST_STEPS = 15
+"""Largest number of Levenberg-Marquardt steps; it bounds the time of a fit that creeps."""
+MOST_TRIALS = 6
+"""Trials of a step, each with five times the damping of the one before, before the search ends."""
 CONVERGED = 1e-3
-"""Relative fall of the sum of squares that is not worth another step."""
+"""Relative fall of the sum of squares below which another step is not worth its time."""
 
 
 @numba.njit(cache=True, error_model='numpy')
@@ -48,7 +51,22 @@ def _fill_slopes(points, axes, lengths, positions, directions, out):  # type: ig
 
 
 def position_slopes(points: Array, axes: Array, lengths: Array, dipoles: DipoleSites) -> Array:
-    """Derivative of the flux basis by the dipoles' positions, shape (P, N, 3), T / (A m^3)."""
+    """Return the derivative of the flux basis by the dipoles' positions.
+
+    Parameters
+    ----------
+    points, axes : ndarray, shape (P, 3)
+        Sensor centres (m) and unit axes, frame fg.
+    lengths : ndarray, shape (P,)
+        Coil lengths, m.
+    dipoles : DipoleSites
+        N dipoles.
+
+    Returns
+    -------
+    ndarray, shape (P, N, 3)
+        Derivatives, T / (A m^3).
+    """
     out = np.empty((points.shape[0], len(dipoles), 3))
     _fill_slopes(
         np.ascontiguousarray(points), np.ascontiguousarray(axes), np.ascontiguousarray(lengths),
@@ -59,16 +77,18 @@ def position_slopes(points: Array, axes: Array, lengths: Array, dipoles: DipoleS
 
 @dataclass(frozen=True)
 class PositionFit:
-    """Optimised dipoles with the damped moments that go with them.
+    """Dipoles at optimised positions with their damped moments.
 
     Attributes
     ----------
     dipoles : DipoleSites
+        The moved dipoles.
     moments : ndarray, shape (N, K), complex
-        A m^2.
+        Moments, A m^2.
     start_t, end_t : float
-        Weighted residual of a phasor component before and after, T rms.
+        Root mean square of the weighted residual of a phasor component before and after, T.
     steps : int
+        Number of steps.
     """
 
     dipoles: DipoleSites
@@ -79,19 +99,23 @@ class PositionFit:
 
 
 class PositionFitter:
-    """Moves dipoles to lower the damped residual of measurements at fixed (corrected) poses.
+    """Moves dipoles to lower the damped residual of measurements at fixed, corrected poses.
 
     Parameters
     ----------
     measurements : sequence of Measurements
+        Measurements at their corrected poses, one a body and session.
     weights : sequence of ndarray, shape (F, S)
+        Weights of the readings in [0, 1].
     dipoles : DipoleSites
-        Start; their directions stay.
+        The positions to start from; the directions stay.
     damping : float
-        As for the moments.
-    prior : ndarray, shape (N, K), complex, or None
+        Tikhonov's parameter of the moments, as for `MomentFitter`.
+    prior : ndarray, shape (N, K), complex, optional
+        Moments towards which the damping pulls, A m^2; zero by default.
     longest_move_m : float
-        Bound of one step of one dipole.
+        Longest step of one dipole, m; a centimetre is small beside the distance of sensors from
+        the dipoles, so that the linearisation holds.
     """
 
     def __init__(
@@ -104,7 +128,7 @@ class PositionFitter:
         longest_move_m: float = 0.01,
     ) -> None:
         self.blocks = [
-            _rows(m.frames(block), w[block])  # type: ignore[arg-type]
+            _rows(m.frames(block), w[block])
             for m, w in zip(measurements, weights, strict=True)
             for block in frame_blocks(len(m.time), len(m.sensors), BLOCK_ROWS // 4)
         ]
@@ -115,7 +139,7 @@ class PositionFitter:
         self.ridge = self._ridge()
 
     def _ridge(self) -> Array:
-        """Tikhonov's term (N,), fixed at the start: the aim must not move with the dipoles."""
+        """Return Tikhonov's term (N,), fixed at the start so that the cost is the same."""
         gram, _, _ = self._linear(self.dipoles)
         diagonal = np.diag(gram)
         scaled = gram / np.sqrt(np.outer(diagonal, diagonal))
@@ -133,16 +157,16 @@ class PositionFitter:
         return gram, right, power
 
     def solve(self, dipoles: DipoleSites) -> tuple[Array, float]:
-        """Damped moments (N, 2K), and the damped sum of squares that they leave."""
+        """Return the damped moments (N, 2K) of dipoles, and their damped sum of squares."""
         gram, right, power = self._linear(dipoles)
         normal = gram + np.diag(self.ridge)
         moments = np.linalg.solve(normal, right + self.ridge[:, None] * self.prior)
         fixed = float((self.ridge[:, None] * self.prior**2).sum())
-        aim = (moments * (right + self.ridge[:, None] * self.prior)).sum()
-        return np.asarray(moments), max(power + fixed - float(aim), 0.0)
+        explained = (moments * (right + self.ridge[:, None] * self.prior)).sum()
+        return np.asarray(moments), max(power + fixed - float(explained), 0.0)
 
     def _normal(self, dipoles: DipoleSites, moments: Array) -> tuple[Array, Array]:
-        """Kaufman's normal matrix (3N, 3N) and gradient (3N,) of the positions."""
+        """Return Kaufman's normal matrix (3N, 3N) and gradient (3N,) of the positions."""
         size = len(dipoles)
         inner = np.zeros((3 * size, 3 * size))
         cross = np.zeros((size, 3 * size))
@@ -164,28 +188,28 @@ class PositionFitter:
         return inner * pairs, gradient.ravel()
 
     def fit(self, most_steps: int = MOST_STEPS) -> PositionFit:
-        """Levenberg-Marquardt steps until they no longer pay."""
+        """Take Levenberg-Marquardt steps until the cost hardly falls any more."""
         dipoles, strength, steps = self.dipoles, 1e-2, 0
-        moments, aim = self.solve(dipoles)
-        start = aim
+        moments, cost = self.solve(dipoles)
+        start = cost
         while steps < most_steps:
             steps += 1
             normal, gradient = self._normal(dipoles, moments)
-            before = aim
-            for _ in range(6):
+            before = cost
+            for _ in range(MOST_TRIALS):
                 trial = self._moved(dipoles, normal, gradient, strength)
-                trial_moments, trial_aim = self.solve(trial)
-                if trial_aim < aim:
-                    dipoles, moments, aim = trial, trial_moments, trial_aim
+                trial_moments, trial_cost = self.solve(trial)
+                if trial_cost < cost:
+                    dipoles, moments, cost = trial, trial_moments, trial_cost
                     strength = max(strength / 5.0, 1e-9)
                     break
                 strength *= 5.0
-            if before - aim < CONVERGED * before:
+            if before - cost < CONVERGED * before:
                 break
         scale = 1.0 / self.count
         return PositionFit(
             dipoles, as_complex(moments), float(np.sqrt(start * scale)),
-            float(np.sqrt(aim * scale)), steps,
+            float(np.sqrt(cost * scale)), steps,
         )  # fmt: skip
 
     def _moved(
@@ -202,7 +226,7 @@ class PositionFitter:
 
 
 def _rows(measurements: Measurements, weights: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Points, axes, lengths, root weights and fluxes (P, 2K) of the readings that count."""
+    """Return points, axes, lengths, root weights and fluxes (P, 2K) of the weighted readings."""
     points, axes = measurements.placed()
     used = weights > 0.0
     lengths = np.broadcast_to(measurements.sensors.length, used.shape)[used]

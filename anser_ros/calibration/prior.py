@@ -1,8 +1,8 @@
-"""What is known before any measurement: the drawn board's field, as moments of any set of dipoles.
+"""The drawn board as a prior: its field, expressed as the moments of any set of dipoles.
 
-A damped fit is pulled towards these moments instead of zero, so that what the data don't determine
-stays as drawn. The drawing is scaled by one complex gain an emitter first: the drive current's
-scale, and most of what a large sheet of metal does, is a factor.
+The damping pulls a fit towards these moments instead of zero, so that what the data do not
+determine stays as drawn. The drawing is first scaled by one complex gain an emitter, because the
+scale of the drive current, and most of the effect of a large metal sheet, is such a factor.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from anser_ros.calibration.dipole_sites import DipoleSites
 from anser_ros.calibration.factors import ComplexArray, GramFactor, as_complex, as_real
-from anser_ros.calibration.pose_correction import frame_blocks
+from anser_ros.calibration.readings import usable_readings
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_basis
@@ -20,19 +20,31 @@ from anser_ros.physics.dipole import flux_basis
 Array = NDArray[np.float64]
 
 POINTS_ALONG = 11
+"""Lattice points along x and y of the volume in which dipoles are to make the drawn field (every
+second one along z). With three axes a point they are some 2000 equations for at most a few hundred
+dipoles; fewer would leave the field between the points free."""
 MARGIN = 0.3
-"""How far beyond the measured volume the drawing is followed, as a part of its half size."""
+"""How far beyond the measured volume the drawn field is followed, as a fraction of its half size,
+so that a model extrapolates as the drawing does."""
+LEAST_HALF_SIZE_M = 0.02
+"""Half size of that volume at least, m, for measurements along a line or in a plane."""
+LEAST_HEIGHT = 0.8
+"""Lowest point of that volume as a fraction of the lowest reading's height: farther down the field
+of the drawn coils changes too fast for a layer of dipoles."""
 PROJECTION_DAMPING = 1e-6
+"""Damping when a known field without noise is expressed by dipoles, as a fraction of the largest
+singular value. It only keeps nearly parallel columns from making huge moments."""
 
 
 class DrawnBoard:
-    """The nominal field in and around a measured volume, ready to be expressed by any dipoles.
+    """The drawn board's field in and around a measured volume, scaled to the measurements.
 
     Parameters
     ----------
     nominal : FieldModel
+        The nominal model of the drawing.
     measurements : sequence of Measurements
-        They give the volume and the emitters' gains.
+        They determine the volume and the emitters' gains.
     """
 
     def __init__(self, nominal: FieldModel, measurements: Sequence[Measurements]) -> None:
@@ -41,7 +53,7 @@ class DrawnBoard:
         self.flux = nominal.flux(self.points, self.axes) * self.gains
 
     def moments(self, dipoles: DipoleSites) -> ComplexArray:
-        """Moments (N, K) with which the dipoles make the drawn field."""
+        """Return the moments (N, K), A m^2, with which N dipoles make the drawn field best."""
         basis = flux_basis(self.points, self.axes, None, dipoles.positions, dipoles.directions)
         factor = GramFactor(len(dipoles), 2 * self.flux.shape[1])
         factor.add(basis, as_real(self.flux))
@@ -49,29 +61,29 @@ class DrawnBoard:
 
 
 def volume_lattice(measurements: Sequence[Measurements]) -> tuple[Array, Array]:
-    """Points and axes (P, 3): three axes at each point of a lattice about the measured volume."""
+    """Return a lattice of sensors in and around the volume of the usable readings.
+
+    Returns
+    -------
+    points, axes : ndarray, shape (P, 3)
+        Positions (m) and unit axes, frame fg; three sensors along x, y and z at each point.
+    """
     points = np.concatenate([m.placed()[0][m.usable] for m in measurements])
     low, high = points.min(axis=0), points.max(axis=0)
     middle, half = (low + high) / 2.0, (high - low) / 2.0
-    half = np.maximum(half * (1.0 + MARGIN), 0.02)
+    half = np.maximum(half * (1.0 + MARGIN), LEAST_HALF_SIZE_M)
     steps = np.linspace(-1.0, 1.0, POINTS_ALONG)
     lattice = np.stack(np.meshgrid(steps, steps, steps[::2], indexing='ij'), axis=3)
     where = middle + lattice.reshape(-1, 3) * half
-    # Downwards the volume ends at the board: never closer than the lowest reading by a fifth.
-    where[:, 2] = np.maximum(where[:, 2], 0.8 * low[2])
+    where[:, 2] = np.maximum(where[:, 2], LEAST_HEIGHT * low[2])
     return np.repeat(where, 3, axis=0), np.tile(np.eye(3), (len(where), 1))
 
 
 def emitter_gains(nominal: FieldModel, measurements: Sequence[Measurements]) -> ComplexArray:
-    """Complex factor of each emitter's drawn field that fits its fluxes best."""
+    """Return the complex factor of each emitter's drawn field that fits its fluxes best, (K,)."""
     above, below = np.zeros(len(nominal.emitters), complex), np.zeros(len(nominal.emitters))
-    for whole in measurements:
-        for block in frame_blocks(len(whole.time), len(whole.sensors)):
-            m = whole.frames(block)  # type: ignore[arg-type]
-            points, axes = m.placed()
-            used = m.usable
-            lengths = np.broadcast_to(m.sensors.length, used.shape)[used]
-            drawn = nominal.flux(points[used], axes[used], lengths)
-            above += (drawn.conj() * m.flux[used]).sum(axis=0)
-            below += (np.abs(drawn) ** 2).sum(axis=0)
+    for points, axes, lengths, flux in usable_readings(measurements):
+        drawn = nominal.flux(points, axes, lengths)
+        above += (drawn.conj() * flux).sum(axis=0)
+        below += (np.abs(drawn) ** 2).sum(axis=0)
     return np.asarray(above / np.maximum(below, 1e-300))

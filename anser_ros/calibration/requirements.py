@@ -1,4 +1,4 @@
-"""What measurements must be for a field model to be determined by them."""
+"""Requirements that measurements must meet to determine a field model."""
 
 from collections.abc import Callable, Sequence
 
@@ -10,21 +10,39 @@ from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 
 FEWEST_FRAMES = 10
+"""Frames with poses below which no calibration is tried. It only catches recordings that are
+empty or cut; how many readings a model needs depends on its dipoles."""
 FLATTEST = 0.002
-"""Thickness (rms) of the cloud of sensors that the fit needs, as a part of its extent."""
+"""Least thickness (rms) of the cloud of sensor positions, as a fraction of its extent (rms). In a
+flatter cloud the field's change across it is not determined."""
 THINNEST_M = 2e-4
-"""The same in metres: what the jitter of the poses alone would feign, thrice."""
+"""Least thickness (rms), m: three times the jitter of the poses, which makes a flat cloud look
+thick."""
 DISAGREEMENT = 10.0
-"""Sessions whose common fit leaves this many times what each alone leaves: different boards."""
+"""Ratio of the residual of a common fit to that of each session alone from which on the sessions
+count as recorded with different boards. Sessions of one board have a ratio near one."""
 
 
 def check_measurements(measurements: Sequence[Measurements], needed: int) -> int:
-    """Refuse what can't determine a field model; returns the number of readings an emitter.
+    """Check that measurements determine a field model.
+
+    Parameters
+    ----------
+    measurements : sequence of Measurements
+        Tool measurements, one a body and session.
+    needed : int
+        Number of readings an emitter that the dipoles need.
+
+    Returns
+    -------
+    int
+        The number of readings an emitter.
 
     Raises
     ------
     FitError
-        With the number needed and the number found: frames with a pose, readings, thickness.
+        When there are too few frames with a pose or too few readings, or all readings lie in one
+        plane; the message has the number needed and the number found.
     """
     if not measurements:
         raise FitError(
@@ -69,21 +87,24 @@ def check_agreement(
     joint: MomentFit,
     fit_part: Callable[[list[Measurements]], LayoutFit],
 ) -> None:
-    """Refuse sessions that one field can't explain.
+    """Check that one field explains all sessions.
 
     Parameters
     ----------
-    measurements, names
-        One session's name for each set of measurements.
+    measurements : sequence of Measurements
+        Tool measurements, one a body and session.
+    names : sequence of str
+        Name of the session of each.
     joint : MomentFit
-        Fit of all together.
+        The fit to all measurements together.
     fit_part : callable
         Fits some of the measurements alone in the same way.
 
     Raises
     ------
     FitError
-        When the common fit leaves `DISAGREEMENT` times what the sessions leave alone.
+        When the residual of the common fit is more than `DISAGREEMENT` times the largest one of
+        the sessions alone.
     """
     sessions = list(dict.fromkeys(names))
     if len(sessions) < 2:

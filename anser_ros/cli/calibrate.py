@@ -13,11 +13,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from anser_ros.calibration.calibrate import Calibration, Options
+from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.document import to_document
 from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.pose_correction import Uncertainty
-from anser_ros.calibration.sensor_survey import KINDS
+from anser_ros.calibration.result import Calibration
+from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.cli.calibration_figure import draw_choice
 from anser_ros.cli.output import make_folder, say_written
 from anser_ros.errors import FitError, ParameterError

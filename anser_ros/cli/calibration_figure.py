@@ -7,7 +7,7 @@ import matplotlib
 matplotlib.use('Agg')
 from matplotlib import pyplot as plt
 
-from anser_ros.calibration.calibrate import Calibration
+from anser_ros.calibration.result import Calibration
 
 
 def draw_choice(calibration: Calibration, path: Path) -> None:

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.calibration.factors import as_real
-from anser_ros.calibration.pose_correction import with_pose
+from anser_ros.calibration.readings import with_pose
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_jacobian

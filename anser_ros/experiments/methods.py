@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from anser_ros.calibration.calibrate import Calibration, Options
+from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.dipole_sites import basis_rows
 from anser_ros.calibration.factors import TriangularFactor, as_complex, as_real
 from anser_ros.calibration.layouts import Layout, place
-from anser_ros.calibration.pose_correction import with_pose
 from anser_ros.calibration.prior import emitter_gains
+from anser_ros.calibration.readings import with_pose
+from anser_ros.calibration.result import Calibration
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.sessions.calibration import calibrate_sessions, generator_of

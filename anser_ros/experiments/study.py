@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.calibration.calibrate import Calibration
 from anser_ros.calibration.error_map import learn_error_map
+from anser_ros.calibration.result import Calibration
 from anser_ros.experiments.bound import position_bound
 from anser_ros.experiments.error_maps import BoardRun, board_folder, board_runs
 from anser_ros.experiments.methods import (

@@ -56,8 +56,8 @@ class Measurements:
         """Mask (F, S) of the values that have a pose and are valid."""
         return np.asarray(self.valid & self.has_pose[:, None])
 
-    def frames(self, rows: NDArray[np.generic]) -> 'Measurements':
-        """Return the measurements of the frames given by index or mask."""
+    def frames(self, rows: NDArray[np.generic] | slice) -> 'Measurements':
+        """Return the measurements of the frames given by index, mask or slice."""
         return replace(
             self,
             time=self.time[rows],

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from anser_ros.calibration.calibrate import Calibration, Options, calibrate
+from anser_ros.calibration.calibrate import Options, calibrate
 from anser_ros.calibration.layouts import Generator
+from anser_ros.calibration.result import Calibration
 from anser_ros.errors import AnserError, FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.sessions.session import Session

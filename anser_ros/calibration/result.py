@@ -1,0 +1,117 @@
+"""The result of a calibration with its residuals and its provenance."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.calibration.factors import as_real
+from anser_ros.calibration.held_out import HeldOut, rms
+from anser_ros.calibration.layout_score import LayoutCandidate
+from anser_ros.calibration.layouts import Layout
+from anser_ros.calibration.moments import MomentFit
+from anser_ros.calibration.readings import usable_readings
+from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import FieldModel
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals of a model at the measured poses.
+
+    Attributes
+    ----------
+    each_t : ndarray, shape (K,)
+        Root mean square of the magnitude of each emitter's complex residual, T.
+    span_t : float
+        Range of the measured in-phase fluxes, T.
+    """
+
+    each_t: Array
+    span_t: float
+
+    @property
+    def rmse_t(self) -> float:
+        """Root mean square over the readings of all emitters, T."""
+        return float(np.sqrt(np.mean(self.each_t**2)))
+
+
+def residuals(measurements: Sequence[Measurements], model: FieldModel) -> Residuals:
+    """Return a model's residuals of the usable readings at the measured poses."""
+    power, count = np.zeros(len(model.emitters)), 0
+    low, high = np.inf, -np.inf
+    for points, axes, lengths, flux in usable_readings(measurements):
+        error = flux - model.flux(points, axes, lengths)
+        power, count = power + (np.abs(error) ** 2).sum(axis=0), count + len(error)
+        low, high = min(low, float(flux.real.min())), max(high, float(flux.real.max()))
+    return Residuals(np.sqrt(power / count), high - low)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A field model with the figures of its fit and of its choice.
+
+    Attributes
+    ----------
+    model : FieldModel
+        The calibrated field model.
+    fit : MomentFit
+        The fit of the moments to all readings.
+    held_out : HeldOut
+        Held-out errors of the chosen layout, with every fold fitted from the start.
+    nominal_rmse_t : float or None
+        Root mean square of the magnitude of the nominal model's residual on the same readings, T;
+        None without a nominal model.
+    candidates : tuple of LayoutCandidate
+        All layouts that were compared.
+    chosen : LayoutCandidate
+        The chosen one of them.
+    layout : Layout
+        The chosen layout.
+    damping : float
+        The damping of the fit, chosen or given.
+    n_measurements : int
+        Number of readings of each emitter.
+    residuals : Residuals
+        Residuals of the model on all readings that it was fitted to.
+    """
+
+    model: FieldModel
+    fit: MomentFit
+    held_out: HeldOut
+    nominal_rmse_t: float | None
+    candidates: tuple[LayoutCandidate, ...]
+    chosen: LayoutCandidate
+    layout: Layout
+    damping: float
+    n_measurements: int
+    residuals: Residuals
+
+    @property
+    def better_than_nominal(self) -> bool:
+        """Whether the held-out error is below the nominal model's, or there is none to compare."""
+        return self.nominal_rmse_t is None or rms(self.held_out.error) < self.nominal_rmse_t
+
+
+def provenance(calibration: Calibration, names: Sequence[str]) -> Mapping[str, Any]:
+    """Return how the model was made, as plain data for its file."""
+    held_out = calibration.held_out
+    return {
+        'method': 'calibration',
+        'sessions': list(dict.fromkeys(names)),
+        'n_measurements': calibration.n_measurements,
+        'layout': calibration.layout.describe(),
+        'damping': calibration.damping,
+        'rank': calibration.fit.rank,
+        'condition': calibration.fit.condition,
+        'noise_t': calibration.fit.noise_t,
+        'heldout_flux_rmse_t': rms(held_out.error),
+        'heldout_marginal_rmse_t': float(np.sqrt(np.mean(as_real(held_out.left_over) ** 2))),
+        'heldout_chi_square': held_out.chi_square,
+        'flux_error_t': held_out.flux_error_t,
+        'nominal_flux_rmse_t': calibration.nominal_rmse_t,
+    }
