@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pytest
 
+from anser_ros.calibration.error_map import learn_error_map
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError
-from anser_ros.experiments import article
+from anser_ros.experiments import article, error_maps
 from anser_ros.experiments.bound import position_bound
 from anser_ros.experiments.error_maps import board_folder, board_places, board_runs
 from anser_ros.experiments.figures import draw_all
@@ -169,12 +170,35 @@ def test_fiducials_are_read_aligned_and_mapped(tmp_path):
 
 
 @pytest.mark.skipif(not board_folder().is_dir(), reason='the measured board is not at hand')
-def test_the_measured_board_is_no_worse_with_a_map():
+def test_the_measured_board_in_blocks_that_took_no_part():
     runs = {run.name: run for run in board_runs(board_folder())}
-    assert 1e3 * runs['standard_data_grid'].before_m == pytest.approx(2.26, abs=0.01)
-    assert 1e3 * runs['steel_shield'].before_m == pytest.approx(5.21, abs=0.01)
-    assert all(run.after_m <= run.before_m for run in runs.values())
-    assert runs['standard_data_grid'].after_m < 0.75 * runs['standard_data_grid'].before_m
+    assert 1e3 * runs['standard_data_grid'].before_m == pytest.approx(2.34, abs=0.01)
+    assert 1e3 * runs['steel_shield'].before_m == pytest.approx(5.39, abs=0.01)
+    assert runs['standard_data_grid'].after_m < 0.65 * runs['standard_data_grid'].before_m
+    # Where there is nothing smooth to learn, an honest figure may rise, by a little.
+    assert all(run.after_m < 1.04 * run.before_m for run in runs.values())
+
+
+def test_a_held_out_block_knows_nothing_of_itself(monkeypatch):
+    """What is reported at one place does not change what its block is judged with."""
+    places = board_places()
+    seen = []
+
+    def learn(tracked, true):
+        seen.append((tracked.copy(), true.copy()))
+        return learn_error_map(tracked, true)
+
+    monkeypatch.setattr(error_maps, 'learn_error_map', learn)
+    found = places + 0.02 * places * np.abs(places)[:, ::-1] / 0.06
+    error_maps.judged('one', found, places)
+    moved = found.copy()
+    moved[0] += [0.05, 0.02, 0.01]
+    error_maps.judged('other', moved, places)
+    before, after = seen[: len(seen) // 2], seen[len(seen) // 2 :]
+    same = [np.array_equal(a[0], b[0]) for a, b in zip(before, after, strict=True)]
+    assert same.count(True) == 1
+    (block,) = (true for (_, true), equal in zip(before, same, strict=True) if equal)
+    assert not (block == places[0]).all(axis=1).any()
 
 
 def test_error_map_command(tmp_path, capsys):

@@ -266,6 +266,29 @@ def test_a_map_of_mere_noise_is_not_used(rng):
     assert found.after_m == found.before_m
 
 
+def test_the_error_reported_of_a_map_is_the_error_at_new_places(rng):
+    """Whether a map is used is decided without the blocks that its error is reported of."""
+    reported, fresh = [], []
+    for _ in range(6):
+        true = rng.uniform(-0.1, 0.1, (40, 3))
+        noise = 1e-3 * rng.normal(size=true.shape)
+        found = learn_error_map(true - 0.01 * true + noise, true)
+        there = rng.uniform(-0.1, 0.1, (400, 3))
+        said = there - 0.01 * there + 1e-3 * rng.normal(size=there.shape)
+        reported.append(found.after_m**2)
+        fresh.append(((found.apply(said) - there) ** 2).sum(axis=1).mean())
+    assert np.mean(reported) > 0.97 * np.mean(fresh)
+
+
+def test_a_map_of_points_in_a_plane_is_learnt_in_it(rng):
+    true = rng.uniform(-0.1, 0.1, (80, 3)) * [1.0, 1.0, 0.0]
+    tracked = true + 0.003 * np.sin(true / 0.05)
+    found = learn_error_map(tracked, true)
+    assert found.after_m < 0.3 * found.before_m
+    lifted = tracked + [0.0, 0.0, 0.01]
+    assert np.allclose(found.correction(lifted), found.correction(tracked), atol=1e-12)
+
+
 def test_error_map_refusals():
     with pytest.raises(FitError, match=r'\(n, 3\)'):
         learn_error_map(np.zeros((9, 3)), np.zeros((8, 3)))

@@ -1,12 +1,14 @@
-"""A smooth map from tracked to true positions, learnt where the true positions are known.
+"""A smooth map from tracked to true positions, learnt where the truth is known.
 
-This is the usual calibration of trackers that give poses and no fluxes, and the article's last
-step of distortion compensation (Table V, "compensated and corrected"). The three components of the
-error are Gaussian processes of the tracked position with one squared-exponential covariance
-(Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, chapter 2) on top of a
-constant or affine trend. Trend, length and noise are chosen by the error in held-out blocks of
-space. Further blocks that took no part in that choice decide whether the map helps; if not, it is
-the identity.
+The classic calibration of trackers that give poses and no fluxes, and the article's last step of
+distortion compensation (Table V, "compensated and corrected"). The error's three components are
+Gaussian processes of the tracked position with one squared-exponential covariance (Rasmussen and
+Williams, Gaussian Processes for Machine Learning, 2006, chapter 2) on top of a constant or an
+affine trend; its mean is the interpolant that `scipy.interpolate.RBFInterpolator` solves for.
+Trend, length and noise are chosen by the error in held-out blocks of space. Whether a map chosen
+so helps is asked of further blocks that took no part in the choice; when it does not, the map is
+the identity. The error that is reported is that of a third set of blocks, which took part neither
+in the choice nor in that decision nor in the fit.
 """
 
 from collections.abc import Sequence
@@ -14,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import RBFInterpolator
 
 from anser_ros.calibration.blocks import fold_of_frames
 from anser_ros.errors import FitError
@@ -21,31 +24,38 @@ from anser_ros.errors import FitError
 Array = NDArray[np.float64]
 
 FEWEST_POINTS = 8
-"""Points with both positions below which no map is learnt: an affine trend has four parameters a
-component, and as many points again have to judge it."""
 MOST_POINTS = 500
-"""Points that a map is learnt from at most; more are thinned evenly, because the map is smooth and
-the time grows with the third power of the points."""
+"""More points than these are thinned evenly: the map is smooth."""
 LENGTHS = (0.15, 0.3, 0.6, 1.2, 2.5)
-"""Covariance lengths that are tried, as a fraction of the points' largest extent: from the
-distance between neighbouring blocks to nearly a quadratic trend."""
+"""Covariance lengths tried, as a part of the points' largest extent."""
 NOISES = (0.03, 0.1, 0.3, 1.0)
-"""Standard deviations of the noise that are tried, as a fraction of the errors' own: from a map
-that follows nearly every point to one that hardly follows any."""
+"""Noise tried, as a part of the errors' standard deviation about the trend."""
 TRENDS = (0, 1)
-"""Degrees of the polynomial trend that are tried: a constant shift and an affine map."""
+FLAT = 1e-6
+"""A direction in which the points extend less than this part of the largest extent carries no
+trend and no distance: what differs there is the rounding of the numbers."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """The degree of a map's trend (-1 for no map), its covariance length (m) and its noise (m)."""
+    """A choice of map.
+
+    Attributes
+    ----------
+    trend : int
+        Polynomial degree of the trend; -1 for no map.
+    length_m : float
+        Covariance length, m; 0 for a trend alone.
+    noise : float
+        Noise as a part of the errors' standard deviation about the trend.
+    """
 
     trend: int
     length_m: float
-    noise_m: float
+    noise: float
 
     def describe(self) -> str:
-        """Return the shape in words for a report."""
+        """Return one line for a report."""
         if self.trend < 0:
             return 'no correction'
         trend = 'shift' if self.trend == 0 else 'affine'
@@ -55,58 +65,49 @@ class Shape:
 
 
 IDENTITY = Shape(-1, 0.0, 0.0)
-"""The shape of a map that corrects nothing."""
 
 
-@dataclass(frozen=True)
-class ErrorMap:
-    """A fitted map from tracked to true positions.
+class Correction:
+    """What a map of one shape, fitted to some points, adds to tracked positions.
 
-    Attributes
+    Parameters
     ----------
-    shape : Shape
-        The chosen trend, length and noise.
     places : ndarray, shape (M, 3)
-        Tracked positions that the map was learnt from, m.
-    weights : ndarray, shape (M, 3)
-        Weights of the Gaussian process at these positions, m.
-    trend : ndarray, shape (T, 3)
-        Coefficients of the trend (T = 0 for no map, 1 for a shift, 4 for an affine map).
-    middle : ndarray, shape (3,)
-        Position from which the affine trend is counted, m.
-    before_m, after_m : float
-        Root mean square error without and with a map in blocks that took part neither in the
-        choice nor in the fit, m.
-    tried : tuple of (Shape, float)
-        Every shape with its held-out error, m.
+        Tracked positions, m.
+    errors : ndarray, shape (M, 3)
+        True less tracked positions, m.
+    shape : Shape
     """
 
-    shape: Shape
-    places: Array
-    weights: Array
-    trend: Array
-    middle: Array
-    before_m: float
-    after_m: float
-    tried: tuple[tuple[Shape, float], ...] = ()
+    def __init__(self, places: Array, errors: Array, shape: Shape) -> None:
+        self.shape = shape
+        self._middle = places.mean(axis=0)
+        _, spread, axes = np.linalg.svd(places - self._middle, full_matrices=False)
+        self._axes = axes[spread > FLAT * spread[0]]
+        if shape.length_m > 0.0:
+            self._smooth = RBFInterpolator(
+                self._reduced(places),
+                errors,
+                kernel='gaussian',
+                epsilon=np.sqrt(0.5) / shape.length_m,
+                smoothing=shape.noise**2,
+                degree=shape.trend,
+            )
+        elif shape.trend >= 0:
+            columns = _trend_columns(self._reduced(places), shape.trend)
+            self._trend = np.linalg.lstsq(columns, errors, rcond=None)[0]
 
-    @property
-    def helps(self) -> bool:
-        """Whether the map is more than the identity."""
-        return self.shape.trend >= 0
-
-    def correction(self, tracked: Array) -> Array:
-        """Return the corrections (P, 3), m, to be added to tracked positions (P, 3), m."""
-        if not self.helps:
+    def __call__(self, tracked: Array) -> Array:
+        """Return what to add to tracked positions (P, 3), m."""
+        if self.shape.trend < 0:
             return np.zeros_like(tracked)
-        out = _trend_columns(tracked - self.middle, self.shape.trend) @ self.trend
+        where = self._reduced(tracked)
         if self.shape.length_m > 0.0:
-            out = out + _covariance(tracked, self.places, self.shape.length_m) @ self.weights
-        return np.asarray(out)
+            return np.asarray(self._smooth(where))
+        return np.asarray(_trend_columns(where, self.shape.trend) @ self._trend)
 
-    def apply(self, tracked: Array) -> Array:
-        """Return the corrected positions (P, 3), m, of tracked positions (P, 3), m."""
-        return np.asarray(tracked + self.correction(tracked))
+    def _reduced(self, places: Array) -> Array:
+        return np.asarray((places - self._middle) @ self._axes.T)
 
 
 def _trend_columns(places: Array, degree: int) -> Array:
@@ -114,45 +115,56 @@ def _trend_columns(places: Array, degree: int) -> Array:
     return ones if degree == 0 else np.concatenate([ones, places], axis=1)
 
 
-def _covariance(one: Array, other: Array, length: float) -> Array:
-    square = ((one[:, None] - other[None]) ** 2).sum(axis=2)
-    return np.asarray(np.exp(-0.5 * square / length**2))
+@dataclass(frozen=True)
+class ErrorMap:
+    """A fitted map.
+
+    Attributes
+    ----------
+    correction : Correction
+        What it adds to tracked positions.
+    n_points : int
+        Points that it was learnt from.
+    before_m, after_m : float
+        Root mean square error (m) without a map and with one, in blocks held out of choice,
+        decision and fit. The latter may be the larger: then the map does not help.
+    tried : tuple of (Shape, float)
+        Every shape with its held-out error (m), by which the shape was chosen.
+    """
+
+    correction: Correction
+    n_points: int
+    before_m: float
+    after_m: float
+    tried: tuple[tuple[Shape, float], ...]
+
+    @property
+    def shape(self) -> Shape:
+        """The shape that was chosen."""
+        return self.correction.shape
+
+    @property
+    def helps(self) -> bool:
+        """Whether the map is more than the identity."""
+        return self.shape.trend >= 0
+
+    def apply(self, tracked: Array) -> Array:
+        """Return corrected positions (P, 3), m."""
+        return np.asarray(tracked + self.correction(tracked))
 
 
-def _fit(places: Array, errors: Array, shape: Shape, middle: Array) -> tuple[Array, Array]:
-    """Return the coefficients of the trend and the weights of the Gaussian process about it."""
-    if shape.trend < 0:
-        return np.zeros((0, 3)), np.zeros((len(places), 3))
-    columns = _trend_columns(places - middle, shape.trend)
-    if shape.length_m == 0.0:
-        plain = np.asarray(np.linalg.lstsq(columns, errors, rcond=None)[0])
-        return plain, np.zeros((len(places), 3))
-    plain = errors - columns @ np.linalg.lstsq(columns, errors, rcond=None)[0]
-    amplitude = max(float(plain.std()), 1e-9)
-    noise = (shape.noise_m / amplitude) ** 2
-    kernel = _covariance(places, places, shape.length_m) + noise * np.eye(len(places))
-    solved = np.linalg.solve(kernel, np.concatenate([columns, errors], axis=1))
-    left, right = solved[:, : columns.shape[1]], solved[:, columns.shape[1] :]
-    trend = np.linalg.lstsq(columns.T @ left, columns.T @ right, rcond=None)[0]
-    return np.asarray(trend), np.asarray(right - left @ trend)
-
-
-def learn_error_map(
-    tracked: Array, true: Array, groups: Sequence[int] | NDArray[np.int64] | None = None
-) -> ErrorMap:
+def learn_error_map(tracked: Array, true: Array) -> ErrorMap:
     """Learn a map from points at which both positions are known.
 
     Parameters
     ----------
     tracked, true : ndarray, shape (M, 3)
-        Positions, m, in one frame; points that are not finite are left out.
-    groups : sequence of int, optional
-        Fold of each point; blocks of space by default.
+        m, in one frame.
 
     Raises
     ------
     FitError
-        When the shapes differ or there are fewer than `FEWEST_POINTS` points.
+        When shapes differ, or there are too few points, or all are at one place.
     """
     if tracked.shape != true.shape or tracked.ndim != 2 or tracked.shape[1] != 3:
         raise FitError(
@@ -168,40 +180,22 @@ def learn_error_map(
     rows = np.flatnonzero(good)
     rows = rows[:: -(-rows.size // MOST_POINTS)]
     places, errors = tracked[rows], true[rows] - tracked[rows]
-    folds = fold_of_frames([places])[0] if groups is None else np.asarray(groups)[rows]
-    shapes = _shapes(places, errors)
-    before = float(np.sqrt((errors**2).sum(axis=1).mean()))
-    after = _nested_rms(places, errors, folds, shapes)
-    tried = tuple((shape, held_out_rms(places, errors, folds, shape)) for shape in shapes)
-    shape = _best(tried) if after < before else IDENTITY
-    middle = places.mean(axis=0)
-    trend, weights = _fit(places, errors, shape, middle)
-    return ErrorMap(shape, places, weights, trend, middle, before, min(after, before), tried)
+    held_out = _HeldOut(places, errors, fold_of_frames([places])[0], _shapes(places))
+    shape = held_out.shapes[held_out.decide(held_out.everything)]
+    return ErrorMap(
+        Correction(places, errors, shape),
+        len(places),
+        float(np.sqrt((errors**2).sum(axis=1).mean())),
+        float(np.sqrt(held_out.square_of_decisions() / len(places))),
+        held_out.tried(),
+    )
 
 
-def _best(tried: Sequence[tuple[Shape, float]]) -> Shape:
-    return min(tried, key=lambda pair: pair[1])[0]
-
-
-def _nested_rms(
-    places: Array, errors: Array, folds: NDArray[np.int64], shapes: Sequence[Shape]
-) -> float:
-    """Return the error (m, rms) over folds of maps whose shape the other folds have chosen."""
-    square = 0.0
-    for fold in np.unique(folds):
-        rest, test = folds != fold, folds == fold
-        inner = (places[rest], errors[rest], folds[rest])
-        shape = _best([(shape, held_out_rms(*inner, shape)) for shape in shapes])
-        square += _square_error(places, errors, rest, test, shape)
-    return float(np.sqrt(square / len(places)))
-
-
-def _shapes(places: Array, errors: Array) -> list[Shape]:
+def _shapes(places: Array) -> list[Shape]:
     extent = float(np.ptp(places, axis=0).max())
-    spread = max(float(errors.std()), 1e-9)
     shapes = [IDENTITY] + [Shape(trend, 0.0, 0.0) for trend in TRENDS]
     shapes += [
-        Shape(trend, length * extent, noise * spread)
+        Shape(trend, length * extent, noise)
         for trend in TRENDS
         for length in LENGTHS
         for noise in NOISES
@@ -209,33 +203,66 @@ def _shapes(places: Array, errors: Array) -> list[Shape]:
     return shapes
 
 
-def held_out_rms(places: Array, errors: Array, folds: NDArray[np.int64], shape: Shape) -> float:
-    """Return the root mean square error (m) of maps of one shape in held-out folds.
+class _HeldOut:
+    """Square errors of every shape in folds that its fit has not seen, worked out when asked for.
 
-    Parameters
-    ----------
-    places, errors : ndarray, shape (M, 3)
-        Tracked positions and true minus tracked positions, m.
-    folds : ndarray of int, shape (M,)
-        Fold of each point.
-    shape : Shape
-        The shape to judge.
+    A set of folds is what is *known*: what is chosen or decided with it takes nothing from the
+    others.
     """
-    square = sum(
-        _square_error(places, errors, folds != fold, folds == fold, shape)
-        for fold in np.unique(folds)
-    )
-    return float(np.sqrt(square / len(places)))
 
+    def __init__(
+        self, places: Array, errors: Array, folds: NDArray[np.int64], shapes: Sequence[Shape]
+    ) -> None:
+        self.shapes = shapes
+        self.everything = frozenset(int(fold) for fold in np.unique(folds))
+        self._points = places, errors, folds
+        self._squares: dict[tuple[frozenset[int], int], Array] = {}
 
-def _square_error(
-    places: Array,
-    errors: Array,
-    train: NDArray[np.bool_],
-    test: NDArray[np.bool_],
-    shape: Shape,
-) -> float:
-    middle = places[train].mean(axis=0)
-    trend, weights = _fit(places[train], errors[train], shape, middle)
-    part = ErrorMap(shape, places[train], weights, trend, middle, 0.0, 0.0)
-    return float(((errors[test] - part.correction(places[test])) ** 2).sum())
+    def squares(self, known: frozenset[int], fold: int) -> Array:
+        """Return the sum of squares (m^2) in a fold, by shape, of maps fitted to known folds."""
+        key = known, fold
+        if key not in self._squares:
+            places, errors, folds = self._points
+            train, test = np.isin(folds, list(known)), folds == fold
+            self._squares[key] = np.array(
+                [
+                    np.sum((errors[test] - part(places[test])) ** 2)
+                    for part in (
+                        Correction(places[train], errors[train], shape) for shape in self.shapes
+                    )
+                ]
+            )
+        return self._squares[key]
+
+    def choose(self, known: frozenset[int]) -> int:
+        """Return the shape with the smallest held-out error; none of one fold alone."""
+        if len(known) < 2:
+            return 0
+        return int(np.argmin(self._crossed(known)))
+
+    def decide(self, known: frozenset[int]) -> int:
+        """Return the chosen shape, or the identity where choosing so has not helped."""
+        if len(known) < 2:
+            return 0
+        rests = {fold: known - {fold} for fold in known}
+        plain = sum(self.squares(rest, fold)[0] for fold, rest in rests.items())
+        chosen = sum(self.squares(rest, fold)[self.choose(rest)] for fold, rest in rests.items())
+        return self.choose(known) if chosen < plain else 0
+
+    def square_of_decisions(self) -> float:
+        """Return the sum of squares (m^2) in each fold of what the other folds decide."""
+        rests = {fold: self.everything - {fold} for fold in self.everything}
+        return float(
+            sum(self.squares(rest, fold)[self.decide(rest)] for fold, rest in rests.items())
+        )
+
+    def tried(self) -> tuple[tuple[Shape, float], ...]:
+        """Return every shape with its held-out error, m."""
+        squares = self._crossed(self.everything)
+        return tuple(
+            (shape, float(np.sqrt(square / len(self._points[0]))))
+            for shape, square in zip(self.shapes, squares, strict=True)
+        )
+
+    def _crossed(self, known: frozenset[int]) -> Array:
+        return np.sum([self.squares(known - {fold}, fold) for fold in known], axis=0)

@@ -72,9 +72,9 @@ def to_document(error_map: ErrorMap) -> dict[str, Any]:
         'map': error_map.shape.describe(),
         'heldout_rmse_before_m': error_map.before_m,
         'heldout_rmse_after_m': error_map.after_m,
-        'n_points': len(error_map.places),
+        'n_points': error_map.n_points,
         'tried': [
-            {'map': shape.describe(), 'noise_m': shape.noise_m, 'heldout_rmse_m': error}
+            {'map': shape.describe(), 'noise_share': shape.noise, 'heldout_rmse_m': error}
             for shape, error in error_map.tried
         ],
     }

@@ -10,7 +10,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from anser_ros.calibration.blocks import fold_of_frames
 from anser_ros.calibration.error_map import learn_error_map
 from anser_ros.errors import BagError
 
@@ -21,7 +23,18 @@ PITCH_M = 31.75e-3
 
 @dataclass(frozen=True)
 class BoardRun:
-    """One run: errors after rigid alignment, without and with a map, in held-out blocks (m)."""
+    """One run: its error after rigid alignment in held-out blocks, without and with a map.
+
+    Attributes
+    ----------
+    name : str
+    points : int
+    before_m, after_m : float
+        Root mean square (m) of each block, predicted from the others. The latter may be the
+        larger: a map that helped among the others has then not helped in the block.
+    shape : str
+        The map that all points together choose, in words.
+    """
 
     name: str
     points: int
@@ -57,12 +70,37 @@ def read_fiducials(path: Path) -> Array:
     return 1e-3 * places
 
 
-def aligned(points: Array, target: Array) -> Array:
-    """The points moved rigidly onto the target (Kabsch, Acta Cryst. A32, 1976)."""
-    middle, aim = points.mean(axis=0), target.mean(axis=0)
-    u, _, vt = np.linalg.svd((points - middle).T @ (target - aim))
-    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    return np.asarray((points - middle) @ u @ flip @ vt + aim)
+def aligned(points: Array, known: NDArray[np.bool_], target: Array) -> Array:
+    """Return all points (P, 3), moved rigidly so that the known ones come onto their targets."""
+    middle, aim = points[known].mean(axis=0), target[known].mean(axis=0)
+    turn = Rotation.align_vectors(target[known] - aim, points[known] - middle)[0]
+    return np.asarray(turn.apply(points - middle) + aim)
+
+
+def judged(name: str, found: Array, places: Array) -> BoardRun:
+    """Return a run's errors in blocks that took part neither in alignment nor in the map.
+
+    Each block of space in its turn is predicted from the others alone: they give the rigid
+    alignment, the choice of a map, the decision whether it is used, and its fit.
+
+    Parameters
+    ----------
+    name : str
+    found, places : ndarray, shape (P, 3)
+        Reported and true positions, m, each in a frame of its own.
+    """
+    folds = fold_of_frames([places])[0]
+    squares = np.zeros(2)
+    for fold in np.unique(folds):
+        known = folds != fold
+        tracked = aligned(found, known, places)
+        error_map = learn_error_map(tracked[known], places[known])
+        for count, said in enumerate((tracked, error_map.apply(tracked))):
+            squares[count] += ((said - places)[~known] ** 2).sum()
+    everything = np.ones(len(places), dtype=bool)
+    whole = learn_error_map(aligned(found, everything, places), places)
+    before, after = np.sqrt(squares / len(places))
+    return BoardRun(name, len(found), float(before), float(after), whole.shape.describe())
 
 
 def board_runs(folder: Path) -> list[BoardRun]:
@@ -73,15 +111,5 @@ def board_runs(folder: Path) -> list[BoardRun]:
         found = read_fiducials(path)
         if found.shape != places.shape:
             raise BagError(f'{path}: {len(places)} fiducials expected, got {len(found)}')
-        tracked = aligned(found, places)
-        error_map = learn_error_map(tracked, places)
-        runs.append(
-            BoardRun(
-                path.stem,
-                len(found),
-                error_map.before_m,
-                error_map.after_m,
-                error_map.shape.describe(),
-            )
-        )
+        runs.append(judged(path.stem, found, places))
     return runs

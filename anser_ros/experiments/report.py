@@ -207,9 +207,11 @@ def _board(results: Results) -> str:
     return (
         '## Error maps on measured positions\n\n'
         'The only measured data of this report: what a real Anser system (github '
-        'kilianod5150/Matlab-Anser, BSD-3) reported at 41 known places of a flat board, aligned '
-        'rigidly. Both figures are of blocks of space that took part neither in the choice of the '
-        'map nor in its fit; a map that does not help there is not used.\n\n' + _table(head, rows)
+        'kilianod5150/Matlab-Anser, BSD-3) reported at 41 known places of a flat board. Both '
+        'figures are of blocks of space that took no part: neither in the rigid alignment, nor in '
+        'the choice of the map, nor in the decision whether to use it, nor in its fit. A map that '
+        'helped among the other blocks can make a block worse, and does in some runs. The last '
+        'column is the map that all points together choose.\n\n' + _table(head, rows)
     )
 
 
