@@ -1,17 +1,16 @@
 """Build of the ROS package: every node and every offline tool is one executable."""
 
+import runpy
 from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
 PACKAGE = 'anser_ros'
 HERE = Path(__file__).parent
-
-
-def commands(folder, mark):
-    """Return the names of a folder's modules that are commands: those that have the mark."""
-    modules = sorted((HERE / PACKAGE / folder).glob('*.py'))
-    return [path.stem for path in modules if mark in path.read_text(encoding='utf-8')]
+# Read without importing the package, whose dependencies may not be installed yet.
+COMMANDS = runpy.run_path(str(HERE / PACKAGE / 'cli' / 'commands.py'))
+VERSION = ElementTree.parse(HERE / 'package.xml').findtext('version')
 
 
 def shared(*folders):
@@ -22,12 +21,12 @@ def shared(*folders):
             yield f'share/{PACKAGE}/{folder}', [str(path.relative_to(HERE)) for path in files]
 
 
-names = commands('nodes', "\nif __name__ == '__main__':") + commands('cli', '\ndef add_arguments(')
+names = [*COMMANDS['NODES'], *COMMANDS['OFFLINE']]
 scripts = [f'{name} = {PACKAGE}.cli.main:run_executable' for name in names]
 
 setup(
     name=PACKAGE,
-    version='0.1.0',
+    version=VERSION,
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
@@ -43,6 +42,7 @@ setup(
         'pyserial>=3.5',
         'mcap>=1.5',
         'mcap-ros2-support>=0.5.5',
+        'zstandard>=0.22',
         'rich>=13',
         'matplotlib>=3.8',
         'pyigtl>=0.3.1',

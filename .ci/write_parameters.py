@@ -6,7 +6,7 @@ from pathlib import Path
 
 import yaml
 
-from anser_ros.cli.main import node_names
+from anser_ros.cli.commands import NODES
 from anser_ros.nodes.node import AnserNode
 
 TARGET = Path(__file__).resolve().parents[1] / 'config' / 'anser.yaml'
@@ -45,5 +45,5 @@ def section(name):
 
 
 if __name__ == '__main__':
-    TARGET.write_text('\n'.join([HEAD, '\n\n'.join(map(section, node_names())), '']))
+    TARGET.write_text('\n'.join([HEAD, '\n\n'.join(map(section, NODES)), '']))
     print(TARGET)

@@ -9,7 +9,7 @@ import pytest
 import rclpy.node
 import yaml
 
-from anser_ros.cli.main import NODES, node_names
+from anser_ros.cli.commands import NODES
 from anser_ros.errors import ParameterError
 from anser_ros.nodes import node as base
 from anser_ros.nodes import parameters
@@ -42,7 +42,7 @@ def check_parameter_file(document):
     """Raise ParameterError on a node or a key that no table knows, or a value out of range."""
     for key, section in document.items():
         name = key.rsplit('/', 1)[-1]
-        if name not in node_names():
+        if name not in NODES:
             raise ParameterError(f'no node {key}')
         if set(section) != {'ros__parameters'}:
             raise ParameterError(f'{key} may hold ros__parameters only')
@@ -72,14 +72,13 @@ def test_what_rclpy_would_drop_is_found(document, said):
 
 def test_the_main_file_names_every_parameter_of_every_node():
     document = yaml.safe_load((CONFIG / 'anser.yaml').read_text())
-    for name in node_names():
+    for name in NODES:
         section = document[f'/**/{name}']['ros__parameters']
         assert set(section) == set(parameters.types(node_class(name).PARAMETERS)), name
 
 
 def test_every_node_has_the_name_of_its_module():
-    assert set(node_names()) <= set(NODES)
-    for name in node_names():
+    for name in NODES:
         assert name == node_class(name).NAME
 
 
@@ -129,6 +128,6 @@ def test_no_node_takes_a_private_name_of_its_bases():
     """rclpy's Node and our base have some that a node would think of too, such as `_clock`."""
     taken = private_names(rclpy.node.__file__) | private_names(base.__file__)
     assert '_clock' in taken
-    for name in node_names():
+    for name in NODES:
         own = private_names(CONFIG.parent / 'anser_ros' / 'nodes' / f'{name}.py')
         assert not own & taken, name

@@ -10,7 +10,7 @@ import pytest
 from conftest import REPO, Process
 
 from anser_ros.cli import main as cli
-from anser_ros.cli.main import node_names, verb_names
+from anser_ros.cli.commands import NODES, OFFLINE
 from anser_ros.errors import BagError
 
 COLCON = shutil.which('colcon', path=f'{Path(sys.executable).parent}:{os.environ["PATH"]}')
@@ -68,10 +68,19 @@ def test_the_ament_index_knows_the_package(installed, monkeypatch):
 @pytest.mark.processes
 def test_every_command_is_an_executable(installed):
     executables = {path.name for path in (installed / 'lib' / 'anser_ros').iterdir()}
-    assert executables == {'anser', *node_names(), *verb_names()}
+    assert executables == {'anser', *NODES, *OFFLINE}
     needed = {'acquisition', 'field_model', 'tracker', 'recorder', 'replay', 'cu_simulator'}
     needed |= {'openigtlink', 'calibrate', 'evaluate', 'diagnose', 'demo'}
     assert needed <= executables
+
+
+def test_the_table_lists_every_module_that_is_a_command():
+    def modules(room, mark):
+        files = (REPO / 'anser_ros' / room).glob('*.py')
+        return {path.stem for path in files if mark in path.read_text()}
+
+    assert set(NODES) == modules('nodes', "\nif __name__ == '__main__':")
+    assert set(OFFLINE) == modules('cli', '\ndef add_arguments(')
 
 
 def test_an_installed_node_runs(installed, overlay, tmp_path):
@@ -108,15 +117,13 @@ class TestConsole:
         """Put a command in place that does what it is told."""
 
         class Module:
-            __doc__ = 'A command of the tests.'
-
             @staticmethod
             def add_arguments(parser):
                 parser.add_argument('--json', action='store_true')
 
         def place(run):
             Module.run = staticmethod(run)
-            monkeypatch.setattr(cli, 'verb_names', lambda: ['sample'])
+            monkeypatch.setattr(cli, 'OFFLINE', {'sample': 'A command of the tests.'})
             monkeypatch.setattr(cli.importlib, 'import_module', lambda name: Module)
 
         return place
@@ -159,7 +166,7 @@ class TestConsole:
         assert cli.main(['smaple']) == 2
         assert "no command 'smaple'; there are:" in capsys.readouterr().err
 
-    @pytest.mark.parametrize('name', verb_names())
+    @pytest.mark.parametrize('name', OFFLINE)
     def test_every_command_says_in_a_line_what_is_wrong_with_its_arguments(self, name, capsys):
         assert cli.main([name, '--bogus']) == 2
         out, said = capsys.readouterr()
@@ -168,7 +175,7 @@ class TestConsole:
         )
         assert out == '' and said.count('\n') == 1
 
-    @pytest.mark.parametrize('name', verb_names())
+    @pytest.mark.parametrize('name', OFFLINE)
     def test_every_command_that_writes_says_that_it_makes_folders(self, name, capsys):
         assert cli.main([name, '--help']) == 0
         words = ' '.join(capsys.readouterr().out.split())
@@ -182,7 +189,7 @@ class TestConsole:
     def test_usage_lists_every_command_without_importing_any(self, capsys):
         assert cli.main(['--help']) == 0
         usage = capsys.readouterr().out
-        for name in node_names() + verb_names():
+        for name in [*NODES, *OFFLINE]:
             assert f'  {name}' in usage
         assert cli.main([]) == 2
         assert cli.main(['--version']) == 0

@@ -265,4 +265,4 @@ class _HeldOut:
         )
 
     def _crossed(self, known: frozenset[int]) -> Array:
-        return np.sum([self.squares(known - {fold}, fold) for fold in known], axis=0)
+        return np.asarray(np.sum([self.squares(known - {fold}, fold) for fold in known], axis=0))

@@ -1,8 +1,7 @@
 """The console script `anser`: one verb a command, each also an executable of the ROS package.
 
 A node is started by exec of its own module, so that this layer never loads rclpy; an offline
-command is a module of this folder with ``add_arguments(parser)`` and ``run(args) -> int``,
-imported only when it is the one asked for.
+command is imported only when it is the one asked for. `commands` lists both.
 """
 
 import importlib
@@ -14,38 +13,16 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import NoReturn
 
+from anser_ros.cli.commands import NODES, OFFLINE
 from anser_ros.errors import AnserError
 from anser_ros.one_line_parser import OneLineParser
 
-NODES = {
-    'acquisition': "samples of a control unit's serial port to fluxes",
-    'field_model': 'serves the field model, and refits it while it runs',
-    'tracker': 'fluxes to poses with covariance',
-    'recorder': 'records the topics into an MCAP bag',
-    'replay': 'publishes a bag again: replay BAG [--rate R] [--loop]',
-    'openigtlink': 'serves the poses to 3D Slicer as OpenIGTLink',
-    'cu_simulator': 'a control unit behind a pseudo-terminal',
-    'monitor': 'a live table of sensors, rates and latencies',
-    'watcher': 'names live, in /diagnostics, what the model lacks',
-}
 EXIT_OK = 0
 EXIT_DEFECT = 1
 EXIT_BAD_INPUT = 2
 # Small matrices: a second BLAS thread gains nothing, and waits for a busy core for milliseconds.
 ONE_THREAD = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
 PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
-
-
-def node_names() -> list[str]:
-    """Return the nodes whose modules are there."""
-    return [name for name in NODES if (PACKAGE_FOLDER / 'nodes' / f'{name}.py').is_file()]
-
-
-def verb_names() -> list[str]:
-    """Return the offline commands: the modules of this folder that take arguments."""
-    modules = sorted(Path(__file__).parent.glob('*.py'))
-    mark = '\ndef add_arguments('
-    return [path.stem for path in modules if mark in path.read_text(encoding='utf-8')]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -80,11 +57,11 @@ def _dispatch(arguments: list[str]) -> int:
         print(_version())
         return EXIT_OK
     name, rest = arguments[0].replace('-', '_'), arguments[1:]
-    if name in node_names():
+    if name in NODES:
         exec_node(name, rest)
-    if name in verb_names():
+    if name in OFFLINE:
         return run_verb(name, rest)
-    known = ', '.join(node_names() + verb_names())
+    known = ', '.join([*NODES, *OFFLINE])
     print(f'anser: no command {arguments[0]!r}; there are: {known}', file=sys.stderr)
     return EXIT_BAD_INPUT
 
@@ -112,8 +89,7 @@ def run_verb(name: str, arguments: Sequence[str]) -> int:
         # Before numpy is loaded: BLAS threads that wait for one another cost more than they bring.
         os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
         module = importlib.import_module(f'anser_ros.cli.{name}')
-        summary = (module.__doc__ or '').strip().split('\n')[0]
-        parser = OneLineParser(prog=f'anser {name}', description=summary)
+        parser = OneLineParser(prog=f'anser {name}', description=OFFLINE[name])
         module.add_arguments(parser)
         args = parser.parse_args(arguments)
         return int(module.run(args))
@@ -150,18 +126,11 @@ def _version() -> str:
         return 'anser_ros, not installed'
 
 
-def _summary(path: Path) -> str:
-    """Return the first line of a module's docstring without importing the module."""
-    first = path.read_text(encoding='utf-8').lstrip().split('\n', 1)[0]
-    return first.strip('"').rstrip('.')
-
-
 def _usage() -> str:
     lines = ['usage: anser VERB [arguments]      (anser VERB --help says which)', '', 'nodes:']
-    lines += [f'  {name:<14} {NODES[name]}' for name in node_names()]
+    lines += [f'  {name:<14} {line}' for name, line in NODES.items()]
     lines += ['', 'offline, no ROS needed:']
-    folder = Path(__file__).parent
-    lines += [f'  {name:<14} {_summary(folder / f"{name}.py")}' for name in verb_names()]
+    lines += [f'  {name:<14} {line}' for name, line in OFFLINE.items()]
     return '\n'.join(lines)
 
 

@@ -1,0 +1,31 @@
+"""Every command of the package with its one line of help: the only list of them.
+
+A command's name is that of its module. A node's lies in ``anser_ros/nodes`` and runs as a process
+of its own; the others lie in ``anser_ros/cli``, have ``add_arguments(parser)`` and
+``run(args) -> int``, and need no ROS. `setup.py` makes an executable of each; as it runs before
+anything is installed, this module imports nothing.
+"""
+
+NODES = {
+    'acquisition': "samples of a control unit's serial port to fluxes",
+    'field_model': 'serves the field model, and refits it while it runs',
+    'tracker': 'fluxes to poses with covariance',
+    'recorder': 'records the topics into an MCAP bag',
+    'replay': 'publishes a bag again: replay BAG [--rate R] [--loop]',
+    'openigtlink': 'serves the poses to 3D Slicer as OpenIGTLink',
+    'cu_simulator': 'a control unit behind a pseudo-terminal',
+    'monitor': 'a live table of sensors, rates and latencies',
+    'watcher': 'names live, in /diagnostics, what the model lacks',
+}
+
+OFFLINE = {
+    'bags': 'record the small simulated sessions of the folder bags/',
+    'calibrate': 'fit a field model to recorded sessions',
+    'demo': 'watch a simulated tool being tracked: a live table, a bag, a picture',
+    'diagnose': 'find what a model leaves unexplained on a session, name the effect, correct it',
+    'error_map': 'learn an error map from tracked and true positions, and apply it to others',
+    'evaluate': 'track a recorded session and compare its poses with the optical ones',
+    'loop': 'put an effect into simulated samples, find it blind, correct it, measure again',
+    'measured': "other people's measurements: what they contain, and the error before and after",
+    'paper': "redo the article's experiments: Tables II to V, Figs. 2 and 5 to 10",
+}
