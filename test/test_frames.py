@@ -161,7 +161,7 @@ def test_corrupt_inputs_are_named_and_the_good_record_behind_is_found(tmp_path):
         reader = FrameReader()
         found = reader.feed(path.read_bytes())
         assert len(found) == 1 and same(found[0].payload, block()), name
-        counted = {key for key, value in reader.counters.as_dict().items() if value}
+        counted = {key for key, value in reader.fault_counters().items() if value}
         assert expected <= counted, (name, counted)
 
 

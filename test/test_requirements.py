@@ -54,11 +54,8 @@ def package(tag):
 
 def test_every_import_is_asked_for_and_nothing_else():
     ros = {name for name in package('exec_depend') if not name.startswith('python3-')}
-    names = {
-        name.lower()
-        for module in imported() - ros
-        for name in packages_distributions().get(module, [module])
-    }
+    known = packages_distributions()
+    names = {name.lower() for module in imported() - ros for name in known.get(module, [module])}
     assert names == required() - {SETUPTOOLS}
     assert ros - OPTIONAL <= imported()
 

@@ -27,6 +27,7 @@ from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.frames import DeviceStatus, Hello, Record, SampleBlock, Stop
 from anser_ros.wire.port import DEFAULT_BAUD, Batch, ControlUnitPort, PortState, find_port
+from anser_ros.wire.protocols import PROTOCOLS
 from anser_ros.wire.setup import Setup, dump_setup, parse_setup
 from anser_ros.wire.stream_control import StreamControl
 
@@ -44,6 +45,9 @@ class AcquisitionParameters:
 
     device: str = parameter(
         '/dev/ttyACM0', "the control unit's port, or auto: listen on all ports for its hello"
+    )
+    protocol: str = parameter(
+        'anser', 'how the control unit speaks on its line', choices=tuple(PROTOCOLS)
     )
     baud: int = parameter(
         DEFAULT_BAUD, 'line speed; without meaning over USB', minimum=9600, maximum=50_000_000
@@ -159,16 +163,18 @@ class Acquisition(AnserNode):
 
     def _open(self) -> None:
         table = self.parameters
-        device = table.device
+        device, protocol = table.device, PROTOCOLS[table.protocol]
         if device == AUTO:
             try:
-                device = find_port(baud=table.baud)
+                device = find_port(protocol=protocol, baud=table.baud)
             except PortError as error:
                 self._refusal = str(error)
                 self._closing.wait(1.0)
                 return
             self._refusal = ''
-        port = ControlUnitPort(device, baud=table.baud, silence_s=table.silence_s)
+        port = ControlUnitPort(
+            device, protocol=protocol, baud=table.baud, silence_s=table.silence_s
+        )
         port.start()
         self._port = port
 

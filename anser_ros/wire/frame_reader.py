@@ -13,11 +13,15 @@ from anser_ros.wire.frames import (
     MAX_PAYLOAD,
     OVERHEAD,
     VERSION,
+    Hello,
     Record,
     decode_payload,
     header_check,
     knows,
 )
+
+_SHORTEST_PAYLOAD = 4096
+"""Bytes that are waited for at least: a status with its text is longer than small blocks."""
 
 
 @dataclass
@@ -32,26 +36,23 @@ class FrameCounters:
     unknown_type: int = 0
     skipped_bytes: int = 0
 
-    def as_dict(self) -> dict[str, int]:
-        """Names and values, in the order of declaration."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
 
 class FrameReader:
     """Turns received bytes into records; everything else is counted and skipped.
 
     After a header or CRC that is wrong the search goes on one byte behind that record's magic, so
     a good record inside or right behind a damaged one is never lost. Bytes are copied only while a
-    record is incomplete; sample blocks are views into the received bytes.
+    record is incomplete; sample blocks are views into the received bytes. Once a hello told the
+    block size, no longer payload is waited for, so that a forged length cannot hold back the
+    records behind it.
 
     Parameters
     ----------
-    max_payload : longest payload to wait for, bytes; lower it once the hello told the block size,
-        so that a forged length cannot hold back the records behind it
+    max_payload : longest payload to wait for before a hello, bytes
     """
 
     def __init__(self, max_payload: int = MAX_PAYLOAD) -> None:
-        self.max_payload = max_payload
+        self._longest = self.max_payload = max_payload
         self.counters = FrameCounters()
         self.last_refusal = ''
         self._pending = b''
@@ -62,8 +63,13 @@ class FrameReader:
         return len(self._pending)
 
     def reset(self) -> None:
-        """Forget a half-received record, after the port was closed."""
+        """Forget a half-received record and the block size, after the port was closed."""
         self._pending = b''
+        self.max_payload = self._longest
+
+    def fault_counters(self) -> dict[str, int]:
+        """Return names and values of the counters, in the order of declaration."""
+        return {field.name: getattr(self.counters, field.name) for field in fields(FrameCounters)}
 
     def feed(self, data: bytes) -> list[Record]:
         """Take bytes as they come and return the records that they complete."""
@@ -121,6 +127,8 @@ class FrameReader:
             self.counters.bad_payload += 1
             self.last_refusal = str(error)
             return None
+        if isinstance(payload, Hello):
+            self.max_payload = max(_SHORTEST_PAYLOAD, payload.samples_size())
         self.counters.records += 1
         return Record(payload, tag)
 

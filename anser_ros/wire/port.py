@@ -24,20 +24,12 @@ import serial
 from serial.tools import list_ports
 
 from anser_ros.errors import PortError
-from anser_ros.wire.frame_reader import FrameReader
-from anser_ros.wire.frames import (
-    MAX_PAYLOAD,
-    Hello,
-    Payload,
-    Record,
-    SampleBlock,
-    encode,
-)
+from anser_ros.wire.frames import Hello, Payload, Record, SampleBlock
+from anser_ros.wire.protocols import ANSER, SerialProtocol
 
 DEFAULT_BAUD = 12_000_000
 _READ_TIMEOUT_S = 0.05
 _WRITE_TIMEOUT_S = 0.2
-_SHORTEST_PAYLOAD = 4096
 _GARBAGE_BYTES = 256
 _READ_BYTES = 1 << 16
 OPEN_FAILURES = {
@@ -98,6 +90,7 @@ class ControlUnitPort:
     Parameters
     ----------
     device : device path, or any pyserial URL
+    protocol : how the control unit speaks
     baud : line speed; without meaning on USB and pseudo-terminals
     silence_s : no byte for so long is a fault; a hello comes once a second even when idle
     queue_blocks : blocks of samples that may wait for the receiver
@@ -113,6 +106,7 @@ class ControlUnitPort:
         self,
         device: str,
         *,
+        protocol: SerialProtocol = ANSER,
         baud: int = DEFAULT_BAUD,
         silence_s: float = 1.5,
         queue_blocks: int = 2048,
@@ -131,7 +125,8 @@ class ControlUnitPort:
         self._arrivals_ns: list[int] = []
         self._held_blocks = 0
         self._pauses = (pause_s, longest_pause_s)
-        self._reader = FrameReader()
+        self._protocol = protocol
+        self._reader = protocol.make_reader()
         self._queue: queue.SimpleQueue[Batch] = queue.SimpleQueue()
         self._commands: deque[bytes] = deque(maxlen=64)
         self._stopping = threading.Event()
@@ -171,13 +166,13 @@ class ControlUnitPort:
         It is lost when the port closes before; whoever sends it watches for the reply.
         """
         self._tag = self._tag % 0xFFFF + 1
-        self._commands.append(encode(command, self._tag))
+        self._commands.append(self._protocol.encode(command, self._tag))
         return self._tag
 
     def fault_counters(self) -> dict[str, int]:
         """All counters by name, the frame reader's included."""
         ours = {field.name: getattr(self.counters, field.name) for field in fields(self.counters)}
-        return ours | self._reader.counters.as_dict()
+        return ours | self._reader.fault_counters()
 
     @property
     def last_refusal(self) -> str:
@@ -200,7 +195,6 @@ class ControlUnitPort:
             self.counters.opens += 1
             self.state, self.reason = PortState.WAITING, ''
             self._reader.reset()
-            self._reader.max_payload = MAX_PAYLOAD
             self._next_sequence = None
             self._commands.clear()
             self._queue.put(Batch(time.monotonic_ns(), ()))
@@ -264,8 +258,6 @@ class ControlUnitPort:
                 self._held_blocks += 1
             else:
                 urgent = True
-                if isinstance(payload, Hello):
-                    self._reader.max_payload = max(_SHORTEST_PAYLOAD, payload.samples_size())
             self._held.append(record)
             self._arrivals_ns.append(arrival_ns)
         if urgent or self._held_blocks >= self.blocks_wanted:
@@ -345,13 +337,18 @@ def _close(port: serial.SerialBase) -> None:
 
 
 def find_port(
-    candidates: Iterable[str] | None = None, *, baud: int = DEFAULT_BAUD, listen_s: float = 1.5
+    candidates: Iterable[str] | None = None,
+    *,
+    protocol: SerialProtocol = ANSER,
+    baud: int = DEFAULT_BAUD,
+    listen_s: float = 1.5,
 ) -> str:
     """Find the control unit's port by listening for its hello; nothing is written to any device.
 
     Parameters
     ----------
     candidates : device paths to try; all serial ports of the computer by default
+    protocol : how the control unit speaks
     baud : line speed
     listen_s : how long to listen to each; a hello comes once a second
 
@@ -366,7 +363,7 @@ def find_port(
             port = _open(device, baud)
         except PortError:
             continue
-        reader = FrameReader()
+        reader = protocol.make_reader()
         end = time.monotonic() + listen_s
         try:
             while time.monotonic() < end:

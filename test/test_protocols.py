@@ -1,0 +1,138 @@
+"""Another control unit's protocol: bytes of its own, the same records, nothing else changed."""
+
+import json
+import threading
+import time
+
+import numpy as np
+import pytest
+from test_port import HELLO, TONES, Wire, receive, wait
+
+from anser_ros.nodes.acquisition import AcquisitionParameters
+from anser_ros.wire.frames import (
+    TYPE_OF,
+    Identify,
+    Record,
+    Reply,
+    ReplyCode,
+    SampleBlock,
+    SetFrequencies,
+    Start,
+)
+from anser_ros.wire.port import ControlUnitPort, PortState, find_port
+from anser_ros.wire.protocols import PROTOCOLS, SerialProtocol
+from anser_ros.wire.stream_control import StreamControl
+
+VERBS = {Identify: 'who', Start: 'go'}
+"""The commands that the toy unit has; its tones are fixed."""
+
+
+class LineReader:
+    """One JSON list a line: ['hello'], ['data', number, codes] or ['done', verb, tag]."""
+
+    def __init__(self):
+        self.last_refusal = ''
+        self._pending, self._bad_lines = b'', 0
+
+    def reset(self):
+        self._pending = b''
+
+    def fault_counters(self):
+        return {'bad_lines': self._bad_lines}
+
+    def feed(self, data):
+        *lines, self._pending = (self._pending + data).split(b'\n')
+        return [record for record in map(self._record, lines) if record is not None]
+
+    def _record(self, line):
+        try:
+            kind, *rest = json.loads(line)
+        except ValueError:
+            self._bad_lines += 1
+            self.last_refusal = 'a line that is no JSON'
+            return None
+        if kind == 'hello':
+            return Record(HELLO, 0)
+        if kind == 'data':
+            return Record(SampleBlock(rest[0], 40 * rest[0], np.array(rest[1], np.int16)), 0)
+        (command,) = (command for command, verb in VERBS.items() if verb == rest[0])
+        return Record(Reply(TYPE_OF[command], ReplyCode.OK), rest[1])
+
+
+def encode_line(command, tag):
+    verb = VERBS.get(type(command))
+    return b'' if verb is None else f'{verb} {tag}\n'.encode()
+
+
+TOY = SerialProtocol(LineReader, encode_line)
+
+
+def line(*parts):
+    return json.dumps(parts).encode() + b'\n'
+
+
+@pytest.fixture
+def wire(tmp_path):
+    cable = Wire(tmp_path / 'cu')
+    yield cable
+    cable.unplug()
+
+
+@pytest.fixture
+def port(wire):
+    reader = ControlUnitPort(str(wire.link), protocol=TOY, silence_s=0.5)
+    reader.start()
+    assert wait(lambda: reader.state is PortState.WAITING)
+    yield reader
+    reader.stop()
+
+
+def test_a_port_speaks_another_protocol(wire, port):
+    codes = np.arange(80).reshape(40, 2)
+    wire.write(b'noise\n' + line('hello') + line('data', 0, codes.tolist()))
+    hello, block = receive(port, 2)
+    assert hello == HELLO
+    assert np.array_equal(block.codes, codes)
+    wire.write(line('data', 3, codes.tolist()))
+    assert receive(port, 1)[0].sequence == 3
+    counters = port.fault_counters()
+    assert (counters['gap_blocks'], counters['bad_lines']) == (2, 1)
+    assert port.last_refusal == 'a line that is no JSON'
+    assert port.send(SetFrequencies(TONES)) == 1  # which the unit does not have
+    tag = port.send(Start())
+    assert wire.read() == f'go {tag}\n'.encode()
+
+
+def test_the_stream_is_started_by_the_same_rules(wire, port):
+    control = StreamControl(TONES)
+    port.send(control.due(1_000_000_000))
+    assert wire.read() == b'who 1\n'
+    wire.write(line('hello'))
+    for record in port.get(1.0).records or port.get(1.0).records:
+        control.take(record, 1_100_000_000)
+    port.send(control.due(1_200_000_000))
+    assert wire.read() == b'go 2\n'
+    wire.write(line('done', 'go', 2))
+    for record in port.get(1.0).records:
+        control.take(record, 1_300_000_000)
+    assert control.started
+
+
+def test_the_port_of_another_unit_is_found_by_its_hello(wire):
+    found = []
+
+    def search():
+        found.append(find_port([str(wire.link)], protocol=TOY, listen_s=1.0))
+
+    thread = threading.Thread(target=search)
+    thread.start()
+    while thread.is_alive():  # pyserial empties the buffer when it opens a port
+        wire.write(line('hello'))
+        time.sleep(0.05)
+    assert found == [str(wire.link)]
+
+
+def test_the_acquisition_knows_every_protocol():
+    rule = AcquisitionParameters.__dataclass_fields__['protocol'].metadata['rule']
+    assert set(rule.choices) == set(PROTOCOLS)
+    assert AcquisitionParameters().protocol in PROTOCOLS
