@@ -1,14 +1,14 @@
-"""A smooth map from tracked to true positions, learnt where the truth is known.
+"""A smooth map from tracked to true positions, learnt where the true positions are known.
 
-The classic calibration of trackers that give poses and no fluxes, and the article's last step of
-distortion compensation (Table V, "compensated and corrected"). The error's three components are
-Gaussian processes of the tracked position with one squared-exponential covariance (Rasmussen and
-Williams, Gaussian Processes for Machine Learning, 2006, chapter 2) on top of a constant or an
-affine trend; its mean is the interpolant that `scipy.interpolate.RBFInterpolator` solves for.
-Trend, length and noise are chosen by the error in held-out blocks of space. Whether a map chosen
-so helps is asked of further blocks that took no part in the choice; when it does not, the map is
-the identity. The error that is reported is that of a third set of blocks, which took part neither
-in the choice nor in that decision nor in the fit.
+This is the usual calibration of trackers that give poses and no fluxes, and the article's last
+step of distortion compensation (Table V, "compensated and corrected"). The three components of the
+error are Gaussian processes of the tracked position with one squared-exponential covariance
+(Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, chapter 2) on top of a
+constant or affine trend; the mean is the interpolant that `scipy.interpolate.RBFInterpolator` solves for.
+Trend, length and noise are chosen by the error in held-out blocks of space. Further blocks that
+took no part in that choice decide whether the map helps; if not, it is the identity. The error
+that is reported is that of a third set of blocks, which took part neither in the choice nor in
+that decision nor in the fit.
 """
 
 from collections.abc import Sequence
@@ -24,13 +24,19 @@ from anser_ros.errors import FitError
 Array = NDArray[np.float64]
 
 FEWEST_POINTS = 8
+"""Points with both positions below which no map is learnt: an affine trend has four parameters a
+component, and as many points again have to judge it."""
 MOST_POINTS = 500
-"""More points than these are thinned evenly: the map is smooth."""
+"""Points that a map is learnt from at most; more are thinned evenly, because the map is smooth and
+the time grows with the third power of the points."""
 LENGTHS = (0.15, 0.3, 0.6, 1.2, 2.5)
-"""Covariance lengths tried, as a part of the points' largest extent."""
+"""Covariance lengths that are tried, as a fraction of the points' largest extent: from the
+distance between neighbouring blocks to nearly a quadratic trend."""
 NOISES = (0.03, 0.1, 0.3, 1.0)
-"""Noise tried, as a part of the errors' standard deviation about the trend."""
+"""Standard deviations of the noise that are tried, as a fraction of the errors' own: from a map
+that follows nearly every point to one that hardly follows any."""
 TRENDS = (0, 1)
+"""Degrees of the polynomial trend that are tried: a constant shift and an affine map."""
 FLAT = 1e-6
 """A direction in which the points extend less than this part of the largest extent carries no
 trend and no distance: what differs there is the rounding of the numbers."""
@@ -55,7 +61,7 @@ class Shape:
     noise: float
 
     def describe(self) -> str:
-        """Return one line for a report."""
+        """Return the shape in words for a report."""
         if self.trend < 0:
             return 'no correction'
         trend = 'shift' if self.trend == 0 else 'affine'
@@ -65,6 +71,7 @@ class Shape:
 
 
 IDENTITY = Shape(-1, 0.0, 0.0)
+"""The shape of a map that corrects nothing."""
 
 
 class Correction:
@@ -117,7 +124,7 @@ def _trend_columns(places: Array, degree: int) -> Array:
 
 @dataclass(frozen=True)
 class ErrorMap:
-    """A fitted map.
+    """A fitted map from tracked to true positions.
 
     Attributes
     ----------
