@@ -4,11 +4,11 @@ This is the usual calibration of trackers that give poses and no fluxes, and the
 step of distortion compensation (Table V, "compensated and corrected"). The three components of the
 error are Gaussian processes of the tracked position with one squared-exponential covariance
 (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, chapter 2) on top of a
-constant or affine trend; the mean is the interpolant that `scipy.interpolate.RBFInterpolator` solves for.
-Trend, length and noise are chosen by the error in held-out blocks of space. Further blocks that
-took no part in that choice decide whether the map helps; if not, it is the identity. The error
-that is reported is that of a third set of blocks, which took part neither in the choice nor in
-that decision nor in the fit.
+constant or affine trend; their mean is the interpolant that `scipy.interpolate.RBFInterpolator`
+solves for. Trend, length and noise are chosen by the error in held-out blocks of space. Further
+blocks that took no part in that choice decide whether the map helps; if not, it is the identity.
+The error that is reported is that of a third set of blocks, which took part neither in the choice
+nor in that decision nor in the fit.
 """
 
 from collections.abc import Sequence
