@@ -10,15 +10,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from anser_ros.cli.evaluate import to_document
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError
-from anser_ros.sessions.evaluation import (
-    Evaluation,
-    RefitSummary,
-    baseline_flux,
-    track_session,
-)
+from anser_ros.sessions.baseline import baseline_flux
+from anser_ros.sessions.evaluation import Evaluation, track_session
+from anser_ros.sessions.evaluation_document import to_document
+from anser_ros.sessions.follower import RefitSummary
 from anser_ros.sessions.model_file import load_model, save_model
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for

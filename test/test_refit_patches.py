@@ -1,5 +1,7 @@
 """Patches in `evaluate`: coils on a body whose poses lie in the bag take part in the refit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from refit_world import anser_world, metal_block, metal_flux
@@ -7,9 +9,11 @@ from test_refit_node import setup_text
 
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, ParameterError
+from anser_ros.sessions.baseline import Baseline
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.patches import PatchFollower, parse_patches
+from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
@@ -60,10 +64,15 @@ def bags(tmp_path_factory):
     return folder
 
 
+def prepared(session):
+    world = anser_world()
+    return replace(prepare(session, world.model), baseline=Baseline('', world.baseline))
+
+
 def test_a_patch_in_the_bag_takes_part(bags):
-    session, world = load_session(bags / 'metal.mcap'), anser_world()
+    session = load_session(bags / 'metal.mcap')
     reference, tool = session.reference, session.tools[0]
-    follower = PatchFollower(session, world.model, world.baseline, {'patch': TOPIC})
+    follower = PatchFollower(prepared(session), {'patch': TOPIC})
     states, left_out, far = [], [], []
     for frame in range(len(reference.time)):
         stamp = START_NS + frame * STEP_NS
@@ -92,7 +101,7 @@ def test_the_command_takes_patches(bags, capsys):
 def test_what_the_bag_lacks_is_said(bags):
     session, world = load_session(bags / 'clean.mcap'), anser_world()
     with pytest.raises(BagError, match='no coils on the body other'):
-        PatchFollower(session, world.model, world.baseline, {'other': TOPIC})
+        PatchFollower(prepared(session), {'other': TOPIC})
     with pytest.raises(BagError, match='no pose on the topic /nobody'):
         track_session(
             session, world.model, baseline=session, refit=True, patches={'patch': '/nobody'}

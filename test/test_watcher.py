@@ -10,10 +10,10 @@ from anser_ros.cli.main import main
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions import watch as watching
-from anser_ros.sessions.evaluation import baseline_flux
 from anser_ros.sessions.model_file import load_model
-from anser_ros.sessions.session import load_session
-from anser_ros.sessions.sliding_window import SlidingWindow
+from anser_ros.sessions.prepared import prepare
+from anser_ros.sessions.session import empty_session, load_session
+from anser_ros.sessions.sliding_window import LIVE, SlidingWindow
 from anser_ros.sessions.watch import OPTICAL, RIGID, Watch
 from anser_ros.wire.bag import read_bag
 from anser_ros.wire.bag_writer import SessionWriter
@@ -55,9 +55,8 @@ def moving():
 
 @pytest.fixture
 def watch(moving):
-    session = load_session(MOVING)
-    clean = baseline_flux(load_session(FACTORY), session.reference.sensors)
-    return Watch(load_model(MODEL), clean)
+    empty = empty_session(moving.setup, LIVE)
+    return Watch(prepare(empty, load_model(MODEL), load_session(FACTORY)))
 
 
 class TestWindow:
@@ -146,7 +145,11 @@ class TestWatch:
         parameters = {'channel': CHANNEL, 'gain': GAIN, 'phase_deg': 0.0}
         known = EffectRecord('sensor_gain', parameters)
         model = replace(load_model(MODEL), effects=(known,))
-        assert Watch(model).look(window.session(), window.first_ns).is_clear
+        assert (
+            Watch(prepare(empty_session(moving.setup, LIVE), model))
+            .look(window.session(), window.first_ns)
+            .is_clear
+        )
 
     def test_what_nothing_explains_is_not_given_a_name(self, moving, watch, monkeypatch):
         nothing = replace(watching.LIGHT, most_effects=0)  # as if no effect explained it

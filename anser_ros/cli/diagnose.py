@@ -4,7 +4,6 @@ import argparse
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,8 @@ from rich.table import Table
 
 from anser_ros.cli.diagnosis_report import render, verdict
 from anser_ros.cli.output import make_folder, say_written
-from anser_ros.field.model import EffectRecord, FieldModel
-from anser_ros.sessions.diagnosis import diagnose_session, plain, to_document
+from anser_ros.sessions.diagnosis import diagnose_session
+from anser_ros.sessions.diagnosis_document import to_document
 from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for
@@ -46,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
         document = to_document(result)
         text = json.dumps(document, indent=1)
         (args.out / 'diagnosis.json').write_text(text + '\n', encoding='utf-8')
-        save_model(args.out / 'model.yaml', _plain_effects(result.diagnosis.model))
+        save_model(args.out / 'model.yaml', result.diagnosis.model)
         page = render(result, document, session=args.session, model=args.model)
         (args.out / 'report.html').write_text(page, encoding='utf-8')
     if session.lost:
@@ -68,20 +67,6 @@ def _progress(console: Console) -> Iterator[Callable[[str], None]]:
         return
     with console.status('preparing') as status:
         yield status.update
-
-
-def _plain_effects(model: FieldModel) -> FieldModel:
-    """The model with effect records that any YAML reader takes."""
-    records = tuple(
-        EffectRecord(
-            effect.name,
-            plain(dict(effect.parameters)),
-            plain(dict(effect.uncertainty)),
-            plain(dict(effect.evidence)),
-        )
-        for effect in model.effects
-    )
-    return replace(model, effects=records)
 
 
 def _show(document: dict[str, Any]) -> None:

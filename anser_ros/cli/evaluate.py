@@ -1,7 +1,6 @@
 """Track a recorded session and compare its poses with the optical ones."""
 
 import argparse
-import csv
 import json
 import sys
 from pathlib import Path
@@ -10,24 +9,15 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
-from scipy.spatial.transform import Rotation
 
 from anser_ros.cli.output import make_folder, say_written
-from anser_ros.sessions.evaluation import Evaluation, PoseSeries, metrics, track_session
+from anser_ros.sessions.evaluation import track_session
+from anser_ros.sessions.evaluation_document import to_document
 from anser_ros.sessions.patches import parse_patches
+from anser_ros.sessions.pose_table import write_body_poses, write_poses
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.tracking.estimate import TrackerSettings
-
-SCHEMA = 'anser_evaluation/1'
-POSE_COLUMNS = (
-    'stamp_ns', 'sensor', 'x_m', 'y_m', 'z_m', 'ax', 'ay', 'az', 'sigma_position_m', 'residual_t',
-    'status',
-)  # fmt: skip
-BODY_COLUMNS = (
-    'stamp_ns', 'body', 'x_m', 'y_m', 'z_m', 'qx', 'qy', 'qz', 'qw', 'sigma_position_m',
-    'residual_t', 'status',
-)  # fmt: skip
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -100,65 +90,11 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def to_document(evaluation: Evaluation) -> dict[str, Any]:
-    """The contract's evaluation document."""
-    document: dict[str, Any] = {
-        'schema': SCHEMA,
-        'sensors': {name: metrics(series) for name, series in evaluation.sensors.items()},
-        'bodies': {name: metrics(series) for name, series in evaluation.bodies.items()},
-    }
-    if evaluation.refit is not None:
-        # Beyond the contract: frames by state, and by the reference sensor that was left out.
-        document['refit'] = {
-            'states': dict(evaluation.refit.states),
-            'left_out': dict(evaluation.refit.left_out),
-        }
-    return document
-
-
 def _refit_line(refit: dict[str, dict[str, int]]) -> str:
     """What the refit did, in a line."""
     states = ', '.join(f'{name} in {count} frames' for name, count in refit['states'].items())
     out = ', '.join(f'{name} in {count}' for name, count in refit['left_out'].items())
     return f'refit: {states or "no frame"}; left out: {out or "no reference"}'
-
-
-def _rows(series: PoseSeries) -> list[list[Any]]:
-    rows = []
-    for pose in series.estimates:
-        head = [pose.stamp_ns, series.name]
-        if pose.state == 'ok':
-            values = [*pose.position, *pose.axis, pose.sigma_position_m, pose.residual_t]
-            rows.append([*head, *(f'{float(v):.9g}' for v in values), 'ok'])
-        else:
-            rows.append([*head, *[''] * 8, pose.state])
-    return rows
-
-
-def write_poses(path: Path, evaluation: Evaluation) -> None:
-    """Write every sensor's pose, or why there is none, by stamp."""
-    rows = [row for series in evaluation.sensors.values() for row in _rows(series)]
-    rows.sort(key=lambda row: row[0])
-    with path.open('w', newline='', encoding='utf-8') as stream:
-        writer = csv.writer(stream)
-        writer.writerow(POSE_COLUMNS)
-        writer.writerows(rows)
-
-
-def write_body_poses(path: Path, evaluation: Evaluation) -> None:
-    """Write every rigid tool's 6-DoF pose, or why there is none, by stamp."""
-    with path.open('w', newline='', encoding='utf-8') as stream:
-        writer = csv.writer(stream)
-        writer.writerow(BODY_COLUMNS)
-        for name, series in evaluation.bodies.items():
-            for pose in series.estimates:
-                if pose.state != 'ok' or pose.rotation is None:
-                    writer.writerow([pose.stamp_ns, name, *[''] * 9, pose.state])
-                    continue
-                quaternion = Rotation.from_matrix(pose.rotation).as_quat()
-                values = [*pose.position, *quaternion, pose.sigma_position_m, pose.residual_t]
-                row = [f'{float(value):.9g}' for value in values]
-                writer.writerow([pose.stamp_ns, name, *row, 'ok'])
 
 
 def _table(document: dict[str, Any]) -> Table:

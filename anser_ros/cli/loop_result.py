@@ -8,8 +8,8 @@ from rich.console import Console
 from rich.table import Table
 
 from anser_ros.cli.loop_run import AFTER, BEFORE, UNGATED
-from anser_ros.effects.correction import Correction
 from anser_ros.field.model import FieldModel
+from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.recorded_poses import LiveErrors, live_errors
 from anser_ros.sessions.session import Session
 
@@ -77,8 +77,7 @@ def second_run(session: Session, corrected: FieldModel, known: FieldModel) -> di
     for name, namespace, model in (
         ('ungated', UNGATED, known), ('before', BEFORE, known), ('after', AFTER, corrected)
     ):  # fmt: skip
-        correction = Correction.of(model.effects, session.tools[0].sensors, model.frequencies_hz)
-        errors = list(live_errors(session, namespace, correction).values())
+        errors = list(live_errors(prepare(session, model), namespace).values())
         poses, frames = sum(e.position.size for e in errors), sum(e.frames for e in errors)
         figures[name] = {'published_share': poses / max(frames, 1), **_figures(errors)}
     return figures

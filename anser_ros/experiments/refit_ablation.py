@@ -16,9 +16,9 @@ from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.free import FreeDipoles
 from anser_ros.refit.live_refit import LiveRefit
-from anser_ros.sessions.evaluation import baseline_flux
+from anser_ros.sessions.baseline import baseline_flux
+from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.session import NANO, Session
-from anser_ros.sessions.starting_model import drawing_of
 from anser_ros.tracking.solve import RealField, solve_coil, whitening_of
 
 Array = NDArray[np.float64]
@@ -113,7 +113,7 @@ def _models(
     """The model of every frame that is tracked."""
     reference = session.reference
     assert reference is not None
-    sensors, drawing = reference.sensors.select(chosen), drawing_of(session.setup)
+    sensors, drawing = reference.sensors.select(chosen), Drawing.of(session.setup).field
     flux = reference.flux[::every, chosen]
     if method == FREE:
         free = FreeDipoles(model, sensors, clean[chosen], drawing)

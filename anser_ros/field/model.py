@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import ModelFileError
+from anser_ros.field.plain_data import plain
 from anser_ros.physics.dipole import flux_basis
 
 Array = NDArray[np.float64]
@@ -174,9 +175,9 @@ def to_document(model: FieldModel) -> dict[str, Any]:
         'effects': [
             {
                 'name': effect.name,
-                'parameters': dict(effect.parameters),
-                'uncertainty': dict(effect.uncertainty),
-                'evidence': dict(effect.evidence),
+                'parameters': plain(dict(effect.parameters)),
+                'uncertainty': plain(dict(effect.uncertainty)),
+                'evidence': plain(dict(effect.evidence)),
             }
             for effect in model.effects
         ],

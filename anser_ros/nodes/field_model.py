@@ -33,7 +33,7 @@ from anser_ros.refit.baseline import ReadingWindow, check_enough
 from anser_ros.refit.change import MOST_RATE_HZ, Pace
 from anser_ros.refit.live_refit import LiveRefit, RefitResult, RefitSettings
 from anser_ros.refit.result import FEW_REFERENCES, POOR_FIT
-from anser_ros.sessions.evaluation import baseline_flux
+from anser_ros.sessions.baseline import baseline_flux
 from anser_ros.sessions.model_file import load_model, save_model
 from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session, sensor_table

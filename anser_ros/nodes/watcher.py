@@ -8,9 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from geometry_msgs.msg import PoseStamped
-from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
@@ -22,12 +20,12 @@ from anser_ros.nodes.model_clouds import NANO
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.sighting_words import figures_of, plain_text, title_of, words_of
-from anser_ros.sessions.evaluation import baseline_flux
-from anser_ros.sessions.session import Session, load_session, sensor_table
-from anser_ros.sessions.sliding_window import SlidingWindow
+from anser_ros.sessions.prepared import prepare
+from anser_ros.sessions.session import Session, empty_session, load_session
+from anser_ros.sessions.sliding_window import LIVE, SlidingWindow
 from anser_ros.sessions.starting_model import NOMINAL, model_for
 from anser_ros.sessions.watch import Sighting, Watch
-from anser_ros.wire.setup import Setup, parse_setup, topic_of
+from anser_ros.wire.setup import parse_setup, topic_of
 
 POLL_S = 0.2
 FILLED = 0.5
@@ -106,26 +104,21 @@ class Watcher(AnserNode):
         try:
             setup = parse_setup(message.data)
             # An empty window has a session's setup already, and a model must fit that.
-            session = Session('live', setup, 0, (), None)
-            model = model_for(self.parameters.model_file, session)
-            clean = self._clean(setup)
+            empty = empty_session(setup, LIVE)
+            model = model_for(self.parameters.model_file, empty)
+            prepared = prepare(empty, model, self._baseline_bag)
         except AnserError as error:
             self._refuse('setups_refused', error)
             return
         self._setup_text, self._trouble = message.data, ''
         self._window = SlidingWindow(setup, self.parameters.window_s, self.parameters.frames)
-        self._watch = Watch(model, clean)
+        self._watch = Watch(prepared)
         self._sighting, self._known = None, {}
         for body in setup.bodies:
             if body not in self._pose_subscriptions:
                 self._pose_subscriptions[body] = self.create_subscription(
                     PoseStamped, f'/optical/{topic_of(body)}/pose', self._taker(body), qos.STREAM
                 )
-
-    def _clean(self, setup: Setup) -> NDArray[np.complex128] | None:
-        if self._baseline_bag is None or not setup.reference_sensors:
-            return None
-        return baseline_flux(self._baseline_bag, sensor_table(setup.reference_sensors))
 
     def _taker(self, body: str) -> Callable[[PoseStamped], None]:
         def take(message: PoseStamped) -> None:

@@ -55,6 +55,18 @@ class SensorTable:
         """Return the table of the sensors on one body."""
         return self.select([i for i, name in enumerate(self.body) if name == body])
 
+    def joined(self, *others: 'SensorTable') -> 'SensorTable':
+        """Return the table of these sensors followed by those of other tables."""
+        tables = (self, *others)
+        return SensorTable(
+            channel=np.concatenate([table.channel for table in tables]),
+            name=tuple(name for table in tables for name in table.name),
+            body=tuple(body for table in tables for body in table.body),
+            position=np.concatenate([table.position for table in tables]),
+            axis=np.concatenate([table.axis for table in tables]),
+            length=np.concatenate([table.length for table in tables]),
+        )
+
     def with_geometry(
         self, position: Array | None = None, axis: Array | None = None, length: Array | None = None
     ) -> 'SensorTable':

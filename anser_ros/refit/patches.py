@@ -196,7 +196,7 @@ class PatchCoils:
         """
         start = self.start_table()
         clean = np.concatenate([self.fixed, clean_reading(model, start, PoseError())[0]])
-        return LiveRefit(model, joined(references, start), clean, **options)
+        return LiveRefit(model, references.joined(start), clean, **options)
 
     def rebuilt(self, refit: LiveRefit, now: SensorTable) -> LiveRefit:
         """The refit for where the patches are now; `settle` puts it in force."""
@@ -207,18 +207,6 @@ class PatchCoils:
         self._built_at = at
 
 
-def joined(first: SensorTable, second: SensorTable) -> SensorTable:
-    """Two tables as one."""
-    return SensorTable(
-        channel=np.concatenate([first.channel, second.channel]),
-        name=(*first.name, *second.name),
-        body=(*first.body, *second.body),
-        position=np.concatenate([first.position, second.position]),
-        axis=np.concatenate([first.axis, second.axis]),
-        length=np.concatenate([first.length, second.length]),
-    )
-
-
 def noise_of(sigma: Array, n_fixed: int, nominal_t: float) -> Array:
     """Noise of all references over the nominal one, the fixed ones' being 1."""
     return np.concatenate([np.ones(n_fixed), np.hypot(1.0, sigma / nominal_t)])
@@ -226,7 +214,7 @@ def noise_of(sigma: Array, n_fixed: int, nominal_t: float) -> Array:
 
 def _rebuild(refit: LiveRefit, now: SensorTable, fixed: ComplexArray) -> LiveRefit:
     count = len(refit.references) - len(now)
-    table = joined(refit.references.select(np.arange(count)), now)
+    table = refit.references.select(np.arange(count)).joined(now)
     clean, sigma = clean_reading(refit.model, now, PoseError())
     noise = noise_of(sigma, count, refit.settings.flux_noise_t)
     return refit.moved(table, np.concatenate([fixed, clean]), noise)

@@ -8,10 +8,9 @@ import numpy as np
 from anser_ros.calibration.calibrate import Options, calibrate
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.result import Calibration
-from anser_ros.errors import AnserError, FitError
-from anser_ros.field.model import FieldModel
+from anser_ros.errors import FitError
+from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.session import Session
-from anser_ros.sessions.starting_model import NOMINAL, model_for
 from anser_ros.wire.setup import Setup
 
 
@@ -47,14 +46,6 @@ def generator_of(setup: Setup) -> Generator:
     return Generator(centres, turns, float(side))
 
 
-def nominal_of(session: Session) -> FieldModel | None:
-    """The nominal model, or None where the setup's geometry makes none."""
-    try:
-        return model_for(NOMINAL, session)
-    except AnserError:
-        return None
-
-
 def calibrate_sessions(
     sessions: list[Session],
     options: Options,
@@ -69,5 +60,5 @@ def calibrate_sessions(
     names = [Path(session.path).name for session in sessions for _ in session.tools]
     return calibrate(
         measurements, names, generator_of(setup), setup.emitter_names, setup.frequencies_hz,
-        options, nominal_of(sessions[0]), progress,
+        options, Drawing.of(setup).model, progress,
     )  # fmt: skip

@@ -1,8 +1,13 @@
-"""Diagnoses a recorded session: the problem, the search, and tracking of the held-out part."""
+"""Diagnosis of a recorded session, and how its held-out part is tracked without and with it.
+
+The stages are `prepare`, `correct`, `problem_of`, `anser_ros.diagnosis.diagnose.diagnose` (which
+screens, searches, confirms and concludes), `held_out_part` and `track_held_out`; each can be
+called alone, and `diagnose_session` runs all of them. What they give is written by
+`diagnosis_document`.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,36 +16,34 @@ from anser_ros.diagnosis.diagnose import Diagnosis, diagnose
 from anser_ros.diagnosis.prepare import build_problem, test_blocks
 from anser_ros.diagnosis.problem import Problem
 from anser_ros.diagnosis.whitening import Spread
-from anser_ros.effects.correction import DRIFTS, Correction
-from anser_ros.errors import DiagnosisError, SetupError
-from anser_ros.field.measurements import Measurements
+from anser_ros.errors import DiagnosisError
 from anser_ros.field.model import FieldModel
-from anser_ros.field.nominal import nominal_model
-from anser_ros.sessions.evaluation import (
-    FOUND_ON,
-    baseline_flux,
-    drift_recorded,
-    track_session,
-)
-from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, Session, noise_of
-from anser_ros.sessions.starting_model import board_of, check_fits
+from anser_ros.sessions.evaluation import compare
+from anser_ros.sessions.follower import ModelFollower
+from anser_ros.sessions.prepared import PreparedSession, correct, prepare
+from anser_ros.sessions.recorded_drift import date_drifts
+from anser_ros.sessions.session import Session
+from anser_ros.sessions.tracked_poses import track
 from anser_ros.tracking.estimate import TrackerSettings
 
 Array = NDArray[np.float64]
 
-SCHEMA = 'anser_diagnosis/1'
-DEPENDENCIES = (
-    'time', 'position', 'orientation', 'speed', 'emitter', 'channel', 'amplitude', 'frequency',
-)  # fmt: skip
 DEFAULT_NOISE_T = 60e-12
 ROOM = 2.0
-BULKY = ('groups', 'knots_s', 'course', 'couplings_m3')
-"""Parameters that only a program needs; they stand in the model file."""
+"""Gate of the held-out part's tracking over the flux residual there. With less, poses that a wrong
+model makes would be refused instead of counted; with much more, wrong minima would be taken for
+poses."""
 
 
 @dataclass(frozen=True)
 class TrackingErrors:
-    """RMSE over all coils tracked singly in the held-out part; None where none was tracked."""
+    """Errors over all coils tracked singly in the held-out part.
+
+    Attributes
+    ----------
+    position_rmse_m, orientation_rmse_rad : float or None
+        Root mean square; None where no coil was tracked.
+    """
 
     position_rmse_m: float | None
     orientation_rmse_rad: float | None
@@ -48,7 +51,15 @@ class TrackingErrors:
 
 @dataclass(frozen=True)
 class SessionDiagnosis:
-    """What was found, and how the held-out part is tracked without and with it."""
+    """What a model lacks on a session.
+
+    Attributes
+    ----------
+    diagnosis : Diagnosis
+        The effects that were found, and the model with them.
+    before, after : TrackingErrors
+        How the held-out part is tracked with the model as it was, and with the effects.
+    """
 
     diagnosis: Diagnosis
     before: TrackingErrors
@@ -83,87 +94,63 @@ def diagnose_session(
     BagError
         When the baseline's references are not the session's.
     """
-    check_fits(model, session)
-    if baseline is not None:
-        check_fits(model, baseline)
+    say = progress or (lambda text: None)
+    prepared = prepare(session, model, baseline)
+    problem = problem_of(correct(prepared))
+    found = diagnose(problem, model, progress=say)
+    found = replace(found, model=date_drifts(found.model, session))
+    say('tracking the held-out part')
+    unseen = prepared.with_session(held_out_part(session, problem))
+    before, after = track_held_out(unseen, found)
+    return SessionDiagnosis(found, before, after)
+
+
+def problem_of(corrected: PreparedSession, spread: Spread | None = None) -> Problem:
+    """The diagnosis problem of a session.
+
+    Parameters
+    ----------
+    corrected : PreparedSession
+        With the effects corrected that the model knows (`correct`).
+    spread : Spread, optional
+        How far readings and poses may be off; by default that of `spread_of`.
+
+    Raises
+    ------
+    DiagnosisError
+        When the session has no tool fluxes, or fewer than 30 frames have fluxes and a pose.
+    """
+    session, clean = corrected.session, corrected.baseline
     if not session.tools:
         raise DiagnosisError(
             f'{session.path}: a diagnosis needs tool fluxes, the session has none'
         )
-    clean = None
-    if baseline is not None and session.reference is not None:
-        clean = baseline_flux(baseline, session.reference.sensors)
-    noise_t = noise_of(session.setup) or DEFAULT_NOISE_T
-    spread = Spread(flux_t=float(np.hypot(noise_t, model.flux_error_t)), noise_t=noise_t)
-    same = drift_recorded(model, session)
-    known = [corrected(tool, model, recorded=same) for tool in session.tools]
-    reference = session.reference
-    if reference is not None:
-        reference = corrected(reference, model, recorded=same)
-    problem = build_problem(known, reference, clean, model, drawn(session), spread)
-    found = _dated(diagnose(problem, model, progress=progress), session.start_ns)
-    say = progress or (lambda text: None)
-    say('tracking the held-out part')
-    unseen = _unseen(session, problem)
-    # What only the references can follow live: metal that moves, an emitter without a course.
-    moves = any(
-        term.effect.moving or term.effect.name == 'coil_fluctuation' for term in found.terms
-    )
-    follow = moves and baseline is not None and session.reference is not None
-    floor = max(found.flux_rms_floor_t, 1e-30)
-    return SessionDiagnosis(
-        found,
-        _tracked(unseen, model, None, found.flux_rms_before_t / floor, refit=False),
-        _tracked(unseen, found.model, baseline, found.flux_rms_after_t / floor, refit=follow),
+    return build_problem(
+        session.tools,
+        session.reference,
+        None if clean is None else clean.flux,
+        corrected.model,
+        corrected.drawing.model,
+        spread or spread_of(corrected),
     )
 
 
-def _dated(found: Diagnosis, start_ns: int) -> Diagnosis:
-    """The diagnosis with drifts that say on which session they took their course."""
-    effects = tuple(
-        replace(effect, evidence={**effect.evidence, FOUND_ON: start_ns})
-        if effect.name in DRIFTS and FOUND_ON not in effect.evidence
-        else effect
-        for effect in found.model.effects
-    )
-    return replace(found, model=replace(found.model, effects=effects))
+def spread_of(prepared: PreparedSession) -> Spread:
+    """How far readings and poses may be from what a right model says."""
+    noise_t = prepared.noise_t or DEFAULT_NOISE_T
+    return Spread(flux_t=float(np.hypot(noise_t, prepared.model.flux_error_t)), noise_t=noise_t)
 
 
-def corrected(
-    measurements: Measurements, model: FieldModel, *, recorded: bool = False
-) -> Measurements:
-    """The measurements as the effects that the model already knows leave them.
+def held_out_part(session: Session, problem: Problem) -> Session:
+    """The frames in the blocks that took no part, and the first frame, which sets the clock.
 
-    ``recorded`` as for `Correction.flux`.
+    Parameters
+    ----------
+    session : Session
+        As it was recorded.
+    problem : Problem
+        Made of that session.
     """
-    correction = Correction.of(model.effects, measurements.sensors, model.frequencies_hz)
-    if not correction.terms:
-        return measurements
-    flux = measurements.flux
-    if correction.changes_flux:
-        channels = measurements.sensors.channel
-        rows = zip(measurements.time.tolist(), flux, strict=True)
-        flux = np.array(
-            [correction.flux(time, channels, frame, recorded=recorded) for time, frame in rows]
-        )
-    out = replace(measurements, sensors=correction.sensors(), flux=flux)
-    if measurements.track is None:
-        return out
-    track = correction.optical(measurements.track)
-    position, rotation, has_pose = track.at(measurements.time, LONGEST_OPTICAL_GAP_S)
-    return replace(out, track=track, position=position, rotation=rotation, has_pose=has_pose)
-
-
-def drawn(session: Session) -> FieldModel | None:
-    """The nominal model, where the setup's geometry makes one."""
-    try:
-        return nominal_model(board_of(session.setup))
-    except SetupError:
-        return None
-
-
-def _unseen(session: Session, problem: Problem) -> Session:
-    """The first frame, which sets the clock, and those in the blocks that took no part."""
     held = {
         tool.body: tool.time[np.isin(blocks, test_blocks())]
         for tool, blocks in zip(problem.tools, problem.blocks, strict=True)
@@ -176,27 +163,49 @@ def _unseen(session: Session, problem: Problem) -> Session:
     reference = session.reference
     if reference is not None:
         times = np.concatenate([tool.time for tool in tools])
-        reference = _at(reference, times)
+        reference = reference.frames(np.flatnonzero(np.isin(reference.time, times)))
     return replace(session, tools=tools, reference=reference)
 
 
-def _at(measurements: Measurements, times: Array) -> Measurements:
-    return measurements.frames(np.flatnonzero(np.isin(measurements.time, times)))
+def track_held_out(
+    unseen: PreparedSession, found: Diagnosis
+) -> tuple[TrackingErrors, TrackingErrors]:
+    """Track the held-out part with the model as it was, and with the effects that were found.
 
+    The second time the model follows the references where only these can tell what an effect does
+    live: metal that moves, and an emitter whose strength has no course of its own.
 
-def _tracked(
-    session: Session, model: FieldModel, baseline: Session | None, misfit: float, *, refit: bool
-) -> TrackingErrors:
-    """Errors with a gate as wide as the misfit: a wrong model's poses are to be seen here.
-
-    A gate that lets everything pass would also take wrong minima for poses.
+    Parameters
+    ----------
+    unseen : PreparedSession
+        The held-out part, with the model as it was.
+    found : Diagnosis
+        Of the same session.
     """
+    floor = max(found.flux_rms_floor_t, 1e-30)
+    after = unseen.with_model(found.model)
+    moves = any(
+        term.effect.moving or term.effect.name == 'coil_fluctuation' for term in found.terms
+    )
+    follower = ModelFollower(after) if moves and after.baseline is not None else None
+    return (
+        _errors(unseen, found.flux_rms_before_t / floor),
+        _errors(after, found.flux_rms_after_t / floor, follower),
+    )
+
+
+def _errors(
+    prepared: PreparedSession, misfit: float, follower: ModelFollower | None = None
+) -> TrackingErrors:
+    """Errors with a gate as wide as the misfit: a wrong model's poses are to be seen here."""
     usual = TrackerSettings()
     settings = replace(usual, gate=usual.gate * max(1.0, ROOM * misfit))
-    evaluation = track_session(session, model, settings, baseline=baseline, refit=refit)
+    evaluation = compare(prepared, track(prepared, settings, follower))
+    series = evaluation.sensors.values()
+    # The first frame of a held-out part is there for its stamp alone.
     return TrackingErrors(
-        _rms([series.position_error[1:] for series in evaluation.sensors.values()]),
-        _rms([series.orientation_error[1:] for series in evaluation.sensors.values()]),
+        _rms([one.position_error[1:] for one in series]),
+        _rms([one.orientation_error[1:] for one in series]),
     )
 
 
@@ -204,51 +213,3 @@ def _rms(errors: list[Array]) -> float | None:
     values = np.concatenate(errors)
     values = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(values**2))) if values.size else None
-
-
-def plain(value: Any) -> Any:
-    """Numbers, lists and mappings as JSON and YAML have them."""
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, complex):
-        return [value.real, value.imag]
-    return value
-
-
-def to_document(result: SessionDiagnosis) -> dict[str, Any]:
-    """The contract's diagnosis document."""
-    found = result.diagnosis
-    return {
-        'schema': SCHEMA,
-        'held_out': {
-            'flux_rms_before_t': found.flux_rms_before_t,
-            'flux_rms_after_t': found.flux_rms_after_t,
-            'flux_rms_floor_t': found.flux_rms_floor_t,
-            'position_rmse_before_m': result.before.position_rmse_m,
-            'position_rmse_after_m': result.after.position_rmse_m,
-            'orientation_rmse_before_rad': result.before.orientation_rmse_rad,
-            'orientation_rmse_after_rad': result.after.orientation_rmse_rad,
-        },
-        'effects': [
-            {
-                'name': finding.record.name,
-                'parameters': plain(
-                    {k: v for k, v in finding.record.parameters.items() if k not in BULKY}
-                ),
-                'uncertainty': plain(dict(finding.record.uncertainty)),
-                'evidence': plain(dict(finding.record.evidence)),
-                'flux_rms_without_t': finding.flux_rms_without_t,
-            }
-            for finding in found.findings
-        ],
-        'unexplained': {
-            'fraction': found.unexplained,
-            'depends_on': [name for name in found.depends_on if name in DEPENDENCIES],
-        },
-    }

@@ -6,12 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import BagError, ParameterError
-from anser_ros.field.model import FieldModel
 from anser_ros.refit.patches import PatchCoils
 from anser_ros.refit.result import RefitResult
+from anser_ros.sessions.prepared import PreparedSession
 from anser_ros.sessions.recorded_poses import PublishedPoses, published_poses
-from anser_ros.sessions.session import Session, sensor_table
-from anser_ros.sessions.starting_model import drawing_of
+from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.volume import stated_volume
 from anser_ros.tracking.rotations import rotation_of_quaternion
 
@@ -43,12 +42,10 @@ class PatchFollower:
 
     Parameters
     ----------
-    session : Session
-    model : FieldModel
-    fixed : ndarray, shape (R, K), complex
-        Baseline of the fixed references, T.
+    prepared : PreparedSession
+        With references and a baseline.
     topics : dict of str to str
-        From `parse_patches`.
+        Topic of every patch's poses by its body (see `parse_patches`).
 
     Raises
     ------
@@ -56,10 +53,9 @@ class PatchFollower:
         When the setup has no coils on such a body, or the bag no poses on such a topic.
     """
 
-    def __init__(
-        self, session: Session, model: FieldModel, fixed: ComplexArray, topics: dict[str, str]
-    ) -> None:
-        assert session.reference is not None
+    def __init__(self, prepared: PreparedSession, topics: dict[str, str]) -> None:
+        session, baseline = prepared.session, prepared.baseline
+        assert session.reference is not None and baseline is not None
         moving = tuple(s for s in session.setup.tool_sensors if s.body in topics)
         for body in topics:
             if body not in {s.body for s in moving}:
@@ -69,13 +65,12 @@ class PatchFollower:
             if poses.stamp_ns.size == 0:
                 raise BagError(f'{session.path}: no pose on the topic {topic}')
         self._poses: dict[str, PublishedPoses] = {b: found[t] for b, t in topics.items()}
-        self._patches = PatchCoils(sensor_table(moving), fixed)
-        setup = session.setup
+        self._patches = PatchCoils(sensor_table(moving), baseline.flux)
         self._refit = self._patches.started(
-            model,
+            prepared.model,
             session.reference.sensors,
-            drawing=drawing_of(setup),
-            volume=stated_volume(setup),
+            drawing=prepared.drawing.field,
+            volume=stated_volume(session.setup),
         )
 
     def take_flux(

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.effects.correction import Correction
 from anser_ros.errors import BagError
 from anser_ros.field.measurements import Measurements
+from anser_ros.sessions.prepared import PreparedSession, with_truth
 from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, NANO, Session
 from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages, stamp_ns
 from anser_ros.wire.setup import topic_of
@@ -67,31 +67,32 @@ def published_poses(
     return found
 
 
-def live_errors(session: Session, namespace: str, correction: Correction) -> dict[str, LiveErrors]:
+def live_errors(prepared: PreparedSession, namespace: str) -> dict[str, LiveErrors]:
     """Errors of everything that the tracker of a namespace published, by sensor and body.
 
     Parameters
     ----------
-    session : Session
-        The recording, with optical poses.
+    prepared : PreparedSession
+        The recording, with optical poses, and the tracker's model, whose corrections of the
+        clock, the optical frame and the sensors are made.
     namespace : str
         Of the tracker, such as ``/anser``.
-    correction : Correction
-        What its model knows of the clock, the optical frame and the sensors.
 
     Raises
     ------
     BagError
         When the recording has no optical poses.
     """
+    session = prepared.session
     names = [name for tool in session.tools for name in (*tool.sensors.name, tool.body)]
     topics = {name: f'{namespace}/{topic_of(name)}/pose' for name in names}
     received = published_poses(session.path, list(topics.values()))
     errors = {}
     for tool in session.tools:
+        true = with_truth(tool, prepared.correction)
         for column, name in enumerate(tool.sensors.name):
-            errors[name] = _compared(session, tool, received[topics[name]], correction, column)
-        errors[tool.body] = _compared(session, tool, received[topics[tool.body]], correction, None)
+            errors[name] = _compared(session, true, received[topics[name]], column)
+        errors[tool.body] = _compared(session, true, received[topics[tool.body]], None)
     return errors
 
 
@@ -99,25 +100,22 @@ def _compared(
     session: Session,
     tool: Measurements,
     poses: PublishedPoses,
-    correction: Correction,
     column: int | None,
 ) -> LiveErrors:
     """Errors of one sensor (by its column), or of the body."""
     if tool.track is None:
         raise BagError(f'{session.path}: no optical poses of {tool.body}')
     time = np.asarray((poses.stamp_ns - session.start_ns) * NANO, dtype=np.float64)
-    track = correction.optical(tool.track)
-    position, rotation, valid = track.at(time, LONGEST_OPTICAL_GAP_S)
-    there = track.at(tool.time, LONGEST_OPTICAL_GAP_S)[2]
+    position, rotation, valid = tool.track.at(time, LONGEST_OPTICAL_GAP_S)
     turned = Rotation.from_quat(poses.quaternion[valid]).as_matrix() if valid.any() else None
-    frames = int(there.sum())
+    frames = int(tool.has_pose.sum())
     if turned is None:
         return LiveErrors(np.zeros(0), np.zeros(0), frames)
     if column is None:
         truth = position[valid]
         turn = Rotation.from_matrix(rotation[valid].transpose(0, 2, 1) @ turned).magnitude()
     else:
-        centres, axes = correction.sensors(tool.sensors).placed(position[valid], rotation[valid])
+        centres, axes = tool.sensors.placed(position[valid], rotation[valid])
         truth = centres[:, column]
         cross = np.linalg.norm(np.cross(turned[:, :, 2], axes[:, column]), axis=1)
         turn = np.arctan2(cross, np.sum(turned[:, :, 2] * axes[:, column], axis=1))

@@ -44,6 +44,11 @@ class Session:
     reference: Measurements | None
     lost: str = ''
 
+    @property
+    def sensors(self) -> SensorTable:
+        """All tool sensors, one body after the other."""
+        return sensor_table(()).joined(*(tool.sensors for tool in self.tools))
+
 
 def sensor_table(specs: tuple[SensorSpec, ...]) -> SensorTable:
     """The setup's sensors as arrays."""
@@ -129,7 +134,7 @@ def session_of(bag: Bag) -> Session:
                 f'{bag.path}: the setup has {n_emitters} emitters, '
                 f'the fluxes {stream.flux.shape[2]}'
             )
-    start = min(int(stream.stamp_ns[0]) for stream in streams)
+    start = min((int(s.stamp_ns[0]) for s in streams if s.stamp_ns.size), default=0)
     tools, reference = [], None
     table = sensor_table(bag.setup.tool_sensors)
     if bag.tool is not None:
@@ -143,3 +148,18 @@ def session_of(bag: Bag) -> Session:
 def load_session(path: str | os.PathLike[str]) -> Session:
     """Read a bag as a session; raises `BagError`."""
     return session_of(read_bag(path))
+
+
+def empty_session(setup: Setup, path: str) -> Session:
+    """A session of a setup in which nothing has been recorded yet: all arrays have no frame."""
+    tables = [sensor_table(specs) for specs in (setup.tool_sensors, setup.reference_sensors)]
+    tool, reference = (_no_fluxes(t, len(setup.emitter.coils)) if len(t) else None for t in tables)
+    return session_of(Bag(path, setup, '', tool, reference, {}))
+
+
+def _no_fluxes(sensors: SensorTable, emitters: int) -> RecordedFluxes:
+    count = len(sensors)
+    return RecordedFluxes(
+        np.zeros(0, dtype=np.int64), sensors.channel, np.zeros((0, count), dtype=np.int64),
+        np.zeros((0, count, emitters), dtype=complex),
+    )  # fmt: skip

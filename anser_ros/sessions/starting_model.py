@@ -1,19 +1,14 @@
 """The field model that a command starts from: a file, or the nominal one of the setup."""
 
-from collections.abc import Callable
-
 import numpy as np
-from numpy.typing import NDArray
 
-from anser_ros.errors import ModelFileError, SetupError
+from anser_ros.errors import ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.nominal import nominal_model
 from anser_ros.physics.board import Board, build_board
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import Session
 from anser_ros.wire.setup import Setup
-
-Array = NDArray[np.float64]
 
 NOMINAL = 'nominal'
 
@@ -29,14 +24,6 @@ def board_of(setup: Setup) -> Board:
         np.array([coil.rotation_deg for coil in emitter.coils]),
         setup.frequencies_hz,
     )
-
-
-def drawing_of(setup: Setup) -> Callable[[Array], Array] | None:
-    """Field of the board as drawn, (P, 3) to (P, K, 3); None where its kind is not known."""
-    try:
-        return board_of(setup).field
-    except SetupError:
-        return None
 
 
 def model_for(name: str, session: Session) -> FieldModel:

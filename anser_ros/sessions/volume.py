@@ -3,7 +3,7 @@
 from anser_ros.errors import FitError
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit.excitation import region_of
-from anser_ros.sessions.starting_model import drawing_of
+from anser_ros.sessions.drawing import Drawing
 from anser_ros.wire.setup import Setup
 
 
@@ -18,7 +18,7 @@ def pose_volume(setup: Setup) -> TrackedVolume:
     It is the stated volume, or else the default volume over the board with its fringe; a board
     that can't be drawn from the setup gets the box of an Anser board.
     """
-    stated, drawing = stated_volume(setup), drawing_of(setup)
+    stated, drawing = stated_volume(setup), Drawing.of(setup).field
     if stated is not None:
         return stated
     if drawing is None:

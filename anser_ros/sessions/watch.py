@@ -11,20 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.diagnose import diagnose
-from anser_ros.diagnosis.prepare import FEWEST_FRAMES, build_problem
+from anser_ros.diagnosis.prepare import FEWEST_FRAMES
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.diagnosis.search import SearchSettings
-from anser_ros.diagnosis.whitening import Spread
 from anser_ros.effects.effect import Term
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel
-from anser_ros.sessions.diagnosis import DEFAULT_NOISE_T, corrected, drawn
-from anser_ros.sessions.session import NANO, Session, noise_of
+from anser_ros.sessions.diagnosis import problem_of, spread_of
+from anser_ros.sessions.prepared import PreparedSession, correct
+from anser_ros.sessions.session import NANO, Session
 from anser_ros.tracking.estimate import OK, TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 
 Array = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 OPTICAL, RIGID, REFERENCES = 'optical poses', 'rigidity of the tools', 'references alone'
 LIGHT = SearchSettings(most_effects=1, finalists=4, iterations=6)
@@ -89,11 +88,9 @@ class Watch:
 
     Parameters
     ----------
-    model : FieldModel
-        With the effects that are corrected already.
-    clean : ndarray, shape (R, K), complex, or None
-        Distortion-free readings of the reference sensors, T; without them the references have no
-        say.
+    prepared : PreparedSession
+        Any session of the setup, an empty one too, with the model whose effects are corrected
+        already; without a baseline the references have no say.
 
     Attributes
     ----------
@@ -101,8 +98,8 @@ class Watch:
         How often something new was searched for.
     """
 
-    def __init__(self, model: FieldModel, clean: ComplexArray | None = None) -> None:
-        self._model, self._clean = model, clean
+    def __init__(self, prepared: PreparedSession) -> None:
+        self._prepared = prepared
         self._last: Sighting | None = None
         self._left = 1.0  # what the last search left
         self.searches = 0
@@ -126,39 +123,35 @@ class Watch:
         DiagnosisError
             When there are too few frames to say anything.
         """
-        began_s = (session.start_ns - first_ns) * NANO
-        tools = tuple(self._known(tool, began_s) for tool in session.tools)
-        reference = session.reference
-        if reference is not None:
-            reference = self._known(reference, began_s)
-        session = replace(session, tools=tools, reference=reference)
+        seen = self._corrected(session, (session.start_ns - first_ns) * NANO)
         truth = OPTICAL
-        if sum(int(tool.has_pose.sum()) for tool in tools) < FEWEST_FRAMES:
+        if sum(int(tool.has_pose.sum()) for tool in seen.session.tools) < FEWEST_FRAMES:
             truth = RIGID
 
         def problem_with(model: FieldModel) -> Problem:
             """Where the tools give their own poses, `model` is what they are worked out with."""
-            return self._problem(session, model if truth == RIGID else None)
+            return self._problem(seen, model if truth == RIGID else None)
 
         self._last = self._judged(problem_with, truth, progress)
         return self._last
 
-    def _known(self, measurements: Measurements, began_s: float) -> Measurements:
-        """Measurements as the model's own effects, whose time began earlier, leave them."""
-        return _moved(corrected(_moved(measurements, began_s), self._model), -began_s)
-
-    def _problem(self, session: Session, by: FieldModel | None) -> Problem:
-        noise_t = noise_of(session.setup) or DEFAULT_NOISE_T
-        spread = Spread(flux_t=float(np.hypot(noise_t, self._model.flux_error_t)), noise_t=noise_t)
-        tools = session.tools
-        if by is not None:
-            # The model's own effects are taken off already.
-            by = replace(by, effects=by.effects[len(self._model.effects) :])
-            tools = tuple(_posed_by_itself(tool, by) for tool in tools)
-            spread = replace(spread, position_m=FREE_POSE_M, rotation_rad=FREE_POSE_RAD)
-        return build_problem(
-            tools, session.reference, self._clean, self._model, drawn(session), spread
+    def _corrected(self, session: Session, began_s: float) -> PreparedSession:
+        """The window as the model's own effects, whose time began earlier, leave it."""
+        # The course of a drift that another session took says nothing of this one.
+        later = replace(
+            self._prepared.with_session(_moved(session, began_s)), recorded_drift=False
         )
+        corrected = correct(later)
+        return corrected.with_session(_moved(corrected.session, -began_s))
+
+    def _problem(self, seen: PreparedSession, by: FieldModel | None) -> Problem:
+        if by is None:
+            return problem_of(seen)
+        # The model's own effects are taken off already.
+        by = replace(by, effects=by.effects[len(seen.model.effects) :])
+        tools = tuple(_posed_by_itself(tool, by) for tool in seen.session.tools)
+        spread = replace(spread_of(seen), position_m=FREE_POSE_M, rotation_rad=FREE_POSE_RAD)
+        return problem_of(seen.with_session(replace(seen.session, tools=tools)), spread)
 
     def _judged(
         self,
@@ -166,7 +159,7 @@ class Watch:
         truth: str,
         progress: Callable[[str], None] | None,
     ) -> Sighting:
-        problem = problem_with(self._model)
+        problem = problem_with(self._prepared.model)
         plain = evaluate(problem, ())
         excess, frames = _excess(plain), sum(tool.time.size for tool in problem.tools)
         seen = Sighting(truth, frames, (), excess, excess, _rms(plain))
@@ -184,11 +177,11 @@ class Watch:
         if not _moves(problem):
             return replace(seen, remark='the tool moves too little to tell what it is')
         self.searches += 1
-        found = diagnose(problem, self._model, LIGHT, progress)
+        found = diagnose(problem, self._prepared.model, LIGHT, progress)
         left = _excess(evaluate(problem, found.terms))
         if truth == RIGID and found.findings and left >= EXCESS:
             problem = problem_with(found.model)
-            found = diagnose(problem, self._model, LIGHT, progress)
+            found = diagnose(problem, self._prepared.model, LIGHT, progress)
             left = _excess(evaluate(problem, found.terms))
         self._left = left
         return replace(
@@ -201,8 +194,17 @@ class Watch:
         )
 
 
-def _moved(measurements: Measurements, seconds: float) -> Measurements:
-    """The same on a time axis that begins so much earlier."""
+def _moved(session: Session, seconds: float) -> Session:
+    """The session on a time axis that begins so much earlier."""
+    reference = session.reference
+    return replace(
+        session,
+        tools=tuple(_shifted(tool, seconds) for tool in session.tools),
+        reference=None if reference is None else _shifted(reference, seconds),
+    )
+
+
+def _shifted(measurements: Measurements, seconds: float) -> Measurements:
     track = measurements.track
     if track is not None:
         track = replace(track, time=track.time + seconds)

@@ -47,8 +47,8 @@ from anser_ros.calibration.layouts import Layout  # noqa: E402
 from anser_ros.diagnosis.diagnose import Diagnosis, diagnose  # noqa: E402
 from anser_ros.field.model import FieldModel  # noqa: E402
 from anser_ros.field.nominal import nominal_model  # noqa: E402
+from anser_ros.sessions.baseline import baseline_flux  # noqa: E402
 from anser_ros.sessions.calibration import calibrate_sessions  # noqa: E402
-from anser_ros.sessions.evaluation import baseline_flux  # noqa: E402
 from anser_ros.sessions.session import Session, load_session  # noqa: E402
 from anser_ros.sessions.starting_model import board_of  # noqa: E402
 

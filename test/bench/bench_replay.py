@@ -24,8 +24,9 @@ from chain import replay_through_nodes  # noqa: E402
 
 from anser_ros.calibration.calibrate import Options  # noqa: E402
 from anser_ros.sessions.calibration import calibrate_sessions  # noqa: E402
-from anser_ros.sessions.evaluation import metrics, track_session  # noqa: E402
+from anser_ros.sessions.evaluation import track_session  # noqa: E402
 from anser_ros.sessions.model_file import load_model, save_model  # noqa: E402
+from anser_ros.sessions.pose_errors import metrics  # noqa: E402
 from anser_ros.sessions.session import load_session  # noqa: E402
 from anser_ros.sessions.starting_model import model_for  # noqa: E402
 from anser_ros.wire.setup import topic_of  # noqa: E402

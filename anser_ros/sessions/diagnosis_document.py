@@ -1,0 +1,51 @@
+"""The document that a diagnosis leaves, as `docs/interfaces.md` promises it."""
+
+from typing import Any
+
+from anser_ros.diagnosis.diagnose import Finding
+from anser_ros.field.plain_data import plain
+from anser_ros.sessions.diagnosis import SessionDiagnosis
+
+SCHEMA = 'anser_diagnosis/1'
+"""Name of the document's layout, which stands in every such document."""
+DEPENDENCIES = (
+    'time', 'position', 'orientation', 'speed', 'emitter', 'channel', 'amplitude', 'frequency',
+)  # fmt: skip
+"""Variables on which a remainder may be said to depend; other tests are for the report only."""
+BULKY = ('groups', 'knots_s', 'course', 'couplings_m3')
+"""Parameters that only a program needs: lists of hundreds of numbers. They are left out here and
+stand in the model file."""
+
+
+def to_document(result: SessionDiagnosis) -> dict[str, Any]:
+    """What was found as plain data."""
+    found = result.diagnosis
+    return {
+        'schema': SCHEMA,
+        'held_out': {
+            'flux_rms_before_t': found.flux_rms_before_t,
+            'flux_rms_after_t': found.flux_rms_after_t,
+            'flux_rms_floor_t': found.flux_rms_floor_t,
+            'position_rmse_before_m': result.before.position_rmse_m,
+            'position_rmse_after_m': result.after.position_rmse_m,
+            'orientation_rmse_before_rad': result.before.orientation_rmse_rad,
+            'orientation_rmse_after_rad': result.after.orientation_rmse_rad,
+        },
+        'effects': [_effect(finding) for finding in found.findings],
+        'unexplained': {
+            'fraction': found.unexplained,
+            'depends_on': [name for name in found.depends_on if name in DEPENDENCIES],
+        },
+    }
+
+
+def _effect(finding: Finding) -> dict[str, Any]:
+    record = finding.record
+    short = {key: value for key, value in record.parameters.items() if key not in BULKY}
+    return {
+        'name': record.name,
+        'parameters': plain(short),
+        'uncertainty': plain(dict(record.uncertainty)),
+        'evidence': plain(dict(record.evidence)),
+        'flux_rms_without_t': finding.flux_rms_without_t,
+    }

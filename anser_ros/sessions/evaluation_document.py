@@ -1,0 +1,28 @@
+"""The document that an evaluation leaves, as `docs/interfaces.md` promises it."""
+
+from typing import Any
+
+from anser_ros.sessions.evaluation import Evaluation
+from anser_ros.sessions.pose_errors import metrics
+
+SCHEMA = 'anser_evaluation/1'
+"""Name of the document's layout, which stands in every such document."""
+
+
+def to_document(evaluation: Evaluation) -> dict[str, Any]:
+    """The figures of every sensor and body as plain data.
+
+    Where the model followed the references, the number of frames in each state of the refit, and
+    in how many each reference sensor was left out, are there too.
+    """
+    document: dict[str, Any] = {
+        'schema': SCHEMA,
+        'sensors': {name: metrics(series) for name, series in evaluation.sensors.items()},
+        'bodies': {name: metrics(series) for name, series in evaluation.bodies.items()},
+    }
+    if evaluation.refit is not None:
+        document['refit'] = {
+            'states': dict(evaluation.refit.states),
+            'left_out': dict(evaluation.refit.left_out),
+        }
+    return document

@@ -1,0 +1,87 @@
+"""The field model that follows a recorded session's reference sensors, as it does live."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+from anser_ros.errors import BagError, FitError
+from anser_ros.field.model import FieldModel
+from anser_ros.refit.baseline import check_enough
+from anser_ros.refit.change import Pace
+from anser_ros.refit.live_refit import LiveRefit, RefitResult, RefitSettings
+from anser_ros.sessions.frames import Frame
+from anser_ros.sessions.patches import PatchFollower
+from anser_ros.sessions.prepared import PreparedSession
+from anser_ros.sessions.volume import stated_volume
+
+
+@dataclass
+class RefitSummary:
+    """In how many frames the refit was in which state, and left out which reference sensor."""
+
+    states: Counter[str] = field(default_factory=Counter)
+    left_out: Counter[str] = field(default_factory=Counter)
+
+    def add(self, result: RefitResult) -> None:
+        """Count one frame's result."""
+        self.states[result.state] += 1
+        self.left_out.update(result.left_out)
+
+
+class ModelFollower:
+    """Refits the model to the reference sensors frame by frame, at the pace of the live node.
+
+    Parameters
+    ----------
+    prepared : PreparedSession
+        With references and a baseline.
+    patches : dict of str to str, optional
+        Bodies that carry further reference coils, each with the topic of its poses in the bag.
+
+    Attributes
+    ----------
+    summary : RefitSummary
+        What the refit did so far.
+
+    Raises
+    ------
+    BagError
+        When the session has no reference fluxes, when there is no baseline or one of too few
+        sensors, or when the session lacks what a patch needs.
+    """
+
+    def __init__(self, prepared: PreparedSession, patches: dict[str, str] | None = None) -> None:
+        session, baseline = prepared.session, prepared.baseline
+        if session.reference is None:
+            raise BagError(f'{session.path}: a refit needs reference fluxes, the session has none')
+        if baseline is None:
+            raise BagError(
+                'a refit needs --baseline, a distortion-free recording of the same board'
+            )
+        try:
+            check_enough(baseline.flux, RefitSettings().min_references)
+        except FitError as error:
+            raise BagError(f'{baseline.path}: {error}') from error
+        self._patches = PatchFollower(prepared, patches) if patches else None
+        self._refit = self._patches or LiveRefit(
+            prepared.model,
+            session.reference.sensors,
+            baseline.flux,
+            drawing=prepared.drawing.field,
+            volume=stated_volume(session.setup),
+        )
+        self._pace = Pace()
+        self.summary = RefitSummary()
+
+    def model_at(self, frame: Frame) -> FieldModel | None:
+        """The model for a frame and those after it; None where the one in force stays."""
+        if self._patches is not None and frame.tools is not None:
+            tools = frame.tools
+            self._patches.take_flux(frame.stamp_ns, tools.channels, tools.flux, tools.flags)
+        reference = frame.reference
+        if reference is None or not self._pace.is_due(frame.stamp_ns):
+            return None
+        result = self._refit.update(
+            frame.stamp_ns, reference.channels, reference.flux, reference.flags
+        )
+        self.summary.add(result)
+        return result.model

@@ -1,0 +1,81 @@
+"""A recorded session as the frames that its nodes received, one after the other."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.field.measurements import Measurements
+from anser_ros.sessions.session import NANO, Session
+
+ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class Readings:
+    """What S sensors read in one frame.
+
+    Attributes
+    ----------
+    channels : ndarray of int, shape (S,)
+        Channel of each sensor.
+    flux : ndarray, shape (S, K), complex
+        T.
+    flags : ndarray of int, shape (S,)
+        Flag bits of the flux messages.
+    """
+
+    channels: NDArray[np.int64]
+    flux: ComplexArray
+    flags: NDArray[np.int64]
+
+    def in_phase(self) -> 'Readings':
+        """The same without the fluxes' quadrature parts."""
+        return replace(self, flux=self.flux.real.astype(complex))
+
+
+@dataclass(frozen=True)
+class Frame:
+    """All that was measured under one stamp.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Stamp of the flux messages.
+    tools : Readings or None
+        Of all tool sensors; None where only the references were read.
+    reference : Readings or None
+        Of the reference sensors; None where only tools were read.
+    """
+
+    stamp_ns: int
+    tools: Readings | None
+    reference: Readings | None
+
+
+def frames_of(session: Session) -> Iterator[Frame]:
+    """Every stamp of a session in order, with what was measured under it."""
+    rows: dict[float, tuple[list[tuple[Measurements, int]], list[int]]] = {}
+    for tool in session.tools:
+        for row, time in enumerate(tool.time.tolist()):
+            rows.setdefault(time, ([], []))[0].append((tool, row))
+    if session.reference is not None:
+        for row, time in enumerate(session.reference.time.tolist()):
+            rows.setdefault(time, ([], []))[1].append(row)
+    for time in sorted(rows):
+        tools, references = rows[time]
+        reference = None
+        if session.reference is not None and references:
+            reference = _readings([(session.reference, references[0])])
+        yield Frame(
+            session.start_ns + round(time / NANO), _readings(tools) if tools else None, reference
+        )
+
+
+def _readings(rows: list[tuple[Measurements, int]]) -> Readings:
+    return Readings(
+        np.concatenate([body.sensors.channel for body, _ in rows]),
+        np.concatenate([body.flux[row] for body, row in rows]),
+        np.concatenate([body.flags[row] for body, row in rows]),
+    )

@@ -1,0 +1,122 @@
+"""Errors of tracked poses against the optical ones, and the figures that are quoted of them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.tracking.estimate import OK, PoseEstimate
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PoseSeries:
+    """Every estimate of one sensor or body, with its error where the truth is known.
+
+    Attributes
+    ----------
+    name : str
+        Of the sensor or body.
+    estimates : tuple of PoseEstimate, length F
+        One a frame.
+    position_error : ndarray, shape (F,)
+        Distance from the optical pose, m; NaN where there is no pose or no optical one.
+    orientation_error : ndarray, shape (F,)
+        Angle to the optical pose, rad: of a sensor between the axes, of a body the whole turn;
+        NaN as above.
+    """
+
+    name: str
+    estimates: tuple[PoseEstimate, ...]
+    position_error: Array
+    orientation_error: Array
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """Mask (F,) of the frames in which a pose was given."""
+        return np.array([estimate.state == OK for estimate in self.estimates], dtype=bool)
+
+
+def sensor_series(
+    name: str, estimates: Sequence[PoseEstimate], centres: Array, axes: Array
+) -> PoseSeries:
+    """Compare a sensor's poses with where it truly was.
+
+    Parameters
+    ----------
+    name : str
+        Of the sensor.
+    estimates : sequence of PoseEstimate, length F
+        One a frame.
+    centres, axes : ndarray, shape (F, 3)
+        True centres (m) and unit axes, frame fg; NaN where they are not known.
+    """
+    distance, angle = np.full(len(estimates), np.nan), np.full(len(estimates), np.nan)
+    for i, estimate in enumerate(estimates):
+        if estimate.state == OK:
+            distance[i] = np.linalg.norm(estimate.position - centres[i])
+            cross = np.linalg.norm(np.cross(estimate.axis, axes[i]))
+            angle[i] = np.arctan2(cross, float(np.dot(estimate.axis, axes[i])))
+    return PoseSeries(name, tuple(estimates), distance, angle)
+
+
+def body_series(
+    name: str, estimates: Sequence[PoseEstimate], position: Array, rotation: Array
+) -> PoseSeries:
+    """Compare a body's poses with the true ones.
+
+    Parameters
+    ----------
+    name : str
+        Of the body.
+    estimates : sequence of PoseEstimate, length F
+        One a frame.
+    position : ndarray, shape (F, 3)
+        True positions, m, frame fg; NaN where they are not known.
+    rotation : ndarray, shape (F, 3, 3)
+        True rotation matrices from the body's frame to fg.
+    """
+    distance, angle = np.full(len(estimates), np.nan), np.full(len(estimates), np.nan)
+    for i, estimate in enumerate(estimates):
+        if estimate.state == OK and estimate.rotation is not None:
+            distance[i] = np.linalg.norm(estimate.position - position[i])
+            turn = estimate.rotation.T @ rotation[i]
+            sine = 0.5 * np.linalg.norm(
+                [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+            )
+            angle[i] = np.arctan2(sine, 0.5 * (np.trace(turn) - 1.0))
+    return PoseSeries(name, tuple(estimates), distance, angle)
+
+
+def metrics(series: PoseSeries) -> dict[str, Any]:
+    """The figures of one sensor or body as the evaluation document has them.
+
+    These are the number of compared poses, the share of frames with a pose, and the RMSE, mean
+    error, 50th and 95th percentile (equation 7 of the article) of position and orientation; None
+    where nothing could be compared.
+    """
+    result: dict[str, Any] = {
+        'n': int(np.isfinite(series.position_error).sum()),
+        'tracked_fraction': float(series.ok.mean()) if series.ok.size else 0.0,
+    }
+    for key, unit, errors in (
+        ('position', 'm', series.position_error),
+        ('orientation', 'rad', series.orientation_error),
+    ):
+        for statistic, value in _statistics(errors[np.isfinite(errors)]).items():
+            result[f'{key}_{statistic}_{unit}'] = value
+    return result
+
+
+def _statistics(errors: Array) -> dict[str, float | None]:
+    if not errors.size:
+        return dict.fromkeys(('rmse', 'me', 'prc50', 'prc95'))
+    return {
+        'rmse': float(np.sqrt(np.mean(errors**2))),
+        'me': float(errors.mean()),
+        'prc50': float(np.percentile(errors, 50)),
+        'prc95': float(np.percentile(errors, 95)),
+    }

@@ -1,0 +1,163 @@
+"""A session with everything about it that is worked out once and then only read.
+
+All that evaluates or diagnoses a session starts with `prepare` and hands its result on: the board,
+the noise, the baseline and the corrections are the same wherever they are needed, and the model
+has been checked against the session.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from anser_ros.effects.correction import Correction
+from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import FieldModel
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.volume import TrackedVolume
+from anser_ros.sessions.baseline import Baseline, baseline_of
+from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.recorded_drift import is_recorded
+from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, Session, noise_of
+from anser_ros.sessions.starting_model import check_fits
+from anser_ros.sessions.volume import pose_volume
+
+
+@dataclass(frozen=True)
+class PreparedSession:
+    """A session and a model that fits it, with what follows from the two.
+
+    Attributes
+    ----------
+    session : Session
+        What was recorded.
+    model : FieldModel
+        Of the session's emitters.
+    drawing : Drawing
+        The emitters as the setup draws them.
+    noise_t : float
+        What the setup says that the fluxes' components scatter by, T; 0 where it says nothing.
+    volume : TrackedVolume
+        The box in which poses are accepted.
+    baseline : Baseline or None
+        Clean readings of the session's reference sensors.
+    correction : Correction
+        Undoes the effects that the model knows.
+    recorded_drift : bool
+        Whether the model's drifts took their course on this very session.
+    """
+
+    session: Session
+    model: FieldModel
+    drawing: Drawing
+    noise_t: float
+    volume: TrackedVolume
+    baseline: Baseline | None
+    correction: Correction
+    recorded_drift: bool
+
+    @property
+    def sensors(self) -> SensorTable:
+        """All tool sensors, one body after the other, as the setup has them."""
+        return self.session.sensors
+
+    def with_session(self, session: Session) -> 'PreparedSession':
+        """The same for a part of the session, or for another recording of the same setup."""
+        return replace(self, session=session, recorded_drift=is_recorded(self.model, session))
+
+    def with_model(self, model: FieldModel) -> 'PreparedSession':
+        """The same with another model.
+
+        Raises
+        ------
+        ModelFileError
+            When the model's emitters are not the session's, or an effect of it is unknown.
+        """
+        check_fits(model, self.session)
+        return replace(
+            self,
+            model=model,
+            correction=_correction(model, self.session),
+            recorded_drift=is_recorded(model, self.session),
+        )
+
+
+def prepare(
+    session: Session, model: FieldModel, baseline: Session | None = None
+) -> PreparedSession:
+    """Check a model against a session, and work out what follows from the two.
+
+    Parameters
+    ----------
+    session : Session
+        What was recorded.
+    model : FieldModel
+        Calibrated or nominal.
+    baseline : Session, optional
+        Distortion-free recording of the same board; its readings are not used where the session
+        has no reference fluxes.
+
+    Raises
+    ------
+    ModelFileError
+        When the model's emitters are not the session's or the baseline's, or an effect of it is
+        unknown.
+    BagError
+        When the baseline's references are not the session's.
+    """
+    check_fits(model, session)
+    clean = None
+    if baseline is not None:
+        check_fits(model, baseline)
+        if session.reference is not None:
+            clean = baseline_of(baseline, session.reference.sensors)
+    return PreparedSession(
+        session,
+        model,
+        Drawing.of(session.setup),
+        noise_of(session.setup),
+        pose_volume(session.setup),
+        clean,
+        _correction(model, session),
+        is_recorded(model, session),
+    )
+
+
+def _correction(model: FieldModel, session: Session) -> Correction:
+    return Correction.of(model.effects, session.sensors, model.frequencies_hz)
+
+
+def correct(prepared: PreparedSession) -> PreparedSession:
+    """The session as the effects that the model knows already leave it.
+
+    Fluxes are those that sound sensors and emitters would have given, sensors are where they
+    truly are, and optical poses are on the fluxes' clock and in the frame fg.
+    """
+    session = prepared.session
+    tools = tuple(_corrected(prepared, tool) for tool in session.tools)
+    reference = session.reference
+    if reference is not None:
+        reference = _corrected(prepared, reference)
+    return prepared.with_session(replace(session, tools=tools, reference=reference))
+
+
+def _corrected(prepared: PreparedSession, measurements: Measurements) -> Measurements:
+    correction, flux = prepared.correction, measurements.flux
+    if not correction.terms:
+        return measurements
+    if correction.changes_flux:
+        channels, recorded = measurements.sensors.channel, prepared.recorded_drift
+        rows = zip(measurements.time.tolist(), flux, strict=True)
+        flux = np.array(
+            [correction.flux(time, channels, frame, recorded=recorded) for time, frame in rows]
+        )
+    return with_truth(replace(measurements, flux=flux), correction)
+
+
+def with_truth(measurements: Measurements, correction: Correction) -> Measurements:
+    """Measurements whose sensors and optical poses are as a model's corrections say."""
+    out = replace(measurements, sensors=correction.sensors(measurements.sensors))
+    if measurements.track is None:
+        return out
+    track = correction.optical(measurements.track)
+    position, rotation, has_pose = track.at(measurements.time, LONGEST_OPTICAL_GAP_S)
+    return replace(out, track=track, position=position, rotation=rotation, has_pose=has_pose)

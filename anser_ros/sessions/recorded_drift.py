@@ -1,0 +1,31 @@
+"""Drifts of emitters, whose course over time holds on the session they were found on only.
+
+A diagnosis notes that session in the drift's evidence, by its first stamp, so that a later
+evaluation can tell whether it tracks the same session.
+"""
+
+from dataclasses import replace
+
+from anser_ros.effects.correction import DRIFTS
+from anser_ros.field.model import FieldModel
+from anser_ros.sessions.session import Session
+
+FOUND_ON = 'session_start_ns'
+"""Key in a drift's evidence: the first stamp, ns, of the session on which it took its course."""
+
+
+def date_drifts(model: FieldModel, session: Session) -> FieldModel:
+    """The model, with drifts that are not dated yet dated by the session they were found on."""
+    effects = tuple(
+        replace(effect, evidence={**effect.evidence, FOUND_ON: session.start_ns})
+        if effect.name in DRIFTS and FOUND_ON not in effect.evidence
+        else effect
+        for effect in model.effects
+    )
+    return replace(model, effects=effects)
+
+
+def is_recorded(model: FieldModel, session: Session) -> bool:
+    """Whether this is the session on which one of the model's drifts was found."""
+    found = [effect.evidence.get(FOUND_ON) for effect in model.effects if effect.name in DRIFTS]
+    return session.start_ns in found

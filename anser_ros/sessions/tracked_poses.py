@@ -1,0 +1,104 @@
+"""Poses of a recorded session, tracked as the live nodes would."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from anser_ros.errors import BagError
+from anser_ros.field.model import FieldModel
+from anser_ros.sessions.follower import ModelFollower, RefitSummary
+from anser_ros.sessions.frames import frames_of
+from anser_ros.sessions.prepared import PreparedSession
+from anser_ros.tracking.tracker import PoseEstimate, Tracker, TrackerSettings
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class TrackedPoses:
+    """What tracking a session gave.
+
+    Attributes
+    ----------
+    estimates : dict of str to tuple of PoseEstimate
+        Of every sensor and body by its name, one a frame, in the order of the stamps.
+    seconds_per_frame : float
+        Mean wall time that a frame took, the refit included.
+    refit : RefitSummary or None
+        What the refit did; None where the model did not follow the references.
+    """
+
+    estimates: dict[str, tuple[PoseEstimate, ...]]
+    seconds_per_frame: float
+    refit: RefitSummary | None = None
+
+
+def in_phase_model(model: FieldModel) -> FieldModel:
+    """The model without its quadrature part, as the article's own method uses it."""
+    modes = None if model.modes is None else model.modes.real.astype(complex)
+    return replace(model, moments=model.moments.real.astype(complex), modes=modes)
+
+
+def track(
+    prepared: PreparedSession,
+    settings: TrackerSettings | None = None,
+    follower: ModelFollower | None = None,
+    in_phase: bool = False,
+    progress: Progress | None = None,
+) -> TrackedPoses:
+    """Track every tool sensor and body of a session at every frame.
+
+    The optical pose is never used: neither as a start value nor to refuse a pose.
+
+    Parameters
+    ----------
+    prepared : PreparedSession
+        The session and its model.
+    settings : TrackerSettings, optional
+        Noise that the setup states is used where it is more than that of the settings.
+    follower : ModelFollower, optional
+        Refits the model on the way.
+    in_phase : bool
+        Whether only the fluxes' in-phase parts are used, for an `in_phase_model`.
+    progress : callable, optional
+        Called with the finished share, 0 to 1.
+
+    Raises
+    ------
+    BagError
+        When the session has no tool fluxes.
+    """
+    if not prepared.session.tools:
+        raise BagError(f'{prepared.session.path}: the session has no tool fluxes to track')
+    tracker = _tracker(prepared, settings or TrackerSettings(), follows=follower is not None)
+    estimates: dict[str, list[PoseEstimate]] = {}
+    frames = list(frames_of(prepared.session))
+    start = time.perf_counter()
+    for count, frame in enumerate(frames, start=1):
+        model = None if follower is None else follower.model_at(frame)
+        if model is not None:
+            tracker = tracker.with_model(model)
+        if frame.tools is not None:
+            seen = frame.tools.in_phase() if in_phase else frame.tools
+            found = tracker.update(frame.stamp_ns, seen.channels, seen.flux, seen.flags)
+            for estimate in found:
+                estimates.setdefault(estimate.name, []).append(estimate)
+        if progress is not None:
+            progress(count / len(frames))
+    seconds = (time.perf_counter() - start) / max(len(frames), 1)
+    by_name = {name: tuple(given) for name, given in estimates.items()}
+    return TrackedPoses(by_name, seconds, None if follower is None else follower.summary)
+
+
+def _tracker(prepared: PreparedSession, settings: TrackerSettings, *, follows: bool) -> Tracker:
+    """A tracker told of the session's noise, and of a drift's course where nothing else tells."""
+    return Tracker(
+        prepared.model,
+        prepared.sensors,
+        replace(
+            settings,
+            flux_noise_t=max(settings.flux_noise_t, prepared.noise_t),
+            recorded_drift=prepared.recorded_drift and not follows,
+            volume=settings.volume or prepared.volume,
+        ),
+    )
