@@ -1,6 +1,8 @@
 """The refit inside its node: marker, centroid, health with names, services, moving patches."""
 
+import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -361,7 +363,27 @@ def test_what_is_no_patch_is_refused(make):
         patches.take_pose('fg', pose_message(1, [0, 0, 0], 'camera'))
     with pytest.raises(FrameError, match='is no pose'):
         patches.take_pose('fg', pose_message(1, [np.nan, 0, 0]))
-    patches.close()
+
+
+def test_a_patch_leaves_no_thread_when_its_refit_is_worked_out(ros):
+    from anser_ros.nodes.patches import WORKER, Patches
+
+    def workers():
+        return [t for t in threading.enumerate() if t.name.startswith(WORKER)]
+
+    world, position, axis = anser_world(), *np.array(PATCH_COILS[0])[:, None]
+    coil = world.references.select([0]).with_geometry(position, axis)
+    patches = Patches(replace(coil, channel=np.array([40]), body=('patch',)), world.baseline, 'fg')
+    refit = patches.started(world.model, world.references)
+    patches.take_pose('patch', pose_message(1, [0.02, 0.05, 0.16]))
+    assert patches.moved_refit(refit, 1) is None and workers()
+    end = time.monotonic() + 20.0
+    while patches.moved_refit(refit, 1) is None:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    for thread in workers():
+        thread.join(timeout=5.0)
+    assert not workers()
 
 
 def test_markers_of_nothing_and_of_one_source(ros):

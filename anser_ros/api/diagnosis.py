@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from anser_ros.api.model import Model
-from anser_ros.sessions.diagnosis import diagnose_session, to_document
+from anser_ros.sessions.diagnosis import diagnose_session
+from anser_ros.sessions.diagnosis_document import to_document
 from anser_ros.sessions.session import Session
 
 

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.api.model import Model
-from anser_ros.sessions.evaluation import PoseSeries, metrics, track_session
+from anser_ros.sessions.evaluation import track_session
+from anser_ros.sessions.evaluation_document import to_document
+from anser_ros.sessions.pose_errors import PoseSeries
 from anser_ros.sessions.session import NANO, Session
 from anser_ros.tracking.estimate import TrackerSettings
 
@@ -149,12 +151,10 @@ def track(
     usual = TrackerSettings()
     settings = usual if gate is None else TrackerSettings(gate=gate)
     found = track_session(session, model.field, settings, baseline, refit, progress=progress)
-    figures: dict[str, Any] = {'schema': 'anser_evaluation/1'}
     tables: dict[str, dict[str, TrackedPoses]] = {}
     for group, series in (('sensors', found.sensors), ('bodies', found.bodies)):
-        figures[group] = {name: metrics(one) for name, one in series.items()}
         tables[group] = {name: _poses(one, session.start_ns) for name, one in series.items()}
-    return TrackingResult(tables['sensors'], tables['bodies'], figures)
+    return TrackingResult(tables['sensors'], tables['bodies'], to_document(found))
 
 
 def _poses(series: PoseSeries, start_ns: int) -> TrackedPoses:

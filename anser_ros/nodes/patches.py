@@ -19,6 +19,9 @@ from anser_ros.tracking.rotations import rotation_of_quaternion
 
 ComplexArray = NDArray[np.complex128]
 
+WORKER = 'patches'
+"""Name of the thread that works a refit out; there is none while nothing is worked out."""
+
 
 class Patches(PatchCoils):
     """Patches that messages tell of; a refit for new places is worked out beside the callbacks.
@@ -36,12 +39,7 @@ class Patches(PatchCoils):
     def __init__(self, coils: SensorTable, fixed: ComplexArray, frame_id: str) -> None:
         super().__init__(coils, fixed)
         self._frame_id = frame_id
-        self._worker = ThreadPoolExecutor(max_workers=1)
         self._pending: tuple[Future[LiveRefit], SensorTable] | None = None
-
-    def close(self) -> None:
-        """End the worker."""
-        self._worker.shutdown(wait=False, cancel_futures=True)
 
     def take_pose(self, body: str, message: PoseStamped) -> None:
         """Keep a body's pose.
@@ -81,5 +79,7 @@ class Patches(PatchCoils):
             return work.result()
         now, known = self.where(stamp_ns)
         if known.any() and self.must_rebuild(now):
-            self._pending = (self._worker.submit(self.rebuilt, refit, now), now)
+            worker = ThreadPoolExecutor(1, thread_name_prefix=WORKER)
+            self._pending = (worker.submit(self.rebuilt, refit, now), now)
+            worker.shutdown(wait=False)  # its thread ends with the work, whoever still asks for it
         return None

@@ -23,7 +23,7 @@ from anser_ros.sessions.follower import ModelFollower
 from anser_ros.sessions.prepared import PreparedSession, correct, prepare
 from anser_ros.sessions.recorded_drift import date_drifts
 from anser_ros.sessions.session import Session
-from anser_ros.sessions.tracked_poses import track
+from anser_ros.sessions.tracked_session import track
 from anser_ros.tracking.estimate import TrackerSettings
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ from anser_ros.sessions.follower import ModelFollower, RefitSummary
 from anser_ros.sessions.pose_errors import PoseSeries, body_series, sensor_series
 from anser_ros.sessions.prepared import PreparedSession, prepare, with_truth
 from anser_ros.sessions.session import Session
-from anser_ros.sessions.tracked_poses import Progress, TrackedPoses, in_phase_model, track
+from anser_ros.sessions.tracked_session import Progress, TrackedSession, in_phase_model, track
 from anser_ros.tracking.estimate import TrackerSettings
 
 
@@ -83,7 +83,7 @@ def track_session(
     return compare(prepared, tracked)
 
 
-def compare(prepared: PreparedSession, tracked: TrackedPoses) -> Evaluation:
+def compare(prepared: PreparedSession, tracked: TrackedSession) -> Evaluation:
     """Compare tracked poses with the optical ones, as the model's corrections place these."""
     sensors: dict[str, PoseSeries] = {}
     bodies: dict[str, PoseSeries] = {}

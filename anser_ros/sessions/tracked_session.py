@@ -15,7 +15,7 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
-class TrackedPoses:
+class TrackedSession:
     """What tracking a session gave.
 
     Attributes
@@ -45,7 +45,7 @@ def track(
     follower: ModelFollower | None = None,
     in_phase: bool = False,
     progress: Progress | None = None,
-) -> TrackedPoses:
+) -> TrackedSession:
     """Track every tool sensor and body of a session at every frame.
 
     The optical pose is never used: neither as a start value nor to refuse a pose.
@@ -87,7 +87,7 @@ def track(
             progress(count / len(frames))
     seconds = (time.perf_counter() - start) / max(len(frames), 1)
     by_name = {name: tuple(given) for name, given in estimates.items()}
-    return TrackedPoses(by_name, seconds, None if follower is None else follower.summary)
+    return TrackedSession(by_name, seconds, None if follower is None else follower.summary)
 
 
 def _tracker(prepared: PreparedSession, settings: TrackerSettings, *, follows: bool) -> Tracker:
