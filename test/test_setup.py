@@ -11,7 +11,7 @@ from anser_ros.errors import SetupError
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit.clouds import default_clouds
 from anser_ros.refit.excitation import region_of
-from anser_ros.sessions.starting_model import drawing_of
+from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.volume import pose_volume, stated_volume
 from anser_ros.wire.setup import dump_setup, parse_setup, topic_of
 
@@ -145,7 +145,7 @@ def test_without_a_stated_volume_it_follows_from_the_board():
     """The tracker's box is the refit's with its fringe: to the digit what it always was."""
     setup = parse_setup(DEMO.read_text())
     assert pose_volume(setup) == TrackedVolume()
-    region = region_of(drawing_of(setup))
+    region = region_of(Drawing.of(setup).field)
     np.testing.assert_allclose(region.volume.low, [-0.174, -0.174, 0.045], atol=5e-4)
     np.testing.assert_allclose(region.volume.high, [0.174, 0.174, 0.302], atol=5e-4)
     box = ((-0.1, -0.12, 0.06), (0.1, 0.1, 0.3))

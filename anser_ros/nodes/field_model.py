@@ -34,10 +34,11 @@ from anser_ros.refit.change import MOST_RATE_HZ, Pace
 from anser_ros.refit.live_refit import LiveRefit, RefitResult, RefitSettings
 from anser_ros.refit.result import FEW_REFERENCES, POOR_FIT
 from anser_ros.sessions.baseline import baseline_flux
+from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.model_file import load_model, save_model
 from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session, sensor_table
-from anser_ros.sessions.starting_model import NOMINAL, board_of, drawing_of
+from anser_ros.sessions.starting_model import NOMINAL, board_of
 from anser_ros.sessions.volume import stated_volume
 from anser_ros.wire.setup import Setup, parse_setup
 
@@ -272,7 +273,7 @@ class FieldModelNode(AnserNode):
         if self._base is None or self._references is None or self._setup is None:
             raise FitError('no setup yet')
         # An emitter that can't be drawn: its own dipoles have to do.
-        drawing = drawing_of(self._setup)
+        drawing = Drawing.of(self._setup).field
         volume = stated_volume(self._setup)
         bodies = tuple(self._patch_topics)
         moving = tuple(s for s in self._setup.tool_sensors if s.body in bodies)
