@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from diagnosis_world import world
 
-from anser_ros.diagnosis.refine import belongs_to
 from anser_ros.effects.correction import Correction
-from anser_ros.effects.effect import Effect, Remedy, Term
+from anser_ros.effects.effect import Effect, Remedy
 from anser_ros.effects.metal_path import FreePath, StraightPath, moving_times
 from anser_ros.effects.metal_remainder import REMAINDER, UP_M, Couplings, Lighting
 from anser_ros.effects.prediction import reference_view, tool_view
 from anser_ros.effects.registry import all_effects, effect_named
 from anser_ros.effects.saturation import compressed
+from anser_ros.effects.term import Term
 from anser_ros.errors import ModelFileError
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.model import EffectRecord
@@ -59,7 +59,7 @@ def _visiting(scene) -> Term:
     term = effect.starting(path, theta, 2.4, np.array([-2.0, -0.3]))
     rng = np.random.default_rng(4)
     modes = 0.02 * rng.normal(size=(lattice(0.035).size, 3))
-    rich = effect.with_body(term, 'extended 35 mm', modes, np.ones(3))
+    rich = term.with_body('extended 35 mm', modes, np.ones(3))
     return rich.with_theta(np.concatenate([theta, rng.normal(size=6)]))
 
 
@@ -68,7 +68,7 @@ def _candidates(scene) -> list[Term]:
     terms, seen = [], set()
     for effect in all_effects().values():
         for term in effect.candidates(scene):
-            kind = (effect.name, tuple(sorted(k for k in term.site if k[0] != '_')))
+            kind = (effect.name, tuple(sorted(term.site)))
             if term.theta.size and kind not in seen:
                 seen.add(kind)
                 terms.append(term)
@@ -203,19 +203,6 @@ def test_a_correction_keeps_missing_readings_missing(scenery):
     assert nothing.flux(0.0, np.array([0, 1]), flux) is flux
 
 
-def test_references_tell_the_strength_of_a_drifting_emitter(scenery):
-    made, problem = scenery
-    record = EffectRecord('coil_drift', {'coil': 2, 'amount': 0.5, 'tau_s': 1.0})
-    correction = Correction.of([record], problem.tools[0].sensors, made.model.frequencies_hz)
-    now = made.baseline * np.array([1.0, 1.0, 0.9, 1.0])
-    now[3] = np.nan
-    strengths = correction.strengths(now, made.baseline)
-    np.testing.assert_allclose(strengths, [1.0, 1.0, 0.9, 1.0], atol=1e-12)
-    flux = np.ones((1, 4), dtype=complex)
-    back = correction.flux(100.0, np.array([0]), flux, strengths)
-    np.testing.assert_allclose(back[0], [1.0, 1.0, 1 / 0.9, 1.0])
-
-
 def test_a_drift_is_left_alone_where_nothing_tells_its_course(scenery):
     made, problem = scenery
     record = EffectRecord('coil_drift', {'coil': 2, 'amount': 0.5, 'tau_s': 1.0})
@@ -299,9 +286,9 @@ def test_moving_metal_is_where_it_says(scenery, made):
     view = tool_view(problem.tools[0], [], problem.fields)
     moved = term.effect.moving_flux(term, view)
     frame = 30
-    sources = term.effect.sources_at(
-        term, problem.fields.illumination, problem.fields.omega, float(view.time[frame])
-    )
+    centre = term.centres(view.time[[frame]])[0]
+    fields = problem.fields
+    sources = term.shapes.sources(centre, term.couplings, fields.illumination, fields.omega)
     alone = sources.flux(view.centres[frame], view.axes[frame], None)
     scale = np.abs(alone).max()
     np.testing.assert_allclose(moved[frame], alone, rtol=2e-3, atol=1e-3 * scale)
@@ -429,8 +416,9 @@ def test_leftovers_are_linear_and_belong_to_their_metal(scenery):
         Lighting([parent], problem.apparatus.emitters),
     ):
         term = REMAINDER.of(parent, leftover)
-        assert belongs_to(term, parent.frozen(np.zeros((0, 0))))
-        assert not belongs_to(term, replace(parent, site={'place': (9.0, 9.0, 9.0)}))
+        assert term.belongs_to(parent.hold())
+        assert not term.belongs_to(replace(parent, site={'place': (9.0, 9.0, 9.0)}))
+        assert not parent.belongs_to(term)
         term = term.with_theta(rng.normal(size=leftover.count))
         more = tool_view(problem.tools[0], [term], problem.fields).flux - view.flux
         columns = REMAINDER.columns(term, view)

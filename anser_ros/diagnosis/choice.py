@@ -2,30 +2,10 @@
 
 from collections.abc import Sequence
 
+from anser_ros.diagnosis.decisions import FROM_OTHERS, NOTHING_LEFT, STEADY, as_good
 from anser_ros.diagnosis.fit import Fit, misfit
-from anser_ros.diagnosis.fluctuating import is_of
 from anser_ros.diagnosis.structure import noise_scale
-from anser_ros.effects.effect import Term
-from anser_ros.effects.fluctuation import Fluctuation
-
-OPEN = 40
-"""Parameters that a fluctuation counts for: more than a constant has, less than shaped metal."""
-SHAPED = 60
-"""Parameters that metal that moves counts for at least: it is shaped once it is taken."""
-STEADY = 0.8
-"""Share of a fluctuation's gain from which a constant, or a curve, of the same coil or channel is
-tried first: freedom in every frame also takes off what is another effect's."""
-OTHERS = 2.0
-"""What a fluctuation takes off others, over what values alike would lose."""
-NOTHING_LEFT = 1.04
-"""Misfit over the noise's up to which nothing but noise is left."""
-
-
-def complexity(term: Term) -> int:
-    """Parameters that are paid for when explanations are compared."""
-    if isinstance(term.effect, Fluctuation):
-        return OPEN
-    return max(int(term.theta.size), SHAPED if term.effect.moving else 0)
+from anser_ros.effects.effect import Family
 
 
 def at_floor(fit: Fit) -> bool:
@@ -38,11 +18,7 @@ def taken_from_others(fit: Fit) -> float:
 
     Along each of its columns a frame loses one value's share of whatever stays.
     """
-    spread = fit.terms[-1].site.get('_spread')
-    if spread is None:
-        return 0.0
-    frames = int(fit.terms[-1].site.get('_frames', 0))
-    return OTHERS * frames * len(spread) * max(misfit(fit) - 1.0, 0.0)
+    return FROM_OTHERS * fit.newest.effect.freedom(fit.newest) * max(misfit(fit) - 1.0, 0.0)
 
 
 def choose(fitted: Sequence[tuple[float, Fit]]) -> tuple[float, Fit]:
@@ -51,25 +27,26 @@ def choose(fitted: Sequence[tuple[float, Fit]]) -> tuple[float, Fit]:
     Where several leave nothing but noise, the simplest is the explanation.
     """
     gain, best = max(fitted, key=lambda pair: pair[0])
+    newest = best.newest
     steady = [
-        (g, f) for g, f in fitted if g > STEADY * gain and is_of(best.terms[-1], f.terms[-1])
+        (g, f) for g, f in fitted if g > STEADY * gain and newest.effect.rivals(newest, f.newest)
     ]
     if steady:
         gain, best = max(steady, key=lambda pair: pair[0])
-    most = complexity(best.terms[-1])
+    most = best.newest.complexity
     simpler = [
         (g, f)
         for g, f in fitted
-        if complexity(f.terms[-1]) < most
-        and gain - g < (10 + 4 * (most - complexity(f.terms[-1]))) * max(misfit(best), 1.0)
+        if f.newest.complexity < most
+        and gain - g < as_good(most - f.newest.complexity) * max(misfit(best), 1.0)
     ]
     simpler += [
         (g, f)
         for g, f in fitted
-        if isinstance(f.terms[-1].effect, Fluctuation)
-        and complexity(f.terms[-1]) < most
+        if f.newest.effect.family is Family.FLUCTUATION
+        and f.newest.complexity < most
         and at_floor(f)
     ]
     if not simpler:
         return gain, best
-    return min(simpler, key=lambda pair: (complexity(pair[1].terms[-1]), -pair[0]))
+    return min(simpler, key=lambda pair: (pair[1].newest.complexity, -pair[0]))

@@ -12,29 +12,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.diagnosis.decisions import (
+    CHANGED,
+    CLEAR,
+    LARGEST_VARIATION,
+    LEAST_OF_THE_REST,
+    MANY,
+    SOMETHING_LEFT,
+    TIME_PARTS,
+    WRONG_BY,
+)
 from anser_ros.diagnosis.fit import Fit, misfit
-from anser_ros.diagnosis.fluctuating import is_of
 from anser_ros.diagnosis.problem import Part, Problem, State, evaluate
-from anser_ros.diagnosis.refine import METALS, belongs_to
 from anser_ros.diagnosis.whitening import parts
-from anser_ros.effects.effect import Term
-from anser_ros.effects.fluctuation import Fluctuation
-from anser_ros.effects.metal_remainder import REMAINDER
+from anser_ros.effects.effect import INEXACT, Family
+from anser_ros.effects.term import Term
 
 Array = NDArray[np.float64]
-
-TIME_PARTS = 6
-LARGEST_VARIATION = 0.1
-"""Share of an effect's power that may vary."""
-LEAST_OF_THE_REST = 0.2
-"""An effect that takes off less than this share of what stays unexplained is not named."""
-CLEAR = 6.0
-"""Standard deviations of the noise's power from which a remainder counts."""
-WRONG_BY = 1.3
-"""Variance over the noise's up to which a field model may be wrong, whatever it says: of a board
-beyond what was scanned. It is not held against an effect on everything."""
-MANY = 3
-"""So many effects of one name stand in for something else that they have in common."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +60,7 @@ class Confirmation:
     variation: float
     share_of_rest: float
     remainder: float = 0.0
-    inexact: float = 0.01
+    inexact: float = INEXACT
     alike: int = 1
     plausible: bool = True
     helps: bool = True
@@ -101,11 +95,11 @@ class Confirmation:
 
 def confirm(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmation:
     """Check one term of a fit; ``noise`` is the variance of the whitened noise."""
-    rest = [t for t in fit.terms if t is not term and not belongs_to(t, term)]
+    rest = [t for t in fit.terms if t is not term and not t.belongs_to(term)]
     without = evaluate(problem, rest)
     power = without.sum_of_squares - fit.state.sum_of_squares
     left = max(fit.state.sum_of_squares - noise * fit.state.count, 0.0)
-    left_tools = left if misfit(fit) > 1.02 * noise else 0.0
+    left_tools = left if misfit(fit) > SOMETHING_LEFT * noise else 0.0
     columns = fit.state.design(term)
     varying = max(
         _by_time(fit.state, columns, noise),
@@ -117,7 +111,7 @@ def confirm(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmatio
         varying / max(power, 1e-300),
         power / max(left_tools, 1e-3 * fit.state.count),
         0.0
-        if term.effect.name in METALS
+        if np.isinf(term.effect.inexact)
         else _stays(fit.state, columns, noise, max(1.0, WRONG_BY * noise)) / max(power, 1e-300),
         inexact=term.effect.inexact,
         alike=_crowd(fit, term),
@@ -135,35 +129,22 @@ def _helps(without: State, with_it: State, columns: Sequence[Array | None]) -> b
     return gain > 0.0 or not acts
 
 
-def _channels(term: Term) -> set[int]:
-    """Channels that a term is about, where they are one or two."""
-    named = {int(term.site['channel'])} if 'channel' in term.site else set()
-    several = term.site.get('channels', ())
-    return named | (set(several) if len(several) <= 2 else set())
-
-
 def _crowd(fit: Fit, term: Term) -> int:
-    """Terms of a fit with the same name, or about the same channel."""
-    terms = [t for t in fit.terms if t.effect is not REMAINDER]
-    alike = sum(t.effect is term.effect for t in terms)
-    about = [sum(c in _channels(t) for t in terms) for c in _channels(term)]
+    """Effects of a fit with the same name, or about the same channel."""
+    alike = sum(t.effect is term.effect for t in fit.effects)
+    about = [sum(c in _singled(t) for t in fit.effects) for c in _singled(term)]
     return max([alike, *about])
+
+
+def _singled(term: Term) -> set[int]:
+    """Channels that a term is about, where they are one or two."""
+    return set(term.channels) if len(term.channels) <= 2 else set()
 
 
 def _plausible(fit: Fit, term: Term) -> bool:
     """Whether the record's values are in the effect's ranges."""
     index = next(i for i, t in enumerate(fit.terms) if t is term)
-    record = term.effect.record(term, fit.covariance_of(index))
-    for key, (low, high) in term.effect.plausible.items():
-        value = record.parameters.get(key)
-        if value is None or isinstance(value, str):
-            continue
-        numbers = np.asarray(value, dtype=np.float64)
-        if key == 'matrix':
-            numbers = numbers - np.eye(len(numbers))
-        if numbers.size and (numbers.min() < low or numbers.max() > high):
-            return False
-    return True
+    return term.effect.possible(term.effect.record(term, fit.covariance_of(index)))
 
 
 def _stays(state: State, columns: Sequence[Array | None], noise: float, expected: float) -> float:
@@ -184,7 +165,7 @@ def _stays(state: State, columns: Sequence[Array | None], noise: float, expected
         if column is not None:
             size = np.abs(column).sum(axis=2).reshape(shape).sum(axis=(0, 1))
             # The pose's marginalisation spreads a trace of every change over all channels.
-            changed = size > 0.1 * size.max()
+            changed = size > CHANGED * size.max()
         good = (part.whitener.weight > 0).reshape(shape).sum(axis=(0, 1))
         own.append(left[changed])
         rest.append(left[~changed])
@@ -218,14 +199,12 @@ def _checked_open(problem: Problem, fit: Fit, term: Term, noise: float) -> Confi
 def doubtful(problem: Problem, fit: Fit, noise: float) -> list[tuple[Confirmation, Term]]:
     """The effects of a fit that are not confirmed, the one with the least power first."""
     checks = [
-        (confirm(problem, fit, term, noise), term)
-        for term in fit.terms
-        if term.effect is not REMAINDER and term.theta.size
+        (confirm(problem, fit, term, noise), term) for term in fit.effects if term.theta.size
     ]
     checks += [
         (_checked_open(problem, fit, term, noise), term)
         for term in fit.terms
-        if isinstance(term.effect, Fluctuation)
+        if term.effect.family is Family.FLUCTUATION
     ]
     checks += _unsteady(problem, fit)
     bad = [(check, term) for check, term in checks if not check.holds]
@@ -237,7 +216,7 @@ def _unsteady(problem: Problem, fit: Fit) -> list[tuple[Confirmation, Term]]:
     found = []
     for free in fit.terms:
         for term in fit.terms:
-            if not is_of(free, term):
+            if not free.effect.rivals(free, term):
                 continue
             steady = [t for t in fit.terms if t is not free]
             alone = evaluate(problem, steady).sum_of_squares

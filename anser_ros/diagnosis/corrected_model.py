@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Remedy, Term
+from anser_ros.effects.effect import Remedy
 from anser_ros.effects.prediction import Fields, lit
+from anser_ros.effects.term import Term
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.model import EffectRecord, FieldModel
 

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.diagnosis.scoring import BlockSums, block_sums, joined
-from anser_ros.effects.effect import Term
+from anser_ros.effects.effect import Family
+from anser_ros.effects.term import Term
 
 Array = NDArray[np.float64]
 
@@ -41,11 +42,21 @@ class Fit:
         """The terms with their parameters."""
         return self.state.terms
 
+    @property
+    def effects(self) -> tuple[Term, ...]:
+        """The terms that explain something of their own, without what belongs to another."""
+        return tuple(t for t in self.terms if t.effect.family is not Family.REMAINDER)
+
+    @property
+    def newest(self) -> Term:
+        """The effect that was added last."""
+        return self.effects[-1]
+
     def covariance_of(self, index: int) -> Array:
-        """Block of one term; where it was held, what it had when it was free."""
-        kept = self.terms[index].site.get('_covariance')
-        if kept is not None:
-            return np.asarray(kept)
+        """Covariance of one term; where it is held, what it had when it was free."""
+        held = self.terms[index].held
+        if held is not None and held.covariance is not None:
+            return held.covariance
         sizes = np.cumsum([0] + [t.theta.size for t in self.terms])
         rows = slice(sizes[index], sizes[index + 1])
         return self.covariance[rows, rows]
@@ -53,6 +64,36 @@ class Fit:
     def held_out(self, folds: int) -> float:
         """Cross-validated sum of squares, linear about the optimum, and what freedom cost."""
         return self.sums.held_out(self.prior, folds) + self.state.penalty
+
+
+@dataclass(frozen=True)
+class Fitter:
+    """What effects are fitted on, and how.
+
+    Attributes
+    ----------
+    problem : Problem
+    blocks : ndarray of int
+        The time blocks that take part.
+    folds : int
+        Parts of the cross-validation over those blocks.
+    iterations : int
+        Most steps of a fit.
+    """
+
+    problem: Problem
+    blocks: NDArray[np.int64]
+    folds: int
+    iterations: int
+
+    def fit(self, terms: Sequence[Term], iterations: int | None = None) -> Fit:
+        """The joint fit of some terms; see `fit_terms`."""
+        steps = self.iterations if iterations is None else iterations
+        return fit_terms(self.problem, terms, self.blocks, steps)
+
+    def held_out(self, fit: Fit) -> float:
+        """Cross-validated sum of squares of a fit, and what its freedom cost."""
+        return fit.held_out(self.folds)
 
 
 def fit_terms(

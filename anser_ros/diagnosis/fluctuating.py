@@ -6,15 +6,15 @@ for, and compares with what a constant effect takes off the held-out sum of squa
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.diagnosis.whitening import parts
-from anser_ros.effects.effect import Term
-from anser_ros.effects.fluctuation import Fluctuation
+from anser_ros.effects.effect import Family
+from anser_ros.effects.term import Term
 
 Array = NDArray[np.float64]
 
@@ -32,12 +32,12 @@ class Open:
 
 
 def opened(state: State, term: Term) -> Open | None:
-    """Each frame's own normal equations along a fluctuating effect's columns."""
-    effect, normal, right = term.effect, [], []
-    if not isinstance(effect, Fluctuation):
+    """Each frame's own normal equations along a fluctuation's columns; None for other effects."""
+    free, normal, right = term.effect.opened(term), [], []
+    if free is None:
         return None
     for part in state.parts:
-        raw = effect.free_columns(term, part.view)
+        raw = free.columns(part.view)
         if raw is None:
             continue
         white = part.whitener(parts(raw))
@@ -58,11 +58,14 @@ def gain_of(found: Open, spread: Array) -> float:
 
 
 def fluctuation_of(state: State, term: Term) -> tuple[float, Term] | None:
-    """The gain of a fluctuating effect at its likeliest spread, and the effect with it."""
-    found = opened(state, term)
-    if found is None or not isinstance(term.effect, Fluctuation):
+    """The gain of a fluctuation at its likeliest spread, and the term with it.
+
+    None for other effects, and where no spread gains anything.
+    """
+    free, found = term.effect.opened(term), opened(state, term)
+    if free is None or found is None:
         return None
-    unit = term.effect.unit_spread(term)
+    unit = free.expected
     gains = [gain_of(found, scale * unit) for scale in SCALES]
     if max(gains) <= 0.0:
         return None
@@ -72,25 +75,14 @@ def fluctuation_of(state: State, term: Term) -> tuple[float, Term] | None:
         mean = np.einsum('fpq,fq->fp', inverse, found.right)
         variance = np.mean(mean**2 + np.einsum('fqq->fq', inverse), axis=0)
         spread = np.maximum(np.sqrt(variance), 1e-6 * unit)
-    spread_term = term.effect.spread_out(term, spread)
-    site = {**spread_term.site, '_frames': found.right.shape[0]}
-    return gain_of(found, spread), Term(term.effect, site)
-
-
-def is_of(free: Term, steady: Term) -> bool:
-    """Whether a steady effect is about the same coil, channel or frame as a fluctuating one."""
-    if not isinstance(free.effect, Fluctuation) or isinstance(steady.effect, Fluctuation):
-        return False
-    if steady.effect.name == free.effect.of.name:
-        return all(steady.site.get(k) == v for k, v in free.site.items() if k[0] != '_')
-    return any(k in free.site and free.site[k] == steady.site.get(k) for k in ('coil', 'channel'))
+    return gain_of(found, spread), replace(free, spread=spread, frames=found.right.shape[0])
 
 
 def respread(problem: Problem, terms: Sequence[Term]) -> tuple[Term, ...]:
     """The terms with the spread of each fluctuation found anew beside the others."""
     out = list(terms)
     for i, term in enumerate(out):
-        if isinstance(term.effect, Fluctuation):
+        if term.effect.family is Family.FLUCTUATION:
             rest = [t for t in out if t is not term]
             found = fluctuation_of(evaluate(problem, rest), term)
             out[i] = term if found is None else found[1]
@@ -99,7 +91,7 @@ def respread(problem: Problem, terms: Sequence[Term]) -> tuple[Term, ...]:
 
 def left_over(state: State, term: Term) -> float:
     """Share of a candidate's power that the fluctuations in force leave it; one without any."""
-    if not any(t.site.get('_spread') is not None for t in state.terms):
+    if not any(t.effect.family is Family.FLUCTUATION for t in state.terms):
         return 1.0
     now, before = 0.0, 0.0
     for part in state.parts:

@@ -5,24 +5,21 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.diagnosis.decisions import FREER, LEAST_MORE, LEAST_OF_EXCESS
 from anser_ros.diagnosis.problem import Problem
 from anser_ros.diagnosis.scoring import BlockSums, Score, Scorer
-from anser_ros.effects.effect import Term
-from anser_ros.effects.metal_path import FreePath, StraightPath
-from anser_ros.effects.moving_metal import MovingMetal
+from anser_ros.effects.effect import Effect
 from anser_ros.effects.registry import all_effects
+from anser_ros.effects.term import Term
 
 Array = NDArray[np.float64]
 
-FREER = 1.05
-"""Places that differ from block to block must explain so much more than one place."""
-LEAST_MORE = 100.0
-LEAST_OF_EXCESS = 0.4
-"""Share of what is left to explain that metal at another place in each block must explain."""
-SHORT_WAY = 0.02
-KNOTS = 9
-ROUGHNESS = 3.0
-"""Weight of the distance between neighbouring blocks' places, in gains a grid step."""
+WAY_PRICE = 0.05
+"""What a way of one step of the grid of places between two blocks costs, as a share of the largest
+gain of a place in a block; it grows with the square of the way. Without it a place jumps wherever
+noise favours another one, with much more it stays at one place."""
+NO_PRIOR = 1e6
+"""Prior spread (1e-4 m^3) of a scatterer's answer in a block: a hundred cubic metres, no bound."""
 
 
 def moving_starts(
@@ -31,45 +28,63 @@ def moving_starts(
     scorer: Scorer,
     blocks: NDArray[np.int64],
 ) -> list[tuple[float, Term]]:
-    """Expected gain and starts for moving metal; none where one place explains as much."""
-    effect = all_effects().get('moving_metal')
-    places = [(t, s) for t, s in scored if t.effect.name == 'static_metal']
-    if not isinstance(effect, MovingMetal) or not places:
+    """Expected gain and start values of effects that are another one at a place for each block.
+
+    None where one place for all the session explains as much.
+
+    Parameters
+    ----------
+    problem : Problem
+    scored : sequence of (Term, Score)
+        All candidates, from ``scorer``.
+    scorer : Scorer
+    blocks : ndarray of int
+        The time blocks that take part.
+    """
+    found = []
+    for effect in all_effects().values():
+        if effect.still is not None:
+            places = [(t, s) for t, s in scored if t.effect is effect.still]
+            found += _starts(effect, places, problem, scorer, blocks)
+    return found
+
+
+def _starts(
+    effect: Effect[Term],
+    scored: Sequence[tuple[Term, Score]],
+    problem: Problem,
+    scorer: Scorer,
+    blocks: NDArray[np.int64],
+) -> list[tuple[float, Term]]:
+    """Starts of one effect along the places of the effect that it is at rest."""
+    places = [
+        (rest.centre, score.own, score.held_out)
+        for term, score in scored
+        if (rest := term.effect.resting(term)) is not None
+    ]
+    if not places:
         return []
-    still = min(s.held_out for _, s in places)
-    gains = np.array([[_gain(s.own, [i]) for i in range(blocks.size)] for _, s in places])
+    one_place = scorer.held_out - min(held_out for _, _, held_out in places)
+    gains = np.array([[_gain(sums, i) for i in range(blocks.size)] for _, sums, _ in places])
     alone = float(gains.max(axis=0).sum())
     excess = scorer.state.sum_of_squares - scorer.state.count
-    if alone < max(FREER * (scorer.held_out - still) + LEAST_MORE, LEAST_OF_EXCESS * excess):
+    if alone < max(FREER * one_place + LEAST_MORE, LEAST_OF_EXCESS * excess):
         return []
-    points = np.array([t.theta[:3] for t, _ in places])
+    points = np.array([centre for centre, _, _ in places])
     course = points[_smoothest(points, gains)]
     best = int(np.argmax([gains[:, i].max() for i in range(blocks.size)]))
-    sums = places[int(np.argmax(gains[:, best]))][1].own
-    alpha = sums.part(np.array([best])).solve(np.full(2, 1e6))[0]
-    duration = problem.apparatus.duration
-    start, end = (
-        course[: max(2, blocks.size // 8)].mean(0),
-        course[-max(2, blocks.size // 8) :].mean(0),
-    )
-    time = (blocks + 0.5) * duration / (blocks.max() + 1)
-    path, knots = FreePath.through(np.linspace(0.0, duration, KNOTS), time, course)
-    free = effect.starting(path, knots, duration, alpha)
-    if np.linalg.norm(end - start) < SHORT_WAY:
-        start = start + np.array([0.0, 0.0, -0.05])
-    times = (0.2 * duration, 0.8 * duration)
-    straight = np.concatenate([start, end, times, [0.5]])
-    return [
-        (alone, effect.starting(StraightPath(), straight, duration, alpha)),
-        (alone, free),
-    ]
+    sums = places[int(np.argmax(gains[:, best]))][1]
+    solution = _estimate(sums.part(np.array([best])))
+    time = (blocks + 0.5) * problem.apparatus.duration / (blocks.max() + 1)
+    starts = effect.along(time, course, solution, problem.apparatus)
+    return [(alone, start) for start in starts]
 
 
 def _smoothest(points: Array, gains: Array) -> NDArray[np.int64]:
     """Place (by index) in each block: much gain, little way (Viterbi's algorithm)."""
     apart = np.linalg.norm(points[:, None] - points[None], axis=2)
     step = np.median(np.where(apart > 0, apart, np.inf).min(axis=1))
-    price = 0.05 * gains.max() * (apart / step) ** 2
+    price = WAY_PRICE * gains.max() * (apart / step) ** 2
     best, back = gains[:, 0], []
     for block in range(1, gains.shape[1]):
         total = best[None, :] - price
@@ -81,7 +96,11 @@ def _smoothest(points: Array, gains: Array) -> NDArray[np.int64]:
     return np.array(way[::-1])
 
 
-def _gain(sums: BlockSums, rows: Sequence[int]) -> float:
-    part = sums.part(np.array(rows))
-    estimate, _ = part.solve(np.full(part.size, 1e6))
-    return float(part.right.sum(axis=0) @ estimate)
+def _estimate(sums: BlockSums) -> Array:
+    return sums.solve(np.full(sums.size, NO_PRIOR))[0]
+
+
+def _gain(sums: BlockSums, block: int) -> float:
+    """What a place explains in one block, by its number."""
+    part = sums.part(np.array([block]))
+    return float(part.right.sum(axis=0) @ _estimate(part))

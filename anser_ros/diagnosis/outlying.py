@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from anser_ros.diagnosis.problem import Problem, State, evaluate
-from anser_ros.effects.fluctuation import Fluctuation
+from anser_ros.effects.effect import Family
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -21,7 +21,7 @@ frame (ten times as many) is no member of the same distribution; noise passes on
 def find_outliers(state: State) -> tuple[Mask, ...]:
     """Mask (F, S) of outlying readings, one a tool; a frame that stands out is out as a whole."""
     masks = []
-    moves = any(isinstance(term.effect, Fluctuation) for term in state.terms)
+    moves = any(term.effect.family is Family.FLUCTUATION for term in state.terms)
     for part, good in zip(state.parts, state.problem.good, strict=False):
         emitters = state.problem.fields.omega.size
         # The residual along the pose's own directions is left in: an optical glitch shows there.

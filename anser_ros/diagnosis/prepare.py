@@ -8,13 +8,12 @@ from numpy.typing import NDArray
 from anser_ros.diagnosis.illumination import CleanReferences, board_box, fit_illumination
 from anser_ros.diagnosis.problem import Problem, References
 from anser_ros.diagnosis.whitening import Spread
-from anser_ros.effects.effect import Apparatus
+from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.prediction import Fields
 from anser_ros.errors import DiagnosisError
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
-from anser_ros.physics.sensor import SensorTable
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -147,10 +146,3 @@ def _binned(reference: Measurements, baseline: ComplexArray, edges: Array) -> Re
         has_pose=np.ones(n_bins, dtype=bool),
     )  # fmt: skip
     return References(binned, counts.astype(np.float64), baseline[known])
-
-
-def sensors_of(tables: Sequence[SensorTable]) -> dict[int, str]:
-    """Name of each channel."""
-    return {
-        int(c): name for table in tables for c, name in zip(table.channel, table.name, strict=True)
-    }

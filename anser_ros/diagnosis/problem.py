@@ -7,8 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.whitening import Spread, Whitener, parts, pose_jacobian
-from anser_ros.effects.effect import Apparatus, Term, View
+from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.effect import Remedy
 from anser_ros.effects.prediction import Fields, reference_view, tool_view
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.field.measurements import Measurements
 
 Array = NDArray[np.float64]
@@ -17,8 +20,6 @@ Mask = NDArray[np.bool_]
 
 SURVEY_ERROR = 0.01
 """Relative error of a change that a surveyed reference sensor sees (0.2 mm, 0.3 deg, 0.4 %)."""
-GRADIENT_ERROR = 0.07
-"""The same of what an emitter's shift changes close to it, where its field is known less well."""
 
 
 @dataclass(frozen=True)
@@ -182,25 +183,22 @@ def _reference_part(problem: Problem, references: References, terms: Sequence[Te
     good = readings.valid
     residual = parts(np.where(good[..., None], readings.flux - view.flux, 0.0))
     # A survey error is the same in every bin: shared among B bins it must count B times as much.
-    exact = [term for term in terms if not _on_field(term)]
+    exact = [term for term in terms if term.effect.remedy is not Remedy.FIELD]
     unchanged = reference_view(readings, references.baseline, exact, problem.fields)
     change = np.where(good[..., None], readings.flux - unchanged.flux, 0.0)
     size = np.sqrt(np.mean(np.abs(change) ** 2, axis=2, keepdims=True) / 2)
     noise = problem.spread.flux_t / np.sqrt(np.maximum(references.count, 1))
     together = np.sqrt(readings.time.size)
     survey = SURVEY_ERROR * size * together
-    shifted = [term for term in terms if term.effect.name == 'coil_moved']
     gradient = np.zeros_like(view.flux.real)
-    for term in shifted:
-        alone = reference_view(readings, references.baseline, [term], problem.fields)
-        gradient += GRADIENT_ERROR * np.abs(alone.flux - references.baseline) * together
+    for term in terms:
+        if term.effect.gradient_error:
+            alone = reference_view(readings, references.baseline, [term], problem.fields)
+            shifted = np.abs(alone.flux - references.baseline)
+            gradient += term.effect.gradient_error * shifted * together
     spread = np.sqrt(noise[..., None] ** 2 + survey**2 + gradient**2)
     weight = np.where(good[..., None], 1 / spread, 0.0).reshape(good.shape[0], -1)
     weight = np.concatenate([weight, weight], axis=1)
     free = _with_free(np.zeros((*weight.shape, 0)), terms, view)
     whitener = Whitener.of(weight, free) if free.shape[2] else Whitener(weight)
     return Part(view, residual, whitener, whitener(residual), problem.reference_blocks)
-
-
-def _on_field(term: Term) -> bool:
-    return term.effect.remedy.name == 'FIELD'

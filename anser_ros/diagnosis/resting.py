@@ -2,38 +2,26 @@
 
 from collections.abc import Callable, Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
-from anser_ros.diagnosis.fit import Fit, fit_terms, misfit
-from anser_ros.diagnosis.problem import Problem
-from anser_ros.diagnosis.refine import AT_REST, METALS, settled
+from anser_ros.diagnosis.decisions import ALIKE, BESIDE_REST, LEAST_MORE, NO_RIVAL
+from anser_ros.diagnosis.fit import Fit, Fitter, misfit
+from anser_ros.diagnosis.refine import settled
 from anser_ros.diagnosis.scoring import Score, Scorer
-from anser_ros.effects.effect import Term
-
-TRIED = 3
-FAR_LESS = 0.25
-"""Metal at rest that explains less than this share by itself is no rival."""
-LEAST_SHARE, LEAST = 0.02, 100.0
-"""Metal moves when that explains so much more, as a share of all that it explains, and in units of
-the misfit."""
+from anser_ros.effects.effect import Family
+from anser_ros.effects.term import Term
 
 
 def moves_or_rests(
-    problem: Problem,
-    blocks: NDArray[np.int64],
+    fitter: Fitter,
     moving: Fit,
     fitted: Sequence[tuple[float, Fit]],
     candidates: Callable[[Scorer], Sequence[tuple[Term, Score]]],
     explained: float,
-    folds: int,
-    iterations: int,
 ) -> Fit:
     """Metal that moves, or metal at rest where it explains as much, alone or beside one effect.
 
     Parameters
     ----------
-    problem, blocks, folds, iterations : as in `anser_ros.diagnosis.search`
+    fitter : Fitter
     moving : Fit
         With metal that moves for its newest effect.
     fitted : sequence of (float, Fit)
@@ -48,35 +36,36 @@ def moves_or_rests(
     Fit
         Settled (`anser_ros.diagnosis.refine`).
     """
-    shaped = settled(problem, moving.terms, blocks, folds, iterations)
-    resting = [(g, f) for g, f in fitted if f.terms[-1].effect.name in AT_REST]
+    shaped = settled(fitter, moving.terms)
+    resting = [(g, f) for g, f in fitted if f.newest.effect.family is Family.METAL_AT_REST]
     gain, rest = max(resting, key=lambda pair: pair[0], default=(0.0, moving))
-    if gain < FAR_LESS * explained:
+    if gain < NO_RIVAL * explained:
         return shaped
-    rest = settled(problem, rest.terms, blocks, folds, iterations)
-    limit = _limit(shaped, explained, folds)
-    if rest.held_out(folds) < limit:
+    rest = settled(fitter, rest.terms)
+    limit = _limit(fitter, shaped, explained)
+    if fitter.held_out(rest) < limit:
         return rest
-    scorer = Scorer(rest.state, blocks, folds)
+    scorer = Scorer(rest.state, fitter.blocks, fitter.folds)
     tried: set[str] = set()
     for term, score in candidates(scorer):
-        if term.effect.name in METALS or term.effect.name in tried:
+        if term.effect.family.is_metal or term.effect.name in tried:
             continue
-        if len(tried) == TRIED or score.held_out > 2.0 * limit + 0.5 * scorer.held_out:
+        # A linear score is no more than a promise: twice the limit may still come below it.
+        if len(tried) == BESIDE_REST or score.held_out > 2.0 * limit + 0.5 * scorer.held_out:
             break
         tried.add(term.effect.name)
         for start in term.effect.started(term, score.solution):
-            both = fit_terms(problem, [*rest.terms, start], blocks, iterations)
-            if both.held_out(folds) > limit:
+            both = fitter.fit([*rest.terms, start])
+            if fitter.held_out(both) > limit:
                 continue
             # What is there besides helps metal that moves as much: like is compared with like.
-            beside = fit_terms(problem, [*shaped.terms, start], blocks, iterations)
-            if both.held_out(folds) < _limit(beside, explained, folds):
+            beside = fitter.fit([*shaped.terms, start])
+            if fitter.held_out(both) < _limit(fitter, beside, explained):
                 return rest
     return shaped
 
 
-def _limit(moving: Fit, explained: float, folds: int) -> float:
+def _limit(fitter: Fitter, moving: Fit, explained: float) -> float:
     """Held-out sum of squares up to which metal at rest explains as much."""
-    more = LEAST_SHARE * explained + LEAST * max(misfit(moving), 1.0)
-    return moving.held_out(folds) + more
+    more = ALIKE * explained + LEAST_MORE * max(misfit(moving), 1.0)
+    return fitter.held_out(moving) + more

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from anser_ros.diagnosis.problem import Part, State
 from anser_ros.diagnosis.scoring import BlockSums, block_sums, joined
 from anser_ros.diagnosis.whitening import parts
-from anser_ros.effects.effect import View
+from anser_ros.effects.view import View
 
 Array = NDArray[np.float64]
 Known = tuple[list[Array | None], Array]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from anser_ros.diagnosis.problem import State
-from anser_ros.effects.effect import Term
+from anser_ros.effects.term import Term
 
 Array = NDArray[np.float64]
 Columns = Sequence[Array | None]

@@ -2,7 +2,8 @@
 
 Every candidate is first scored by its linear columns (a score test beside the effects in force).
 The best ones are fitted in full, and the best of these is taken, or a simpler one that is as good.
-What others explain away is removed at the end.
+What others explain away is removed at the end. The numbers by which this is decided are in
+`anser_ros.diagnosis.decisions`.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,53 +12,23 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.choice import (
-    OPEN,
-    STEADY,
-    at_floor,
-    choose,
-    complexity,
-    taken_from_others,
-)
+from anser_ros.diagnosis import decisions
+from anser_ros.diagnosis.choice import at_floor, choose, taken_from_others
 from anser_ros.diagnosis.confirm import doubtful
-from anser_ros.diagnosis.fit import Fit, fit_terms, misfit
+from anser_ros.diagnosis.fit import Fit, Fitter, misfit
 from anser_ros.diagnosis.fluctuating import fluctuation_of, left_over
 from anser_ros.diagnosis.moving_start import moving_starts
 from anser_ros.diagnosis.problem import Problem
-from anser_ros.diagnosis.refine import METALS, settled
+from anser_ros.diagnosis.refine import settled
 from anser_ros.diagnosis.resting import moves_or_rests
 from anser_ros.diagnosis.scoring import Score, Scorer
 from anser_ros.diagnosis.structure import noise_scale
-from anser_ros.effects.effect import Term
-from anser_ros.effects.fluctuation import Fluctuation
-from anser_ros.effects.metal_remainder import REMAINDER
+from anser_ros.effects.effect import Family
 from anser_ros.effects.registry import all_effects
+from anser_ros.effects.term import Term
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
-
-PROMISING = 0.5
-"""A candidate whose probe promises less than this share of the best fitted gain is not fitted."""
-REMNANT = 0.01
-"""Further metal with less than this share of the first metal's gain is what its model left."""
-MOST_DOUBTFUL = 2
-"""With so many effects in force that are not the same in all parts of the data, something else is
-the cause, and further effects would only stand in for it."""
-PLAIN_TO_SEE = 5.0
-"""An effect whose parameters stand so many times above what it must gain is not tried without."""
-MOST_METALS = 2
-OPEN_FINALISTS = 3
-"""Fluctuations that are tried in full a round."""
-LEAST_OF_EXCESS = 0.4
-"""Share of what is left to explain that a fluctuation, or metal at another place in each block of
-time, must explain."""
-LEAST_OF_NOISE = 0.05
-"""Share of the noise's power that a fluctuation must explain: a field model's own error is alike
-in neighbouring frames and channels, and any freedom takes some of it."""
-TOLD_APART = 0.05
-"""A candidate of whose power the fluctuations in force leave less can't be told from them."""
-APART = 0.12
-"""Distance (m) from metal in force within which further metal is the same body's."""
 
 
 @dataclass(frozen=True)
@@ -67,24 +38,30 @@ class SearchSettings:
     Attributes
     ----------
     folds : int
-        Of the cross-validation over time blocks.
+        Of the cross-validation over time blocks: with four, three quarters of the blocks predict
+        the rest; more folds predict little better and take longer.
     most_effects : int
+        Effects that are looked for; a session with more than this many is not understood.
     finalists : int
-        Candidates that are fitted in full a round.
-    least_gain, gain_per_parameter : float
-        What an effect must take off the held-out sum of squares, in units of the misfit that it
-        leaves; a clean session's best of 700 candidates takes off about 15.
+        Candidates that are fitted in full in a round, which is what a round's time goes into.
+    least_gain, gain_per_parameter, least_share, least_share_beside_metal : float
+        What an effect must gain (`anser_ros.diagnosis.decisions`).
     iterations : int
+        Most steps of a fit; most settle in fewer.
     """
 
     folds: int = 4
     most_effects: int = 6
     finalists: int = 7
-    least_gain: float = 40.0
-    gain_per_parameter: float = 6.0
-    least_share: float = 0.002
-    least_share_beside_metal: float = 0.01
+    least_gain: float = decisions.LEAST_GAIN
+    gain_per_parameter: float = decisions.PER_PARAMETER
+    least_share: float = decisions.LEAST_SHARE
+    least_share_beside_metal: float = decisions.LEAST_SHARE_BESIDE_METAL
     iterations: int = 8
+
+    def fitter(self, problem: Problem, blocks: NDArray[np.int64]) -> Fitter:
+        """What fits effects on some blocks of a problem with these settings."""
+        return Fitter(problem, blocks, self.folds, self.iterations)
 
 
 @dataclass(frozen=True)
@@ -137,7 +114,7 @@ def search_effects(
     Parameters
     ----------
     problem : Problem
-    blocks : ndarray
+    blocks : ndarray of int
         Time blocks that take part.
     start : sequence of Term
         Effects that are known already (polarities, for example).
@@ -147,18 +124,18 @@ def search_effects(
     """
     how = settings or SearchSettings()
     say = progress or (lambda text: None)
-    search = Search(fit_terms(problem, start, blocks, how.iterations))
+    fitter = how.fitter(problem, blocks)
+    search = Search(fitter.fit(start))
     for _ in range(how.most_effects):
-        found = _round(problem, blocks, search, how)
+        found = _Round(fitter, search, how).best()
         if found is None:
             break
         search.fit = found
-        newest = [t for t in found.terms if t.effect is not REMAINDER][-1]
-        say(f'{newest.label}: misfit {misfit(found):.4g}')
-        _replace(problem, blocks, search, how)
-        _thin_out(problem, blocks, search, how)
+        say(f'{found.newest.label}: misfit {misfit(found):.4g}')
+        _replace(fitter, search)
+        _thin_out(fitter, search, how)
         noise = noise_scale(search.fit.state) ** 2
-        if len(doubtful(problem, search.fit, noise)) >= MOST_DOUBTFUL:
+        if len(doubtful(problem, search.fit, noise)) >= decisions.MOST_DOUBTFUL:
             break
     return search
 
@@ -166,123 +143,146 @@ def search_effects(
 def worth(gain: float, parameters: int, fit: Fit, how: SearchSettings) -> bool:
     """Whether a gain pays for its parameters, with this fit left."""
     left = max(misfit(fit), 1.0)
-    metal = any(term.effect.name in METALS for term in fit.terms)
+    metal = any(term.effect.family.is_metal for term in fit.terms)
     share = how.least_share_beside_metal if metal else how.least_share
     least = how.least_gain + how.gain_per_parameter * parameters + share * fit.state.count
     return gain > least * left
 
 
-def _round(
-    problem: Problem, blocks: NDArray[np.int64], search: Search, how: SearchSettings
-) -> Fit | None:
-    """The fit with one effect more, or None when none pays."""
-    before = search.fit
-    scorer = Scorer(before.state, blocks, how.folds)
-    scored = _scored(problem, scorer)
-    table = [Candidate(t, s.solution.size, scorer.held_out - s.held_out) for t, s in scored]
-    open_ones = _fluctuating(problem, before, how)
-    table += [Candidate(t, complexity(t), g) for g, t in open_ones]
-    starts = _finalists(scored, scorer, how) + moving_starts(problem, scored, scorer, blocks)
-    fitted: list[tuple[float, Fit]] = []
-    for expected, term in sorted(starts + open_ones, key=lambda pair: -pair[0]):
-        if fitted and expected < PROMISING * max(g for g, _ in fitted):
-            continue
-        if any(at_floor(f) and complexity(term) > complexity(f.terms[-1]) for _, f in fitted):
-            continue
-        fit = fit_terms(problem, [*before.terms, term], blocks, how.iterations)
-        gain = scorer.held_out - fit.held_out(how.folds) - taken_from_others(fit)
-        fitted.append((gain, fit))
-        table.append(Candidate(fit.terms[-1], complexity(term), gain, gain))
-    search.rounds.append(sorted(table, key=lambda c: -c.gain))
-    if not fitted:
-        return None
-    gain, best = choose(fitted)
+class _Round:
+    """One round of the search: the best effect to add to those in force."""
 
-    def shaped(start: Fit, explained: float) -> Fit:
-        return moves_or_rests(
-            problem, blocks, start, fitted, lambda s: _scored(problem, s), explained, how.folds,
-            how.iterations,
-        )  # fmt: skip
+    def __init__(self, fitter: Fitter, search: Search, how: SearchSettings) -> None:
+        self._fitter, self._search, self._how = fitter, search, how
+        self._before = search.fit
+        self._scorer = Scorer(self._before.state, fitter.blocks, fitter.folds)
 
-    metal = _metal_beside(best, gain, fitted)
-    if metal is not None:
-        # What bends with dozens of parameters is no match for metal before that has its shape.
-        settled_metal = shaped(metal[1], metal[0])
-        if scorer.held_out - settled_metal.held_out(how.folds) > gain:
-            search.metal_gain = max(search.metal_gain, metal[0])
-            return settled_metal
-    term = best.terms[-1]
-    if not worth(gain, complexity(term), best, how):
-        return None
-    if term.effect.name in METALS and gain < REMNANT * search.metal_gain:
-        return None
-    if term.effect.name in METALS:
-        search.metal_gain = max(search.metal_gain, gain)
-    search.rivals[term.label] = [
-        Candidate(f.terms[-1], f.terms[-1].theta.size, g, g)
+    def best(self) -> Fit | None:
+        """The fit with one effect more, or None when none pays."""
+        search, held_out = self._search, self._scorer.held_out
+        fitted = self._fitted()
+        if not fitted:
+            return None
+        gain, best = choose(fitted)
+        metal = _metal_beside(best, gain, fitted)
+        if metal is not None:
+            # A freedom in every frame is no match for metal before that has its shape.
+            shaped = self._moves_or_rests(metal[1], fitted, metal[0])
+            if held_out - self._fitter.held_out(shaped) > gain:
+                search.metal_gain = max(search.metal_gain, metal[0])
+                return shaped
+        term = best.newest
+        if not worth(gain, term.complexity, best, self._how):
+            return None
+        if term.effect.family.is_metal:
+            if gain < decisions.REMNANT * search.metal_gain:
+                return None
+            search.metal_gain = max(search.metal_gain, gain)
+        search.rivals[term.label] = _rivals(gain, best, fitted)
+        if term.effect.family is Family.MOVING_METAL:
+            return self._moves_or_rests(best, fitted, gain)
+        search.close[term.label] = [
+            f.newest
+            for g, f in fitted
+            if f is not best
+            and g > decisions.STEADY * gain
+            and f.newest.effect.family is Family.STEADY
+        ]
+        if any(t.effect.family.is_metal for t in best.terms):
+            return settled(self._fitter, best.terms)
+        return best
+
+    def _fitted(self) -> list[tuple[float, Fit]]:
+        """Gain and fit of the finalists; all candidates go into the table of the round."""
+        fitter, scorer, before = self._fitter, self._scorer, self._before
+        scored = _scored(fitter.problem, scorer)
+        table = [Candidate(t, s.solution.size, scorer.held_out - s.held_out) for t, s in scored]
+        fluctuations = _fluctuating(fitter.problem, before, self._how)
+        table += [Candidate(t, t.complexity, g) for g, t in fluctuations]
+        starts = _finalists(scored, scorer, self._how)
+        starts += moving_starts(fitter.problem, scored, scorer, fitter.blocks)
+        fitted: list[tuple[float, Fit]] = []
+        for expected, term in sorted(starts + fluctuations, key=lambda pair: -pair[0]):
+            if fitted and expected < decisions.PROMISING * max(g for g, _ in fitted):
+                continue
+            if any(at_floor(f) and term.complexity > f.newest.complexity for _, f in fitted):
+                continue
+            fit = fitter.fit([*before.terms, term])
+            gain = scorer.held_out - fitter.held_out(fit) - taken_from_others(fit)
+            fitted.append((gain, fit))
+            table.append(Candidate(fit.newest, term.complexity, gain, gain))
+        self._search.rounds.append(sorted(table, key=lambda c: -c.gain))
+        return fitted
+
+    def _moves_or_rests(
+        self, moving: Fit, fitted: Sequence[tuple[float, Fit]], explained: float
+    ) -> Fit:
+        def candidates(scorer: Scorer) -> list[tuple[Term, Score]]:
+            return _scored(self._fitter.problem, scorer)
+
+        return moves_or_rests(self._fitter, moving, fitted, candidates, explained)
+
+
+def _rivals(gain: float, best: Fit, fitted: Sequence[tuple[float, Fit]]) -> list[Candidate]:
+    """What explained as much as the effect that was taken."""
+    least = gain - decisions.AS_GOOD * max(misfit(best), 1.0) - decisions.ALIKE * abs(gain)
+    return [
+        Candidate(f.newest, f.newest.theta.size, g, g)
         for g, f in fitted
-        if f is not best and g > gain - 10 * max(misfit(best), 1.0) - 0.02 * abs(gain)
+        if f is not best and g > least
     ]
-    if term.effect.name == 'moving_metal':
-        return shaped(best, gain)
-    search.close[term.label] = [
-        f.terms[-1]
-        for g, f in fitted
-        if f is not best and g > STEADY * gain and _steady(f.terms[-1])
-    ]
-    if any(t.effect.name in METALS for t in best.terms):
-        return settled(problem, best.terms, blocks, how.folds, how.iterations)
-    return best
 
 
 def _metal_beside(
     best: Fit, gain: float, fitted: Sequence[tuple[float, Fit]]
 ) -> tuple[float, Fit] | None:
-    """Moving metal that explains nearly as much as a curve with many parameters."""
-    newest = best.terms[-1]
-    if newest.effect.name in METALS or complexity(newest) < OPEN or at_floor(best):
+    """Moving metal that explains nearly as much as a fluctuation that leaves something."""
+    if best.newest.effect.family is not Family.FLUCTUATION or at_floor(best):
         return None
     metals = [
         (g, f)
         for g, f in fitted
-        if f.terms[-1].effect.name == 'moving_metal' and g > PROMISING * gain
+        if f.newest.effect.family is Family.MOVING_METAL and g > decisions.PROMISING * gain
     ]
     return max(metals, key=lambda pair: pair[0], default=None)
 
 
 def _fluctuating(problem: Problem, before: Fit, how: SearchSettings) -> list[tuple[float, Term]]:
     """The fluctuations that explain most of what is there to explain."""
-    excess = before.state.sum_of_squares - before.state.count
-    least = max(how.least_gain, LEAST_OF_EXCESS * excess, LEAST_OF_NOISE * before.state.count)
+    count = before.state.count
+    excess = before.state.sum_of_squares - count
+    least = max(
+        how.least_gain, decisions.LEAST_OF_EXCESS * excess, decisions.LEAST_OF_NOISE * count
+    )
     found = []
     for effect in all_effects().values():
-        if not isinstance(effect, Fluctuation):
+        if effect.family is not Family.FLUCTUATION:
             continue
         for term in effect.candidates(problem.apparatus):
-            if any(_same(term, other) for other in before.terms):
+            if any(_covered(term, other) for other in before.terms):
                 continue
             likeliest = fluctuation_of(before.state, term)
             if likeliest is not None and likeliest[0] > least:
                 found.append(likeliest)
-    return sorted(found, key=lambda pair: -pair[0])[:OPEN_FINALISTS]
+    return sorted(found, key=lambda pair: -pair[0])[: decisions.OPEN_FINALISTS]
 
 
 def _scored(problem: Problem, scorer: Scorer) -> list[tuple[Term, Score]]:
     """All candidates that are not in force already, best first."""
     taken, ours = scorer.state.terms, problem.apparatus.tool_channels
-    metals = sum(term.effect.name in METALS for term in taken)
-    metal, moving = metals > 0, any(term.effect.name == 'moving_metal' for term in taken)
+    metals = sum(term.effect.family.is_metal for term in taken)
+    moving = any(term.effect.family is Family.MOVING_METAL for term in taken)
     out = []
     for effect in all_effects().values():
+        if effect.family.is_metal and (moving or metals >= decisions.MOST_METALS):
+            continue
         for term in effect.candidates(problem.apparatus):
-            if any(_same(term, other) for other in taken):
+            if any(_covered(term, other) for other in taken):
                 continue
-            if metal and term.site.get('channel', ours[0]) not in ours:
+            if metals and not all(channel in ours for channel in term.channels):
                 # Beside metal a reference's survey error looks like a fault of its channel.
                 continue
-            if effect.name in METALS and (moving or metals >= MOST_METALS):
-                continue
-            if left_over(scorer.state, term) < TOLD_APART:
+            if left_over(scorer.state, term) < decisions.TOLD_APART:
                 continue
             score = scorer.score(term)
             if score is not None:
@@ -290,29 +290,15 @@ def _scored(problem: Problem, scorer: Scorer) -> list[tuple[Term, Score]]:
     return sorted(out, key=lambda pair: pair[1].held_out)
 
 
-def _same(term: Term, other: Term) -> bool:
-    """Whether a candidate is what another term stands for already."""
-    if isinstance(other.effect, Fluctuation) and term.effect.name == other.effect.of.name:
-        return _site(term) == _site(other)
-    if term.effect is not other.effect:
-        return False
-    if term.effect.name == 'static_metal':
-        return bool(np.linalg.norm(term.theta[:3] - other.theta[:3]) < APART)
-    if term.effect.name == 'conductive_plate':
-        return True
-    if term.effect.name == 'saturation':
-        return bool(term.site['channel'] == other.site['channel'])
-    return _site(term) == _site(other)
-
-
-def _site(term: Term) -> str:
-    return repr(sorted((k, v) for k, v in term.site.items() if k[0] != '_'))
+def _covered(candidate: Term, other: Term) -> bool:
+    """Whether a term in force stands for a candidate already."""
+    return other.effect.covers(other, candidate)
 
 
 def _finalists(
     scored: Sequence[tuple[Term, Score]], scorer: Scorer, how: SearchSettings
 ) -> list[tuple[float, Term]]:
-    """Expected gain and start values of the best candidates, at most two of a name."""
+    """Expected gain and start values of the best candidates, few of each effect."""
     out: list[tuple[float, Term]] = []
     count: dict[str, int] = {}
     for term, score in scored:
@@ -320,7 +306,7 @@ def _finalists(
         name = term.effect.name
         if len(out) >= how.finalists or gain < how.least_gain:
             break
-        if count.get(name, 0) >= 2:
+        if count.get(name, 0) >= decisions.SITES_PER_EFFECT:
             continue
         count[name] = count.get(name, 0) + 1
         out += [(gain, start) for start in term.effect.started(term, score.solution)]
@@ -334,62 +320,54 @@ def _wald(fit: Fit, index: int) -> float:
     term = fit.terms[index]
     covariance = fit.sums.solve(fit.prior)[1][rows, rows]
     use = np.flatnonzero(term.effect.prior(term) > 1e-9)
-    # What tells how much of an effect there is; the place of nothing says nothing.
+    # Only its amount tells whether an effect is there; the place of no amount is arbitrary.
     use = np.intersect1d(use, term.effect.amounts(term))
     theta, part = term.theta[use], covariance[np.ix_(use, use)]
     return float(theta @ np.linalg.pinv(part, rcond=1e-10, hermitian=True) @ theta)
 
 
-def _steady(term: Term) -> bool:
-    return term.effect.name not in METALS and not isinstance(term.effect, Fluctuation)
-
-
-def _replace(
-    problem: Problem, blocks: NDArray[np.int64], search: Search, how: SearchSettings
-) -> None:
+def _replace(fitter: Fitter, search: Search) -> None:
     """Take a simpler effect for an earlier one where, beside the newest, it is as good.
 
     What was taken while much was unexplained may have won by parameters that took up another's.
     """
     for term in search.fit.terms[:-1]:
-        if not _steady(term):
+        if term.effect.family is not Family.STEADY:
             continue
         for other in search.close.get(term.label, []):
-            spared = complexity(term) - complexity(other)
-            if spared < 0 or any(_same(other, t) for t in search.fit.terms):
+            spared = term.complexity - other.complexity
+            if spared < 0 or any(_covered(other, t) for t in search.fit.terms):
                 continue
             terms = [other if t.label == term.label else t for t in search.fit.terms]
-            fit = settled(problem, terms, blocks, how.folds, how.iterations)
-            loss = fit.held_out(how.folds) - search.fit.held_out(how.folds)
-            if loss < (10 * (spared > 0) + 4 * spared) * max(misfit(fit), 1.0):
+            fit = settled(fitter, terms)
+            loss = fitter.held_out(fit) - fitter.held_out(search.fit)
+            if loss < decisions.as_good(spared) * max(misfit(fit), 1.0):
                 search.removed.append(term)
                 search.close[other.label] = search.close[term.label]
                 search.fit = fit
                 break
 
 
-def _thin_out(
-    problem: Problem, blocks: NDArray[np.int64], search: Search, how: SearchSettings
-) -> None:
+def _thin_out(fitter: Fitter, search: Search, how: SearchSettings) -> None:
     """Remove effects that the others explain away."""
     while len(search.fit.terms) > 1:
-        terms = search.fit.terms
-        full = search.fit.held_out(how.folds)
-        newest = [t for t in terms if t.effect is not REMAINDER][-1]
-        for index, term in enumerate(terms):
-            fixed = term.theta.size == 0 and not isinstance(term.effect, Fluctuation)
-            if term is newest or term.effect is REMAINDER or fixed:
+        full = fitter.held_out(search.fit)
+        for index, term in enumerate(search.fit.terms):
+            fixed = term.effect.family in (Family.REMAINDER, Family.SEEN)
+            if fixed or term is search.fit.newest or _is_plain(search.fit, index, how):
                 continue
-            if term.theta.size and worth(
-                _wald(search.fit, index) / PLAIN_TO_SEE, term.theta.size, search.fit, how
-            ):
-                continue
-            rest = [t for t in terms if t is not term]
-            without = settled(problem, rest, blocks, how.folds, how.iterations)
-            gain = without.held_out(how.folds) - full
-            if not worth(gain, complexity(term), search.fit, how):
+            rest = [t for t in search.fit.terms if t is not term]
+            without = settled(fitter, rest)
+            gain = fitter.held_out(without) - full
+            if not worth(gain, term.complexity, search.fit, how):
                 search.removed.append(term)
                 search.fit = without
                 break
         else:
             return
+
+
+def _is_plain(fit: Fit, index: int, how: SearchSettings) -> bool:
+    """Whether the parameters of a term show by themselves that it is needed."""
+    size = fit.terms[index].theta.size
+    return size > 0 and worth(_wald(fit, index) / decisions.PLAIN_TO_SEE, size, fit, how)

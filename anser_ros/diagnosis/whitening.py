@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import View
+from anser_ros.effects.view import View
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

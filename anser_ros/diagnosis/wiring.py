@@ -4,8 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.problem import Problem, State, evaluate
-from anser_ros.effects.effect import Term
-from anser_ros.effects.registry import effect_named
+from anser_ros.effects.sensor_polarity import SENSOR_POLARITY
+from anser_ros.effects.term import Term
+from anser_ros.effects.wiring import DEAD_CHANNEL, SWAPPED_CHANNELS, SWAPPED_COILS
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -46,12 +47,12 @@ def wiring_faults(problem: Problem) -> list[Term]:
                 'channels': tuple(int(c) for c in channels[order[moved]]),
                 'read_as': tuple(int(c) for c in channels[moved]),
             }
-            faults.append(Term(effect_named('swapped_channels'), site))
+            faults.append(Term(SWAPPED_CHANNELS, site))
     dead += _silent_references(problem)
     if turned:
-        faults.append(Term(effect_named('sensor_polarity'), {'channels': tuple(turned)}))
+        faults.append(Term(SENSOR_POLARITY, {'channels': tuple(turned)}))
     if dead:
-        faults.append(Term(effect_named('dead_channel'), {'channels': tuple(dead)}))
+        faults.append(Term(DEAD_CHANNEL, {'channels': tuple(dead)}))
     return faults
 
 
@@ -108,4 +109,4 @@ def _swapped_coils(state: State) -> Term | None:
     if not moved.size:
         return None
     site = {'coils': tuple(int(c) for c in order[moved]), 'read_as': tuple(moved.tolist())}
-    return Term(effect_named('swapped_coils'), site)
+    return Term(SWAPPED_COILS, site)

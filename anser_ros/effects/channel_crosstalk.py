@@ -1,24 +1,25 @@
 """Channels leak into each other, inside a cluster or between two of them."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import (
-    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Term,
-    View,
     needed,
     sigmas,
     unit_matrix,
-)  # fmt: skip
+)
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 
@@ -28,7 +29,7 @@ def _pairs(count: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(count) for j in range(count) if i != j]
 
 
-class ChannelCrosstalk(Effect):
+class ChannelCrosstalk(Effect[Term]):
     """theta: off-diagonal entries, row by row: measured = M true with ones on the diagonal."""
 
     name = 'channel_crosstalk'
@@ -93,6 +94,12 @@ class ChannelCrosstalk(Effect):
             {'channels': list(term.site['channels']), 'matrix': self._matrix(term).tolist()},
             {'matrix': sigma.tolist()},
         )
+
+    def possible(self, record: EffectRecord) -> bool:
+        """Whether the leaks, the matrix less its diagonal of ones, are in their range."""
+        leaks = np.asarray(record.parameters['matrix'], dtype=np.float64)
+        leaks = leaks - np.eye(len(leaks))
+        return super().possible(replace(record, parameters={'matrix': leaks}))
 
     def term(self, record: EffectRecord) -> Term:
         """From the matrix."""

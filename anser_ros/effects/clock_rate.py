@@ -6,23 +6,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from anser_ros.effects.effect import (
-    Apparatus,
-    Array,
-    ComplexArray,
-    Effect,
-    Remedy,
-    Term,
-    View,
-    needed,
-    sigmas,
-)  # fmt: skip
+from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed, sigmas
+from anser_ros.effects.term import Term
 from anser_ros.effects.time_offset import flux_rate
+from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 
 
-class ClockRate(Effect):
+class ClockRate(Effect[Term]):
     """theta: offset at time 0 (s) and rate (s a second): optical t' counts as t' + a + b t'."""
 
     name = 'clock_rate'

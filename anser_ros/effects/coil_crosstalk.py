@@ -6,22 +6,22 @@ from typing import ClassVar
 
 import numpy as np
 
+from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import (
-    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Term,
-    View,
     needed,
     sigmas,
     unit_matrix,
-)  # fmt: skip
+)
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
 
 
-class CoilCrosstalk(Effect):
+class CoilCrosstalk(Effect[Term]):
     """theta: one-way leak, real and imaginary share; mutual leak, one real share both ways.
 
     The tone of the second coil is read with a share of the first one's field.

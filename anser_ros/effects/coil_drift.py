@@ -1,23 +1,24 @@
 """An emitter's strength changes with time, as its copper or its driver warms up."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import (
-    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Term,
-    View,
     needed,
     sigmas,
     unit_matrix,
-)  # fmt: skip
+)
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
 
 PROBED_SHARES = (0.1, 0.5, 2.5)
@@ -28,7 +29,20 @@ def _shape(time: Array, tau: float) -> Array:
     return np.asarray(1 - np.exp(-np.maximum(time, 0.0) / tau))
 
 
-class CoilDrift(Effect):
+@dataclass(frozen=True, kw_only=True)
+class CoilDriftTerm(Term):
+    """An emitter's drift.
+
+    Attributes
+    ----------
+    duration : float
+        Of the session, s; only the search needs it.
+    """
+
+    duration: float = 1.0
+
+
+class CoilDrift(Effect[CoilDriftTerm]):
     """theta: amount (final relative change) and log(tau / s): 1 + amount (1 - exp(-t/tau))."""
 
     name = 'coil_drift'
@@ -39,29 +53,30 @@ class CoilDrift(Effect):
         'tau_s': (0.5, 1000.0),
     }
     remedy = Remedy.FLUX
+    drifts = True
 
-    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[CoilDriftTerm]:
         """Every emitter."""
-        tau = 0.5 * max(apparatus.duration, 1.0)
+        start = np.array([0.0, np.log(0.5 * max(apparatus.duration, 1.0))])
         return [
-            Term(self, {'coil': k, '_duration': apparatus.duration}, np.array([0.0, np.log(tau)]))
+            CoilDriftTerm(self, {'coil': k}, start, duration=max(apparatus.duration, 1.0))
             for k in range(apparatus.emitters)
         ]
 
-    def amounts(self, term: Term) -> NDArray[np.int64]:
+    def amounts(self, term: CoilDriftTerm) -> NDArray[np.int64]:
         """The amount."""
         return np.array([0])
 
-    def prior(self, term: Term) -> Array:
+    def prior(self, term: CoilDriftTerm) -> Array:
         """Some percent; a time constant known to a factor of five."""
         return np.array([0.1, 1.6])
 
-    def _own(self, term: Term, view: View) -> ComplexArray:
+    def _own(self, term: CoilDriftTerm, view: View) -> ComplexArray:
         coil, (amount, log_tau) = term.site['coil'], term.theta
         factor = 1 + amount * _shape(view.time, float(np.exp(log_tau)))
         return np.asarray(view.linear[:, :, coil] / factor[:, None])
 
-    def columns(self, term: Term, view: View) -> ComplexArray | None:
+    def columns(self, term: CoilDriftTerm, view: View) -> ComplexArray | None:
         """The emitter's flux times the derivatives of the curve."""
         amount, log_tau = term.theta
         tau = float(np.exp(log_tau))
@@ -71,18 +86,18 @@ class CoilDrift(Effect):
         out[:, :, term.site['coil'], 1] = own * (-amount * late * np.exp(-late))[:, None]
         return out
 
-    def probe(self, term: Term, view: View) -> ComplexArray | None:
+    def probe(self, term: CoilDriftTerm, view: View) -> ComplexArray | None:
         """Curves of three time constants."""
         own = self._own(term, view)
         out = view.columns(len(PROBED_SHARES))
         for i, share in enumerate(PROBED_SHARES):
-            curve = _shape(view.time, share * max(term.site['_duration'], 1.0))
+            curve = _shape(view.time, share * term.duration)
             out[:, :, term.site['coil'], i] = own * curve[:, None]
         return out
 
-    def started(self, term: Term, solution: Array) -> Sequence[Term]:
+    def started(self, term: CoilDriftTerm, solution: Array) -> Sequence[CoilDriftTerm]:
         """The time constant whose curve comes nearest to the probe's sum."""
-        duration = max(term.site['_duration'], 1.0)
+        duration = term.duration
         time = np.linspace(0.0, duration, 60)
         curves = [_shape(time, share * duration) for share in PROBED_SHARES]
         wanted = sum(a * c for a, c in zip(solution, curves, strict=True))
@@ -95,12 +110,12 @@ class CoilDrift(Effect):
                 best = (misfit, np.array([amount, np.log(tau)]))
         return (term.with_theta(best[1] if best else term.theta),)
 
-    def bounded(self, term: Term) -> Term:
+    def bounded(self, term: CoilDriftTerm) -> CoilDriftTerm:
         """Time constants from half a second to a quarter of an hour."""
         amount, log_tau = term.theta
         return term.with_theta(np.array([amount, np.clip(log_tau, np.log(0.3), np.log(1500.0))]))
 
-    def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
+    def emitter_matrix(self, term: CoilDriftTerm, time: Array, omega: Array) -> ComplexArray:
         """Diagonal, by time."""
         amount, log_tau = term.theta
         matrix = np.repeat(unit_matrix(omega.size)[None], time.size, axis=0)
@@ -108,7 +123,7 @@ class CoilDrift(Effect):
         matrix[:, coil, coil] = 1 + amount * _shape(time, float(np.exp(log_tau)))
         return matrix
 
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
+    def record(self, term: CoilDriftTerm, covariance: Array) -> EffectRecord:
         """Amount and time constant."""
         sigma, tau = sigmas(covariance), float(np.exp(term.theta[1]))
         return EffectRecord(
@@ -117,10 +132,10 @@ class CoilDrift(Effect):
             {'amount': float(sigma[0]), 'tau_s': tau * float(sigma[1])},
         )
 
-    def term(self, record: EffectRecord) -> Term:
+    def term(self, record: EffectRecord) -> CoilDriftTerm:
         """From amount and time constant."""
         theta = np.array([float(needed(record, 'amount')), np.log(float(needed(record, 'tau_s')))])
-        return Term(self, {'coil': int(needed(record, 'coil')), '_duration': 40.0}, theta)
+        return CoilDriftTerm(self, {'coil': int(needed(record, 'coil'))}, theta)
 
 
 EFFECTS = (CoilDrift(),)

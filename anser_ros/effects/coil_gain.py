@@ -5,21 +5,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from anser_ros.effects.effect import (
-    Apparatus,
-    Array,
-    ComplexArray,
-    Effect,
-    Remedy,
-    Term,
-    View,
-    needed,
-    unit_matrix,
-)  # fmt: skip
+from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed, unit_matrix
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
 
 
-class CoilGain(Effect):
+class CoilGain(Effect[Term]):
     """theta: real and imaginary part of (gain - 1)."""
 
     name = 'coil_gain'

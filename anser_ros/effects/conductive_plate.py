@@ -6,21 +6,23 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import (
     FROZEN,
-    Apparatus,
     Array,
     ComplexArray,
     Effect,
+    Family,
     Remedy,
-    Term,
-    View,
+    Resting,
     needed,
     sigmas,
-)  # fmt: skip
+)
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.model import EffectRecord
-from anser_ros.metal.sheet import sheet_sources
+from anser_ros.metal.sheet import sheet_shapes, sheet_sizes, sheet_sources
 
 MESH = 12
 STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])
@@ -32,7 +34,7 @@ HEIGHT, RIM, OHM = 0.005, 0.03, 0.1
 height and each rim as shares of its edge, and its resistance."""
 
 
-class ConductivePlate(Effect):
+class ConductivePlate(Effect[Term]):
     """theta: height z, edge, centre x and y (m), log of the sheet resistance (ohm)."""
 
     name = 'conductive_plate'
@@ -49,6 +51,8 @@ class ConductivePlate(Effect):
         'sheet_ohm': (1e-7, 1.0),
     }
     remedy = Remedy.FIELD
+    family = Family.METAL_AT_REST
+    inexact = np.inf
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Heights below the board and above the volume, two sizes."""
@@ -72,7 +76,7 @@ class ConductivePlate(Effect):
 
     def prior(self, term: Term) -> Array:
         """Anywhere near the board; sheet resistances over decades. A frozen sheet stays."""
-        if term.site.get('_frozen'):
+        if term.held:
             return np.full(5, FROZEN)
         return np.array([0.1, 0.2, 0.1, 0.1, 3.0])
 
@@ -82,6 +86,15 @@ class ConductivePlate(Effect):
         theta[1] = np.clip(theta[1], 0.02, 2.0)
         theta[4] = np.clip(theta[4], np.log(1e-7), 0.0)
         return term.with_theta(theta)
+
+    def covers(self, term: Term, candidate: Term) -> bool:
+        """One sheet is looked for; another height or size is the same sheet's."""
+        return candidate.effect is self
+
+    def resting(self, term: Term) -> Resting:
+        """What the sheet's currents lack, in waves over the sheet."""
+        edge = float(term.theta[1])
+        return Resting(term.theta[[2, 3, 0]], [(sheet_shapes(edge), sheet_sizes(edge))])
 
     def sources(
         self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
@@ -98,7 +111,7 @@ class ConductivePlate(Effect):
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
         """By differences."""
-        if term.site.get('_frozen'):
+        if term.held:
             return view.columns(5)
         parts = [
             (self._flux(term.theta + step, view) - self._flux(term.theta - step, view))

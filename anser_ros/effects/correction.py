@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Remedy, Term, unit_matrix
+from anser_ros.effects.effect import Remedy
 from anser_ros.effects.registry import effect_named
+from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
@@ -21,8 +22,20 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 DECOMPRESSION_STEPS = 12
-DRIFTS = ('coil_drift', 'coil_fluctuation')
-"""Effects whose course over time another session doesn't repeat; the references can tell it."""
+"""Most steps of the fixed point that undoes a compression. Each step
+leaves of the error about the share that the compression takes of a change of the signal, so a few
+steps settle it wherever a channel is of any use; the bound keeps a hopeless one from looping."""
+
+
+def drifts(record: EffectRecord) -> bool:
+    """Whether a record's course over time is one that another session doesn't repeat.
+
+    Raises
+    ------
+    ModelFileError
+        When no effect has the record's name.
+    """
+    return effect_named(record.name).drifts
 
 
 @dataclass(frozen=True)
@@ -65,7 +78,7 @@ class Correction:
     @property
     def drifting(self) -> tuple[str, ...]:
         """Effects that only references, or a recorded course, can correct."""
-        return tuple(term.label for term in self.terms if term.effect.name in DRIFTS)
+        return tuple(term.label for term in self.terms if term.effect.drifts)
 
     def sensors(self, table: SensorTable | None = None) -> SensorTable:
         """The sensors (by default those given at the start) as they truly are."""
@@ -81,26 +94,11 @@ class Correction:
             track = term.effect.optical(term, track)
         return track
 
-    def strengths(self, reference_flux: ComplexArray, baseline: ComplexArray) -> ComplexArray:
-        """Strength of each emitter now over that of the baseline, as the references see it.
-
-        Parameters
-        ----------
-        reference_flux, baseline : ndarray, shape (R, K), complex
-            Readings of the same reference sensors, T; rows with NaN are left out.
-        """
-        good = np.isfinite(reference_flux).all(axis=1) & np.isfinite(baseline).all(axis=1)
-        now, then = reference_flux[good], baseline[good]
-        power = np.sum(np.abs(then) ** 2, axis=0)
-        ratio = np.sum(then.conj() * now, axis=0) / np.where(power > 0, power, 1.0)
-        return np.asarray(np.where(power > 0, ratio, 1.0))
-
     def flux(
         self,
         time: float,
         channels: NDArray[np.generic],
         flux: ComplexArray,
-        strengths: ComplexArray | None = None,
         *,
         recorded: bool = False,
     ) -> ComplexArray:
@@ -114,11 +112,10 @@ class Correction:
         channels : ndarray, shape (S,)
         flux : ndarray, shape (S, K), complex
             T. A row with NaN stays NaN.
-        strengths : ndarray, shape (K,), complex, optional
-            What the references say about the emitters now (`strengths`), for those that drift.
         recorded : bool
             Whether the course that a drift took in the diagnosed session holds, because this is
-            that session. Without it and without ``strengths`` a drift is left as it is.
+            that session. Without it a drift is left as it is: live, the refit follows the
+            strengths of the emitters with the references.
 
         Returns
         -------
@@ -140,29 +137,14 @@ class Correction:
             mixing = term.effect.channel_matrix(term, number)
             if mixing is not None:
                 values = np.asarray(np.linalg.solve(mixing, values), dtype=complex)
-        for term in terms:
-            gain = term.effect.channel_gain(term, number, np.array([time]))
-            values = values if gain is None else values / gain[0][:, None]
         for term in reversed(terms):
-            matrix = self._emitters(term, time, strengths, recorded)
+            if term.effect.drifts and not recorded:
+                continue
+            matrix = term.effect.emitter_matrix(term, np.array([time]), self.omega)
             if matrix is not None:
-                values = np.asarray(np.linalg.solve(matrix, values.T).T, dtype=complex)
+                values = np.asarray(np.linalg.solve(matrix[0], values.T).T, dtype=complex)
         out[good] = values
         return out
-
-    def _emitters(
-        self, term: Term, time: float, strengths: ComplexArray | None, recorded: bool
-    ) -> ComplexArray | None:
-        if term.effect.name in DRIFTS:
-            if strengths is not None:
-                coil = int(term.site['coil'])
-                live = unit_matrix(self.omega.size)
-                live[coil, coil] = strengths[coil]
-                return live
-            if not recorded:
-                return None
-        matrix = term.effect.emitter_matrix(term, np.array([time]), self.omega)
-        return None if matrix is None else np.asarray(matrix[0])
 
     @staticmethod
     def _decompressed(
@@ -188,4 +170,4 @@ class Correction:
         return np.asarray(x)
 
 
-__all__ = ['Correction']
+__all__ = ['Correction', 'drifts']

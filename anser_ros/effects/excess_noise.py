@@ -1,13 +1,29 @@
 """Only the noise has grown."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import ClassVar
 
-from anser_ros.effects.effect import Array, Effect, Remedy, Term, needed
+from anser_ros.effects.effect import Array, Effect, Family, Remedy, needed
+from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
 
 
-class ExcessNoise(Effect):
+@dataclass(frozen=True, kw_only=True)
+class ExcessNoiseTerm(Term):
+    """How much the noise has grown.
+
+    Attributes
+    ----------
+    factor, sigma : float
+        Noise over what it should be, and its standard deviation.
+    """
+
+    factor: float
+    sigma: float = 0.0
+
+
+class ExcessNoise(Effect[ExcessNoiseTerm]):
     """Found from the residuals' spread once they show no structure (`anser_ros.diagnosis`)."""
 
     name = 'excess_noise'
@@ -15,17 +31,25 @@ class ExcessNoise(Effect):
     units: ClassVar[Mapping[str, str]] = {'factor': '1', 'channels': '1'}
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'factor': (1.0, 1000.0)}
     remedy = Remedy.NONE
+    family = Family.SEEN
 
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
+    def record(self, term: ExcessNoiseTerm, covariance: Array) -> EffectRecord:
         """The factor, and the channels where not all have it."""
-        parameters = {'factor': term.site['factor']}
+        parameters: dict[str, object] = {'factor': term.factor}
         if 'channels' in term.site:
             parameters['channels'] = list(term.site['channels'])
-        return EffectRecord(self.name, parameters, {'factor': term.site['sigma']})
+        return EffectRecord(self.name, parameters, {'factor': term.sigma})
 
-    def term(self, record: EffectRecord) -> Term:
-        """From the factor."""
-        return Term(self, {'factor': float(needed(record, 'factor')), 'sigma': 0.0})
+    def term(self, record: EffectRecord) -> ExcessNoiseTerm:
+        """The factor from a record."""
+        return ExcessNoiseTerm(self, factor=float(needed(record, 'factor')))
 
 
-EFFECTS = (ExcessNoise(),)
+EXCESS_NOISE = ExcessNoise()
+EFFECTS = (EXCESS_NOISE,)
+
+
+def excess_noise_of(factor: float, sigma: float, channels: Sequence[int]) -> ExcessNoiseTerm:
+    """Noise that has grown on some channels, or on all where none are named."""
+    site = {'channels': tuple(channels)} if channels else {}
+    return ExcessNoiseTerm(EXCESS_NOISE, site, factor=factor, sigma=sigma)

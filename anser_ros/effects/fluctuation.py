@@ -7,33 +7,68 @@ column however it goes, explains nothing but what those columns can, and hides n
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
+from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.coil_gain import CoilGain
 from anser_ros.effects.effect import (
-    Apparatus,
     Array,
     ComplexArray,
     Effect,
+    Family,
     Remedy,
-    Term,
-    View,
     needed,
-)  # fmt: skip
+)
 from anser_ros.effects.registration import Registration
 from anser_ros.effects.sensor_axis import SensorAxis
 from anser_ros.effects.sensor_gain import SensorGain
 from anser_ros.effects.sensor_position import SensorPosition
+from anser_ros.effects.term import Term
 from anser_ros.effects.time_offset import TimeOffset
 from anser_ros.effects.tool_gain import ToolGain
+from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
 
+OPEN = 40
+"""Parameters that a fluctuation counts for when explanations are compared: more than a constant
+has, whose columns it shares, and less than shaped metal (60), whose freedom is what it replaces.
+Larger lets moving metal explain an emitter that steps; smaller lets a fluctuation take over from
+a curve with several parameters."""
 
-class Fluctuation(Effect):
-    """No theta; the site's ``_spread`` is the standard deviation of each of the columns.
+
+@dataclass(frozen=True, kw_only=True)
+class FluctuationTerm(Term):
+    """Something constant that fluctuates; theta is empty.
+
+    Attributes
+    ----------
+    constant : Term or None
+        The constant effect at the same site; None for a term from a record.
+    spread : ndarray or None
+        Standard deviation of each of its parameters from frame to frame; None before it is found.
+    frames : int
+        Frames that the spread was found on.
+    """
+
+    constant: Term | None = None
+    spread: Array | None = None
+    frames: int = 1
+
+    def columns(self, view: View) -> ComplexArray | None:
+        """Columns (F, S, K, q) of unit size along which a frame may move."""
+        return None if self.constant is None else self.constant.effect.columns(self.constant, view)
+
+    @property
+    def expected(self) -> Array:
+        """Standard deviation of each parameter that the constant effect expects, shape (q,)."""
+        return np.zeros(0) if self.constant is None else self.constant.effect.prior(self.constant)
+
+
+class Fluctuation(Effect[FluctuationTerm]):
+    """Base of the fluctuations, each of one constant effect.
 
     Attributes
     ----------
@@ -41,70 +76,82 @@ class Fluctuation(Effect):
         The constant effect whose columns a frame may move along.
     """
 
-    of: ClassVar[Effect]
+    of: ClassVar[Effect[Any]]
+    family = Family.FLUCTUATION
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'rms': (0.0, 1.0)}
 
-    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[FluctuationTerm]:
         """Every site of the constant effect on emitters and tools."""
+        ours = apparatus.tool_channels
         return [
-            Term(self, {**term.site, '_constant': term})
+            FluctuationTerm(self, term.site, constant=term)
             for term in self.of.candidates(apparatus)
-            if self._is_tool(term, apparatus)
+            if all(channel in ours for channel in term.channels)
         ]
 
-    @staticmethod
-    def _is_tool(term: Term, apparatus: Apparatus) -> bool:
-        own = apparatus.tool_channels
-        return bool(term.site.get('channel', own[0]) in own)
+    def opened(self, term: FluctuationTerm) -> FluctuationTerm:
+        """The term, whose spread is found."""
+        return term
 
-    def free_columns(self, term: Term, view: View) -> ComplexArray | None:
-        """Columns (F, S, K, q) of unit size along which a frame may move."""
-        constant: Term = term.site['_constant']
-        return self.of.columns(constant, view)
+    def complexity(self, term: FluctuationTerm) -> int:
+        """As many as `OPEN`, whatever the number of its columns."""
+        return OPEN
 
-    def unit_spread(self, term: Term) -> Array:
-        """Standard deviations that the constant effect expects, shape (q,)."""
-        return self.of.prior(term.site['_constant'])
+    def covers(self, term: FluctuationTerm, candidate: Term) -> bool:
+        """It stands for the constant effect at its site too, whose columns are its own."""
+        if candidate.effect.name == self.of.name:
+            return candidate.seat[1] == term.seat[1]
+        return super().covers(term, candidate)
 
-    def spread_out(self, term: Term, spread: Array) -> Term:
-        """The term with a spread for each column."""
-        return replace(term, site={**term.site, '_spread': spread})
+    def rivals(self, term: FluctuationTerm, other: Term) -> bool:
+        """What is constant at its site, and whatever is steady on its coil or channel."""
+        if other.effect.family is Family.FLUCTUATION:
+            return False
+        if other.effect.name == self.of.name:
+            return all(other.site.get(k) == v for k, v in term.site.items())
+        about = [k for k in ('coil', 'channel') if k in term.site]
+        return any(term.site[k] == other.site.get(k) for k in about)
 
-    def directions(self, term: Term, view: View) -> ComplexArray | None:
+    def freedom(self, term: FluctuationTerm) -> int:
+        """One value for each column in each frame."""
+        return 0 if term.spread is None else term.frames * len(term.spread)
+
+    def directions(self, term: FluctuationTerm, view: View) -> ComplexArray | None:
         """The columns, a standard deviation long."""
-        columns = self.free_columns(term, view)
-        spread = term.site.get('_spread')
-        return None if columns is None or spread is None else columns * spread
+        columns = term.columns(view)
+        return None if columns is None or term.spread is None else columns * term.spread
 
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Where, and how much."""
-        site = {k: v for k, v in term.site.items() if k[0] != '_'}
-        spread = np.asarray(term.site['_spread'])
-        rms, frames = float(np.sqrt(np.sum(spread**2))), max(int(term.site.get('_frames', 1)), 1)
-        where: dict[str, Any] = {k: list(v) if k == 'channels' else v for k, v in site.items()}
-        return EffectRecord(
-            self.name, {**where, 'rms': rms}, {'rms': rms / float(np.sqrt(2 * frames))}
-        )
+    def record(self, term: FluctuationTerm, covariance: Array) -> EffectRecord:
+        """Where it is, and how much it is; sigma is that of a spread of so many numbers."""
+        spread = np.zeros(1) if term.spread is None else term.spread
+        rms = float(np.sqrt(np.sum(spread**2)))
+        where: dict[str, Any] = {
+            k: list(v) if k == 'channels' else v for k, v in term.site.items()
+        }
+        sigma = rms / float(np.sqrt(2 * max(term.frames, 1)))
+        return EffectRecord(self.name, {**where, 'rms': rms}, {'rms': sigma})
 
-    def term(self, record: EffectRecord) -> Term:
+    def term(self, record: EffectRecord) -> FluctuationTerm:
         """Where it is; what it does in a frame only the frame can tell."""
         needed(record, 'rms')
         where = {k: v for k, v in record.parameters.items() if k != 'rms'}
-        return Term(self, where)
+        return FluctuationTerm(self, where)
 
 
 class CoilFluctuation(Fluctuation):
-    """Of a `CoilGain`; live, the references tell the strength of the moment."""
+    """A `CoilGain` that changes; live, the references tell the strength of the moment."""
 
     name = 'coil_fluctuation'
     summary = "an emitter's strength steps, swings or fails, not as a warming coil's does"
     units: ClassVar[Mapping[str, str]] = {'coil': '1', 'rms': '1'}
     remedy = Remedy.FLUX
+    drifts = True
+    followed = True
     of = CoilGain()
 
 
 class SensorGainDrift(Fluctuation):
-    """Of a `SensorGain`."""
+    """A `SensorGain` that changes from frame to frame."""
 
     name = 'sensor_gain_drift'
     summary = "a sensor's gain changes with time"
@@ -113,7 +160,7 @@ class SensorGainDrift(Fluctuation):
 
 
 class ToolGainDrift(Fluctuation):
-    """Of a `ToolGain`."""
+    """A `ToolGain` that changes from frame to frame."""
 
     name = 'tool_gain_drift'
     summary = "the gain that all of a tool's sensors share changes with time"
@@ -122,7 +169,7 @@ class ToolGainDrift(Fluctuation):
 
 
 class LooseSensorAxis(Fluctuation):
-    """Of a `SensorAxis`."""
+    """A `SensorAxis` that changes from frame to frame."""
 
     name = 'loose_sensor_axis'
     summary = "a sensor's axis changes with time"
@@ -131,20 +178,20 @@ class LooseSensorAxis(Fluctuation):
 
 
 class LooseSensorPosition(Fluctuation):
-    """Of a `SensorPosition`, for clusters: the readings of one coil are too few for three."""
+    """A `SensorPosition` that changes, of clusters: one coil reads too little for it."""
 
     name = 'loose_sensor_position'
     summary = "a cluster's place in its body changes with time"
     units: ClassVar[Mapping[str, str]] = {'channels': '1', 'rms': 'm'}
     of = SensorPosition()
 
-    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[FluctuationTerm]:
         """Every cluster."""
         return [term for term in super().candidates(apparatus) if len(term.site['channels']) > 1]
 
 
 class StampJitter(Fluctuation):
-    """Of a `TimeOffset`."""
+    """A `TimeOffset` that changes from frame to frame."""
 
     name = 'stamp_jitter'
     summary = 'the optical stamps are early or late by a different time in every frame'
@@ -153,7 +200,7 @@ class StampJitter(Fluctuation):
 
 
 class OpticalJitter(Fluctuation):
-    """Of a `Registration`: what the optical poses err by beyond what they may."""
+    """A `Registration` that changes: what the optical poses err by beyond what they may."""
 
     name = 'optical_jitter'
     summary = 'the optical poses err by more than they may'

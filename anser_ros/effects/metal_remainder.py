@@ -11,7 +11,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term, View
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Family, Remedy
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.model import EffectRecord
 from anser_ros.metal.scattering import Shapes
@@ -132,33 +134,53 @@ class Lighting:
         return out
 
 
-class MetalRemainder(Effect):
-    """theta: the parameters of a leftover (`Couplings` or `Lighting`)."""
+@dataclass(frozen=True, kw_only=True)
+class RemainderTerm(Term):
+    """A leftover of one metal; theta is the leftover's parameters.
+
+    Attributes
+    ----------
+    parent : tuple of str
+        `Term.seat` of the metal.
+    leftover : Leftover
+    """
+
+    parent: tuple[str, str]
+    leftover: Leftover
+
+
+class MetalRemainder(Effect[RemainderTerm]):
+    """What the few parameters of metal at rest leave (`Couplings` or `Lighting`)."""
 
     name = 'metal_remainder'
     summary = 'what a simple metal body leaves'
     remedy = Remedy.FIELD
+    family = Family.REMAINDER
 
-    def of(self, parent: Term, leftover: Leftover) -> Term:
+    def of(self, parent: Term, leftover: Leftover) -> RemainderTerm:
         """A leftover of a metal that is at rest, with parameters of zero."""
-        site = {'of': parent.effect.name, '_parent': parent.seat, '_leftover': leftover}
-        return Term(self, site, np.zeros(leftover.count))
+        return RemainderTerm(
+            self, {'of': parent.effect.name}, np.zeros(leftover.count),
+            parent=parent.seat, leftover=leftover,
+        )  # fmt: skip
 
-    def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """Linear."""
-        leftover: Leftover = term.site['_leftover']
-        return leftover.columns(view)
+    def belongs(self, term: RemainderTerm, other: Term) -> bool:
+        """A leftover belongs to its metal."""
+        return term.parent == other.seat
+
+    def columns(self, term: RemainderTerm, view: View) -> ComplexArray | None:
+        """The leftover's own columns: it is linear in its parameters."""
+        return term.leftover.columns(view)
 
     def sources(
-        self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
+        self, term: RemainderTerm, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
         """The leftover's dipoles."""
         if not np.any(term.theta):
             return None
-        leftover: Leftover = term.site['_leftover']
-        return leftover.sources(term.theta, illumination, omega)
+        return term.leftover.sources(term.theta, illumination, omega)
 
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
+    def record(self, term: RemainderTerm, covariance: Array) -> EffectRecord:
         """Size only; the parent's record names the metal."""
         rms = float(np.sqrt(np.mean(term.theta**2)))
         return EffectRecord(self.name, {'of': term.site['of'], 'rms': rms})

@@ -1,41 +1,120 @@
 """A metal object that moves during the session."""
 
-from collections.abc import Mapping
-from typing import ClassVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.body_term import LARGEST, BodyTerm
 from anser_ros.effects.effect import (
     FROZEN,
     Array,
     ComplexArray,
     Effect,
+    Family,
     Remedy,
-    Term,
-    View,
     needed,
     sigmas,
 )
 from anser_ros.effects.metal_path import FreePath, MetalPath, StraightPath, moving_times
-from anser_ros.field.dipoles import Dipoles
+from anser_ros.effects.static_metal import STATIC_METAL
+from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
-from anser_ros.metal.body import BODIES, COMPACT, SPACINGS, ball_modes, centre_sigma
-from anser_ros.metal.scattering import UNIT, Shapes
+from anser_ros.metal.body import COMPACT, SPACINGS, ball_modes, centre_sigma
+from anser_ros.metal.scattering import UNIT
 
 STEP = 1e-3
+"""Step (m) of the central differences that give the derivative by the place. Their relative error
+is about the square of the step over the distance: 1e-4 at a decimetre, far above rounding."""
 PATH_SAMPLES = 21
-LARGEST = 10.0
-"""Prior size of a simple body's modes, `UNIT`."""
+"""Times at which a record says where the metal is: two seconds apart in a session of 40 s."""
+SHAPED = 60
+"""Parameters that moving metal counts for at least when explanations are compared: it is shaped
+with dozens of modes once it is taken, and must not win as a simple body against a fluctuation,
+which counts for 40. Larger makes it give way to fluctuations that explain less."""
+SHORT_WAY = 0.02
+"""Ends of the course nearer to each other than this (m) don't give a straight path a direction."""
+UPWARDS = np.array([0.0, 0.0, -0.05])
+"""What the straight path's start is shifted by then, m: metal that comes from below."""
+KNOTS = 9
+"""Knots of the free path that is tried first: one in 4.5 s of a session of 40 s."""
 
 
-class MovingMetal(Effect):
-    """theta: the path's parameters, then real and imaginary parts of the modes' amplitudes.
+@dataclass(frozen=True, kw_only=True)
+class MovingTerm(BodyTerm):
+    """Metal on a path; theta is the path's parameters, then the modes' amplitudes.
 
-    The body doesn't turn. The site holds the path, the session's times, the modes
-    (`anser_ros.metal.scattering`) and the prior size of each.
+    Attributes
+    ----------
+    path : MetalPath
+    duration : float
+        Of the session, s.
+    first : ndarray or None
+        Parameters of the path as the search started with; None for a term from a record.
     """
+
+    path: MetalPath
+    duration: float
+    first: Array | None = None
+
+    @property
+    def placed(self) -> int:
+        """Parameters of the path."""
+        return self.path.count
+
+    @property
+    def knots(self) -> int:
+        """Knots of a free path; 0 for a straight one."""
+        return len(self.path.knots)
+
+    def centres(self, time: Array) -> Array:
+        """Where the body is at each time, (F, 3), m, frame fg."""
+        return self.path.centre(self.course, time)
+
+    def _seen(self, view: View, shift: Array) -> tuple[Array, ComplexArray]:
+        """Amplitudes of the sensors (F, S, M) and emitters (F, K, M) about the moving centre.
+
+        The emitters' are interpolated between nodes on the way.
+        """
+        nodes, on_way, at = self.path.nodes(self.course, view.time)
+        grid = (on_way + shift)[:, None, :] + self.shapes.offsets
+        field = view.illumination.field(grid.reshape(-1, 3)).reshape(*grid.shape, -1)
+        drive = CubicSpline(nodes, self.shapes.driven(field))(at)
+        centre = self.centres(view.time) + shift
+        return self.shapes.heard(centre, view.centres, view.axes, view.sensors.length), drive
+
+    def flux(self, view: View, shift: Array) -> ComplexArray:
+        """Flux (F, S, K) of the whole body, moved by a shift (m)."""
+        return self.shapes.flux(*self._seen(view, shift), self.couplings, view.omega)
+
+    def unit(self, view: View) -> NDArray[np.inexact]:
+        """Flux of each mode of unit amplitude, (F, S, K, m)."""
+        return self.shapes.mode_flux(*self._seen(view, np.zeros(3)), self.modes, view.omega)
+
+    def freer(self, knots: int) -> Self | None:
+        """The same body on a free path with so many knots; None where it has as many."""
+        if self.knots >= knots:
+            return None
+        time = np.linspace(0.0, self.duration, 6 * knots)
+        path, course = FreePath.through(
+            np.linspace(0.0, self.duration, knots), time, self.centres(time)
+        )
+        theta = np.concatenate([course, self.theta[self.placed :]])
+        return replace(self, path=path, theta=theta)
+
+    def restarted(self) -> Self | None:
+        """The body on the path that the search started with."""
+        if self.first is None:
+            return None
+        return self.with_theta(np.concatenate([self.first, self.theta[self.first.size :]]))
+
+
+class MovingMetal(Effect[MovingTerm]):
+    """Metal on a straight path from rest to rest, or on a free one. The body doesn't turn."""
 
     name = 'moving_metal'
     summary = 'a metal object moves during the session'
@@ -44,123 +123,98 @@ class MovingMetal(Effect):
         'path': 's and m', 'polarizability': 'm^3 (3x3, [re, im])',
     }  # fmt: skip
     remedy = Remedy.FIELD
-    moving = True
+    family = Family.MOVING_METAL
+    inexact = np.inf
+    followed = True
+    still = STATIC_METAL
 
-    def starting(self, path: MetalPath, course: Array, duration: float, alpha: Array) -> Term:
+    def along(
+        self, time: Array, course: Array, solution: Array, apparatus: Apparatus
+    ) -> Sequence[MovingTerm]:
+        """A straight and a free path along the best places; ``solution`` is re, im of alpha."""
+        duration, few = apparatus.duration, max(2, len(course) // 8)
+        start, end = course[:few].mean(0), course[-few:].mean(0)
+        path, knots = FreePath.through(np.linspace(0.0, duration, KNOTS), time, course)
+        if np.linalg.norm(end - start) < SHORT_WAY:
+            start = start + UPWARDS
+        straight = np.concatenate([start, end, (0.2 * duration, 0.8 * duration), [0.5]])
+        return (
+            self.starting(StraightPath(), straight, duration, solution),
+            self.starting(path, knots, duration, solution),
+        )
+
+    def starting(
+        self, path: MetalPath, course: Array, duration: float, alpha: Array
+    ) -> MovingTerm:
         """A simple body on a path with parameters ``course``; alpha: re, im in 1e-4 m^3."""
         modes = ball_modes()
         amplitudes = np.zeros((2, modes.shape[1]))
         amplitudes[:, 0] = alpha
-        site = {
-            '_path': path, '_course': course, '_duration': float(duration), '_kind': COMPACT,
-            '_modes': modes, '_spread': np.full(modes.shape[1], LARGEST),
-        }  # fmt: skip
-        return Term(self, site, np.concatenate([course, amplitudes.ravel()]))
+        return MovingTerm(
+            self, theta=np.concatenate([course, amplitudes.ravel()]), kind=COMPACT, modes=modes,
+            spread=np.full(modes.shape[1], LARGEST), path=path, duration=float(duration),
+            first=course,
+        )  # fmt: skip
 
-    def with_body(self, term: Term, kind: str, modes: Array, spread: Array) -> Term:
-        """The same path, another body, whose amplitudes are still zero."""
-        site = {**term.site, '_kind': kind, '_modes': modes, '_spread': spread}
-        amplitudes = np.zeros(2 * modes.shape[1])
-        return Term(self, site, np.concatenate([term.theta[: path_of(term).count], amplitudes]))
+    def complexity(self, term: MovingTerm) -> int:
+        """At least what it will have once it is shaped."""
+        return max(int(term.theta.size), SHAPED)
 
-    def with_path(self, term: Term, path: MetalPath, course: Array) -> Term:
-        """The same body on another path."""
-        amplitudes = term.theta[path_of(term).count :]
-        return Term(self, {**term.site, '_path': path}, np.concatenate([course, amplitudes]))
+    def body(self, term: MovingTerm) -> MovingTerm:
+        """The term, whose body and path are refined."""
+        return term
 
-    def amounts(self, term: Term) -> NDArray[np.int64]:
-        """The polarisabilities."""
-        return np.arange(path_of(term).count, term.theta.size)
+    def amounts(self, term: MovingTerm) -> NDArray[np.int64]:
+        """The amplitudes of the modes."""
+        return np.arange(term.placed, term.theta.size)
 
-    def prior(self, term: Term) -> Array:
-        """Anywhere, any time. Frozen metal stays on its path."""
-        path = path_of(term).prior()
-        if term.site.get('_frozen'):
+    def prior(self, term: MovingTerm) -> Array:
+        """The path's own prior and the modes' sizes; held metal stays on its path."""
+        path = term.path.prior()
+        if term.held:
             path = np.full(path.size, FROZEN)
-        return np.concatenate([path, term.site['_spread'], term.site['_spread']])
+        return np.concatenate([path, term.spread, term.spread])
 
-    def bounded(self, term: Term) -> Term:
+    def bounded(self, term: MovingTerm) -> MovingTerm:
         """The path in its domain."""
-        count = path_of(term).count
-        course = path_of(term).bounded(term.theta[:count])
-        return term.with_theta(np.concatenate([course, term.theta[count:]]))
+        course = term.path.bounded(term.course)
+        return term.with_theta(np.concatenate([course, term.theta[term.placed :]]))
 
-    def _couplings(self, term: Term) -> ComplexArray:
-        parts = term.theta[path_of(term).count :].reshape(2, -1)
-        return np.asarray(term.site['_modes'] @ (parts[0] + 1j * parts[1]))
-
-    def _seen(self, term: Term, view: View, shift: Array) -> tuple[Array, ComplexArray]:
-        """Amplitudes of the sensors (F, S, M) and emitters (F, K, M) about the moving centre.
-
-        The emitters' are interpolated between nodes on the way.
-        """
-        path, shapes = path_of(term), shapes_of(term)
-        course = term.theta[: path.count]
-        nodes, on_way, at = path.nodes(course, view.time)
-        grid = (on_way + shift)[:, None, :] + shapes.offsets
-        field = view.illumination.field(grid.reshape(-1, 3)).reshape(*grid.shape, -1)
-        drive = CubicSpline(nodes, shapes.driven(field))(at)
-        centre = path.centre(course, view.time) + shift
-        return shapes.heard(centre, view.centres, view.axes, view.sensors.length), drive
-
-    def _sum(self, term: Term, view: View, shift: Array) -> ComplexArray:
-        """Flux (F, S, K) of the whole body, moved by a shift."""
-        seen = self._seen(term, view, shift)
-        return shapes_of(term).flux(*seen, self._couplings(term), view.omega)
-
-    def unit(self, term: Term, view: View) -> NDArray[np.inexact]:
-        """Flux of each mode, (F, S, K, m)."""
-        seen = self._seen(term, view, np.zeros(3))
-        return shapes_of(term).mode_flux(*seen, term.site['_modes'], view.omega)
-
-    def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """By path (differences, chained) and by polarisability (exact)."""
-        path = path_of(term)
-        unit = self.unit(term, view)
+    def columns(self, term: MovingTerm, view: View) -> ComplexArray | None:
+        """Derivatives by the path (differences, chained) and by the amplitudes (exact)."""
+        unit = term.unit(view)
         out = view.columns(term.theta.size)
         groups = unit.shape[-1]
-        out[..., path.count : path.count + groups] = unit
-        out[..., path.count + groups :] = 1j * unit
-        if term.site.get('_frozen'):
+        out[..., term.placed : term.placed + groups] = unit
+        out[..., term.placed + groups :] = 1j * unit
+        if term.held:
             return out
         by_place = np.stack(
             [
-                (self._sum(term, view, step) - self._sum(term, view, -step)) / (2 * STEP)
+                (term.flux(view, step) - term.flux(view, -step)) / (2 * STEP)
                 for step in STEP * np.eye(3)
             ],
             axis=-1,
         )
-        rates = path.rates(term.theta[: path.count], view.time)
-        out[..., : path.count] = by_place @ rates[:, None]
+        rates = term.path.rates(term.course, view.time)
+        out[..., : term.placed] = by_place @ rates[:, None]
         return out
 
-    def moving_flux(self, term: Term, view: View) -> ComplexArray:
+    def moving_flux(self, term: MovingTerm, view: View) -> ComplexArray:
         """What the body adds to a view."""
-        return self._sum(term, view, np.zeros(3))
+        return term.flux(view, np.zeros(3))
 
-    def centres(self, term: Term, time: Array) -> Array:
-        """Where the body is at each time, (F, 3), m."""
-        return path_of(term).centre(term.theta[: path_of(term).count], time)
-
-    def sources_at(
-        self, term: Term, illumination: Dipoles, omega: Array, time: float
-    ) -> Dipoles | None:
-        """Induced dipoles with the body where it is."""
-        centre = self.centres(term, np.array([time]))[0]
-        return shapes_of(term).sources(centre, self._couplings(term), illumination, omega)
-
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Path, times and polarisability."""
-        path, total = path_of(term), shapes_of(term).polarisability(self._couplings(term))
-        course, couplings = term.theta[: path.count], UNIT * self._couplings(term)
-        times = np.linspace(0.0, term.site['_duration'], PATH_SAMPLES)
-        start, end = moving_times(path, course, times)
+    def record(self, term: MovingTerm, covariance: Array) -> EffectRecord:
+        """Path, times, polarisability, and all that makes the term again."""
+        total, couplings = term.shapes.polarisability(term.couplings), UNIT * term.couplings
+        times = np.linspace(0.0, term.duration, PATH_SAMPLES)
+        start, end = moving_times(term.path, term.course, times)
         ends = np.array([start, end])
-        at, spread = self.centres(term, ends), self._place_sigma(term, covariance, ends)
+        at, spread = term.centres(ends), _place_sigma(term, covariance, ends)
         # Which point of a body is its centre, hardly anything tells; of an extended one, nothing.
-        vague = max(centre_sigma(total), SPACINGS.get(term.site['_kind'], 0.0))
+        vague = max(centre_sigma(total), SPACINGS.get(term.kind, 0.0))
         spread = np.hypot(spread, vague)
-        times_sigma = self._time_sigma(term, covariance, start, end)
+        times_sigma = _time_sigma(term, covariance, start, end)
         return EffectRecord(
             self.name,
             {
@@ -170,12 +224,12 @@ class MovingMetal(Effect):
                 't_end_s': end,
                 'path': {
                     'time_s': times.tolist(),
-                    'position_m': self.centres(term, times).tolist(),
+                    'position_m': term.centres(times).tolist(),
                 },
                 'polarizability': np.stack([total.real, total.imag], axis=-1).tolist(),
-                'knots_s': list(path.knots),
-                'course': course.tolist(),
-                'body': term.site['_kind'],
+                'knots_s': list(term.path.knots),
+                'course': term.course.tolist(),
+                'body': term.kind,
                 'couplings_m3': np.stack([couplings.real, couplings.imag], axis=-1).tolist(),
             },
             {
@@ -183,63 +237,53 @@ class MovingMetal(Effect):
                 'end_m': spread[1].tolist(),
                 't_start_s': times_sigma[0],
                 't_end_s': times_sigma[1],
-                'path': np.hypot(self._place_sigma(term, covariance, times), vague).tolist(),
+                'path': np.hypot(_place_sigma(term, covariance, times), vague).tolist(),
             },
         )
 
-    def _place_sigma(self, term: Term, covariance: Array, time: Array) -> Array:
-        """Standard deviation of the centre at each time, (F, 3), m."""
-        path = path_of(term)
-        rates = path.rates(term.theta[: path.count], time)
-        block = covariance[: path.count, : path.count]
-        variance = np.einsum('fic,cd,fid->fi', rates, block, rates)
-        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
-
-    def _time_sigma(
-        self, term: Term, covariance: Array, start: float, end: float
-    ) -> tuple[float, float]:
-        """Standard deviation of the times when the way begins and ends, s.
-
-        On a free path a body has left its first place for certain only where it is farther from
-        it than it is known to be anywhere.
-        """
-        path = path_of(term)
-        if not path.knots:
-            first, last = sigmas(covariance)[6:8]
-            return float(first), float(last)
-        time = np.linspace(path.knots[0], path.knots[-1], PATH_SAMPLES * 8)
-        centre = self.centres(term, time)
-        known = 2.0 * np.linalg.norm(self._place_sigma(term, covariance, time), axis=1)
-        gone = np.flatnonzero(np.linalg.norm(centre - centre[0], axis=1) > known)
-        coming = np.flatnonzero(np.linalg.norm(centre - centre[-1], axis=1) > known)
-        knot = 0.5 * (path.knots[1] - path.knots[0])
-        left = float(time[gone[0]]) if gone.size else path.knots[-1]
-        there = float(time[coming[-1]]) if coming.size else path.knots[0]
-        return float(np.hypot(knot, left - start)), float(np.hypot(knot, end - there))
-
-    def term(self, record: EffectRecord) -> Term:
-        """From path and couplings."""
+    def term(self, record: EffectRecord) -> MovingTerm:
+        """From path and couplings; every coupling is a mode of its own."""
         knots = tuple(float(k) for k in needed(record, 'knots_s'))
         course = np.asarray(needed(record, 'course'), dtype=np.float64)
         couplings = np.asarray(needed(record, 'couplings_m3'), dtype=np.float64) / UNIT
-        path = FreePath(knots) if knots else StraightPath()
-        site = {
-            '_path': path, '_kind': str(needed(record, 'body')), '_modes': np.eye(len(couplings)),
-            '_spread': np.full(len(couplings), LARGEST),
-            '_duration': float(needed(record, 'path')['time_s'][-1]),
-        }  # fmt: skip
-        return Term(self, site, np.concatenate([course, couplings.T.ravel()]))
+        return MovingTerm(
+            self, theta=np.concatenate([course, couplings.T.ravel()]),
+            kind=str(needed(record, 'body')), modes=np.eye(len(couplings)),
+            spread=np.full(len(couplings), LARGEST),
+            path=FreePath(knots) if knots else StraightPath(),
+            duration=float(needed(record, 'path')['time_s'][-1]),
+        )  # fmt: skip
 
 
-def path_of(term: Term) -> MetalPath:
-    """The path that a term's site holds."""
-    path: MetalPath = term.site['_path']
-    return path
+def _place_sigma(term: MovingTerm, covariance: Array, time: Array) -> Array:
+    """Standard deviation of the centre at each time, (F, 3), m."""
+    rates = term.path.rates(term.course, time)
+    block = covariance[: term.placed, : term.placed]
+    variance = np.einsum('fic,cd,fid->fi', rates, block, rates)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def shapes_of(term: Term) -> Shapes:
-    """The shapes that a term's body is made of."""
-    return BODIES[term.site['_kind']]()
+def _time_sigma(
+    term: MovingTerm, covariance: Array, start: float, end: float
+) -> tuple[float, float]:
+    """Standard deviation of the times when the way begins and ends, s.
+
+    On a free path a body has left its first place for certain only where it is farther from it
+    than it is known to be anywhere.
+    """
+    knots = term.path.knots
+    if not knots:
+        first, last = sigmas(covariance)[6:8]
+        return float(first), float(last)
+    time = np.linspace(knots[0], knots[-1], PATH_SAMPLES * 8)
+    centre = term.centres(time)
+    known = 2.0 * np.linalg.norm(_place_sigma(term, covariance, time), axis=1)
+    gone = np.flatnonzero(np.linalg.norm(centre - centre[0], axis=1) > known)
+    coming = np.flatnonzero(np.linalg.norm(centre - centre[-1], axis=1) > known)
+    knot = 0.5 * (knots[1] - knots[0])
+    left = float(time[gone[0]]) if gone.size else knots[-1]
+    there = float(time[coming[-1]]) if coming.size else knots[0]
+    return float(np.hypot(knot, left - start)), float(np.hypot(knot, end - there))
 
 
 EFFECTS = (MovingMetal(),)

@@ -1,28 +1,21 @@
 """What else an optical frame may be besides turned and shifted: too large, or on the move."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import (
-    Apparatus,
-    Array,
-    ComplexArray,
-    Effect,
-    Remedy,
-    Term,
-    View,
-    needed,
-    sigmas,
-)
+from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed, sigmas
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 
 
-class OpticalScale(Effect):
+class OpticalScale(Effect[Term]):
     """theta: scale - 1, and the point of fg that stays where it is (m) times it.
 
     Optical positions are ``p (1 + e) - c``; a scale comes about the tracker's own origin, which is
@@ -79,7 +72,20 @@ class OpticalScale(Effect):
         return Term(self, {}, np.array([float(needed(record, 'scale')) - 1, *shift]))
 
 
-class RegistrationDrift(Effect):
+@dataclass(frozen=True, kw_only=True)
+class RegistrationDriftTerm(Term):
+    """A tracker's drift.
+
+    Attributes
+    ----------
+    duration : float
+        Time over which the growth in theta is made, s.
+    """
+
+    duration: float
+
+
+class RegistrationDrift(Effect[RegistrationDriftTerm]):
     """theta: translation (m) at the session's start, and what it grows by (m) to its end."""
 
     name = 'registration_drift'
@@ -95,36 +101,37 @@ class RegistrationDrift(Effect):
     }
     remedy = Remedy.OPTICAL
 
-    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[RegistrationDriftTerm]:
         """One tracker for all bodies."""
-        site = {'_duration': max(apparatus.duration, 1e-3)}
-        return [Term(self, site, np.zeros(6))] if apparatus.tools else []
+        duration = max(apparatus.duration, 1e-3)
+        term = RegistrationDriftTerm(self, {}, np.zeros(6), duration=duration)
+        return [term] if apparatus.tools else []
 
-    def prior(self, term: Term) -> Array:
+    def prior(self, term: RegistrationDriftTerm) -> Array:
         """Some millimetres."""
         return np.full(6, 5e-3)
 
-    def amounts(self, term: Term) -> NDArray[np.int64]:
+    def amounts(self, term: RegistrationDriftTerm) -> NDArray[np.int64]:
         """The growth."""
         return np.arange(3, 6)
 
-    def columns(self, term: Term, view: View) -> ComplexArray | None:
+    def columns(self, term: RegistrationDriftTerm, view: View) -> ComplexArray | None:
         """All sensors moved the other way, from the start and more and more."""
         if view.is_reference:
             return None
         out, back = view.columns(6), -np.moveaxis(view.d_position, 2, -1)
-        share = (view.time / term.site['_duration'])[:, None, None, None]
+        share = (view.time / term.duration)[:, None, None, None]
         out[..., :3], out[..., 3:] = back, back * share
         return out
 
-    def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
+    def optical(self, term: RegistrationDriftTerm, track: PoseTrack) -> PoseTrack:
         """Positions in fg."""
-        share = (track.time / term.site['_duration'])[:, None]
+        share = (track.time / term.duration)[:, None]
         return replace(track, position=track.position - term.theta[:3] - share * term.theta[3:])
 
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
+    def record(self, term: RegistrationDriftTerm, covariance: Array) -> EffectRecord:
         """Translation and velocity."""
-        sigma, duration = sigmas(covariance), float(term.site['_duration'])
+        sigma, duration = sigmas(covariance), term.duration
         return EffectRecord(
             self.name,
             {
@@ -138,12 +145,12 @@ class RegistrationDrift(Effect):
             },
         )
 
-    def term(self, record: EffectRecord) -> Term:
+    def term(self, record: EffectRecord) -> RegistrationDriftTerm:
         """From translation and velocity."""
         duration = float(needed(record, 'duration_s'))
         start = np.asarray(needed(record, 'translation_m'), dtype=np.float64)
         way = np.asarray(needed(record, 'velocity_m_per_s'), dtype=np.float64) * duration
-        return Term(self, {'_duration': duration}, np.concatenate([start, way]))
+        return RegistrationDriftTerm(self, {}, np.concatenate([start, way]), duration=duration)
 
 
 EFFECTS = (OpticalScale(), RegistrationDrift())

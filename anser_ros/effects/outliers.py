@@ -1,13 +1,29 @@
 """Frames that belong to no model."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import ClassVar
 
-from anser_ros.effects.effect import Array, Effect, Remedy, Term, needed
+from anser_ros.effects.effect import Array, Effect, Family, Remedy, needed
+from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
 
 
-class Outliers(Effect):
+@dataclass(frozen=True, kw_only=True)
+class OutliersTerm(Term):
+    """How many frames stand out.
+
+    Attributes
+    ----------
+    fraction, sigma : float
+        Share of the frames, and its standard deviation.
+    """
+
+    fraction: float
+    sigma: float = 0.0
+
+
+class Outliers(Effect[OutliersTerm]):
     """Found as frames that stand out from their neighbours in time (`anser_ros.diagnosis`)."""
 
     name = 'outliers'
@@ -15,17 +31,18 @@ class Outliers(Effect):
     units: ClassVar[Mapping[str, str]] = {'fraction': '1', 'channels': '1'}
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'fraction': (0.0, 0.5)}
     remedy = Remedy.NONE
+    family = Family.SEEN
 
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
+    def record(self, term: OutliersTerm, covariance: Array) -> EffectRecord:
         """The share of frames, and the channels where not all have them."""
-        parameters = {'fraction': term.site['fraction']}
+        parameters: dict[str, object] = {'fraction': term.fraction}
         if 'channels' in term.site:
             parameters['channels'] = list(term.site['channels'])
-        return EffectRecord(self.name, parameters, {'fraction': term.site['sigma']})
+        return EffectRecord(self.name, parameters, {'fraction': term.sigma})
 
-    def term(self, record: EffectRecord) -> Term:
-        """From the share."""
-        return Term(self, {'fraction': float(needed(record, 'fraction')), 'sigma': 0.0})
+    def term(self, record: EffectRecord) -> OutliersTerm:
+        """The share of frames from a record."""
+        return OutliersTerm(self, fraction=float(needed(record, 'fraction')))
 
 
 class LooseContact(Outliers):
@@ -35,4 +52,13 @@ class LooseContact(Outliers):
     summary = 'single readings of a channel fail now and then'
 
 
-EFFECTS = (Outliers(), LooseContact())
+OUTLIERS, LOOSE_CONTACT = Outliers(), LooseContact()
+EFFECTS = (OUTLIERS, LOOSE_CONTACT)
+
+
+def outliers_of(fraction: float, sigma: float, channels: Sequence[int]) -> OutliersTerm:
+    """Outliers in whole frames, or of some channels, which is what a loose contact does."""
+    if not channels:
+        return OutliersTerm(OUTLIERS, fraction=fraction, sigma=sigma)
+    site = {'channels': tuple(channels)}
+    return OutliersTerm(LOOSE_CONTACT, site, fraction=fraction, sigma=sigma)

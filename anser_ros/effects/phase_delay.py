@@ -5,23 +5,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from anser_ros.effects.effect import (
-    Apparatus,
-    Array,
-    ComplexArray,
-    Effect,
-    Remedy,
-    Term,
-    View,
-    needed,
-)  # fmt: skip
+from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
 
 UNIT = 1e-6
 """theta counts microseconds."""
 
 
-class PhaseDelay(Effect):
+class PhaseDelay(Effect[Term]):
     """theta: delay, us: a phasor at w becomes exp(-j w delay) times itself."""
 
     name = 'phase_delay'

@@ -6,24 +6,17 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import (
-    Apparatus,
-    Array,
-    ComplexArray,
-    Effect,
-    Remedy,
-    Term,
-    View,
-    needed,
-    sigmas,
-)  # fmt: skip
+from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed, sigmas
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
 
 UNIT = 1e-9
 """theta counts nanotesla."""
 
 
-class Pickup(Effect):
+class Pickup(Effect[Term]):
     """theta: real, then imaginary parts of one channel's phasors, nT."""
 
     name = 'pickup'

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Term, View
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_jacobian
@@ -174,11 +175,6 @@ def _measured(view: View, terms: Sequence[Term]) -> View:
             mixed = _frames(matrix, view)
             linear = np.einsum('fab,fsb->fsa', mixed, linear)
             slopes = [np.einsum('fab,fsib->fsia', mixed, slope) for slope in slopes]
-    for term in terms:
-        gain = term.effect.channel_gain(term, channels, view.time)
-        if gain is not None:
-            linear = linear * gain[..., None]
-            slopes = [slope * gain[..., None, None] for slope in slopes]
     for term in terms:
         mixing = term.effect.channel_matrix(term, channels)
         if mixing is not None:

@@ -6,22 +6,15 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from anser_ros.effects.effect import (
-    Apparatus,
-    Array,
-    ComplexArray,
-    Effect,
-    Remedy,
-    Term,
-    View,
-    needed,
-    sigmas,
-)  # fmt: skip
+from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed, sigmas
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 
 
-class Registration(Effect):
+class Registration(Effect[Term]):
     """theta: rotation vector (rad) and translation (m): optical = R(theta) fg + t."""
 
     name = 'registration'

@@ -6,6 +6,7 @@ Adding an effect means adding its file; nothing else needs to know.
 import importlib
 import pkgutil
 from functools import cache
+from typing import Any
 
 import anser_ros.effects as package
 from anser_ros.effects.effect import Effect
@@ -13,9 +14,9 @@ from anser_ros.errors import ModelFileError
 
 
 @cache
-def all_effects() -> dict[str, Effect]:
+def all_effects() -> dict[str, Effect[Any]]:
     """Every effect by its name, in alphabetical order."""
-    found: dict[str, Effect] = {}
+    found: dict[str, Effect[Any]] = {}
     for info in pkgutil.iter_modules(package.__path__):
         module = importlib.import_module(f'{package.__name__}.{info.name}')
         for effect in getattr(module, 'EFFECTS', ()):
@@ -25,7 +26,7 @@ def all_effects() -> dict[str, Effect]:
     return dict(sorted(found.items()))
 
 
-def effect_named(name: str) -> Effect:
+def effect_named(name: str) -> Effect[Any]:
     """The effect with a name; raises `ModelFileError` when there is none."""
     try:
         return all_effects()[name]

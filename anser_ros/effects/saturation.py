@@ -9,21 +9,16 @@ induces, in which a tone counts in proportion to its frequency.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import (
-    Apparatus,
-    Array,
-    ComplexArray,
-    Effect,
-    Remedy,
-    Term,
-    View,
-    needed,
-)  # fmt: skip
+from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
 
 UNIT = 1e12
@@ -59,7 +54,20 @@ def compressed(flux: ComplexArray, per_full_scale_squared: float, shape: str) ->
     return np.asarray(third + (rest @ turn.conj()) * (2 / POINTS))
 
 
-class Saturation(Effect):
+@dataclass(frozen=True, kw_only=True)
+class SaturationTerm(Term):
+    """One channel's saturation.
+
+    Attributes
+    ----------
+    weights : ndarray, shape (K,) or ()
+        What each emitter's tone counts in what the amplifier sees.
+    """
+
+    weights: Array
+
+
+class Saturation(Effect[SaturationTerm]):
     """theta: 1 / full_scale^2 in 1/uT^2."""
 
     name = 'saturation'
@@ -75,30 +83,38 @@ class Saturation(Effect):
     remedy = Remedy.FLUX
     inexact = 0.2  # the curve, and tones that mix into each other's place
 
-    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[SaturationTerm]:
         """Every channel of a tool; references don't see signals of different size."""
         weights = {
             FLUX: np.ones(apparatus.emitters),
             VOLTAGE: apparatus.omega / apparatus.omega.mean(),
         }
         return [
-            Term(self, {'channel': c, 'shape': shape, 'sees': sees, '_weights': w}, np.zeros(1))
+            SaturationTerm(
+                self, {'channel': c, 'shape': shape, 'sees': sees}, np.zeros(1), weights=w
+            )
             for c in apparatus.tool_channels
             for shape in SHAPES
             for sees, w in weights.items()
             if sees == FLUX or not np.allclose(w, 1.0)
         ]
 
-    def prior(self, term: Term) -> Array:
+    def covers(self, term: SaturationTerm, candidate: Term) -> bool:
+        """A channel saturates along one curve only."""
+        if candidate.effect is not self:
+            return False
+        return bool(candidate.site['channel'] == term.site['channel'])
+
+    def prior(self, term: SaturationTerm) -> Array:
         """Full scales down to the size of the signals."""
         return np.full(1, 3.0)
 
-    def columns(self, term: Term, view: View) -> ComplexArray | None:
+    def columns(self, term: SaturationTerm, view: View) -> ComplexArray | None:
         """The third-order loss."""
         row = view.row(term.site['channel'])
         if row is None:
             return None
-        weights = term.site['_weights']
+        weights = term.weights
         out, own = view.columns(1), view.linear[:, row] * weights
         if term.theta[0] <= 0:
             out[:, row, :, 0] = UNIT * third_order(own) / weights
@@ -110,17 +126,17 @@ class Saturation(Effect):
         return out
 
     def compress(
-        self, term: Term, channels: NDArray[np.int64], flux: ComplexArray
+        self, term: SaturationTerm, channels: NDArray[np.int64], flux: ComplexArray
     ) -> ComplexArray:
         """The channel behind its amplifier."""
-        out, weights = flux.copy(), term.site['_weights']
+        out, weights = flux.copy(), term.weights
         for row in np.flatnonzero(channels == term.site['channel']):
             seen = flux[:, row] * weights
             out[:, row] = compressed(seen, UNIT * float(term.theta[0]), term.site['shape'])
             out[:, row] /= weights
         return out
 
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
+    def record(self, term: SaturationTerm, covariance: Array) -> EffectRecord:
         """Full scale."""
         value = max(float(term.theta[0]), 1e-9)
         full_scale = 1 / np.sqrt(UNIT * value)
@@ -130,20 +146,21 @@ class Saturation(Effect):
             'full_scale_t': float(full_scale),
             'shape': term.site['shape'],
             'sees': term.site['sees'],
-            'tone_weights': np.asarray(term.site['_weights']).tolist(),
+            'tone_weights': term.weights.tolist(),
         }
         return EffectRecord(self.name, parameters, {'full_scale_t': float(full_scale * relative)})
 
-    def term(self, record: EffectRecord) -> Term:
+    def term(self, record: EffectRecord) -> SaturationTerm:
         """From the full scale."""
         full_scale = float(needed(record, 'full_scale_t'))
         site = {
             'channel': int(needed(record, 'channel')),
             'shape': str(record.parameters.get('shape', SHAPES[0])),
             'sees': str(record.parameters.get('sees', FLUX)),
-            '_weights': np.asarray(record.parameters.get('tone_weights', 1.0), dtype=np.float64),
         }
-        return Term(self, site, np.array([1 / (UNIT * full_scale**2)]))
+        weights = np.asarray(record.parameters.get('tone_weights', 1.0), dtype=np.float64)
+        theta = np.array([1 / (UNIT * full_scale**2)])
+        return SaturationTerm(self, site, theta, weights=weights)
 
 
 EFFECTS = (Saturation(),)

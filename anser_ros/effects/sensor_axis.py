@@ -1,29 +1,43 @@
 """A sensor's axis, or a whole triaxial cluster's frame, is not the surveyed one."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import (
-    Apparatus,
     Array,
     ComplexArray,
     Effect,
     Remedy,
-    Term,
-    View,
     needed,
     orthogonal_pair,
     sigmas,
-)  # fmt: skip
+)
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
 
 
-class SensorAxis(Effect):
+@dataclass(frozen=True, kw_only=True)
+class SensorAxisTerm(Term):
+    """One sensor's tilt, or one cluster's turn.
+
+    Attributes
+    ----------
+    surveyed : tuple of float
+        The sensor's surveyed axis in the body's frame; empty for a cluster.
+    """
+
+    surveyed: tuple[float, ...] = ()
+
+
+class SensorAxis(Effect[SensorAxisTerm]):
     """theta: one channel, two tangent steps (rad); a cluster, a rotation vector (rad, body)."""
 
     name = 'sensor_axis'
@@ -37,7 +51,7 @@ class SensorAxis(Effect):
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'tilt_deg': (0.0, 30.0)}
     remedy = Remedy.SENSORS
 
-    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[SensorAxisTerm]:
         """Every single tool sensor, and every cluster as a whole."""
         axes = {
             int(c): tuple(float(v) for v in a)
@@ -45,19 +59,19 @@ class SensorAxis(Effect):
             for c, a in zip(table.channel, table.axis, strict=True)
         }
         terms = [
-            Term(self, {'channel': c, '_axis': axes[c]}, np.zeros(2))
+            SensorAxisTerm(self, {'channel': c}, np.zeros(2), surveyed=axes[c])
             for c in apparatus.tool_channels
         ]
         for cluster in apparatus.clusters():
             if len(apparatus.tool_channels) > len(cluster) and len(cluster) > 1:
-                terms.append(Term(self, {'channels': cluster}, np.zeros(3)))
+                terms.append(SensorAxisTerm(self, {'channels': cluster}, np.zeros(3)))
         return terms
 
-    def prior(self, term: Term) -> Array:
+    def prior(self, term: SensorAxisTerm) -> Array:
         """Some degrees."""
         return np.full(term.theta.size, 0.1)
 
-    def columns(self, term: Term, view: View) -> ComplexArray | None:
+    def columns(self, term: SensorAxisTerm, view: View) -> ComplexArray | None:
         """Derivative by the axis, along the tangents or across the cluster's turn."""
         if view.is_reference:
             return None
@@ -66,7 +80,7 @@ class SensorAxis(Effect):
             row = view.row(term.site['channel'])
             if row is None:
                 return None
-            surveyed = np.array(term.site['_axis'])
+            surveyed = np.array(term.surveyed)
             pair, axis = orthogonal_pair(surveyed), self._tilted(term)
             length = np.linalg.norm(surveyed + term.theta @ pair)
             across = (pair - np.outer(pair @ axis, axis)) / length
@@ -82,7 +96,7 @@ class SensorAxis(Effect):
             out[:, row] = np.einsum('fik,fti->fkt', view.d_axis[:, row], steps)
         return out
 
-    def table(self, term: Term, sensors: SensorTable) -> SensorTable:
+    def table(self, term: SensorAxisTerm, sensors: SensorTable) -> SensorTable:
         """Sensors with their true axes."""
         axis = sensors.axis.copy()
         if 'channel' in term.site:
@@ -94,12 +108,12 @@ class SensorAxis(Effect):
             axis[rows] = axis[rows] @ turn.T
         return sensors.with_geometry(axis=axis)
 
-    def _tilted(self, term: Term) -> Array:
-        surveyed = np.array(term.site['_axis'])
+    def _tilted(self, term: SensorAxisTerm) -> Array:
+        surveyed = np.array(term.surveyed)
         axis = surveyed + term.theta @ orthogonal_pair(surveyed)
         return np.asarray(axis / np.linalg.norm(axis))
 
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
+    def record(self, term: SensorAxisTerm, covariance: Array) -> EffectRecord:
         """Tilt and true axis, or the cluster's rotation."""
         if 'channel' not in term.site:
             return EffectRecord(
@@ -118,24 +132,24 @@ class SensorAxis(Effect):
                 'channel': term.site['channel'],
                 'tilt_deg': float(np.degrees(np.arctan(tilt))),
                 'axis': self._tilted(term).tolist(),
-                'surveyed_axis': list(term.site['_axis']),
+                'surveyed_axis': list(term.surveyed),
             },
             {'tilt_deg': float(np.degrees(np.sqrt(unit @ covariance @ unit)))},
         )
 
-    def term(self, record: EffectRecord) -> Term:
+    def term(self, record: EffectRecord) -> SensorAxisTerm:
         """From the true axis or the rotation."""
         if 'channels' in record.parameters:
             theta = np.radians(np.asarray(needed(record, 'rotation_deg'), dtype=np.float64))
-            return Term(self, {'channels': tuple(record.parameters['channels'])}, theta)
+            return SensorAxisTerm(self, {'channels': tuple(record.parameters['channels'])}, theta)
         surveyed = np.asarray(needed(record, 'surveyed_axis'), dtype=np.float64)
         axis = np.asarray(needed(record, 'axis'), dtype=np.float64)
         along = float(axis @ surveyed)
         if along <= 0:
             raise ModelFileError('model: sensor_axis turns an axis by a right angle or more')
         theta = orthogonal_pair(surveyed) @ (axis / along)
-        site = {'channel': int(needed(record, 'channel')), '_axis': tuple(surveyed.tolist())}
-        return Term(self, site, theta)
+        site = {'channel': int(needed(record, 'channel'))}
+        return SensorAxisTerm(self, site, theta, surveyed=tuple(surveyed.tolist()))
 
 
 EFFECTS = (SensorAxis(),)

@@ -6,17 +6,19 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term, needed
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Family, Remedy, needed
+from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
 
 
-class SensorPolarity(Effect):
+class SensorPolarity(Effect[Term]):
     """No parameter: the channels' signs are turned round."""
 
     name = 'sensor_polarity'
     summary = 'a sensor is wired the other way round'
     units: ClassVar[Mapping[str, str]] = {'channels': '1'}
     remedy = Remedy.FLUX
+    family = Family.SEEN
 
     def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
         """Diagonal of signs."""
@@ -33,4 +35,5 @@ class SensorPolarity(Effect):
         return Term(self, {'channels': channels})
 
 
-EFFECTS = (SensorPolarity(),)
+SENSOR_POLARITY = SensorPolarity()
+EFFECTS = (SENSOR_POLARITY,)

@@ -5,22 +5,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from anser_ros.effects.effect import (
-    Apparatus,
-    Array,
-    ComplexArray,
-    Effect,
-    Remedy,
-    Term,
-    View,
-    needed,
-    sigmas,
-)  # fmt: skip
+from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed, sigmas
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
 
 
-class SensorPosition(Effect):
+class SensorPosition(Effect[Term]):
     """theta: offset of some of a body's sensors in the body's frame, m."""
 
     name = 'sensor_position'

@@ -1,20 +1,15 @@
 """The tool's coils are too long to be points."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from anser_ros.effects.effect import (
-    Apparatus,
-    Array,
-    ComplexArray,
-    Effect,
-    Remedy,
-    Term,
-    View,
-    needed,
-)  # fmt: skip
+from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
 
@@ -22,7 +17,20 @@ UNIT = 1e-4
 """theta counts squared lengths in units of (10 mm)^2."""
 
 
-class SensorSize(Effect):
+@dataclass(frozen=True, kw_only=True)
+class SensorSizeTerm(Term):
+    """The coils of one body.
+
+    Attributes
+    ----------
+    surveyed : mapping of int to float
+        Surveyed length (m) of the coil on each channel.
+    """
+
+    surveyed: Mapping[int, float]
+
+
+class SensorSize(Effect[SensorSizeTerm]):
     """theta: length squared over (10 mm)^2, of all coils of a body.
 
     The mean field over a coil of length L differs from its centre's by L^2/24 times the second
@@ -35,29 +43,26 @@ class SensorSize(Effect):
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'length_m': (0.0, 0.08)}
     remedy = Remedy.SENSORS
 
-    def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
+    def candidates(self, apparatus: Apparatus) -> Sequence[SensorSizeTerm]:
         """All coils of a body together."""
         return [
-            Term(
+            SensorSizeTerm(
                 self,
-                {
-                    'body': table.body[0],
-                    '_channels': tuple(int(c) for c in table.channel),
-                    '_lengths': tuple(float(v) for v in table.length),
-                },
+                {'body': table.body[0]},
                 np.zeros(1),
+                surveyed=dict(zip(table.channel.tolist(), table.length.tolist(), strict=True)),
             )
             for table in apparatus.tools
             if len(table)
         ]
 
-    def prior(self, term: Term) -> Array:
+    def prior(self, term: SensorSizeTerm) -> Array:
         """Lengths of a few centimetres."""
         return np.full(1, 10.0)
 
-    def columns(self, term: Term, view: View) -> ComplexArray | None:
+    def columns(self, term: SensorSizeTerm, view: View) -> ComplexArray | None:
         """Difference between the flux of a longer coil and the coil as it is."""
-        rows = np.isin(view.sensors.channel, term.site['_channels'])
+        rows = np.isin(view.sensors.channel, list(term.surveyed))
         if view.is_reference or not rows.any():
             return None
         centres, axes, lengths = view.flat
@@ -69,44 +74,43 @@ class SensorSize(Effect):
         ) - view.dipoles.flux(centres[pick], axes[pick], lengths[pick])
         return view.along(difference)[..., None]
 
-    def bounded(self, term: Term) -> Term:
+    def bounded(self, term: SensorSizeTerm) -> SensorSizeTerm:
         """A squared length is not negative where that can be helped: the sum must not be."""
-        smallest = -min(v**2 for v in term.site['_lengths']) / UNIT
+        smallest = -min(v**2 for v in term.surveyed.values()) / UNIT
         return term.with_theta(np.maximum(term.theta, smallest))
 
-    def table(self, term: Term, sensors: SensorTable) -> SensorTable:
+    def table(self, term: SensorSizeTerm, sensors: SensorTable) -> SensorTable:
         """Longer sensors."""
         length = sensors.length.copy()
-        surveyed = dict(zip(term.site['_channels'], term.site['_lengths'], strict=True))
         for row, channel in enumerate(sensors.channel.tolist()):
-            if channel in surveyed:
-                squared = surveyed[channel] ** 2 + UNIT * term.theta[0]
+            if channel in term.surveyed:
+                squared = term.surveyed[channel] ** 2 + UNIT * term.theta[0]
                 length[row] = np.sqrt(max(squared, 0.0))
         return sensors.with_geometry(length=length)
 
-    def record(self, term: Term, covariance: Array) -> EffectRecord:
+    def record(self, term: SensorSizeTerm, covariance: Array) -> EffectRecord:
         """The length (root mean square over the coils)."""
-        base = float(np.mean(np.square(term.site['_lengths'])))
+        base = float(np.mean(np.square(list(term.surveyed.values()))))
         length = float(np.sqrt(max(base + UNIT * term.theta[0], 0.0)))
         sigma = UNIT * float(np.sqrt(covariance[0, 0])) / (2 * max(length, 1e-4))
         return EffectRecord(
             self.name,
             {
                 'length_m': length,
-                'channels': list(term.site['_channels']),
-                'surveyed_length_m': list(term.site['_lengths']),
+                'channels': list(term.surveyed),
+                'surveyed_length_m': list(term.surveyed.values()),
             },
             {'length_m': sigma},
         )
 
-    def term(self, record: EffectRecord) -> Term:
+    def term(self, record: EffectRecord) -> SensorSizeTerm:
         """From the length."""
         channels = tuple(int(c) for c in needed(record, 'channels'))
         surveyed = record.parameters.get('surveyed_length_m') or [0.0] * len(channels)
         base = float(np.mean(np.square(surveyed)))
         theta = (float(needed(record, 'length_m')) ** 2 - base) / UNIT
-        site = {'_channels': channels, '_lengths': tuple(float(v) for v in surveyed)}
-        return Term(self, site, np.array([theta]))
+        lengths = dict(zip(channels, (float(v) for v in surveyed), strict=True))
+        return SensorSizeTerm(self, {}, np.array([theta]), surveyed=lengths)
 
 
 EFFECTS = (SensorSize(),)

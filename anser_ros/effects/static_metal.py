@@ -7,27 +7,41 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import (
     FROZEN,
-    Apparatus,
     Array,
     ComplexArray,
     Effect,
+    Family,
     Remedy,
-    Term,
-    View,
+    Resting,
     needed,
     sigmas,
-)  # fmt: skip
+)
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.model import EffectRecord
-from anser_ros.metal.body import ball_modes, centre_sigma, multipoles
+from anser_ros.metal.body import (
+    BODIES,
+    COMPACT,
+    SPACINGS,
+    ball_modes,
+    body_sizes,
+    centre_sigma,
+    multipoles,
+)
 from anser_ros.metal.scattering import UNIT
 from anser_ros.physics.constants import MU_0
 
 STEP = 1e-3
 CLOSEST = 0.02
-"""Metal that is searched keeps this distance (m) from where sensors were."""
+"""Metal that is searched keeps this distance (m) from where sensors were: a point-like answer is
+no model of a body that is nearer than its own size."""
+APART = 0.12
+"""Distance (m) from metal in force within which further metal is taken for the same body: about
+the step of the grid of places. Nearer candidates only stand in for the body's shape."""
 
 
 def places(apparatus: Apparatus) -> Array:
@@ -61,7 +75,7 @@ def places(apparatus: Apparatus) -> Array:
     return np.asarray(points[~inside & ~on_board])
 
 
-class StaticMetal(Effect):
+class StaticMetal(Effect[Term]):
     """theta: centre (m, 3), then real and imaginary parts of a simple body's modes.
 
     What the body is besides belongs to its remainder (`anser_ros.effects.metal_remainder`).
@@ -75,6 +89,8 @@ class StaticMetal(Effect):
     }
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'position_m': (-1.0, 1.0)}
     remedy = Remedy.FIELD
+    family = Family.METAL_AT_REST
+    inexact = np.inf
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """A grid of places."""
@@ -94,7 +110,7 @@ class StaticMetal(Effect):
 
     def prior(self, term: Term) -> Array:
         """Anywhere; a few litres of metal at most. Frozen metal stays at its place."""
-        place = FROZEN if term.site.get('_frozen') else 0.1
+        place = FROZEN if term.held else 0.1
         return np.concatenate([np.full(3, place), np.full(term.theta.size - 3, 10.0)])
 
     def _couplings(self, term: Term) -> ComplexArray:
@@ -114,7 +130,7 @@ class StaticMetal(Effect):
         """By place (differences) and by polarisability (exact)."""
         centre, alpha = term.theta[:3], term.theta[3:]
         out = view.columns(term.theta.size)
-        if np.any(alpha) and not term.site.get('_frozen'):
+        if np.any(alpha) and not term.held:
             for i, step in enumerate(STEP * np.eye(3)):
                 more, less = (self._flux(term, centre + s, view) for s in (step, -step))
                 out[..., i] = (more - less) / (2 * STEP)
@@ -135,6 +151,17 @@ class StaticMetal(Effect):
         alpha = np.zeros((2, ball_modes().shape[1]))
         alpha[:, 0] = solution
         return (term.with_theta(np.concatenate([term.theta[:3], alpha.ravel()])),)
+
+    def covers(self, term: Term, candidate: Term) -> bool:
+        """Metal that is near to metal in force is the same body."""
+        if candidate.effect is not self:
+            return False
+        return bool(np.linalg.norm(candidate.theta[:3] - term.theta[:3]) < APART)
+
+    def resting(self, term: Term) -> Resting:
+        """A compact body about its place; an extended one of small pieces where much is left."""
+        lattices = [(BODIES[kind](), body_sizes(kind)) for kind in SPACINGS]
+        return Resting(term.theta[:3], [(multipoles(), body_sizes(COMPACT))], lattices)
 
     def sources(
         self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
@@ -164,4 +191,5 @@ class StaticMetal(Effect):
         return Term(self, {'place': tuple(place.tolist())}, np.concatenate([place, alpha]))
 
 
-EFFECTS = (StaticMetal(),)
+STATIC_METAL = StaticMetal()
+EFFECTS = (STATIC_METAL,)

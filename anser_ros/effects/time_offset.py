@@ -6,16 +6,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from anser_ros.effects.effect import (
-    Apparatus,
-    Array,
-    ComplexArray,
-    Effect,
-    Remedy,
-    Term,
-    View,
-    needed,
-)  # fmt: skip
+from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 
@@ -31,7 +25,7 @@ def flux_rate(view: View) -> ComplexArray:
     )
 
 
-class TimeOffset(Effect):
+class TimeOffset(Effect[Term]):
     """theta: at flux stamp t the optical pose stamped t - theta applies, s."""
 
     name = 'time_offset'

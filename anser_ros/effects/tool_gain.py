@@ -6,20 +6,14 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import (
-    Apparatus,
-    Array,
-    ComplexArray,
-    Effect,
-    Remedy,
-    Term,
-    View,
-    needed,
-)
+from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
 
 
-class ToolGain(Effect):
+class ToolGain(Effect[Term]):
     """theta: real and imaginary part of (gain - 1)."""
 
     name = 'tool_gain'

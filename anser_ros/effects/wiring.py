@@ -9,17 +9,27 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, Term, needed, unit_matrix
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Family,
+    Remedy,
+    needed,
+    unit_matrix,
+)
+from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
 
 
-class SwappedChannels(Effect):
+class SwappedChannels(Effect[Term]):
     """``channels`` in order: each is read at the place of the one after it in ``read_as``."""
 
     name = 'swapped_channels'
     summary = 'sensors are plugged into each other'
     units: ClassVar[Mapping[str, str]] = {'channels': '1', 'read_as': '1'}
     remedy = Remedy.FLUX
+    family = Family.SEEN
 
     def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
         """A permutation; channels of which one is missing stay as they are."""
@@ -42,13 +52,14 @@ class SwappedChannels(Effect):
         return Term(self, site)
 
 
-class SwappedCoils(Effect):
+class SwappedCoils(Effect[Term]):
     """As `SwappedChannels`, of emitters."""
 
     name = 'swapped_coils'
     summary = 'emitters are plugged into each other'
     units: ClassVar[Mapping[str, str]] = {'coils': '1', 'read_as': '1'}
     remedy = Remedy.FLUX
+    family = Family.SEEN
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
         """A permutation."""
@@ -69,13 +80,18 @@ class SwappedCoils(Effect):
         )
 
 
-class DeadChannel(Effect):
+class DeadChannel(Effect[Term]):
     """Channels whose readings are noise; they take no part in anything."""
 
     name = 'dead_channel'
     summary = 'a channel hears nothing'
     units: ClassVar[Mapping[str, str]] = {'channels': '1'}
     remedy = Remedy.NONE
+    family = Family.SEEN
+
+    def silenced(self, term: Term) -> tuple[int, ...]:
+        """All of its channels."""
+        return term.channels
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """The channels."""
@@ -86,4 +102,5 @@ class DeadChannel(Effect):
         return Term(self, {'channels': tuple(int(c) for c in needed(record, 'channels'))})
 
 
-EFFECTS = (SwappedChannels(), SwappedCoils(), DeadChannel())
+SWAPPED_CHANNELS, SWAPPED_COILS, DEAD_CHANNEL = SwappedChannels(), SwappedCoils(), DeadChannel()
+EFFECTS = (SWAPPED_CHANNELS, SWAPPED_COILS, DEAD_CHANNEL)

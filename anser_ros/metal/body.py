@@ -26,6 +26,12 @@ TOGETHER = 6
 ODD = 0.2
 """Couplings that a body lacks which is its own mirror image, as a share of others; so much of its
 radius its centre may lie beside the symmetric body's."""
+RADII = (0.008, 0.012, 0.018, 0.027, 0.04, 0.06, 0.09)
+"""Radii (m) of compact bodies that are tried, each half again the one before: from what can hardly
+be seen beside a tracked volume to what is larger than its distance."""
+PIECES = (0.01, 0.05, 0.2, 1.0)
+"""Sizes of an extended body's pieces that are tried, in 1e-4 m^3: perfectly conducting balls with
+radii of 5 to 25 mm."""
 FREQUENCY_SLOPE = 0.5
 """Prior size of d(ln T) / d(ln f); a sphere's parts have slopes between -1/2 and 1."""
 
@@ -87,6 +93,14 @@ def body_spread(radius: float, odd: float) -> Array:
     size = 2 * np.pi * radius**3 / UNIT * (radius / RADIUS) ** (total - 2)
     size *= np.where(total % 2, odd, 1.0)
     return np.concatenate([size, FREQUENCY_SLOPE * size[shapes.sloped]])
+
+
+@cache
+def body_sizes(kind: str) -> tuple[Array, ...]:
+    """Prior sizes, each of shape (`Shapes.size`,), of the couplings of a kind of body to try."""
+    if kind == COMPACT:
+        return tuple(body_spread(radius, ODD) for radius in RADII)
+    return tuple(np.full(BODIES[kind]().size, size) for size in PIECES)
 
 
 def centre_sigma(polarisability: NDArray[np.complexfloating]) -> float:

@@ -23,6 +23,9 @@ FINEST = 7
 """Half waves along both edges together, at most, of the shapes that a sheet's answer may have."""
 SHAPE_POINTS = 12
 WIDER = 1.06
+SHEET_SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)
+"""Sizes that are tried of what the couplings of a meshed sheet lack, as shares of a perfect
+conductor's: from what the mesh leaves to holes, rims and a second sheet."""
 
 
 def _strip_distance(aside: Array) -> Array:
@@ -134,3 +137,8 @@ def sheet_spread(edge: float, share: float) -> Array:
     shapes, waves = _unit_shapes()
     each = np.sqrt(2 * WIDER * edge / waves)
     return np.asarray(share / UNIT * each[shapes.first] * each[shapes.second])
+
+
+def sheet_sizes(edge: float) -> tuple[Array, ...]:
+    """Prior sizes of the couplings of a sheet to try, each of shape (`Shapes.size`,)."""
+    return tuple(sheet_spread(edge, share) for share in SHEET_SHARES)

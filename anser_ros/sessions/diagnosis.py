@@ -184,9 +184,7 @@ def track_held_out(
     """
     floor = max(found.flux_rms_floor_t, 1e-30)
     after = unseen.with_model(found.model)
-    moves = any(
-        term.effect.moving or term.effect.name == 'coil_fluctuation' for term in found.terms
-    )
+    moves = any(term.effect.followed for term in found.terms)
     follower = ModelFollower(after) if moves and after.baseline is not None else None
     return (
         _errors(unseen, found.flux_rms_before_t / floor),

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from anser_ros.diagnosis.diagnose import Finding
+from anser_ros.diagnosis.finding import Finding
 from anser_ros.field.plain_data import plain
 from anser_ros.sessions.diagnosis import SessionDiagnosis
 

@@ -6,7 +6,7 @@ evaluation can tell whether it tracks the same session.
 
 from dataclasses import replace
 
-from anser_ros.effects.correction import DRIFTS
+from anser_ros.effects.correction import drifts
 from anser_ros.field.model import FieldModel
 from anser_ros.sessions.session import Session
 
@@ -18,7 +18,7 @@ def date_drifts(model: FieldModel, session: Session) -> FieldModel:
     """The model, with drifts that are not dated yet dated by the session they were found on."""
     effects = tuple(
         replace(effect, evidence={**effect.evidence, FOUND_ON: session.start_ns})
-        if effect.name in DRIFTS and FOUND_ON not in effect.evidence
+        if drifts(effect) and FOUND_ON not in effect.evidence
         else effect
         for effect in model.effects
     )
@@ -27,5 +27,5 @@ def date_drifts(model: FieldModel, session: Session) -> FieldModel:
 
 def is_recorded(model: FieldModel, session: Session) -> bool:
     """Whether this is the session on which one of the model's drifts was found."""
-    found = [effect.evidence.get(FOUND_ON) for effect in model.effects if effect.name in DRIFTS]
+    found = [effect.evidence.get(FOUND_ON) for effect in model.effects if drifts(effect)]
     return session.start_ns in found

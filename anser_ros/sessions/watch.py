@@ -14,7 +14,7 @@ from anser_ros.diagnosis.diagnose import diagnose
 from anser_ros.diagnosis.prepare import FEWEST_FRAMES
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.diagnosis.search import SearchSettings
-from anser_ros.effects.effect import Term
+from anser_ros.effects.term import Term
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.sessions.diagnosis import problem_of, spread_of

@@ -1,0 +1,144 @@
+"""The numbers by which explanations are accepted, compared and named.
+
+Three currencies are compared here, and all count in the whitened sum of squares, where noise alone
+has a mean of one a value:
+
+- the *gain* of an effect, what it takes off the cross-validated sum of squares of blocks of time
+  that took no part in fitting it;
+- the gain of a fluctuation, what -2 log marginal likelihood falls by;
+- the *power* of an effect, what it takes off the sum of squares of the data it was fitted to.
+
+Gains are judged in units of the *misfit*, the mean square of the residuals that stay: among large
+unexplained residuals a gain must be larger by as much to mean anything.
+
+Unless a number says otherwise, it was chosen by hand on injected effects with seeds below 100
+(`test/injection.py`); cases of later seeds that led to a rule are named in `docs/diagnosis.md`.
+"""
+
+# --- whether an effect is accepted -------------------------------------------------------------
+LEAST_GAIN = 40.0
+"""Gain, in units of the misfit, that any effect must have before its parameters are paid for. The
+best of 700 candidates gains about 15 on a clean session; smaller lets chance win now and then,
+larger hides small effects."""
+PER_PARAMETER = 6.0
+"""Gain, in units of the misfit, that each parameter must have: a useless one gains about one on
+the data it is fitted to and costs about one on held-out data. It is paid by a new effect and by
+each further parameter of a course."""
+LEAST_SHARE = 0.002
+"""Gain over the number of values, in units of the misfit, that an effect must have on top: what a
+field model's own error lets an effect gain grows with the data, while chance doesn't."""
+LEAST_SHARE_BESIDE_METAL = 0.01
+"""The same beside metal, whose shape is never known and leaves what other effects can take up."""
+LEAST_OF_EXCESS = 0.4
+"""Share of what is left to explain that an explanation with freedom in time (a fluctuation, or
+metal at another place in each block) must explain: less than that is another effect's trace along
+its columns."""
+LEAST_OF_NOISE = 0.05
+"""Share of the noise's power that a fluctuation must explain: a field model's own error is alike
+in neighbouring frames and channels, and any freedom takes some of it."""
+REMNANT = 0.01
+"""Further metal with less than this share of the strongest metal's gain is what the model of that
+one left."""
+MOST_METALS = 2
+"""Pieces of metal in force beside which no further metal is looked for."""
+MOST_DOUBTFUL = 2
+"""With so many effects in force that are not the same in all parts of the data, something else is
+the cause, and further effects would only stand in for it: the search ends."""
+PLAIN_TO_SEE = 5.0
+"""An effect whose parameters stand so many times above what it must gain (by their covariance) is
+kept without the fit of all the others without it."""
+TOLD_APART = 0.05
+"""A candidate of whose power the fluctuations in force leave less than this share can't be told
+from them."""
+
+# --- which candidates are fitted in full -------------------------------------------------------
+PROMISING = 0.5
+"""Share of the best fitted gain that a candidate's probe must promise. The probe is linear and
+may promise too little, by less than this for the effects that there are."""
+OPEN_FINALISTS = 3
+"""Fluctuations that are fitted in full in each round."""
+SITES_PER_EFFECT = 2
+"""Sites of one effect that are fitted in full in each round."""
+
+# --- which of several explanations is taken ----------------------------------------------------
+AS_GOOD, AS_GOOD_PER_PARAMETER = 10.0, 4.0
+"""Gain, in units of the misfit, that a simpler explanation may lack: so much, and so much for each
+parameter that it spares. The second lies below what a parameter must gain to be accepted, so no
+explanation is given up for one that would have been refused beside it."""
+ALIKE = 0.02
+"""Share of a gain by which two explanations may differ that the data don't tell apart: metal of an
+unknown shape leaves about as much. Within it a rival is listed, and metal rests."""
+STEADY = 0.8
+"""Share of a fluctuation's gain from which a constant, or a curve, of the same coil or channel is
+tried first: freedom in every frame also takes off what is another effect's."""
+FROM_OTHERS = 2.0
+"""What a fluctuation takes off the others' unexplained residuals, over what would be lost if all
+values along its columns were alike. It is taken off the fluctuation's gain."""
+NOTHING_LEFT = 1.04
+"""Misfit over the noise's up to which nothing but noise is left, so that the simplest of the
+explanations that reach it is taken."""
+SOMETHING_LEFT = 1.02
+"""Misfit over the noise's from which there is something to explain: a body is made richer only
+above it, and below it nothing that stays speaks against an effect."""
+MUCH_LEFT = 1.3
+"""The same for a first, coarse shape: the finer one follows once all effects are known."""
+
+# --- whether metal moves or rests --------------------------------------------------------------
+FREER = 1.05
+"""Metal at the best place for each block of time must explain so much more than at one place, or
+it isn't tried as metal that moves."""
+LEAST_MORE = 100.0
+"""Gain, in units of the misfit, that metal that moves must have over metal at rest, beside the
+shares above: its course and shape cost some dozens of parameters."""
+NO_RIVAL = 0.25
+"""Metal at rest that by itself explains less than this share of what moving metal explains is no
+rival to it."""
+BESIDE_REST = 3
+"""Effects that are tried beside metal at rest before metal is said to move."""
+
+# --- whether an effect is confirmed and named --------------------------------------------------
+TIME_PARTS = 6
+"""Parts of the session in which an effect is fitted again: enough to see a change, few enough that
+each has the poses that tell the parameters."""
+LARGEST_VARIATION = 0.1
+"""Share of an effect's power that refits in parts of the data may take off besides. An effect that
+truly is there varies by what its model is wrong by, 1 % of the power and less."""
+LEAST_OF_THE_REST = 0.2
+"""An effect that takes off less than this share of what stays unexplained is not named: something
+larger is unknown, and the effect is probably its trace."""
+CLEAR = 6.0
+"""Standard deviations of the noise's power from which a remainder counts: noise passes it once in
+1e9, and there are some hundred cells to test."""
+WRONG_BY = 1.3
+"""Variance over the noise's up to which a field model may be wrong, whatever it says: of a board
+beyond what was scanned. It is not held against an effect on everything."""
+MANY = 3
+"""So many effects of one name, or on one channel, stand in for something else that they share."""
+CHANGED = 0.1
+"""Share of the largest change from which an effect counts as acting on a cell (what one channel
+reads of one emitter): taking the pose out spreads a trace of each change over all of them."""
+
+# --- whether what stays is noise ---------------------------------------------------------------
+NOISIER = 1.15
+"""Factor from which noise counts as grown."""
+FEWEST_OUTLIERS = 0.004
+"""Share of frames from which outliers are named; noise makes none in a session (1e-6)."""
+BESIDE_OUTLIERS = 0.3
+"""Unexplained power over the floor's up to which frames that stand out are outliers: a model that
+is wrong by more makes some itself."""
+STRUCTURED, UNSTRUCTURED = 0.03, 0.1
+"""Unexplained power over the floor's from which it is reported: where it depends on something,
+and where no test finds on what."""
+DEPENDENT = 0.05
+"""Unexplained power over the floor's from which it is said what it depends on."""
+
+
+def as_good(spared: int) -> float:
+    """Gain, in units of the misfit, that an explanation with fewer parameters may lack.
+
+    Parameters
+    ----------
+    spared : int
+        Parameters that it spares; with none it may lack nothing.
+    """
+    return AS_GOOD + AS_GOOD_PER_PARAMETER * spared if spared > 0 else 0.0

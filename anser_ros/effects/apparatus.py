@@ -1,0 +1,76 @@
+"""What a session consists of, as far as effects need it to say at which sites they may sit."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.field.dipoles import Dipoles
+from anser_ros.physics.sensor import SensorTable
+
+Array = NDArray[np.float64]
+
+SAME_CENTRE_M = 2e-3
+"""Tool sensors closer together than this (m) are one cluster: coils of a triaxial sensor share a
+centre within winding tolerances of some 0.1 mm, separate sensors are centimetres apart."""
+
+
+@dataclass(frozen=True)
+class Apparatus:
+    """Tools, references, emitters and the space that they take up.
+
+    Attributes
+    ----------
+    tools : tuple of SensorTable
+        One table for each tool body.
+    references : SensorTable or None
+        The sensors that are fixed in fg.
+    emitters : int
+        Number of emitters, K.
+    omega : ndarray, shape (K,)
+        Angular drive frequencies, rad/s.
+    duration : float
+        Length of the session, s.
+    illumination : Dipoles
+        The emitters' own field, good also beside and below the board.
+    visited_box : ndarray, shape (2, 3)
+        Lower and upper corner of the box in which tool sensors were during this session, m, frame
+        fg: what the data can tell about, not where tools may be (that is
+        `physics.volume.TrackedVolume`).
+    board : ndarray, shape (2, 3)
+        Lower and upper corner of the field generator, m, frame fg.
+    """
+
+    tools: tuple[SensorTable, ...]
+    references: SensorTable | None
+    emitters: int
+    omega: Array
+    duration: float
+    illumination: Dipoles
+    visited_box: Array
+    board: Array
+
+    @property
+    def tool_channels(self) -> tuple[int, ...]:
+        """Channels of all tool sensors."""
+        return tuple(int(c) for table in self.tools for c in table.channel)
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """Channels of all sensors, those of the tools first."""
+        extra = () if self.references is None else self.references.channel
+        return self.tool_channels + tuple(int(c) for c in extra)
+
+    def clusters(self) -> list[tuple[int, ...]]:
+        """Channels of tool sensors that share one centre, where there are two or more."""
+        groups = []
+        for table in self.tools:
+            left = list(range(len(table)))
+            while left:
+                first = table.position[left[0]]
+                apart = np.linalg.norm(table.position[left] - first, axis=1)
+                near = [i for i, d in zip(left, apart, strict=True) if d < SAME_CENTRE_M]
+                left = [i for i in left if i not in near]
+                if len(near) > 1:
+                    groups.append(tuple(int(table.channel[i]) for i in near))
+        return groups

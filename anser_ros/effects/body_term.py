@@ -1,0 +1,118 @@
+"""The term of metal whose body is a sum of modes, and which the search refines.
+
+A simple body has few modes; a real one has more, and the data say which (`with_body`). Metal whose
+answer changes with time has a course besides, which may be refined as well (`freer`).
+"""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
+from anser_ros.metal.body import BODIES, COMPACT, ball_modes
+from anser_ros.metal.scattering import Shapes
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+LARGEST = 10.0
+"""Prior standard deviation of the amplitudes of a simple body's modes, in units of 1e-4 m^3
+(`anser_ros.metal.scattering.UNIT`). A perfectly conducting ball of 25 mm radius has -1, one of
+54 mm -10: the prior holds nothing back that fits beside a tracked volume, and only keeps modes
+that the data don't tell from growing without bound."""
+
+
+@dataclass(frozen=True)
+class Richness:
+    """How finely metal is shaped.
+
+    Attributes
+    ----------
+    modes : int
+        Most modes of a body.
+    knots : tuple of int
+        Numbers of knots that a free course may have, tried in this order.
+    left : float
+        Misfit over the noise's from which a freer course is tried.
+    """
+
+    modes: int
+    knots: tuple[int, ...]
+    left: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class BodyTerm(Term):
+    """Metal of modes: theta is its course, then real and imaginary parts of their amplitudes.
+
+    Attributes
+    ----------
+    kind : str
+        Of body (`anser_ros.metal.body.BODIES`).
+    modes : ndarray, shape (c, m)
+        Each a combination of the c couplings of the body's shapes.
+    spread : ndarray, shape (m,)
+        Prior standard deviation of each mode's amplitude, in phase and in quadrature.
+    richness : Richness or None
+        How finely the body was shaped; None for a simple body as it starts.
+    """
+
+    kind: str
+    modes: Array
+    spread: Array
+    richness: Richness | None = None
+
+    @property
+    def shapes(self) -> Shapes:
+        """The shapes that the body couples."""
+        return BODIES[self.kind]()
+
+    @property
+    def placed(self) -> int:
+        """Parameters of the course, which come before the amplitudes."""
+        return int(self.theta.size) - 2 * int(self.modes.shape[1])
+
+    @property
+    def knots(self) -> int:
+        """Knots of a free course; 0 where the course has few parameters of its own kind."""
+        return 0
+
+    @property
+    def course(self) -> Array:
+        """Parameters of the course."""
+        return self.theta[: self.placed]
+
+    @property
+    def couplings(self) -> ComplexArray:
+        """Couplings of the whole body, shape (c,)."""
+        parts = self.theta[self.placed :].reshape(2, -1)
+        return np.asarray(self.modes @ (parts[0] + 1j * parts[1]))
+
+    def unit(self, view: View) -> NDArray[np.inexact]:
+        """Flux of each mode of unit amplitude in a view, (F, S, K, m), T."""
+        raise NotImplementedError
+
+    def with_body(self, kind: str, modes: Array, spread: Array) -> Self:
+        """The same course, another body, whose amplitudes are still zero."""
+        theta = np.concatenate([self.course, np.zeros(2 * modes.shape[1])])
+        return replace(self, kind=kind, modes=modes, spread=spread, theta=theta)
+
+    def shaped(self, kind: str, modes: Array, richness: Richness) -> Self:
+        """The same course, a body of modes of unit prior size; a compact one has a ball's too."""
+        spread = np.ones(modes.shape[1])
+        if kind == COMPACT:
+            ball = ball_modes()
+            modes = np.concatenate([ball, modes], axis=1)
+            spread = np.concatenate([np.full(ball.shape[1], LARGEST), spread])
+        return replace(self.with_body(kind, modes, spread), richness=richness)
+
+    def freer(self, knots: int) -> Self | None:
+        """The same body on a freer course near this one; None where there is none."""
+        return None
+
+    def restarted(self) -> Self | None:
+        """The body as it is, where its course started from; None where that isn't known."""
+        return None

@@ -1,0 +1,95 @@
+"""A term: one effect at one site, with values of its parameters."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from anser_ros.effects.effect import Effect
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Held:
+    """Marks a term whose parameters that are not linear stay where they are in a fit.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (q, q), or None
+        Of all its parameters, from when they were last free; None where they never were.
+    """
+
+    covariance: Array | None = None
+
+
+@dataclass(frozen=True)
+class Term:
+    """An effect at one site (a channel, a coil, a body, ...) with values of its parameters.
+
+    An effect that needs to know more than a site says defines a subclass with more fields.
+
+    Attributes
+    ----------
+    effect : Effect
+    site : mapping
+        What tells this candidate from others of the same effect, as reports and records show it.
+    theta : ndarray, shape (q,)
+        Parameters in the units that the effect works in; zero is no effect.
+    held : Held or None
+        None where all parameters are free.
+    """
+
+    effect: 'Effect[Any]'
+    site: Mapping[str, Any] = field(default_factory=dict)
+    theta: Array = field(default_factory=lambda: np.zeros(0))
+    held: Held | None = None
+
+    def with_theta(self, theta: Array) -> Self:
+        """The same term with other parameters."""
+        return replace(self, theta=np.asarray(theta, dtype=np.float64))
+
+    def hold(self, covariance: Array | None = None) -> Self:
+        """The same term, held; ``covariance`` is kept for its record."""
+        return replace(self, held=Held(covariance))
+
+    def free(self) -> Self:
+        """The same term with all parameters free again."""
+        return replace(self, held=None)
+
+    def belongs_to(self, other: 'Term') -> bool:
+        """Whether this term is part of another one's explanation, and goes when that one goes."""
+        return self.effect.belongs(self, other)
+
+    @property
+    def complexity(self) -> int:
+        """Parameters that are paid for when explanations are compared."""
+        return self.effect.complexity(self)
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """Channels that the site names; none where it is about something else."""
+        one = (int(self.site['channel']),) if 'channel' in self.site else ()
+        return (*one, *(int(c) for c in self.site.get('channels', ())))
+
+    @property
+    def seat(self) -> tuple[str, str]:
+        """Name and site: the same for one term whatever its parameters, and held or free."""
+        return self.effect.name, repr(sorted(self.site.items()))
+
+    @property
+    def label(self) -> str:
+        """Name and site in words."""
+        parts = [f'{key} {_short(value)}' for key, value in self.site.items()]
+        return f'{self.effect.name}{" (" + ", ".join(parts) + ")" if parts else ""}'
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, float):
+        return f'{value:.3g}'
+    if isinstance(value, (tuple, list)):
+        return '[' + ' '.join(_short(v) for v in value) + ']'
+    return str(value)

@@ -1,0 +1,91 @@
+"""The predicted readings of one body's sensors, with their derivatives."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.field.dipoles import Dipoles
+from anser_ros.physics.sensor import SensorTable
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class View:
+    """The predicted readings of one body's S sensors in F frames, with some effects in force.
+
+    Attributes
+    ----------
+    time : ndarray, shape (F,)
+        s since the session's start.
+    sensors : SensorTable
+        The sensors as the effects say that they are.
+    position, rotation : ndarray, shapes (F, 3) and (F, 3, 3)
+        Pose of the body, m, frame fg.
+    velocity : ndarray, shape (F, 6)
+        m/s and rad/s along the axes of fg, of the body's origin.
+    centres, axes : ndarray, shape (F, S, 3)
+        Places (m) and unit axes of the sensors, frame fg.
+    linear : ndarray, shape (F, S, K), complex
+        Flux before offsets and compression, T.
+    flux : ndarray, shape (F, S, K), complex
+        Flux as it is read, T.
+    d_position, d_axis : ndarray, shape (F, S, 3, K), complex
+        Derivatives of the flux by the sensor's centre (T/m) and by its axis vector (T).
+    d_turn : ndarray, shape (F, S, 3, K), complex
+        Derivative of the flux by a turn of the body about its origin, along fg's axes, T/rad.
+    dipoles : Dipoles
+        The field that the sensors see, without what moves.
+    illumination : Dipoles
+        The emitters' own field, as metal sees it.
+    omega : ndarray, shape (K,)
+        Angular drive frequencies, rad/s.
+    is_reference : bool
+        Whether the sensors are the references, which are fixed in fg.
+    """
+
+    time: Array
+    sensors: SensorTable
+    position: Array
+    rotation: Array
+    velocity: Array
+    centres: Array
+    axes: Array
+    linear: ComplexArray
+    flux: ComplexArray
+    d_position: ComplexArray
+    d_axis: ComplexArray
+    d_turn: ComplexArray
+    dipoles: Dipoles
+    illumination: Dipoles
+    omega: Array
+    is_reference: bool
+
+    def row(self, channel: int) -> int | None:
+        """Row of a channel, or None where the body doesn't carry it."""
+        found = np.flatnonzero(self.sensors.channel == channel)
+        return int(found[0]) if found.size else None
+
+    def columns(self, count: int) -> ComplexArray:
+        """Zeros of shape (F, S, K, count)."""
+        return np.zeros((*self.flux.shape, count), dtype=complex)
+
+    def frames(self, rows: NDArray[np.int64]) -> 'View':
+        """The view of some frames, named by index."""
+        each = (
+            'time', 'position', 'rotation', 'velocity', 'centres', 'axes', 'linear', 'flux',
+            'd_position', 'd_axis', 'd_turn',
+        )  # fmt: skip
+        return replace(self, **{name: getattr(self, name)[rows] for name in each})
+
+    def along(self, field_flux: ComplexArray) -> ComplexArray:
+        """Fluxes of flattened sensors, shape (F S, K), in the shape (F, S, K)."""
+        return field_flux.reshape(self.flux.shape)
+
+    @property
+    def flat(self) -> tuple[Array, Array, Array]:
+        """Centres, axes (F S, 3) and lengths (F S,) of every sensor in every frame."""
+        lengths = np.tile(self.sensors.length, self.time.size)
+        return self.centres.reshape(-1, 3), self.axes.reshape(-1, 3), lengths

@@ -1,0 +1,115 @@
+"""Effects declare what the rest needs to know of them: nothing outside asks for one by name.
+
+Every file's syntax tree is walked. Left out are files that speak of effects without the classes in
+`anser_ros/effects`, each for the reason that stands beside it.
+"""
+
+import ast
+import importlib
+import inspect
+import pkgutil
+from pathlib import Path
+
+import pytest
+
+import anser_ros.effects as package
+from anser_ros.effects.effect import Effect
+from anser_ros.effects.registry import all_effects
+from anser_ros.effects.term import Term
+
+PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
+ALLOWED = {
+    'effects/': 'their own room',
+    'simulation/': 'faults of a simulated nature, labelled with what a diagnosis should call them',
+    'measured/': 'models of other laboratories, with effects of their own that share some names',
+    'calibration/sensor_survey.py': 'writes records in the names of `docs/interfaces.md`, from '
+    'below the effects: the scan finds gains, axes and lever arms with its own fit',
+}
+FILES = sorted(
+    path
+    for path in PACKAGE.rglob('*.py')
+    if not path.relative_to(PACKAGE).as_posix().startswith(tuple(ALLOWED))
+)
+
+
+def members(base):
+    """The names of all classes in the effects' room that derive from a base."""
+    found = set()
+    for info in pkgutil.iter_modules(package.__path__):
+        module = importlib.import_module(f'{package.__name__}.{info.name}')
+        found |= {
+            name
+            for name, value in inspect.getmembers(module, inspect.isclass)
+            if issubclass(value, base)
+        }
+    return found
+
+
+NAMES = {*all_effects(), 'metal_remainder'}
+CLASSES = members(Effect) | members(Term)
+
+
+def special_cases(text):
+    """Yield the line and text of each effect's name, and each test for an effect's class."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value in NAMES:
+            yield f'{node.lineno}: {node.value!r}'
+        elif isinstance(node, ast.Call) and _named(node.func) in ('isinstance', 'issubclass'):
+            kinds = {_named(part) for part in ast.walk(node.args[1])}
+            yield from (f'{node.lineno}: isinstance of {kind}' for kind in kinds & CLASSES)
+        elif isinstance(node, ast.Compare) and 'type' in {
+            _named(part.func) for part in ast.walk(node) if isinstance(part, ast.Call)
+        }:
+            kinds = {_named(part) for part in ast.walk(node)}
+            yield from (f'{node.lineno}: type is {kind}' for kind in kinds & CLASSES)
+        elif isinstance(node, ast.MatchClass) and _named(node.cls) in CLASSES:
+            yield f'{node.lineno}: case {_named(node.cls)}'
+
+
+def _named(node):
+    if isinstance(node, ast.Attribute):
+        return node.attr
+    return node.id if isinstance(node, ast.Name) else ''
+
+
+@pytest.mark.parametrize('path', FILES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
+def test_no_effect_is_a_special_case_outside_its_room(path):
+    found = list(special_cases(path.read_text(encoding='utf-8')))
+    assert not found, f'{path}: let the effect declare it (anser_ros/effects/effect.py): {found}'
+
+
+def test_no_site_hides_state_behind_an_underscore():
+    """What a term needs to know beside its site is a field of a class of its own."""
+    for path in PACKAGE.rglob('*.py'):
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            if isinstance(node, ast.Subscript) and _named(node.value) == 'site':
+                key = getattr(node.slice, 'value', None)
+                assert not str(key).startswith('_'), f'{path}:{node.lineno}'
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        "if term.effect.name == 'coil_moved': pass",
+        "METALS = ('static_metal', 'something else')",
+        'isinstance(term.effect, Fluctuation)',
+        'isinstance(term, (int, moving_metal.MovingTerm))',
+        'type(term.effect) is CoilGain',
+        'match term:\n    case MovingTerm(): pass',
+    ],
+)
+def test_the_walk_sees_special_cases(text):
+    assert list(special_cases(text))
+
+
+def test_the_walk_sees_nothing_else():
+    assert len(NAMES) > 30
+    assert FILES
+    text = '"""An outliers\' pickup."""\nisinstance(x, Measurements)\ntype(x) is int\ny = "metal"'
+    assert not list(special_cases(text))
+
+
+def test_every_exception_is_needed():
+    for place in ALLOWED:
+        files = [PACKAGE / place] if place.endswith('.py') else (PACKAGE / place).rglob('*.py')
+        assert any(list(special_cases(f.read_text(encoding='utf-8'))) for f in files), place
