@@ -1,1 +1,1 @@
-"""From samples to phasors: windows, least-squares demodulation, fluxes and device time."""
+"""From samples to fluxes: windows, least-squares demodulation, conversion, and device time."""

@@ -1,4 +1,4 @@
-"""Maps the device's clock to the host's by the earliest arrivals."""
+"""The map from the device's clock to the host's, by the records that arrive earliest."""
 
 from __future__ import annotations
 
@@ -7,31 +7,40 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 FOLLOWED_SHARE = 1e-4
-"""More than two quartz clocks drift apart: how fast a device clock is followed at most."""
+"""Largest relative rate difference at which a device clock is followed. Two quartz clocks differ
+by less; a larger value would follow slow changes of the host's load."""
 _JUMP_NS = 1_000_000_000
+"""A difference between device and host time beyond this (1 s) is no delay of the line."""
 _STALL_NS = 3_000_000_000
+"""Time (3 s) that all arrivals must be later than `_JUMP_NS` before the clock counts as changed;
+a host that stalls catches up within it."""
 _STRETCH_NS = 500_000_000
+"""Length (0.5 s) of a stretch of which only the earliest arrival is kept. Shorter stretches keep
+more late arrivals, longer ones give the line fewer points."""
 _MEMORY = 120
-"""Stretches of time whose earliest arrivals are remembered: a minute."""
+"""Stretches whose earliest arrivals are kept, together a minute. A longer memory makes the rate
+more certain and follows its changes with temperature more slowly."""
 _FEWEST = 6
+"""Stretches from which on the rate is estimated: with fewer, delays look like a rate."""
 _TYPICAL_SHARE = 3e-5
-"""What two quartz clocks differ by, as a standard deviation."""
+"""Standard deviation of the relative rate difference of two quartz clocks, a prior of the rate."""
 
 
 class DeviceClock:
-    """Host time of device timestamps.
+    """Converts timestamps of the device to host time.
 
-    Every arrival is late by an unknown delay that is never negative. So arrival minus device time
-    lies above a line, whose slope is the difference of the two clocks' rates, and touches it where
-    something came without delay: the line is the edge, around the middle of the last minute, of
-    the lower hull of the earliest arrivals (Moon, Skelly and Towsley, "Estimation and removal of
-    clock skew from network delay measurements", INFOCOM 1999). A busy host on which nothing comes
-    early for a while does not move the stamps. At first the line rises by `FOLLOWED_SHARE`; a
-    slope that is not certain yet is drawn towards that of clocks that agree.
+    Every record arrives late by an unknown delay that is never negative. Arrival minus device time
+    therefore lies above a line whose slope is the difference of the two clocks' rates, and touches
+    it where a record arrived without delay. The line is estimated by the edge, around the middle
+    of the last minute, of the lower convex hull of the earliest arrivals (Moon, Skelly and
+    Towsley, "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999).
+    A busy host on which nothing arrives early for a while thus does not move the stamps. At first
+    the line rises by `FOLLOWED_SHARE`; a slope that is still uncertain is shrunk towards zero.
 
     Parameters
     ----------
-    tick_hz : rate of the device's timestamp counter
+    tick_hz : float
+        Rate of the device's timestamp counter, Hz.
     """
 
     def __init__(self, tick_hz: float) -> None:
@@ -45,11 +54,18 @@ class DeviceClock:
         self.jumps = 0
 
     def observe(self, ticks: float, arrival_ns: int) -> None:
-        """Note that device time `ticks` was already past at host time `arrival_ns`.
+        """Take in the arrival of a record with a device timestamp.
 
-        Device time that runs backwards, or leaps ahead of the host's by more than a second, starts
-        the estimate anew. One that is a second behind may be a host that stalled: only when that
-        lasts for three seconds has the clock changed.
+        A device time that runs backwards, or jumps ahead of the host's by more than a second,
+        starts the estimate anew. If it falls behind by a second, the host may have stalled; only
+        when that lasts for three seconds does the clock count as changed.
+
+        Parameters
+        ----------
+        ticks : float
+            Device time, already past at the arrival, in ticks of its counter.
+        arrival_ns : int
+            Host time of the arrival, ns.
         """
         device_ns = ticks * self._ns_per_tick
         offset = arrival_ns - device_ns
@@ -69,7 +85,7 @@ class DeviceClock:
             self._draw(device_ns)
 
     def _begin(self, device_ns: float, offset_ns: float) -> None:
-        """Start anew with a first arrival."""
+        """Start the estimate anew with a first arrival."""
         self._late_from_ns = None
         self._slope = FOLLOWED_SHARE
         self._offset_ns, self._last_device_ns = offset_ns, device_ns
@@ -78,7 +94,7 @@ class DeviceClock:
         self._stretch_end_ns = device_ns + _STRETCH_NS
 
     def _remember(self, device_ns: float, offset_ns: float) -> None:
-        """Keep the earliest arrival of this stretch: the last one that is remembered."""
+        """Keep an arrival as the earliest one of the present stretch if it is."""
         before = self._earliest[-1]
         if offset_ns - before[1] < self._slope * (device_ns - before[0]):
             self._earliest[-1] = (device_ns, offset_ns)
@@ -101,16 +117,16 @@ class DeviceClock:
         return self._late_from_ns is not None and device_ns - self._late_from_ns > _STALL_NS
 
     def host_ns(self, ticks: float) -> int:
-        """Host time at device time `ticks`, in the clock of the arrivals; 0 before the first."""
+        """Return the host time (ns) of device time `ticks`; 0 before the first arrival."""
         if self._offset_ns is None:
             return 0
         return round(ticks * self._ns_per_tick + self._offset_ns)
 
 
 def _slope_below(points: Sequence[tuple[float, float]]) -> float:
-    """Most probable slope of the line below points, given what clocks differ by.
+    """Return the most probable slope of the line below points, with `_TYPICAL_SHARE` as prior.
 
-    Two points fix a line; how far the next ones lie above it tells how far it can be trusted.
+    Two points determine a line; the distances of the next ones above it tell how certain it is.
     """
     slope = _hull_slope(points)
     above = sorted(y - slope * x for x, y in points)
@@ -120,7 +136,7 @@ def _slope_below(points: Sequence[tuple[float, float]]) -> float:
 
 
 def _hull_slope(points: Sequence[tuple[float, float]]) -> float:
-    """Slope of the lower convex hull's edge above the middle of the abscissae, in their order."""
+    """Return the slope of the lower convex hull's edge at the middle of the abscissae."""
     hull: list[tuple[float, float]] = []
     for x, y in points:
         while len(hull) > 1:

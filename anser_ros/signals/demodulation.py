@@ -4,11 +4,11 @@ A window of samples x(t) of one channel is modelled as
 
     x(t) = sum_k Re[(P_k + Q_k t) exp(+j w_k t)] + c_0 + c_1 t (+ mains harmonics) + white noise
 
-with t = 0 in the middle of the window. P_k is the phasor wanted, Q_k its rate of change: a coil
-that moves changes all its amplitudes within the window, and a fit without Q_k takes that change
-for other tones. The model is linear, so its pseudo-inverse is computed once and a window costs one
-matrix product (Kay, Fundamentals of Statistical Signal Processing I, section 4.3). Windows too
-short to hold the Q_k are fitted without them; what known rates add to such a fit is linear too.
+with t = 0 in the middle of the window. P_k is the phasor and Q_k its rate of change: all
+amplitudes of a moving coil change within the window, and a fit without Q_k takes that change for
+other tones. The model is linear, so that its pseudo-inverse is computed once and a window costs
+one matrix product (Kay, Fundamentals of Statistical Signal Processing I, section 4.3). Windows
+that are too short to determine Q_k are fitted without; the bias by known rates is linear as well.
 """
 
 from __future__ import annotations
@@ -21,24 +21,40 @@ from numpy.typing import NDArray
 from anser_ros.errors import FitError, ParameterError
 
 SHORTEST_WINDOW_S = 0.005
+"""Shortest window, s. Tones 170 Hz apart need about 1/170 s to be told apart."""
 LONGEST_WINDOW_S = 0.05
+"""Longest window, s. A tool at 0.2 m/s moves 1 cm meanwhile, and its phasors no longer change
+linearly."""
 _RANK_TOLERANCE = 1e-6
+"""Singular values below this fraction of the largest are left out. What the window determines lies
+far above it, and rounding far below."""
+_LARGEST_LOSS = 1e-3
+"""Largest part of a wanted coefficient that may lie in the singular vectors that are left out."""
 _WORST_VARIANCE_RATIO = 30.0
+"""Variance of a phasor, relative to that of a single tone in the same window, beyond which the
+tones count as not separable: the noise would then be 5.5 times larger."""
 _AFFORDABLE_VARIANCE_RATIO = 2.0
+"""The same ratio up to which rates of change are fitted unless asked otherwise. They cost that
+much noise and save the error of a moving tool."""
 
 
 @dataclass(frozen=True)
 class ToneFit:
-    """Phasors of one window, in the unit of the samples.
+    """Fitted phasors of one window, in the unit of the samples.
 
     Attributes
     ----------
-    phasors : ndarray, shape (C, K), complex, peak amplitude and phase in the middle of the window
-    sigma : ndarray, shape (C, K), standard deviation of the real and of the imaginary part
-    noise : ndarray, shape (C,), root mean square of what the model leaves, per sample
-    rates : ndarray, shape (C, K), complex, change of the phasors per second; zero where not fitted
-    motion_bias : ndarray, shape (2K, 2K), or None where the rates are fitted: what rates [Re, Im]
-        per second, which the fit knows nothing of, add to the phasors [Re, Im]
+    phasors : ndarray, shape (C, K), complex
+        Peak amplitude and phase in the middle of the window.
+    sigma : ndarray, shape (C, K)
+        Standard deviation of the real and of the imaginary part.
+    noise : ndarray, shape (C,)
+        Root mean square of the residual of a sample.
+    rates : ndarray, shape (C, K), complex
+        Change of the phasors per second; zero where it is not fitted.
+    motion_bias : ndarray, shape (2K, 2K), or None
+        Bias of the phasors [Re, Im] by rates [Re, Im] that the fit leaves out, s; None where the
+        rates are fitted.
     """
 
     phasors: NDArray[np.complex128]
@@ -58,17 +74,23 @@ class _Solution:
 
 
 class Demodulator:
-    """Demodulates windows of a fixed length.
+    """Demodulates windows of a fixed length by least squares.
 
     Parameters
     ----------
-    sample_rate_hz : samples a second and channel
-    frequencies_hz : K drive tones
-    window_samples : samples in a window, 5 to 50 ms of them
-    mains_hz : fundamental of the mains whose harmonics are fitted as well; None for none
-    mains_harmonics : how many harmonics; one that falls on a tone is left out
-    follow_motion : fit the phasors' rates of change too; None does so where that does not double
-        the variance of the phasors (from 10 ms on with tones 170 Hz apart)
+    sample_rate_hz : float
+        Samples a second and channel.
+    frequencies_hz : ndarray, shape (K,)
+        Drive tones, Hz.
+    window_samples : int
+        Samples in a window, 5 to 50 ms of them.
+    mains_hz : float, optional
+        Fundamental of the mains whose harmonics are fitted as well.
+    mains_harmonics : int
+        Number of these harmonics; one that falls on a tone is left out.
+    follow_motion : bool, optional
+        Whether the phasors' rates of change are fitted. By default they are where that does not
+        double the variance of the phasors (from 10 ms on with tones 170 Hz apart).
 
     Raises
     ------
@@ -123,12 +145,14 @@ class Demodulator:
     def demodulate(
         self, samples: NDArray[np.generic], present: NDArray[np.bool_] | None = None
     ) -> ToneFit:
-        """Fit all tones of all channels.
+        """Fit the phasors of all tones of all channels.
 
         Parameters
         ----------
-        samples : ndarray, shape (N, C), any real type
-        present : ndarray, shape (N,), False where a sample was lost; its rows are not looked at
+        samples : ndarray, shape (N, C)
+            Samples of a window, of any real type.
+        present : ndarray of bool, shape (N,), optional
+            False where a sample was lost; its values are ignored.
 
         Raises
         ------
@@ -162,7 +186,7 @@ class Demodulator:
     def _motion_bias(
         self, solution: _Solution, design: NDArray[np.float64], times_s: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Phasors that a fit without motion finds in tones of size t, shape (2K, 2K), s."""
+        """Return the phasors that a fit without motion finds in tones times t, (2K, 2K), s."""
         count = 2 * self.frequencies_hz.size
         projected = solution.basis.T @ (times_s[:, None] * design[:, :count])
         return np.asarray((solution.to_coefficients @ projected)[:count])
@@ -190,7 +214,7 @@ def _kept_harmonics(
 
 
 def _times_s(sample_rate_hz: float, window_samples: int) -> NDArray[np.float64]:
-    """Times of a window's samples from its middle."""
+    """Return the times of a window's samples from its middle, s."""
     times = (np.arange(window_samples) - (window_samples - 1) / 2) / sample_rate_hz
     return np.asarray(times, float)
 
@@ -202,7 +226,7 @@ def _design_matrix(
     harmonics: NDArray[np.float64],
     follow_motion: bool,
 ) -> NDArray[np.float64]:
-    """Columns: cos and -sin of the tones, the same times t, offset and slope, mains."""
+    """Return the columns: cos and -sin of the tones, the same times t, offset, slope, mains."""
     time = _times_s(sample_rate_hz, window_samples)
     unit = time / (window_samples / sample_rate_hz / 2)
     angle = 2 * np.pi * time[:, None] * tones
@@ -219,12 +243,13 @@ def _design_matrix(
 def _solve(
     design: NDArray[np.float64], wanted: int, worst_ratio: float = _WORST_VARIANCE_RATIO
 ) -> _Solution:
-    """Solve the design by SVD; its first `wanted` coefficients must be determined.
+    """Solve the design by singular value decomposition.
 
     Raises
     ------
     FitError
-        When they are not, or only with more than `worst_ratio` times one tone's own variance.
+        When the first `wanted` coefficients are not determined, or with more than `worst_ratio`
+        times the variance of a single tone.
     """
     samples, columns = design.shape
     if samples < columns + 1:
@@ -236,6 +261,6 @@ def _solve(
     variance = np.einsum('pr,pr->p', to_coefficients, to_coefficients)
     lost = np.abs(right[~kept][:, :wanted]).max(initial=0.0)
     worst = variance[:wanted].max() * samples / 2
-    if lost > 1e-3 or worst > worst_ratio:
+    if lost > _LARGEST_LOSS or worst > worst_ratio:
         raise FitError(f'tones not separable: variance {worst:.3g} times that of one tone alone')
     return _Solution(np.ascontiguousarray(left[:, kept]), to_coefficients, variance)

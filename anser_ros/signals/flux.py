@@ -1,16 +1,16 @@
-"""From code phasors to fluxes in tesla, referred to the measured coil currents.
+"""Conversion of phasors in codes to fluxes in tesla, referred to the measured coil currents.
 
-A coil of N turns and area A behind an amplifier of gain G sees a flux density B exp(+j w t) along
-its axis as the voltage (Faraday's law; the winding sense makes the sign positive)
+A coil of N turns and area A behind an amplifier of gain G turns a flux density B exp(+j w t) along
+its axis into the voltage (Faraday's law; the winding sense makes the sign positive)
 
     V = j w a B exp(-j w d),    a = N A G,    d = delay of the channel
 
-and the sum-of-currents channel sees the current I_k of emitter k at that emitter's tone, so
+and the channel of the summed currents has the current I_k of emitter k at that emitter's tone, so
 
     B_k = V_k / (j w_k a exp(-j w_k d)) * I_nominal,k exp(-j w_k d_I) / I_k
 
-is the flux density at nominal current with the phase of the measured current as its zero. A
-current that drifts, and the unknown start of the window, drop out.
+is the flux density at nominal current, with the phase of the measured current as its zero. A drift
+of the current and the unknown start of the window cancel.
 """
 
 from __future__ import annotations
@@ -26,15 +26,20 @@ from anser_ros.signals.demodulation import ToneFit
 
 @dataclass(frozen=True)
 class FluxWindow:
-    """Fluxes of one window.
+    """Fluxes and currents of one window.
 
     Attributes
     ----------
-    flux : ndarray, shape (S, K), complex, T at nominal current; NaN for an emitter without current
-    sigma : ndarray, shape (S, K), T, standard deviation of each component, by the residual noise
-    current : ndarray, shape (K,), complex, A, phase relative to the window's middle
-    current_sigma : ndarray, shape (K,), A
-    driven : ndarray, shape (K,), whether the emitter carries current
+    flux : ndarray, shape (S, K), complex
+        Flux density at nominal current, T; NaN for an emitter without current.
+    sigma : ndarray, shape (S, K)
+        Standard deviation of each component from the residual noise, T.
+    current : ndarray, shape (K,), complex
+        Measured currents, A, with their phase in the middle of the window.
+    current_sigma : ndarray, shape (K,)
+        Standard deviation of each component of the currents, A.
+    driven : ndarray of bool, shape (K,)
+        Whether the emitter carries current.
     """
 
     flux: NDArray[np.complex128]
@@ -45,18 +50,31 @@ class FluxWindow:
 
 
 class FluxConverter:
-    """Converts fits of all columns to the fluxes of the sensor columns.
+    """Converts fitted phasors of all columns to the fluxes of the sensor columns.
 
     Parameters
     ----------
-    frequencies_hz : K drive tones
-    sensor_columns : S columns of the sensors, in the order wanted
-    volts_per_code : S scales of these columns
-    area_m2 : S effective areas N A G; negative for a coil wired the other way round
-    delay_s : S delays of the channels behind the coil
-    current_column, amperes_per_code, current_delay_s : the sum-of-currents channel
-    nominal_currents_a : K peak currents that the fluxes are given for
-    least_current : share of the nominal current below which an emitter counts as not driven
+    frequencies_hz : ndarray, shape (K,)
+        Drive tones, Hz.
+    sensor_columns : ndarray of int, shape (S,)
+        Columns of the sensors in the order wanted.
+    volts_per_code : ndarray, shape (S,)
+        Scale of these columns, V.
+    area_m2 : ndarray, shape (S,)
+        Effective areas N A G, m^2; negative for a coil wired the other way round.
+    delay_s : ndarray, shape (S,)
+        Delays of the channels behind the coils, s.
+    current_column : int
+        Column of the summed currents.
+    amperes_per_code : float
+        Scale of that column, A.
+    nominal_currents_a : ndarray, shape (K,)
+        Peak currents that the fluxes are given for, A.
+    current_delay_s : float
+        Delay of the channel of the currents, s.
+    least_current : float
+        Fraction of the nominal current below which an emitter counts as not driven. It must be
+        above the noise of the current channel; a flux is divided by the current.
 
     Raises
     ------
@@ -94,13 +112,15 @@ class FluxConverter:
     def convert(
         self, fit: ToneFit, flux_rates: NDArray[np.complex128] | None = None
     ) -> FluxWindow:
-        """Convert one window.
+        """Convert the phasors of one window to fluxes.
 
         Parameters
         ----------
-        fit : phasors of all columns
-        flux_rates : ndarray, shape (S, K), T/s, where they are known though the window was too
-            short to fit them; what they add to the phasors is taken off
+        fit : ToneFit
+            Phasors of all columns.
+        flux_rates : ndarray, shape (S, K), complex, optional
+            Rates of change of the fluxes, T/s, for windows that are too short to fit them; the
+            bias of the phasors by them is subtracted.
         """
         current = fit.phasors[self._current_column] * self._amperes_per_code
         current_sigma = fit.sigma[self._current_column] * np.abs(self._amperes_per_code)
@@ -116,8 +136,7 @@ class FluxConverter:
             added = np.hstack([rates.real, rates.imag]) @ fit.motion_bias.T
             phasors = phasors - added[:, : driven.size] - 1j * added[:, driven.size :]
         flux = phasors * to_flux
-        own = fit.sigma[self._columns] * np.abs(to_flux)
-        shared = np.divide(current_sigma, magnitude, where=driven, out=np.zeros_like(magnitude))
-        return FluxWindow(
-            flux, np.hypot(own, np.abs(flux) * shared), current, current_sigma, driven
-        )
+        sensor_sigma = fit.sigma[self._columns] * np.abs(to_flux)
+        relative = np.divide(current_sigma, magnitude, where=driven, out=np.zeros_like(magnitude))
+        sigma = np.hypot(sensor_sigma, np.abs(flux) * relative)
+        return FluxWindow(flux, sigma, current, current_sigma, driven)

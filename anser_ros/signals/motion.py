@@ -1,4 +1,4 @@
-"""How fast fluxes change, from the windows before: for windows too short to tell it themselves."""
+"""Rates of change of the fluxes from earlier windows, for windows too short to fit them."""
 
 from __future__ import annotations
 
@@ -8,33 +8,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 REACH_S = 0.03
+"""Time over which the straight line is fitted, s. A tool's velocity hardly changes meanwhile; a
+shorter time makes the slopes noisier, a longer one makes them late."""
 LONGEST_GAP_S = 0.05
-LEAST = 3
+"""Longest time from one window to the next, s; after a longer gap the windows before it say
+nothing about the present motion."""
+FEWEST_WINDOWS = 3
+"""Windows that a slope needs at least, so that the noise of a single one does not make it."""
 
 
 class FluxRates:
-    """Slopes of the fluxes over the last windows, by a straight line through them.
+    """The slopes of the fluxes over the last windows, by a straight line through them.
 
-    Over `REACH_S` a tool's velocity hardly changes, and the slopes are known so well that what
-    they take off a short window adds next to no noise.
+    Over `REACH_S` the slopes are determined so well that subtracting their effect from a short
+    window adds hardly any noise.
     """
 
     def __init__(self) -> None:
         self._past: deque[tuple[float, NDArray[np.complex128]]] = deque()
 
     def add(self, time_s: float, flux: NDArray[np.complex128]) -> None:
-        """Take a window's fluxes (S, K) at its middle; a gap or step back in time starts anew."""
+        """Take in the fluxes (S, K), T, of a window at the time of its middle.
+
+        A gap or a step back in time discards the windows before.
+        """
         past = self._past
         if past and not 0 < time_s - past[-1][0] <= LONGEST_GAP_S:
             past.clear()
         past.append((time_s, flux))
-        while len(past) > LEAST and time_s - past[0][0] > REACH_S:
+        while len(past) > FEWEST_WINDOWS and time_s - past[0][0] > REACH_S:
             past.popleft()
 
     def at(self, time_s: float) -> NDArray[np.complex128] | None:
-        """Rates (S, K), T/s; None until there are three windows not long ago."""
+        """Return the rates (S, K), T/s, at a time, or None without enough recent windows."""
         past = self._past
-        if len(past) < LEAST or not 0 < time_s - past[-1][0] <= LONGEST_GAP_S:
+        if len(past) < FEWEST_WINDOWS or not 0 < time_s - past[-1][0] <= LONGEST_GAP_S:
             return None
         times = np.array([moment for moment, _ in past])
         weights = times - times.mean()

@@ -1,4 +1,4 @@
-"""Cuts a stream of sample blocks into overlapping windows, and knows what is missing in them."""
+"""Overlapping windows, cut from a stream of sample blocks, with the samples that they miss."""
 
 from __future__ import annotations
 
@@ -10,22 +10,30 @@ from numpy.typing import NDArray
 from anser_ros.errors import ParameterError
 
 _SEQUENCES = 2**32
+"""Number after which the blocks' sequence number begins again (an unsigned 32-bit counter)."""
 _CLOCK_TOLERANCE = 0.01
+"""Relative difference up to which a hole's length by device time and by sequence number agree. It
+is far above the rate error of any clock and below one block in a hundred."""
 _FULL_SCALE = (-32768, 32767)
+"""Ends of the range of the 16-bit converter; a code at either end counts as saturated."""
 
 
 @dataclass(frozen=True)
 class Window:
-    """One window of samples.
+    """One window of samples of all channels.
 
     Attributes
     ----------
-    codes : ndarray, shape (N, C), int16
-    present : ndarray, shape (N,), False where a sample was lost
-    middle_ticks : device time of the middle of the window
-    saturated : ndarray, shape (C,), whether a sample lies at an end of the converter's range
-    stuck : ndarray, shape (C,), whether all samples are the same
-    dropped : whether samples are missing
+    codes : ndarray of int16, shape (N, C)
+        Converter codes.
+    present : ndarray of bool, shape (N,)
+        False where a sample was lost.
+    middle_ticks : float
+        Device time of the middle of the window, ticks.
+    saturated : ndarray of bool, shape (C,)
+        Whether a sample lies at an end of the converter's range.
+    stuck : ndarray of bool, shape (C,)
+        Whether all samples are the same.
     """
 
     codes: NDArray[np.int16]
@@ -42,7 +50,7 @@ class Window:
 
 @dataclass
 class CutterCounters:
-    """What happened to the stream, in the unit of the name."""
+    """Counters of the windows, samples and blocks of a stream, and of its restarts."""
 
     windows: int = 0
     windows_lost: int = 0
@@ -53,18 +61,22 @@ class CutterCounters:
 
 
 class WindowCutter:
-    """Collects blocks and hands out a window every `hop_samples`.
+    """Collects blocks and returns a window every `hop_samples`.
 
-    Lost blocks leave a hole of the right length, so the windows keep their grid; a window with
-    less than half of its samples is counted as lost. A sequence that does not fit the device time
-    is a new stream.
+    Lost blocks leave a hole of the right length, so that the windows keep their grid. A window
+    with less than half of its samples counts as lost. A sequence number that does not fit the
+    device time begins a new stream.
 
     Parameters
     ----------
-    window_samples, hop_samples : length of a window, and from one window to the next; a longer
-        hop leaves samples out
-    columns : channels
-    samples_per_tick : sample rate over tick rate of the device
+    window_samples : int
+        Samples in a window.
+    hop_samples : int
+        Samples from one window to the next; a hop longer than the window leaves samples out.
+    columns : int
+        Number of channels.
+    samples_per_tick : float
+        Sample rate over the tick rate of the device.
 
     Raises
     ------
@@ -105,9 +117,12 @@ class WindowCutter:
 
         Parameters
         ----------
-        sequence : number of the block, modulo 2^32
-        timestamp_ticks : device time of its first sample
-        codes : ndarray, shape (n, C), int16
+        sequence : int
+            Number of the block, modulo 2^32.
+        timestamp_ticks : int
+            Device time of its first sample, ticks.
+        codes : ndarray of int16, shape (n, C)
+            Its samples.
 
         Raises
         ------
@@ -133,10 +148,10 @@ class WindowCutter:
         return windows + self._advance(codes, len(codes), timestamp_ticks)
 
     def _missing_blocks(self, sequence: int, ticks: int, block: int) -> int:
-        """Blocks lost before this one; -1 for one that came before.
+        """Return the number of blocks lost before this one; -1 for a block that came before.
 
-        Sequence and device time must agree on the size of a hole; else the device has started a
-        new stream, whose start was lost on the way.
+        Sequence number and device time must agree on the size of a hole; otherwise the device has
+        started a new stream, and its first blocks were lost.
         """
         if self._expected is None or sequence == self._expected:
             return 0
@@ -152,7 +167,7 @@ class WindowCutter:
         return 0
 
     def _skip_whole_windows(self, missing: int) -> int:
-        """Jump over the windows that lie inside a long hole; returns the samples jumped over."""
+        """Skip the windows that lie inside a long hole and return the samples skipped."""
         hops = (missing - 2 * self._window) // self._hop
         if hops <= 0:
             return 0
@@ -162,7 +177,7 @@ class WindowCutter:
     def _advance(
         self, codes: NDArray[np.int16] | None, count: int, first_ticks: float
     ) -> list[Window]:
-        """Append samples, or a hole where `codes` is None, and cut the windows they complete."""
+        """Append samples, or a hole where `codes` is None, and return the completed windows."""
         windows: list[Window] = []
         done = 0
         while done < count:

@@ -1,0 +1,1 @@
+"""A simulated control unit and its world: board, tools, metal, sampling, faults and recordings."""

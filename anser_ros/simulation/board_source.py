@@ -1,4 +1,4 @@
-"""The field of the simulated board: Biot and Savart's law over all tracks of the setup's coils."""
+"""The field of the simulated board, by Biot and Savart's law over all tracks of its coils."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from anser_ros.wire.setup import Setup
 
 
 def board_source(setup: Setup) -> FieldSource:
-    """Field of the setup's own board, without the dipoles that the tracker models it by.
+    """Return the field of a setup's board, without the dipoles that models express it by.
 
     Raises
     ------
     SetupError
-        When the setup's geometry makes no board.
+        When the setup's geometry does not describe a board.
     """
     board = board_of(setup)
 

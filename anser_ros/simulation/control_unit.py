@@ -1,6 +1,6 @@
-"""A whole control unit without its plug: takes command bytes, gives record bytes.
+"""A simulated control unit that turns the bytes of commands into the bytes of records.
 
-It keeps no clock of its own: whoever owns it says how many samples have gone by.
+It has no clock: its owner tells it how many samples of time have passed.
 """
 
 from __future__ import annotations
@@ -37,18 +37,22 @@ from anser_ros.wire.frames import (
 )
 
 TICK_HZ = 1e6
+"""Rate of the device's timestamp counter, Hz."""
 _COMMANDS = (Identify, Start, Stop, SetFrequencies)
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Bytes of one record, with what an observer of the wire may want to know.
+    """The bytes of one record, with what a port needs to know of it.
 
     Attributes
     ----------
-    data : the record
-    is_block : whether it carries samples; such a record may be dropped when the pipe is full
-    end_sample : number of samples since power-up after which a block is complete; 0 for others
+    data : bytes
+        The record.
+    is_block : bool
+        Whether it carries samples; such a record may be dropped when the line is full.
+    end_sample : int
+        Number of samples since power-up after which a block is complete; 0 for other records.
     """
 
     data: bytes
@@ -57,16 +61,24 @@ class Piece:
 
 
 class ControlUnit:
-    """Speaks the protocol of `docs/cu_protocol.md`.
+    """A control unit that speaks the protocol of `docs/cu_protocol.md`.
 
     Parameters
     ----------
-    world, calibration : what it is connected to
-    front_end : converter and noise
-    block_samples : samples a block
-    effects : changes of the signals
-    seed : of the noise
-    name : the device's name
+    world : World
+        True fluxes of the sensors that it is connected to.
+    calibration : ChannelCalibration
+        True response of its channels.
+    front_end : FrontEnd, optional
+        Converter and noise.
+    block_samples : int
+        Samples in a block.
+    effects : sequence of RawEffect
+        Changes of the signals.
+    seed : int
+        Seed of the noise.
+    name : str
+        Name by which the device introduces itself.
     """
 
     def __init__(
@@ -98,17 +110,17 @@ class ControlUnit:
 
     @property
     def sample_rate_hz(self) -> float:
-        """Samples a second and channel."""
+        """Number of samples a second and channel."""
         return self._hello.sample_rate_hz
 
     @property
     def samples(self) -> int:
-        """Samples since power-up."""
+        """Number of samples since power-up."""
         return self._sample
 
     @property
     def streaming(self) -> bool:
-        """Whether it sends samples."""
+        """Whether the unit sends samples."""
         return self._state is DeviceState.STREAMING
 
     def receive(self, data: bytes) -> list[Piece]:
@@ -119,16 +131,16 @@ class ControlUnit:
         return answers
 
     def drop(self) -> None:
-        """Note that the pipe was too full for a block."""
+        """Count a block that was lost because the line was full."""
         self._dropped += 1
         self._lost_before = True
 
     def overload(self, is_on: bool) -> None:
-        """Let the first channel's amplifier saturate, or no longer."""
+        """Switch the overload of the first channel's amplifier on or off."""
         self._sampler.is_overloaded = is_on
 
     def skip(self, samples: int) -> None:
-        """Let time go by in which the device could not send: whole blocks are lost, not time."""
+        """Let time pass in which the device could not send and whole blocks are lost."""
         block = self._hello.block_samples
         if self.streaming:
             end = self._sample + samples - self._stream_begin
@@ -139,11 +151,12 @@ class ControlUnit:
         self._sample += samples
 
     def advance(self, samples: int) -> list[Piece]:
-        """Let time go by and return the records of that time, in order.
+        """Let time pass and return the records of that time, in order.
 
         Parameters
         ----------
-        samples : sampling instants; blocks are sent when their last sample is taken
+        samples : int
+            Time in sampling instants; a block is sent once its last sample is taken.
         """
         pieces: list[Piece] = []
         if self._sample >= self._next_hello:

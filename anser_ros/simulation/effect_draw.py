@@ -1,4 +1,4 @@
-"""Draws an effect at random, so that a test of the diagnosis can be blind to it."""
+"""Random draws of an effect and its parameters, for tests that do not know the answer."""
 
 from __future__ import annotations
 
@@ -35,15 +35,21 @@ RANDOM = 'random'
 
 @dataclass(frozen=True)
 class Drawn:
-    """An effect with its name and parameters as the contract writes them.
+    """A drawn effect with its name and parameters.
 
     Attributes
     ----------
-    name : what it is
-    parameters : plain data, named as in the interfaces where they have the effect
-    effects, metal : what puts it into the simulation
-    answers : names under which a diagnosis may rightly report it; empty where no catalogue has it
-        and only ``unexplained`` is right
+    name : str
+        Name of the effect.
+    parameters : dict
+        Its parameters as plain data, named as in docs/interfaces.md where the effect is there.
+    effects : tuple of RawEffect
+        What puts the effect into the signals.
+    metal : tuple of MetalBody
+        What puts it into the world.
+    answers : tuple of str
+        Names under which a diagnosis may rightly report the effect; empty where it has no such
+        effect and only ``unexplained`` is right.
     """
 
     name: str
@@ -53,7 +59,7 @@ class Drawn:
     answers: tuple[str, ...] = ()
 
     def document(self) -> dict[str, Any]:
-        """What a file of the truth says."""
+        """Return the effect as plain data for a file of the truth."""
         return {
             'name': self.name, 'parameters': self.parameters, 'answers': list(self.answers)
         }  # fmt: skip
@@ -61,7 +67,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Unit:
-    """What an effect is put into: the sensors with their channels' response."""
+    """The sensors that an effect is put into, with the response of their channels."""
 
     setup: Setup
     channels: ChannelCalibration
@@ -73,7 +79,7 @@ def _tool_columns(setup: Setup) -> list[int]:
 
 
 def _clusters(setup: Setup) -> list[list[int]]:
-    """Columns of tool sensors that sit at one place, three or more together."""
+    """Return the columns of tool sensors of which three or more are at the same place."""
     places: dict[tuple[str, tuple[float, ...]], list[int]] = {}
     for column in _tool_columns(setup):
         sensor = setup.sensors[column]
@@ -94,7 +100,7 @@ def _resting(place: NDArray[np.float64]) -> Callable[[float], Any]:
 
 
 def _known(name: str, parameters: dict[str, Any], *effects: RawEffect, **rest: Any) -> Drawn:
-    """An effect that the interfaces have under the same name."""
+    """Return an effect that the diagnosis reports under the same name."""
     return Drawn(name, parameters, effects, answers=(name,), **rest)
 
 
@@ -117,7 +123,7 @@ def _time_offset(unit: Unit, rng: np.random.Generator) -> Drawn:
 
 def _clock_rate(unit: Unit, rng: np.random.Generator) -> Drawn:
     slow_ppm = float(rng.uniform(2500.0, 6000.0))
-    # The host follows as far as two quartz clocks may differ; only the rest shows.
+    # The host follows as far as two quartz clocks may differ; only the remainder is visible.
     rate_ppm = 1e6 * FOLLOWED_SHARE - slow_ppm
     parameters = {'rate_ppm': rate_ppm, 'device_clock_ppm': -slow_ppm}
     return _known('clock_rate', parameters, SlowClock(-slow_ppm))
@@ -145,7 +151,8 @@ def _saturation(unit: Unit, rng: np.random.Generator) -> Drawn:
     column = int(rng.choice(_tool_columns(unit.setup)))
     limit_v = float(rng.uniform(2.0, 4.0))
     channel = unit.setup.sensors[column].channel
-    # What the tones' mean frequency makes of it; the amplifier sees volts, the higher tones more.
+    # The amplifier's limit is a voltage, which grows with the frequency: the mean tone stands for
+    # all of them.
     volts_per_tesla = unit.channels.areas_m2([channel])[0] * np.mean(unit.setup.frequencies_hz)
     full_scale_t = float(limit_v / (2 * np.pi * volts_per_tesla))
     parameters = {'channel': channel, 'full_scale_t': full_scale_t, 'limit_v': limit_v}
@@ -174,7 +181,7 @@ def _loose_contact(unit: Unit, rng: np.random.Generator) -> Drawn:
 def _gain_ripple(unit: Unit, rng: np.random.Generator) -> Drawn:
     depth, period_s = float(rng.uniform(0.005, 0.02)), float(rng.uniform(1.0, 4.0))
     parameters = {'depth': depth, 'period_s': period_s}
-    # No catalogue has the swing, but one has a gain's course over time.
+    # The diagnosis has no oscillating gain, but one that varies over time.
     return Drawn(
         'gain_ripple',
         parameters,
@@ -207,6 +214,17 @@ CATALOGUE: dict[str, Callable[[Unit, np.random.Generator], Drawn]] = {
 
 def draw(name: str, setup: Setup, channels: ChannelCalibration, rng: np.random.Generator) -> Drawn:
     """Draw the parameters of an effect, and the effect itself when `name` is ``random``.
+
+    Parameters
+    ----------
+    name : str
+        A key of `CATALOGUE`, ``random`` or ``none``.
+    setup : Setup
+        The sensors and coils.
+    channels : ChannelCalibration
+        Response of the channels.
+    rng : numpy.random.Generator
+        Source of the draw.
 
     Raises
     ------

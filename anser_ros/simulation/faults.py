@@ -1,4 +1,4 @@
-"""Faults of the line between control unit and host, on request."""
+"""Faults of the line between control unit and host that a simulator can be asked for."""
 
 from __future__ import annotations
 
@@ -16,21 +16,28 @@ FAULTS = (
     NONE, 'bad_crc', 'gap', 'garbage', 'wrong_baud', 'silence', UNPLUG, OVERRUN, SATURATION,
 )  # fmt: skip
 _BURST_BYTES = 700
+"""Length of a burst of garbage: about as long as a block of samples, so that it may hold bytes
+that look like the begin of a record."""
 _LASTS_S = {'wrong_baud': 2.5, 'silence': 2.5, UNPLUG: 1.0, OVERRUN: 0.1, SATURATION: 1.0}
+"""Duration of each lasting fault, s. The first two outlast the host's patience, so that it notices
+them; the others last long enough for several blocks."""
 
 
 class FaultInjector:
-    """Damages what goes over the line, once every period.
+    """Damages the records on the line once in every period.
 
-    `bad_crc`, `gap` and `garbage` happen to one block, the others last. `unplug`, `overrun` (the
-    unit has no room for its blocks) and `saturation` (of its first channel) are for the unit and
-    its port to show, while they last.
+    `bad_crc`, `gap` and `garbage` affect one block, the others last for some time. The owner of
+    the unit and of its port has to act on `unplug`, `overrun` (the unit has no room for its
+    blocks) and `saturation` (of its first channel) while they last.
 
     Parameters
     ----------
-    kind : one of `FAULTS`
-    period_s : from one fault to the next
-    seed : of the damage
+    kind : str
+        One of `FAULTS`.
+    period_s : float
+        Time from one fault to the next, s.
+    seed : int
+        Seed of the damage.
     """
 
     def __init__(self, kind: str = NONE, period_s: float = 5.0, seed: int = 0) -> None:
@@ -40,7 +47,7 @@ class FaultInjector:
         self._done = -1
 
     def lasts(self, time_s: float, kind: str) -> bool:
-        """Whether the lasting fault `kind` is on at a time; each period begins with it."""
+        """Return whether the lasting fault `kind` is on at a time; each period begins with it."""
         in_period = time_s % self.period_s
         return self.kind == kind and in_period < min(_LASTS_S[kind], self.period_s / 2)
 
@@ -72,7 +79,7 @@ class FaultInjector:
         return arrived
 
     def _garble(self, data: bytes) -> bytes:
-        """What a receiver at another speed makes of it: fewer bytes, all wrong."""
+        """Return what a receiver at another baud rate gets: fewer bytes, all of them wrong."""
         return self._noise(max(1, len(data) // 3))
 
     def _noise(self, count: int) -> bytes:

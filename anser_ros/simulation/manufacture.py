@@ -1,4 +1,5 @@
-"""A board as a workshop builds it: a little off the drawing that the setup document holds."""
+"""A simulated board with the errors of its manufacture, which differs slightly from its
+drawing."""
 
 from __future__ import annotations
 
@@ -9,14 +10,18 @@ import numpy as np
 from anser_ros.wire.setup import Setup
 
 SHIFT_M = 0.2e-3
+"""Standard deviation of a coil's position along each axis, m: an assumption about printed boards,
+smaller than the tolerances of the nominal model (0.5 mm)."""
 TURN_DEG = 0.1
+"""Standard deviation of a coil's rotation about z, degrees, an assumption as well."""
 CURRENT_SHARE = 0.01
+"""Fraction by which all currents are too large, half of the nominal model's tolerance of gains."""
 
 
 def manufactured(setup: Setup, rng: np.random.Generator) -> Setup:
-    """The setup with its coils a little off and its current a little too strong.
+    """Return a setup with random errors of its coils' places and a slightly too large current.
 
-    The drawing does not know of it, so the nominal model is wrong for such a board.
+    The setup document keeps the drawing, so that the nominal model is wrong for such a board.
     """
     coils = tuple(
         replace(

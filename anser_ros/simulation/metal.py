@@ -1,4 +1,4 @@
-"""Metal bodies as clouds of spheres that every emitter drives with the same polarisability."""
+"""Metal bodies, simulated as rigid clouds of conducting and permeable spheres."""
 
 from __future__ import annotations
 
@@ -17,19 +17,27 @@ ComplexArray = NDArray[np.complex128]
 def sphere_polarisability(
     radius_m: float, conductivity_s_per_m: float, relative_permeability: float, omega: Array
 ) -> ComplexArray:
-    """Magnetic moment of a sphere per tesla of a uniform field exp(+j w t), A m^2 / T.
+    """Return the magnetic moment of a sphere per tesla of a uniform field exp(+j w t).
 
-    J. R. Wait, Geophysics 16 (1951) 666, the induced dipole of a conducting permeable sphere; its
-    limits are -2 pi a^3 / mu_0 for a perfect conductor and
+    This is the induced dipole of a conducting permeable sphere (J. R. Wait, Geophysics 16, 1951,
+    p. 666). Its limits are -2 pi a^3 / mu_0 for a perfect conductor and
     4 pi a^3 / mu_0 (mu_r - 1) / (mu_r + 2) for a permeable insulator.
 
     Parameters
     ----------
-    omega : ndarray, shape (K,), rad/s
+    radius_m : float
+        Radius a, m.
+    conductivity_s_per_m : float
+        Conductivity, S/m.
+    relative_permeability : float
+        Relative permeability mu_r.
+    omega : ndarray, shape (K,)
+        Angular frequencies, rad/s.
 
     Returns
     -------
     ndarray, shape (K,), complex
+        Moment per flux density, A m^2 / T.
     """
     mu = relative_permeability
     x = radius_m * np.sqrt(1j * omega * conductivity_s_per_m * mu * MU_0)
@@ -41,13 +49,16 @@ def sphere_polarisability(
 
 @dataclass(frozen=True)
 class MetalBody:
-    """A rigid cloud of equal spheres on a path; their fields on each other are left out.
+    """A rigid cloud of equal spheres on a path, which do not drive each other.
 
     Attributes
     ----------
-    offsets : ndarray, shape (M, 3), m, sphere centres in the body's frame
-    radius_m, conductivity_s_per_m, relative_permeability : of each sphere
-    path : pose of the body at a time
+    offsets : ndarray, shape (M, 3)
+        Centres of the spheres in the body's frame, m.
+    radius_m, conductivity_s_per_m, relative_permeability : float
+        Radius (m), conductivity (S/m) and relative permeability of each sphere.
+    path : Path
+        Pose of the body over time.
     """
 
     offsets: Array
@@ -57,12 +68,12 @@ class MetalBody:
     path: Path
 
     def centres(self, time_s: float) -> Array:
-        """Sphere centres (M, 3), m, frame fg."""
+        """Return the centres of the spheres at a time, shape (M, 3), m, frame fg."""
         position, rotation = self.path(time_s)
         return np.asarray(position + self.offsets @ rotation.T)
 
     def polarisability(self, frequencies_hz: Array) -> ComplexArray:
-        """Polarisability of one sphere at each drive tone, shape (K,)."""
+        """Return the polarisability of one sphere at each drive tone, shape (K,), A m^2 / T."""
         return sphere_polarisability(
             self.radius_m,
             self.conductivity_s_per_m,
@@ -72,7 +83,17 @@ class MetalBody:
 
 
 def steel_disc(path: Path | None = None, *, radius_m: float = 0.06, rings: int = 3) -> MetalBody:
-    """A disc of touching steel balls, like the foot of an instrument stand or an X-ray head."""
+    """Return a disc of touching steel balls, like the foot of a stand or the head of a C-arm.
+
+    Parameters
+    ----------
+    path : Path, optional
+        Pose over time; by default it approaches and leaves again.
+    radius_m : float
+        Radius of the disc, m.
+    rings : int
+        Rings of balls around the one in the middle.
+    """
     ball = radius_m / (2 * rings + 1)
     centres = [np.zeros(3)]
     for ring in range(1, rings + 1):

@@ -1,4 +1,4 @@
-"""Where things are at a time: a tool on a smooth closed path, and metal that comes and goes."""
+"""Paths of simulated bodies: a tool on a smooth path, and metal that approaches and leaves."""
 
 from __future__ import annotations
 
@@ -11,21 +11,24 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
-"""Position (3,), m, and rotation matrix (3, 3), frame fg."""
+"""A position (3,), m, and a rotation matrix (3, 3) from the body's frame to fg."""
 
 Path = Callable[[float], Pose]
-"""A pose for every time in seconds."""
+"""A function from a time in seconds to a pose."""
 
 
 @dataclass(frozen=True)
 class Lissajous:
-    """Sums of sines in each coordinate and in each component of the rotation vector.
+    """A path that is a sine in each coordinate and in each component of the rotation vector.
 
     Attributes
     ----------
-    centre_m, amplitude_m, period_s : three values each, x y z
-    turn_rad, turn_period_s : amplitude and period of the rotation vector's components
-    phase_rad : start phase, so that two bodies need not move alike
+    centre_m, amplitude_m, period_s : tuple of three floats
+        Centre (m), amplitude (m) and period (s) of x, y and z in fg.
+    turn_rad, turn_period_s : tuple of three floats
+        Amplitude (rad) and period (s) of the components of the rotation vector.
+    phase_rad : float
+        Phase at the start, so that two bodies need not move alike.
     """
 
     centre_m: tuple[float, float, float] = (0.0, 0.0, 0.15)
@@ -36,7 +39,7 @@ class Lissajous:
     phase_rad: float = 0.0
 
     def __call__(self, time_s: float) -> Pose:
-        """Pose at a time."""
+        """Return the pose at a time, s."""
         angle = 2 * np.pi * time_s / np.array(self.period_s) + self.phase_rad
         position = np.array(self.centre_m) + np.array(self.amplitude_m) * np.sin(angle)
         turn = 2 * np.pi * time_s / np.array(self.turn_period_s) + self.phase_rad
@@ -45,11 +48,11 @@ class Lissajous:
 
 
 BODY_PHASE_RAD = 0.7
-"""What a body's path is ahead of that of the body before."""
+"""Phase difference between the paths of one body and the next, so that they stay apart."""
 
 
 def tool_paths(bodies: Sequence[str], phase_rad: float = 0.0) -> Mapping[str, Path]:
-    """Usual path of each body."""
+    """Return the default path of each body, by its name."""
     return {
         body: Lissajous(phase_rad=phase_rad + BODY_PHASE_RAD * rank)
         for rank, body in enumerate(bodies)
@@ -58,13 +61,16 @@ def tool_paths(bodies: Sequence[str], phase_rad: float = 0.0) -> Mapping[str, Pa
 
 @dataclass(frozen=True)
 class Approach:
-    """A visit from afar: far, then near, then far again, each way along a smooth ramp.
+    """A path that comes near, stays, and leaves again, each way along a smooth ramp.
 
     Attributes
     ----------
-    far_m, near_m : positions between which it moves
-    start_s, travel_s, stay_s : begin, time for one way, time near
-    period_s : the visit repeats after this long; 0 for once
+    far_m, near_m : tuple of three floats
+        Positions between which it moves, m, frame fg.
+    start_s, travel_s, stay_s : float
+        Time of the start, time for one way, and time near, s.
+    period_s : float
+        Time after which the visit repeats, s; 0 for a single visit.
     """
 
     far_m: tuple[float, float, float] = (0.05, -0.03, -0.6)
@@ -75,7 +81,7 @@ class Approach:
     period_s: float = 0.0
 
     def __call__(self, time_s: float) -> Pose:
-        """Pose at a time; the orientation stays."""
+        """Return the pose at a time, s; the orientation is constant."""
         local = time_s - self.start_s
         if self.period_s > 0 and local > 0:
             local %= self.period_s

@@ -1,4 +1,4 @@
-"""A serial port made of a pseudo-terminal, behind a link that keeps its name when replugged."""
+"""A simulated serial port: a pseudo-terminal behind a link that keeps its name."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ from anser_ros.errors import PortError
 from anser_ros.simulation.control_unit import Piece
 
 _PENDING_LIMIT_BYTES = 1 << 20
-"""Half a second of samples: a host that is slower loses blocks and does not fall behind more."""
+"""Bytes that wait for the host at most, about half a second of samples. A host that is slower
+loses blocks instead of falling behind more and more."""
 
 
 class PseudoPort:
-    """The device's end of the line; never blocks.
+    """The device's end of the line, which never blocks.
 
     Parameters
     ----------
-    link : path under which the host opens the port
+    link : Path
+        Path under which the host opens the port.
 
     Raises
     ------
     PortError
-        When something else than a link has that path, or it cannot be made.
+        When something other than a link has that path, or the link cannot be made.
     """
 
     def __init__(self, link: Path) -> None:
@@ -38,11 +40,11 @@ class PseudoPort:
 
     @property
     def plugged(self) -> bool:
-        """Whether the cable is in."""
+        """Whether the cable is plugged in."""
         return self._fds is not None
 
     def plug(self) -> None:
-        """Put the cable in: a fresh terminal behind the same link."""
+        """Plug the cable in: a new terminal appears behind the same link."""
         if self.link.exists() and not self.link.is_symlink():
             raise PortError(f'{self.link} exists and is no link')
         master, slave = os.openpty()
@@ -59,7 +61,7 @@ class PseudoPort:
         self._fds = (master, slave)
 
     def unplug(self) -> None:
-        """Pull the cable out."""
+        """Pull the cable out, so that the link disappears."""
         if self._fds is None:
             return
         self._remove_own_link()
@@ -72,7 +74,7 @@ class PseudoPort:
         self.unplug()
 
     def write(self, pieces: Sequence[Piece]) -> int:
-        """Send records; returns how many blocks found the line full and were dropped."""
+        """Send records and return the number of blocks dropped because the line was full."""
         if self._fds is None:
             return sum(piece.is_block for piece in pieces)
         dropped = 0
@@ -89,7 +91,7 @@ class PseudoPort:
         return dropped
 
     def write_all(self, data: bytes) -> None:
-        """Send bytes, and wait until the line has taken the last one."""
+        """Send bytes and wait until the line has taken all of them."""
         self._pending += data
         self._flush()
         while self._pending and self._fds is not None:
@@ -97,9 +99,9 @@ class PseudoPort:
             self._flush()
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until the host sends something or time is over; what is pending goes out meanwhile.
+        """Wait until the host sends something or the time is over, and send what is pending.
 
-        The system takes a few kilobytes at a time, so a port that nobody waits on is a slow one.
+        The system takes a few kilobytes at a time, so that a port on which nobody waits is slow.
         """
         end = time.monotonic() + timeout_s
         while (left := end - time.monotonic()) > 0:
@@ -123,7 +125,7 @@ class PseudoPort:
                 self._pending = self._pending[os.write(self._fds[0], self._pending) :]
 
     def read(self) -> bytes:
-        """Return what the host has sent; empty when nothing."""
+        """Return the bytes that the host has sent, possibly none."""
         if self._fds is None:
             return b''
         try:

@@ -1,9 +1,9 @@
-"""Effects put into a control unit's signals: the place where a simulated fault of nature goes in.
+"""Simulated faults of sensors, coils, amplifiers and clocks, put into a control unit's signals.
 
 An effect overrides the stage at which it acts. The stages run in the order of the methods: the
-world's fluxes, the coil currents, the voltages of all samples before the converter, the records'
-device time. Times count from when the coils were first driven, s, but for the device's own clock.
-An effect must not know who looks at the result.
+world's fluxes, the coil currents, the voltages of all samples before the converter, the device
+time of the records. Times count from the first drive of the coils, s, except for the device's
+clock. An effect does not know which analysis will look at the result.
 """
 
 from __future__ import annotations
@@ -21,48 +21,50 @@ ComplexArray = NDArray[np.complex128]
 
 
 class RawEffect:
-    """Base: changes nothing."""
+    """The base of all effects, which changes nothing at any stage."""
 
     def setup(self, setup: Setup) -> Setup:
-        """The setup as it really is, where the effect makes it differ from the document."""
+        """Return the true setup, which the effect may make differ from its document."""
         return setup
 
     def flux(self, time_s: float, flux: ComplexArray) -> ComplexArray:
-        """Fluxes (S, K) of all sensors, T at nominal current, in the order of the setup."""
+        """Return the fluxes (S, K), T at nominal current, in the order of the setup's sensors."""
         return flux
 
     def current(self, time_s: float, current: ComplexArray) -> ComplexArray:
-        """Coil currents (K,), A; what drives the field is also what the current channel sees."""
+        """Return the coil currents (K,), A, for the field and for the current channel alike."""
         return current
 
     def volts(self, time_s: Array, volts: Array) -> Array:
-        """Voltages (n, S) of all sensors at n sampling instants, before noise and converter."""
+        """Return the voltages (n, S), V, at n sampling instants before noise and converter."""
         return volts
 
     def device_time(self, time_s: float) -> float:
-        """What the device's clock says at a true time."""
+        """Return the time of the device's clock at a true time, s."""
         return time_s
 
     def delivery_delay_s(self) -> float:
-        """How much later than usual the records reach the host."""
+        """Return the additional delay of the records on their way to the host, s."""
         return 0.0
 
 
 @dataclass(frozen=True)
 class RawChannelCrosstalk(RawEffect):
-    """Sensors of one cluster leak into each other.
+    """Crosstalk between the sensors of one cluster.
 
     Attributes
     ----------
-    columns : of the cluster's sensors, in the order of the setup
-    matrix : what each of them (row) sees of the others (column), ones on the diagonal
+    columns : tuple of int
+        Columns of the cluster's sensors in the order of the setup.
+    matrix : tuple of tuple of float
+        Gain from each sensor (column) to each channel (row), with ones on the diagonal.
     """
 
     columns: tuple[int, ...]
     matrix: tuple[tuple[float, ...], ...]
 
     def volts(self, time_s: Array, volts: Array) -> Array:
-        """Mix."""
+        """Return the voltages with those of the cluster mixed."""
         mixed = volts.copy()
         mixed[:, list(self.columns)] = volts[:, list(self.columns)] @ np.array(self.matrix).T
         return mixed
@@ -70,13 +72,13 @@ class RawChannelCrosstalk(RawEffect):
 
 @dataclass(frozen=True)
 class CompressingAmplifier(RawEffect):
-    """One sensor's amplifier runs out of room: v becomes limit * tanh(v / limit)."""
+    """An amplifier of one sensor that saturates: v becomes ``limit * tanh(v / limit)``."""
 
     column: int
     limit_v: float
 
     def volts(self, time_s: Array, volts: Array) -> Array:
-        """Compress."""
+        """Return the voltages with those of the sensor compressed."""
         compressed = volts.copy()
         compressed[:, self.column] = self.limit_v * np.tanh(volts[:, self.column] / self.limit_v)
         return compressed
@@ -84,16 +86,16 @@ class CompressingAmplifier(RawEffect):
 
 @dataclass(frozen=True)
 class CrossoverAmplifier(RawEffect):
-    """One sensor's output stage loses what is small: v becomes v - dead * tanh(v / dead).
+    """A crossover distortion of one sensor: v becomes ``v - dead * tanh(v / dead)``.
 
-    No effect of any catalogue: the share that is lost is the larger the weaker all tones are.
+    The diagnosis has no such effect. The weaker all tones are, the larger is the lost fraction.
     """
 
     column: int
     dead_v: float
 
     def volts(self, time_s: Array, volts: Array) -> Array:
-        """Take the dead zone off."""
+        """Return the voltages with the dead zone subtracted from those of the sensor."""
         crossed = volts.copy()
         crossed[:, self.column] -= self.dead_v * np.tanh(volts[:, self.column] / self.dead_v)
         return crossed
@@ -101,7 +103,19 @@ class CrossoverAmplifier(RawEffect):
 
 @dataclass(frozen=True)
 class LooseSensor(RawEffect):
-    """One sensor's contact fails: for a share of the time its voltage drops to a small rest."""
+    """A loose contact of one sensor: periodically its voltage drops to a small remainder.
+
+    Attributes
+    ----------
+    column : int
+        Column of the sensor in the order of the setup.
+    share : float
+        Fraction of the time in which the contact is open.
+    rest : float
+        Factor of the voltage at an open contact.
+    period_s : float
+        Time from one opening to the next, s.
+    """
 
     column: int
     share: float = 0.1
@@ -109,7 +123,7 @@ class LooseSensor(RawEffect):
     period_s: float = 0.7
 
     def volts(self, time_s: Array, volts: Array) -> Array:
-        """Drop out."""
+        """Return the voltages with those of the sensor reduced while its contact is open."""
         open_contact = (time_s / self.period_s) % 1.0 < self.share
         loose = volts.copy()
         loose[open_contact, self.column] *= self.rest
@@ -118,35 +132,35 @@ class LooseSensor(RawEffect):
 
 @dataclass(frozen=True)
 class SlowClock(RawEffect):
-    """The device's clock runs at another rate than it says."""
+    """A device clock whose rate differs from its nominal one by a constant."""
 
     error_ppm: float
 
     def device_time(self, time_s: float) -> float:
-        """Time by the wrong clock."""
+        """Return the time by the wrong clock, s."""
         return time_s * (1 + 1e-6 * self.error_ppm)
 
 
 @dataclass(frozen=True)
 class LateDelivery(RawEffect):
-    """A filter or buffer holds the records back."""
+    """A filter or buffer that delays all records by the same time."""
 
     delay_s: float
 
     def delivery_delay_s(self) -> float:
-        """Constant."""
+        """Return the constant delay, s."""
         return self.delay_s
 
 
 @dataclass(frozen=True)
 class TiltedSensor(RawEffect):
-    """A sensor has come loose: it points elsewhere than the setup document says."""
+    """A sensor that has come loose and has another axis than the setup document states."""
 
     column: int
     axis: tuple[float, float, float]
 
     def setup(self, setup: Setup) -> Setup:
-        """Turn the one sensor."""
+        """Return the setup with the true axis of the sensor."""
         sensors = list(setup.sensors)
         sensors[self.column] = replace(sensors[self.column], axis=self.axis)
         return replace(setup, sensors=tuple(sensors))
@@ -154,13 +168,13 @@ class TiltedSensor(RawEffect):
 
 @dataclass(frozen=True)
 class ChannelGain(RawEffect):
-    """One channel's gain is off."""
+    """A wrong gain of one channel."""
 
     column: int
     gain: float
 
     def volts(self, time_s: Array, volts: Array) -> Array:
-        """Scale."""
+        """Return the voltages with those of the channel scaled."""
         scaled = volts.copy()
         scaled[:, self.column] *= self.gain
         return scaled
@@ -168,27 +182,27 @@ class ChannelGain(RawEffect):
 
 @dataclass(frozen=True)
 class GainRipple(RawEffect):
-    """The gain of all channels swings, as by a bad supply: no effect of any catalogue."""
+    """A gain of all channels that oscillates, as by a bad supply; the diagnosis has none such."""
 
     depth: float
     period_s: float
 
     def volts(self, time_s: Array, volts: Array) -> Array:
-        """Swing."""
+        """Return the voltages times the oscillating gain."""
         swing = 1 + self.depth * np.sin(2 * np.pi * time_s / self.period_s)
         return np.asarray(volts * swing[:, None])
 
 
 @dataclass(frozen=True)
 class CoilWeakens(RawEffect):
-    """A coil's field changes though its current does not: a turn that heats up and shorts."""
+    """A coil whose field changes at constant current, as by a turn that heats up and shorts."""
 
     coil: int
     amount: float
     tau_s: float
 
     def flux(self, time_s: float, flux: ComplexArray) -> ComplexArray:
-        """Drift."""
+        """Return the fluxes with those of the coil at their strength of the time."""
         drifted = flux.copy()
         drifted[:, self.coil] *= 1 + self.amount * (1 - np.exp(-time_s / self.tau_s))
         return drifted
@@ -196,21 +210,21 @@ class CoilWeakens(RawEffect):
 
 @dataclass(frozen=True)
 class CurrentDrift(RawEffect):
-    """A coil's current changes by `amount` with time constant `tau_s`, as its copper warms up."""
+    """A coil current that changes by `amount` with time constant `tau_s`, as copper warms up."""
 
     coil: int
     amount: float
     tau_s: float
 
     def current(self, time_s: float, current: ComplexArray) -> ComplexArray:
-        """Drift."""
+        """Return the currents with that of the coil at its strength of the time."""
         drifted = current.copy()
         drifted[self.coil] *= 1 + self.amount * (1 - np.exp(-time_s / self.tau_s))
         return drifted
 
 
 def chained_volts(effects: Sequence[RawEffect], time_s: Array, volts: Array) -> Array:
-    """Voltages behind all effects, in their order."""
+    """Return the voltages after all effects, applied in their order."""
     for effect in effects:
         volts = effect.volts(time_s, volts)
     return volts

@@ -1,7 +1,7 @@
-"""Recorded sessions of our own world: fluxes with noise, optical poses with jitter, in a bag.
+"""Simulated recordings: the fluxes of a world with noise, and optical poses with jitter, in a bag.
 
-These bags stand in where nobody else's are at hand. They are simulated, and nothing measured on
-them is called anything else.
+These bags are used where no recordings of a real device are at hand; figures from them are always
+called simulated.
 """
 
 from dataclasses import dataclass
@@ -18,17 +18,24 @@ from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, dump_setup
 
 Array = NDArray[np.float64]
 SECOND_NS = 1_000_000_000
+"""Nanoseconds in a second."""
 START_NS = 1_700_000_000 * SECOND_NS
+"""First stamp of every recording, ns since 1970: a fixed date in 2023, so that the same seed makes
+the same bag."""
+OPTICAL_MARGIN_S = 0.2
+"""Time by which the optical poses begin before the fluxes and end after them, s."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """What the instruments of a recording get wrong.
+    """Standard deviations of the errors of a recording's instruments.
 
     Attributes
     ----------
-    flux_noise_t : standard deviation of each phasor component, T
-    optical_jitter_m, optical_jitter_rad : of each axis of the optical pose
+    flux_noise_t : float
+        Noise of each phasor component, T.
+    optical_jitter_m, optical_jitter_rad : float
+        Jitter of each axis of the optical pose, m and rad.
     """
 
     flux_noise_t: float = 60e-12
@@ -38,15 +45,20 @@ class Errors:
 
 @dataclass(frozen=True)
 class GridScan:
-    """A body that rests at one point after another, row by row and layer by layer.
+    """A path on which a body rests at one grid point after another, layer by layer.
 
     Attributes
     ----------
-    count : points along x and along y
-    span_m : edge of the square that they cover
-    heights_m : z of the body's origin in each layer
-    dwell_s : time at each point
-    tilt_rad : small seeded turns at each point, so that no two poses are parallel
+    count : int
+        Points along x and along y.
+    span_m : float
+        Edge of the square that they cover, m.
+    heights_m : tuple of float
+        Height z of the body's origin in each layer, m.
+    dwell_s : float
+        Time at each point, s.
+    tilt_rad : float
+        Size of small rotations that differ from point to point, so that no two poses are parallel.
     """
 
     count: int = 13
@@ -57,11 +69,11 @@ class GridScan:
 
     @property
     def frames(self) -> int:
-        """Number of points."""
+        """Number of grid points of all layers."""
         return self.count**2 * len(self.heights_m)
 
     def __call__(self, time_s: float) -> Pose:
-        """Pose at a time."""
+        """Return the pose at a time, s."""
         index = int(np.clip(round(time_s / self.dwell_s), 0, self.frames - 1))
         layer, place = divmod(index, self.count**2)
         row, column = divmod(place, self.count)
@@ -86,7 +98,7 @@ def _cloud(sensors: tuple[SensorSpec, ...], flux: NDArray[np.complex128]) -> Flu
 
 
 def _jittered(pose: Pose, errors: Errors, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Position and quaternion of a pose as an optical tracker reports it."""
+    """Return a pose as an optical tracker reports it: position (m) and quaternion x y z w."""
     position = pose[0] + rng.normal(scale=errors.optical_jitter_m, size=3)
     turn = Rotation.from_rotvec(rng.normal(scale=errors.optical_jitter_rad, size=3))
     return position, np.asarray((turn * Rotation.from_matrix(pose[1])).as_quat())
@@ -108,17 +120,24 @@ def record(
     ----------
     path : str
         The ``.mcap`` file; it must not exist yet.
-    frames, rate_hz : number of flux windows and their rate
+    world : World
+        True fluxes and poses.
+    frames : int
+        Number of flux windows.
+    rate_hz : float
+        Their rate, Hz.
     optical_rate_hz : float or None
-        Rate of the optical tracker on its own clock, which starts 0.2 s earlier and ends 0.2 s
-        later; None for one pose at every flux stamp (a static recording).
+        Rate of the optical poses, Hz, which begin and end `OPTICAL_MARGIN_S` outside the fluxes;
+        None for one pose at every flux stamp (a static recording).
     errors : Errors
-    rng : numpy Generator
+        Noise and jitter.
+    rng : numpy.random.Generator
+        Source of the errors.
 
     Raises
     ------
     BagError
-        When the file exists or can't be written.
+        When the file exists or cannot be written.
     """
     sensors = world.setup.sensors
     tool_rows = np.array([s.body != FIELD_GENERATOR for s in sensors])
@@ -150,6 +169,6 @@ def _optical_times(
 ) -> set[tuple[int, float]]:
     if rate_hz is None:
         return stamps
-    first, last = -0.2, max(stamps)[1] + 0.2
+    first, last = -OPTICAL_MARGIN_S, max(stamps)[1] + OPTICAL_MARGIN_S
     times = np.arange(first, last, 1 / rate_hz)
     return {(START_NS + round(time * SECOND_NS), float(time)) for time in times}

@@ -1,4 +1,4 @@
-"""From the world's fluxes to the codes of an analogue-to-digital converter."""
+"""Sampling of the world's fluxes into the codes of an analogue-to-digital converter."""
 
 from __future__ import annotations
 
@@ -18,20 +18,25 @@ ComplexArray = NDArray[np.complex128]
 
 
 OVERLOAD_GAIN = 1e4
-"""Of an amplifier that is at its limits whatever it hears."""
+"""Gain of an amplifier under overload: so large that any signal reaches the converter's limits."""
 
 
 @dataclass(frozen=True)
 class FrontEnd:
-    """The analogue side of a control unit.
+    """The analogue side of a control unit with its converter.
 
     Attributes
     ----------
-    sample_rate_hz : samples a second and channel
-    full_scale_v, full_scale_a : volts and amperes at code 32768
-    noise_codes, current_noise_codes : white noise before the converter, codes rms per sample
-    current_drift : share by which the currents fall while the coils warm up
-    warm_up_s : time constant of that, from the first start on
+    sample_rate_hz : float
+        Samples a second and channel.
+    full_scale_v, full_scale_a : float
+        Voltage and current at code 32768, V and A.
+    noise_codes, current_noise_codes : float
+        White noise before the converter of the sensors and of the currents, codes rms a sample.
+    current_drift : float
+        Fraction by which the currents fall while the coils warm up.
+    warm_up_s : float
+        Time constant of the warming, from the first start on, s.
     """
 
     sample_rate_hz: float = 40e3
@@ -44,19 +49,25 @@ class FrontEnd:
 
 
 class Sampler:
-    """Samples all sensors and the sum of currents, one stretch after the other.
+    """Samples all sensors and the sum of the currents, one stretch of time after the other.
 
-    Within a stretch the phasors change linearly from the world's at its begin to those at its end,
-    so stretches of 5 ms follow a tool at 0.1 m/s to some 10 pT.
+    Within a stretch the phasors change linearly between the world's at its two ends, so that
+    stretches of 5 ms follow a tool at 0.1 m/s to some 10 pT.
 
     Parameters
     ----------
-    world : true fluxes
-    calibration : true response of the channels
-    front_end : converter and noise
-    nominal_current_a : peak current that the world's fluxes are given for
-    effects : changes of the signals, in order
-    seed : of the noise
+    world : World
+        True fluxes.
+    calibration : ChannelCalibration
+        True response of the channels.
+    front_end : FrontEnd
+        Converter and noise.
+    nominal_current_a : float
+        Peak current that the world's fluxes are given for, A.
+    effects : sequence of RawEffect
+        Changes of the signals, in order.
+    seed : int
+        Seed of the noise.
     """
 
     def __init__(
@@ -84,23 +95,23 @@ class Sampler:
         self._last: tuple[float, ComplexArray] | None = None
 
     def set_frequencies(self, frequencies_hz: Array) -> None:
-        """Drive the coils at other tones from the next stretch on."""
+        """Drive the coils at other tones, shape (K,), Hz, from the next stretch on."""
         self.frequencies_hz = frequencies_hz
         omega = 2 * np.pi * frequencies_hz
         self._volts_per_tesla = 1j * omega * self._areas * np.exp(-1j * omega * self._delays)
         self._current_response = np.exp(-1j * omega * self._current_delay)
-        # The synthesisers start at phases of their own, and each coil has its own impedance.
+        # Each synthesiser starts at another phase, and each coil has another impedance.
         self._start = np.exp(1j * np.arange(1, frequencies_hz.size + 1) ** 2)
         self._last = None
 
     def drive(self, time_s: float) -> None:
-        """Note that the coils are driven from a time on; only the first one counts."""
+        """Begin to drive the coils at a time (s); later calls change nothing."""
         if self._driven_from_s is None:
             self._driven_from_s = time_s
             self._last = None
 
     def codes(self, first_sample: int, count: int) -> NDArray[np.int16]:
-        """Converter codes of `count` samples from number `first_sample` since power-up.
+        """Return the converter codes of `count` samples from `first_sample` since power-up on.
 
         Returns
         -------
@@ -129,11 +140,11 @@ class Sampler:
 
     @property
     def _start_s(self) -> float:
-        """When the coils were first driven; their warming and all effects count from there."""
+        """Time at which the coils were first driven, from which warming and effects count."""
         return self._driven_from_s or 0.0
 
     def _phasors(self, time_s: float) -> ComplexArray:
-        """Voltages of the sensors and, in the last row, currents; shape (S + 1, K)."""
+        """Return the voltages of the sensors and, in the last row, currents; shape (S + 1, K)."""
         flux = self._world.flux(time_s)
         for effect in self._effects:
             flux = effect.flux(time_s - self._start_s, flux)
@@ -142,7 +153,7 @@ class Sampler:
         return np.vstack([volts, current * self._current_response])
 
     def current(self, time_s: float) -> ComplexArray:
-        """True coil currents (K,), A."""
+        """Return the true complex currents of the coils at a time, shape (K,), A."""
         driven_s = time_s - self._start_s
         warm = 1 - np.exp(-driven_s / self._front_end.warm_up_s)
         current = self._nominal_a * (1 - self._front_end.current_drift * warm) * self._start

@@ -1,6 +1,6 @@
-"""The world around a control unit: a board, tools that move, reference coils and metal.
+"""The simulated world around a control unit: a board, moving tools, reference coils and metal.
 
-It gives the true flux of every sensor at any time; nothing here knows of samples, noise or bytes.
+It gives the true flux of every sensor at any time. Samples, noise and bytes are added elsewhere.
 """
 
 from __future__ import annotations
@@ -18,18 +18,22 @@ from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 FieldSource = Callable[[Array], ComplexArray]
-"""Field of each emitter at nominal current: points (P, 3), m, to (P, 3, K), T."""
+"""A function from points (P, 3), m, to each emitter's field at nominal current (P, 3, K), T."""
 
 
 class World:
-    """Sensors of a setup in the field of a board.
+    """The sensors of a setup in the field of a board and of metal.
 
     Parameters
     ----------
-    setup : which sensors there are, on which bodies
-    source : field of the emitters without metal
-    paths : pose of each moving body over time; a body without one moves on a default path
-    metal : bodies that distort the field
+    setup : Setup
+        The sensors and the bodies that they are on.
+    source : FieldSource
+        Field of the emitters without metal.
+    paths : mapping of str to Path, optional
+        Pose of each moving body over time; a body without one moves on a default path.
+    metal : sequence of MetalBody
+        Bodies that distort the field.
     """
 
     def __init__(
@@ -59,18 +63,18 @@ class World:
             self._still[fixed] = _linked(source(ends), self._local_axes[fixed])
 
     def pose(self, body: str, time_s: float) -> Pose:
-        """True pose of a body that moves."""
+        """Return the true pose of a moving body at a time."""
         return self._paths[body](time_s)
 
     def flux(self, time_s: float) -> ComplexArray:
-        """Flux of every sensor of the setup, in its order, shape (S, K), T at nominal current."""
+        """Return the flux of every sensor in the setup's order, (S, K), T at nominal current."""
         flux = self._still.copy()
         if not (self._moving.size or self._metal):
             return flux
         centres, axes = self._placed(time_s)
         ends = self._coil_ends(self._moving, centres, axes)
         spheres = [body.centres(time_s) for body in self._metal]
-        # one call for all points costs a third of three
+        # One call for all points costs a third of three calls.
         field = self._source(np.concatenate([ends, *spheres]))
         flux[self._moving] = _linked(field[: len(ends)], axes[self._moving])
         begin = len(ends)
@@ -81,7 +85,7 @@ class World:
         return flux
 
     def _placed(self, time_s: float) -> tuple[Array, Array]:
-        """Centres and axes (S, 3) of all coils in fg."""
+        """Return the centres (m) and axes of all coils in fg, each of shape (S, 3)."""
         centres, axes = self._local.copy(), self._local_axes.copy()
         for body, rows in self._groups.items():
             position, rotation = self.pose(body, time_s)
@@ -90,7 +94,7 @@ class World:
         return centres, axes
 
     def _coil_ends(self, rows: NDArray[np.intp], centres: Array, axes: Array) -> Array:
-        """Gauss points of some coils, all upper ones before all lower ones; points for points."""
+        """Return the quadrature points of some coils, all upper ones first; centres of points."""
         if not self._lengths[rows].any():
             return np.asarray(centres[rows])
         reach = GAUSS_OFFSET * self._lengths[rows, None] * axes[rows]
@@ -99,7 +103,7 @@ class World:
     def _induced(
         self, centres: Array, axes: Array, spheres: Array, moments: ComplexArray
     ) -> ComplexArray:
-        """Flux (S, K) of moments (M, 3, K), A m^2, in the spheres."""
+        """Return the flux (S, K), T, of moments (M, 3, K), A m^2, at the spheres' centres."""
         flux = np.zeros_like(self._still)
         for component, unit in enumerate(np.eye(3)):
             directions = np.broadcast_to(unit, spheres.shape)
@@ -109,7 +113,7 @@ class World:
 
 
 def _linked(field: ComplexArray, axes: Array) -> ComplexArray:
-    """Flux along each axis (S, 3) of the field (S or 2 S, 3, K) at the coils' Gauss points."""
+    """Return the flux along axes (S, 3) of the field (S or 2 S, 3, K) at quadrature points."""
     if len(field) > len(axes):
         field = (field[: len(axes)] + field[len(axes) :]) / 2
     return np.asarray(np.einsum('pi,pik->pk', axes, field))
