@@ -113,7 +113,7 @@ def test_compensation_takes_the_distortion_away(study):
 
 def test_report_and_figures_say_simulated(study, tmp_path):
     figures = draw_all(study, tmp_path)
-    write_report(study.results, figures, tmp_path / 'paper.md')
+    write_report(study.results.document(), figures, tmp_path / 'paper.md')
     text = (tmp_path / 'paper.md').read_text()
     for heading in ('Table II', 'Table III', 'Table IV', 'Table V', 'Figures'):
         assert any(heading in line and 'imulated' in line for line in text.split('\n'))

@@ -22,7 +22,15 @@ from anser_ros.experiments.report import write_report
 from anser_ros.experiments.simulated import simulate_recordings
 from anser_ros.experiments.study import Results, Study
 
-SHOWN = ('table_2', 'table_3 aluminium', 'table_3 mu-metal', 'table_5 compensated')
+SHOWN = (
+    'table_2',
+    'table_3 aluminium',
+    'table_3 mu-metal',
+    'table_4 unshielded',
+    'table_4 aluminium',
+    'table_4 mu-metal',
+    'table_5 compensated',
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,8 +65,9 @@ def run(args: argparse.Namespace) -> int:
         )
         results = study.run()
         figures = draw_all(study, args.out)
-    write_report(results, figures, args.out / 'paper.md')
-    text = json.dumps(results.document(), indent=1)
+    document = results.document()
+    write_report(document, figures, args.out / 'paper.md')
+    text = json.dumps(document, indent=1)
     (args.out / 'paper.json').write_text(text + '\n', encoding='utf-8')
     if args.json:
         print(text)

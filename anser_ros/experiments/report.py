@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from anser_ros.experiments import article
 from anser_ros.experiments.recordings import HEAD_DISTANCES_CM, MATERIALS
-from anser_ros.experiments.study import Results
-from anser_ros.experiments.tracking_errors import SensorErrors
 
-Errors = Mapping[str, SensorErrors]
+Document = Mapping[str, Any]
+"""What `Results.document` returns and paper.json holds."""
 PRINTED = 'article, printed (its own hardware)'
 WORDS = {
     'drawing': 'Biot-Savart of the drawing, one gain an emitter',
@@ -28,8 +28,8 @@ CAPTIONS = {
 }
 
 
-def write_report(results: Results, figures: Mapping[str, str], path: Path) -> None:
-    """Write the report; figures are linked by file name."""
+def write_report(results: Document, figures: Mapping[str, str], path: Path) -> None:
+    """Write the report of the results; the figures are linked by their file names."""
     parts = [
         _header(results), _table_2(results), _table_3(results), _table_4(results),
         _table_5(results), _models(results), _board(results), _figures(figures),
@@ -37,13 +37,14 @@ def write_report(results: Results, figures: Mapping[str, str], path: Path) -> No
     path.write_text('\n\n'.join(part for part in parts if part) + '\n', encoding='utf-8')
 
 
-def _header(results: Results) -> str:
+def _header(results: Document) -> str:
     return (
         "# The article's experiments, redone\n\n"
-        f'**The data of these experiments is simulated** ({results.origin}); the rows "{PRINTED}" '
-        'were measured by the authors on their hardware. Errors are against the optical pose, '
-        'which itself jitters by 0.07 mm an axis (0.12 mm in space): no method can be below that. '
-        'No optical pose is used to track. Each experiment gives three lines: what the article '
+        f'**The data of these experiments is simulated** ({results["origin"]}); the rows '
+        f'"{PRINTED}" were measured by the authors on their hardware. Errors are against the '
+        'optical pose, which itself jitters by 0.07 mm an axis (0.12 mm in space): no method can '
+        'be below that. No optical pose is used to track. Each experiment gives three lines: what '
+        'the article '
         "prints, the article's own method on this data, and ours. The bound is Cramer and Rao's: "
         'the smallest error that the flux noise allows, without the jitter of the reference.\n\n'
         'Made by `anser paper`.'
@@ -69,28 +70,28 @@ def _statistics_rows(
     return rows
 
 
-def _both(name: str, errors: Errors) -> list[list[str]]:
+def _both(name: str, errors: Document) -> list[list[str]]:
     rows = []
     for sensor in article.SENSORS:
-        mm, deg = errors[sensor].millimetres(), errors[sensor].degrees()
+        mm, deg = errors[sensor]['position_mm'], errors[sensor]['orientation_deg']
         rows.append([name, sensor, *(f'{mm[s]:.3f} / {deg[s]:.3f}' for s in article.STATISTICS)])
     return rows
 
 
-def _bound_line(results: Results, experiment: str) -> str:
-    bounds = results.bounds[experiment]
+def _bound_line(results: Document, experiment: str) -> str:
+    bounds = results['bounds_m'][experiment]
     values = ', '.join(f'{sensor} {1e3 * value:.3f} mm' for sensor, value in bounds.items())
     return f'Cramer-Rao bound of the position (root mean square): {values}.'
 
 
-def _table_2(results: Results) -> str:
+def _table_2(results: Document) -> str:
     rows = []
     for model in ('Biot-Savart', 'data-driven'):
         mm, deg = article.TABLE_2_MM[model], article.TABLE_2_DEG[model]
         for sensor in article.SENSORS:
             values = [f'{mm[sensor][s]:.2f} / {deg[sensor][s]:.2f}' for s in article.STATISTICS]
             rows.append([f'{PRINTED}: {model}', sensor, *values])
-    for method, errors in results.tracking['table_2'].items():
+    for method, errors in results['tracking']['table_2'].items():
         rows += _both(f'{WORDS[method]}', errors)
     head = ['model', 'sensor', *(f'{s}, mm / deg' for s in article.STATISTICS)]
     return (
@@ -99,7 +100,7 @@ def _table_2(results: Results) -> str:
     )
 
 
-def _table_3(results: Results) -> str:
+def _table_3(results: Document) -> str:
     parts = ['## Table III: fields over a shield (simulated)']
     parts.append(
         'Half of the points train, the other half of the checkerboard tests. Errors of the field '
@@ -111,12 +112,12 @@ def _table_3(results: Results) -> str:
         printed = article.TABLE_3_FIELD[material]
         for which in ('training', 'test'):
             rows.append([PRINTED, which, *(f'{printed[which][n]:.4f}' for n in names)])
-        for method, sets in results.fields[material].items():
+        for method, sets in results['fields'][material].items():
             for which, found in sets.items():
                 rows.append([WORDS[method], which, *(f'{found[n]:.4f}' for n in names)])
         parts.append(f'### {material}\n\n' + _table(['model', 'set', *names], rows))
         rows = _statistics_rows(PRINTED, article.TABLE_3_MM[material], 2)
-        for method, errors in results.tracking[f'table_3 {material}'].items():
+        for method, errors in results['tracking'][f'table_3 {material}'].items():
             rows += _position_rows(WORDS[method], errors)
         parts.append(
             'Tracking on the test points, mm:\n\n'
@@ -126,11 +127,11 @@ def _table_3(results: Results) -> str:
     return '\n\n'.join(parts)
 
 
-def _position_rows(name: str, errors: Errors) -> list[list[str]]:
-    return _statistics_rows(name, {s: e.millimetres() for s, e in errors.items()}, 3)
+def _position_rows(name: str, errors: Document) -> list[list[str]]:
+    return _statistics_rows(name, {s: e['position_mm'] for s, e in errors.items()}, 3)
 
 
-def _table_4(results: Results) -> str:
+def _table_4(results: Document) -> str:
     parts = [
         '## Table IV: shields against the X-ray head (simulated)',
         'Models trained with the plate and without the head, tested with both; the head is 2 cm '
@@ -138,18 +139,18 @@ def _table_4(results: Results) -> str:
     ]
     for case in ('unshielded', *MATERIALS):
         rows = _statistics_rows(PRINTED, article.TABLE_4_MM[case], 2)
-        for method, errors in results.tracking[f'table_4 {case}'].items():
+        for method, errors in results['tracking'][f'table_4 {case}'].items():
             name = 'our model of the clean board' if case == 'unshielded' else WORDS['ours']
             rows += _position_rows(name if method == 'ours' else WORDS[method], errors)
         parts.append(f'### {case}\n\n' + _table(['model', 'sensor', *article.STATISTICS], rows))
     rows = []
     for distance in HEAD_DISTANCES_CM:
-        methods = results.tracking[f'fig_7 {distance} cm']
+        methods = results['tracking'][f'fig_7 {distance} cm']
         rows.append(
             [
                 f'{distance} cm',
                 *(
-                    f'{methods[method][sensor].millimetres()["RMSE"]:.3f}'
+                    f'{methods[method][sensor]["position_mm"]["RMSE"]:.3f}'
                     for method in ('drawing', 'ours')
                     for sensor in article.SENSORS
                 ),
@@ -160,7 +161,7 @@ def _table_4(results: Results) -> str:
     return '\n\n'.join(parts)
 
 
-def _table_5(results: Results) -> str:
+def _table_5(results: Document) -> str:
     parts = [
         '## Table V: distortion compensated (simulated)',
         'The board lies on the X-ray collimator. Models trained on the bottom and top planes of '
@@ -170,38 +171,38 @@ def _table_5(results: Results) -> str:
     ]
     for case, printed in article.TABLE_5_MM.items():
         rows = _statistics_rows(PRINTED, printed, 2)
-        for method, errors in results.tracking[f'table_5 {case}'].items():
+        for method, errors in results['tracking'][f'table_5 {case}'].items():
             name = WORDS[method]
             if case == 'uncompensated' and method == 'ours':
                 name = 'our model of the clean board'
             rows += _position_rows(name, errors)
         parts.append(f'### {case}\n\n' + _table(['model', 'sensor', *article.STATISTICS], rows))
-    for method, words in results.corrections.items():
+    for method, words in results['corrections'].items():
         lines = '; '.join(f'{sensor}: {text}' for sensor, text in words.items())
         parts.append(f'Correction, {WORDS[method]}: {lines}.')
     parts.append(_bound_line(results, 'table_5 compensated'))
     return '\n\n'.join(parts)
 
 
-def _models(results: Results) -> str:
-    rows = [[name, text] for name, text in results.models.items()]
+def _models(results: Document) -> str:
+    rows = [[name, text] for name, text in results['models'].items()]
     return '## Our models, as held-out error chose them\n\n' + _table(
         ['trained on', 'model'], rows
     )
 
 
-def _board(results: Results) -> str:
-    if not results.board_runs:
+def _board(results: Document) -> str:
+    if not results['measured_board']:
         return ''
     rows = [
         [
-            run.name,
-            f'{run.points}',
-            f'{1e3 * run.before_m:.2f}',
-            f'{1e3 * run.after_m:.2f}',
-            run.shape,
+            run['name'],
+            f'{run["points"]}',
+            f'{1e3 * run["before_m"]:.2f}',
+            f'{1e3 * run["after_m"]:.2f}',
+            run['shape'],
         ]
-        for run in results.board_runs
+        for run in results['measured_board']
     ]
     head = ['run', 'points', 'before, mm rms', 'after, mm rms', 'map']
     return (
