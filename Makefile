@@ -11,7 +11,7 @@ WORKERS = -n 2 --dist loadgroup --no-loadscope-reorder
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-quick test-oldest lint format types parameters bench paper loop measured clean
+.PHONY: help demo test test-quick test-oldest lint format types parameters bench paper loop measured docs clean
 
 help:
 	@echo 'make demo [DURATION=30]  watch a simulated tool being tracked'
@@ -19,6 +19,7 @@ help:
 	@echo 'make test-quick          the same without the tests that start nodes or processes'
 	@echo 'make test-oldest         tests with the oldest dependencies (needs Python 3.12)'
 	@echo 'make bench               speed and accuracy beside rivals, writes bench.json'
+	@echo 'make docs                the documentation as a site, out/docs/index.html'
 	@echo 'make paper|loop|measured the studies; options with ARGS=...'
 
 $(READY): .ci/requirements-newest.txt .ci/requirements-oldest.txt .ci/bootstrap setup.py
@@ -66,6 +67,11 @@ test-oldest: $(READY_OLDEST)
 
 bench: $(READY)
 	@$(ENVIRONMENT) $(VENV)/bin/python test/bench/run.py $(ARGS)
+
+# -W: a warning is a fault; nothing is fetched from anywhere.
+docs: $(READY)
+	$(VENV)/bin/python -m sphinx -W --keep-going -q -b html docs out/docs
+	@echo 'out/docs/index.html'
 
 paper loop measured: $(READY)
 	@$(ENVIRONMENT) $(ANSER) $@ $(ARGS)

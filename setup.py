@@ -47,6 +47,7 @@ setup(
         'matplotlib>=3.8',
         'pyigtl>=0.3.1',
     ],
+    extras_require={'docs': ['sphinx>=9', 'myst-parser>=5', 'furo>=2025.9']},
     python_requires='>=3.11',
     zip_safe=True,
     maintainer='anser_ros maintainers',

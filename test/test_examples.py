@@ -1,0 +1,40 @@
+"""The scripts of examples/ run as they stand, and say what their first lines promise."""
+
+import runpy
+import sys
+
+import pytest
+from conftest import REPO
+
+EXAMPLES = REPO / 'examples'
+SAID = {
+    'own_data': 'model error on held-out places',
+    'track_and_plot': '100% of 200 frames tracked',
+    'find_an_effect': "sensor_gain {'channel': 4",
+    'own_board': 'calibrated: 9',
+    'batch': 'moving.mcap: 100% of 200 frames tracked',
+}
+
+
+@pytest.mark.parametrize('name', SAID)
+def test_example_runs(name, tmp_path, monkeypatch, capsys):
+    arguments = [str(tmp_path / 'out')]
+    if name == 'batch':  # two bags are as good as all
+        bags = tmp_path / 'bags'
+        bags.mkdir()
+        (bags / 'moving.mcap').symlink_to(REPO / 'bags' / 'moving.mcap')
+        (bags / 'none.mcap').write_text('no bag')
+        arguments.append(str(bags))
+    monkeypatch.setenv('MPLBACKEND', 'Agg')
+    monkeypatch.setattr(sys, 'argv', [name, *arguments])
+    runpy.run_path(str(EXAMPLES / f'{name}.py'), run_name='__main__')
+    assert SAID[name] in capsys.readouterr().out
+
+
+def test_every_example_is_short_documented_and_run():
+    scripts = {path.stem: path.read_text(encoding='utf-8') for path in EXAMPLES.glob('*.py')}
+    assert set(scripts) == set(SAID)
+    page = (REPO / 'docs' / 'examples.md').read_text(encoding='utf-8')
+    for name, text in scripts.items():
+        assert len(text.splitlines()) <= 40 and text.startswith('"""')
+        assert f'examples/{name}.py' in page
