@@ -1,0 +1,153 @@
+"""The documentation is a site that builds without a warning, and its pages say what is so."""
+
+import doctest
+import importlib
+import re
+import subprocess
+import sys
+
+import pytest
+from conftest import REPO
+
+from anser_ros.api.setup import load_setup
+from anser_ros.cli.main import node_names, verb_names
+from anser_ros.effects.registry import all_effects
+from anser_ros.physics.board import KINDS
+from anser_ros.sessions.starting_model import board_of
+from anser_ros.tracking.estimate import STATES
+from anser_ros.wire.points import flux_fields
+
+DOCS = REPO / 'docs'
+# Builds the site where no socket can be opened.
+BUILD = """
+import socket, sys
+def refused(*_arguments, **_options):
+    raise OSError('the documentation must not need a network')
+socket.socket.connect = socket.getaddrinfo = refused
+from sphinx.cmd.build import main
+sys.exit(main(['-W', '--keep-going', '-q', '-j', '1', '-b', 'html', *sys.argv[1:]]))
+"""
+
+
+def page(name):
+    return (DOCS / f'{name}.md').read_text(encoding='utf-8')
+
+
+@pytest.mark.processes
+def test_the_site_builds_without_warnings_and_without_a_network(tmp_path):
+    """The newest requirements have Sphinx; the oldest, those of a distribution, do not."""
+    for library in ('sphinx', 'myst_parser', 'furo'):
+        pytest.importorskip(library)
+    command = [sys.executable, '-c', BUILD, str(DOCS), str(tmp_path / 'site')]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=REPO, check=False)
+    assert (done.returncode, done.stdout + done.stderr) == (0, '')
+    site = tmp_path / 'site'
+    assert 'write_session' in (site / 'api.html').read_text(encoding='utf-8')
+    foreign = re.compile(r'<(?:script|link|img)[^>]+(?:src|href)="(?:https?:)?//')
+    for html in site.rglob('*.html'):
+        assert not foreign.search(html.read_text(encoding='utf-8')), html.name
+
+
+@pytest.mark.parametrize('name', ['start', 'setup'])
+def test_python_on_the_pages_runs(name, tmp_path, monkeypatch):
+    for folder in ('bags', 'config'):
+        (tmp_path / folder).symlink_to(REPO / folder)
+    monkeypatch.chdir(tmp_path)
+    outcome = doctest.testfile(str(DOCS / f'{name}.md'), module_relative=False)
+    assert outcome.failed == 0 and outcome.attempted > 0
+
+
+class TestSetupPage:
+    """Every kind of emitter has an example that draws; every key that the code reads is told."""
+
+    SENSOR = """
+sensors:
+- {channel: 0, name: pen, body: pen, position_m: [0, 0, 0], axis: [0, 0, 1]}
+"""
+
+    def examples(self):
+        return re.findall(r'```yaml\n(.*?)```', page('setup'), re.DOTALL)
+
+    def test_every_kind_has_an_example_that_draws(self):
+        drawn = set()
+        for text in self.examples():
+            if 'kind:' not in text:
+                continue
+            whole = text if 'schema:' in text else None
+            setup = load_setup(
+                whole or f'schema: anser_setup/1\nflux_rate_hz: 50\n{text}{self.SENSOR}'
+            )
+            board = board_of(setup)
+            assert (abs(board.moments()[:, 2]) > 0).all()
+            drawn.add(setup.emitter.kind)
+        assert drawn == set(KINDS)
+
+    def test_every_kind_and_key_is_on_the_page(self):
+        code = ''.join(
+            (REPO / 'anser_ros' / place).read_text(encoding='utf-8')
+            for place in ('wire/setup.py', 'physics/board.py')
+        )
+        keys = set(re.findall(r"(?:_take|_number|_whole)\(\w+, '(\w+)'", code))
+        keys |= set(re.findall(r"\.get\('(\w+)'", code))
+        assert {'channel', 'pitch_m', 'rotation_deg', 'sides'} <= keys
+        for key in keys | set(KINDS):
+            assert f'`{key}`' in page('setup'), key
+
+
+class TestInterfacesPage:
+    """What the code promises is on the page, and what the page lists exists."""
+
+    def test_the_flux_layout(self):
+        text = page('interfaces')
+        fields, step = flux_fields(8)
+        assert f'({step} with eight emitters)' in text
+        assert 'point_step` 28 + 8 K' in text and step == 28 + 8 * 8
+        rows = dict(
+            re.findall(r'^\| (`x`.*?|`nx`.*?|`channel`|`flags`) \| ([\d, ]+) \|', text, re.M)
+        )
+        told = {
+            name: int(offset)
+            for names, offsets in rows.items()
+            for name, offset in zip(re.findall(r'`(\w+)`', names), offsets.split(','), strict=True)
+        }
+        assert told == {name: offset for name, offset, _, _ in fields if offset < 28}
+        assert fields[8][:2] == ('coil0_re', 28) and fields[9][:2] == ('coil0_im', 32)
+
+    def test_every_effect_with_its_parameters(self):
+        rows = dict(re.findall(r'^\| (`\w+`(?:, `\w+`)?) \| (.*?) \|', page('interfaces'), re.M))
+        told = {n: cell for names, cell in rows.items() for n in re.findall(r'`(\w+)`', names)}
+        for name, effect in all_effects().items():
+            assert name in told, f'{name} is not on the page'
+            for parameter in effect.units:
+                assert f'`{parameter}`' in told[name], f'{name}: {parameter} is not on the page'
+
+    def test_states_nodes_and_commands(self):
+        text = page('interfaces')
+        for name in (*STATES, *node_names(), *verb_names()):
+            assert re.search(rf'`{name}`|anser {name}', text), name
+
+    def test_node_parameters_come_from_the_file_that_the_tables_write(self):
+        assert '```{literalinclude} ../config/anser.yaml' in page('interfaces')
+
+    def test_every_service(self):
+        nodes = (REPO / 'anser_ros' / 'nodes').glob('*.py')
+        code = ''.join(path.read_text(encoding='utf-8') for path in nodes)
+        services = re.findall(r"create_service\(\w+, '([\w/]+)'", code)
+        assert len(services) == 6
+        for service in services:
+            assert service in page('interfaces')
+
+    def test_what_the_diagnosis_depends_on(self):
+        module = importlib.import_module('anser_ros.sessions.diagnosis')
+        for name in module.DEPENDENCIES:
+            assert f'`{name}`' in page('interfaces')
+
+
+def test_the_glossary_has_the_words_of_the_code():
+    words = re.findall(r'^(\S.*)\n: ', page('glossary'), re.MULTILINE)
+    assert words == sorted(words, key=str.casefold)
+    asked = {
+        'jitter', 'baseline', 'site', 'term', 'cloud', 'layer', 'mode', 'gate', 'sigma', 'refit',
+        'held out', 'effect', 'remainder', 'fluctuation', 'standoff', 'slot', 'bank', 'apparatus',
+    }  # fmt: skip
+    assert asked <= set(words)
