@@ -62,7 +62,7 @@ class TestSetupPage:
 
     SENSOR = """
 sensors:
-- {channel: 0, name: pen, body: pen, position_m: [0, 0, 0], axis: [0, 0, 1]}
+- {channel: 0, name: pen/tip, body: pen, position_m: [0, 0, 0], axis: [0, 0, 1]}
 """
 
     def examples(self):
