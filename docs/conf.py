@@ -21,5 +21,6 @@ napoleon_use_ivar = True
 
 html_theme = 'furo'
 html_title = 'anser_ros'
-html_static_path: list[str] = []
+html_static_path = ['_static']
+html_css_files = ['site.css']
 html_show_sourcelink = False

@@ -10,7 +10,7 @@ import pytest
 from conftest import REPO
 
 from anser_ros.api.setup import load_setup
-from anser_ros.cli.main import node_names, verb_names
+from anser_ros.cli.commands import NODES, OFFLINE
 from anser_ros.effects.registry import all_effects
 from anser_ros.physics.board import KINDS
 from anser_ros.sessions.starting_model import board_of
@@ -48,7 +48,7 @@ def test_the_site_builds_without_warnings_and_without_a_network(tmp_path):
         assert not foreign.search(html.read_text(encoding='utf-8')), html.name
 
 
-@pytest.mark.parametrize('name', ['start', 'setup'])
+@pytest.mark.parametrize('name', ['api', 'setup', 'start'])
 def test_python_on_the_pages_runs(name, tmp_path, monkeypatch):
     for folder in ('bags', 'config'):
         (tmp_path / folder).symlink_to(REPO / folder)
@@ -123,7 +123,7 @@ class TestInterfacesPage:
 
     def test_states_nodes_and_commands(self):
         text = page('interfaces')
-        for name in (*STATES, *node_names(), *verb_names()):
+        for name in (*STATES, *NODES, *OFFLINE):
             assert re.search(rf'`{name}`|anser {name}', text), name
 
     def test_node_parameters_come_from_the_file_that_the_tables_write(self):
