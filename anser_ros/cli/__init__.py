@@ -1,0 +1,1 @@
+"""The offline commands of the console script, with their reports, figures and processes."""

@@ -1,4 +1,4 @@
-"""Record the small simulated sessions of the folder bags/."""
+"""The command that records the small simulated sessions of the folder bags/."""
 
 import argparse
 import contextlib
@@ -17,15 +17,22 @@ from anser_ros.wire.bag import bag_file
 from anser_ros.wire.setup import parse_setup
 
 RATE_HZ = 25.0
+"""Rate of the fluxes of moving tools, Hz: half of the demo's, which keeps the bags small."""
 OPTICAL_RATE_HZ = 60.0
+"""Rate of the optical poses of moving tools, Hz, as usual for optical trackers; it is no multiple
+of `RATE_HZ`, so that poses have to be interpolated."""
 SECONDS = 8.0
+"""Duration of the recordings of moving tools, s: enough for metal to approach and leave."""
 STATIC_NOISE_T = 30e-12
-# The demo's tool reaches from 0.09 to 0.21 m: two layers of the three clusters do too. Means over
-# a second's rest at each point: 60 optical poses of 0.07 mm and 0.4 mrad each.
+"""Flux noise of a tool at rest, T a component: half of a single window's by averaging."""
 SCAN_HEIGHTS_M = (0.12, 0.18)
+"""Heights of the scan's two layers, m. With them the three clusters of the tool cover 0.09 to 0.21
+m, the heights that the demo's tool reaches."""
 SCAN_ERRORS = Errors(
     flux_noise_t=STATIC_NOISE_T, optical_jitter_m=0.01e-3, optical_jitter_rad=0.05e-3
 )
+"""Errors of the scan: means over a second at rest, of 60 optical poses with a jitter of 0.07 mm
+and 0.4 mrad each."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -49,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     tall = GridScan(heights_m=SCAN_HEIGHTS_M)
     scanned_tall = World(setup, source, paths=dict.fromkeys(setup.bodies, tall))
     frames = int(SECONDS * RATE_HZ)
-    # Within the heights that the scan's three clusters cover: a model is no better outside them.
+    # The path stays within the heights that the scan covers, outside which a model is worse.
     path = Lissajous(centre_m=(0.0, 0.0, 0.16), amplitude_m=(0.08, 0.08, 0.02))
     paths = dict.fromkeys(setup.bodies, path)
     visit = steel_disc(Approach(near_m=(0.05, -0.03, -0.06), start_s=2.0, travel_s=3.0))

@@ -1,4 +1,4 @@
-"""Fit a field model to recorded sessions."""
+"""The command that fits a field model to recorded sessions."""
 
 import argparse
 import json
@@ -76,7 +76,7 @@ def _kinds(text: str) -> tuple[str, ...]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the command; the exit code."""
+    """Run the command and return the exit code."""
     sessions = [load_session(path) for path in args.sessions]
     check_same_board(sessions)
     for path, session in zip(args.sessions, sessions, strict=True):
@@ -122,7 +122,7 @@ def _options(args: argparse.Namespace) -> Options:
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, float], None]]:
-    """A bar on stderr where that is a terminal."""
+    """Yield a function that updates a bar on stderr, which is shown only on a terminal."""
     columns = (TextColumn('{task.description}'), BarColumn(), TimeElapsedColumn())
     console = Console(stderr=True)
     with Progress(*columns, console=console, disable=not sys.stderr.isatty()) as bar:

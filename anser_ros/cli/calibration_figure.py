@@ -1,4 +1,4 @@
-"""The figure of a calibration: held-out error of everything that was tried."""
+"""The figure of a calibration: the held-out errors of all layouts and dampings that were tried."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from anser_ros.calibration.result import Calibration
 
 
 def draw_choice(calibration: Calibration, path: Path) -> None:
-    """Draw the curve of held-out errors: by dipoles, and by damping for the best layouts."""
+    """Draw held-out errors by the number of dipoles, and by damping for the six best layouts."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4))
     for mark, name, chosen in (
         ('o', 'placed', lambda layout: not layout.moved),

@@ -1,4 +1,4 @@
-"""Watch a simulated tool being tracked: all nodes as processes, a live table, a bag, a picture.
+"""The demo: all nodes as processes track a simulated tool, with a table, a bag and a picture.
 
 Two chains of field model and tracker run side by side: one refits its model to the reference
 coils, the other keeps the model as calibrated. A steel disc comes from below and leaves again.
@@ -25,17 +25,20 @@ from anser_ros.wire.bag_metadata import told
 from anser_ros.wire.config_folder import config_path
 
 PATIENCE_S = 180.0
+"""Time that the monitor waits for the first pose, s; kernels may have to be compiled meanwhile."""
 # The board of the bags in bags/, from which config/demo_model.yaml is calibrated:
 # anser calibrate bags/scan.mcap --out config/demo_model.yaml
 BOARD_SEED = 1
-# Half the usual rate: two cores carry it all and have room left.
+# Half the usual rate, so that all processes together fit on two cores.
 SAMPLE_RATE_HZ = 20e3
 METAL_RADIUS_M = 0.1
-# The frozen chain shows what a tracker without residual gate would say: with one, it would fall
-# silent near metal and nobody would see the error that it avoids.
+"""Radius of the steel disc, m: as large as the foot of a stand or the head of a C-arm."""
+# The frozen chain shows the poses of a tracker without residual gate. With one it would withhold
+# them near metal, and nobody would see the error that the refit avoids.
 NO_GATE = {'gate': 1e6, 'adaptive': False}
 POLL_S = 0.05
-# What the monitor leaves.
+"""Time from one look at the processes to the next, s."""
+# The file that the monitor writes.
 DATA = 'demo.npz'
 SHARED_TOPICS = ('setup', 'tool/flux', 'reference/flux')
 
@@ -61,12 +64,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the demo.
+    """Run the demo and return the exit code.
 
     Raises
     ------
     ParameterError
-        When the duration or the rate is out of range, or the folder to draw from holds no demo.
+        When the duration or the rate is out of range, or the folder to draw from has no demo.
     """
     if args.draw is not None:
         return _draw_left(args.draw, args)
@@ -131,7 +134,7 @@ def _say(text: str, args: argparse.Namespace) -> None:
 
 
 def _draw_left(folder: Path, args: argparse.Namespace) -> int:
-    """Summary and picture of a demo that did not come to them itself."""
+    """Write the summary and the picture of a demo that was interrupted before."""
     if not (folder / DATA).is_file():
         raise ParameterError(f'{folder} holds no {DATA} of a demo that showed poses')
     return _report(folder, args, interrupted=False)
@@ -146,7 +149,7 @@ def _report(folder: Path, args: argparse.Namespace, *, interrupted: bool) -> int
     results = load(data) if data.is_file() else None
     if results is not None:
         summary |= summarise(results)
-        if interrupted:  # drawing takes longer than who wants to leave likes to wait
+        if interrupted:  # drawing takes longer than someone who interrupts wants to wait
             summary['draw'] = f'anser demo --draw {folder}'
         elif not args.no_picture:
             draw(results, folder / 'demo.png')
@@ -191,7 +194,17 @@ def _print(summary: dict[str, object]) -> None:
 
 
 def node_command(name: str, /, *words: str, **parameters: object) -> list[str]:
-    """Command of a node; `words` are further ROS arguments."""
+    """Return the command line of a node.
+
+    Parameters
+    ----------
+    name : str
+        Name of the node's module.
+    *words : str
+        Further ROS arguments.
+    **parameters : object
+        Values of the node's parameters.
+    """
     command = [sys.executable, '-P', '-m', f'anser_ros.nodes.{name}', '--ros-args', *words]
     for key, value in parameters.items():
         text = str(value).lower() if isinstance(value, bool) else str(value)

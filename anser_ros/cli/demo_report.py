@@ -1,4 +1,4 @@
-"""Summary and picture of a demo, from the file that the monitor leaves."""
+"""Summary and picture of a demo, from the file that the monitor writes."""
 
 from __future__ import annotations
 
@@ -17,18 +17,23 @@ MEANINGS = {
 }
 COLOURS = ('tab:blue', 'tab:orange')
 GAP_S = 0.1
+"""Longest time between poses, s, that a line is drawn across."""
 SMOOTH = 25
+"""Number of poses of the running median by which the reported sigma is drawn."""
 METAL_NEAR_M = 0.3
+"""Distance of the disc from the board, m, up to which the picture marks the metal as near."""
+VISITS_APART_S = 3.0
+"""Time, s, after which metal that is near again counts as a further visit."""
 
 
 def load(path: Path) -> Results:
-    """Return the arrays of the monitor's file."""
+    """Return the arrays of the file that the monitor wrote."""
     with np.load(path, allow_pickle=False) as stored:
         return {name: stored[name] for name in stored.files}
 
 
 def summarise(results: Results) -> dict[str, object]:
-    """Figures of each chain, over all its sensors and bodies together."""
+    """Return the errors, rates and latencies of each chain over all its sensors and bodies."""
     chains: dict[str, object] = {}
     for rank, chain in enumerate(results['chains']):
         error = _joined(results, 'error', rank)
@@ -76,18 +81,18 @@ def draw(results: Results, path: Path) -> None:
 
 
 def _shown_target(results: Results) -> int:
-    """The last body if there is one with poses, else whatever has most poses."""
+    """Return the index of the last body if it has poses, else of what has the most poses."""
     counts = [len(results[f'stamp_0_{i}']) for i in range(len(results['names']))]
     return len(counts) - 1 if counts[-1] else int(np.argmax(counts))
 
 
 def _behind_first(results: Results) -> list[int]:
-    """Ranks of the chains: the live one, which matters, is drawn last and lies on top."""
+    """Return the ranks of the chains so that the live one is drawn last and lies on top."""
     return list(reversed(range(len(results['chains']))))
 
 
 def broken(stamp_s: NDArray[np.float64], values: NDArray[np.float64]) -> Any:
-    """Stamps and values with a NaN in every gap, so that no line goes across it."""
+    """Return stamps and values with a NaN in every gap, so that no line is drawn across it."""
     gaps = np.flatnonzero(np.diff(stamp_s) > GAP_S) + 1
     middle = (stamp_s[gaps - 1] + stamp_s[gaps]) / 2
     return np.insert(stamp_s, gaps, middle), np.insert(values, gaps, np.nan, axis=0)
@@ -144,7 +149,7 @@ def _draw_error(axes: Any, results: Results, shown: int) -> None:
 
 
 def _smoothed(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Running median over `SMOOTH` values."""
+    """Return the running median over `SMOOTH` values."""
     reach = min(SMOOTH, len(values) - 1 + len(values) % 2) // 2
     padded = np.pad(values, reach, mode='edge')
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1)
@@ -155,7 +160,7 @@ def _shade_metal(axes: Any, metal: NDArray[np.float64], begin: float) -> None:
     near = metal[metal[:, 1] < METAL_NEAR_M, 0] - begin
     if not near.size:
         return
-    breaks = np.flatnonzero(np.diff(near) > 3.0)
+    breaks = np.flatnonzero(np.diff(near) > VISITS_APART_S)
     starts = near[np.concatenate([[0], breaks + 1])]
     ends = near[np.concatenate([breaks, [near.size - 1]])]
     for rank, (start, end) in enumerate(zip(starts, ends, strict=True)):

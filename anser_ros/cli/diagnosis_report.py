@@ -1,4 +1,4 @@
-"""The diagnosis as one self-contained page that someone who has not read the code understands."""
+"""The diagnosis as one self-contained page for readers who do not know the code."""
 
 import base64
 import html
@@ -20,6 +20,7 @@ from anser_ros.sessions.diagnosis import SessionDiagnosis
 
 Array = NDArray[np.float64]
 
+# Candidates of a round that the page lists at most, to keep it short.
 MOST_CANDIDATES = 40
 BEFORE, AFTER = '#c44e52', '#4c72b0'
 STYLE = """
@@ -34,7 +35,7 @@ td.n { text-align: right; font-variant-numeric: tabular-nums } code { background
 
 
 def verdict(document: dict[str, Any]) -> str:
-    """What was found, in one paragraph."""
+    """Return in one paragraph what the diagnosis found."""
     held, effects = document['held_out'], document['effects']
     before, after = held['flux_rms_before_t'], held['flux_rms_after_t']
     if effects:
@@ -72,7 +73,7 @@ def _named(effect: dict[str, Any]) -> str:
 
 
 def _short(parameters: dict[str, Any]) -> list[tuple[str, Any]]:
-    """Parameters that fit a line: no long lists."""
+    """Return the parameters that fit on a line, without long lists."""
     return [(key, value) for key, value in parameters.items() if _size(value) <= 9]
 
 
@@ -87,7 +88,7 @@ def _value(value: Any) -> str:
 
 
 def render(result: SessionDiagnosis, document: dict[str, Any], *, session: str, model: str) -> str:
-    """The page.
+    """Return the page as HTML with its figures inside.
 
     Parameters
     ----------
@@ -202,7 +203,7 @@ def _structure(result: SessionDiagnosis) -> str:
 
 
 def _strongest(state: State) -> str:
-    """Where the residual is largest, in words."""
+    """Return in words where the residual is largest."""
     said = []
     parts = _tools(state)
     emitters = state.problem.fields.omega.size
@@ -332,7 +333,7 @@ def _bars(before: State, after: State) -> Figure:
 
 
 def _by(state: State, axis: str) -> tuple[list[str], Array]:
-    """Residual of each channel or emitter."""
+    """Return the names of all channels or emitters, and the residual of each."""
     names: list[str] = []
     sizes: list[float] = []
     squares: Array | None = None

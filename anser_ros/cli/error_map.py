@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the command; the exit code."""
+    """Run the command and return the exit code."""
     rows, _ = _read(args.points)
     make_folder(args.out)
     error_map = learn_error_map(
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def to_document(error_map: ErrorMap) -> dict[str, Any]:
-    """The map and how it was chosen, as plain data."""
+    """Return the map and the figures of its choice as plain data."""
     return {
         'schema': SCHEMA,
         'map': error_map.shape.describe(),
@@ -91,7 +91,7 @@ def _read(path: Path) -> tuple[list[dict[str, str]], list[str]]:
 
 
 def _columns(rows: list[dict[str, str]], names: tuple[str, ...], path: Path) -> Array:
-    """Columns as numbers; an empty cell is NaN."""
+    """Return columns as numbers, with NaN for an empty cell."""
     try:
         return np.array([[float(row[name] or 'nan') for name in names] for row in rows])
     except (KeyError, TypeError, ValueError) as error:

@@ -1,6 +1,6 @@
-"""Compiles every kernel of the chain once, before processes that share the cache need them.
+"""Compilation of all numerical kernels, before processes that share their cache need them.
 
-Nodes that start together on a cold cache would each compile all of them, on the same cores.
+Nodes that start together with an empty cache would each compile all kernels on the same cores.
 """
 
 import sys
@@ -12,14 +12,18 @@ from anser_ros.wire.config_folder import config_path, read_config
 from anser_ros.wire.setup import parse_setup
 
 PATIENT_S = 3.0
+"""Time, s, after which the user is told that kernels are being compiled. With a filled cache the
+process ends before."""
 POLL_S = 0.05
+"""Time from one look at the process to the next, s."""
 SECOND_NS = 1_000_000_000
+"""Nanoseconds in a second."""
 
 
 def compile_kernels(
     supervisor: Supervisor, say: Callable[[str], None], is_stopped: Callable[[], bool]
 ) -> Child | None:
-    """Run `main` in a process of its own; return it when it failed, None when all is ready."""
+    """Run `main` in another process; return it if it failed, and None when all is ready."""
     child = supervisor.start('kernels', [sys.executable, '-P', '-m', 'anser_ros.cli.kernels'])
     begin, told = time.monotonic(), False
     while child.process.poll() is None and not is_stopped():
@@ -37,7 +41,7 @@ def compile_kernels(
 
 def main() -> int:
     """Run the demo's world, a tracker and a refit for a few frames."""
-    # Whoever only starts this process needs none of them.
+    # Imported here, because the process that only starts this one needs none of them.
     import numpy as np
 
     from anser_ros.refit.live_refit import LiveRefit

@@ -1,4 +1,4 @@
-"""Put an effect into simulated raw samples, find it blind, correct it, measure live again."""
+"""The loop: an effect in simulated samples is diagnosed blind, corrected and measured again."""
 
 import argparse
 import json
@@ -27,14 +27,18 @@ from anser_ros.simulation.effect_draw import CATALOGUE, NONE, RANDOM
 
 ALL = 'all'
 CLEAN_S = 6.0
+"""Duration of the clean recording, s: 150 frames, whose mean is the references' baseline."""
 SECOND_SHARE = 0.6
-"""Duration of the second run over that of the first."""
+"""Duration of the second run as a fraction of the first one's."""
 OTHER_PATH_RAD = 2.0
+"""Phase of the second run's path, rad, so that the correction is tested at other poses."""
 OPTICAL_NOISE_M = 0.07e-3
+"""Jitter of the simulated optical tracker, m an axis, as `calibrate` assumes by default."""
 LAST_DOMAIN = 101
-"""Domains up to this leave all of Linux's ephemeral ports alone."""
+"""Largest ROS domain used. The ports of domains up to this are no ephemeral ports of Linux."""
 LEAST_KEPT = 0.85
-"""Share of whole frames below which a recording says more of the machine than of the effect."""
+"""Fraction of whole frames below which a recording shows the load of the machine rather than the
+effect."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,12 +67,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the loop; the exit code.
+    """Run the loop and return the exit code.
 
     Raises
     ------
     ParameterError
-        When the duration, the seed or an effect's name is none that can be.
+        When the duration or the seed is out of range, or an effect's name is unknown.
     DiagnosisError
         When a run records nothing or a diagnosis fails.
     """
@@ -86,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     for variable in ('OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
         os.environ.setdefault(variable, '1')
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    # A system that runs already must not be heard, nor hear what is simulated here.
+    # A ROS system that runs already must neither be heard nor hear what is simulated here.
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % LAST_DOMAIN))
     folder = args.out / time.strftime('loop_%Y%m%d_%H%M%S')
     make_folder(folder)
@@ -126,7 +130,7 @@ def _round(
     is_watched: bool,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """One effect, from the raw samples to the error of the second run."""
+    """Run the loop for one effect, from the raw samples to the error of the second run."""
     model, truth_file = world.model, folder / 'truth.json'
     folder.mkdir()
     unit = {'effect': effect, 'effect_seed': seed, 'effect_file': truth_file}
@@ -183,13 +187,13 @@ def _round(
 
 
 def _drifts(model_file: Path, session: Path) -> bool:
-    """Whether a model has effects whose course only the references can tell, another time."""
+    """Return whether a model has effects that vary, so that only references can follow them."""
     model, sensors = load_model(model_file), load_session(session).tools[0].sensors
     return bool(Correction.of(model.effects, sensors, model.frequencies_hz).drifting)
 
 
 def _diagnose(bag: Path, clean: Path | None, model: Path, out: Path) -> dict[str, Any]:
-    """Run the diagnosis in a process of its own, which knows the bags and the model alone."""
+    """Run the diagnosis in another process, which knows only the bags and the model."""
     command = [
         sys.executable, '-P', '-m', 'anser_ros.cli.main', 'diagnose', str(bag),
         '--model', str(model), '--out', str(out),

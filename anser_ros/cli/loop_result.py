@@ -1,4 +1,4 @@
-"""What a loop gave: truth beside finding, parameters compared, errors of the second run."""
+"""Results of a loop: truth and finding, their parameters, and the errors of the second run."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -21,10 +21,22 @@ TRACKERS = ('ungated', 'before', 'after')
 
 
 def verdict(truth: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> str:
-    """How right a diagnosis is, in one of the words above; empty for a clean run found clean.
+    """Return how right a diagnosis is; empty for a clean run that was found clean.
 
-    An effect that has an answer must be named by it, at its place, with nothing else. One that no
-    catalogue has must leave something unexplained: all of it, or a part beside other names.
+    An effect that the diagnosis knows must be named, at its place, with nothing else. One that it
+    does not know must leave something unexplained: all of it, or a part beside other names.
+
+    Parameters
+    ----------
+    truth : mapping
+        Name, parameters and answers of the effect that was put in.
+    diagnosis : mapping
+        The document of the diagnosis.
+
+    Returns
+    -------
+    str
+        `NAMED`, `PARTLY`, `SAID`, `MISSED`, `WRONG` or the empty string.
     """
     names = [effect['name'] for effect in diagnosis['effects']]
     unexplained = diagnosis['unexplained']['fraction'] > 0.0
@@ -44,9 +56,9 @@ def _same_site(truth: Mapping[str, Any], found: Mapping[str, Any]) -> bool:
 
 
 def parameter_errors(truth: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str, Any]:
-    """Each number of the truth that the finding has too: put in, found, difference, 1 sigma.
+    """Return each parameter that truth and finding share, with its error and standard deviation.
 
-    Of lists the largest difference counts, of a position the distance.
+    The error of a list is its largest difference, that of a position the distance.
     """
     out: dict[str, Any] = {}
     for effect in diagnosis['effects']:
@@ -68,10 +80,10 @@ def parameter_errors(truth: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> 
 
 
 def second_run(session: Session, corrected: FieldModel, known: FieldModel) -> dict[str, Any]:
-    """Live errors over all sensors and bodies, and the share of frames with a pose, by tracker.
+    """Return each tracker's live errors over all sensors and bodies, and its share of poses.
 
-    A tracker with a wrong model withholds the poses that its gate catches, so its error is to be
-    read beside its share; `ungated` says what those poses would have been.
+    A tracker with a wrong model withholds the poses that its gate catches, so that its error is to
+    be read together with its share of frames with a pose; `ungated` has those poses as well.
     """
     figures = {}
     for name, namespace, model in (
@@ -98,7 +110,7 @@ def _figures(errors: list[LiveErrors]) -> dict[str, float | None]:
 
 
 def table(rounds: list[dict[str, Any]], console: Console) -> None:
-    """Print a line for every round, and what went wrong with the machine."""
+    """Print a line for every round, and the signs of an overloaded machine."""
     out = Table(title='live error of the second run, on another path (simulated)')
     for heading in ('put in', 'found', 'verdict', 'parameters'):
         out.add_column(heading, overflow='fold')

@@ -1,4 +1,4 @@
-"""One run of the loop: simulated control unit, acquisition, trackers and recorder as processes."""
+"""One run of the loop with simulated control unit, acquisition, trackers and recorder."""
 
 import shutil
 import tempfile
@@ -18,29 +18,35 @@ from anser_ros.wire.config_folder import config_path, read_config
 from anser_ros.wire.setup import dump_setup, parse_setup
 
 PATIENCE_S = 180.0
+"""Time to wait for all nodes and for the first flux, s; kernels may be compiled meanwhile."""
 POLL_S = 0.2
+"""Time from one look at the processes to the next, s."""
 RATE_HZ = 25.0
+"""Rate of the fluxes, Hz; low enough for all processes together on two cores."""
 AFTER, BEFORE, UNGATED = '/anser', '/anser/before', '/anser/ungated'
-"""Namespaces of the trackers: with the corrected model, with the model as it was, and with that
-one and no residual gate, whose error shows what a gate is there for."""
+"""Namespaces of the trackers: with the corrected model, with the model as it was, and with the
+latter without residual gate, whose error shows what the gate withholds."""
 
 
 TONES_HZ = tuple(5025.0 + 100.0 * mark for mark in (0, 1, 4, 9, 15, 22, 32, 34))
-"""Marks of a Golomb ruler (no two pairs are equally far apart) in steps of 100 Hz: where a channel
-compresses, the third-order products of the tones, also those that the converter's rate of 20 kHz
-folds back, then fall between the tones, whole cycles of a 20 ms window away."""
+"""Drive tones, Hz, at the marks of a Golomb ruler (no two pairs are equally far apart) in steps of
+100 Hz. Where a channel compresses, the third-order products of the tones, also those that the
+converter's rate of 20 kHz folds back, then fall between the tones, whole cycles of a 20 ms window
+away."""
 
 
 @dataclass(frozen=True)
 class LoopFiles:
-    """What all runs of a loop share: files of the setup and of the model known at first."""
+    """The files of the setup and of the uncorrected model, which all runs of a loop share."""
 
     setup: Path
     model: Path
 
 
 def make_world(folder: Path) -> LoopFiles:
-    """Write the demo's setup and model with the loop's tones, which a field without metal ignores.
+    """Write the demo's setup and model with the loop's tones.
+
+    The field without metal does not depend on the tones, so that the model stays right.
 
     Raises
     ------
@@ -55,8 +61,8 @@ def make_world(folder: Path) -> LoopFiles:
         for coil, tone in zip(setup.emitter.coils, TONES_HZ, strict=True)
     )
     world = LoopFiles(folder / 'setup.yaml', folder / 'model.yaml')
-    own = replace(setup, emitter=replace(setup.emitter, coils=coils))
-    world.setup.write_text(dump_setup(own), encoding='utf-8')
+    changed = replace(setup, emitter=replace(setup.emitter, coils=coils))
+    world.setup.write_text(dump_setup(changed), encoding='utf-8')
     model = load_model(config_path('demo_model.yaml'))
     save_model(world.model, replace(model, frequencies_hz=TONES_HZ))
     return world
@@ -64,26 +70,26 @@ def make_world(folder: Path) -> LoopFiles:
 
 @dataclass(frozen=True)
 class Run:
-    """What is simulated, and who tracks it.
+    """The settings of one run: what is simulated, and which nodes track it.
 
     Attributes
     ----------
     folder : Path
-        Gets the bag and the logs.
+        Folder for the bag and the logs.
     setup : Path
-        Document of the unit and of everybody else.
+        Setup document of the unit and of all nodes.
     duration_s : float
-        From the first flux on.
+        Duration from the first flux on, s.
     unit : mapping
         Parameters of the simulated control unit.
     served : Path or None
-        Model of the chain whose poses are judged; without it nobody tracks.
+        Model of the chain whose poses are judged; without it no tracker runs in this chain.
     baseline : Path or None
         Clean recording; with it the served model follows the references.
     known : Path or None
-        Model of the trackers beside it.
+        Uncorrected model of the trackers that run beside it; None for no such trackers.
     watched : mapping or None
-        Parameters of a watcher; None for none.
+        Parameters of a watcher; None for no watcher.
     """
 
     folder: Path
@@ -97,15 +103,15 @@ class Run:
 
 
 def record(run: Run) -> Path:
-    """Record a run; the bag's folder.
+    """Record a run and return the folder of its bag.
 
-    The unit is started when all who listen are there: what drifts begins with its first start,
-    which then is the first frame of every recording and of every tracker.
+    The unit is started once all nodes are ready: drifts begin with its first start, which is then
+    the first frame of the recording and of every tracker.
 
     Raises
     ------
     DiagnosisError
-        When a process ends, or nothing comes.
+        When a process ends, or no flux arrives in time.
     """
     ports = Path(tempfile.mkdtemp(prefix='anser_loop_'))
     bag = run.folder / 'bag'
@@ -159,7 +165,7 @@ def _commands(run: Run, port: Path) -> dict[str, list[str]]:
 
 
 def _beside(run: Run) -> dict[str, dict[str, object]]:
-    """Namespaces and settings of the trackers with the known model."""
+    """Return the namespaces and settings of the trackers with the uncorrected model."""
     return {} if run.known is None else {BEFORE: {}, UNGATED: dict(NO_GATE)}
 
 
@@ -180,7 +186,7 @@ def _check(supervisor: Supervisor) -> None:
 
 
 def _unready(bag: Path, names: Sequence[str]) -> str:
-    """Who has not spoken yet, or is a tracker without a model."""
+    """Return a message with the nodes that have not reported, or that lack a model."""
     told = last_words(bag)
     missing = [
         name.strip('/')

@@ -1,4 +1,4 @@
-"""The console script `anser`: one verb a command, each also an executable of the ROS package.
+"""The console script `anser` with one verb a command; each is also a ROS executable.
 
 A node is started by exec of its own module, so that this layer never loads rclpy; an offline
 command is imported only when it is the one asked for. `commands` lists both.
@@ -17,16 +17,18 @@ from anser_ros.cli.commands import NODES, OFFLINE
 from anser_ros.errors import AnserError
 from anser_ros.one_line_parser import OneLineParser
 
-EXIT_OK = 0
-EXIT_DEFECT = 1
-EXIT_BAD_INPUT = 2
-# Small matrices: a second BLAS thread gains nothing, and waits for a busy core for milliseconds.
+# Exit codes, as docs/interfaces.md has them.
+EXIT_OK = 0  # done
+EXIT_DEFECT = 1  # an error of this program
+EXIT_BAD_INPUT = 2  # an error of the caller
+# For small matrices a second BLAS thread gains nothing, and waits milliseconds for a busy core.
 ONE_THREAD = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
+# The folder anser_ros, whose parent must be on a node's search path.
 PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb.
+    """Run one verb and return the exit code.
 
     Parameters
     ----------
@@ -43,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         code = _dispatch(list(sys.argv[1:] if argv is None else argv))
         sys.stdout.flush()
-    except BrokenPipeError:  # whoever read the output has had enough
+    except BrokenPipeError:  # the reader of the output has closed it
         sys.stdout = open(os.devnull, 'w', encoding='utf-8')  # noqa: SIM115 - until the exit
         return EXIT_OK
     return code
@@ -72,7 +74,7 @@ def run_executable() -> int:
 
 
 def exec_node(name: str, arguments: Sequence[str]) -> NoReturn:
-    """Replace this process by a node, so that signals reach it without a go-between."""
+    """Replace this process by a node, so that signals reach the node directly."""
     environment = dict(os.environ)
     paths = [str(PACKAGE_FOLDER.parent), environment.get('PYTHONPATH', '')]
     environment['PYTHONPATH'] = os.pathsep.join(path for path in paths if path)
@@ -84,9 +86,10 @@ def exec_node(name: str, arguments: Sequence[str]) -> NoReturn:
 
 
 def run_verb(name: str, arguments: Sequence[str]) -> int:
-    """Run one offline command in this process."""
+    """Run one offline command in this process and return the exit code."""
     try:
-        # Before numpy is loaded: BLAS threads that wait for one another cost more than they bring.
+        # Set before numpy is loaded: BLAS threads that wait for one another cost more than they
+        # gain.
         os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
         module = importlib.import_module(f'anser_ros.cli.{name}')
         parser = OneLineParser(prog=f'anser {name}', description=OFFLINE[name])

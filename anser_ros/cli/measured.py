@@ -1,4 +1,4 @@
-"""Other people's measurements: what they contain, and the error before and after."""
+"""The command that analyses other people's measurements and compares errors before and after."""
 
 import argparse
 import json
@@ -56,13 +56,13 @@ STUDIES: dict[str, Study] = {
     hpi_coils.NAME: _hpi_coils,
     anser_board.NAME: _anser_board,
 }
-"""Data set to its rows and the text of its candidates."""
+"""Analysis of each data set, which gives the rows of its figures and a text of its candidates."""
 SESSIONS: dict[str, Callable[[Path, Path], list[Path]]] = {
     navion.NAME: navion_session.write_sessions,
     magnet_patch.NAME: magnet_session.write_sessions,
     hpi_coils.NAME: hpi_session.write_sessions,
 }
-"""Data set to what writes its sessions; one without fluxes has none."""
+"""Function of each data set with fluxes that writes its sessions as bags."""
 SHARED = 'ANSER_SHARED'
 SCHEMA = 'anser_measured/1'
 
@@ -90,7 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the command; the exit code."""
+    """Run the command and return the exit code."""
     wrong = [name for name in args.datasets if name not in STUDIES]
     if wrong:
         raise ParameterError(f'no data set {wrong[0]!r}; there are {", ".join(STUDIES)}')
@@ -121,7 +121,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _write_bags(names: Iterable[str], shared: Path, into: Path, console: Console) -> None:
-    """Write the sessions of all data sets that have fluxes, and say so."""
+    """Write the sessions of all data sets that have fluxes, and print their paths."""
     for name in names:
         if name not in SESSIONS:
             console.print(f'{name}: positions only, no session', highlight=False)
@@ -131,12 +131,12 @@ def _write_bags(names: Iterable[str], shared: Path, into: Path, console: Console
 
 
 def shared_folder(given: Path | None) -> Path:
-    """The folder that holds ``measured/``.
+    """Return the folder that contains ``measured/``.
 
     Raises
     ------
     ParameterError
-        When it is nowhere.
+        When there is no such folder.
     """
     source = Path(__file__).resolve().parents[2].parent / 'shared'
     folder = given or Path(os.environ.get(SHARED, source))
@@ -146,7 +146,7 @@ def shared_folder(given: Path | None) -> Path:
 
 
 def to_document(rows: list[ReportRow]) -> dict[str, Any]:
-    """The table for machines; a missing number is null."""
+    """Return the rows as plain data, with null for a missing number."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, float | np.floating):
@@ -160,7 +160,7 @@ def to_document(rows: list[ReportRow]) -> dict[str, Any]:
 
 
 def table(rows: list[ReportRow]) -> Table:
-    """The table for people."""
+    """Return the rows as a table for the terminal."""
     out = Table(title='Measured data: before and after, on data that took no part')
     for heading in ('data set', 'figure', 'before', 'after', 'target', 'met', 'chosen on'):
         number = heading in ('before', 'after', 'target')

@@ -1,4 +1,4 @@
-"""Where commands write: each makes the folders that are missing and says what it wrote."""
+"""The folders that commands write to, and the line that names the files written."""
 
 import os
 from pathlib import Path
@@ -7,12 +7,12 @@ from anser_ros.errors import ParameterError
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder for results, before the work whose results it is for.
+    """Make a folder for results before the work begins.
 
     Raises
     ------
     ParameterError
-        When it can't be made, or nothing can be written there.
+        When the folder cannot be made, or nothing can be written there.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -23,5 +23,5 @@ def make_folder(folder: Path) -> None:
 
 
 def say_written(*paths: Path) -> None:
-    """Say where the results are, in one line."""
+    """Print the paths of the results in one line."""
     print(f'wrote {", ".join(map(str, paths))}')

@@ -1,4 +1,4 @@
-"""Redo the article's experiments: Tables II to V, Figs. 2 and 5 to 10."""
+"""The command that redoes the article's experiments: Tables II to V, Figs. 2 and 5 to 10."""
 
 import argparse
 import json
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the command; the exit code."""
+    """Run the command and return the exit code."""
     make_folder(args.out)
     console = Console(stderr=True)
     columns = (TextColumn('{task.description}'), BarColumn(), TimeElapsedColumn())
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _recordings(args: argparse.Namespace, scratch: Path) -> Recordings:
-    """The recordings asked for, the shared ones, or ones made here."""
+    """Return the recordings asked for, the shared ones, or else ones simulated here."""
     if args.simulate:
         return simulate_recordings(scratch, args.seed)
     if args.sessions is not None:

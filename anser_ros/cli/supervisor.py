@@ -1,4 +1,4 @@
-"""Starts processes, watches them, and leaves none behind: a launch without `launch`."""
+"""Processes that are started, watched and ended together, without the package `launch`."""
 
 from __future__ import annotations
 
@@ -14,19 +14,27 @@ from dataclasses import dataclass
 from pathlib import Path
 
 _PR_SET_PDEATHSIG = 1
+"""Option of Linux's prctl that sends a signal to a process when its parent ends."""
 _TERMINATE_S = 1.5
+"""Time for a process to end after SIGTERM, s, enough to close a bag; then it is killed."""
+_KILL_S = 1.0
+"""Time for the system to end a killed process, s."""
 _TAIL_LINES = 8
+"""Last lines of a log that an error message shows."""
 
 
 @dataclass(frozen=True)
 class Child:
-    """A process that was started.
+    """A process that a supervisor has started.
 
     Attributes
     ----------
-    name : what it is called in messages
-    process : the process, leader of a group of its own
-    log : where its output goes; None for the terminal
+    name : str
+        Name in messages.
+    process : subprocess.Popen
+        The process, leader of a separate group.
+    log : Path or None
+        File of its output; None for the terminal.
     """
 
     name: str
@@ -35,14 +43,15 @@ class Child:
 
 
 class Supervisor:
-    """Processes that live and end together; used as a context.
+    """Starts processes and ends them together when its context is left.
 
-    Each is a group of its own, so Ctrl-C reaches only the supervisor, which ends them in order.
-    When the supervisor itself is killed the system ends them (Linux).
+    Each process is in a separate group, so that Ctrl-C reaches only the supervisor, which ends
+    them in order. When the supervisor itself is killed, the system ends them (Linux).
 
     Parameters
     ----------
-    logs : folder for their output
+    logs : Path
+        Folder for their output.
     """
 
     def __init__(self, logs: Path) -> None:
@@ -57,7 +66,17 @@ class Supervisor:
         self.end()
 
     def start(self, name: str, command: Sequence[str], *, on_terminal: bool = False) -> Child:
-        """Start a process."""
+        """Start a process whose output goes to a log, or to the terminal if asked.
+
+        Parameters
+        ----------
+        name : str
+            Name in messages and of the log.
+        command : sequence of str
+            The program with its arguments.
+        on_terminal : bool
+            Whether the process writes to the terminal.
+        """
         log = None if on_terminal else self._logs / f'{name}.log'
         stream = None if log is None else log.open('wb')
         try:
@@ -76,19 +95,19 @@ class Supervisor:
         return self._children[-1]
 
     def forget(self, child: Child) -> None:
-        """Watch a process no longer that has done its work."""
+        """Stop watching a process that has done its work."""
         self._children.remove(child)
 
     def ended(self) -> Child | None:
-        """Return a process that has ended by itself, None while all run."""
+        """Return a process that has ended by itself, or None while all run."""
         return next((c for c in self._children if c.process.poll() is not None), None)
 
     def end(self) -> None:
-        """End all: ask to terminate, then kill what does not heed.
+        """Ask all processes to terminate, and kill those that do not end in time.
 
-        Whoever has files to close has a handler; who is still starting has none, and just ends.
+        A process with files to close has a handler of the signal; others simply end.
         """
-        for number, patience_s in ((signal.SIGTERM, _TERMINATE_S), (signal.SIGKILL, 1.0)):
+        for number, patience_s in ((signal.SIGTERM, _TERMINATE_S), (signal.SIGKILL, _KILL_S)):
             running = [c for c in self._children if c.process.poll() is None]
             for child in running:
                 _signal_group(child, number)
@@ -114,6 +133,6 @@ def _signal_group(child: Child, number: int) -> None:
 
 
 def _prepare() -> None:
-    """Run in the child: the system kills it when its parent is gone (Linux)."""
+    """Let the system kill the new process when its parent ends (Linux)."""
     if sys.platform.startswith('linux'):
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
