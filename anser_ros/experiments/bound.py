@@ -13,10 +13,24 @@ Array = NDArray[np.float64]
 
 
 def position_bound(measurements: Measurements, model: FieldModel, noise_t: float) -> Array:
-    """Root mean square position error (m) of an unbiased estimate, for every sensor, shape (S,).
+    """Return the least root mean square position error of unbiased estimates.
 
-    The Fisher information of position and axis is ``J^T J / sigma^2``; the axis is a unit vector,
-    so it counts in its tangent plane (Kay, Estimation Theory, 1993, section 3.7).
+    The Fisher information of position and axis is ``J^T J / sigma^2`` (Kay, Estimation Theory,
+    1993, section 3.7); the axis, a unit vector, counts in its tangent plane.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        The poses at which the bound is wanted.
+    model : FieldModel
+        The field.
+    noise_t : float
+        Flux noise of a phasor component, T.
+
+    Returns
+    -------
+    ndarray, shape (S,)
+        Error of each sensor over the frames, m.
     """
     posed = with_pose(measurements)
     points, axes = posed.placed()

@@ -19,6 +19,7 @@ from anser_ros.errors import BagError
 Array = NDArray[np.float64]
 
 PITCH_M = 31.75e-3
+"""Distance of neighbouring places in a row of the board, m (1.25 inches)."""
 
 
 @dataclass(frozen=True)
@@ -44,13 +45,13 @@ class BoardRun:
 
 
 def board_folder() -> Path:
-    """Where the recordings are: beside the repository, or in ``$ANSER_SHARED``."""
+    """Return the folder of the recordings, in ``$ANSER_SHARED`` or beside the repository."""
     beside = Path(__file__).resolve().parents[2].parent / 'shared'
     return Path(os.environ.get('ANSER_SHARED', beside)) / 'measured' / 'anser_board'
 
 
 def board_places() -> Array:
-    """True places (41, 3), m: 5 x 5 points row by row, then 4 x 4 between them."""
+    """Return the true places, shape (41, 3), m: 5 x 5 row by row, then 4 x 4 between them."""
     rows = [PITCH_M * np.arange(-2.0, 2.1), PITCH_M * np.arange(-1.5, 1.6)]
     parts = []
     for line in rows:
@@ -60,7 +61,13 @@ def board_places() -> Array:
 
 
 def read_fiducials(path: Path) -> Array:
-    """Positions (P, 3), m, of a Slicer markups file; raises `BagError` when it is none."""
+    """Return the positions (P, 3), m, of a Slicer markups file.
+
+    Raises
+    ------
+    BagError
+        When the file has no table of fiducials.
+    """
     lines = path.read_text(encoding='utf-8').splitlines()
     try:
         rows = [[float(v) for v in line.split(',')[1:4]] for line in lines if line[:1] != '#']
@@ -104,7 +111,13 @@ def judged(name: str, found: Array, places: Array) -> BoardRun:
 
 
 def board_runs(folder: Path) -> list[BoardRun]:
-    """All runs of the folder; none when it isn't there."""
+    """Return the errors of all runs of a folder, or none when the folder does not exist.
+
+    Raises
+    ------
+    BagError
+        When a file has another number of fiducials than the board has places.
+    """
     runs = []
     places = board_places()
     for path in sorted(folder.glob('*.fcsv')):

@@ -1,4 +1,4 @@
-"""The article's Figs. 2 and 5 to 10, drawn from the results."""
+"""The article's Figs. 2 and 5 to 10, drawn from the results of the experiments."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,13 +22,16 @@ Array = NDArray[np.float64]
 SIMULATED = 'simulated data'
 SENSOR_WORDS = {'Y': 'Y sensor (horizontal)', 'Z': 'Z sensor (vertical)'}
 PROFILE_EMITTER = 3
-"""Fig. 6 shows the article's coil number 4."""
+"""Index of the emitter of Fig. 6, the article's coil number 4."""
 PROFILE_BAND_M = 0.006
+"""Distance from the line y = 0, m, up to which readings are drawn beside a profile; it is about
+half the distance of neighbouring points."""
 DOTS_PER_INCH = 110
+"""Resolution of the figures, a compromise between legible text and the size of the files."""
 
 
 def draw_all(study: Study, folder: Path) -> dict[str, str]:
-    """Draw every figure into a folder; file names by figure."""
+    """Draw every figure into a folder and return the file names by figure."""
     folder.mkdir(parents=True, exist_ok=True)
     tracking = study.results.tracking
     made = {
@@ -73,7 +76,7 @@ def _save(figure: Any, path: Path, title: str) -> Path:
 
 
 def _cdfs(path: Path, curves: Mapping[str, Mapping[str, SensorErrors]], title: str) -> Path:
-    """Empirical distribution of the position error, a panel a sensor."""
+    """Draw the empirical distribution of the position error with a panel for each sensor."""
     figure, panels = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True)
     for panel, (sensor, words) in zip(panels, SENSOR_WORDS.items(), strict=True):
         largest, smallest = 0.0, np.inf
@@ -106,7 +109,7 @@ def _training_points(study: Study, folder: Path) -> Path:
 
 
 def _profiles(study: Study, folder: Path) -> Path:
-    """Field of one emitter along x at y = 0: fits, and the readings that lie there."""
+    """Draw the field of one emitter along x at y = 0, with the readings near that line."""
     figure, panels = plt.subplots(1, 2, figsize=(10, 4))
     cases: list[tuple[str, Session, FieldModel]] = [
         ('no shield', study.factory, study.factory_calibration.model)
@@ -136,7 +139,7 @@ def _profiles(study: Study, folder: Path) -> Path:
 def _readings_near(
     session: Session, component: int, emitter: int
 ) -> tuple[Array, NDArray[np.complex128]]:
-    """Readings near the line by sensors along this component: x (m) and flux (T)."""
+    """Return x (m) and flux (T) of the readings near the line by sensors along a component."""
     tool = session.tools[0]
     points, axes = tool.placed()
     near = (np.abs(points[..., 1]) < PROFILE_BAND_M) & (np.abs(points[..., 2] - 0.15) < 0.004)
@@ -145,7 +148,7 @@ def _readings_near(
 
 
 def _lattices(errors: Mapping[str, SensorErrors], folder: Path) -> Path:
-    """True (red) and tracked (black) lattice, coloured by the error."""
+    """Draw the true (red) and the tracked (black) lattice, coloured by the error."""
     figure, panels = plt.subplots(1, 2, figsize=(10, 4.4))
     for panel, (sensor, words) in zip(panels, SENSOR_WORDS.items(), strict=True):
         found = errors[sensor]
@@ -164,7 +167,7 @@ def _lattices(errors: Mapping[str, SensorErrors], folder: Path) -> Path:
 
 
 def _lattice_lines(places: Array) -> Sequence[NDArray[np.int64]]:
-    """Rows and columns of a square lattice, as indices in order."""
+    """Return the rows and columns of a square lattice as indices in order."""
     side = max(round(np.sqrt(len(places))) - 1, 1)
     low, high = np.nanmin(places, axis=0)[:2], np.nanmax(places, axis=0)[:2]
     cell = np.rint((places[:, :2] - low) / np.maximum(high - low, 1e-9) * side)

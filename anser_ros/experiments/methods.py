@@ -1,4 +1,4 @@
-"""The field models that are compared: the drawing, the article's own method, and ours."""
+"""The field models that are compared: the drawing, the article's method, and this package's."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,12 +19,13 @@ from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import NOMINAL, model_for
 
 ARTICLE_COUNT = 12
+"""Dipoles along a side of the article's layer."""
 OUTLINE = 1.0
-"""The article's layer as large as the coils' outline."""
+"""Size of the article's layer as a multiple of the coils' outline."""
 
 
 def centres_extension(session: Session) -> float:
-    """Size of a layer that ends at the outermost coils' centres, as a part of the outline."""
+    """Return the size of a layer up to the outermost coil centres, relative to the outline."""
     generator = generator_of(session.setup)
     centres = generator.centres[:, :2]
     reach = np.abs(centres - generator.middle[:2]).max(axis=0)
@@ -32,7 +33,10 @@ def centres_extension(session: Session) -> float:
 
 
 def drawn_model(session: Session, learnt_from: Sequence[Session]) -> FieldModel:
-    """Biot-Savart of the drawing with one real gain an emitter, found on undistorted data."""
+    """Return the drawing's Biot-Savart model with a real gain for each emitter.
+
+    The gains are fitted to undistorted recordings.
+    """
     nominal = model_for(NOMINAL, session)
     tools = [with_pose(tool) for other in learnt_from for tool in other.tools]
     gains = emitter_gains(nominal, tools).real
@@ -42,12 +46,12 @@ def drawn_model(session: Session, learnt_from: Sequence[Session]) -> FieldModel:
 
 
 def expecting(model: FieldModel, flux_error_t: float) -> FieldModel:
-    """The model, told that it may be wrong by so much: its solutions are then not refused."""
+    """Return the model with at least this error of its own, so that solutions are not refused."""
     return replace(model, flux_error_t=max(flux_error_t, model.flux_error_t))
 
 
 def _residual_rms(model: FieldModel, tools: Sequence[Measurements]) -> float:
-    """Root mean square of an in-phase residual at the measured poses, T."""
+    """Return the root mean square of the in-phase residuals at the measured poses, T."""
     errors = []
     for tool in tools:
         points, axes = tool.placed()
@@ -58,7 +62,7 @@ def _residual_rms(model: FieldModel, tools: Sequence[Measurements]) -> float:
 
 
 def article_model(session: Session, extension: float = OUTLINE) -> FieldModel:
-    """The article's equation (6): 12 x 12 fixed z-dipoles, plain least squares, in phase."""
+    """Return the article's model: 12 x 12 fixed z-dipoles by least squares (its equation 6)."""
     dipoles = place(Layout('layer', ARTICLE_COUNT, extension, 0.0), generator_of(session.setup))
     factor = TriangularFactor(len(dipoles), 2 * len(session.setup.emitter_names))
     for tool in session.tools:
@@ -74,5 +78,5 @@ def article_model(session: Session, extension: float = OUTLINE) -> FieldModel:
 
 
 def our_model(sessions: Sequence[Session]) -> Calibration:
-    """Everything chosen by held-out error."""
+    """Return this package's calibration, with everything chosen by held-out error."""
     return calibrate_sessions(list(sessions), Options())

@@ -1,4 +1,4 @@
-"""The recordings that the experiments need: a folder of them, or ones of our own simulator."""
+"""The recordings that the experiments need, in a folder with one bag each."""
 
 import os
 from dataclasses import dataclass, replace
@@ -10,6 +10,7 @@ from anser_ros.errors import BagError
 from anser_ros.sessions.session import Session, load_session
 
 HEAD_DISTANCES_CM = (30, 20, 10, 8, 6, 4, 2)
+"""Distances of the X-ray head below the board, cm (article, Figs. 7 and 8)."""
 MATERIALS = ('aluminium', 'mu-metal')
 NAMES = (
     'factory_tool_a',
@@ -30,36 +31,37 @@ class Recordings:
     Attributes
     ----------
     folder : Path
+        The folder.
     origin : str
-        Whose simulation it is, for the report.
+        Who simulated the recordings, for the report.
     """
 
     folder: Path
     origin: str
 
     def load(self, name: str) -> Session:
-        """One of them; raises `BagError`."""
+        """Return the recording of a name; raises `BagError` when it cannot be read."""
         return load_session(self.folder / f'{name}.mcap')
 
     def shield(self, material: str, head: bool = False) -> Session:
-        """Tool B over a plate, with or without the X-ray head below it."""
+        """Return the recording of tool B over a plate, with or without the X-ray head below."""
         middle = '_c_arm' if head else ''
         return self.load(f'shield_{material.replace("-", "_")}{middle}_tool_b')
 
 
 def missing(folder: Path) -> list[str]:
-    """Names that the folder has no bag for."""
+    """Return the names of the recordings that a folder lacks."""
     return [name for name in NAMES if not (folder / f'{name}.mcap').is_file()]
 
 
 def default_folder() -> Path:
-    """Where the shared recordings are: beside the repository, or in ``$ANSER_SHARED``."""
+    """Return the shared recordings' folder, in ``$ANSER_SHARED`` or beside the repository."""
     beside = Path(__file__).resolve().parents[2].parent / 'shared'
     return Path(os.environ.get('ANSER_SHARED', beside)) / 'sessions' / 'paper'
 
 
 def given_recordings(folder: Path) -> Recordings:
-    """A folder that was asked for.
+    """Return the recordings of a folder that the user has named.
 
     Raises
     ------
@@ -76,19 +78,19 @@ def given_recordings(folder: Path) -> Recordings:
 
 
 def with_frames(session: Session, rows: np.ndarray) -> Session:
-    """The session with some frames of its only tool."""
+    """Return the session with some frames of its only tool."""
     return replace(session, tools=(session.tools[0].frames(rows),), reference=None)
 
 
 def with_sensors(session: Session, names: list[str]) -> Session:
-    """The session with some sensors of its only tool."""
+    """Return the session with some sensors of its only tool."""
     tool = session.tools[0]
     rows = np.array([i for i, name in enumerate(tool.sensors.name) if name in names])
     return replace(session, tools=(tool.sensors_only(rows),), reference=None)
 
 
 def checkerboard(session: Session) -> tuple[Session, Session]:
-    """Training and test points of a lattice: a checkerboard's two colours (article, Fig. 2)."""
+    """Return training and test points of a lattice, as on a checkerboard (article, Fig. 2)."""
     tool = session.tools[0]
     where = tool.position[:, :2]
     side = max(round(np.sqrt(len(where))) - 1, 1)

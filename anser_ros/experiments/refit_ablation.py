@@ -1,8 +1,8 @@
-"""What the refit owes to what: error against the number of references, and simpler methods.
+"""The refit's error by number of references, compared with simpler methods.
 
-All methods see the same references and start from the same calibrated model: the frozen model,
-free dipoles for every emitter (`refit.free`), and the shared polarisability. No gate
-refuses a pose here, so that wrong ones count as such.
+All methods have the same references and start from the same calibrated model: the frozen model,
+free dipoles for every emitter (`refit.free`), and the shared polarisability. No gate refuses a
+pose here, so that wrong poses count as such.
 """
 
 from collections.abc import Sequence
@@ -24,16 +24,19 @@ from anser_ros.tracking.solve import RealField, solve_coil, whitening_of
 Array = NDArray[np.float64]
 
 NOISE_T = 60e-12
+"""Flux noise of a phasor component that the solve assumes, T."""
 REACH_M = 0.15
-"""How far a wrong model may lead a pose astray."""
+"""Largest distance of a solution from the optical position, m; a wrong model may not lead a pose
+farther astray."""
 COUNTS = (4, 8, 16, 32)
+"""Numbers of reference coils that are compared; the demo's board has 32."""
 FROZEN, FREE, SHARED = 'frozen model', 'free dipoles', 'shared polarisability'
 METHODS = (FROZEN, FREE, SHARED)
 
 
 @dataclass(frozen=True)
 class AblationRow:
-    """One method with one number of references on one session.
+    """The error of one method with one number of references on one session.
 
     Attributes
     ----------
@@ -51,9 +54,9 @@ class AblationRow:
 
 
 def spread_out(references: SensorTable, count: int) -> NDArray[np.int64]:
-    """Rows of so many references, each as far as can be from those before it.
+    """Return the rows of some references, each as far as possible from those before it.
 
-    Coils at one place come after coils at other places, the more different axis first.
+    Coils at the place of another one come last, the one with the most different axis first.
     """
     chosen = [0]
     while len(chosen) < min(count, len(references)):
@@ -110,7 +113,7 @@ def _models(
     method: str,
     every: int,
 ) -> list[FieldModel]:
-    """The model of every frame that is tracked."""
+    """Return the model of every frame that is tracked."""
     reference = session.reference
     assert reference is not None
     sensors, drawing = reference.sensors.select(chosen), Drawing.of(session.setup).field
@@ -125,9 +128,9 @@ def _models(
 
 
 def _rmse(session: Session, models: Sequence[FieldModel], every: int) -> float:
-    """Position RMSE of the first tool's coils; one model for all frames, or one a frame.
+    """Return the position RMSE (m) of the first tool's coils, by one model or one a frame.
 
-    The solve starts at the optical pose: what is compared is the models, not the search.
+    The solve starts at the optical pose, since the models are compared and not the search.
     """
     tool = session.tools[0]
     centres, axes = tool.placed()
@@ -150,7 +153,7 @@ def _rmse(session: Session, models: Sequence[FieldModel], every: int) -> float:
 
 
 def plot(rows: Sequence[AblationRow], path: Path) -> None:
-    """Error against number of references, one panel a session, as a picture."""
+    """Draw the error over the number of references with a panel for each session."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter, ScalarFormatter

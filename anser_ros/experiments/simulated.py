@@ -1,8 +1,8 @@
-"""The experiments' recordings made by our own simulator, where nobody else's are at hand.
+"""The experiments' recordings by the package's own simulator, used where no others are at hand.
 
-The board is a little off its drawing. Plates and the X-ray head are lattices of metal balls that
-the board magnetises and that do not feel each other: rougher than plates and heads, and enough to
-bend the field by as much.
+The board differs slightly from its drawing. Plates and the X-ray head are lattices of metal balls
+that the board magnetises and that do not magnetise each other. They are rougher than real plates
+and heads, and distort the field by about as much.
 """
 
 from collections.abc import Sequence
@@ -27,26 +27,31 @@ from anser_ros.wire.setup import SensorSpec, Setup, parse_setup
 Array = NDArray[np.float64]
 
 STATIC = Errors(flux_noise_t=30e-12)
+"""Errors of a tool at rest; the noise is half of a single window's."""
 PLATE_EDGE_M = 0.25
+"""Edge of the square plate, m, about as large as the board."""
 PLATE_BALLS = 12
+"""Balls along an edge of the plate; more make it smoother and the simulation slower."""
 PLATE_DEPTH_M = 0.02
+"""Depth of the balls' centres below the board, m."""
 COLLIMATOR_DEPTH_M = 0.03
+"""Depth of the X-ray head below the board in the last experiment, m."""
 METALS = {'aluminium': (35e6, 1.0), 'mu-metal': (1.8e6, 1e4)}
 """Conductivity, S/m, and relative permeability (article, Table I)."""
 
 
 @dataclass(frozen=True)
 class Raster:
-    """A body that rests at the points of a lattice, one a second, held by a not quite steady hand.
+    """A path on which a body rests at the points of a lattice, one a second, held by hand.
 
     Attributes
     ----------
     side : int
         Points along x and along y.
     span_m : float
-        Edge of the square.
+        Edge of the square, m.
     height_m : float
-        Height of the lattice; each point is up to 4 mm off, and turned by up to 20 mrad.
+        Height of the lattice, m; each point is off by up to 4 mm and turned by up to 20 mrad.
     """
 
     side: int
@@ -54,11 +59,11 @@ class Raster:
     height_m: float
 
     def __call__(self, time_s: float) -> Pose:
-        """Pose at a time."""
+        """Return the pose at a time, s."""
         index = int(np.clip(round(time_s), 0, self.side**2 - 1))
         row, column = divmod(index, self.side)
         line = np.linspace(-self.span_m / 2, self.span_m / 2, self.side)
-        # Golden-ratio multiples: evenly spread and the same in every run.
+        # Multiples of irrational numbers are evenly spread and the same in every run.
         unsteady = np.mod(np.outer([0.6180340, 0.7548777, 0.5698403], [1, 2]) * (index + 1), 1.0)
         offset = 0.004 * (2.0 * unsteady[:, 0] - 1.0)
         turn = 0.02 * (2.0 * unsteady[:, 1] - 1.0)
@@ -91,7 +96,7 @@ def _at_rest(place: Array) -> Pose:
 
 
 def plate(material: str) -> MetalBody:
-    """A square plate below the board."""
+    """Return a square plate of a material below the board."""
     ball = PLATE_EDGE_M / (2 * PLATE_BALLS)
     line = np.linspace(-PLATE_EDGE_M / 2 + ball, PLATE_EDGE_M / 2 - ball, PLATE_BALLS)
     x, y = np.meshgrid(line, line)
@@ -102,13 +107,13 @@ def plate(material: str) -> MetalBody:
 
 
 def head(depth_m: float) -> MetalBody:
-    """The X-ray head below the board."""
+    """Return the X-ray head at a depth below the board, m."""
     place = np.array([0.01, -0.01, -depth_m])
     return steel_disc(lambda _: _at_rest(place), radius_m=0.1, rings=4)
 
 
 def with_metal(source: FieldSource, metal: Sequence[MetalBody], setup: Setup) -> FieldSource:
-    """The field of the board and of what it induces in metal at rest."""
+    """Return the field of a board together with that of the metal at rest that it magnetises."""
     tones = np.array(setup.frequencies_hz)
     places, moments = [], []
     for body in metal:
@@ -135,9 +140,11 @@ def simulate_recordings(folder: Path, seed: int, share: float = 1.0) -> Recordin
     Parameters
     ----------
     folder : Path
+        Folder for the bags.
     seed : int
+        Seed of the board's errors and of the noise.
     share : float
-        Points along a lattice's side, as a part of the article's; at least six are left.
+        Points along a lattice's side as a fraction of the article's; at least six are left.
     """
     rng = np.random.default_rng(seed)
     text = config_path('demo_setup.yaml').read_text(encoding='utf-8')

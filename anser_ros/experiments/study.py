@@ -1,4 +1,4 @@
-"""The article's experiments, run on recordings: Tables II to V and what its figures show."""
+"""The article's experiments on recordings: Tables II to V, and the data of its figures."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -35,28 +35,28 @@ Array = NDArray[np.float64]
 Errors = dict[str, SensorErrors]
 
 STATIC_NOISE_T = 30e-12
-"""Flux noise of a static point, rms a component, as the recordings say; for the bound only."""
+"""Flux noise of a static point, T rms a component, as the recordings have it; for the bound."""
 METHODS = ('drawing', 'article', 'ours')
 
 
 @dataclass
 class Results:
-    """Everything that was found.
+    """The results of all experiments.
 
     Attributes
     ----------
     origin : str
-        Whose simulation the data is.
+        Who simulated the recordings.
     tracking : dict
-        By experiment, then method: errors by sensor.
+        Errors by experiment, method and sensor.
     fields : dict
-        By material, then method, then set: the article's field metrics.
+        The article's field metrics by material, method and set.
     bounds : dict
-        By experiment: the Cramer-Rao bound of each sensor, m.
+        Cramer-Rao bound of each sensor by experiment, m.
     models : dict
-        By what they were trained on: how our model was chosen.
+        Figures of our model's choice by the recording that it was trained on.
     corrections : dict
-        By method, then sensor: the error map of Table V, in words.
+        The error map of Table V in words, by method and sensor.
     board_runs : list of BoardRun
         Error maps of a real tracker's positions; the only measured data here.
     """
@@ -70,7 +70,7 @@ class Results:
     board_runs: list[BoardRun] = field(default_factory=list)
 
     def document(self) -> dict[str, Any]:
-        """The figures as plain data."""
+        """Return the figures as plain data."""
         return {
             'schema': 'anser_paper/1',
             'origin': self.origin,
@@ -100,7 +100,7 @@ Progress = Callable[[str, float], None]
 
 
 class Study:
-    """Runs the experiments one by one; what several need is made once.
+    """Runs the experiments one by one, and keeps what several of them need.
 
     Parameters
     ----------
@@ -115,21 +115,21 @@ class Study:
 
     @cached_property
     def factory(self) -> Session:
-        """Tool A in clean surroundings."""
+        """The recording of tool A without metal."""
         return self.recordings.load('factory_tool_a')
 
     @cached_property
     def factory_calibration(self) -> Calibration:
-        """Our model of the clean board."""
+        """This package's model of the board without metal."""
         return self._ours('factory_tool_a', self.factory)
 
     @cached_property
     def drawing(self) -> FieldModel:
-        """Biot-Savart of the drawing, one gain an emitter from the clean recording."""
+        """The drawing's Biot-Savart model with gains from the recording without metal."""
         return drawn_model(self.factory, [self.factory])
 
     def run(self) -> Results:
-        """All experiments."""
+        """Run all experiments and return their results."""
         steps: tuple[tuple[str, Callable[[], None]], ...] = (
             ('Table II', self.new_model),
             ('Table III', self.shields),
@@ -154,7 +154,7 @@ class Study:
         return calibration
 
     def _bent(self, model: FieldModel) -> FieldModel:
-        """A model for a field that it does not know the distortion of."""
+        """Return a model with the error of a distorted field that it does not know."""
         return expecting(model, self.drawing.flux_error_t)
 
     def _bound(self, experiment: str, session: Session, model: FieldModel) -> None:
@@ -166,7 +166,7 @@ class Study:
         }
 
     def new_model(self) -> None:
-        """Table II and Fig. 5: the board's own model, tested with tool B."""
+        """Run Table II and Fig. 5: the model without metal, tested with tool B."""
         test = self.recordings.load('midplane_tool_b')
         ours = self.factory_calibration.model
         small = article_model(self.factory, centres_extension(self.factory))
@@ -179,7 +179,7 @@ class Study:
         self._bound('table_2', test, ours)
 
     def shields(self) -> None:
-        """Table III and Fig. 6: half of the points over a plate predict the other half."""
+        """Run Table III and Fig. 6: half of the points over a plate predict the other half."""
         for material in MATERIALS:
             training, test = checkerboard(self.recordings.shield(material))
             article, ours = (
@@ -200,7 +200,7 @@ class Study:
             self._bound(f'table_3 {material}', test, ours)
 
     def head(self) -> None:
-        """Figs. 7 and 8: the X-ray head comes closer, and nothing compensates."""
+        """Run Figs. 7 and 8: the X-ray head comes closer, without compensation."""
         # What bends the field is not in this model; it only knows that it may be wrong.
         ours = self._bent(self.factory_calibration.model)
         for distance in HEAD_DISTANCES_CM:
@@ -212,7 +212,7 @@ class Study:
 
     @cached_property
     def shield_models(self) -> dict[str, tuple[FieldModel, FieldModel]]:
-        """By material: the article's model and ours, from all points over the plate."""
+        """Return the article's model and ours of each material, from all points over the plate."""
         out = {}
         for material in MATERIALS:
             session = self.recordings.shield(material)
@@ -220,7 +220,7 @@ class Study:
         return out
 
     def shields_and_head(self) -> None:
-        """Table IV and Fig. 9: models with the plate and without the head, tested with both."""
+        """Run Table IV and Fig. 9: models of the plate alone are tested with plate and head."""
         for material in MATERIALS:
             test = self.recordings.shield(material, head=True)
             article, ours = (self._bent(model) for model in self.shield_models[material])
@@ -232,7 +232,7 @@ class Study:
         self.results.tracking['table_4 unshielded'] = self.results.tracking[nearest]
 
     def compensation(self) -> None:
-        """Table V and Fig. 10: two planes over the head predict the one between them."""
+        """Run Table V and Fig. 10: two planes over the head predict the one between them."""
         session = self.recordings.load('collimator_tool_a')
         training = outer_planes(session)
         article, ours = article_model(training), self._ours('collimator', training).model
@@ -258,11 +258,11 @@ class Study:
         self._bound('table_5 compensated', test, ours)
 
     def error_maps(self) -> None:
-        """The classic error map, for a tracker that gives positions only."""
+        """Run the error map of a tracker that gives positions only."""
         self.results.board_runs = board_runs(board_folder())
 
     def _corrected(self, method: str, known: Errors, errors: Errors) -> Errors:
-        """Positions corrected with what the bottom plane says, where that helps there."""
+        """Return errors after an error map learnt in the bottom plane, if it helps there."""
         out, words = {}, {}
         for sensor, found in errors.items():
             error_map = learn_error_map(known[sensor].tracked, known[sensor].true)
@@ -277,7 +277,7 @@ class Study:
 
 
 def outer_planes(session: Session) -> Session:
-    """The recording of a stack of coils without those of its middle plane."""
+    """Return the recording of a stack of coils without those of its middle plane."""
     tool = session.tools[0]
     heights = tool.sensors.position[:, 2]
     outer = np.abs(heights - np.median(heights)) > 0.25 * np.ptp(heights)
@@ -287,9 +287,10 @@ def outer_planes(session: Session) -> Session:
 
 
 def field_errors(session: Session, model: FieldModel) -> dict[str, float]:
-    """The article's equation (8) over all sensors and emitters, in phase, at the measured poses.
+    """Return the in-phase errors of the field over all sensors, emitters and measured poses.
 
-    MAE and RMSE in mA/m, N-MAE and N-RMSE in percent of the range of the measured values.
+    They are those of the article's equation (8): MAE and RMSE in mA/m, N-MAE and N-RMSE in percent
+    of the range of the measured values.
     """
     tool = session.tools[0]
     points, axes = tool.placed()

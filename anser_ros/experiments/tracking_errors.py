@@ -1,4 +1,4 @@
-"""Errors of tracked poses against the optical ones, sensor by sensor."""
+"""Errors of tracked poses compared with the optical ones, sensor by sensor."""
 
 from dataclasses import dataclass
 
@@ -15,14 +15,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """One sensor's errors, frame by frame; NaN where it was not tracked.
+    """One sensor's errors frame by frame, with NaN where it was not tracked.
 
     Attributes
     ----------
     tracked, true : ndarray, shape (F, 3)
-        m, frame fg.
+        Tracked and optical position, m, frame fg.
     distance, angle : ndarray, shape (F,)
-        m and rad.
+        Position error, m, and orientation error, rad.
     """
 
     tracked: Array
@@ -31,7 +31,7 @@ class SensorErrors:
     angle: Array
 
     def corrected(self, tracked: Array) -> 'SensorErrors':
-        """The same with other positions."""
+        """Return the errors with other tracked positions."""
         distance = np.where(
             np.isfinite(self.distance), np.linalg.norm(tracked - self.true, axis=1), np.nan
         )
@@ -39,20 +39,20 @@ class SensorErrors:
 
     @property
     def tracked_fraction(self) -> float:
-        """Part of the frames with a pose."""
+        """Fraction of the frames with a pose."""
         return float(np.isfinite(self.distance).mean())
 
     def millimetres(self) -> dict[str, float]:
-        """RMSE, ME, PRC50, PRC95 of the position (article, equation 7), mm."""
+        """Return RMSE, ME, PRC50 and PRC95 of the position (article, equation 7), mm."""
         return statistics(1e3 * self.distance)
 
     def degrees(self) -> dict[str, float]:
-        """The same of the orientation, degrees."""
+        """Return the same figures of the orientation, degrees."""
         return statistics(np.degrees(self.angle))
 
 
 def statistics(errors: Array) -> dict[str, float]:
-    """The article's four figures; NaN when there is no error at all."""
+    """Return the article's four figures of errors, or NaN without any finite error."""
     good = errors[np.isfinite(errors)]
     if good.size == 0:
         return dict.fromkeys(STATISTICS, float('nan'))
@@ -65,9 +65,9 @@ def statistics(errors: Array) -> dict[str, float]:
 
 
 def track(session: Session, model: FieldModel, in_phase: bool = False) -> dict[str, SensorErrors]:
-    """Track a session; the errors by the last token of a sensor's name, in capitals.
+    """Track a session and return the errors by the last part of a sensor's name, in capitals.
 
-    As in the article every solution counts, those too whose residual a tracker would refuse.
+    As in the article every solution counts, even if a tracker would refuse its residual.
     """
     evaluation = track_session(session, model, in_phase=in_phase)
     out = {}
