@@ -15,8 +15,17 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 # The rooms that are held to it.
 ROOMS = (
-    'physics', 'field', 'calibration', 'signals', 'simulation', 'experiments', 'cli',
-)  # fmt: skip
+    'physics',
+    'field',
+    'calibration',
+    'signals',
+    'simulation',
+    'experiments',
+    'cli',
+    'effects',
+    'diagnosis',
+    'metal',
+)
 FEWEST_WORDS = 4
 """A sentence of fewer words than these is a fragment."""
 FILES = sorted(path for room in ROOMS for path in (PACKAGE / room).rglob('*.py'))

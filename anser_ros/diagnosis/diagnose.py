@@ -42,7 +42,7 @@ on: time grows with them in proportion, and neighbouring frames tell much the sa
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found.
+    """What was found, and what speaks for it.
 
     Attributes
     ----------

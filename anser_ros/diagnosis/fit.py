@@ -14,6 +14,8 @@ from anser_ros.effects.term import Term
 Array = NDArray[np.float64]
 
 ATTEMPTS = 6
+"""Dampings that are tried for a step that lowers the sum of squares; each is ten or a hundred
+times the one before, so the last steps are far too small to help."""
 SETTLED = 1e-5
 """A step that lowers the sum of squares by less than this share ends the fit."""
 

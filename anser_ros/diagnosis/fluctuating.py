@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 SCALES = np.geomspace(1e-3, 1.0, 7)
 """Spreads that are tried first, over what the constant effect expects."""
 ROUNDS = 25
+"""Rounds of expectation-maximisation. It starts at the best of seven spreads, so it has less than
+a factor of two to go."""
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ from anser_ros.physics.sensor import SensorTable
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-VOLUME_ERROR = 1e-3
-REFERENCE_ERROR = 4e-3
+VOLUME_ERROR, REFERENCE_ERROR = 1e-3, 4e-3
 """Relative errors that the fit allows: of the model in the volume, of a reference's survey."""
 DRAWING_ERROR = 0.05
 """Prior spread of the sheet's moments about the drawn ones, as a share of their rms."""

@@ -13,6 +13,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 WINDOW = 11
+"""Neighbouring frames, this one among them, whose median an outlier stands out from: up to five
+bad ones in a row are seen, and motion changes little over so many."""
 READING_RATIO, FRAME_RATIO = 6.0, 2.5
 """Mean squares over the neighbours' median from which a reading (16 values with 8 emitters) or a
 frame (ten times as many) is no member of the same distribution; noise passes once in 1e6."""

@@ -19,12 +19,18 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 BLOCKS = 25
+"""Blocks of time in a session: longer than what is alike from frame to frame, and enough of them
+to hold some out and still have every pose in the rest."""
 TEST_EVERY = 5
 """One block of five never takes part in choosing or fitting."""
 BINS_PER_BLOCK = 2
+"""Means of the references in each block of time: they don't move, so more tell no more."""
 FEWEST_FRAMES = 30
+"""Frames with an optical pose that a diagnosis needs, about one in each block."""
 POINTS = 250
+"""Places in the volume, about, at which the emitters' own field is fitted to the model."""
 MARGIN_S = 0.15
+"""Time (s) by which fluxes may lie outside the optical track: a time offset may bring them in."""
 
 
 def test_blocks() -> NDArray[np.int64]:

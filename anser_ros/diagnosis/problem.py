@@ -105,7 +105,7 @@ class Part:
 
     @property
     def count(self) -> int:
-        """Values that count."""
+        """The number of values that count."""
         return int(np.count_nonzero(self.whitener.weight))
 
 
@@ -134,7 +134,7 @@ class State:
 
     @property
     def count(self) -> int:
-        """Values that count."""
+        """The number of values that count."""
         return sum(part.count for part in self.parts)
 
     def design(self, term: Term, probe: bool = False) -> list[Array | None]:
@@ -148,7 +148,7 @@ class State:
 
 
 def evaluate(problem: Problem, terms: Sequence[Term]) -> State:
-    """Predict and compare."""
+    """Predict all readings with some effects in force, and whiten what they differ by."""
     found = []
     for tool, blocks, good in zip(problem.tools, problem.blocks, problem.good, strict=True):
         if tool.time.size == 0:

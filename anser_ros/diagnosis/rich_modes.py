@@ -18,9 +18,12 @@ Unit = Callable[[View, Array], NDArray[np.inexact]]
 """Flux (F, S, K, m) of modes (c, m) of couplings in a view."""
 
 MOST_TOLD = 130
+"""Modes, at most, of which the data are asked how large they are: more would be slower to compare
+than they could ever explain."""
 LEAST_TOLD = 0.3
 """A mode is left out of which the data tell less than this share of what the prior does."""
 SCORED_FRAMES = 130
+"""Frames of each part, about, on which sizes of couplings are compared."""
 
 
 def rich_modes(

@@ -14,6 +14,8 @@ Array = NDArray[np.float64]
 Columns = Sequence[Array | None]
 
 MOST_COLUMNS = 60
+"""Columns that a term in force may have to be fitted again beside each candidate. A term with more
+is what metal left, and no effect's rival."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class BlockSums:
 
     @property
     def size(self) -> int:
-        """Number of columns."""
+        """The number of columns."""
         return int(self.right.shape[1])
 
     def part(self, rows: NDArray[np.int64]) -> 'BlockSums':

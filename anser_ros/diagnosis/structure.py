@@ -11,13 +11,17 @@ from anser_ros.diagnosis.problem import Part, State
 Array = NDArray[np.float64]
 
 BINS = 12
+"""Cells into which frames are binned by one variable, so that each has tens of frames."""
 SIGNIFICANT = 1e-5
+"""Probability in noise below which a dependence is one: eight variables are tested, on residuals
+whose noise is only estimated."""
 FEWEST = 4
+"""Values that a cell needs for its mean to be compared."""
 
 
 @dataclass(frozen=True)
 class StructureTest:
-    """One variable's test.
+    """The test of one variable.
 
     Attributes
     ----------
@@ -104,7 +108,8 @@ def _position(part: Part) -> list[NDArray[np.int64]]:
 
 
 def _orientation(part: Part) -> list[NDArray[np.int64]]:
-    # The turn about the mean orientation, by its components.
+    # The turn from the orientation of the middle frame, by its components: any orientation that
+    # the tool is near to serves, as the cells are quantiles.
     reference = part.view.rotation[part.view.rotation.shape[0] // 2]
     turn = reference.T @ part.view.rotation
     parts = np.stack(

@@ -14,6 +14,7 @@ from anser_ros.diagnosis.problem import Part, State
 Array = NDArray[np.float64]
 
 LAGS = 12
+"""Frames back to which a memory is looked for."""
 REMEMBERED = 0.06
 """Correlation with a frame before from which residuals have a memory."""
 SHARED = 1.6

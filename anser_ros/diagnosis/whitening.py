@@ -18,7 +18,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Spread:
-    """Expected standard deviations.
+    """Standard deviations that are expected when all is well.
 
     Attributes
     ----------

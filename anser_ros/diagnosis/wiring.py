@@ -1,4 +1,4 @@
-"""Wiring faults, which are no small change of anything: whose prediction is a reading like?"""
+"""Wiring faults: no small change of anything, they show in whose prediction a reading is like."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -30,7 +30,7 @@ def _pairs(count: int) -> list[tuple[int, int]]:
 
 
 class ChannelCrosstalk(Effect[Term]):
-    """theta: off-diagonal entries, row by row: measured = M true with ones on the diagonal."""
+    """Theta is the off-diagonal entries of M, row by row; readings are M times the true ones."""
 
     name = 'channel_crosstalk'
     summary = 'channels leak into each other'
@@ -47,7 +47,7 @@ class ChannelCrosstalk(Effect[Term]):
         return [Term(self, {'channels': g}, np.zeros(len(g) * (len(g) - 1))) for g in groups]
 
     def prior(self, term: Term) -> Array:
-        """Some percent."""
+        """Leaks are some percent."""
         return np.full(term.theta.size, 0.1)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
@@ -84,7 +84,7 @@ class ChannelCrosstalk(Effect[Term]):
         return matrix
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The whole matrix."""
+        """The record has the whole matrix, ones on its diagonal."""
         size = len(term.site['channels'])
         sigma = np.zeros((size, size))
         for value, place in zip(sigmas(covariance), _pairs(size), strict=True):
@@ -102,7 +102,7 @@ class ChannelCrosstalk(Effect[Term]):
         return super().possible(replace(record, parameters={'matrix': leaks}))
 
     def term(self, record: EffectRecord) -> Term:
-        """From the matrix."""
+        """The leaks from a record's matrix."""
         channels = tuple(int(c) for c in needed(record, 'channels'))
         matrix = np.asarray(needed(record, 'matrix'), dtype=np.float64)
         if matrix.shape != (len(channels), len(channels)):

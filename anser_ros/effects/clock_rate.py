@@ -16,7 +16,7 @@ from anser_ros.physics.pose_track import PoseTrack
 
 
 class ClockRate(Effect[Term]):
-    """theta: offset at time 0 (s) and rate (s a second): optical t' counts as t' + a + b t'."""
+    """Theta is an offset a (s) and a rate b (s a second): optical t' counts as t' + a + b t'."""
 
     name = 'clock_rate'
     summary = "one of the two clocks runs slow, so that the stamps' offset grows"
@@ -47,7 +47,7 @@ class ClockRate(Effect[Term]):
         return replace(track, time=track.time * (1 + term.theta[1]) + term.theta[0])
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Offset and rate."""
+        """The record has the offset and the rate."""
         sigma = sigmas(covariance)
         return EffectRecord(
             self.name,

@@ -22,7 +22,7 @@ from anser_ros.field.model import EffectRecord
 
 
 class CoilCrosstalk(Effect[Term]):
-    """theta: one-way leak, real and imaginary share; mutual leak, one real share both ways.
+    """Theta is the real and imaginary share of a one-way leak, or one real share both ways.
 
     The tone of the second coil is read with a share of the first one's field.
     """
@@ -48,7 +48,7 @@ class CoilCrosstalk(Effect[Term]):
         return one_way + both
 
     def prior(self, term: Term) -> Array:
-        """Some percent."""
+        """Leaks are some percent."""
         return np.full(term.theta.size, 0.1)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:

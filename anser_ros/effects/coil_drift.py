@@ -31,7 +31,7 @@ def _shape(time: Array, tau: float) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class CoilDriftTerm(Term):
-    """An emitter's drift.
+    """The drift of one emitter.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class CoilDriftTerm(Term):
 
 
 class CoilDrift(Effect[CoilDriftTerm]):
-    """theta: amount (final relative change) and log(tau / s): 1 + amount (1 - exp(-t/tau))."""
+    """The factor is 1 + a (1 - exp(-t/tau)); theta is a and log(tau / s)."""
 
     name = 'coil_drift'
     summary = "an emitter's strength changes with time"
@@ -56,7 +56,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
     drifts = True
 
     def candidates(self, apparatus: Apparatus) -> Sequence[CoilDriftTerm]:
-        """Every emitter."""
+        """A candidate for every emitter."""
         start = np.array([0.0, np.log(0.5 * max(apparatus.duration, 1.0))])
         return [
             CoilDriftTerm(self, {'coil': k}, start, duration=max(apparatus.duration, 1.0))
@@ -64,7 +64,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
         ]
 
     def amounts(self, term: CoilDriftTerm) -> NDArray[np.int64]:
-        """The amount."""
+        """The amount alone: a drift of nothing has any time constant."""
         return np.array([0])
 
     def prior(self, term: CoilDriftTerm) -> Array:
@@ -116,7 +116,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
         return term.with_theta(np.array([amount, np.clip(log_tau, np.log(0.3), np.log(1500.0))]))
 
     def emitter_matrix(self, term: CoilDriftTerm, time: Array, omega: Array) -> ComplexArray:
-        """Diagonal, by time."""
+        """The emitter's factor at each time, on the diagonal."""
         amount, log_tau = term.theta
         matrix = np.repeat(unit_matrix(omega.size)[None], time.size, axis=0)
         coil = term.site['coil']

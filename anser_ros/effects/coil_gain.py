@@ -13,7 +13,7 @@ from anser_ros.field.model import EffectRecord
 
 
 class CoilGain(Effect[Term]):
-    """theta: real and imaginary part of (gain - 1)."""
+    """Theta is the real and imaginary part of (gain - 1)."""
 
     name = 'coil_gain'
     summary = "an emitter's strength is not the calibrated one"
@@ -25,11 +25,11 @@ class CoilGain(Effect[Term]):
     remedy = Remedy.FLUX
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Every emitter."""
+        """A candidate for every emitter."""
         return [Term(self, {'coil': k}, np.zeros(2)) for k in range(apparatus.emitters)]
 
     def prior(self, term: Term) -> Array:
-        """Some ten percent."""
+        """A strength is off by some ten percent."""
         return np.full(2, 0.3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
@@ -40,13 +40,13 @@ class CoilGain(Effect[Term]):
         return out
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
-        """Diagonal."""
+        """The emitter's gain on the diagonal."""
         matrix = unit_matrix(omega.size)
         matrix[term.site['coil'], term.site['coil']] = 1 + complex(*term.theta)
         return matrix[None]
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Gain and phase."""
+        """The record has the gain's size and phase."""
         gain = 1 + complex(*term.theta)
         turn = np.array([gain.real, gain.imag]) / abs(gain)
         across = np.array([-turn[1], turn[0]]) / abs(gain)

@@ -19,7 +19,7 @@ gradients that the model only guesses; larger leaves the shift to the tools alon
 
 
 class CoilMoved(Effect[Term]):
-    """theta: shift of one emitter, m, frame fg."""
+    """Theta is the shift of one emitter, m, frame fg."""
 
     name = 'coil_moved'
     summary = 'an emitter is not where the model has it'
@@ -29,11 +29,11 @@ class CoilMoved(Effect[Term]):
     gradient_error = GRADIENT_ERROR
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Every emitter."""
+        """A candidate for every emitter."""
         return [Term(self, {'coil': k}, np.zeros(3)) for k in range(apparatus.emitters)]
 
     def prior(self, term: Term) -> Array:
-        """Some millimetres."""
+        """Shifts are some millimetres."""
         return np.full(3, 3e-3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
@@ -64,7 +64,7 @@ class CoilMoved(Effect[Term]):
         )
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The shift."""
+        """The record has the shift."""
         return EffectRecord(
             self.name,
             {'coil': term.site['coil'], 'shift_m': term.theta.tolist()},
@@ -72,7 +72,7 @@ class CoilMoved(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """From the shift."""
+        """The term of a record's shift."""
         shift = np.asarray(needed(record, 'shift_m'), dtype=np.float64)
         return Term(self, {'coil': int(needed(record, 'coil'))}, shift)
 

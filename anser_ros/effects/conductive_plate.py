@@ -25,7 +25,11 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.metal.sheet import sheet_shapes, sheet_sizes, sheet_sources
 
 MESH = 12
+"""Loops along an edge of the sheet's mesh: a loop is then as wide as a twelfth of the edge, less
+than the distance to the sensors for any sheet that is found."""
 STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])
+"""Steps of the central differences, in theta's units: small beside the distances and beside a
+change of the resistance that shows."""
 TYPICAL_OHM = 3e-5
 """A millimetre of aluminium."""
 
@@ -35,7 +39,7 @@ height and each rim as shares of its edge, and its resistance."""
 
 
 class ConductivePlate(Effect[Term]):
-    """theta: height z, edge, centre x and y (m), log of the sheet resistance (ohm)."""
+    """Theta is height z, edge, centre x and y (m), and the log of the sheet resistance (ohm)."""
 
     name = 'conductive_plate'
     summary = 'a metal sheet lies parallel to the board'
@@ -71,7 +75,7 @@ class ConductivePlate(Effect[Term]):
         ]
 
     def amounts(self, term: Term) -> NDArray[np.int64]:
-        """Its size."""
+        """The edge: a sheet without size is none."""
         return np.array([1])
 
     def prior(self, term: Term) -> Array:
@@ -110,7 +114,7 @@ class ConductivePlate(Effect[Term]):
         return view.along(added.flux(*view.flat))
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """By differences."""
+        """Derivatives by central differences with `STEPS`."""
         if term.held:
             return view.columns(5)
         parts = [

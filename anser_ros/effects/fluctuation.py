@@ -186,7 +186,7 @@ class LooseSensorPosition(Fluctuation):
     of = SensorPosition()
 
     def candidates(self, apparatus: Apparatus) -> Sequence[FluctuationTerm]:
-        """Every cluster."""
+        """A candidate for every cluster."""
         return [term for term in super().candidates(apparatus) if len(term.site['channels']) > 1]
 
 

@@ -14,7 +14,7 @@ from anser_ros.physics.sensor import SensorTable
 
 
 class LeverArm(Effect[Term]):
-    """theta: offset of all of a body's sensors in the body's frame, m."""
+    """Theta is the offset of all of a body's sensors in the body's frame, m."""
 
     name = 'lever_arm'
     summary = "the sensors sit elsewhere in the body's frame"
@@ -23,7 +23,7 @@ class LeverArm(Effect[Term]):
     remedy = Remedy.SENSORS
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Every body."""
+        """A candidate for every body."""
         return [
             Term(self, {'body': table.body[0]}, np.zeros(3))
             for table in apparatus.tools
@@ -31,7 +31,7 @@ class LeverArm(Effect[Term]):
         ]
 
     def prior(self, term: Term) -> Array:
-        """Some millimetres."""
+        """Offsets are some millimetres."""
         return np.full(3, 5e-3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
@@ -48,7 +48,7 @@ class LeverArm(Effect[Term]):
         )
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The offset."""
+        """The record has the offset and the body."""
         return EffectRecord(
             self.name,
             {'offset_m': term.theta.tolist(), 'body': term.site['body']},
@@ -56,7 +56,7 @@ class LeverArm(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """From the offset."""
+        """The term of a record's offset."""
         offset = np.asarray(needed(record, 'offset_m'), dtype=np.float64)
         return Term(self, {'body': str(needed(record, 'body'))}, offset)
 

@@ -10,7 +10,10 @@ from scipy.interpolate import CubicSpline
 Array = NDArray[np.float64]
 
 SHORTEST = 0.2
+"""Shortest time (s) that a straight way may take: a hand is no faster, and a jump has no
+derivative."""
 FINE_STEP_S = 0.05
+"""Step (s) in which the length of a way is summed up, a quarter of the shortest way."""
 NODES, NODES_PER_KNOT = 41, 6
 """Nodes on a path, in which fields are found; between them they are interpolated."""
 NEGLIGIBLE_WAY = 0.02
@@ -22,7 +25,7 @@ class MetalPath(Protocol):
 
     @property
     def count(self) -> int:
-        """Number of parameters."""
+        """The number of the path's parameters."""
 
     @property
     def knots(self) -> tuple[float, ...]:
@@ -88,7 +91,7 @@ class StraightPath:
         return share, theta[:3] + share[:, None] * way, made
 
     def prior(self) -> Array:
-        """Anywhere, any time."""
+        """Places within decimetres, times within tens of seconds, any ease."""
         return np.concatenate([np.full(6, 0.1), np.full(2, 10.0), [0.5]])
 
     def bounded(self, theta: Array) -> Array:
@@ -113,7 +116,7 @@ class FreePath:
 
     @property
     def count(self) -> int:
-        """Three a knot."""
+        """Three parameters for each knot."""
         return 3 * len(self.knots)
 
     def _weights(self, time: Array) -> Array:
@@ -139,11 +142,11 @@ class FreePath:
         return times, self.centre(theta, times), np.clip(time, times[0], times[-1])
 
     def prior(self) -> Array:
-        """Anywhere."""
+        """Places within decimetres of the start value."""
         return np.full(self.count, 0.1)
 
     def bounded(self, theta: Array) -> Array:
-        """All is allowed."""
+        """A free path has no bounds."""
         return theta
 
     @staticmethod

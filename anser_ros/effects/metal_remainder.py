@@ -22,6 +22,7 @@ GAIN, ASIDE_M, UP_M = 3e-3, 0.2e-3, 0.4e-3
 """How well an emitter's field is known where metal is and nothing was measured: as if the emitter
 were so much stronger, or so far away. The far side of the board tells least about its height."""
 STEP_M = 0.5e-3
+"""Shift (m) of an emitter in the differences that tell what its place does to metal."""
 
 
 class Leftover(Protocol):
@@ -73,7 +74,7 @@ class Couplings:
         return np.concatenate([unit, 1j * unit], axis=-1)
 
     def sources(self, theta: Array, illumination: Dipoles, omega: Array) -> Dipoles:
-        """The modes' sum."""
+        """The dipoles of all modes together."""
         parts = theta.reshape(2, -1)
         couplings = self.modes @ (parts[0] + 1j * parts[1])
         return self.shapes.sources(self.centre, couplings, illumination, omega)
@@ -126,7 +127,7 @@ class Lighting:
         return out
 
     def sources(self, theta: Array, illumination: Dipoles, omega: Array) -> Dipoles:
-        """All ways together."""
+        """The dipoles of all errors of the light together."""
         shares = theta.reshape(4, self.emitters)
         out = Dipoles.none(self.emitters)
         for share, answer in zip(shares, self._answers(illumination, omega), strict=True):
@@ -175,7 +176,7 @@ class MetalRemainder(Effect[RemainderTerm]):
     def sources(
         self, term: RemainderTerm, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
-        """The leftover's dipoles."""
+        """The dipoles of the leftover, none while all is zero."""
         if not np.any(term.theta):
             return None
         return term.leftover.sources(term.theta, illumination, omega)

@@ -16,7 +16,7 @@ from anser_ros.physics.pose_track import PoseTrack
 
 
 class OpticalScale(Effect[Term]):
-    """theta: scale - 1, and the point of fg that stays where it is (m) times it.
+    """Theta is the scale less one, and times it the point of fg that stays where it is (m).
 
     Optical positions are ``p (1 + e) - c``; a scale comes about the tracker's own origin, which is
     anywhere, so the shift ``c`` is free.
@@ -40,7 +40,7 @@ class OpticalScale(Effect[Term]):
         return np.array([0.01, 5e-3, 5e-3, 5e-3])
 
     def amounts(self, term: Term) -> NDArray[np.int64]:
-        """The scale."""
+        """The scale alone: a shift is a registration's."""
         return np.array([0])
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
@@ -58,7 +58,7 @@ class OpticalScale(Effect[Term]):
         return replace(track, position=(track.position + term.theta[1:]) / (1 + term.theta[0]))
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Scale and shift."""
+        """The record has the scale and the shift."""
         sigma = sigmas(covariance)
         return EffectRecord(
             self.name,
@@ -74,7 +74,7 @@ class OpticalScale(Effect[Term]):
 
 @dataclass(frozen=True, kw_only=True)
 class RegistrationDriftTerm(Term):
-    """A tracker's drift.
+    """The drift of the optical tracker.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class RegistrationDriftTerm(Term):
 
 
 class RegistrationDrift(Effect[RegistrationDriftTerm]):
-    """theta: translation (m) at the session's start, and what it grows by (m) to its end."""
+    """Theta is the translation (m) at the session's start, and its growth (m) to the end."""
 
     name = 'registration_drift'
     summary = 'the optical tracker moves steadily'
@@ -108,11 +108,11 @@ class RegistrationDrift(Effect[RegistrationDriftTerm]):
         return [term] if apparatus.tools else []
 
     def prior(self, term: RegistrationDriftTerm) -> Array:
-        """Some millimetres."""
+        """Shifts are some millimetres."""
         return np.full(6, 5e-3)
 
     def amounts(self, term: RegistrationDriftTerm) -> NDArray[np.int64]:
-        """The growth."""
+        """The growth alone: a constant shift is a registration's."""
         return np.arange(3, 6)
 
     def columns(self, term: RegistrationDriftTerm, view: View) -> ComplexArray | None:
@@ -125,12 +125,12 @@ class RegistrationDrift(Effect[RegistrationDriftTerm]):
         return out
 
     def optical(self, term: RegistrationDriftTerm, track: PoseTrack) -> PoseTrack:
-        """Positions in fg."""
+        """The track as it is in fg."""
         share = (track.time / term.duration)[:, None]
         return replace(track, position=track.position - term.theta[:3] - share * term.theta[3:])
 
     def record(self, term: RegistrationDriftTerm, covariance: Array) -> EffectRecord:
-        """Translation and velocity."""
+        """The record has the first translation and the velocity."""
         sigma, duration = sigmas(covariance), term.duration
         return EffectRecord(
             self.name,

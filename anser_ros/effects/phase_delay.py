@@ -16,7 +16,7 @@ UNIT = 1e-6
 
 
 class PhaseDelay(Effect[Term]):
-    """theta: delay, us: a phasor at w becomes exp(-j w delay) times itself."""
+    """Theta is the delay d, us: a phasor at w becomes exp(-j w d) times itself."""
 
     name = 'phase_delay'
     summary = 'a common acquisition delay turns all phasors'
@@ -29,7 +29,7 @@ class PhaseDelay(Effect[Term]):
         return [Term(self, {}, np.zeros(1))]
 
     def prior(self, term: Term) -> Array:
-        """Some microseconds."""
+        """Delays are some microseconds."""
         return np.full(1, 5.0)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
@@ -37,11 +37,11 @@ class PhaseDelay(Effect[Term]):
         return np.asarray((-1j * UNIT * view.omega * view.linear)[..., None])
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
-        """Diagonal."""
+        """The turn of each emitter's phasors on the diagonal."""
         return np.diag(np.exp(-1j * omega * term.theta[0] * UNIT))[None]
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The delay."""
+        """The record has the delay."""
         return EffectRecord(
             self.name,
             {'delay_s': UNIT * float(term.theta[0])},
@@ -49,7 +49,7 @@ class PhaseDelay(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """From the delay."""
+        """The term of a record's delay."""
         return Term(self, {}, np.array([float(needed(record, 'delay_s')) / UNIT]))
 
 

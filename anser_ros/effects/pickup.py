@@ -17,7 +17,7 @@ UNIT = 1e-9
 
 
 class Pickup(Effect[Term]):
-    """theta: real, then imaginary parts of one channel's phasors, nT."""
+    """Theta is the real, then the imaginary parts of one channel's phasors, nT."""
 
     name = 'pickup'
     summary = 'a constant phasor is added to a channel'
@@ -76,7 +76,7 @@ class Pickup(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """From the phasors."""
+        """The term of a record's phasors."""
         parts = np.asarray(needed(record, 'phasor_t'), dtype=np.float64)
         return Term(self, {'channel': int(needed(record, 'channel'))}, parts.T.ravel() / UNIT)
 
@@ -88,7 +88,7 @@ class ReferenceChanged(Pickup):
     summary = "a reference sensor's reading changed for good: it was moved, turned or picks up"
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Every reference channel."""
+        """A candidate for every reference."""
         return [
             self._at(c, apparatus) for c in apparatus.channels if c not in apparatus.tool_channels
         ]

@@ -16,8 +16,9 @@ from anser_ros.physics.pose_track import PoseTrack
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-LONGEST_GAP_S = 0.25
 VELOCITY_STEP_S = 0.02
+"""Half the time (s) over which the body's velocity is taken: much shorter would multiply the
+optical jitter, much longer would smooth away how a hand accelerates."""
 
 
 @dataclass(frozen=True)

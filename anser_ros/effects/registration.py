@@ -15,7 +15,7 @@ from anser_ros.physics.pose_track import PoseTrack
 
 
 class Registration(Effect[Term]):
-    """theta: rotation vector (rad) and translation (m): optical = R(theta) fg + t."""
+    """Theta is a rotation vector r (rad) and a translation t (m): optical = R(r) fg + t."""
 
     name = 'registration'
     summary = "the optical frame is not the field generator's"
@@ -48,7 +48,7 @@ class Registration(Effect[Term]):
         return out
 
     def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
-        """Poses in fg."""
+        """The track as it is in fg."""
         back = Rotation.from_rotvec(term.theta[:3]).inv()
         return PoseTrack(
             track.time,

@@ -56,7 +56,7 @@ def compressed(flux: ComplexArray, per_full_scale_squared: float, shape: str) ->
 
 @dataclass(frozen=True, kw_only=True)
 class SaturationTerm(Term):
-    """One channel's saturation.
+    """The saturation of one channel.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class SaturationTerm(Term):
 
 
 class Saturation(Effect[SaturationTerm]):
-    """theta: 1 / full_scale^2 in 1/uT^2."""
+    """Theta is one over the squared full scale, in 1/uT^2."""
 
     name = 'saturation'
     summary = 'a channel compresses large signals'
@@ -110,7 +110,7 @@ class Saturation(Effect[SaturationTerm]):
         return np.full(1, 3.0)
 
     def columns(self, term: SaturationTerm, view: View) -> ComplexArray | None:
-        """The third-order loss."""
+        """The third-order loss, or differences along the whole curve."""
         row = view.row(term.site['channel'])
         if row is None:
             return None
@@ -137,7 +137,7 @@ class Saturation(Effect[SaturationTerm]):
         return out
 
     def record(self, term: SaturationTerm, covariance: Array) -> EffectRecord:
-        """Full scale."""
+        """The record has the full scale and the curve."""
         value = max(float(term.theta[0]), 1e-9)
         full_scale = 1 / np.sqrt(UNIT * value)
         relative = 0.5 * float(np.sqrt(covariance[0, 0])) / value

@@ -38,7 +38,7 @@ class SensorAxisTerm(Term):
 
 
 class SensorAxis(Effect[SensorAxisTerm]):
-    """theta: one channel, two tangent steps (rad); a cluster, a rotation vector (rad, body)."""
+    """Theta is two tangent steps (rad) of a sensor, or a cluster's rotation vector (rad, body)."""
 
     name = 'sensor_axis'
     summary = "a sensor's axis is not the surveyed one"
@@ -68,7 +68,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
         return terms
 
     def prior(self, term: SensorAxisTerm) -> Array:
-        """Some degrees."""
+        """Tilts are some degrees."""
         return np.full(term.theta.size, 0.1)
 
     def columns(self, term: SensorAxisTerm, view: View) -> ComplexArray | None:

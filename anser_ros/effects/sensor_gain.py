@@ -14,7 +14,7 @@ from anser_ros.field.model import EffectRecord
 
 
 class SensorGain(Effect[Term]):
-    """theta: real and imaginary part of (gain - 1)."""
+    """Theta is the real and imaginary part of (gain - 1)."""
 
     name = 'sensor_gain'
     summary = "one sensor's gain is off"
@@ -45,14 +45,14 @@ class SensorGain(Effect[Term]):
         return out
 
     def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
-        """Diagonal."""
+        """The channel's gain on the diagonal."""
         matrix = unit_matrix(channels.size)
         for row in np.flatnonzero(channels == term.site['channel']):
             matrix[row, row] = 1 + term.theta[0] + 1j * term.theta[1]
         return matrix
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Gain and phase."""
+        """The record has the gain's size and phase."""
         gain = complex(1 + term.theta[0], term.theta[1])
         turn = np.array([gain.real, gain.imag]) / abs(gain)
         sigma_gain = float(np.sqrt(turn @ covariance @ turn))

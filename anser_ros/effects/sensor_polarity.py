@@ -21,16 +21,16 @@ class SensorPolarity(Effect[Term]):
     family = Family.SEEN
 
     def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
-        """Diagonal of signs."""
+        """The channels' signs on the diagonal."""
         signs = np.where(np.isin(channels, term.site['channels']), -1.0, 1.0)
         return np.diag(signs).astype(complex)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The channels."""
+        """The record has the channels."""
         return EffectRecord(self.name, {'channels': list(term.site['channels'])})
 
     def term(self, record: EffectRecord) -> Term:
-        """From the channels."""
+        """The term of a record's channels."""
         channels = tuple(int(c) for c in needed(record, 'channels'))
         return Term(self, {'channels': channels})
 

@@ -14,7 +14,7 @@ from anser_ros.physics.sensor import SensorTable
 
 
 class SensorPosition(Effect[Term]):
-    """theta: offset of some of a body's sensors in the body's frame, m."""
+    """Theta is the offset of some of a body's sensors in the body's frame, m."""
 
     name = 'sensor_position'
     summary = 'one sensor of a body sits elsewhere than surveyed'
@@ -33,7 +33,7 @@ class SensorPosition(Effect[Term]):
         return [Term(self, {'channels': group}, np.zeros(3)) for group in groups]
 
     def prior(self, term: Term) -> Array:
-        """Some millimetres."""
+        """Offsets are some millimetres."""
         return np.full(3, 5e-3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
@@ -46,14 +46,14 @@ class SensorPosition(Effect[Term]):
         return out
 
     def table(self, term: Term, sensors: SensorTable) -> SensorTable:
-        """Those sensors moved."""
+        """The table with those sensors moved."""
         rows = np.isin(sensors.channel, term.site['channels'])
         return sensors.with_geometry(
             position=sensors.position + rows[:, None] * term.theta[None, :]
         )
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The offset."""
+        """The record has the channels and the offset."""
         return EffectRecord(
             self.name,
             {'channels': list(term.site['channels']), 'offset_m': term.theta.tolist()},
@@ -61,7 +61,7 @@ class SensorPosition(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """From the offset."""
+        """The term of a record's offset."""
         offset = np.asarray(needed(record, 'offset_m'), dtype=np.float64)
         return Term(self, {'channels': tuple(needed(record, 'channels'))}, offset)
 

@@ -31,7 +31,7 @@ class SensorSizeTerm(Term):
 
 
 class SensorSize(Effect[SensorSizeTerm]):
-    """theta: length squared over (10 mm)^2, of all coils of a body.
+    """Theta is what the squared length of a body's coils grows by, in (10 mm)^2.
 
     The mean field over a coil of length L differs from its centre's by L^2/24 times the second
     derivative along the coil, so the effect is linear in L^2.
@@ -80,7 +80,7 @@ class SensorSize(Effect[SensorSizeTerm]):
         return term.with_theta(np.maximum(term.theta, smallest))
 
     def table(self, term: SensorSizeTerm, sensors: SensorTable) -> SensorTable:
-        """Longer sensors."""
+        """The table with longer coils."""
         length = sensors.length.copy()
         for row, channel in enumerate(sensors.channel.tolist()):
             if channel in term.surveyed:
@@ -104,7 +104,7 @@ class SensorSize(Effect[SensorSizeTerm]):
         )
 
     def term(self, record: EffectRecord) -> SensorSizeTerm:
-        """From the length."""
+        """The term of a record's length."""
         channels = tuple(int(c) for c in needed(record, 'channels'))
         surveyed = record.parameters.get('surveyed_length_m') or [0.0] * len(channels)
         base = float(np.mean(np.square(surveyed)))

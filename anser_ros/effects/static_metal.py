@@ -36,6 +36,8 @@ from anser_ros.metal.scattering import UNIT
 from anser_ros.physics.constants import MU_0
 
 STEP = 1e-3
+"""Step (m) of the central differences that give the derivative by the place, small beside a
+decimetre."""
 CLOSEST = 0.02
 """Metal that is searched keeps this distance (m) from where sensors were: a point-like answer is
 no model of a body that is nearer than its own size."""
@@ -76,7 +78,7 @@ def places(apparatus: Apparatus) -> Array:
 
 
 class StaticMetal(Effect[Term]):
-    """theta: centre (m, 3), then real and imaginary parts of a simple body's modes.
+    """Theta is the centre (m), then real and imaginary parts of a simple body's modes.
 
     What the body is besides belongs to its remainder (`anser_ros.effects.metal_remainder`).
     """
@@ -105,7 +107,7 @@ class StaticMetal(Effect[Term]):
         ]
 
     def amounts(self, term: Term) -> NDArray[np.int64]:
-        """The polarisabilities."""
+        """The amplitudes of the modes."""
         return np.arange(3, term.theta.size)
 
     def prior(self, term: Term) -> Array:
@@ -140,14 +142,14 @@ class StaticMetal(Effect[Term]):
         return out
 
     def probe(self, term: Term, view: View) -> ComplexArray | None:
-        """One isotropic scatterer."""
+        """The two columns of an isotropic scatterer."""
         points = term.theta[:3]
         field = view.illumination.field(points[None])[0] * (UNIT / MU_0)
         unit = view.along(Dipoles.vectors(points[None], field[None]).flux(*view.flat))
         return np.stack([unit, 1j * unit], axis=-1)
 
     def started(self, term: Term, solution: Array) -> Sequence[Term]:
-        """The scatterer alone."""
+        """The scatterer at its place."""
         alpha = np.zeros((2, ball_modes().shape[1]))
         alpha[:, 0] = solution
         return (term.with_theta(np.concatenate([term.theta[:3], alpha.ravel()])),)
@@ -166,7 +168,7 @@ class StaticMetal(Effect[Term]):
     def sources(
         self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
-        """Induced dipoles."""
+        """The dipoles that the emitters induce."""
         if not np.any(term.theta[3:]):
             return None
         return multipoles().sources(term.theta[:3], self._couplings(term), illumination, omega)

@@ -26,7 +26,7 @@ def flux_rate(view: View) -> ComplexArray:
 
 
 class TimeOffset(Effect[Term]):
-    """theta: at flux stamp t the optical pose stamped t - theta applies, s."""
+    """At flux stamp t the optical pose stamped t - theta applies, s."""
 
     name = 'time_offset'
     summary = 'the optical stamps are early or late'
@@ -51,7 +51,7 @@ class TimeOffset(Effect[Term]):
         return replace(track, time=track.time + term.theta[0])
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The offset."""
+        """The record has the offset."""
         return EffectRecord(
             self.name,
             {'offset_s': float(term.theta[0])},
@@ -59,7 +59,7 @@ class TimeOffset(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """From the offset."""
+        """The term of a record's offset."""
         return Term(self, {}, np.array([float(needed(record, 'offset_s'))]))
 
 

@@ -14,7 +14,7 @@ from anser_ros.field.model import EffectRecord
 
 
 class ToolGain(Effect[Term]):
-    """theta: real and imaginary part of (gain - 1)."""
+    """Theta is the real and imaginary part of (gain - 1)."""
 
     name = 'tool_gain'
     summary = "the gain that all of a tool's sensors share is off"
@@ -48,12 +48,12 @@ class ToolGain(Effect[Term]):
         return out
 
     def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
-        """Diagonal."""
+        """The gain of the tool's channels on the diagonal."""
         own = np.isin(channels, term.site['channels'])
         return np.diag(np.where(own, 1 + complex(*term.theta), 1.0))
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Gain and phase."""
+        """The record has the gain's size and phase."""
         gain = 1 + complex(*term.theta)
         turn = np.array([gain.real, gain.imag]) / abs(gain)
         across = np.array([-turn[1], turn[0]]) / abs(gain)

@@ -23,7 +23,7 @@ from anser_ros.field.model import EffectRecord
 
 
 class SwappedChannels(Effect[Term]):
-    """``channels`` in order: each is read at the place of the one after it in ``read_as``."""
+    """Each of ``channels`` is read at the place of the one in ``read_as``."""
 
     name = 'swapped_channels'
     summary = 'sensors are plugged into each other'
@@ -47,7 +47,7 @@ class SwappedChannels(Effect[Term]):
         return EffectRecord(self.name, {k: list(term.site[k]) for k in ('channels', 'read_as')})
 
     def term(self, record: EffectRecord) -> Term:
-        """From the channels."""
+        """The term of a record's channels."""
         site = {k: tuple(int(c) for c in needed(record, k)) for k in ('channels', 'read_as')}
         return Term(self, site)
 
@@ -62,7 +62,7 @@ class SwappedCoils(Effect[Term]):
     family = Family.SEEN
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
-        """A permutation."""
+        """The emitters' permutation as a matrix."""
         matrix = unit_matrix(omega.size)
         for shown, true in zip(term.site['read_as'], term.site['coils'], strict=True):
             matrix[shown] = 0.0
@@ -74,7 +74,7 @@ class SwappedCoils(Effect[Term]):
         return EffectRecord(self.name, {k: list(term.site[k]) for k in ('coils', 'read_as')})
 
     def term(self, record: EffectRecord) -> Term:
-        """From the emitters."""
+        """The term of a record's emitters."""
         return Term(
             self, {k: tuple(int(c) for c in needed(record, k)) for k in ('coils', 'read_as')}
         )
@@ -94,11 +94,11 @@ class DeadChannel(Effect[Term]):
         return term.channels
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The channels."""
+        """The record has the channels."""
         return EffectRecord(self.name, {'channels': list(term.site['channels'])})
 
     def term(self, record: EffectRecord) -> Term:
-        """From the channels."""
+        """The term of a record's channels."""
         return Term(self, {'channels': tuple(int(c) for c in needed(record, 'channels'))})
 
 

@@ -144,6 +144,8 @@ def lattice(spacing: float) -> Shapes:
 
 
 COMPACT = 'compact'
+# Distances (m) of an extended body's pieces, by its kind: six by six by two of them make bodies
+# of 0.1 to 0.3 m, as large as their distance from the sensors.
 SPACINGS = {'extended 20 mm': 0.02, 'extended 35 mm': 0.035, 'extended 55 mm': 0.055}
 BODIES: Mapping[str, Callable[[], Shapes]] = {
     COMPACT: multipoles,

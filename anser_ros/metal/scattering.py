@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 NEGLIGIBLE = 1e-4
+"""Share of the emitters' field that may lie in quadrature and is left out: less than metal is
+known to."""
 UNIT = 1e-4
 """Couplings count in 1e-4 m^3; a perfectly conducting ball of 25 mm has the polarisability -1."""
 
@@ -174,7 +176,7 @@ class Shapes:
 
 
 def tilt(omega: Array) -> Array:
-    """log f of each emitter, about the mean."""
+    """Logarithm of each emitter's frequency, less the mean of all, shape (K,)."""
     logs = np.log(omega)
     return np.asarray(logs - logs.mean())
 

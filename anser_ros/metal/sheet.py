@@ -22,7 +22,11 @@ Array = NDArray[np.float64]
 FINEST = 7
 """Half waves along both edges together, at most, of the shapes that a sheet's answer may have."""
 SHAPE_POINTS = 12
+"""Points along an edge at which the field through a sheet is taken, more than three in the
+shortest of the waves."""
 WIDER = 1.06
+"""Edge of the square that carries the waves, over the sheet's: they vanish at its edges, where the
+currents of the sheet are largest."""
 SHEET_SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)
 """Sizes that are tried of what the couplings of a meshed sheet lack, as shares of a perfect
 conductor's: from what the mesh leaves to holes, rims and a second sheet."""
