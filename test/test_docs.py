@@ -1,7 +1,6 @@
 """The documentation is a site that builds without a warning, and its pages say what is so."""
 
 import doctest
-import importlib
 import re
 import subprocess
 import sys
@@ -13,6 +12,7 @@ from anser_ros.api.setup import load_setup
 from anser_ros.cli.commands import NODES, OFFLINE
 from anser_ros.effects.registry import all_effects
 from anser_ros.physics.board import KINDS
+from anser_ros.sessions.diagnosis_document import DEPENDENCIES
 from anser_ros.sessions.starting_model import board_of
 from anser_ros.tracking.estimate import STATES
 from anser_ros.wire.points import flux_fields
@@ -138,8 +138,7 @@ class TestInterfacesPage:
             assert service in page('interfaces')
 
     def test_what_the_diagnosis_depends_on(self):
-        module = importlib.import_module('anser_ros.sessions.diagnosis')
-        for name in module.DEPENDENCIES:
+        for name in DEPENDENCIES:
             assert f'`{name}`' in page('interfaces')
 
 
