@@ -1,4 +1,4 @@
-"""Writes config/anser.yaml: every parameter of every node, with its default and its meaning."""
+"""Write config/anser.yaml with every parameter of every node, its default and its meaning."""
 
 import dataclasses
 import importlib

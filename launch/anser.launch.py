@@ -1,4 +1,4 @@
-"""The full chain: control unit (or its simulator), field model, tracker, recorder, OpenIGTLink.
+"""Launch the full chain: control unit or simulator, field model, tracker, recorder and servers.
 
 ros2 launch anser_ros anser.launch.py device:=/dev/ttyACM0 setup:=my_setup.yaml
 ros2 launch anser_ros anser.launch.py simulate:=true
@@ -19,18 +19,18 @@ ARGUMENTS = {
     'setup': ('demo_setup.yaml', 'setup document: a path, or a file of the package'),
     'channels': ('demo_channels.yaml', 'channel calibration: a path, or a file of the package'),
     'model': ('nominal', 'model file of calibrate, or nominal'),
-    'board_seed': ('0', "the simulated unit's board: 0 fits nominal, 1 demo_model.yaml"),
-    'simulate': ('false', 'whether a simulated control unit takes the place of the real one'),
+    'board_seed': ('0', "the simulated unit's board: 0 as drawn, 1 that of demo_model.yaml"),
+    'simulate': ('false', 'whether a simulated control unit replaces the real one'),
     'record': ('true', 'whether a bag is recorded'),
     'directory': ('recordings', 'folder of the bags'),
-    'watch': ('false', 'whether what the model lacks is told live in /diagnostics'),
+    'watch': ('false', 'whether effects that the model lacks are reported in /diagnostics'),
     'openigtlink': ('false', 'whether poses are served to 3D Slicer'),
     'rviz': ('false', 'whether RViz is started'),
 }
 
 
 def node(name, condition=None, **parameters):
-    """Return one node with the common parameter file and its own values over it."""
+    """Return one node with the common parameter file, and values that override it."""
     common = PathJoinSubstitution(
         [FindPackageShare(PACKAGE), 'config', LaunchConfiguration('params')]
     )
@@ -47,7 +47,7 @@ def node(name, condition=None, **parameters):
 
 
 def generate_launch_description():
-    """Return the chain with its arguments."""
+    """Return the nodes of the chain with the launch arguments."""
     value = LaunchConfiguration
     board = {'setup_file': value('setup'), 'channels_file': value('channels')}
     rviz_config = PathJoinSubstitution([FindPackageShare(PACKAGE), 'config', 'anser.rviz'])

@@ -1,7 +1,7 @@
-"""The demo on an installation with `launch`: simulated control unit, two trackers, live table.
+"""Launch the demo: a simulated control unit, two trackers and a live table.
 
-One tracker follows a field model that is refitted live, the other one keeps the model as
-calibrated. Without `launch`, `anser demo` starts the same processes.
+One tracker follows a field model that is refitted live, the other keeps the model as calibrated.
+Without the package `launch`, `anser demo` starts the same processes.
 
 ros2 launch anser_ros demo.launch.py duration:=30
 """
@@ -16,7 +16,7 @@ from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = 'anser_ros'
 PORT = '/tmp/anser_cu'
-# The board that config/demo_model.yaml is calibrated on.
+# Seed of the board that config/demo_model.yaml was calibrated with.
 BOARD_SEED = 1
 SHARED_TOPICS = ('setup', 'tool/flux', 'reference/flux')
 ARGUMENTS = {
@@ -41,7 +41,7 @@ def node(name, remappings=(), output='log', **parameters):
 
 
 def generate_launch_description():
-    """Return the nodes, and the rule that the monitor's end is everybody's end."""
+    """Return the nodes, all of which end when the monitor does."""
     value = LaunchConfiguration
     model = PathJoinSubstitution([FindPackageShare(PACKAGE), 'config', 'demo_model.yaml'])
     monitor = node(

@@ -15,16 +15,17 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 # The rooms that are held to it.
 ROOMS = (
-    'physics',
-    'field',
     'calibration',
+    'cli',
+    'diagnosis',
+    'effects',
+    'experiments',
+    'field',
+    'measured',
+    'metal',
+    'physics',
     'signals',
     'simulation',
-    'experiments',
-    'cli',
-    'effects',
-    'diagnosis',
-    'metal',
 )
 FEWEST_WORDS = 4
 """A sentence of fewer words than these is a fragment."""

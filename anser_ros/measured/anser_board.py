@@ -1,4 +1,4 @@
-"""A square board before a real Anser tracker: what bends it?
+"""The errors of a real Anser tracker over a square board, and their candidate causes.
 
 Positions only, no fluxes (github kilianod5150/Matlab-Anser, BSD-3; read where they lie). So each
 candidate cause is turned into the displacements that it would make, and fitted to the reported
@@ -31,8 +31,11 @@ Array = NDArray[np.float64]
 NAME = 'anser_board'
 
 PITCH_M = 31.75e-3
+"""Distance of neighbouring places in a row of the board, m (1.25 inches)."""
 N_BLOCKS = 7
+"""Blocks of places that are held out in turn: the middle and six sectors around it."""
 N_POINTS = 41
+"""Places of the board, 5 x 5 and 4 x 4 between them."""
 FIELD_ERRORS = ('coil_gain', 'pickup', 'coil_moved', 'coil_tilted')
 CLEAR = 3.0
 """Standard errors over the blocks: seven blocks and two dozen candidates ask for more than two."""
@@ -82,7 +85,7 @@ class RunAnalysis:
 
 @dataclass(frozen=True)
 class BoardAnalysis:
-    """All runs together.
+    """The analyses of all runs together.
 
     Attributes
     ----------

@@ -17,8 +17,12 @@ from anser_ros.physics.board import Board
 Array = NDArray[np.float64]
 
 STEP_M = 1e-3
+"""Step of the numerical derivative of the flux by the position, m; the field hardly curves over
+it."""
 POSITION_SCALE_M, ANGLE_SCALE_RAD = 1e-3, 1e-2
+"""Scales of position (m) and tilt (rad) by which columns are divided before the pseudo-inverse."""
 PLATE_DEPTHS_M = (0.02, 0.05, 0.1)
+"""Depths below the board, m, of the metal plates whose effect is tried."""
 QUADRATURE = 0.08
 """Modulus of an unexpected quadrature flux over a coil's largest flux."""
 

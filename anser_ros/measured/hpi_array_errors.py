@@ -23,16 +23,21 @@ STEPS = {
     'gradiometer_size': 0.01,
     'gradiometer_gain': 0.01,
 }
+"""Step of each shared error by which the likelihood is searched, in the unit of the error."""
 UNITS = {'array_offset': 'm'}
 PLACES_M = (1e-4, 2e-4, 3e-4, 5e-4, 8e-4)
+"""Standard deviations of a chip's place that are tried, m, around the accuracy of the survey."""
 TILTS_RAD = (5e-3, 1e-2, 2e-2, 3e-2)
+"""Standard deviations of a chip's tilt that are tried, rad."""
 GAINS = (0.0, 0.01, 0.02, 0.03)
+"""Standard deviations of a channel's gain that are tried, relative."""
 START = ChipErrors(3e-4, 0.01, 0.01)
+"""Errors of the chips from which the search starts, in the middle of the values that are tried."""
 
 
 @dataclass(frozen=True)
 class SharedError:
-    """One candidate.
+    """One candidate for an error that all chips share.
 
     Attributes
     ----------

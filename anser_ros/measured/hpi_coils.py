@@ -44,7 +44,10 @@ Array = NDArray[np.float64]
 NAME = 'hpi_coils'
 
 TARGET_MM, TARGET_CORRELATION = 1.2, 0.9999
+"""Figures that the analysis should reach: distance (mm) from the digitised places, and
+correlation."""
 MOST_LEADS, FOLDS = 5, 6
+"""Largest number of dipoles of a lead, and folds of channels by which the number is chosen."""
 WORTH = 0.02
 """Least fall of the held-out loss (log density a channel) that a dipole of a lead must bring."""
 FREEDOM = 4.0
@@ -105,7 +108,7 @@ class HpiAnalysis:
 
 
 def load(folder: Path) -> HpiData:
-    """Read ``hpi_coils.npz``.
+    """Read the data of the file ``hpi_coils.npz``.
 
     Raises
     ------
@@ -257,7 +260,7 @@ def run(shared: Path, rng: np.random.Generator) -> list[ReportRow]:
 
 
 def rows(analysis: HpiAnalysis) -> list[ReportRow]:
-    """Before and after."""
+    """Return the figures before and after the analysis."""
     return [*_demodulation_rows(analysis), *_place_rows(analysis), *_channel_rows(analysis)]
 
 

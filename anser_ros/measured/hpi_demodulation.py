@@ -12,9 +12,11 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 DRIFT_ORDER = 2
+"""Degree of the polynomial that follows a channel's drift within an epoch."""
 LEAST_PROMINENCE = 20.0
 """A tone stands above the median of the spectrum by this factor."""
 WINDOW_BINS = 2
+"""Bins of the spectrum by which a frequency may be moved off its peak at most."""
 OFF_TONE_HZ = (4.0, 16.0)
 """Distance from the nearest tone at which a channel's noise is measured, Hz."""
 

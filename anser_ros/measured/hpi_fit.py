@@ -17,13 +17,20 @@ from anser_ros.measured.squid_array import ChipErrors, SquidArray, SquidWhitener
 Array = NDArray[np.float64]
 
 SCALE_M = 1e-2
+"""Unit of the positions in the least-squares search, m, so that its unknowns are near one."""
 ROUNDS = 5
+"""Rounds of reweighting; each further one changes the weights of the chips less."""
 REACH_M = 0.14
+"""Half size of the grid of start positions, m: the size of a head."""
 GRID_STEP_M = 0.02
+"""Distance of neighbouring start positions, m."""
 GRID_GAP_M = (0.02, 0.12)
+"""Smallest and largest distance of a start position from the nearest channel, m."""
 LEAD_MOMENT = 3e-10
 """Plausible moment of a stretch of lead, A m^2: a few hundredths of a coil's."""
 FREEDOM = 4.0
+"""Degrees of freedom of the Student density of a chip's residuals; fewer give outliers less
+weight."""
 
 
 @dataclass(frozen=True)

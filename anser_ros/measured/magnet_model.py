@@ -46,7 +46,7 @@ class Recording:
     stamp_s: Array
 
     def select(self, frames: NDArray[np.generic]) -> 'Recording':
-        """Only these frames."""
+        """Return the recording of some frames only."""
         parts = {
             key: getattr(self, key)[frames]
             for key in (
@@ -87,7 +87,7 @@ class Source:
 
 
 def point_source() -> Source:
-    """One dipole."""
+    """Return a source that is a single dipole."""
     return Source(np.zeros((1, 3)), np.ones(1))
 
 
@@ -147,9 +147,13 @@ EFFECTS: Mapping[str, EffectSpec] = {
     'moment_drift': EffectSpec(1, False, 1e-5, '1/s', 'strength changes with time'),
     'time_offset': EffectSpec(1, False, 0.1, 's', 'pose and field of different moments'),
 }
+"""Number of parameters, expected spread and unit of every effect; the spreads are priors."""
 _OFF_DIAGONAL = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
+"""Rows and columns of the six elements of a sensor's crosstalk."""
 _REGISTRATION_SPREAD = np.array([2e-3] * 3 + [0.02] * 3)
+"""Expected shift (m) and rotation (rad) of the patch from its stated place."""
 SATURATION_SCALE_T = 1e-2
+"""Flux density at which the parameter of the saturation is the relative loss, T."""
 
 
 def zero(name: str, sensors: int) -> Array:

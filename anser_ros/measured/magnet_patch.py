@@ -30,10 +30,15 @@ Array = NDArray[np.float64]
 NAME = 'magnet_patch'
 
 RADIUS_M, HALF_LENGTH_M = 5e-3, 5e-3
+"""Radius and half length of the magnet, m."""
 OPTICAL = Jitter(2e-4, 8e-3)
+"""Jitter of the optical poses, m and rad."""
 FIRST_NOISE_T = 3e-6
+"""Noise of the readings from which the fit starts, T; it is then estimated."""
 TARGET_MM, TARGET_DEG = 0.24, 0.55
+"""Position and orientation errors that the analysis should reach, mm and degrees."""
 SENSORS = 16
+"""Sensors of the patch."""
 CANDIDATES = (
     'sensor_gain',
     'channel_gain',

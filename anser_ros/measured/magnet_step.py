@@ -1,4 +1,4 @@
-"""The robot's file: where do the sensors really sit?
+"""The positions of the sensors, as the file of the robot that carries a magnet shows them.
 
 A large magnet is carried past the patch by a robot, its axis always along z. Its own size and the
 sensors' constant offsets make a point-dipole model believe that the patch is somewhere else.
@@ -17,7 +17,9 @@ from anser_ros.measured.magnet_model import Recording, Source
 Array = NDArray[np.float64]
 
 ROBOT = Jitter(1e-5, 1e-4)
+"""Jitter of the robot's poses, m and rad."""
 FIRST_NOISE_T = 5e-6
+"""Noise of the readings from which the fit starts, T; it is then estimated."""
 CANDIDATES = (
     'pickup',
     'ambient',
@@ -33,11 +35,12 @@ CANDIDATES = (
     'moment_drift',
 )
 N_BLOCKS = 5
+"""Blocks of poses that are held out in turn."""
 
 
 @dataclass(frozen=True)
 class StepAnalysis:
-    """What was found.
+    """The effects and positions that the analysis found.
 
     Attributes
     ----------

@@ -18,10 +18,15 @@ from anser_ros.physics.dipole import field_basis
 Array = NDArray[np.float64]
 
 REACH_M = 0.06
+"""Half size of the grid of start positions, m."""
 NEAREST_M = 0.012
+"""Smallest distance of a start position from a sensor, m: the magnet is about as large."""
 STEP_M = 0.008
+"""Distance of neighbouring start positions, m."""
 POSITION_SCALE_M = 1e-3
+"""Unit of the position in the least-squares search, m."""
 ANGLE_SCALE_RAD = 1e-2
+"""Unit of the tilt in the least-squares search, rad."""
 
 
 @dataclass(frozen=True)

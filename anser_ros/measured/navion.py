@@ -27,7 +27,9 @@ Array = NDArray[np.float64]
 NAME = 'navion'
 
 TARGET_MT = 0.27
+"""Error of the field that the analysis should reach, mT."""
 INNER_TARGET_MT = 0.135
+"""Error of the field that it should reach at the inner heights, mT."""
 
 STRICT = 'effects and model: the other heights only; scored on the height left out'
 OWN_POSE = 'as above, but pose and bend of the height left out from half its sensors; other half'

@@ -37,9 +37,11 @@ PLATE_EFFECTS = ('registration', 'plate_bend')
 EFFECTS = (*SENSOR_EFFECTS, *PLATE_EFFECTS)
 
 _ITERATIONS = 10
+"""Gauss-Newton steps of a fit; the widths are learnt in all but the first and last two."""
 _GAUGE = 100.0
 """How many times tighter the sum of a plate state over the heights is held than the state."""
 _METAL_STEP = 0.01
+"""Longest movement of a metal object in one step along each axis, m."""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,9 @@ PAYS = 20.0
 """Log evidence that an effect must add: overwhelming odds, and far above rounding."""
 
 MAX_METAL = 4
+"""Largest number of metal objects that are tried; each further one costs a scan."""
 _NO_METAL = np.zeros((0, 3))
+"""Positions of metal objects for a fit without any."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ def prediction_error(data: PlateData, held: int, fit: PlateFit) -> Array:
 
 
 def rms(values: Array) -> float:
-    """Root mean square."""
+    """Return the root mean square of values."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 

@@ -18,6 +18,7 @@ from anser_ros.physics.dipole import field_basis, flux_jacobian
 Array = NDArray[np.float64]
 
 BEND_DEGREE = 4
+"""Degree of the polynomial of a plate's bend."""
 BEND_SPAN = 0.12
 """Distance (m) from the plate's centre at which a bend of 1 mm lifts it by 1 mm."""
 
@@ -87,7 +88,7 @@ class Sources:
 
     @property
     def magnets(self) -> Sources:
-        """The magnets alone."""
+        """The sources of the magnets without metal."""
         count = len(self.position_m) - self.n_metal
         return Sources(self.position_m[:count], self.moment_am2[:count])
 

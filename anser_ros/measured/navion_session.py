@@ -27,6 +27,7 @@ PLATE, SENSOR = 'plate', 'sensor'
 AXES = 'xyz'
 KIND = 'electromagnet'
 CURRENT_A = 35.0
+"""Nominal current of the electromagnets, A, that fluxes are referred to."""
 
 
 def emitter_of(data: NavionData) -> Emitter:

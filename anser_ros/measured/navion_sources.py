@@ -20,8 +20,11 @@ CLOUD_RADIUS = 0.05
 """Radius (m) of a magnet's cloud: about a coil's own radius."""
 
 _SCAN_STEP = 0.06
+"""Distance of neighbouring places of the scan for metal, m."""
 _CLEARANCE = 0.015
+"""Smallest distance of a scanned place from a sensor, m."""
 _BATCH = 64
+"""Places of the scan that are in memory at a time."""
 
 
 def locate_magnets(data: PlateData) -> Array:

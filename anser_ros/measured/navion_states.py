@@ -19,8 +19,11 @@ from anser_ros.measured.navion_plate import Plate, PlateData, vector_basis
 Array = NDArray[np.float64]
 
 _MEMORY_MOMENT_AM2 = 30.0
+"""Expected size of a moment that the iron remembers, A m^2, a prior of the fit."""
 _MEMORY_NOISE_T = 2e-5
+"""Noise of a reading in the fit of the iron's memory, T."""
 _OFFSET_T = 3e-4
+"""Expected size of a sensor's constant offset, T, a prior of the fit."""
 
 
 def split_states(reading_t: Array, sign: Array) -> Array:

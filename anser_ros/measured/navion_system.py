@@ -23,12 +23,14 @@ from anser_ros.measured.navion_plate import (
 Array = NDArray[np.float64]
 
 _UNIT = np.eye(3)
+"""Unit vectors of a sensor's three axes."""
 _GAIN = [np.outer(a, a) for a in _UNIT]
 _TURN = [np.cross(_UNIT, a) for a in _UNIT]
 _LEAK = [
     np.outer(_UNIT[i], _UNIT[j]) + np.outer(_UNIT[j], _UNIT[i])
     for i, j in ((1, 2), (0, 2), (0, 1))
 ]
+"""Symmetric changes of a sensor's matrix, one for each pair of axes."""
 GENERATORS = np.array([*_GAIN, *_TURN, *_LEAK])
 """Small changes of a sensor's matrix, shape (9, 3, 3): gains, turns, symmetric leaks."""
 
@@ -105,7 +107,7 @@ class NavionProblem:
 
 @dataclass
 class Estimate:
-    """What Gauss-Newton moves.
+    """The unknowns that Gauss-Newton steps change.
 
     Attributes
     ----------

@@ -16,9 +16,13 @@ from anser_ros.measured.navion_plate import HallSensorErrors, Plate, Sources, ro
 Array = NDArray[np.float64]
 
 _TABLE_STEP = 0.02
+"""Distance of neighbouring start positions in the table, m."""
 _MAX_STEP = 0.02
+"""Longest Gauss-Newton step of the position, m."""
 _STARTS = 3
+"""Start positions that are refined; the one with the smallest residual wins."""
 _START_SPACING = 0.04
+"""Smallest distance between start positions that are refined, m."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,9 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 STEP_M = 2e-4
+"""Step of the numerical derivative of the signals by a chip's place, m."""
 STEP_RAD = 1e-3
+"""Step of the numerical derivative of the signals by a chip's tilt, rad."""
 LEFT_OUT = 1e8
 """Factor on the noise of a channel that takes no part."""
 
