@@ -5,7 +5,8 @@ ANSER = $(VENV)/bin/anser
 READY = $(VENV)/.installed-newest
 READY_OLDEST = $(VENV_OLDEST)/.installed-oldest
 # One thread each: two cores are shared with the processes under test.
-ENVIRONMENT = OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1
+# Compiled bytecode is kept, as every process under test would compile all modules again.
+ENVIRONMENT = OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=
 # Two processes run the tests, as test/conftest.py shares them out. ARGS='-n 0' has one alone.
 WORKERS = -n 2 --dist loadgroup --no-loadscope-reorder
 ARGS ?=
@@ -16,7 +17,7 @@ ARGS ?=
 help:
 	@echo 'make demo [DURATION=30]  watch a simulated tool being tracked'
 	@echo 'make test                lint, types, tests'
-	@echo 'make test-quick          the same without the tests that start nodes or processes'
+	@echo 'make test-quick          the same without the tests that start processes or take long'
 	@echo 'make test-oldest         tests with the oldest dependencies (needs Python 3.12)'
 	@echo 'make bench               speed and accuracy beside rivals, writes bench.json'
 	@echo 'make docs                the documentation as a site, out/docs/index.html'
@@ -54,12 +55,12 @@ parameters: $(READY)
 # and only if something is wrong.
 test: lint
 	@types=$$(mktemp); trap 'rm -f $$types' EXIT; \
-	$(MAKE) --no-print-directory types >$$types 2>&1 & checked=$$!; \
+	nice $(MAKE) --no-print-directory types >$$types 2>&1 & checked=$$!; \
 	$(ENVIRONMENT) $(VENV)/bin/python -m pytest $(WORKERS) $(QUICK) $(ARGS); passed=$$?; \
 	wait $$checked || { cat $$types; exit 1; }; \
 	exit $$passed
 
-test-quick: QUICK = -m 'not processes'
+test-quick: QUICK = -m 'not processes and not long'
 test-quick: test
 
 test-oldest: $(READY_OLDEST)

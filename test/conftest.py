@@ -6,6 +6,7 @@ process, fails: what `make test-quick` leaves out is exactly what is marked.
 """
 
 import contextlib
+import fcntl
 import importlib.util
 import os
 import signal
@@ -55,16 +56,28 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests that take a ROS domain, before `-m` chooses among them, and share them out.
 
     Of two workers one takes the tests with processes, which mostly wait, and the other the files
-    that calculate: so only one set of nodes runs at a time, and a file's fixtures are made once.
+    that calculate, longest first: so only one set of nodes runs at a time, and a file's fixtures
+    are made once.
     """
     for item in items:
         if 'domain' in getattr(item, 'fixturenames', ()):
             item.add_marker('processes')
     if 'PYTEST_XDIST_WORKER' in os.environ:
-        items.sort(key=lambda item: not _has_processes(item))
+        long = {item.path for item in items if item.get_closest_marker('long')}
+        items.sort(key=lambda item: (not _has_processes(item), item.path not in long))
         for item in items:
             group = 'processes' if _has_processes(item) else item.path.stem
             item.add_marker(pytest.mark.xdist_group(group))
+
+
+_begun: list[pytest.Item] = []
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Let the worker that calculates give way to the nodes that the other one has started."""
+    if 'PYTEST_XDIST_WORKER' in os.environ and not _begun and not _has_processes(item):
+        os.nice(10)
+    _begun.append(item)
 
 
 def _has_processes(item: pytest.Item) -> bool:
@@ -184,6 +197,35 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip('the folder of recorded sessions is not beside the repository')
     return SHARED
+
+
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
+    """Return a folder that the first worker to need it makes; the other waits and reads it."""
+    folder = factory.getbasetemp()
+    if 'PYTEST_XDIST_WORKER' in os.environ:
+        folder = folder.parent
+    made = folder / name
+    with (folder / f'{name}.lock').open('w') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not made.is_dir():
+            begun = folder / f'{name}.begun'
+            begun.mkdir()
+            make(begun)
+            begun.rename(made)
+    return made
+
+
+@pytest.fixture(scope='session')
+def factory_calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder with model and report of `anser calibrate` on our own factory scan."""
+    from anser_ros.cli.main import main
+
+    def make(folder: Path) -> None:
+        arguments = ['calibrate', str(REPO / 'bags' / 'factory.mcap')]
+        arguments += ['--out', str(folder / 'model.yaml'), '--report', str(folder)]
+        assert main(arguments) == 0
+
+    return made_once(tmp_path_factory, 'factory_calibration', make)
 
 
 @pytest.fixture(scope='session')

@@ -1,9 +1,11 @@
 """A small exact world for the tests of the refit: a board, reference coils, and metal."""
 
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+import pytest
 from tracking_world import NOISE_T, anser_board
 
 from anser_ros.field.model import FieldModel
@@ -11,6 +13,7 @@ from anser_ros.field.nominal import nominal_model
 from anser_ros.physics.board import Board, build_board
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit import live_refit
 from anser_ros.refit.live_refit import LiveRefit, RefitSettings
 
 
@@ -120,3 +123,23 @@ def volume_points(count: int = 60, seed: int = 11):
     points = rng.uniform([-0.12, -0.12, 0.09], [0.12, 0.12, 0.2], (count, 3))
     axes = rng.normal(size=(count, 3))
     return points, axes / np.linalg.norm(axes, axis=1)[:, None]
+
+
+@contextmanager
+def tables_made_once():
+    """Within it, refits of one board with the same references and settings share their tables.
+
+    For tests that make many refits of the same drawing, which is not compared.
+    """
+    build, made = live_refit.build_tables, {}
+
+    def shared(model, references, settings, drawing, *rest):
+        arrays = model.positions, model.moments, references.position, references.axis
+        key = (*(array.tobytes() for array in arrays), drawing is None, repr((settings, rest)))
+        if key not in made:
+            made[key] = build(model, references, settings, drawing, *rest)
+        return made[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(live_refit, 'build_tables', shared)
+        yield

@@ -118,6 +118,7 @@ def test_two_scatterers_answer_to_each_other(world):
     np.testing.assert_allclose(*fields, atol=1e-3 * np.abs(fields[0]).max())
 
 
+@pytest.mark.long
 def test_a_session_reads_as_the_contract_says(world, tmp_path):
     make, boards = world('make'), world('boards')
     board = boards.build(1, np.random.default_rng(7))

@@ -63,10 +63,8 @@ def calibrate(*arguments):
 
 
 @pytest.fixture(scope='module')
-def done(tmp_path_factory):
-    folder = tmp_path_factory.mktemp('calibration')
-    assert calibrate(FACTORY, '--out', folder / 'model.yaml', '--report', folder) == 0
-    return folder
+def done(factory_calibration):
+    return factory_calibration
 
 
 def test_calibration_json_is_the_contracts(done):
@@ -242,6 +240,7 @@ def test_parameters_out_of_range(tmp_path, arguments, capsys):
     assert 'must be positive' in text
 
 
+@pytest.mark.long
 def test_a_cut_scan_is_said_to_be_cut(tmp_path, capsys):
     whole = FACTORY.read_bytes()
     cut = tmp_path / 'cut.mcap'

@@ -46,6 +46,7 @@ def run(bag: Path, out: Path, model: Path = MODEL, *more: str) -> dict:
     return json.loads((out / 'diagnosis.json').read_text())
 
 
+@pytest.mark.long
 def test_a_clean_session_has_no_effect(tmp_path):
     document = run(BAGS / 'moving.mcap', tmp_path, MODEL, '--baseline', str(BAGS / 'factory.mcap'))
     assert document['schema'] == 'anser_diagnosis/1'
@@ -54,6 +55,7 @@ def test_a_clean_session_has_no_effect(tmp_path):
     assert document['unexplained']['fraction'] == 0.0
 
 
+@pytest.mark.long
 def test_a_wrong_gain_is_named_and_the_model_corrects_it(tmp_path):
     bag = with_gain(tmp_path / 'gain.mcap')
     document = run(bag, tmp_path / 'out')

@@ -25,6 +25,7 @@ def found(names: str, seed: int, size: str = 'medium') -> tuple[Diagnosis, dict]
     return diagnose(target.problem(), target.model), truth
 
 
+@pytest.mark.long
 def test_effects_of_the_table_are_named_and_nothing_else():
     result, truth = found('pickup+coil_drift', 1)
     assert sorted(f.record.name for f in result.findings) == sorted(truth)
@@ -41,6 +42,7 @@ def test_effects_of_the_table_are_named_and_nothing_else():
     assert result.unexplained == 0.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ('name', 'called'),
     [
@@ -54,6 +56,7 @@ def test_an_effect_of_no_table_gets_a_name_of_its_own(name, called):
     assert result.flux_rms_after_t < 1.1 * result.flux_rms_floor_t
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('name', ['quantised', 'channel_lag'])
 def test_what_nothing_describes_stays_unexplained(name):
     result, _ = found(name, 5)

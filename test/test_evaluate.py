@@ -12,6 +12,7 @@ import pytest
 
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError
+from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.baseline import baseline_flux
 from anser_ros.sessions.evaluation import Evaluation, track_session
 from anser_ros.sessions.evaluation_document import to_document
@@ -31,10 +32,8 @@ FIGURES = {
 
 
 @pytest.fixture(scope='module')
-def model(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp('model') / 'model.yaml'
-    assert main(['calibrate', str(BAGS / 'factory.mcap'), '--out', str(path)]) == 0
-    return path
+def model(factory_calibration) -> Path:
+    return factory_calibration / 'model.yaml'
 
 
 @pytest.fixture(scope='module')
@@ -117,6 +116,28 @@ def test_the_nominal_model_tracks_worse_than_the_calibrated(tmp_path):
     assert main([*arguments, '--out', str(tmp_path)]) == 0
     document = json.loads((tmp_path / 'evaluation.json').read_text())
     assert document['sensors']['tool_a/2/y']['position_rmse_m'] > 0.3e-3
+
+
+@pytest.mark.parametrize(
+    ('record', 'moved_m'),
+    [
+        (EffectRecord('registration', {'rotation_deg': [0.0] * 3,
+                                       'translation_m': [0.0, 0.0, 0.01]}), 0.01),
+        (EffectRecord('time_offset', {'offset_s': 0.5}), None),
+    ],
+)  # fmt: skip
+def test_the_truth_is_what_the_model_s_effects_make_of_it(model, moving, record, moved_m):
+    """A wrong frame or clock of the optical poses that the model states is taken into account."""
+    wrong = dataclasses.replace(load_model(model), effects=(record,))
+    session = load_session(BAGS / 'moving.mcap')
+    body = track_session(session, wrong).bodies['tool_a']
+    # The tool moves, so the poses half a second apart differ by what the track itself says.
+    track = session.tools[0].track
+    later = track.at(session.tools[0].time - 0.5, 0.1)
+    apart = np.linalg.norm(later[0] - track.at(session.tools[0].time, 0.1)[0], axis=1)
+    expected = np.full(len(apart), moved_m) if moved_m else np.where(later[2], apart, np.nan)
+    assert np.nanmax(expected) > 5e-3
+    np.testing.assert_allclose(body.position_error, expected, atol=1.5e-3)
 
 
 @pytest.mark.parametrize(

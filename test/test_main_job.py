@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from chain import replay_through_nodes
 
-from anser_ros.cli.main import main
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import load_session
@@ -43,10 +42,8 @@ def compare(bag: Path, model: Path) -> None:
         assert np.abs(live.position - same).max() < 2e-5
 
 
-def test_our_own_bag(domain, tmp_path):
-    model = tmp_path / 'model.yaml'
-    assert main(['calibrate', str(BAGS / 'factory.mcap'), '--out', str(model)]) == 0
-    compare(BAGS / 'moving.mcap', model)
+def test_our_own_bag(domain, factory_calibration):
+    compare(BAGS / 'moving.mcap', factory_calibration / 'model.yaml')
 
 
 @pytest.mark.timeout(180)

@@ -105,6 +105,7 @@ class TestPlate:
 
 
 class TestFit:
+    @pytest.mark.long
     def test_a_clean_plate_gains_nothing(self) -> None:
         data = made_up_plate(np.random.default_rng(2), made_up_sources(), errors=False)
         cloud = magnet_cloud(MAGNETS)
@@ -113,6 +114,7 @@ class TestFit:
             fit = fit_plates(data, cloud, np.zeros((0, 3)), frozenset({name}))
             assert fit.log_evidence < none.log_evidence + 5.0, name
 
+    @pytest.mark.long
     def test_errors_and_metal_are_found_and_predict_the_height_left_out(self) -> None:
         metal = np.array([0.14, -0.02, -0.08])
         data = made_up_plate(np.random.default_rng(3), made_up_sources(metal), errors=True)
@@ -195,6 +197,7 @@ class TestFiles:
 
 @needs_data
 class TestMeasured:
+    @pytest.mark.long
     def test_an_inner_height_from_the_others(self) -> None:
         data = load(FOLDER)
         held = inner(data)[0]
@@ -208,6 +211,7 @@ class TestMeasured:
         assert rms(prediction_error(data.coils, held, fit)) < 0.10e-3
         assert rms(states - join_states(data.terms_t[held], data.sign)) < 0.18e-3
 
+    @pytest.mark.long
     def test_metal_under_the_lowest_height_is_seen_from_above(self) -> None:
         data = load(FOLDER)
         above = others(data.coils, 0)

@@ -84,6 +84,7 @@ def test_the_drawing_gets_one_gain_an_emitter(recordings):
     assert field_errors(session, model)['N-RMSE'] < 3.0
 
 
+@pytest.mark.long
 def test_ours_is_near_the_jitter_and_the_article_is_not_better(study):
     tracking = study.results.tracking['table_2']
     for sensor in article.SENSORS:
@@ -94,6 +95,7 @@ def test_ours_is_near_the_jitter_and_the_article_is_not_better(study):
         assert study.results.bounds['table_2'][sensor] < 0.1e-3
 
 
+@pytest.mark.long
 def test_the_head_makes_it_worse_the_nearer_it_is(study):
     errors = [
         study.results.tracking[f'fig_7 {d} cm']['ours']['Y'].millimetres()['RMSE']
@@ -103,6 +105,7 @@ def test_the_head_makes_it_worse_the_nearer_it_is(study):
     assert np.argmax(errors) >= len(errors) - 2
 
 
+@pytest.mark.long
 def test_compensation_takes_the_distortion_away(study):
     tracking = study.results.tracking
     for sensor in article.SENSORS:
@@ -111,6 +114,7 @@ def test_compensation_takes_the_distortion_away(study):
         assert straight < 0.3 < bent
 
 
+@pytest.mark.long
 def test_report_and_figures_say_simulated(study, tmp_path):
     figures = draw_all(study, tmp_path)
     write_report(study.results.document(), figures, tmp_path / 'paper.md')
@@ -125,6 +129,7 @@ def test_report_and_figures_say_simulated(study, tmp_path):
     assert f'{article.TABLE_2_MM["data-driven"]["Y"]["RMSE"]:.2f}' in text
 
 
+@pytest.mark.long
 def test_the_document_is_plain(study):
     document = json.loads(json.dumps(study.results.document()))
     assert document['schema'] == 'anser_paper/1'

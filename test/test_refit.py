@@ -307,6 +307,7 @@ def test_coils_that_could_not_be_read_one_after_the_other_return(refit):
     assert (result.state, result.left_out) == ('frozen', ())
 
 
+@pytest.mark.long
 def test_a_reference_without_a_baseline_takes_no_part():
     world = anser_world()
     baseline = world.baseline.copy()
@@ -329,6 +330,7 @@ def test_the_order_of_channels_does_not_matter_and_strange_ones_are_passed_over(
     np.testing.assert_allclose(first.model.moments, second.model.moments, rtol=1e-12)
 
 
+@pytest.mark.long
 def test_any_number_of_emitters():
     world = three_coil_world()
     points = metal_block([0.01, 0.02, -0.08], [0.06, 0.06, 0.03])
@@ -342,6 +344,7 @@ def test_any_number_of_emitters():
     assert rms(truth - made) < 0.05 * rms(truth)
 
 
+@pytest.mark.long
 def test_phases_of_the_emitters_are_turned_back():
     world = anser_world()
     turn = np.exp(1j * np.linspace(0.2, 0.9, 8))
@@ -356,6 +359,7 @@ def test_phases_of_the_emitters_are_turned_back():
     assert rms(truth - made) < 0.03 * rms(truth)
 
 
+@pytest.mark.long
 def test_a_drawing_of_another_board_is_not_believed():
     world, other = anser_world(), three_coil_world()
     assert world.refit().excitation_source == 'board'
@@ -372,6 +376,7 @@ def test_a_drawing_of_another_board_is_not_believed():
         LiveRefit(world.model, world.references, world.baseline, drawing=other.board.field)
 
 
+@pytest.mark.long
 def test_references_that_move(refit):
     world = anser_world()
     result = run(refit, world, world.metal(HEAD))

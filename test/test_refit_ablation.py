@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 from refit_world import NOISE_T, anser_world, metal_block, volume_points
 
 from anser_ros.experiments.refit_ablation import FREE, FROZEN, SHARED, ablate, plot, spread_out
@@ -23,6 +24,7 @@ def test_references_are_spread_out():
     np.testing.assert_array_equal(spread_out(table, 99), np.arange(32))
 
 
+@pytest.mark.long
 def test_free_dipoles_correct_but_less_than_the_shared_polarisability():
     world = anser_world()
     points = metal_block([0.03, -0.02, -0.11], [0.1, 0.12, 0.06])
@@ -41,6 +43,7 @@ def test_free_dipoles_correct_but_less_than_the_shared_polarisability():
     assert np.abs(still.flux(places, axes) - world.model.flux(places, axes)).max() < 5 * NOISE_T
 
 
+@pytest.mark.long
 def test_the_ablation_runs_on_a_recording(tmp_path):
     session, baseline = load_session(BAGS / 'metal.mcap'), load_session(BAGS / 'factory.mcap')
     model = nominal_model(board_of(session.setup))

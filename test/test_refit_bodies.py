@@ -69,6 +69,7 @@ def test_approximate_evidence_is_that_of_its_own_normal_distribution():
     assert got == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.long
 def test_metal_beside_the_volume_is_found_corrected_and_honest(refit):
     world, result = anser_world(24), follow(refit, BESIDE)
     best = max(result.weights, key=result.weights.get)
@@ -85,6 +86,7 @@ def test_metal_beside_the_volume_is_found_corrected_and_honest(refit):
     assert np.sqrt(np.mean((np.abs(found - truth) / sigma) ** 2)) < 2.0
 
 
+@pytest.mark.long
 def test_slots_follow_metal_that_moves_and_are_emptied_by_a_reset(refit):
     names = [
         {name for name in follow(refit, BESIDE + [0.0, shift, 0.0]).weights if 'body' in name}

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from chain import replay_through_nodes
 
-from anser_ros.cli.main import main
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import load_session
@@ -19,10 +18,8 @@ JITTER_M = 0.12e-3
 
 
 @pytest.fixture(scope='module')
-def model(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp('refit') / 'model.yaml'
-    assert main(['calibrate', str(BAGS / 'factory.mcap'), '--out', str(path)]) == 0
-    return path
+def model(factory_calibration) -> Path:
+    return factory_calibration / 'model.yaml'
 
 
 @pytest.fixture(scope='module')

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from refit_world import anser_world, metal_block
+from refit_world import anser_world, metal_block, tables_made_once
 from tracking_world import CENTRES_MM, GEOMETRY, TURNED
 
 from anser_ros.errors import FitError, FrameError, ParameterError
@@ -45,6 +45,12 @@ def setup_text(world):
         sensors.append(SensorSpec(40 + i, f'patch/{i}', 'patch', place, axis, 0.0))
     emitter = Emitter('square_spiral_pcb', GEOMETRY, coils)
     return dump_setup(Setup('fg', 50.0, emitter, tuple(sensors)))
+
+
+@pytest.fixture(scope='module', autouse=True)
+def shared_tables():
+    with tables_made_once():
+        yield
 
 
 class Rig:

@@ -129,6 +129,7 @@ def test_the_choice_is_neither_too_coarse_nor_undamped(world):
     assert curve[1e-2] > scores[9].score
 
 
+@pytest.mark.long
 def test_selection_finds_a_prior_and_is_deterministic(world):
     thin = thin_frames([world.measurements], 300)
     folds = fold_of_frames([m.position for m in thin])

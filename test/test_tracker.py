@@ -433,6 +433,18 @@ def test_effects_of_the_model_are_undone(rng):
     assert np.linalg.norm(sound.position - point) < 1e-3
 
 
+def test_what_a_correction_makes_absurd_is_no_signal(rng):
+    """A model may be wrong too: a gain of next to nothing makes fluxes of thousands of tesla."""
+    record = EffectRecord('sensor_gain', {'channel': 3, 'gain': 1e-12, 'phase_deg': 0.0})
+    flux = fluxes(MODEL, TOOL, *random_pose(rng), rng)
+    tracker = Tracker(replace(MODEL, effects=(record,)), TOOL)
+    found = one_frame(tracker, flux)
+    assert found[TOOL.name[3]].state == states.NO_SIGNAL
+    assert 'absurd' in found[TOOL.name[3]].reason
+    assert tracker.counters['readings_absurd'] == 1
+    assert found['tool_a'].state == states.OK
+
+
 def test_the_gate_is_where_the_settings_say(rng):
     """Noise three times as large as it is taken to be misses a gate that is a little smaller."""
     position, rotation = random_pose(rng)
