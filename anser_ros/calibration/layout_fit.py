@@ -27,7 +27,7 @@ RICH_MOST = 22
 grows with the fourth power of it or faster."""
 RICH_SPACING = 0.4
 """Spacing of that layer's dipoles as a fraction of the lowest sensor's height. A layer whose
-spacing is larger than the height is felt as single dipoles."""
+spacing is larger than the height has the field of single dipoles there."""
 RICH_DAMPING = 1e-5
 """Damping of that layer's moments, a fraction of the largest singular value: small, so that the
 field is not biased, and large enough for a fit by inner products."""

@@ -48,13 +48,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--dipoles', type=_layer, metavar='NxN',
-        help='layer of N x N z-dipoles on the board instead of the choice by held-out error',
+        help='use a layer of N x N z-dipoles on the board; chosen by held-out error by default',
     )  # fmt: skip
     parser.add_argument(
         '--estimate', type=_kinds, default=(), metavar='LIST',
-        help=f'find these of the sensors together with the field: {",".join(KINDS)}',
+        help=f'estimate these of the sensors together with the field: {",".join(KINDS)}',
     )  # fmt: skip
-    parser.add_argument('--damping', type=float, help='damping instead of the choice')
+    parser.add_argument(
+        '--damping', type=float, help='damping of the moments; chosen by held-out error by default'
+    )
     parser.add_argument('--flux-noise', type=float, default=60e-12, help='T a component')
     parser.add_argument('--pose-jitter-mm', type=float, default=0.07, help='optical, per axis')
     parser.add_argument('--pose-jitter-mrad', type=float, default=0.4, help='optical, per axis')

@@ -50,15 +50,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--out', type=Path, default=Path('recordings'), metavar='DIR',
-        help='folder that gets a folder with bag, picture and logs, made if missing '
+        help='folder in which a folder with bag, picture and logs is made '
         '(%(default)s)',
     )  # fmt: skip
     parser.add_argument('--rate', type=float, default=50.0, metavar='HZ', help='poses a second')
-    parser.add_argument('--no-metal', action='store_true', help='leave the steel disc away')
-    parser.add_argument('--no-picture', action='store_true', help='draw nothing at the end')
+    parser.add_argument('--no-metal', action='store_true', help='simulate no steel disc')
+    parser.add_argument('--no-picture', action='store_true', help='draw no picture at the end')
     parser.add_argument(
         '--draw', type=Path, metavar='DIR',
-        help='run nothing: draw the picture of an interrupted demo, from the folder that it left',
+        help='only draw the picture of an interrupted demo, from the folder of its results',
     )  # fmt: skip
     parser.add_argument('--json', action='store_true', help='print only the summary, as JSON')
 

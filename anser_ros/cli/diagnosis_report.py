@@ -204,7 +204,7 @@ def _structure(result: SessionDiagnosis) -> str:
 
 def _strongest(state: State) -> str:
     """Return in words where the residual is largest."""
-    said = []
+    largest = []
     parts = _tools(state)
     emitters = state.problem.fields.omega.size
     for kind, axis in (('channel', 1), ('emitter', 2)):
@@ -218,10 +218,10 @@ def _strongest(state: State) -> str:
                 sizes[name] = max(sizes.get(name, 0.0), value)
         worst = max(sizes, key=lambda name: sizes[name])
         usual = float(np.median(list(sizes.values())))
-        said.append(
+        largest.append(
             f'{kind} {worst} ({sizes[worst]:.1f} times the expected, the median is {usual:.1f}'
         )
-    return f'It is largest on {") and on ".join(said)}).'
+    return f'It is largest on {") and on ".join(largest)}).'
 
 
 def _candidates(rounds: Sequence[Sequence[Candidate]]) -> str:

@@ -25,11 +25,11 @@ def compile_kernels(
 ) -> Child | None:
     """Run `main` in another process; return it if it failed, and None when all is ready."""
     child = supervisor.start('kernels', [sys.executable, '-P', '-m', 'anser_ros.cli.kernels'])
-    begin, told = time.monotonic(), False
+    begin, announced = time.monotonic(), False
     while child.process.poll() is None and not is_stopped():
-        if not told and time.monotonic() - begin > PATIENT_S:
+        if not announced and time.monotonic() - begin > PATIENT_S:
             say('compiling kernels (once)')
-            told = True
+            announced = True
         time.sleep(POLL_S)
     if is_stopped():
         return None

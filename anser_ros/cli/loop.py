@@ -46,22 +46,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     known = ', '.join(sorted(CATALOGUE))
     parser.add_argument(
         '--effect', nargs='+', default=[RANDOM], metavar='NAME',
-        help=f'{RANDOM}, {ALL} (each in its turn), {NONE}, or of: {known}',
+        help=f'{RANDOM}, {ALL} (one after the other), {NONE}, or some of: {known}',
     )  # fmt: skip
-    parser.add_argument('--seed', type=int, help='of the effect; another one every time without')
+    parser.add_argument('--seed', type=int, help='seed of the effect; random by default')
     parser.add_argument(
-        '--duration', type=float, default=30.0, metavar='S', help='of the first run'
+        '--duration', type=float, default=30.0, metavar='S', help='duration of the first run'
     )
     parser.add_argument(
         '--clean', type=float, default=CLEAN_S, metavar='S',
-        help='of the clean recording that the references are compared with; 0 for none',
+        help='duration of the clean recording that is the baseline of the references; 0 for none',
     )  # fmt: skip
     parser.add_argument(
-        '--watch', action='store_true', help='tell too what the live watcher said in the first run'
+        '--watch', action='store_true', help='also report what the watcher found in the first run'
     )
     parser.add_argument(
         '--out', type=Path, default=Path('recordings'), metavar='DIR',
-        help='folder that gets a folder with all results, made if missing (%(default)s)',
+        help='folder in which a folder with all results is made (%(default)s)',
     )  # fmt: skip
     parser.add_argument('--json', action='store_true', help='print only the result, as JSON')
 

@@ -187,12 +187,12 @@ def _check(supervisor: Supervisor) -> None:
 
 def _unready(bag: Path, names: Sequence[str]) -> str:
     """Return a message with the nodes that have not reported, or that lack a model."""
-    told = last_words(bag)
+    reported = last_words(bag)
     missing = [
         name.strip('/')
         for name in names
-        if name.strip('/') not in told
-        or ('tracker' in name and 'dipoles' not in told[name.strip('/')])
+        if name.strip('/') not in reported
+        or ('tracker' in name and 'dipoles' not in reported[name.strip('/')])
     ]
     return f'{", ".join(missing)} not ready' if missing else ''
 

@@ -70,7 +70,10 @@ SCHEMA = 'anser_measured/1'
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument(
-        'datasets', nargs='*', metavar='DATASET', help=f'of {", ".join(STUDIES)}; all by default'
+        'datasets',
+        nargs='*',
+        metavar='DATASET',
+        help=f'some of {", ".join(STUDIES)}; all by default',
     )
     parser.add_argument(
         '--shared',
@@ -85,7 +88,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--bags', type=Path, help='folder for MCAP sessions of the data, made if missing'
     )
-    parser.add_argument('--quiet', action='store_true', help='only the table, no candidates')
+    parser.add_argument(
+        '--quiet', action='store_true', help='print only the table, without candidates'
+    )
     parser.add_argument('--json', action='store_true', help='print measured.json on stdout')
 
 

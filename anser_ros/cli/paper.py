@@ -36,7 +36,9 @@ SHOWN = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument(
-        '--sessions', type=Path, help='folder of the recordings; simulated where there is none'
+        '--sessions',
+        type=Path,
+        help='folder of the recordings; by default the shared ones, or simulated',
     )
     parser.add_argument(
         '--out',
@@ -44,8 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=Path('out/paper'),
         help='folder for the report, made if missing',
     )
-    parser.add_argument('--simulate', action='store_true', help='use our own simulator anyway')
-    parser.add_argument('--seed', type=int, default=1, help='of our own simulator')
+    parser.add_argument('--simulate', action='store_true', help='simulate the recordings anyway')
+    parser.add_argument('--seed', type=int, default=1, help='seed of the simulated recordings')
     parser.add_argument('--json', action='store_true', help='print paper.json on stdout')
 
 

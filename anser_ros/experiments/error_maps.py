@@ -94,7 +94,7 @@ def judged(name: str, found: Array, places: Array) -> BoardRun:
     ----------
     name : str
     found, places : ndarray, shape (P, 3)
-        Reported and true positions, m, each in a frame of its own.
+        Reported and true positions, m, in two different frames.
     """
     folds = fold_of_frames([places])[0]
     squares = np.zeros(2)
@@ -102,8 +102,8 @@ def judged(name: str, found: Array, places: Array) -> BoardRun:
         known = folds != fold
         tracked = aligned(found, known, places)
         error_map = learn_error_map(tracked[known], places[known])
-        for count, said in enumerate((tracked, error_map.apply(tracked))):
-            squares[count] += ((said - places)[~known] ** 2).sum()
+        for row, positions in enumerate((tracked, error_map.apply(tracked))):
+            squares[row] += ((positions - places)[~known] ** 2).sum()
     everything = np.ones(len(places), dtype=bool)
     whole = learn_error_map(aligned(found, everything, places), places)
     before, after = np.sqrt(squares / len(places))

@@ -138,7 +138,7 @@ def loop_moment(corners: NDArray[np.generic], current_a: float = 1.0) -> Array:
 def paths_field(
     paths: Sequence[NDArray[np.generic]], points: NDArray[np.generic], currents_a: Array
 ) -> Array:
-    """Return the fields of K closed paths that each carry a current of their own.
+    """Return the fields of K closed paths with different currents.
 
     Parameters
     ----------
