@@ -1,8 +1,6 @@
 """The tracker as a whole: states and their reasons, honest uncertainty, bad input, model swaps."""
 
 import math
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,19 +15,17 @@ from tracking_world import (
     triaxial_tool,
 )
 
-from anser_ros.errors import FitError, LayoutError, TrackingError
+from anser_ros.errors import TrackingError
 from anser_ros.field.model import EffectRecord
 from anser_ros.field.nominal import nominal_model
 from anser_ros.physics.board import build_board
 from anser_ros.physics.metal import induced_moments, sphere_polarisability
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.refit.baseline import ReadingWindow
 from anser_ros.tracking import estimate as states
 from anser_ros.tracking.estimate import NoiseScale, TrackerSettings
 from anser_ros.tracking.rotations import rotation_of_vector
 from anser_ros.tracking.tracker import Tracker
-from anser_ros.wire.model_error import ModelError, decode_model_error, encode_model_error
 
 MODEL = certain_model()
 TOOL = triaxial_tool()
@@ -535,110 +531,3 @@ def test_noise_scale_is_a_running_mean_that_one_frame_can_not_break():
         quiet.add(0.5)
     assert quiet.of_frame(0.9, 2.0) == quiet.value
     assert quiet.of_frame(1.5, 2.0) > 4.0 * quiet.value, 'unusual for this sensor'
-
-
-FIRST_FRAMES = """
-import sys
-from numba.core.dispatcher import Dispatcher
-from anser_ros.tracking.warm_up import warm_up
-
-def compiled():
-    rooms = [m for name, m in sys.modules.items() if name.startswith('anser_ros.tracking.')]
-    found = [value for room in rooms for value in vars(room).values()]
-    kernels = {id(value): value for value in found if isinstance(value, Dispatcher)}
-    return {kernel.py_func.__qualname__: len(kernel.signatures) for kernel in kernels.values()}
-
-warm_up()
-before = compiled()
-from test_tracker import CHANNELS, MODEL, TOOL, Tracker, anser_board, fluxes, nominal_model, path
-for model in (MODEL, nominal_model(anser_board())):
-    tracker = Tracker(model, TOOL)
-    for stamp, position, rotation in path(5):
-        tracker.update(stamp, CHANNELS, fluxes(model, TOOL, position, rotation))
-print({name: count for name, count in compiled().items() if count != before.get(name)})
-print(len(before))
-"""
-
-
-@pytest.mark.processes
-def test_after_the_warm_up_no_frame_waits_for_a_kernel():
-    """In a process of its own, as a node's is."""
-    command = [sys.executable, '-c', FIRST_FRAMES]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=HERE, check=False)
-    assert done.returncode == 0, done.stderr
-    late, kernels = done.stdout.splitlines()
-    assert late == '{}'
-    assert int(kernels) > 10
-
-
-# What travels beside a model ------------------------------------------------------------
-
-
-def test_model_error_survives_its_message(rng):
-    modes = rng.normal(size=(4, 6, 3)) + 1j * rng.normal(size=(4, 6, 3))
-    modes[:, ::2] = 0.0
-    modes[1] = 0.0
-    fields, step, data = encode_model_error(ModelError(3e-11, modes))
-    back = decode_model_error(fields, step, len(data) // step, data, 6, 3)
-    np.testing.assert_allclose(back.modes, modes, rtol=1e-6)
-    assert back.flux_error_t == pytest.approx(3e-11)
-    assert not back.follows
-    fields, step, data = encode_model_error(ModelError(3e-11, modes, follows=True))
-    assert decode_model_error(fields, step, len(data) // step, data, 6, 3).follows
-    fields, step, data = encode_model_error(ModelError(1e-12, np.zeros((0, 6, 3), complex)))
-    assert decode_model_error(fields, step, 1, data, 6, 3).modes.shape == (0, 6, 3)
-
-
-def test_model_errors_that_are_none_are_refused(rng):
-    modes = np.ones((2, 6, 3), complex)
-    fields, step, data = encode_model_error(ModelError(3e-11, modes))
-    width = len(data) // step
-    for arguments, word in [
-        ((fields[:-1], step, width, data, 6, 3), 'no model uncertainty'),
-        ((fields, step, width, data, 6, 4), 'no model uncertainty'),
-        ((fields, step, width, data[:-1], 6, 3), 'do not fit'),
-        ((fields, step, 0, b'', 6, 3), 'do not fit'),
-        ((fields, step, width, data, 5, 3), 'dipole 5 of 5'),
-    ]:
-        with pytest.raises(LayoutError, match=word):
-            decode_model_error(*arguments)
-    for wrong, word in [(np.nan, 'not finite'), (-1.0, 'not be negative')]:
-        fields, step, data = encode_model_error(ModelError(wrong, modes))
-        with pytest.raises(LayoutError, match=word):
-            decode_model_error(fields, step, width, data, 6, 3)
-    with pytest.raises(LayoutError, match='must be'):
-        encode_model_error(ModelError(0.0, np.ones((2, 3), complex)))
-    fields, step, data = encode_model_error(ModelError(1e-12, np.ones((65000, 1, 1), complex)))
-    with pytest.raises(LayoutError, match='too many'):
-        decode_model_error(fields, step, 65000, data, 60000, 1)
-
-
-def test_baseline_window():
-    window = ReadingWindow(TOOL, 8, 0.1)
-    with pytest.raises(FitError, match='needs 3 frames'):
-        window.mean()
-    flux = np.arange(72.0).reshape(9, 8) + 1j
-    flags = np.zeros(9, int)
-    for i in range(10):
-        noisy = flux + (1.0 if i % 2 else -1.0)
-        noisy[0] = np.nan
-        flags[1] = 1 if i < 8 else 0
-        window.add(i * STEP_NS, CHANNELS[::-1], noisy[::-1], flags[::-1])
-    assert window.full
-    assert len(window) == 6, 'only the last tenth of a second'
-    mean = window.mean()
-    assert np.isnan(mean[0]).all()
-    assert np.isnan(mean[1]).all(), 'flagged in most frames'
-    np.testing.assert_allclose(mean[2:], flux[2:])
-    window.add(0, CHANNELS, flux, flags)
-    assert len(window) == 1, 'a jump back starts anew'
-    assert not window.full
-    with pytest.raises(FitError, match='8 emitters'):
-        window.add(1, CHANNELS, flux[:, :3], flags)
-    with pytest.raises(FitError, match='positive'):
-        ReadingWindow(TOOL, 8, 0.0)
-    dead = ReadingWindow(TOOL, 8, 1.0)
-    for i in range(4):
-        dead.add(i + 1, CHANNELS, np.full((9, 8), np.nan, complex), flags)
-    with pytest.raises(FitError, match='no reference'):
-        dead.mean()
