@@ -7,7 +7,7 @@ import pytest
 from diagnosis_world import world
 
 from anser_ros.effects.correction import Correction
-from anser_ros.effects.effect import Effect, Remedy
+from anser_ros.effects.effect import Effect, Family, Remedy
 from anser_ros.effects.metal_path import FreePath, StraightPath, moving_times
 from anser_ros.effects.metal_remainder import REMAINDER, UP_M, Couplings, Lighting
 from anser_ros.effects.prediction import reference_view, tool_view
@@ -103,6 +103,39 @@ def test_every_name_of_the_contract_is_found():
         assert effect.summary
         assert effect.units
         assert isinstance(effect.remedy, Remedy)
+
+
+def test_effects_declare_what_the_search_needs(scenery):
+    """Whoever adds an effect of a family must give what that family is refined with."""
+    apparatus = scenery[1].apparatus
+    for name, effect in all_effects().items():
+        terms = [*effect.candidates(apparatus)]
+        if effect.still is not None:
+            assert effect.still in all_effects().values(), name
+            time, course = np.array([0.5, 1.5]), np.array([[0.0, 0.0, -0.1], [0.1, 0.0, -0.1]])
+            terms += effect.along(time, course, np.array([-1.0, 0.0]), apparatus)
+        assert bool(terms) is not (effect.family is Family.SEEN), name
+        for term in terms[:3]:
+            assert (effect.resting(term) is not None) is (effect.family is Family.METAL_AT_REST)
+            assert (effect.body(term) is not None) is (effect.family is Family.MOVING_METAL)
+            assert (effect.opened(term) is not None) is (effect.family is Family.FLUCTUATION)
+            assert effect.covers(term, term), name
+            assert term.complexity >= term.theta.size
+            assert term.free().seat == term.hold().seat
+        assert np.isinf(effect.inexact) is np.bool_(effect.family.is_metal), name
+        assert not effect.drifts or effect.remedy is Remedy.FLUX, name
+
+
+def test_a_fluctuation_is_a_rival_of_what_is_steady_on_its_coil(scenery):
+    apparatus, effects = scenery[1].apparatus, all_effects()
+    free = effects['coil_fluctuation'].candidates(apparatus)
+    steady = {name: effects[name].candidates(apparatus) for name in ('coil_gain', 'coil_drift')}
+    for terms in steady.values():
+        assert free[1].effect.rivals(free[1], terms[1])
+        assert not free[1].effect.rivals(free[1], terms[0])
+    assert free[1].effect.covers(free[1], steady['coil_gain'][1])
+    assert not free[1].effect.covers(free[1], steady['coil_drift'][1])
+    assert not free[1].effect.rivals(free[1], free[1])
 
 
 def test_an_effect_nobody_wrote_is_refused():

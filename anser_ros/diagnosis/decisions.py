@@ -11,6 +11,9 @@ has a mean of one a value:
 Gains are judged in units of the *misfit*, the mean square of the residuals that stay: among large
 unexplained residuals a gain must be larger by as much to mean anything.
 
+What an explanation's parameters cost is declared by its effect (`Effect.complexity`), and so is
+the share of its power that its model may miss (`Effect.inexact`).
+
 Unless a number says otherwise, it was chosen by hand on injected effects with seeds below 100
 (`test/injection.py`); cases of later seeds that led to a rule are named in `docs/diagnosis.md`.
 """

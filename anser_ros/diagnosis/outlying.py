@@ -18,6 +18,13 @@ bad ones in a row are seen, and motion changes little over so many."""
 READING_RATIO, FRAME_RATIO = 6.0, 2.5
 """Mean squares over the neighbours' median from which a reading (16 values with 8 emitters) or a
 frame (ten times as many) is no member of the same distribution; noise passes once in 1e6."""
+JUMP_RATIO = 40.0
+"""The same for a frame whose pose's own directions are left in: the optical jitter along them is
+larger than the noise and differs from pose to pose, so only a glitch stands out so far."""
+WHOLE = 0.5
+"""Share of a frame's readings, and of the frames that lost any, from which whole frames are out."""
+OFTEN = 0.2
+"""Share of the frames with an outlier from which a channel that has it is named."""
 
 
 def find_outliers(state: State) -> tuple[Mask, ...]:
@@ -35,7 +42,7 @@ def find_outliers(state: State) -> tuple[Mask, ...]:
         jumps = np.where(good, _by_reading(size, good.shape[1], emitters), 0.0).sum(axis=1) / count
         bad = _stands_out(readings, READING_RATIO) | _stands_out(frames[:, None], FRAME_RATIO)
         if not moves:
-            bad |= _stands_out(jumps[:, None], 40.0)
+            bad |= _stands_out(jumps[:, None], JUMP_RATIO)
         masks.append(bad & good)
     return tuple(masks)
 
@@ -70,14 +77,14 @@ def outlying_share(before: Problem, after: Problem) -> tuple[float, list[int]]:
     for tool, old, new in zip(before.tools, before.good, after.good, strict=True):
         lost = old & ~new
         lost_frames += int(lost.any(axis=1).sum())
-        whole += int((lost.sum(axis=1) > 0.5 * old.sum(axis=1).clip(1)).sum())
+        whole += int((lost.sum(axis=1) > WHOLE * old.sum(axis=1).clip(1)).sum())
         frames += tool.time.size
         for row, channel in enumerate(tool.sensors.channel.tolist()):
             by_channel[channel] = int(lost[:, row].sum())
     share = lost_frames / max(frames, 1)
-    if whole > 0.5 * max(lost_frames, 1):
+    if whole > WHOLE * max(lost_frames, 1):
         return share, []
-    return share, [c for c, n in by_channel.items() if n > 0.2 * max(lost_frames, 1)]
+    return share, [c for c, n in by_channel.items() if n > OFTEN * max(lost_frames, 1)]
 
 
 def clean_start(problem: Problem) -> Problem:

@@ -50,7 +50,7 @@ def moves_or_rests(
     for term, score in candidates(scorer):
         if term.effect.family.is_metal or term.effect.name in tried:
             continue
-        # A linear score is no more than a promise: twice the limit may still come below it.
+        # A linear score is only a promise: the fit may still bring down what is within these.
         if len(tried) == BESIDE_REST or score.held_out > 2.0 * limit + 0.5 * scorer.held_out:
             break
         tried.add(term.effect.name)

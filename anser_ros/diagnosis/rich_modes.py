@@ -1,4 +1,8 @@
-"""Combinations of a metal's couplings that the data tell, of a size that they ask."""
+"""Combinations of a metal's couplings that the data tell, of the size that predicts them best.
+
+Metal has many more couplings than any data tell. Those combinations of them that the data tell
+most about are its modes; how large a prior lets them be is chosen on held-out blocks of time.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -13,7 +17,7 @@ from anser_ros.effects.view import View
 
 Array = NDArray[np.float64]
 Known = tuple[list[Array | None], Array]
-"""Columns, one array a part of a state, and their prior sizes."""
+"""Columns, one array for each part of a state, and their prior sizes."""
 Unit = Callable[[View, Array], NDArray[np.inexact]]
 """Flux (F, S, K, m) of modes (c, m) of couplings in a view."""
 
@@ -21,7 +25,8 @@ MOST_TOLD = 130
 """Modes, at most, of which the data are asked how large they are: more would be slower to compare
 than they could ever explain."""
 LEAST_TOLD = 0.3
-"""A mode is left out of which the data tell less than this share of what the prior does."""
+"""Information in the data, over that in the prior, below which a mode is left out: it would stay
+at about zero and only take time."""
 SCORED_FRAMES = 130
 """Frames of each part, about, on which sizes of couplings are compared."""
 

@@ -15,6 +15,8 @@ BINS = 12
 SIGNIFICANT = 1e-5
 """Probability in noise below which a dependence is one: eight variables are tested, on residuals
 whose noise is only estimated."""
+MATTERS = 0.005
+"""Share of the residual power that a dependence must explain to be reported."""
 FEWEST = 4
 """Values that a cell needs for its mean to be compared."""
 
@@ -39,7 +41,7 @@ class StructureTest:
     @property
     def significant(self) -> bool:
         """Whether noise hardly does that, and it matters."""
-        return self.probability < SIGNIFICANT and self.share > 0.005
+        return self.probability < SIGNIFICANT and self.share > MATTERS
 
 
 def structure_tests(state: State) -> list[StructureTest]:
@@ -71,7 +73,7 @@ def _noise(parts: list[Part]) -> float:
 
 
 def noise_scale(state: State) -> float:
-    """Standard deviation of the white part of the tools' residuals, in expected ones."""
+    """Standard deviation of the white part of the tools' residuals, over the expected one."""
     return float(np.sqrt(_noise(_tools(state))))
 
 

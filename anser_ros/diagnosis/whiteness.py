@@ -43,7 +43,7 @@ class Whiteness:
 
     @property
     def depends_on(self) -> tuple[str, ...]:
-        """What they depend on, in the contract's words."""
+        """What they depend on, in the words of `docs/interfaces.md`."""
         found: list[str] = []
         if self.memory > REMEMBERED:
             found.append('time')

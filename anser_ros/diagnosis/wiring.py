@@ -12,6 +12,8 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 Mask = NDArray[np.bool_]
 
+ITS_OWN = 0.9
+"""Correlation with its own prediction from which a reading is its own, whatever its sign."""
 TURNED_ROUND = 0.3
 """A gain within this of -1 is a polarity."""
 ALIKE, BETTER = 0.95, 0.1
@@ -38,7 +40,7 @@ def wiring_faults(problem: Problem) -> list[Term]:
         gain, alike = _likeness(tool.flux, part.view.flux, usable)
         own = np.diag(alike)
         turned += channels[
-            (np.abs(np.diag(gain) + 1) < TURNED_ROUND) & (own > 0.9) & ~silent
+            (np.abs(np.diag(gain) + 1) < TURNED_ROUND) & (own > ITS_OWN) & ~silent
         ].tolist()
         order = np.argmax(alike, axis=1)
         moved = _moved(alike, ~silent)

@@ -68,7 +68,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
         return np.array([0])
 
     def prior(self, term: CoilDriftTerm) -> Array:
-        """Some percent; a time constant known to a factor of five."""
+        """Amounts are some percent, time constants are known to a factor of five."""
         return np.array([0.1, 1.6])
 
     def _own(self, term: CoilDriftTerm, view: View) -> ComplexArray:

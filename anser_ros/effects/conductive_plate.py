@@ -79,7 +79,7 @@ class ConductivePlate(Effect[Term]):
         return np.array([1])
 
     def prior(self, term: Term) -> Array:
-        """Anywhere near the board; sheet resistances over decades. A frozen sheet stays."""
+        """Heights and places near the board, resistances over decades; a held sheet stays."""
         if term.held:
             return np.full(5, FROZEN)
         return np.array([0.1, 0.2, 0.1, 0.1, 3.0])

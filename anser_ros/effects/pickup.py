@@ -37,7 +37,7 @@ class Pickup(Effect[Term]):
         return Term(self, {'channel': channel}, np.zeros(2 * apparatus.emitters))
 
     def prior(self, term: Term) -> Array:
-        """Some tens of nanotesla."""
+        """Phasors are some tens of nanotesla."""
         return np.full(term.theta.size, 30.0)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
