@@ -24,6 +24,7 @@ ROOMS = (
     'measured',
     'metal',
     'physics',
+    'sessions',
     'signals',
     'simulation',
 )

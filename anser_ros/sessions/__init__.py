@@ -1,0 +1,1 @@
+"""Recorded sessions: read, prepared, tracked, evaluated, diagnosed, and watched while they run."""

@@ -29,6 +29,8 @@ from anser_ros.tracking.estimate import TrackerSettings
 Array = NDArray[np.float64]
 
 DEFAULT_NOISE_T = 60e-12
+"""Noise of a phasor component, T, where the setup states none; the diagnosis then measures it, and
+says so when it has grown."""
 ROOM = 2.0
 """Gate of the held-out part's tracking over the flux residual there. With less, poses that a wrong
 model makes would be refused instead of counted; with much more, wrong minima would be taken for

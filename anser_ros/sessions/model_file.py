@@ -1,4 +1,4 @@
-"""Field models in files."""
+"""Field models read from files and written to them."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""Patches of a recorded session: reference coils that move, followed as the live node does."""
+"""Patches of a recorded session, which carry reference coils that move, followed as live."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""What the nodes said of themselves in ``/diagnostics`` during a recording."""
+"""What the nodes reported about themselves in ``/diagnostics`` during a recording."""
 
 import os
 from collections.abc import Mapping
@@ -12,6 +12,7 @@ from anser_ros.wire.bag import MessageDecoder, Salvage, iter_messages
 
 TOPIC = '/diagnostics'
 WARN = 1
+"""Level of a warning in diagnostic_msgs/DiagnosticStatus."""
 BUSY = {
     'lags': 'stretches of samples that the simulated unit could not make in time',
     'dropped_blocks': 'blocks that the simulated unit could not send',
@@ -22,11 +23,14 @@ BUSY = {
     'frames_skipped': 'frames that the tracker was too slow for',
     'lost_messages': 'messages that the recorder lost',
 }
-"""Counters that rise when a machine can't keep up, and what they count."""
+"""Counters that rise when a machine cannot keep up, and what they count."""
 
 
 def last_words(path: str | os.PathLike[str]) -> dict[str, Mapping[str, str]]:
-    """The last values of every status, by its name; empty where nothing was recorded yet."""
+    """The last values of every status by its name.
+
+    A bag without diagnostics, or one that cannot be read yet, gives an empty mapping.
+    """
     found: dict[str, Mapping[str, str]] = {}
     decoder = MessageDecoder()
     try:
@@ -40,7 +44,25 @@ def last_words(path: str | os.PathLike[str]) -> dict[str, Mapping[str, str]]:
 
 
 def first_warnings(path: str | os.PathLike[str], part_of: str) -> dict[str, int]:
-    """When each part of a node first warned: names behind ``part_of: ``, log times in ns."""
+    """When each part of a node first warned.
+
+    Parameters
+    ----------
+    path : path
+        The recording.
+    part_of : str
+        The node, whose statuses are named ``NODE: PART``.
+
+    Returns
+    -------
+    dict of str to int
+        Log time of the first warning, ns, by the part's name.
+
+    Raises
+    ------
+    BagError
+        When the recording cannot be read.
+    """
     found: dict[str, int] = {}
     decoder = MessageDecoder()
     for raw in iter_messages(path, Salvage()):
@@ -59,7 +81,7 @@ def _level(status: Any) -> int:
 
 
 def overload(path: str | os.PathLike[str]) -> list[str]:
-    """Signs that the machine was too busy for a recording, in words; empty for a sound one."""
+    """Signs in words that the machine was too busy for a recording; empty for a sound one."""
     signs = []
     for name, values in last_words(path).items():
         for key, meaning in BUSY.items():
@@ -70,7 +92,11 @@ def overload(path: str | os.PathLike[str]) -> list[str]:
 
 
 def kept_share(session: Session) -> float:
-    """Share of a recording's tool readings that arrived whole: 1 where no window is missing."""
+    """Share of a recording's frames with tool readings, which is 1 where no window is missing.
+
+    How many there should be follows from the median time between two frames; of several tools the
+    best counts.
+    """
     shares = [0.0]
     for tool in session.tools:
         if tool.time.size > 1:

@@ -1,4 +1,4 @@
-"""A recorded session as arrays: a bag's documents turned into measurements on one time axis."""
+"""A recorded session as arrays: the messages of a bag on one time axis."""
 
 import os
 from dataclasses import dataclass
@@ -15,24 +15,34 @@ from anser_ros.wire.points import STALE
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
 
 NANO = 1e-9
+"""Seconds in a nanosecond."""
 LONGEST_OPTICAL_GAP_S = 0.25
-"""An optical tracker at 60 Hz that misses more than a quarter of a second has no pose between."""
+"""Longest gap between two optical poses, s, over which a pose is interpolated.
+
+A tracker at 60 Hz that is silent for longer did not see the tool, whose motion meanwhile is not
+known; a hand moves by centimetres in that time.
+"""
 MOST_NOISE_T = 1e-3
+"""Noise, T, from which on a setup's statement is taken for a mistake and not used. The emitters
+make microtesla at most, so that nothing could be tracked in so much noise."""
 
 
 @dataclass(frozen=True)
 class Session:
-    """One recording.
+    """One recording as measurements of every body.
 
     Attributes
     ----------
     path : str
+        Of the bag.
     setup : Setup
+        The setup document that the bag holds.
     start_ns : int
         The stamp at time 0 of all measurements.
     tools : tuple of Measurements
         One a body that moves, in the order of the setup.
     reference : Measurements or None
+        Of the reference sensors, where their fluxes were recorded.
     lost : str
         What could not be read, in words; empty when nothing is missing.
     """
@@ -51,7 +61,7 @@ class Session:
 
 
 def sensor_table(specs: tuple[SensorSpec, ...]) -> SensorTable:
-    """The setup's sensors as arrays."""
+    """The specified sensors as a table, in the given order."""
     return SensorTable(
         channel=np.array([s.channel for s in specs], dtype=np.int64),
         name=tuple(s.name for s in specs),
@@ -63,14 +73,14 @@ def sensor_table(specs: tuple[SensorSpec, ...]) -> SensorTable:
 
 
 def noise_of(setup: Setup) -> float:
-    """What a setup says that the fluxes' components scatter by, T; 0 where it says nothing."""
+    """Noise of a phasor component that a setup states, T; 0 where it states none that can be."""
     told = setup.extra.get('flux_noise_t', 0.0)
     is_number = isinstance(told, (int, float)) and not isinstance(told, bool)
     return float(told) if is_number and 0.0 < told < MOST_NOISE_T else 0.0
 
 
 def pose_track(stream: PoseStream, start_ns: int) -> PoseTrack:
-    """A pose stream on the session's time axis."""
+    """A recorded pose stream on the time axis of a session that starts at a stamp."""
     time = (stream.stamp_ns - start_ns) * NANO
     return PoseTrack(np.asarray(time, dtype=np.float64), stream.position, stream.quaternion)
 

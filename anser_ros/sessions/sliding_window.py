@@ -13,9 +13,12 @@ from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import Setup
 
 LIVE = 'live'
+"""What stands in place of a path in the sessions of a running system."""
 MARGIN_NS = 1_000_000_000
+"""How much longer than fluxes poses are kept, ns, because their clock may be ahead."""
 RESTART_NS = 1_000_000_000
-"""Stamps that run back by more are a replay that begins again, or a clock that was set."""
+"""Stamps that run back by more, ns, are a replay that begins again or a clock that was set; by
+less, a message that came late."""
 
 
 @dataclass
@@ -61,15 +64,15 @@ class SlidingWindow:
         self._poses: dict[str, deque[tuple[int, tuple[float, ...]]]] = {}
 
     def take_tool(self, stamp_ns: int, points: FluxPoints) -> None:
-        """Add tool fluxes."""
+        """Keep the tools' fluxes of one stamp, unless they are late or too close to the last."""
         self._take(self._tool, stamp_ns, points)
 
     def take_reference(self, stamp_ns: int, points: FluxPoints) -> None:
-        """Add reference fluxes."""
+        """Keep the references' fluxes of one stamp, under the same rule."""
         self._take(self._reference, stamp_ns, points)
 
     def take_pose(self, body: str, stamp_ns: int, pose: Sequence[float]) -> None:
-        """Add an optical pose: x y z in m, then a quaternion x y z w; what is none is left out."""
+        """Keep an optical pose (x y z in m, quaternion x y z w), unless it is late or no pose."""
         values = np.asarray(pose, dtype=np.float64)
         if not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1.0) > 1e-3:
             return

@@ -11,6 +11,7 @@ from anser_ros.sessions.session import Session
 from anser_ros.wire.setup import Setup
 
 NOMINAL = 'nominal'
+"""Name of the model of the setup's own geometry, given where a model file's path may stand."""
 
 
 def board_of(setup: Setup) -> Board:

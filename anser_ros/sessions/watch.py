@@ -1,4 +1,4 @@
-"""A light diagnosis of the last seconds: is there anything that the model lacks, and what is it?
+"""A light diagnosis of the last seconds, which says whether the model lacks anything, and what.
 
 A look costs little while all is well, and while what was found last still explains what is seen;
 only something new starts a search.
@@ -27,15 +27,19 @@ Array = NDArray[np.float64]
 
 OPTICAL, RIGID, REFERENCES = 'optical poses', 'rigidity of the tools', 'references alone'
 LIGHT = SearchSettings(most_effects=1, finalists=4, iterations=6)
-"""One effect, the strongest: what it leaves is said, and is for the whole diagnosis to find."""
+"""A search that names the strongest effect alone, so that a look takes seconds. What that effect
+leaves is reported, and finding its cause is left to the whole diagnosis."""
 FREE_POSE_M, FREE_POSE_RAD = 0.02, 0.1
-"""A pose that the fluxes themselves gave may be so far off, and says nothing of its own."""
+"""Standard deviations, m and rad per axis, of a pose that the fluxes themselves gave. They are far
+above what such a pose is wrong by, so that it holds nothing against any effect."""
 EXCESS = 1.25
-"""Mean square of the whitened residuals from which something is there."""
+"""Mean square of the whitened residuals from which on the model lacks something. Noise alone gives
+1; less of a margin would start searches on noise, more would miss small effects."""
 SAME = 1.3
-"""Factor within which the same residual says that nothing has changed."""
+"""Factor by which the residual that a finding leaves may grow before it is searched for anew."""
 LEAST_SPREAD_M, LEAST_TURN_RAD = 0.01, 0.1
-"""A tool that has moved and turned less shows that something is wrong, but not what."""
+"""Least standard deviation of a tool's places, m, and of its orientations, rad, for a search. A
+tool that stays closer shows that something is wrong, but not what."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,7 @@ class Sighting:
 
 
 class Watch:
-    """Looks at one window after the other, and remembers what it found.
+    """A watch looks at one window after the other, and remembers what it found.
 
     Parameters
     ----------
