@@ -10,7 +10,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from anser_ros.cli.diagnosis_report import render, verdict
+from anser_ros.cli.diagnosis_report import render
+from anser_ros.cli.diagnosis_words import verdict
 from anser_ros.cli.output import make_folder, say_written
 from anser_ros.sessions.diagnosis import diagnose_session
 from anser_ros.sessions.diagnosis_document import to_document

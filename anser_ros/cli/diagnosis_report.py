@@ -1,28 +1,16 @@
 """The diagnosis as one self-contained page for readers who do not know the code."""
 
-import base64
 import html
-import io
 from collections.abc import Sequence
 from typing import Any
 
-import matplotlib
-
-matplotlib.use('Agg')
-import matplotlib.pyplot as plt
-import numpy as np
-from matplotlib.figure import Figure
-from numpy.typing import NDArray
-
-from anser_ros.diagnosis.problem import Part, State
+from anser_ros.cli.diagnosis_figures import bars, image, maps, strongest, time_line
+from anser_ros.cli.diagnosis_words import short_ones, value_text, verdict
 from anser_ros.diagnosis.search import Candidate
 from anser_ros.sessions.diagnosis import SessionDiagnosis
 
-Array = NDArray[np.float64]
-
-# Candidates of a round that the page lists at most, to keep it short.
 MOST_CANDIDATES = 40
-BEFORE, AFTER = '#c44e52', '#4c72b0'
+"""Most candidates of a round that the page lists, the best first; it says how many there were."""
 STYLE = """
 body { font: 15px/1.5 sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em; color: #222 }
 table { border-collapse: collapse; margin: 1em 0 } td, th { padding: .25em .8em; text-align: left;
@@ -32,59 +20,6 @@ img { max-width: 100% }
 td.n { text-align: right; font-variant-numeric: tabular-nums } code { background: #f4f4f4 }
 .note { color: #666 }
 """
-
-
-def verdict(document: dict[str, Any]) -> str:
-    """Return in one paragraph what the diagnosis found."""
-    held, effects = document['held_out'], document['effects']
-    before, after = held['flux_rms_before_t'], held['flux_rms_after_t']
-    if effects:
-        names = ', '.join(_named(effect) for effect in effects)
-        text = (
-            f'The model lacks {len(effects)} effect{"s" if len(effects) > 1 else ""}: {names}. '
-            f'With {"them" if len(effects) > 1 else "it"} the residual on data that took no part '
-            f'falls from {1e12 * before:.0f} to {1e12 * after:.0f} pT'
-        )
-        pair = held['position_rmse_before_m'], held['position_rmse_after_m']
-        if None not in pair:
-            text += f', and the position error from {1e3 * pair[0]:.3g} to {1e3 * pair[1]:.3g} mm'
-        text += '.'
-    else:
-        floor = 1e12 * held['flux_rms_floor_t']
-        text = 'No effect that is known here explains what this session shows: '
-        if document['unexplained']['fraction'] == 0:
-            text = 'The model explains this session, and no effect is needed: '
-        text += (
-            f'the residual on held-out data is {1e12 * after:.0f} pT, the noise {floor:.0f} pT.'
-        )
-    rest = document['unexplained']
-    if rest['fraction'] > 0:
-        on = ', '.join(rest['depends_on']) or 'nothing that was looked at'
-        share = f'{rest["fraction"]:.0%}' if rest['fraction'] >= 0.01 else 'Less than 1%'
-        text += f' {share} of the power above the noise stays unexplained; it depends on {on}.'
-    else:
-        text += ' Nothing above the noise stays unexplained.'
-    return text
-
-
-def _named(effect: dict[str, Any]) -> str:
-    shown = ', '.join(f'{key} {_value(value)}' for key, value in _short(effect['parameters']))
-    return f'{effect["name"]} ({shown})' if shown else str(effect['name'])
-
-
-def _short(parameters: dict[str, Any]) -> list[tuple[str, Any]]:
-    """Return the parameters that fit on a line, without long lists."""
-    return [(key, value) for key, value in parameters.items() if _size(value) <= 9]
-
-
-def _size(value: Any) -> int:
-    return sum(_size(item) for item in value) if isinstance(value, list) else 1
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, list):
-        return '[' + ', '.join(_value(item) for item in value) + ']'
-    return f'{value:.4g}' if isinstance(value, float) else str(value)
 
 
 def render(result: SessionDiagnosis, document: dict[str, Any], *, session: str, model: str) -> str:
@@ -110,11 +45,11 @@ def render(result: SessionDiagnosis, document: dict[str, Any], *, session: str, 
         '<h2>Effects</h2>',
         _effects(document),
         '<h2>Residuals over time</h2><p>In the pictures 1 is what noise alone would give.</p>',
-        _image(_time_line(found.before, found.after)),
+        image(time_line(found.before, found.after)),
         '<h2>Residuals over the volume</h2>',
-        _image(_maps(found.before, found.after)),
+        image(maps(found.before, found.after)),
         '<h2>Residuals by channel and emitter</h2>',
-        _image(_bars(found.before, found.after)),
+        image(bars(found.before, found.after)),
         '<h2>What stays unexplained</h2>',
         _structure(result),
         '<h2>Every candidate</h2>',
@@ -160,8 +95,8 @@ def _effects(document: dict[str, Any]) -> str:
         return '<p>None. A clean session passes every test and is not corrected.</p>'
     rows = []
     for effect in document['effects']:
-        values = '\n'.join(f'{k} = {_value(v)}' for k, v in _short(effect['parameters']))
-        sigmas = '\n'.join(f'{k} ± {_value(v)}' for k, v in _short(effect['uncertainty']))
+        values = '\n'.join(f'{k} = {value_text(v)}' for k, v in short_ones(effect['parameters']))
+        sigmas = '\n'.join(f'{k} ± {value_text(v)}' for k, v in short_ones(effect['uncertainty']))
         evidence = effect['evidence']
         rivals = ', '.join(evidence.get('rivals') or []) or 'none'
         rows.append(
@@ -198,30 +133,8 @@ def _structure(result: SessionDiagnosis) -> str:
     text = '<p>Share of the residual power that follows each variable beyond chance. A trace is '
     text += 'plain to see, but too small to matter.</p>'
     if found.unexplained > 0:
-        text += f'<p>{html.escape(_strongest(found.after))}</p>'
+        text += f'<p>{html.escape(strongest(found.after))}</p>'
     return text + _table(head, rows)
-
-
-def _strongest(state: State) -> str:
-    """Return in words where the residual is largest."""
-    largest = []
-    parts = _tools(state)
-    emitters = state.problem.fields.omega.size
-    for kind, axis in (('channel', 1), ('emitter', 2)):
-        sizes: dict[int, float] = {}
-        for part in parts:
-            channels = part.view.sensors.channel
-            cells = _rms(part, 0).reshape(2, len(channels), emitters)
-            values = np.sqrt(np.mean(cells**2, axis=(0, 3 - axis)))
-            names = channels.tolist() if kind == 'channel' else range(emitters)
-            for name, value in zip(names, values.tolist(), strict=True):
-                sizes[name] = max(sizes.get(name, 0.0), value)
-        worst = max(sizes, key=lambda name: sizes[name])
-        usual = float(np.median(list(sizes.values())))
-        largest.append(
-            f'{kind} {worst} ({sizes[worst]:.1f} times the expected, the median is {usual:.1f}'
-        )
-    return f'It is largest on {") and on ".join(largest)}).'
 
 
 def _candidates(rounds: Sequence[Sequence[Candidate]]) -> str:
@@ -264,88 +177,3 @@ def _left_out(result: SessionDiagnosis) -> str:
         names = ', '.join(term.label for term in found.search.removed)
         text += f'<p>Explained away by others: {html.escape(names)}.</p>'
     return text
-
-
-def _tools(state: State) -> list[Part]:
-    return [part for part in state.parts if not part.view.is_reference]
-
-
-def _rms(part: Part, axis: int) -> Array:
-    good = part.whitener.weight > 0
-    return np.asarray(
-        np.sqrt((part.white**2 * good).sum(axis=axis) / np.maximum(good.sum(axis=axis), 1))
-    )
-
-
-def _image(figure: Figure) -> str:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format='png', dpi=110)
-    plt.close(figure)
-    data = base64.b64encode(buffer.getvalue()).decode('ascii')
-    return f'<img alt="figure" src="data:image/png;base64,{data}">'
-
-
-def _time_line(before: State, after: State) -> Figure:
-    figure, axes = plt.subplots(figsize=(9, 3), layout='constrained')
-    for state, colour, label in ((before, BEFORE, 'before'), (after, AFTER, 'after')):
-        for part in _tools(state):
-            axes.plot(part.view.time, _rms(part, 1), '.', ms=3, color=colour, label=label)
-    axes.axhline(1.0, color='0.6', lw=0.8)
-    axes.set(xlabel='time, s', ylabel='residual / expected', yscale='log')
-    _legend_once(axes)
-    return figure
-
-
-def _legend_once(axes: Any) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    unique = dict(zip(labels, handles, strict=True))
-    axes.legend(unique.values(), unique.keys())
-
-
-def _maps(before: State, after: State) -> Figure:
-    figure, panels = plt.subplots(1, 2, figsize=(9, 4), layout='constrained', sharey=True)
-    sizes = [np.concatenate([_rms(part, 1) for part in _tools(s)]) for s in (before, after)]
-    top = max(float(np.percentile(sizes[0], 98)), 1.5)
-    for panel, state, size, title in zip(
-        panels, (before, after), sizes, ('before', 'after'), strict=True
-    ):
-        place = np.concatenate([part.view.position for part in _tools(state)])
-        shown = panel.scatter(1e3 * place[:, 0], 1e3 * place[:, 1], c=size, s=8, vmin=0, vmax=top)
-        panel.set(title=title, xlabel='x, mm', aspect='equal')
-    panels[0].set_ylabel('y, mm')
-    figure.colorbar(shown, ax=panels, label='residual / expected')
-    return figure
-
-
-def _bars(before: State, after: State) -> Figure:
-    figure, panels = plt.subplots(1, 2, figsize=(9, 3), layout='constrained')
-    for offset, state, colour, label in (
-        (-0.2, before, BEFORE, 'before'), (0.2, after, AFTER, 'after'),
-    ):  # fmt: skip
-        for panel, axis in zip(panels, ('channel', 'emitter'), strict=True):
-            names, sizes = _by(state, axis)
-            panel.bar(np.arange(len(names)) + offset, sizes, 0.4, color=colour, label=label)
-            panel.set_xticks(np.arange(len(names)), names)
-            panel.set_xlabel(axis)
-    panels[0].set_ylabel('residual / expected')
-    panels[0].legend()
-    return figure
-
-
-def _by(state: State, axis: str) -> tuple[list[str], Array]:
-    """Return the names of all channels or emitters, and the residual of each."""
-    names: list[str] = []
-    sizes: list[float] = []
-    squares: Array | None = None
-    for part in _tools(state):
-        sensors, emitters = part.view.flux.shape[1:]
-        size = (_rms(part, 0) ** 2).reshape(2, sensors, emitters).mean(axis=0)
-        if axis == 'channel':
-            names += [str(c) for c in part.view.sensors.channel.tolist()]
-            sizes += np.sqrt(size.mean(axis=1)).tolist()
-        else:
-            squares = size.mean(axis=0) if squares is None else squares + size.mean(axis=0)
-            names = [str(k) for k in range(emitters)]
-    if squares is not None:
-        sizes = np.sqrt(squares / len(_tools(state))).tolist()
-    return names, np.array(sizes)

@@ -1,0 +1,134 @@
+"""What a diagnosis leaves, drawn over time, over the volume, by channel and by emitter.
+
+In all of them 1 is what noise alone would give.
+"""
+
+import base64
+import io
+from typing import Any
+
+import matplotlib
+
+matplotlib.use('Agg')
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from anser_ros.diagnosis.problem import Part, State
+
+Array = NDArray[np.float64]
+
+BEFORE, AFTER = '#c44e52', '#4c72b0'
+"""Colours of the residuals without and with the effects that were found."""
+
+
+def strongest(state: State) -> str:
+    """Say in words on which channel and emitter the residual is largest."""
+    said = []
+    parts = _tools(state)
+    emitters = state.problem.fields.omega.size
+    for kind, axis in (('channel', 1), ('emitter', 2)):
+        sizes: dict[int, float] = {}
+        for part in parts:
+            channels = part.view.sensors.channel
+            cells = _rms(part, 0).reshape(2, len(channels), emitters)
+            values = np.sqrt(np.mean(cells**2, axis=(0, 3 - axis)))
+            names = channels.tolist() if kind == 'channel' else range(emitters)
+            for name, value in zip(names, values.tolist(), strict=True):
+                sizes[name] = max(sizes.get(name, 0.0), value)
+        worst = max(sizes, key=lambda name: sizes[name])
+        usual = float(np.median(list(sizes.values())))
+        said.append(
+            f'{kind} {worst} ({sizes[worst]:.1f} times the expected, the median is {usual:.1f}'
+        )
+    return f'It is largest on {") and on ".join(said)}).'
+
+
+def _tools(state: State) -> list[Part]:
+    return [part for part in state.parts if not part.view.is_reference]
+
+
+def _rms(part: Part, axis: int) -> Array:
+    good = part.whitener.weight > 0
+    return np.asarray(
+        np.sqrt((part.white**2 * good).sum(axis=axis) / np.maximum(good.sum(axis=axis), 1))
+    )
+
+
+def image(figure: Figure) -> str:
+    """The figure as an HTML element that holds the picture itself; the figure is closed."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format='png', dpi=110)
+    plt.close(figure)
+    data = base64.b64encode(buffer.getvalue()).decode('ascii')
+    return f'<img alt="figure" src="data:image/png;base64,{data}">'
+
+
+def time_line(before: State, after: State) -> Figure:
+    """Draw the residual of every frame over time, without and with the effects."""
+    figure, axes = plt.subplots(figsize=(9, 3), layout='constrained')
+    for state, colour, label in ((before, BEFORE, 'before'), (after, AFTER, 'after')):
+        for part in _tools(state):
+            axes.plot(part.view.time, _rms(part, 1), '.', ms=3, color=colour, label=label)
+    axes.axhline(1.0, color='0.6', lw=0.8)
+    axes.set(xlabel='time, s', ylabel='residual / expected', yscale='log')
+    _legend_once(axes)
+    return figure
+
+
+def _legend_once(axes: Any) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    unique = dict(zip(labels, handles, strict=True))
+    axes.legend(unique.values(), unique.keys())
+
+
+def maps(before: State, after: State) -> Figure:
+    """Draw the residual of every frame where the tool was, seen from above."""
+    figure, panels = plt.subplots(1, 2, figsize=(9, 4), layout='constrained', sharey=True)
+    sizes = [np.concatenate([_rms(part, 1) for part in _tools(s)]) for s in (before, after)]
+    top = max(float(np.percentile(sizes[0], 98)), 1.5)
+    for panel, state, size, title in zip(
+        panels, (before, after), sizes, ('before', 'after'), strict=True
+    ):
+        place = np.concatenate([part.view.position for part in _tools(state)])
+        shown = panel.scatter(1e3 * place[:, 0], 1e3 * place[:, 1], c=size, s=8, vmin=0, vmax=top)
+        panel.set(title=title, xlabel='x, mm', aspect='equal')
+    panels[0].set_ylabel('y, mm')
+    figure.colorbar(shown, ax=panels, label='residual / expected')
+    return figure
+
+
+def bars(before: State, after: State) -> Figure:
+    """Draw the residual of every channel and of every emitter."""
+    figure, panels = plt.subplots(1, 2, figsize=(9, 3), layout='constrained')
+    for offset, state, colour, label in (
+        (-0.2, before, BEFORE, 'before'), (0.2, after, AFTER, 'after'),
+    ):  # fmt: skip
+        for panel, axis in zip(panels, ('channel', 'emitter'), strict=True):
+            names, sizes = _by(state, axis)
+            panel.bar(np.arange(len(names)) + offset, sizes, 0.4, color=colour, label=label)
+            panel.set_xticks(np.arange(len(names)), names)
+            panel.set_xlabel(axis)
+    panels[0].set_ylabel('residual / expected')
+    panels[0].legend()
+    return figure
+
+
+def _by(state: State, axis: str) -> tuple[list[str], Array]:
+    """Return the names of all channels or emitters, and the residual of each."""
+    names: list[str] = []
+    sizes: list[float] = []
+    squares: Array | None = None
+    for part in _tools(state):
+        sensors, emitters = part.view.flux.shape[1:]
+        size = (_rms(part, 0) ** 2).reshape(2, sensors, emitters).mean(axis=0)
+        if axis == 'channel':
+            names += [str(c) for c in part.view.sensors.channel.tolist()]
+            sizes += np.sqrt(size.mean(axis=1)).tolist()
+        else:
+            squares = size.mean(axis=0) if squares is None else squares + size.mean(axis=0)
+            names = [str(k) for k in range(emitters)]
+    if squares is not None:
+        sizes = np.sqrt(squares / len(_tools(state))).tolist()
+    return names, np.array(sizes)

@@ -1,0 +1,63 @@
+"""What a diagnosis found, in words for people."""
+
+from typing import Any
+
+LONGEST = 9
+"""Most numbers of a parameter that are shown: those of a 3 x 3 matrix. Longer ones stand in
+diagnosis.json alone."""
+
+
+def verdict(document: dict[str, Any]) -> str:
+    """Say in one paragraph what was found and what stays unexplained."""
+    held, effects = document['held_out'], document['effects']
+    before, after = held['flux_rms_before_t'], held['flux_rms_after_t']
+    if effects:
+        names = ', '.join(_named(effect) for effect in effects)
+        text = (
+            f'The model lacks {len(effects)} effect{"s" if len(effects) > 1 else ""}: {names}. '
+            f'With {"them" if len(effects) > 1 else "it"} the residual on data that took no part '
+            f'falls from {1e12 * before:.0f} to {1e12 * after:.0f} pT'
+        )
+        pair = held['position_rmse_before_m'], held['position_rmse_after_m']
+        if None not in pair:
+            text += f', and the position error from {1e3 * pair[0]:.3g} to {1e3 * pair[1]:.3g} mm'
+        text += '.'
+    else:
+        floor = 1e12 * held['flux_rms_floor_t']
+        text = 'No effect that is known here explains what this session shows: '
+        if document['unexplained']['fraction'] == 0:
+            text = 'The model explains this session, and no effect is needed: '
+        text += (
+            f'the residual on held-out data is {1e12 * after:.0f} pT, the noise {floor:.0f} pT.'
+        )
+    rest = document['unexplained']
+    if rest['fraction'] > 0:
+        on = ', '.join(rest['depends_on']) or 'nothing that was looked at'
+        share = f'{rest["fraction"]:.0%}' if rest['fraction'] >= 0.01 else 'Less than 1%'
+        text += f' {share} of the power above the noise stays unexplained; it depends on {on}.'
+    else:
+        text += ' Nothing above the noise stays unexplained.'
+    return text
+
+
+def _named(effect: dict[str, Any]) -> str:
+    shown = ', '.join(
+        f'{key} {value_text(value)}' for key, value in short_ones(effect['parameters'])
+    )
+    return f'{effect["name"]} ({shown})' if shown else str(effect['name'])
+
+
+def short_ones(parameters: dict[str, Any]) -> list[tuple[str, Any]]:
+    """Parameters that fit a line, by name; long lists are left out."""
+    return [(key, value) for key, value in parameters.items() if _size(value) <= LONGEST]
+
+
+def _size(value: Any) -> int:
+    return sum(_size(item) for item in value) if isinstance(value, list) else 1
+
+
+def value_text(value: Any) -> str:
+    """A parameter's value as text with four digits."""
+    if isinstance(value, list):
+        return '[' + ', '.join(value_text(item) for item in value) + ']'
+    return f'{value:.4g}' if isinstance(value, float) else str(value)
