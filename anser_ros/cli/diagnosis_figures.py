@@ -25,7 +25,7 @@ BEFORE, AFTER = '#c44e52', '#4c72b0'
 
 def strongest(state: State) -> str:
     """Say in words on which channel and emitter the residual is largest."""
-    said = []
+    largest = []
     parts = _tools(state)
     emitters = state.problem.fields.omega.size
     for kind, axis in (('channel', 1), ('emitter', 2)):
@@ -39,10 +39,10 @@ def strongest(state: State) -> str:
                 sizes[name] = max(sizes.get(name, 0.0), value)
         worst = max(sizes, key=lambda name: sizes[name])
         usual = float(np.median(list(sizes.values())))
-        said.append(
+        largest.append(
             f'{kind} {worst} ({sizes[worst]:.1f} times the expected, the median is {usual:.1f}'
         )
-    return f'It is largest on {") and on ".join(said)}).'
+    return f'It is largest on {") and on ".join(largest)}).'
 
 
 def _tools(state: State) -> list[Part]:
