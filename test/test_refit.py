@@ -13,6 +13,7 @@ from refit_world import (
 )
 
 from anser_ros.errors import FitError
+from anser_ros.frames.intake import Intake
 from anser_ros.refit.baseline import ReadingWindow
 from anser_ros.refit.live_refit import LiveRefit, RefitSettings
 
@@ -215,10 +216,11 @@ def test_an_absurd_reading_is_left_out_with_its_reason(refit):
 
 def window_of(world, change, frames=12):
     window = ReadingWindow(world.references, 8, 10.0)
-    rng, none = np.random.default_rng(4), np.zeros(len(world.references), int)
+    intake = Intake(world.references.channel)
+    rng = np.random.default_rng(4)
     for frame in range(frames):
         flux = world.baseline + change(frame / frames) + world.noise(rng)
-        window.add(1 + frame, world.references.channel, flux, none)
+        window.add(intake.judge(1 + frame, world.references.channel, flux))
     return window
 
 
@@ -425,7 +427,7 @@ def test_what_does_not_fit_is_refused(refit):
         LiveRefit(world.model, table.select([0, 0]), baseline[[0, 0]])
     with pytest.raises(FitError, match='noise must be'):
         LiveRefit(world.model, table, baseline, noise=np.zeros(len(table)))
-    with pytest.raises(FitError, match='as many flags'):
+    with pytest.raises(FitError, match='the model has 8 emitters, the fluxes 2'):
         refit.update(1, table.channel, baseline[:, :2])
     with pytest.raises(FitError, match='twice in the frame'):
         refit.update(1, table.channel[[0, 0]], baseline[[0, 0]])

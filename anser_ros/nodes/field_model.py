@@ -17,29 +17,26 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from anser_ros.errors import AnserError, FitError, ModelFileError
+from anser_ros.errors import AnserError, FitError
 from anser_ros.field.model import FieldModel
-from anser_ros.field.nominal import nominal_model
-from anser_ros.nodes import qos
+from anser_ros.frames.intake import Frame, Intake
+from anser_ros.nodes import qos, refit_status
 from anser_ros.nodes.diagnostics import Trouble
-from anser_ros.nodes.flux_reader import FrameWatch, read_frame
+from anser_ros.nodes.flux_reader import read_frame
 from anser_ros.nodes.metal_view import MetalView
 from anser_ros.nodes.model_clouds import ModelWriter
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
-from anser_ros.nodes.patches import Patches
+from anser_ros.nodes.patches import Patches, start_refit
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.baseline import ReadingWindow, check_enough
 from anser_ros.refit.change import MOST_RATE_HZ, Pace
 from anser_ros.refit.live_refit import LiveRefit, RefitResult, RefitSettings
-from anser_ros.refit.result import FEW_REFERENCES, POOR_FIT
 from anser_ros.sessions.baseline import baseline_flux
-from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.model_file import load_model, save_model
 from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session, sensor_table
-from anser_ros.sessions.starting_model import NOMINAL, board_of
-from anser_ros.sessions.volume import stated_volume
+from anser_ros.sessions.starting_model import NOMINAL, starting_model
 from anser_ros.wire.setup import Setup, parse_setup
 
 
@@ -94,9 +91,8 @@ class FieldModelNode(AnserNode):
         self._result: RefitResult | None = None
         self._frozen = False
         self._trouble = Trouble()
-        self._watch: FrameWatch | None = None
+        self._frames: Intake | None = None
         self._stamp_ns = 0
-        self._told: tuple[NDArray[np.complex128] | None, float, int, bool] | None = None
         self._refit_s = 0.0
         self._pace = Pace(table.refit_rate_hz)
         self._writer = ModelWriter()
@@ -129,7 +125,7 @@ class FieldModelNode(AnserNode):
             if self._setup is not None and setup.has_same_board(self._setup):
                 self._setup_text, self._setup = message.data, setup
                 return  # another rate or noise: model and baseline hold
-            base = self._starting_model(setup)
+            base = starting_model(setup, self._file_model)
         except AnserError as error:
             self._refuse('setups_refused', error)
             return
@@ -137,7 +133,7 @@ class FieldModelNode(AnserNode):
         self._trouble.forget()
         self._refit = self._result = None
         self._references = sensor_table(setup.reference_sensors)
-        self._watch = FrameWatch(self._references.channel, base.emitters, self.count)
+        self._frames = Intake(self._references.channel, self.count)
         self._window = ReadingWindow(
             self._references, len(base.emitters), self.parameters.baseline_s
         )
@@ -167,47 +163,35 @@ class FieldModelNode(AnserNode):
         except AnserError as error:
             self._refuse('patch_fluxes_refused', error)
 
-    def _starting_model(self, setup: Setup) -> FieldModel:
-        if self._file_model is None:
-            return nominal_model(board_of(setup))
-        if self._file_model.emitters != setup.emitter_names:
-            raise ModelFileError(
-                f'the model has the emitters {", ".join(self._file_model.emitters)}; '
-                f'the setup {", ".join(setup.emitter_names)}'
-            )
-        return self._file_model
-
     def _on_flux(self, message: PointCloud2) -> None:
-        setup, window, watch = self._setup, self._window, self._watch
-        if setup is None or window is None or watch is None:
+        setup, window, frames = self._setup, self._window, self._frames
+        if setup is None or window is None or frames is None:
             self.count('fluxes_before_setup')
             return
         try:
             stamp_ns, points = read_frame(message, setup.frame_id, self.count)
-            flux = watch.admit(stamp_ns, points)
-            if flux is None:
+            frame = frames.admit(
+                stamp_ns, points.channel, points.flux, points.flags, setup.emitter_names
+            )
+            if frame is None:
                 return
-            window.add(stamp_ns, points.channel, flux, points.flags)
+            for kind, many in frame.kinds.items():
+                self.count(f'readings_{kind}', many)
+            window.add(frame)
             if self._refit is None and self.parameters.baseline_at_start and window.full:
                 self._follow(window.still_mean())
             if self._refit is not None and self._follows:
-                self._update(self._refit, stamp_ns, points.channel, flux, points.flags)
+                self._update(self._refit, frame)
         except AnserError as error:
             self._refuse('fluxes_refused', error)
 
-    def _update(
-        self,
-        refit: LiveRefit,
-        stamp_ns: int,
-        channels: NDArray[np.int64],
-        flux: NDArray[np.complex128],
-        flags: NDArray[np.int64],
-    ) -> None:
+    def _update(self, refit: LiveRefit, frame: Frame) -> None:
         """Let the model follow the references, not more often than wanted.
 
         Every frame is answered by the model in force for it, even where that is as before: so the
         tracker knows what to track a frame with, and gives the poses that are found offline.
         """
+        stamp_ns = frame.stamp_ns
         if not self._pace.is_due(stamp_ns):
             self.count('frames_between_refits')
             if self._model is not None:
@@ -215,23 +199,17 @@ class FieldModelNode(AnserNode):
             return
         begin_s = time.monotonic()
         if self._patches is None:
-            self._result = refit.update(stamp_ns, channels, flux, flags)
+            self._result = refit.follow(frame)
         else:
-            refit = self._with_patches(self._patches, refit, stamp_ns)
-            self._result = self._patches.update(refit, stamp_ns, channels, flux, flags)
+            moved = self._patches.moved_refit(refit, stamp_ns)
+            if moved is not None:  # the patches' new places have been worked out
+                self._refit = refit = moved
+                self.count('patch_moves')
+            self._result = self._patches.follow(refit, frame)
         self.count('refits')
         self._serve(self._result.model, stamp_ns)
         self._refit_s = time.monotonic() - begin_s
         self._metal.show(self._result, self._frame_id, stamp_ns)
-
-    def _with_patches(self, patches: Patches, refit: LiveRefit, stamp_ns: int) -> LiveRefit:
-        """Take over the refit for the patches' new places once it has been worked out."""
-        moved = patches.moved_refit(refit, stamp_ns)
-        if moved is None:
-            return refit
-        self._refit = moved
-        self.count('patch_moves')
-        return moved
 
     @property
     def _frame_id(self) -> str:
@@ -251,13 +229,10 @@ class FieldModelNode(AnserNode):
         """
         self._stamp_ns = stamp_ns if stamp_ns != self._stamp_ns else stamp_ns + 1
         frame_id = self._frame_id
-        # The uncertainty goes first, so that a receiver has both when the model comes; where it
-        # is the same as before, that one still holds.
-        told, follows = self._told, self._follows
-        uncertainty = (model.modes, model.flux_error_t, len(model.positions), follows)
-        if told is None or told[0] is not uncertainty[0] or told[1:] != uncertainty[1:]:
-            self._errors.publish(self._writer.error(model, frame_id, self._stamp_ns, follows))
-            self._told = uncertainty
+        # The uncertainty goes first, so that a receiver has both when the model comes.
+        error = self._writer.new_error(model, frame_id, self._stamp_ns, self._follows)
+        if error is not None:
+            self._errors.publish(error)
         self._models.publish(self._writer.dipoles(model, frame_id, self._stamp_ns))
         if model is not self._model:
             self.count('models')
@@ -265,29 +240,16 @@ class FieldModelNode(AnserNode):
 
     def _tell_following(self) -> None:
         """Let receivers know, when it has changed, whether frames are answered from now on."""
-        if self._model is not None and self._told is not None and self._told[3] != self._follows:
+        if self._model is not None and not self._writer.has_told(self._follows):
             self._serve(self._model, self.get_clock().now().nanoseconds)
 
     def _follow(self, baseline: NDArray[np.complex128]) -> None:
         """Refit from now on to what differs from a baseline, shape (S, K), T."""
         if self._base is None or self._references is None or self._setup is None:
             raise FitError('no setup yet')
-        # An emitter that can't be drawn: its own dipoles have to do.
-        drawing = Drawing.of(self._setup).field
-        volume = stated_volume(self._setup)
-        bodies = tuple(self._patch_topics)
-        moving = tuple(s for s in self._setup.tool_sensors if s.body in bodies)
-        self._patches = None
-        if moving:
-            patches = Patches(sensor_table(moving), baseline, self._frame_id)
-            self._refit = patches.started(
-                self._base, self._references, drawing=drawing, volume=volume
-            )
-            self._patches = patches
-        else:
-            self._refit = LiveRefit(
-                self._base, self._references, baseline, drawing=drawing, volume=volume
-            )
+        self._refit, self._patches = start_refit(
+            self._setup, self._base, self._references, baseline, tuple(self._patch_topics)
+        )
         self._result = None
         self._tell_following()
         self.count('baselines')
@@ -307,8 +269,7 @@ class FieldModelNode(AnserNode):
     def _on_save(self, _request: Any, response: Any) -> Any:
         if self._model is None:
             raise FitError('no model yet')
-        path = Path(self.parameters.save_file).expanduser().resolve()
-        save_model(path, self._model)
+        save_model(path := Path(self.parameters.save_file).expanduser().resolve(), self._model)
         response.success, response.message = True, str(path)
         return response
 
@@ -325,8 +286,8 @@ class FieldModelNode(AnserNode):
         baseline = self._window.still_mean()
         good = check_enough(baseline, RefitSettings().min_references)
         self._follow(baseline)
-        done = f'baseline of {good} references over {len(self._window)} frames'
-        response.success, response.message = True, done
+        response.success = True
+        response.message = f'baseline of {good} references over {len(self._window)} frames'
         return response
 
     # What is told -------------------------------------------------------------------------
@@ -346,26 +307,21 @@ class FieldModelNode(AnserNode):
         values: dict[str, object] = {'last_refusal': self._trouble.last}
         if model is None:
             return Status('', Level.WARN, self._trouble.last or 'no setup yet', values)
-        provenance = model.provenance
         values |= {
-            'source': provenance.get('source', self.parameters.model_file),
+            **refit_status.model_values(model, self.parameters.model_file),
             'stamp_ns': self._stamp_ns,
-            'dipoles': len(model.positions),
-            'emitters': len(model.emitters),
-            'flux_error_t': float(model.flux_error_t),
-            'modes': 0 if model.modes is None else len(model.modes),
             'freeze': self._frozen,
             'refit_time_s': self._refit_s,
         }
         activity = self._activity(values)
-        dead = '' if self._watch is None else ', '.join(self._watch.dead)
+        dead = '' if self._frames is None else ', '.join(self._frames.dead)
         values['dead_emitters'] = dead
         if dead:
             return Status('', Level.WARN, f'no flux of {dead}', values)
         trouble = self._trouble.recent(time.monotonic())
         if trouble:
             return Status('', Level.WARN, f'{activity}; lately: {trouble}', values)
-        level = Level.WARN if values.get('refit_state') in (FEW_REFERENCES, POOR_FIT) else Level.OK
+        level = Level.WARN if values.get('refit_state') in refit_status.TROUBLED else Level.OK
         return Status('', level, activity, values)
 
     def _activity(self, values: dict[str, object]) -> str:
@@ -373,33 +329,12 @@ class FieldModelNode(AnserNode):
             return 'held as it is: freeze was called'
         if self._refit is None or not self.parameters.refit:
             return 'constant' if not self.parameters.refit else 'constant, no baseline yet'
-        result = self._result
-        if result is None:
-            return 'baseline set'
-        values |= {
-            'refit_state': result.state,
-            'refit_reason': result.reason,
-            'reference_noise_t': result.noise_t,
-            'change_log_odds': result.log_odds,
-            'references_left_out': ', '.join(result.left_out),
-            'most_likely': max(result.weights, key=result.weights.__getitem__, default=''),
-            'largest_drift': float(np.abs(result.drift).max(initial=0.0)),
-        }
-        return result.state if not result.reason else f'{result.state}: {result.reason}'
+        values |= refit_status.refit_values(self._result)
+        return refit_status.refit_words(self._result)
 
     def part_statuses(self) -> list[Status]:
         """Return a line for every reference sensor that the refit looks at."""
-        if self._result is None:
-            return []
-        return [
-            Status(
-                health.name,
-                Level.OK if health.state == 'ok' else Level.WARN,
-                health.state,
-                {'residual_t': health.residual_t, 'distance': health.distance},
-            )
-            for health in self._result.references
-        ]
+        return refit_status.reference_statuses(self._result)
 
 
 if __name__ == '__main__':

@@ -60,6 +60,7 @@ class ModelWriter:
     def __init__(self) -> None:
         self._maker = CloudMaker()
         self._told: tuple[FieldModel, PointCloud2] | None = None
+        self._uncertainty: tuple[object, float, int, bool] | None = None
 
     def dipoles(self, model: FieldModel, frame_id: str, stamp_ns: int) -> PointCloud2:
         """Return the ``field_model`` message; for the model of the last one, that one renamed."""
@@ -72,6 +73,21 @@ class ModelWriter:
         message = self._maker.message(encode_field_model(points), frame_id, stamp_ns)
         self._told = (model, message)
         return message
+
+    def new_error(
+        self, model: FieldModel, frame_id: str, stamp_ns: int, follows: bool
+    ) -> PointCloud2 | None:
+        """Return the ``field_model_error`` message; None where the last one still holds."""
+        told = self._uncertainty
+        now = (model.modes, model.flux_error_t, len(model.positions), follows)
+        if told is not None and told[0] is now[0] and told[1:] == now[1:]:
+            return None
+        self._uncertainty = now
+        return self.error(model, frame_id, stamp_ns, follows)
+
+    def has_told(self, follows: bool) -> bool:
+        """Return whether receivers know, if anything, whether the model follows the references."""
+        return self._uncertainty is None or self._uncertainty[3] == follows
 
     def error(
         self, model: FieldModel, frame_id: str, stamp_ns: int, follows: bool = False

@@ -12,7 +12,7 @@ from typing import Any
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
-from anser_ros.errors import AnserError, ModelFileError, ParameterError
+from anser_ros.errors import AnserError, ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.nodes import qos
 from anser_ros.nodes.answered_frames import AnsweredFrames
@@ -28,7 +28,7 @@ from anser_ros.nodes.readiness import digest_of
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import noise_of, sensor_table
-from anser_ros.sessions.starting_model import NOMINAL
+from anser_ros.sessions.starting_model import NOMINAL, check_emitters
 from anser_ros.sessions.volume import pose_volume
 from anser_ros.tracking.estimate import OK, TrackerSettings
 from anser_ros.tracking.tracker import Tracker
@@ -227,12 +227,8 @@ class TrackerNode(AnserNode):
     def _model(self, setup: Setup) -> tuple[FieldModel | None, str]:
         """The model in force and its name: the published one, or that of the file."""
         given = self._file_model
-        names = setup.emitter_names
-        if given is not None and given.emitters != names:
-            raise ModelFileError(
-                f'the model file has the emitters {", ".join(given.emitters)}; '
-                f'the setup {", ".join(names)}'
-            )
+        if given is not None:
+            check_emitters(setup, given)
         if self._in_force is None:
             return given, self.parameters.model_file
         return self._in_force.field_model(setup, given), str(self._in_force.stamp_ns)

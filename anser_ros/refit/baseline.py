@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import FitError
+from anser_ros.field.model import FieldModel
+from anser_ros.frames.intake import Frame
 from anser_ros.physics.sensor import SensorTable
 
 ComplexArray = NDArray[np.complex128]
@@ -36,7 +38,6 @@ class ReadingWindow:
     def __init__(self, sensors: SensorTable, emitters: int, span_s: float) -> None:
         if not span_s > 0:
             raise FitError(f'the span of a baseline must be positive, got {span_s}')
-        self._place = {int(c): i for i, c in enumerate(sensors.channel.tolist())}
         self._shape = (len(sensors), emitters)
         self._span_ns = round(1e9 * span_s)
         self._frames: deque[tuple[int, ComplexArray]] = deque(maxlen=MOST_FRAMES)
@@ -51,29 +52,21 @@ class ReadingWindow:
             return False
         return self._frames[-1][0] - self._frames[0][0] >= 0.9 * self._span_ns
 
-    def add(
-        self,
-        stamp_ns: int,
-        channels: NDArray[np.generic],
-        flux: NDArray[np.generic],
-        flags: NDArray[np.generic],
-    ) -> None:
-        """Take in a frame: channels and flags (S,), fluxes (S, K), T; a jump back starts anew.
+    def add(self, frame: Frame) -> None:
+        """Take in a judged frame of the sensors; a jump back in time starts anew.
 
         Raises
         ------
         FitError
             When the number of emitters is another one.
         """
-        if flux.ndim != 2 or flux.shape[1] != self._shape[1]:
-            raise FitError(f'readings of {self._shape[1]} emitters wanted, got {flux.shape}')
+        if frame.flux.shape != self._shape:
+            raise FitError(f'readings of {self._shape[1]} emitters wanted, got {frame.flux.shape}')
+        stamp_ns = frame.stamp_ns
         if self._frames and stamp_ns < self._frames[-1][0]:
             self._frames.clear()
-        frame = np.full(self._shape, np.nan, dtype=np.complex128)
-        for row, (channel, bits) in enumerate(zip(channels.tolist(), flags.tolist(), strict=True)):
-            if channel in self._place and not bits and np.isfinite(flux[row]).all():
-                frame[self._place[channel]] = flux[row]
-        self._frames.append((stamp_ns, frame))
+        readings = np.where(frame.usable[:, None], frame.flux, np.nan)
+        self._frames.append((stamp_ns, readings))
         while stamp_ns - self._frames[0][0] > self._span_ns:
             self._frames.popleft()
 
@@ -143,3 +136,26 @@ def check_enough(baseline: ComplexArray, needed: int) -> int:
             f'a baseline of {count} of {len(baseline)} reference sensors; {needed} are needed'
         )
     return count
+
+
+def checked_baseline(
+    model: FieldModel, references: SensorTable, baseline: ComplexArray
+) -> ComplexArray:
+    """Return a refit's baseline as an array, shape (S, K), T.
+
+    Raises
+    ------
+    FitError
+        When there are no references, their channels are not unique, or the shape is another.
+    """
+    given = np.asarray(baseline, dtype=np.complex128)
+    if len(references) == 0:
+        raise FitError('refit: there are no reference sensors')
+    if given.shape != (len(references), len(model.emitters)):
+        raise FitError(
+            f'refit: {len(references)} references and {len(model.emitters)} emitters need a '
+            f'baseline of that shape, got {given.shape}'
+        )
+    if len(set(references.channel.tolist())) != len(references):
+        raise FitError('refit: a channel appears twice in the references')
+    return given

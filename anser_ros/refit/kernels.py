@@ -149,35 +149,22 @@ def bend_power(flux, previous, before):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model='numpy')
-def fill_frame(given, marks, rows, least, largest, ordered, code):  # type: ignore[no-untyped-def]
-    """Write a frame's fluxes (S, K) in the references' order, and what each reading is.
+def find_silent(flux, least, silent, no_baseline, codes):  # type: ignore[no-untyped-def]
+    """Write which good readings (S, K) are silent, and which have no baseline.
 
-    ``rows`` (S,): each reference's row of the frame, -1 for none. ``least`` (S,): power (T^2)
-    below which a coil hears nothing; NaN without a baseline. ``largest``: of a component, T.
-    ``code``: 0 missing, 1 good, 2 flagged, 3 not finite, 4 without a baseline, 5 silent, 6 absurd.
+    ``least`` (S,): power (T^2) below which a coil hears nothing; NaN without a baseline.
+    ``codes`` (S,): 0 for a good reading; the codes ``silent`` and ``no_baseline`` are put in.
     """
-    for s in range(rows.shape[0]):
-        row = rows[s]
-        if row < 0:
-            ordered[s] = complex(math.nan, math.nan)
-            code[s] = 0
-        else:
-            code[s] = 1
-            power = 0.0
-            for k in range(ordered.shape[1]):
-                value = given[row, k]
-                ordered[s, k] = value
-                power += value.real * value.real + value.imag * value.imag
-                if not (math.isfinite(value.real) and math.isfinite(value.imag)):
-                    code[s] = 3
-                elif code[s] != 3 and max(abs(value.real), abs(value.imag)) > largest:
-                    code[s] = 6
-            if power < least[s]:
-                code[s] = 5
-            if marks[row] != 0:
-                code[s] = 2
+    for s in range(flux.shape[0]):
         if math.isnan(least[s]):
-            code[s] = 4
+            codes[s] = no_baseline
+        elif codes[s] == 0:
+            power = 0.0
+            for k in range(flux.shape[1]):
+                value = flux[s, k]
+                power += value.real * value.real + value.imag * value.imag
+            if power < least[s]:
+                codes[s] = silent
 
 
 @numba.njit(cache=True, error_model='numpy')

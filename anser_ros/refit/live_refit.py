@@ -15,13 +15,15 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
+from anser_ros.frames.intake import Frame, Intake
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit import health
 from anser_ros.refit.assembly import Assembly
+from anser_ros.refit.baseline import checked_baseline
 from anser_ros.refit.change import Average, NoiseLevel
 from anser_ros.refit.excitation import FieldFunction
-from anser_ros.refit.frame import FrameOrder
+from anser_ros.refit.frame import BaselineCheck
 from anser_ros.refit.health import ReferenceHealth, ReferenceWatch
 from anser_ros.refit.posterior import Bank, FrameEvidence
 from anser_ros.refit.result import (
@@ -89,7 +91,7 @@ class LiveRefit:
         self.model = model
         self.references = references
         self.settings = settings or RefitSettings()
-        self.baseline = _checked_baseline(model, references, baseline)
+        self.baseline = checked_baseline(model, references, baseline)
         self._row_noise = _checked_noise(noise, len(references), len(model.emitters))
         self._tables = build_tables(model, references, self.settings, drawing, volume)
         self._prepare()
@@ -113,7 +115,8 @@ class LiveRefit:
             self._drift[emitter::k, emitter] = np.nan_to_num(turned[:, emitter].real) * scale
         self._to_noise_units = self._tables.excitation.phase.conj() / self.settings.flux_noise_t
         self._banks: dict[bytes, tuple[Bank, BodySlots]] = {}
-        self._order = FrameOrder(references.channel, self.baseline)
+        self._intake = Intake(references.channel, error=FitError)
+        self._baseline_check = BaselineCheck(self.baseline)
         self._assembly = Assembly(model)
 
     @property
@@ -149,7 +152,7 @@ class LiveRefit:
             raise FitError('refit: moved references must be the same coils in the same order')
         other = copy(self)
         other.references = references
-        other.baseline = _checked_baseline(self.model, references, baseline)
+        other.baseline = checked_baseline(self.model, references, baseline)
         other._row_noise = _checked_noise(noise, len(references), len(self.model.emitters))
         other._tables = self._tables.moved(references, self.settings)
         other._prepare()
@@ -188,7 +191,21 @@ class LiveRefit:
         FitError
             When shapes don't fit or a channel appears twice.
         """
-        ordered, readable, reasons = self._order.read(channels, flux, flags, baseline)
+        width = len(self.model.emitters)
+        return self.follow(self._intake.judge(stamp_ns, channels, flux, flags, width), baseline)
+
+    def follow(self, frame: Frame, baseline: ComplexArray | None = None) -> RefitResult:
+        """Take in one frame that has been judged.
+
+        Parameters
+        ----------
+        frame : Frame
+            In the order of the references.
+        baseline : ndarray, shape (S, K), complex, optional
+            As for `update`.
+        """
+        stamp_ns, ordered = frame.stamp_ns, frame.flux
+        readable, reasons = self._baseline_check.read(frame, baseline)
         if stamp_ns < self._last_ns:
             self._noise.forget()
             self._average.forget()
@@ -378,19 +395,3 @@ def _fresh_weights(count: int) -> Array:
     weights = np.zeros(count)
     weights[0] = 1.0
     return weights
-
-
-def _checked_baseline(
-    model: FieldModel, references: SensorTable, baseline: ComplexArray
-) -> ComplexArray:
-    given = np.asarray(baseline, dtype=np.complex128)
-    if len(references) == 0:
-        raise FitError('refit: there are no reference sensors')
-    if given.shape != (len(references), len(model.emitters)):
-        raise FitError(
-            f'refit: {len(references)} references and {len(model.emitters)} emitters need a '
-            f'baseline of that shape, got {given.shape}'
-        )
-    if len(set(references.channel.tolist())) != len(references):
-        raise FitError('refit: a channel appears twice in the references')
-    return given

@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
+from anser_ros.frames.intake import Frame, Intake
 from anser_ros.physics.dipole import flux_jacobian
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.live_refit import LiveRefit
@@ -109,6 +111,7 @@ class PatchCoils:
         self.coils = coils
         self.fixed = fixed
         self._poses: dict[str, tuple[int, Array, Array]] = {}
+        self._intake = Intake(coils.channel, error=FitError)
         self._flux = np.full((len(coils), fixed.shape[1]), np.nan, dtype=np.complex128)
         self._flux_ns = 0
         self._built_at: SensorTable | None = None
@@ -125,11 +128,8 @@ class PatchCoils:
         flags: NDArray[np.int64],
     ) -> None:
         """Keep the fluxes of the patches' coils among the tools'."""
-        self._flux[:] = np.nan
-        row = {int(c): i for i, c in enumerate(channels.tolist())}
-        for coil, channel in enumerate(self.coils.channel.tolist()):
-            if channel in row and not flags[row[channel]]:
-                self._flux[coil] = flux[row[channel]]
+        frame = self._intake.judge(stamp_ns, channels, flux, flags, self.fixed.shape[1])
+        self._flux = np.where(frame.usable[:, None], frame.flux, np.nan)
         self._flux_ns = stamp_ns
 
     def where(self, stamp_ns: int) -> tuple[SensorTable, NDArray[np.bool_]]:
@@ -163,25 +163,11 @@ class PatchCoils:
         """Coils somewhere over the board, for a first refit that leaves them out."""
         return self.coils.with_geometry(self.coils.position + np.array([0.0, 0.0, 0.3]))
 
-    def update(
-        self,
-        refit: LiveRefit,
-        stamp_ns: int,
-        channels: NDArray[np.int64],
-        flux: ComplexArray,
-        flags: NDArray[np.int64],
-    ) -> RefitResult:
+    def follow(self, refit: LiveRefit, frame: Frame) -> RefitResult:
         """Refit to a frame of the fixed references, and to the patches' coils as they are now."""
-        placed = self.frame(stamp_ns, refit.model)
-        own = self.coils.channel
-        fixed = np.isin(channels, own, invert=True)
-        return refit.update(
-            stamp_ns,
-            np.concatenate([channels[fixed], own]),
-            np.concatenate([flux[fixed], placed.flux]),
-            np.concatenate([flags[fixed], np.zeros(len(own), dtype=np.int64)]),
-            np.concatenate([self.fixed, placed.baseline]),
-        )
+        placed = self.frame(frame.stamp_ns, refit.model)
+        both = frame.joined(self.coils.channel, placed.flux)
+        return refit.follow(both, np.concatenate([self.fixed, placed.baseline]))
 
     def started(self, model: FieldModel, references: SensorTable, **options: Any) -> LiveRefit:
         """A first refit, in which the patches' coils have no place yet.

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.errors import BagError, ParameterError
+from anser_ros.errors import BagError, FitError, ParameterError
+from anser_ros.frames.intake import Intake
 from anser_ros.refit.patches import PatchCoils
 from anser_ros.refit.result import RefitResult
 from anser_ros.sessions.prepared import PreparedSession
@@ -66,6 +67,7 @@ class PatchFollower:
                 raise BagError(f'{session.path}: no pose on the topic {topic}')
         self._poses: dict[str, PublishedPoses] = {b: found[t] for b, t in topics.items()}
         self._patches = PatchCoils(sensor_table(moving), baseline.flux)
+        self._intake = Intake(session.reference.sensors.channel, error=FitError)
         self._refit = self._patches.started(
             prepared.model,
             session.reference.sensors,
@@ -100,4 +102,5 @@ class PatchFollower:
         if known.any() and self._patches.must_rebuild(now):
             self._refit = self._patches.rebuilt(self._refit, now)
             self._patches.settle(now)
-        return self._patches.update(self._refit, stamp_ns, channels, flux, flags)
+        frame = self._intake.judge(stamp_ns, channels, flux, flags, self._patches.fixed.shape[1])
+        return self._patches.follow(self._refit, frame)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import BagError
 from anser_ros.field.measurements import Measurements
+from anser_ros.frames.faults import GOOD, value_codes
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.wire.bag import Bag, PoseStream, RecordedFluxes, read_bag
@@ -96,9 +97,8 @@ def _columns(
     for column, channel in enumerate(sensors.channel.tolist()):
         if channel in place:
             flux[:, column] = stream.flux[:, place[channel]]
-            finite = np.isfinite(flux[:, column]).all(axis=1)
             flags[:, column] = stream.flags[:, place[channel]]
-            valid[:, column] = (flags[:, column] == 0) & finite
+            valid[:, column] = (flags[:, column] == 0) & (value_codes(flux[:, column]) == GOOD)
     return flux, valid, flags
 
 

@@ -27,6 +27,31 @@ def board_of(setup: Setup) -> Board:
     )
 
 
+def starting_model(setup: Setup, given: FieldModel | None) -> FieldModel:
+    """The model to start from live: the given one, or the nominal one of the setup's geometry.
+
+    Raises
+    ------
+    ModelFileError
+        When the given model has other emitters than the setup.
+    SetupError
+        When none is given and the setup's geometry makes no nominal model.
+    """
+    if given is None:
+        return nominal_model(board_of(setup))
+    check_emitters(setup, given)
+    return given
+
+
+def check_emitters(setup: Setup, given: FieldModel) -> None:
+    """Raise `ModelFileError` when a model's emitters are not the setup's."""
+    if given.emitters != setup.emitter_names:
+        raise ModelFileError(
+            f'the model has the emitters {", ".join(given.emitters)}; '
+            f'the setup {", ".join(setup.emitter_names)}'
+        )
+
+
 def model_for(name: str, session: Session) -> FieldModel:
     """The model that ``name`` stands for: a file's path, or ``nominal``.
 

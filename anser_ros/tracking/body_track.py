@@ -7,11 +7,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.frames.intake import NANO
 from anser_ros.tracking import estimate as states
 from anser_ros.tracking.body_descent import step_to_coils
 from anser_ros.tracking.coil_track import (
     MOST_STEPS,
-    NANO,
     SELDOM,
     SUSPICIOUS_JUMP_M,
     CoilResult,

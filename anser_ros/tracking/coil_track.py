@@ -8,6 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.frames.intake import NANO
 from anser_ros.tracking import estimate as states
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.seed import solve_cold
@@ -18,7 +19,6 @@ from anser_ros.tracking.uncertainty import chi2_limit, coil_covariance
 Array = NDArray[np.float64]
 Start = tuple[Array, Array]
 
-NANO = 1e-9
 SELDOM = 0.1
 """Probability of a residual that counts as more than this frame's share of noise."""
 SUSPICIOUS_JUMP_M = 0.02

@@ -16,25 +16,6 @@ FEWEST_EMITTERS = 6
 """One more than a coil's pose has unknowns, so that a residual is left to judge it by."""
 
 
-def living_emitters(
-    flux: NDArray[np.complex128], usable: NDArray[np.bool_]
-) -> NDArray[np.bool_] | None:
-    """Which emitters the usable sensors hear, shape (K,); None when they hear all or none.
-
-    Parameters
-    ----------
-    flux : ndarray, shape (S, K)
-        T.
-    usable : ndarray, shape (S,)
-        Sensors whose readings are not missing or flagged.
-    """
-    heard = np.isfinite(flux) & (flux != 0.0)
-    if heard.all():
-        return None
-    living: NDArray[np.bool_] = heard[usable].any(axis=0)
-    return None if living.all() or not living.any() else living
-
-
 @dataclass(frozen=True)
 class ReducedScene:
     """A context without its dead emitters, and what it was made from."""

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
+from anser_ros.frames import faults
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.uncertainty import ROLL_VARIANCE
 
@@ -14,13 +15,13 @@ Array = NDArray[np.float64]
 
 OK = 'ok'
 NO_MODEL = 'no_model'
-NO_SIGNAL = 'no_signal'
+NO_SIGNAL = faults.ABSURD.state
 RESIDUAL = 'residual'
 OUTSIDE_VOLUME = 'outside_volume'
 AMBIGUOUS = 'ambiguous'
-STALE = 'stale'
-SATURATED = 'saturated'
-DROPPED = 'dropped'
+STALE = faults.STALE.state
+SATURATED = faults.SATURATED.state
+DROPPED = faults.DROPPED.state
 STATES = (
     OK, NO_MODEL, NO_SIGNAL, RESIDUAL, OUTSIDE_VOLUME, AMBIGUOUS, STALE, SATURATED, DROPPED,
 )  # fmt: skip

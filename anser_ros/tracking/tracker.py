@@ -15,24 +15,18 @@ from numpy.typing import NDArray
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import TrackingError
 from anser_ros.field.model import EffectRecord, FieldModel
-from anser_ros.physics.sensor import LARGEST_FLUX_T, SensorTable
+from anser_ros.frames.faults import FAULTS, GOOD, value_codes
+from anser_ros.frames.intake import BACK, NANO, Frame, Intake
+from anser_ros.physics.sensor import SensorTable
 from anser_ros.tracking import estimate as states
 from anser_ros.tracking.body_track import BodyTrack, track_body
-from anser_ros.tracking.coil_track import NANO, CoilResult, CoilTrack, prepare, track_coil
-from anser_ros.tracking.emitters import (
-    FEWEST_EMITTERS,
-    ReducedScene,
-    living_emitters,
-    without_dead,
-)
+from anser_ros.tracking.coil_track import CoilResult, CoilTrack, prepare, track_coil
+from anser_ros.tracking.emitters import FEWEST_EMITTERS, ReducedScene, without_dead
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.rigid import BodyCoils
 from anser_ros.tracking.solve_context import SolveContext, build_context
 
-Array = NDArray[np.float64]
-
-FLAGS = ((1, states.SATURATED), (2, states.STALE), (4, states.DROPPED))
-"""Flag bits of a flux point (interfaces, section 3) and the states that they cause."""
+ComplexArray = NDArray[np.complex128]
 
 __all__ = ['PoseEstimate', 'Tracker', 'TrackerSettings']
 
@@ -84,11 +78,10 @@ class Tracker:
         self.counters: Counter[str] = Counter()
         self._coil_tracks = {name: CoilTrack() for name in sensors.name}
         self._body_tracks = {name: BodyTrack() for name in dict.fromkeys(sensors.body)}
-        self._last_ns = [0]
+        self._intake = Intake(sensors.channel, self._count, spares_dead=True, error=TrackingError)
         self._first_ns: list[int] = []
         self._context: SolveContext | None = None
         self._reduced: ReducedScene | None = None
-        self._dead: list[str] = []
         self._effects: tuple[EffectRecord, ...] = ()
         self._correction: Correction | None = None
         self._table = sensors
@@ -121,9 +114,14 @@ class Tracker:
         return self._model
 
     @property
+    def last_stamp_ns(self) -> int:
+        """Stamp of the last frame, ns; 0 before there was one."""
+        return self._intake.last_ns
+
+    @property
     def dead_emitters(self) -> tuple[str, ...]:
         """Emitters that no sensor heard in the last frame while others were heard."""
-        return tuple(self._dead)
+        return self._intake.dead
 
     @property
     def drifting_effects(self) -> tuple[str, ...]:
@@ -203,7 +201,7 @@ class Tracker:
         flux : ndarray, shape (S, K), complex
             T.
         flags : ndarray, shape (S,), optional
-            Flag bits: 1 saturated, 2 stale, 4 dropped samples.
+            Flag bits of `wire.points`.
 
         Yields
         ------
@@ -216,60 +214,61 @@ class Tracker:
             Before the first estimate: when the stamp is not positive, shapes don't fit, a channel
             appears twice, or the emitters are not as many as the model's.
         """
-        rows, values, bits = self._checked(stamp_ns, channels, flux, flags)
-        if stamp_ns == self._last_ns[0]:
-            self.counters['duplicates'] += 1
-            return
-        if stamp_ns < self._last_ns[0]:
-            self.counters['time_jumps'] += 1
+        names = None if self._model is None else self._model.emitters
+        frame = self._intake.admit(
+            stamp_ns, channels, flux, flags, names, self.settings.warm_age_s
+        )
+        if frame is not None:
+            yield from self.track(frame)
+
+    def track(self, frame: Frame) -> Iterator[PoseEstimate]:
+        """Estimate the poses of a frame that has been judged; yields what `estimates` does.
+
+        Parameters
+        ----------
+        frame : Frame
+            Of an `Intake` of this tracker's sensors that spares dead emitters.
+        """
+        if frame.jump == BACK:
             self.reset()
-        elif 0 < self._last_ns[0] < stamp_ns - self.settings.warm_age_s / NANO:
-            self.counters['time_jumps_forward'] += 1
-        self._last_ns[0] = stamp_ns
         if not self._first_ns:
-            self._first_ns.append(stamp_ns)
-        self.counters['frames'] += 1
-        if not len(channels):
-            self.counters['frames_empty'] += 1
-        context, table = self._context, self._table
-        names = (*table.name, *self._bodies)
-        living = living_emitters(values.view(np.complex128), (rows >= 0) & (bits == 0))
-        self._note_dead(living)
+            self._first_ns.append(frame.stamp_ns)
+        context = self._context
         if context is None:
-            for name in names:
-                yield no_pose(name, stamp_ns, states.NO_MODEL, '', 'no field model yet')
+            yield from self._without_poses(frame, states.NO_MODEL, '', 'no field model yet')
             return
+        living = frame.living
         if living is not None:
             if living.sum() < FEWEST_EMITTERS:
+                names = [name for name, lives in zip(self._emitters, living, strict=True)
+                         if not lives]  # fmt: skip
                 reason = (
-                    f'no flux of {", ".join(self._dead)}; {living.sum()} emitters are left, '
+                    f'no flux of {", ".join(names)}; {living.sum()} emitters are left, '
                     f'{FEWEST_EMITTERS} needed'
                 )
-                for name in names:
-                    yield no_pose(name, stamp_ns, states.NO_SIGNAL, context.model_id, reason)
+                model_id = context.model_id
+                yield from self._without_poses(frame, states.NO_SIGNAL, model_id, reason)
                 return
-            # An emitter that is off leaks nothing into another's tone either.
-            values.view(np.complex128)[:, ~living] = 0.0
             self._reduced = without_dead(context, living, self._reduced)
             context = self._reduced.context
-        # Arithmetic on an infinity only warns; the kind of a bad value is counted as it came.
-        faults = _faults(rows, values, bits)
-        values[~np.isfinite(values)] = np.nan
-        corrected = self._corrected(stamp_ns, values)
-        if corrected is not values:
-            values = corrected
-            again = _faults(np.zeros_like(rows), values, np.zeros_like(bits))
-            faults = [one or other for one, other in zip(faults, again, strict=True)]
+        flux, codes = self._corrected(frame)
         if living is not None:
-            values = np.ascontiguousarray(values[:, np.repeat(living, 2)])
+            flux = flux[:, living]
+        yield from self._solved(frame.stamp_ns, np.ascontiguousarray(flux), codes, context)
+
+    def _solved(
+        self, stamp_ns: int, flux: ComplexArray, codes: NDArray[np.int64], context: SolveContext
+    ) -> Iterator[PoseEstimate]:
+        """Yield the poses of fluxes (S, K) whose readings are good or bad by ``codes`` (S,)."""
+        table, values = self._table, flux.view(np.float64)
         results: list[CoilResult] = []
         tracks = [self._coil_tracks[name] for name in table.name]
         prepare(tracks, table.length, stamp_ns, context, self.settings)
-        for i, name in enumerate(table.name):
-            refusal = faults[i]
-            if refusal is not None:
-                self.counters[f'readings_{refusal[2]}'] += 1
-                bad = no_pose(name, stamp_ns, refusal[0], context.model_id, refusal[1])
+        for i, (name, code) in enumerate(zip(table.name, codes.tolist(), strict=True)):
+            fault = FAULTS[code]
+            if fault is not None:
+                self.counters[f'readings_{fault.kind}'] += 1
+                bad = no_pose(name, stamp_ns, fault.state, context.model_id, fault.reason)
                 result = CoilResult(bad, None)
             else:
                 result = track_coil(
@@ -293,79 +292,28 @@ class Tracker:
                 self.settings,
             )
 
-    def _note_dead(self, living: NDArray[np.bool_] | None) -> None:
-        """Keep the names of emitters that are not heard (trackers of other models share them)."""
-        self._dead.clear()
-        if living is None:
-            return
-        self.counters['frames_dead_emitter'] += 1
-        given = None if self._model is None else self._model.emitters
-        dead = np.flatnonzero(~living).tolist()
-        self._dead.extend(f'emitter {k}' if given is None else given[k] for k in dead)
+    def _without_poses(
+        self, frame: Frame, state: str, model_id: str, reason: str
+    ) -> Iterator[PoseEstimate]:
+        """Yield an estimate without a pose for every sensor and body."""
+        for name in (*self._table.name, *self._bodies):
+            yield no_pose(name, frame.stamp_ns, state, model_id, reason)
 
-    def _corrected(self, stamp_ns: int, values: Array) -> Array:
-        """Fluxes (S, 2K) without what the model's effects did to them."""
+    @property
+    def _emitters(self) -> tuple[str, ...]:
+        return () if self._model is None else self._model.emitters
+
+    def _count(self, name: str, by: int) -> None:
+        self.counters[name] += by
+
+    def _corrected(self, frame: Frame) -> tuple[ComplexArray, NDArray[np.int64]]:
+        """Fluxes (S, K) without what the model's effects did to them, and the readings' codes."""
         if self._correction is None or not self._correction.changes_flux:
-            return values
-        time = (stamp_ns - self._first_ns[0]) * 1e-9
-        flux = values.view(np.complex128)
+            return frame.flux, frame.codes
+        time = (frame.stamp_ns - self._first_ns[0]) * NANO
         recorded = self.settings.recorded_drift
-        sound = self._correction.flux(time, self.sensors.channel, flux, recorded=recorded)
-        return np.ascontiguousarray(sound, dtype=np.complex128).view(np.float64)
-
-    def _checked(
-        self,
-        stamp_ns: int,
-        channels: NDArray[np.generic],
-        flux: NDArray[np.generic],
-        flags: NDArray[np.generic] | None,
-    ) -> tuple[NDArray[np.int64], Array, NDArray[np.int64]]:
-        """Rows of the frame (-1: missing), fluxes (S, 2K) and flags in the table's order."""
-        if stamp_ns <= 0:
-            raise TrackingError(f'a flux frame needs a positive stamp, got {stamp_ns} ns')
-        given = np.asarray(flux)
-        number = np.asarray(channels, dtype=np.int64)
-        marks = np.zeros(number.shape, np.int64) if flags is None else np.asarray(flags)
-        if given.ndim != 2 or number.shape != given.shape[:1] or marks.shape != number.shape:
-            raise TrackingError(
-                f'fluxes (s, k) need s channels and s flags, got {given.shape}, {number.shape} '
-                f'and {marks.shape}'
-            )
-        if self._context is not None and given.shape[1] != self._context.field.emitters:
-            raise TrackingError(
-                f'the model has {self._context.field.emitters} emitters, '
-                f'the fluxes {given.shape[1]}'
-            )
-        place = {channel: i for i, channel in enumerate(number.tolist())}
-        if len(place) != number.size:
-            raise TrackingError('a channel appears twice in the frame')
-        rows = np.array([place.get(c, -1) for c in self.sensors.channel.tolist()], dtype=np.int64)
-        values = np.full((len(rows), given.shape[1]), np.nan, dtype=np.complex128)
-        bits = np.zeros(len(rows), dtype=np.int64)
-        here = rows >= 0
-        values[here], bits[here] = given[rows[here]], marks[rows[here]]
-        return rows, values.view(np.float64), bits
-
-
-def _faults(
-    rows: NDArray[np.int64], values: Array, bits: NDArray[np.int64]
-) -> list[tuple[str, str, str] | None]:
-    """State, reason and kind where a sensor's fluxes must not be used; None for the others."""
-    # A comparison with NaN is false, so this is also what is not finite.
-    sound = ((np.abs(values) < LARGEST_FLUX_T).all(axis=1) & (rows >= 0) & (bits == 0)).tolist()
-    return [None if good else _fault(rows[i], values[i], int(bits[i])) for i, good in
-            enumerate(sound)]  # fmt: skip
-
-
-def _fault(row: int, values: Array, bits: int) -> tuple[str, str, str] | None:
-    """State, reason and kind of a sensor whose fluxes must not be used."""
-    if row < 0:
-        return states.STALE, 'its channel is not in the frame', 'missing'
-    for bit, state in FLAGS:
-        if bits & bit:
-            return state, f'flagged {state} by the acquisition', state
-    if bool((np.abs(values) < LARGEST_FLUX_T).all()):
-        return None
-    if np.isfinite(values).all():
-        return states.NO_SIGNAL, f'fluxes beyond {LARGEST_FLUX_T:g} T are absurd', 'absurd'
-    return states.NO_SIGNAL, 'the fluxes are not finite', 'not_finite'
+        sound = self._correction.flux(time, self.sensors.channel, frame.flux, recorded=recorded)
+        flux = np.asarray(sound, dtype=np.complex128)
+        # A correction may carry one sensor's absurd value over to another.
+        codes = np.where(frame.codes == GOOD, value_codes(flux), frame.codes)
+        return flux, codes

@@ -1,0 +1,69 @@
+"""Why a reading must not be used: every fault with its name, its state and its reason.
+
+A reading is what one sensor hears of all emitters in one frame. Its first fault in the order of
+`FAULTS` counts. The flag bits are those of `wire.points`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.physics.sensor import LARGEST_FLUX_T
+
+
+class Fault(NamedTuple):
+    """One kind of fault.
+
+    Attributes
+    ----------
+    kind : str
+        Its name in the counters: ``readings_<kind>``.
+    state : str
+        The state of a pose that the reading was for.
+    reason : str
+        What `/diagnostics` says of it.
+    """
+
+    kind: str
+    state: str
+    reason: str
+
+
+GOOD = 0
+"""Code of a reading without a fault; the codes of faults are their places in `FAULTS`."""
+MISSING_CODE, SATURATED_CODE, STALE_CODE, DROPPED_CODE, FLAGGED_CODE = 1, 2, 3, 4, 5
+"""Codes of what the frame itself says: no such channel, or a flag."""
+NOT_FINITE_CODE, ABSURD_CODE = 6, 7
+"""Codes of what the values say."""
+
+MISSING = Fault('missing', 'stale', 'its channel is not in the frame')
+SATURATED = Fault('saturated', 'saturated', 'flagged saturated by the acquisition')
+STALE = Fault('stale', 'stale', 'flagged stale by the acquisition')
+DROPPED = Fault('dropped', 'dropped', 'flagged dropped by the acquisition')
+FLAGGED = Fault('flagged', 'no_signal', 'flagged by the acquisition with an unknown bit')
+NOT_FINITE = Fault('not_finite', 'no_signal', 'the fluxes are not finite')
+ABSURD = Fault('absurd', 'no_signal', f'fluxes beyond {LARGEST_FLUX_T:g} T are absurd')
+
+FAULTS: tuple[Fault | None, ...] = (
+    None, MISSING, SATURATED, STALE, DROPPED, FLAGGED, NOT_FINITE, ABSURD,
+)  # fmt: skip
+
+
+def value_codes(flux: NDArray[np.complex128]) -> NDArray[np.int64]:
+    """Return what the values of readings say about them.
+
+    Parameters
+    ----------
+    flux : ndarray, shape (..., K), complex
+        T.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        `GOOD`, `NOT_FINITE_CODE` or `ABSURD_CODE`.
+    """
+    with np.errstate(invalid='ignore'):
+        largest = np.maximum(np.abs(flux.real), np.abs(flux.imag)).max(axis=-1, initial=0.0)
+    codes = np.where(largest < LARGEST_FLUX_T, GOOD, ABSURD_CODE)
+    return np.where(np.isfinite(largest), codes, NOT_FINITE_CODE)

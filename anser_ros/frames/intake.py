@@ -1,0 +1,303 @@
+"""Frames of fluxes in a table's order, judged once: order of the stamps, flags, values, emitters.
+
+The tracker, the refit and the nodes before them share this component, so that the same fault has
+the same name and counter everywhere, and a frame that has been judged is not judged again.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import AnserError, LayoutError
+from anser_ros.frames import faults
+from anser_ros.frames.faults import FAULTS, GOOD
+from anser_ros.physics.sensor import LARGEST_FLUX_T
+from anser_ros.wire.points import DROPPED, SATURATED, STALE
+
+Integers = NDArray[np.int64]
+ComplexArray = NDArray[np.complex128]
+Count = Callable[[str, int], None]
+"""Takes a counter's name and by how much it rises."""
+
+NANO = 1e-9
+"""Seconds in a nanosecond."""
+JUMP_S = 1.0
+"""A stamp that is further ahead of the last one than this is a jump forward, s: as old as a good
+pose may be to start the tracker's next one from. Smaller, and every short pause is called a jump;
+larger, and a clock that was set passes unnoticed."""
+BACK, FORWARD = -1, 1
+"""Values of `Frame.jump`."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame of fluxes as a table of sensors has them.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Middle of the demodulation window.
+    channels : ndarray of int, shape (S,)
+        Channels in the table's order.
+    flux : ndarray, shape (S, K), complex
+        T; NaN where a channel is missing and in place of components that are not finite.
+    codes : ndarray of int, shape (S,)
+        What is wrong with each reading: places in `frames.faults.FAULTS`, 0 for nothing.
+    living : ndarray of bool, shape (K,), or None
+        Emitters that a usable sensor hears; None when all are heard, or none at all.
+    jump : int
+        `BACK` or `FORWARD` where the stamp is not the next one, else 0.
+    """
+
+    stamp_ns: int
+    channels: Integers
+    flux: ComplexArray
+    codes: Integers
+    living: NDArray[np.bool_] | None = None
+    jump: int = 0
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Readings without a fault, shape (S,)."""
+        return np.asarray(self.codes == GOOD)
+
+    @property
+    def kinds(self) -> Counter[str]:
+        """How many readings have which kind of fault."""
+        found = (FAULTS[code] for code in self.codes.tolist())
+        return Counter(fault.kind for fault in found if fault is not None)
+
+    def joined(self, channels: Integers, flux: ComplexArray) -> 'Frame':
+        """Return the frame with the readings of further channels, (P,) and (P, K), at its end."""
+        return replace(
+            self,
+            channels=np.concatenate([self.channels, channels]),
+            flux=np.concatenate([self.flux, flux]),
+            codes=np.concatenate([self.codes, faults.value_codes(flux)]),
+        )
+
+
+class Intake:
+    """Puts frames into a table's order and judges them.
+
+    Parameters
+    ----------
+    channels : ndarray of int, shape (S,)
+        The table's channels; others in a frame are passed over.
+    count : callable, optional
+        Gets the counters of frames that are admitted: ``frames``, ``duplicates``; ``time_jumps``
+        back, ``time_jumps_forward``; ``frames_empty``, ``frames_dead_emitter``.
+    spares_dead : bool
+        Whether the user goes on without emitters that died: what is read of them is then set to
+        zero and is no fault.
+    error : type
+        What is raised for a frame that is none.
+
+    Attributes
+    ----------
+    last_ns : int
+        Stamp of the last admitted frame; 0 before.
+    dead : tuple of str
+        Emitters that no sensor heard in that frame while others were heard.
+    """
+
+    def __init__(
+        self,
+        channels: Integers,
+        count: Count | None = None,
+        spares_dead: bool = False,
+        error: type[AnserError] = LayoutError,
+    ) -> None:
+        self._channels, self._count = np.asarray(channels, dtype=np.int64), count
+        self._spares_dead, self._error = spares_dead, error
+        self._told: bytes | None = None
+        self._rows = np.empty(0, dtype=np.int64)
+        self.last_ns = 0
+        self.dead: tuple[str, ...] = ()
+
+    def admit(
+        self,
+        stamp_ns: int,
+        channels: NDArray[np.generic],
+        flux: NDArray[np.generic],
+        flags: NDArray[np.generic] | None = None,
+        emitters: tuple[str, ...] | None = None,
+        jump_s: float = JUMP_S,
+    ) -> Frame | None:
+        """Judge a frame as the next one of a stream.
+
+        Parameters
+        ----------
+        stamp_ns, channels, flux, flags
+            As for `judge`.
+        emitters : tuple of str or None
+            Names of the emitters that there ought to be; None while no model is known.
+        jump_s : float
+            How far ahead of the last one a stamp may be, s.
+
+        Returns
+        -------
+        Frame or None
+            None for a frame that was already seen.
+
+        Raises
+        ------
+        LayoutError or what the intake was told
+            As `judge`, and when the emitters are not as many as there ought to be.
+        """
+        frame = self.judge(stamp_ns, channels, flux, flags, None if emitters is None else
+                           len(emitters))  # fmt: skip
+        last_ns = self.last_ns
+        if stamp_ns == last_ns:
+            self._note('duplicates')
+            return None
+        jump = 0
+        if stamp_ns < last_ns:
+            jump = BACK
+            self._note('time_jumps')
+        elif 0 < last_ns < stamp_ns - jump_s / NANO:
+            jump = FORWARD
+            self._note('time_jumps_forward')
+        self.last_ns = stamp_ns
+        self._note('frames')
+        if not len(channels):
+            self._note('frames_empty')
+        self.dead = ()
+        if frame.living is not None:
+            self._note('frames_dead_emitter')
+            silent = np.flatnonzero(~frame.living).tolist()
+            self.dead = tuple(f'emitter {k}' if emitters is None else emitters[k] for k in silent)
+        return replace(frame, jump=jump) if jump else frame
+
+    def _note(self, name: str) -> None:
+        if self._count is not None:
+            self._count(name, 1)
+
+    def judge(
+        self,
+        stamp_ns: int,
+        channels: NDArray[np.generic],
+        flux: NDArray[np.generic],
+        flags: NDArray[np.generic] | None = None,
+        emitters: int | None = None,
+    ) -> Frame:
+        """Judge a frame by itself; nothing is counted.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Middle of the demodulation window; must be positive.
+        channels : ndarray, shape (N,)
+            Channel of each row, in any order.
+        flux : ndarray, shape (N, K), complex
+            T.
+        flags : ndarray, shape (N,), optional
+            Flag bits of `wire.points`.
+        emitters : int or None
+            How many there ought to be.
+
+        Raises
+        ------
+        LayoutError or what the intake was told
+            When the stamp is not positive, shapes don't fit, a channel appears twice, or the
+            emitters are not as many as there ought to be.
+        """
+        if stamp_ns <= 0:
+            raise self._error(f'a flux frame needs a positive stamp, got {stamp_ns} ns')
+        given = np.ascontiguousarray(flux, dtype=np.complex128)
+        number = np.asarray(channels, dtype=np.int64)
+        if flags is None:
+            marks = np.zeros(number.shape, dtype=np.int64)
+        else:
+            marks = np.ascontiguousarray(flags, dtype=np.int64)
+        if given.ndim != 2 or number.shape != given.shape[:1] or marks.shape != number.shape:
+            raise self._error(
+                f'fluxes (s, k) need s channels and as many flags, got {given.shape}, '
+                f'{number.shape} and {marks.shape}'
+            )
+        width = given.shape[1]
+        if emitters is not None and width != emitters:
+            raise self._error(f'the model has {emitters} emitters, the fluxes {width}')
+        self._find_rows(number)
+        count = len(self._channels)
+        ordered = np.empty((count, width), dtype=np.complex128)
+        codes, heard = np.empty(count, dtype=np.int64), np.zeros(width, dtype=np.bool_)
+        some_dead = fill_frame(
+            given, marks, self._rows, LARGEST_FLUX_T, self._spares_dead, ordered, codes, heard
+        )
+        return Frame(stamp_ns, self._channels, ordered, codes, heard if some_dead else None)
+
+    def _find_rows(self, number: Integers) -> None:
+        """Find each channel's row of the frame, -1 for none; frames seldom differ in this."""
+        told = number.tobytes()
+        if told != self._told:
+            row = {channel: i for i, channel in enumerate(number.tolist())}
+            if len(row) != number.size:
+                raise self._error('a channel appears twice in the frame')
+            wanted = self._channels.tolist()
+            self._rows = np.array([row.get(c, -1) for c in wanted], dtype=np.int64)
+            self._told = told
+
+
+@numba.njit(cache=True, error_model='numpy')
+def fill_frame(given, marks, rows, largest, spares_dead, flux, codes, heard):  # type: ignore[no-untyped-def]
+    """Write a frame's fluxes (S, K) in a table's order, and what each reading is.
+
+    ``rows`` (S,): each sensor's row of the frame, -1 for none. ``largest``: of a component, T.
+    ``codes`` (S,): places in `frames.faults.FAULTS`. ``heard`` (K,), False on entry: emitters that
+    a usable sensor hears. Returns whether some are heard and some are not.
+    """
+    count, width = flux.shape
+    for s in range(count):
+        row = rows[s]
+        if row < 0:
+            codes[s] = faults.MISSING_CODE
+            for k in range(width):
+                flux[s, k] = complex(math.nan, math.nan)
+            continue
+        bits = marks[row]
+        codes[s] = GOOD
+        if bits & SATURATED:
+            codes[s] = faults.SATURATED_CODE
+        elif bits & STALE:
+            codes[s] = faults.STALE_CODE
+        elif bits & DROPPED:
+            codes[s] = faults.DROPPED_CODE
+        elif bits:
+            codes[s] = faults.FLAGGED_CODE
+        for k in range(width):
+            value = given[row, k]
+            flux[s, k] = value
+            there = math.isfinite(value.real) and math.isfinite(value.imag) and value != 0.0
+            if there and bits == 0:
+                heard[k] = True
+    number = 0
+    for k in range(width):
+        number += heard[k]
+    some_dead = 0 < number < width
+    for s in range(count):
+        if rows[s] < 0:
+            continue
+        finite, sound = True, True
+        for k in range(width):
+            if some_dead and spares_dead and not heard[k]:
+                flux[s, k] = 0.0
+                continue
+            real, imag = flux[s, k].real, flux[s, k].imag
+            # A comparison with NaN is false, so this is also what is not finite.
+            if abs(real) < largest and abs(imag) < largest:
+                continue
+            sound = False
+            if not math.isfinite(real):
+                finite, real = False, math.nan
+            if not math.isfinite(imag):
+                finite, imag = False, math.nan
+            flux[s, k] = complex(real, imag)
+        if codes[s] == GOOD and not sound:
+            codes[s] = faults.ABSURD_CODE if finite else faults.NOT_FINITE_CODE
+    return some_dead

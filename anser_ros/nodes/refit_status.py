@@ -1,0 +1,58 @@
+"""What `/diagnostics` says of model and refit: their figures, and a line for every reference."""
+
+import numpy as np
+
+from anser_ros.field.model import FieldModel
+from anser_ros.nodes.node import Level, Status
+from anser_ros.refit.result import FEW_REFERENCES, POOR_FIT, RefitResult
+
+TROUBLED = (FEW_REFERENCES, POOR_FIT)
+"""States of the refit that an operator is warned of."""
+
+
+def model_values(model: FieldModel, name: str) -> dict[str, object]:
+    """Return the figures of the model in force; ``name`` is told where its source is not known."""
+    return {
+        'source': model.provenance.get('source', name),
+        'dipoles': len(model.positions),
+        'emitters': len(model.emitters),
+        'flux_error_t': float(model.flux_error_t),
+        'modes': 0 if model.modes is None else len(model.modes),
+    }
+
+
+def refit_values(result: RefitResult | None) -> dict[str, object]:
+    """Return the figures of a frame's refit by their names in `/diagnostics`."""
+    if result is None:
+        return {}
+    return {
+        'refit_state': result.state,
+        'refit_reason': result.reason,
+        'reference_noise_t': result.noise_t,
+        'change_log_odds': result.log_odds,
+        'references_left_out': ', '.join(result.left_out),
+        'most_likely': max(result.weights, key=result.weights.__getitem__, default=''),
+        'largest_drift': float(np.abs(result.drift).max(initial=0.0)),
+    }
+
+
+def refit_words(result: RefitResult | None) -> str:
+    """Return what the refit did in this frame, and why where something was in its way."""
+    if result is None:
+        return 'baseline set'
+    return result.state if not result.reason else f'{result.state}: {result.reason}'
+
+
+def reference_statuses(result: RefitResult | None) -> list[Status]:
+    """Return a line for every reference sensor that the refit looked at."""
+    if result is None:
+        return []
+    return [
+        Status(
+            health.name,
+            Level.OK if health.state == 'ok' else Level.WARN,
+            health.state,
+            {'residual_t': health.residual_t, 'distance': health.distance},
+        )
+        for health in result.references
+    ]
