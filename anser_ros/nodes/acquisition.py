@@ -35,8 +35,12 @@ AUTO = 'auto'
 FLUX_NOISE = 'flux_noise_t'
 """Key of the setup document: what the fluxes' components scatter by, T."""
 MANY_BLOCKS = 8
+"""Blocks still wanted by a window, above which the node is woken one block early, so that what
+takes most of the time is done when the last block arrives."""
 WAIT_S = 0.1
+"""Longest wait for blocks, s: how late the end of the node or a change is noticed in a silence."""
 GOODBYE_S = 0.1
+"""Time, s, that the last messages get to leave before the process ends."""
 
 
 @dataclass(frozen=True)

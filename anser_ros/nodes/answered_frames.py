@@ -18,6 +18,8 @@ OTHER_CLOCK_NS = 1_000_000_000
 MOST_LATE = 5
 """Frames in a row that waited in vain, after which none waits until an answer has come again."""
 MOST_WAITING = 200
+"""Most frames and models that are kept waiting, each; older models are dropped, and the oldest
+frame is tracked at once. At 50 frames a second that is four seconds, beyond any useful wait."""
 
 
 class AnsweredFrames(Generic[Model, Frame]):

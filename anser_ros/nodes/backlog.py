@@ -10,14 +10,18 @@ from statistics import median
 from typing import Any
 
 NANO = 1e-9
+"""Seconds in a nanosecond."""
 LATE_WINDOWS = 3.0
-"""Age of a message, in the spacing of messages, from which it may be late."""
+"""Age of a message, in the spacing of messages, from which it may be late. Smaller, and the jitter
+of a loaded machine looks like a backlog; larger, and poses are that many windows old."""
 SHORTEST_LATE_S = 0.05
+"""Age, s, below which no message is late, however fast messages come: the executor has delays."""
 CATCH_UP_S = 1.0
 """A backlog that will be gone within this time is worked off."""
 MEMORY = 25
 """Messages that typical figures are taken of, so that a few slow ones say nothing."""
 FEWEST = 10
+"""Messages that must have been worked on before a backlog is judged: the first ones are slow."""
 
 
 class Backlog:

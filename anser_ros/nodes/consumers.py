@@ -15,9 +15,11 @@ from rcl_interfaces.srv import GetParameterTypes
 from rclpy.node import Node
 
 REPLY_TIMEOUT_S = 2.0
+"""Time, s, that a listener has for an answer before it is asked again."""
 # A listener may be compiling its kernels.
 ATTEMPTS = 30
 POLL_S = 0.1
+"""How often a wait looks whether it was given up, s."""
 # How often the graph is asked for new listeners, in messages.
 REFRESH_EVERY = 50
 
@@ -59,7 +61,7 @@ class Consumers:
                 self._listeners[topics].discard(name)
 
     def give_up(self) -> None:
-        """End every wait."""
+        """End every wait that is going on."""
         self._given_up.set()
 
     def _find(self, topic: str) -> set[str]:

@@ -43,7 +43,10 @@ from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
 STRETCH_S = 0.005
+"""Stretch of samples that is made at a time, s: it bounds how unevenly they are sent."""
 LONGEST_LAG_S = 0.25
+"""Lag behind the clock, s, beyond which samples are left out instead of made up for: a machine
+that is so late would hardly catch up, and what it sent would be old."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,9 @@ from typing import Any
 
 from anser_ros.errors import BagError
 
+# What rosbag2 and mcap put between the definitions of a message and of its parts.
 SEPARATOR = '=' * 80
+# The integers of ROS's interface language.
 NUMBERS = {f'{kind}{bits}' for kind in ('int', 'uint') for bits in (8, 16, 32, 64)}
 PRIMITIVES = NUMBERS | {'bool', 'byte', 'char', 'float32', 'float64', 'string', 'wstring'}
 FIELD = re.compile(r'^([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+\w+')

@@ -11,10 +11,11 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 HARDWARE_ID = 'anser'
 TROUBLE_TOLD_S = 10.0
+"""How long, s, a trouble is still told of after it was last seen, so that nobody misses it."""
 
 
 class Level(IntEnum):
-    """Levels of diagnostic_msgs."""
+    """The levels of diagnostic_msgs."""
 
     OK = 0
     WARN = 1
@@ -88,7 +89,7 @@ class Trouble:
         return self.last if now_s - self._at_s < self._told_s else ''
 
     def forget(self) -> None:
-        """It is over."""
+        """Take the trouble for over."""
         self.last, self._at_s = '', -math.inf
 
 

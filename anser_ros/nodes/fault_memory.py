@@ -6,6 +6,7 @@ from anser_ros.nodes.diagnostics import Level
 from anser_ros.wire.frames import DeviceStatus, StatusFlag
 
 MEMORY_S = 5.0
+"""How long, s, a fault is remembered: several diagnostics, so that an operator sees it."""
 FAULTS = {
     'unplug': 'cable pulled out',
     'silence': 'nothing arrived',
@@ -23,6 +24,7 @@ FAULTS = {
 """Counters that only faults raise, the gravest first, with their meaning."""
 GRAVE = ('unplug', 'silence', 'wrong_baud')
 MOST = 3
+"""Faults that are named in one line; the graver ones come first."""
 
 
 class RecentFaults:

@@ -20,9 +20,14 @@ from anser_ros.errors import PortError
 # A client that takes nothing for so long is dropped.
 SEND_TIMEOUT_S = 2.0
 POLL_S = 0.1
+"""How often threads look whether the server was closed, s."""
 QUEUE_LENGTH = 256
+"""Messages that may wait for a slow client; then the oldest is dropped. A second's or so, for ten
+sensors at 25 Hz: older poses are of no use to it."""
 DEVICE_NAME_LENGTH = 20
+"""Bytes that the header of an OpenIGTLink message has for the device's name."""
 MM_PER_M = 1e3
+"""OpenIGTLink has millimetres."""
 
 
 def device_name(name: str, ending: str = '') -> str:
@@ -164,7 +169,7 @@ class IgtlServer:
                 client.put(data)
 
     def close(self) -> None:
-        """End all connections."""
+        """End the connections of all clients."""
         self._ending.set()
         self._thread.join()
         self._listener.close()

@@ -15,7 +15,9 @@ from anser_ros.refit.result import Metal, RefitResult
 SHOWN = 0.15
 """Sources whose density is at least this part of the strongest one's are shown."""
 MOST_SHOWN = 400
+"""Sources that are shown at most, the strongest ones: as many as a viewer draws with ease."""
 CENTROID_M = 0.03
+"""Diameter of the ball that marks the centroid, m: large enough to be seen among the sources."""
 VIEW_PERIOD_S = 0.2
 """How often the marker is renewed."""
 

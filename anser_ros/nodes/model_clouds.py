@@ -17,7 +17,10 @@ from anser_ros.wire.points import (
 )
 
 NANO = 1_000_000_000
+"""Nanoseconds in a second."""
 MOST_BYTES = 64_000_000
+"""Size of a message, bytes, beyond which it is refused: far more than any sensible model has, and
+far less than would exhaust the memory."""
 
 
 class CloudMaker:

@@ -22,8 +22,12 @@ from anser_ros.nodes.traces import OpticalTrace, Row, Traces, targets_of
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
 LINE_PERIOD_S = 1.0
+"""Time between two lines where the output is no terminal, s."""
 WIDE = 100
+"""Columns of a terminal from which on all columns of the table fit."""
 STATE_WIDTH = 14
+"""Characters of the column of states: as many as the longest state has."""
+# Colours of the levels of diagnostic_msgs.
 LEVELS = {0: 'green', 1: 'yellow', 2: 'red', 3: 'red'}
 
 

@@ -39,7 +39,9 @@ from anser_ros.nodes.process import main
 
 NAMESPACE = 'anser'
 DIAGNOSTICS_PERIOD_S = 1.0
+"""Time between two messages in /diagnostics, s, as other ROS nodes have it."""
 WARNING_PERIOD_S = 10.0
+"""Least time between two warnings of one kind in the log, s."""
 # Parameters that rclpy itself declares or reads.
 FOREIGN_PARAMETERS = ('use_sim_time', 'start_type_description_service')
 FOREIGN_PREFIXES = ('qos_overrides.',)

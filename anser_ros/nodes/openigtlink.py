@@ -17,6 +17,7 @@ from anser_ros.nodes.parameters import parameter
 from anser_ros.wire.setup import parse_setup, topic_of
 
 WATCH_PERIOD_S = 0.05
+"""How often sensors are looked at that have fallen silent, s."""
 OK = 'ok'
 SILENT = 'stale'
 
@@ -72,7 +73,7 @@ class OpenIGTLink(AnserNode):
         return Status('', Level.OK, 'serving', values)
 
     def close(self) -> None:
-        """End the connections."""
+        """End the connections of all clients."""
         self._server.close()
 
     def _on_setup(self, message: String) -> None:

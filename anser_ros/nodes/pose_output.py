@@ -21,6 +21,7 @@ except ImportError:  # the wheels don't have it
     TFMessage = None
 
 LONGEST_LATENCY_S = 10.0
+"""Age of a frame, s, beyond which its stamp is of another clock and tells no latency."""
 
 
 @dataclass

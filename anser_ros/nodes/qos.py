@@ -18,6 +18,7 @@ LATCHED = latched(1)
 # Field models and their uncertainty. While the model is refitted every frame has its own, so what
 # a busy reader has not taken yet must not give way to the next: there is room for a second's.
 MODELS = latched(50)
+# Their uncertainty is a larger message; there is room for a third of a second.
 MODEL_ERRORS = latched(16)
 # Fluxes and poses. Reliable, and deep enough to bridge half a second at 200 Hz without a loss.
 STREAM = QoSProfile(

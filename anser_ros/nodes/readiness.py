@@ -87,7 +87,7 @@ class Readiness:
         )
 
     def close(self) -> None:
-        """Stop watching."""
+        """Stop watching the listeners."""
         self._node.destroy_subscription(self._subscription)
 
     def missing(self) -> str:

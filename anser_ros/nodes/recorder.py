@@ -20,6 +20,7 @@ from anser_ros.nodes.recording_log import TopicLog, report
 from anser_ros.wire.bag_metadata import qos_profile, write_metadata
 from anser_ros.wire.bag_writer import BagWriter
 
+# How often new topics are looked for, s: what they say before they are found is lost.
 DISCOVERY_PERIOD_S = 0.25
 # How old metadata.yaml may be when the process is killed.
 METADATA_PERIOD_S = 2.0

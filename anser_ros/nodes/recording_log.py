@@ -9,6 +9,7 @@ from anser_ros.wire.bag_metadata import BagRecord
 
 # Intervals from which a topic's own period is learnt.
 LEARNING = 25
+# An interval of more than so many usual ones is a gap: less than the two of one lost message.
 GAP_FACTOR = 1.5
 
 

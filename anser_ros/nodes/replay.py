@@ -27,15 +27,21 @@ FLUX_ENDINGS = ('/tool/flux', '/reference/flux')
 # What the nodes that listen will publish themselves.
 OUTPUT_ENDINGS = ('/pose', '/pose_with_covariance', '/field_model')
 OUTPUT_TOPICS = ('/diagnostics', '/tf', '/tf_static', '/clock')
+# How long listeners are waited for, s, before the bag is played without them.
 WAIT_S = 30.0
 # A node that is there and starting is given so many times that before it counts: on a slow or busy
 # machine it takes a minute or two to compile its kernels for the first time.
 STARTING_FACTOR = 5.0
+# How often a paused or waiting replay looks whether it may go on, s.
 POLL_S = 0.05
 # Who is waited for is said after so long.
 TELL_AFTER_S = 3.0
+# Time of the recording between two messages on /clock, ns: half a window at 50 Hz.
 CLOCK_PERIOD_NS = 10_000_000
+# How long the end waits for listeners to acknowledge the last messages, s.
 LAST_ACK_S = 5.0
+# How often a silent listener of poses is asked again: fewer times than one of fluxes, for it is
+# asked after every frame.
 ATTEMPTS_OF_LISTENERS = 2
 
 
@@ -122,7 +128,7 @@ class Replay(AnserNode):
         return Status('', Level.OK, 'replaying', values)
 
     def close(self) -> None:
-        """Stop the thread."""
+        """Stop the thread that plays."""
         self._ending.set()
         self._consumers.give_up()
         self._thread.join(LAST_ACK_S)

@@ -9,6 +9,7 @@ from anser_ros.sessions.watch import Sighting
 
 SITES = ('channel', 'channels', 'coil', 'coils', 'body')
 MOST_TEXT = 60
+"""Characters of a figure beyond which it is left to the values: a line is read at a glance."""
 
 
 def words_of(seen: Sighting) -> str:

@@ -37,10 +37,14 @@ from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import Setup, parse_setup
 
 EARLIEST_DIAGNOSTICS_S = 0.1
-# How often frames that wait for a model are looked at beside the arrival of models.
+"""Least time between two messages in /diagnostics that a changed state asks for, s: a state that
+flickers from frame to frame must not flood the topic."""
 WAIT_PERIOD_S = 0.02
-# Fluxes whose stamps are further from the host's clock are a recording's.
+"""How often, s, frames that wait for a model are looked at beside the arrival of models: a part of
+the parameter ``model_wait_s``, which it makes inexact by as much."""
 LIVE_WITHIN_S = 60.0
+"""Fluxes whose stamps are further from the host's clock, s, are a recording's. Larger than any
+clock's error between two hosts that work together, smaller than the age of any recording."""
 
 
 @dataclass(frozen=True)

@@ -28,9 +28,11 @@ from anser_ros.sessions.watch import Sighting, Watch
 from anser_ros.wire.setup import parse_setup, topic_of
 
 POLL_S = 0.2
+"""How often it is asked whether a look is due, s: far less than the time between looks."""
 FILLED = 0.5
 """Share of the window that must be there before the first look."""
 SILENCE_S = 2.0
+"""Time without fluxes, s, after which the stream is said to be silent and no look begins."""
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,18 @@ Array = NDArray[np.float64]
 Start = tuple[Array, Array]
 
 SELDOM = 0.1
-"""Probability of a residual that counts as more than this frame's share of noise."""
+"""Probability of a residual beyond which it counts as more than noise and widens the sigma of its
+frame. Smaller, and slight distortion is not seen; larger, and plain noise widens many poses."""
 SUSPICIOUS_JUMP_M = 0.02
-FIRST_RETRY_S = 0.05
-LAST_RETRY_S = 0.25
+"""A pose that moved further from one frame to the next, m, is confirmed by a scan, for it may be
+another solution of the same fluxes. Smaller, and fast tools are scanned for in every frame;
+larger, and a wrong solution near by is followed."""
+FIRST_RETRY_S, LAST_RETRY_S = 0.05, 0.25
+"""Pauses after a scan without a good pose, s: the first one, which doubles from scan to scan, and
+the longest. Scans cost far more than warm solves, and a long distortion would ask for one in every
+frame; the longest pause bounds how late the end of a distortion is noticed."""
 THOROUGH_EVERY = 4
-"""A long distortion gets a scan after growing pauses; every so many of them tries all starts."""
+"""Every so many scans of a long distortion one tries all starts."""
 CHANGED = 3.0
 """A suspect's chi-square that changes by this factor calls for a scan before its time."""
 MOST_STEPS = 2.5

@@ -13,8 +13,9 @@ import numpy as np
 from anser_ros.physics.constants import DIPOLE_CONSTANT
 from anser_ros.physics.dipole import GAUSS_OFFSET
 
-LARGEST_MOVE_M = 0.04
-LARGEST_TURN = 0.6
+LARGEST_MOVE_M, LARGEST_TURN = 0.04, 0.6
+"""Longest step of the descent: of the position, m, and of the axis, rad. Over this distance the
+linearised field is no guide any more; shorter steps only need more evaluations."""
 FIRST_DAMPING = 1e-8
 """Next to nothing: most starts are so near that the plain step ends within the noise."""
 LEAST_RAISED = 1e-3

@@ -27,6 +27,8 @@ STATES = (
 )  # fmt: skip
 
 USUAL_GATE = 4.0
+"""Largest residual of a pose in units of the expected one, unless a setting says another. Smaller,
+and poses are lost to the model's own small errors; larger, and distorted poses pass."""
 
 HIDDEN = 4.0
 """How much more of a distortion's power goes into the pose than its share of the dimensions.
@@ -178,7 +180,7 @@ class NoiseScale:
 
     @property
     def value(self) -> float:
-        """Variance scale."""
+        """Residual power over its expectation, by which variances are multiplied."""
         return self._sum / self._weight
 
     def add(self, ratio: float) -> None:

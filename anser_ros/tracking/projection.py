@@ -15,7 +15,10 @@ from anser_ros.physics.dipole import fill_field_and_gradient
 from anser_ros.tracking.descent import fill_tangent
 
 LARGEST_MOVE_M = 0.05
+"""Longest step of the position, m; beyond it the linearised field is no guide any more."""
 AXIS_STEPS = 3
+"""Newton steps that bring the linear solution for the axis to unit length; they converge
+quadratically from a start that is nearly a unit vector."""
 NEAR = 1e-4
 """A relative fall of chi-square below this ends the descent: the joint one does the rest."""
 

@@ -1,4 +1,4 @@
-"""6-DoF pose of a rigid tool from all of its coils at once.
+"""The 6-DoF pose of a rigid tool from all of its coils at once.
 
 The rotation moves by a rotation vector in fg, R <- exp([w]) R, so no attitude is singular. Model
 errors are common to all coils; they enter as a low-rank part of the residuals' covariance
@@ -20,6 +20,8 @@ from anser_ros.tracking.seed import SeedGrid
 from anser_ros.tracking.solve import Array, RealField
 
 MAX_EVALUATIONS = 30
+"""Evaluations of the residuals after which a descent is given up as not converged. Good starts
+need a few; the bound keeps the time of a frame limited when the fluxes fit no pose."""
 PARALLEL = 0.05
 """Sine of the angle between axes below which all coils of a tool count as parallel."""
 

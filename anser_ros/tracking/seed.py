@@ -19,11 +19,13 @@ from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.projection import descend_projected
 from anser_ros.tracking.solve import Array, CoilSolution, RealField, solve_coil
 
-SAME_PLACE_M = 2e-3
-SAME_AXIS = 0.05
-"""Two solutions closer than this (m; chord of the unit axes) are one."""
+SAME_PLACE_M, SAME_AXIS = 2e-3, 0.05
+"""Two solutions closer than this (m; chord of the unit axes) are one. Larger, and a rival that
+makes a pose ambiguous is overlooked; smaller, and one solution is found to rival itself."""
 
 PROJECTED_BUDGET = 25
+"""Evaluations that the descent of a start may take with the axis eliminated, before the joint
+descent; starts that need more are in a wrong valley."""
 HOPELESS = 100.0
 """Starts whose descent ends so many times above the gate and the best one are given up."""
 
