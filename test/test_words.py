@@ -21,12 +21,15 @@ ROOMS = (
     'effects',
     'experiments',
     'field',
+    'frames',
     'measured',
     'metal',
+    'nodes',
     'physics',
     'sessions',
     'signals',
     'simulation',
+    'tracking',
 )
 FEWEST_WORDS = 4
 """A sentence of fewer words than these is a fragment."""
