@@ -76,17 +76,9 @@ def run(args: argparse.Namespace) -> int:
     DiagnosisError
         When a run records nothing or a diagnosis fails.
     """
-    if not 10.0 <= args.duration <= 600.0:
-        raise ParameterError(f'--duration must be 10 to 600 s, got {args.duration:g}')
     seed = int(np.random.default_rng().integers(1, 2**31)) if args.seed is None else args.seed
-    if args.clean and not 2.0 <= args.clean <= 600.0:
-        raise ParameterError(f'--clean must be 0 or 2 to 600 s, got {args.clean:g}')
-    if seed < 1:
-        raise ParameterError(f'--seed must be at least 1, got {seed}')
     effects = [*sorted(CATALOGUE), NONE] if ALL in args.effect else list(args.effect)
-    for name in effects:
-        if name not in (*CATALOGUE, NONE, RANDOM):
-            raise ParameterError(f'no effect {name!r}; there are: {", ".join(sorted(CATALOGUE))}')
+    _check(args, seed, effects)
     for variable in ('OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
         os.environ.setdefault(variable, '1')
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
@@ -118,6 +110,18 @@ def run(args: argparse.Namespace) -> int:
         table(document['rounds'], Console(width=None if os.isatty(1) else 200))
         say_written(folder)
     return 0
+
+
+def _check(args: argparse.Namespace, seed: int, effects: list[str]) -> None:
+    if not 10.0 <= args.duration <= 600.0:
+        raise ParameterError(f'--duration must be 10 to 600 s, got {args.duration:g}')
+    if args.clean and not 2.0 <= args.clean <= 600.0:
+        raise ParameterError(f'--clean must be 0 or 2 to 600 s, got {args.clean:g}')
+    if seed < 1:
+        raise ParameterError(f'--seed must be at least 1, got {seed}')
+    for name in effects:
+        if name not in (*CATALOGUE, NONE, RANDOM):
+            raise ParameterError(f'no effect {name!r}; there are: {", ".join(sorted(CATALOGUE))}')
 
 
 def _round(
@@ -157,15 +161,7 @@ def _round(
             folder / 'second', world.setup, second_s, {**unit, **other}, corrected, baseline, model
         )
     )
-    session = load_session(second)
     truth = json.loads(truth_file.read_text(encoding='utf-8'))  # not before all is analysed
-    busy = {
-        name: signs
-        for name, bag in (('first', first), ('second', second))
-        if (signs := overload(bag))
-    }
-    recorded = load_session(first)
-    kept = {'first': kept_share(recorded), 'second': kept_share(session)}
     return {
         'truth': truth,
         'found': diagnosis['effects'],
@@ -173,16 +169,28 @@ def _round(
         'parameters': parameter_errors(truth, diagnosis),
         'unexplained': diagnosis['unexplained'],
         'first_run_held_out': diagnosis['held_out'],
-        'second_run_live': second_run(session, load_model(corrected), load_model(model)),
-        'watcher_said_after_s': {
-            name: NANO * (told_ns - recorded.start_ns)
-            for name, told_ns in first_warnings(first, f'{AFTER}/watcher'.strip('/')).items()
-        },
+        'second_run_live': second_run(
+            load_session(second), load_model(corrected), load_model(model)
+        ),
         'follows_references': follows,
         'diagnosis_s': took_s,
+        **_recorded(first, second),
+    }
+
+
+def _recorded(first: Path, second: Path) -> dict[str, Any]:
+    """Return what the watcher reported in the first run, and how the machine kept up."""
+    bags = {'first': first, 'second': second}
+    sessions = {name: load_session(bag) for name, bag in bags.items()}
+    kept = {name: kept_share(session) for name, session in sessions.items()}
+    return {
+        'watcher_said_after_s': {
+            name: NANO * (told_ns - sessions['first'].start_ns)
+            for name, told_ns in first_warnings(first, f'{AFTER}/watcher'.strip('/')).items()
+        },
         'kept_share': kept,
         'too_busy': min(kept.values()) < LEAST_KEPT,
-        'machine': busy,
+        'machine': {name: signs for name, bag in bags.items() if (signs := overload(bag))},
     }
 
 
