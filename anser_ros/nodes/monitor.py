@@ -290,7 +290,7 @@ class Monitor(AnserNode):
 
 
 def _z_axis(q: Any) -> tuple[float, ...]:
-    """Axis of a pose: +z, by the contract, for sensors as for bodies."""
+    """Axis of a pose: +z, as docs/interfaces.md has it, for sensors as for bodies."""
     return (
         2 * (q.x * q.z + q.w * q.y),
         2 * (q.y * q.z - q.w * q.x),

@@ -47,7 +47,7 @@ class RecorderParameters:
     flush_period_s: float = parameter(
         0.25, 'most that a crash may cost, s', minimum=0.05, maximum=1.0
     )
-    topics: tuple[str, ...] = parameter((), 'topics to record besides those of the contract')
+    topics: tuple[str, ...] = parameter((), 'topics to record besides those of docs/interfaces.md')
     without: tuple[str, ...] = parameter(
         ('field_model_error',),
         'last names of topics that are left out; the default: 100 kB each time that metal moves, '
@@ -56,7 +56,7 @@ class RecorderParameters:
 
 
 class Recorder(AnserNode):
-    """Subscribes to all topics of the contract as they appear, and writes their raw bytes."""
+    """Subscribes to all topics of docs/interfaces.md as they appear, and writes their raw bytes."""
 
     NAME = 'recorder'
     PARAMETERS = RecorderParameters
