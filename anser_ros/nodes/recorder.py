@@ -56,7 +56,7 @@ class RecorderParameters:
 
 
 class Recorder(AnserNode):
-    """Subscribes to all topics of docs/interfaces.md as they appear, and writes their raw bytes."""
+    """Subscribes to the topics of docs/interfaces.md as they appear and writes their raw bytes."""
 
     NAME = 'recorder'
     PARAMETERS = RecorderParameters

@@ -301,7 +301,7 @@ def _message_of(message: RawMessage, kind: type) -> Any:
 
 
 def _is_latched(message: RawMessage) -> bool:
-    """Return whether a topic was latched when it was recorded, or must be by docs/interfaces.md."""
+    """Return whether a topic was latched in the recording, or must be by docs/interfaces.md."""
     if message.topic.endswith(('/setup', '/field_model')):
         return True
     try:
