@@ -15,6 +15,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 # The rooms that are held to it.
 ROOMS = (
+    'api',
     'calibration',
     'cli',
     'diagnosis',
