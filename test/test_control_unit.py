@@ -1,6 +1,6 @@
 """The simulated control unit: bytes in, bytes out, and fluxes that come back as they went in."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -40,6 +40,21 @@ from anser_ros.wire.setup import parse_setup
 SETUP = parse_setup(read_config('demo_setup.yaml'))
 CHANNELS = parse_channels(read_config('demo_channels.yaml'))
 TONES = np.array(SETUP.frequencies_hz)
+
+
+@dataclass(frozen=True)
+class CurrentDrift(raw_effects.RawEffect):
+    """A coil current that changes by `amount` with time constant `tau_s`, as copper warms up."""
+
+    coil: int
+    amount: float
+    tau_s: float
+
+    def current(self, time_s, current):
+        """Return the currents with that of the coil at its strength of the time."""
+        drifted = current.copy()
+        drifted[self.coil] *= 1 + self.amount * (1 - np.exp(-time_s / self.tau_s))
+        return drifted
 
 
 def dipoles(points):
@@ -152,7 +167,7 @@ class TestSignals:
 
     def test_drifting_current_moves_no_flux(self):
         truth = world()
-        drift = raw_effects.CurrentDrift(coil=2, amount=-0.3, tau_s=0.5)
+        drift = CurrentDrift(coil=2, amount=-0.3, tau_s=0.5)
         unit = ControlUnit(truth, CHANNELS, effects=[drift])
         got, sigma, times = fluxes(unit, 0.2)
         expected = np.array([truth.flux(t) for t in times])

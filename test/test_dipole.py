@@ -16,11 +16,10 @@ import math
 import magpylib
 import numpy as np
 import pytest
+from metal_world import dipole_field, dipole_gradient
 
 from anser_ros.physics.constants import DIPOLE_CONSTANT, MU_0
 from anser_ros.physics.dipole import (
-    dipole_field,
-    dipole_gradient,
     field_basis,
     flux_basis,
     flux_jacobian,

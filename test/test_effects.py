@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from diagnosis_world import world
+from metal_world import induced_moments
 
 from anser_ros.effects.correction import Correction
 from anser_ros.effects.effect import Effect, Family, Remedy
@@ -26,7 +27,7 @@ from anser_ros.metal.body import (
     multipoles,
 )
 from anser_ros.metal.sheet import sheet_sources
-from anser_ros.physics.metal import induced_moments
+from anser_ros.physics.constants import MU_0
 
 CONTRACT = {
     'sensor_gain', 'sensor_axis', 'sensor_polarity', 'sensor_size', 'lever_arm', 'registration',
@@ -376,7 +377,7 @@ def test_a_coupled_body_is_a_sum_of_few_multipoles():
         np.eye(6).astype(complex),
     )
     field = emitters.field(centre + balls).transpose(0, 2, 1)
-    alpha = np.full(len(balls), -2 * np.pi * 0.0043**3 * (1 + 0.1j))
+    alpha = np.full(len(balls), -2 * np.pi * 0.0043**3 / MU_0 * (1 + 0.1j))
     moments = induced_moments(centre + balls, alpha, field)
     sources = Dipoles.vectors(centre + balls, moments.transpose(0, 2, 1))
     places = np.concatenate(

@@ -10,8 +10,8 @@ from anser_ros.errors import FitError
 from anser_ros.measured.navion_data import inner, load
 from anser_ros.measured.navion_fit import EFFECTS, fit_plates
 from anser_ros.measured.navion_held_out import (
+    add_metal,
     chess_even,
-    fit_effects,
     metal_places,
     others,
     prediction_error,
@@ -43,6 +43,15 @@ needs_data = pytest.mark.skipif(
 )
 FOUND = frozenset(EFFECTS) - {'lever_arm'}
 MAGNETS = np.array([[0.0, 0.28, 0.11], [-0.09, 0.29, -0.07], [0.09, 0.29, -0.07]])
+
+
+def fit_effects(data, effects, n_metal):
+    """Fit given effects and a given number of metal objects to all heights."""
+    cloud = magnet_cloud(locate_magnets(data))
+    fit = fit_plates(data, cloud, np.zeros((0, 3)), effects)
+    for _ in range(n_metal):
+        fit = add_metal(data, cloud, fit)
+    return fit
 
 
 def made_up_sources(metal: np.ndarray | None = None) -> Sources:

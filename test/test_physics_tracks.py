@@ -14,6 +14,7 @@ import math
 import magpylib
 import numpy as np
 import pytest
+from metal_world import dipole_field
 from tracking_world import GEOMETRY, anser_board
 
 from anser_ros.errors import FitError, SetupError
@@ -21,7 +22,6 @@ from anser_ros.field.nominal import Tolerances, nominal_model
 from anser_ros.physics import board as boards
 from anser_ros.physics.board import Board, build_board, spiral_path
 from anser_ros.physics.constants import MU_0
-from anser_ros.physics.dipole import dipole_field
 from anser_ros.physics.tracks import loop_field, loop_moment, paths_field, segment_field
 
 

@@ -18,8 +18,8 @@ from tracking_world import (
 from anser_ros.errors import TrackingError
 from anser_ros.field.model import EffectRecord
 from anser_ros.field.nominal import nominal_model
+from anser_ros.metal.sphere import sphere_polarisability
 from anser_ros.physics.board import build_board
-from anser_ros.physics.metal import induced_moments, sphere_polarisability
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking import estimate as states
@@ -265,8 +265,8 @@ def metal_near(model, position):
     at = np.array(position)[None]
     axes = np.eye(3)
     field = np.stack([model.flux(at, a[None])[0] for a in axes], axis=1)[None]
-    alpha = [sphere_polarisability(0.03, 5.8e7, 1.0, f) for f in model.frequencies_hz]
-    moments = induced_moments(at, np.array([alpha]), field)
+    alpha = sphere_polarisability(0.03, 5.8e7, 1.0, 2 * np.pi * np.array(model.frequencies_hz))
+    moments = alpha[None, :, None] * field
     return model.with_dipoles(np.repeat(at, 3, axis=0), axes, moments[0].T.copy())
 
 

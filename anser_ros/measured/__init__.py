@@ -1,6 +1,8 @@
 """Importers of other people's measurements: each finds what its data contain and scores it.
 
-A module here has a ``NAME`` and a function ``run(shared, rng)`` that returns its `ReportRow` list.
+The module of a data set has its ``NAME``, ``analyse(folder)``, ``rows(analysis)``, which returns
+its `ReportRow` list, and ``tables(analysis)``, the text of all candidates. `cli/measured.py` lists
+the data sets.
 """
 
 from dataclasses import dataclass

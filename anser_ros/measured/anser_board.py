@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import FitError
 from anser_ros.measured import ReportRow
@@ -130,14 +131,10 @@ def read_points(path: Path) -> Array:
 
 
 def align(ideal: Array, reported: Array) -> Array:
-    """The ideal points laid rigidly onto the reported ones, m.
-
-    Source: W. Kabsch, Acta Cryst. A32 (1976) 922.
-    """
+    """The ideal points laid rigidly onto the reported ones, m."""
     a, b = ideal - ideal.mean(axis=0), reported - reported.mean(axis=0)
-    u, _, vt = np.linalg.svd(a.T @ b)
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    return np.asarray(a @ (u @ sign @ vt) + reported.mean(axis=0))
+    turn = Rotation.align_vectors(b, a)[0]
+    return np.asarray(turn.apply(a) + reported.mean(axis=0))
 
 
 def block_of(points: Array) -> NDArray[np.int64]:
@@ -304,12 +301,6 @@ def _from_others(free: list[Array], left_out: int) -> float:
     part = free[left_out]
     left = part[:, -1] - part[:, :-1] @ np.linalg.solve(normal, right)
     return float(np.log(np.mean(left**2) / np.mean(part[:, -1] ** 2)))
-
-
-def run(shared: Path, rng: np.random.Generator) -> list[ReportRow]:
-    """Rows of the table; nothing here is random, `rng` is not used."""
-    del rng
-    return rows(analyse(shared / 'measured' / NAME))
 
 
 def rows(analysis: BoardAnalysis) -> list[ReportRow]:

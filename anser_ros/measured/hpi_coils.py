@@ -253,12 +253,6 @@ def relative_error(analysis: HpiAnalysis, predicted: Array, kind: NDArray[np.boo
     return 100.0 * float(np.linalg.norm(predicted[:, keep] - signals) / np.linalg.norm(signals))
 
 
-def run(shared: Path, rng: np.random.Generator) -> list[ReportRow]:
-    """Rows of the table; nothing here is random, `rng` is not used."""
-    del rng
-    return rows(analyse(shared / 'measured' / NAME))
-
-
 def rows(analysis: HpiAnalysis) -> list[ReportRow]:
     """Return the figures before and after the analysis."""
     return [*_demodulation_rows(analysis), *_place_rows(analysis), *_channel_rows(analysis)]

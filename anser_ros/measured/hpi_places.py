@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
@@ -12,14 +13,10 @@ ARMS_M = np.arange(-6e-3, 6.001e-3, 5e-5)
 
 
 def rigid_distance(fitted: Array, digitised: Array) -> Array:
-    """Distances (n,) of points after the best rotation and shift; rows correspond.
-
-    Source: W. Kabsch, Acta Cryst. A32 (1976) 922.
-    """
+    """Distances (n,) of points after the best rotation and shift; rows correspond."""
     a, b = fitted - fitted.mean(axis=0), digitised - digitised.mean(axis=0)
-    u, _, vt = np.linalg.svd(a.T @ b)
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    return np.asarray(np.linalg.norm(a @ (u @ sign @ vt) - b, axis=1))
+    turn = Rotation.align_vectors(b, a)[0]
+    return np.asarray(np.linalg.norm(turn.apply(a) - b, axis=1))
 
 
 def rms(values: Array) -> float:

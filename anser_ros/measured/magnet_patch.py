@@ -257,12 +257,6 @@ def analyse(folder: Path) -> MagnetAnalysis:
     return MagnetAnalysis(lessons, step)
 
 
-def run(shared: Path, rng: np.random.Generator) -> list[ReportRow]:
-    """Rows of the table; nothing here is random, `rng` is not used."""
-    del rng
-    return rows(analyse(shared / 'measured' / NAME))
-
-
 def rows(analysis: MagnetAnalysis) -> list[ReportRow]:
     """Before and after, on files that took no part."""
     out = []

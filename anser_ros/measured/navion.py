@@ -18,7 +18,7 @@ from anser_ros.measured import ReportRow
 from anser_ros.measured.navion_data import NavionData, inner
 from anser_ros.measured.navion_held_out import chess_even, prediction_error, rms, with_own_pose
 from anser_ros.measured.navion_plate import PlateData, predict_plane
-from anser_ros.measured.navion_report import NavionAnalysis, analyse, predict_states
+from anser_ros.measured.navion_report import NavionAnalysis, predict_states
 from anser_ros.measured.navion_states import fit_slew, join_states
 from anser_ros.measured.navion_tool import ToolErrors, tool_errors
 
@@ -33,13 +33,6 @@ INNER_TARGET_MT = 0.135
 
 STRICT = 'effects and model: the other heights only; scored on the height left out'
 OWN_POSE = 'as above, but pose and bend of the height left out from half its sensors; other half'
-
-
-def run(shared: Path, rng: np.random.Generator) -> list[ReportRow]:
-    """Rows of the table; nothing here is random, `rng` is not used."""
-    del rng
-    folder = shared / 'measured' / NAME if (shared / 'measured').is_dir() else shared / NAME
-    return rows(analyse(folder), folder)
 
 
 def rows(analysis: NavionAnalysis, folder: Path) -> list[ReportRow]:

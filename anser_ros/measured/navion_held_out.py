@@ -152,15 +152,6 @@ def choose_effects(
     return Choice(cloud, plain, best, tuple(trials))
 
 
-def fit_effects(data: PlateData, effects: frozenset[str], n_metal: int) -> PlateFit:
-    """Fit given effects and a given number of metal objects to all heights of `data`."""
-    cloud = magnet_cloud(locate_magnets(data))
-    fit = fit_plates(data, cloud, _NO_METAL, effects)
-    for _ in range(n_metal):
-        fit = add_metal(data, cloud, fit)
-    return fit
-
-
 def add_metal(data: PlateData, cloud: Array, fit: PlateFit) -> PlateFit:
     """Add the one more metal object that raises the evidence most.
 

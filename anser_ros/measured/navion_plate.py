@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from anser_ros.physics.dipole import field_basis, flux_jacobian
 
@@ -114,15 +115,8 @@ def vector_basis(points: Array, positions: Array) -> Array:
 
 
 def rotation_matrices(vectors: Array) -> Array:
-    """Rotation matrices (n, 3, 3) of rotation vectors (n, 3), rad (Rodrigues' formula)."""
-    angle = np.linalg.norm(vectors, axis=1)
-    safe = np.maximum(angle, 1e-12)
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-    first = (np.sin(safe) / safe)[:, None, None]
-    second = ((1.0 - np.cos(safe)) / safe**2)[:, None, None]
-    return np.asarray(np.eye(3) + first * cross + second * (cross @ cross))
+    """Return the rotation matrices (n, 3, 3) of rotation vectors (n, 3), rad."""
+    return np.asarray(Rotation.from_rotvec(vectors).as_matrix())
 
 
 class Plate:

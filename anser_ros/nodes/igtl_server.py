@@ -5,7 +5,6 @@ one client, and does not notice one that has left.
 """
 
 import contextlib
-import math
 import select
 import socket
 import threading
@@ -14,6 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pyigtl
+from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import PortError
 
@@ -40,7 +40,7 @@ def transform_bytes(
 ) -> bytes:
     """Pack a TRANSFORM message; OpenIGTLink and 3D Slicer work in millimetres."""
     matrix = np.eye(4)
-    matrix[:3, :3] = _rotation(quaternion_xyzw)
+    matrix[:3, :3] = Rotation.from_quat(quaternion_xyzw).as_matrix()
     matrix[:3, 3] = MM_PER_M * np.asarray(position_m)
     message = pyigtl.TransformMessage(matrix, timestamp=stamp_s, device_name=device_name(name))
     packed: bytes = message.pack()
@@ -55,20 +55,6 @@ def state_bytes(name: str, stamp_s: float, state: str) -> bytes:
     )
     packed: bytes = message.pack()
     return packed
-
-
-def _rotation(quaternion_xyzw: Sequence[float]) -> np.ndarray:
-    """Return the rotation matrix of a quaternion, shape (3, 3)."""
-    x, y, z, w = quaternion_xyzw
-    norm = math.sqrt(x * x + y * y + z * z + w * w)
-    x, y, z, w = x / norm, y / norm, z / norm, w / norm
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 class _Client:

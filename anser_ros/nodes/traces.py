@@ -14,8 +14,6 @@ from anser_ros.wire.setup import Setup
 Array = NDArray[np.float64]
 LONGEST_GAP_S = 0.1
 """Gap between optical poses, s, over which none is interpolated to compare with."""
-RECENT = 200
-"""Comparisons that the figures of a sensor are taken of: four seconds at 50 frames a second."""
 
 
 @dataclass(frozen=True)

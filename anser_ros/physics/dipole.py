@@ -191,54 +191,6 @@ def field_basis(
     return np.stack(columns, axis=2)
 
 
-def dipole_field(
-    points: NDArray[np.generic], positions: NDArray[np.generic], moments: NDArray[np.generic]
-) -> Array:
-    """Return the sum of the fields of dipoles.
-
-    Parameters
-    ----------
-    points : ndarray, shape (P, 3)
-        Where the field is wanted, m, frame fg.
-    positions : ndarray, shape (N, 3)
-        Dipole positions, m, frame fg.
-    moments : ndarray, shape (N, 3)
-        Moment vectors, A m^2, frame fg.
-
-    Returns
-    -------
-    ndarray, shape (P, 3)
-        Flux density, T, frame fg.
-    """
-    vectors = _rows(moments, 3, 'moments')
-    return np.asarray(field_basis(points, positions, vectors).sum(axis=1))
-
-
-def dipole_gradient(
-    points: NDArray[np.generic], positions: NDArray[np.generic], moments: NDArray[np.generic]
-) -> Array:
-    """Return the gradient of the sum of the fields of dipoles.
-
-    Parameters
-    ----------
-    points, positions, moments
-        As for `dipole_field`.
-
-    Returns
-    -------
-    ndarray, shape (P, 3, 3)
-        ``dB_j / dx_i``, T/m, frame fg.
-    """
-    r, q, m = _rows(points, 3, 'points'), _rows(positions, 3, 'positions'), _rows(moments, 3, 'm')
-    basis = np.empty((9, q.shape[0]))
-    out = np.empty((r.shape[0], 3, 3))
-    for p in range(r.shape[0]):
-        fill_field_and_gradient(r[p], q, m, basis)
-        xx, xy, xz, yy, yz, zz = basis[3:].sum(axis=1)
-        out[p] = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
-    return out
-
-
 def flux_jacobian(
     points: NDArray[np.generic],
     axes: NDArray[np.generic],

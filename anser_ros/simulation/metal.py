@@ -7,44 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.physics.constants import MU_0
+from anser_ros.metal.sphere import sphere_polarisability
 from anser_ros.simulation.motion import Approach, Path
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
-
-
-def sphere_polarisability(
-    radius_m: float, conductivity_s_per_m: float, relative_permeability: float, omega: Array
-) -> ComplexArray:
-    """Return the magnetic moment of a sphere per tesla of a uniform field exp(+j w t).
-
-    This is the induced dipole of a conducting permeable sphere (J. R. Wait, Geophysics 16, 1951,
-    p. 666). Its limits are -2 pi a^3 / mu_0 for a perfect conductor and
-    4 pi a^3 / mu_0 (mu_r - 1) / (mu_r + 2) for a permeable insulator.
-
-    Parameters
-    ----------
-    radius_m : float
-        Radius a, m.
-    conductivity_s_per_m : float
-        Conductivity, S/m.
-    relative_permeability : float
-        Relative permeability mu_r.
-    omega : ndarray, shape (K,)
-        Angular frequencies, rad/s.
-
-    Returns
-    -------
-    ndarray, shape (K,), complex
-        Moment per flux density, A m^2 / T.
-    """
-    mu = relative_permeability
-    x = radius_m * np.sqrt(1j * omega * conductivity_s_per_m * mu * MU_0)
-    tanh = np.tanh(np.where(np.abs(x) > 300, 300.0, x))
-    numerator = (1 + x**2 + 2 * mu) * tanh - (1 + 2 * mu) * x
-    denominator = (1 + x**2 - mu) * tanh - (1 - mu) * x
-    return np.asarray(-2 * np.pi * radius_m**3 / MU_0 * numerator / denominator)
 
 
 @dataclass(frozen=True)

@@ -208,21 +208,6 @@ class CoilWeakens(RawEffect):
         return drifted
 
 
-@dataclass(frozen=True)
-class CurrentDrift(RawEffect):
-    """A coil current that changes by `amount` with time constant `tau_s`, as copper warms up."""
-
-    coil: int
-    amount: float
-    tau_s: float
-
-    def current(self, time_s: float, current: ComplexArray) -> ComplexArray:
-        """Return the currents with that of the coil at its strength of the time."""
-        drifted = current.copy()
-        drifted[self.coil] *= 1 + self.amount * (1 - np.exp(-time_s / self.tau_s))
-        return drifted
-
-
 def chained_volts(effects: Sequence[RawEffect], time_s: Array, volts: Array) -> Array:
     """Return the voltages after all effects, applied in their order."""
     for effect in effects:

@@ -57,11 +57,6 @@ class FrameReader:
         self.last_refusal = ''
         self._pending = b''
 
-    @property
-    def pending(self) -> int:
-        """Bytes that wait for the rest of their record."""
-        return len(self._pending)
-
     def reset(self) -> None:
         """Forget a half-received record and the block size, after the port was closed."""
         self._pending = b''
