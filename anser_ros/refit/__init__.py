@@ -1,0 +1,1 @@
+"""The live refit: the field model follows reference sensors while metal moves."""

@@ -17,11 +17,15 @@ ComplexArray = NDArray[np.complex128]
 NEGLIGIBLE = 0.01
 """Hypotheses less probable than this take no part in the mean."""
 INFLATION_STEP = 1.2
+"""Ratio of neighbouring factors by which modes are inflated. The steps keep modes, and what was
+computed for them, the same for many frames."""
 Uncertainty = tuple[ComplexArray | None, float]
 """Modes and flux error of a model."""
 
 MOST_MODES = 16
+"""Sets of modes that are kept; the oldest is dropped."""
 KEEP_FRAMES = 25
+"""Frames for which an inflation is kept at least before it may fall."""
 RIVAL = 0.05
 """Probability from which on a second hypothesis adds what it disagrees about."""
 

@@ -13,10 +13,12 @@ from anser_ros.physics.sensor import SensorTable
 ComplexArray = NDArray[np.complex128]
 
 FEWEST_FRAMES = 3
+"""Frames that a baseline needs at least: their scatter is its noise."""
 CHANGING, FELT = 4.0, 2e-4
 """Readings that change while a baseline is taken: in units of the noise, and as a share of their
 size (which moves a pose by a hundredth of a millimetre)."""
 MOST_FRAMES = 2000
+"""Most recent frames that a baseline is averaged over, 40 s at 50 Hz."""
 
 
 class ReadingWindow:

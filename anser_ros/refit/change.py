@@ -12,12 +12,14 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 MEMORY_FRAMES = 50.0
+"""Frames over which the ratio of measured to expected noise is averaged."""
 STEP = 1.1
 """Noise levels are rounded to powers of this, so that tables made for one serve for a while."""
 
 BURST = 5
 """Readings that may follow each other faster than the rate; they don't come evenly."""
 MOST_RATE_HZ = 50.0
+"""Default of the frame rate, Hz, which turns times into numbers of frames."""
 
 
 @dataclass
@@ -113,5 +115,5 @@ class Average:
         return self._mean, self._frames
 
     def forget(self) -> None:
-        """Drop the mean."""
+        """Drop the mean, so that averaging begins anew."""
         self._mean, self._frames = None, 0

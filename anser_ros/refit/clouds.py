@@ -26,6 +26,7 @@ SPACING_PER_DEPTH = 0.7
 """Lateral spacing of a layer's sources over its depth."""
 
 BODY_SPACING = 0.6
+"""Distance of neighbouring compact bodies of the lattice, in halves of the board."""
 BODY_RADIUS = 0.45
 """Lattice of compact bodies and their radius, in halves of the board: neighbours overlap."""
 

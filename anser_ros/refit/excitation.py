@@ -25,8 +25,11 @@ FieldFunction = Callable[[Array], Array]
 AGREEMENT = 0.9
 """Correlation with the calibrated model below which a drawing is not of this board."""
 SEARCH_M = 1.0
+"""Half size of the square in which the board is searched, m."""
 SEARCH_POINTS = 61
+"""Points along a side of that search, about 3 cm apart."""
 SEARCH_HEIGHT_M = 0.02
+"""Height over the board at which its field is compared, m."""
 
 
 @dataclass(frozen=True)

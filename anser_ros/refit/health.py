@@ -40,6 +40,7 @@ SEEN = 10.0
 AGREES = 2.5
 """Left-out chi-square per degree of freedom below which an excluded coil agrees again."""
 RETRY_FRAMES = 25
+"""Frames after which an excluded coil is looked at again."""
 OUTSTANDING = 8.0
 """A change this many times the median coil's is looked at as a possible fault."""
 MOST_AT_ONCE = 4
@@ -69,7 +70,7 @@ class ReferenceHealth(NamedTuple):
 
 
 def typical(values: Array) -> float:
-    """Median."""
+    """Return the median of values."""
     ordered = sorted(values.tolist())
     middle = len(ordered) // 2
     return float(0.5 * (ordered[middle] + ordered[-1 - middle]))

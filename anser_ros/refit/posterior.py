@@ -56,6 +56,7 @@ class FrameEvidence:
 
 
 MOST = len(STRENGTHS) - 1
+"""Index of the largest strength."""
 MOST_TABLES, MOST_BLOCKS = 12, 128
 """Noise levels and coil blocks that are kept ready."""
 
@@ -152,7 +153,7 @@ class Bank:
         self._set(hypothesis, self.whitening @ vectors)
 
     def vacate(self, hypothesis: int) -> None:
-        """Empty a slot."""
+        """Empty a slot of the bank."""
         self.priors[hypothesis - 1] = None
         self._prior[hypothesis] = -np.inf
         self._name()

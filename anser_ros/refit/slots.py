@@ -37,7 +37,7 @@ class BodySlots:
         self._wait = 0
 
     def clear(self) -> None:
-        """Empty the slots."""
+        """Empty all slots of bodies."""
         self._bodies, self._wait = [], 0
         for slot in range(SLOTS):
             self._bank.vacate(self._first + slot)

@@ -31,6 +31,8 @@ _BROKEN = (
     OverflowError, OSError, zstandard.ZstdError, RuntimeError,
 )  # fmt: skip
 _RECORD_LIMIT = 256 * 2**20
+"""Largest record of a bag that is read, bytes; a larger length means a damaged file, and memory
+for it is never asked for."""
 
 FLUX_TYPE = 'sensor_msgs/msg/PointCloud2'
 POSE_TYPE = 'geometry_msgs/msg/PoseStamped'

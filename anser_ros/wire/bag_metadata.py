@@ -8,6 +8,7 @@ from typing import Any
 import yaml
 
 METADATA_VERSION = 9
+"""Version of rosbag2's metadata.yaml that is written, as ROS 2 Jazzy reads it."""
 # What rosbag2 calls "for ever".
 FOREVER = {'sec': 9223372036, 'nsec': 854775807}
 

@@ -21,7 +21,10 @@ from anser_ros.wire.bag_metadata import BagRecord, TopicRecord, plain_yaml, qos_
 from anser_ros.wire.points import PointFieldTuple
 
 CHUNK_BYTES = 256 * 1024
+"""Size of a chunk, bytes. A recording that is cut off loses at most its last chunk; smaller chunks
+make larger files."""
 RESERVE_BYTES = 1024 * 1024
+"""Disk space that is reserved at the start, bytes, for the end of a recording on a full disk."""
 LIBRARY = 'anser_ros'
 
 

@@ -12,6 +12,7 @@ from anser_ros.wire.points import PointFieldTuple
 
 HEADER = b'\x00\x01\x00\x00'
 NS = 1_000_000_000
+"""Nanoseconds in a second."""
 
 _TIME = """
 ================================================================================
@@ -95,7 +96,7 @@ class _Bytes:
 
 
 def string_bytes(text: str) -> bytes:
-    """Serialise a ``std_msgs/String``."""
+    """Return a serialised ``std_msgs/String``."""
     out = _Bytes()
     out.text(text)
     return out.done()

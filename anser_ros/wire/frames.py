@@ -20,14 +20,20 @@ from anser_ros.errors import FrameError
 
 MAGIC = b'\xa5\x41\x4e\xda'
 VERSION = 1
+"""Version of the protocol in docs/cu_protocol.md."""
 HEADER = struct.Struct('<4sBBHHH')
 CRC = struct.Struct('<I')
 OVERHEAD = HEADER.size + CRC.size
 MAX_PAYLOAD = 0xFFFF
+"""Largest payload of a record, bytes: its length is an unsigned 16-bit number."""
 MAX_CHANNELS = 1024
+"""Most channels that a hello may state; more are taken for a damaged record."""
 FASTEST_SAMPLE_RATE_HZ = 4e5
+"""Highest sample rate that a hello may state, Hz; a higher one is taken for a damaged record."""
 TICK_RATES_HZ = (1e3, 1e10)
+"""Lowest and highest rate of the device's timestamp counter that a hello may state, Hz."""
 FULL_SCALE_CODE = 32768
+"""Code of a full-scale signal: one beyond the largest signed 16-bit number."""
 
 _HELLO = struct.Struct('<HddHHHB')
 _CHANNEL = struct.Struct('<HBBf')
@@ -173,7 +179,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Stop:
-    """Command: stop streaming."""
+    """The command to stop streaming."""
 
 
 @dataclass(frozen=True)
@@ -352,7 +358,9 @@ _LAYOUTS: dict[int, tuple[type, Callable[..., bytes], Callable[[memoryview], Pay
     0x83: (Stop, _nothing, lambda raw: Stop()),
     0x84: (SetFrequencies, _encode_frequencies, _decode_frequencies),
 }
+"""Type, encoder and decoder of the payload of each record, by the number of its type."""
 TYPE_OF = {layout[0]: number for number, layout in _LAYOUTS.items()}
+"""Number of the record type of each class of payload."""
 
 
 def knows(number: int) -> bool:

@@ -21,6 +21,8 @@ from anser_ros.wire.points import FLOAT32, UINT16, UINT32, PointFieldTuple
 ComplexArray = NDArray[np.complex128]
 
 MOST_VALUES = 50_000_000
+"""Largest number of values of the modes that are unpacked, 400 MB; more means a damaged
+message."""
 _HEAD = [('mode', '<u2'), ('dipole', '<u2'), ('flux_error', '<f4'), ('follows', '<u4')]
 
 

@@ -18,11 +18,16 @@ ComplexArray = NDArray[np.complex128]
 PointFieldTuple = tuple[str, int, int, int]
 
 SATURATED = 1
+"""Flag bit of a reading with a sample at an end of the converter's range."""
 STALE = 2
+"""Flag bit of a reading that is repeated because no newer one has arrived."""
 DROPPED = 4
+"""Flag bit of a reading with samples missing inside its window."""
 
 UINT16, UINT32, FLOAT32, FLOAT64 = 4, 6, 7, 8
+"""Numbers of the data types of sensor_msgs/PointField that are used here."""
 _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
+"""numpy's codes of all data types of sensor_msgs/PointField, by their number."""
 
 
 @dataclass(frozen=True)

@@ -28,10 +28,15 @@ from anser_ros.wire.frames import Hello, Payload, Record, SampleBlock
 from anser_ros.wire.protocols import ANSER, SerialProtocol
 
 DEFAULT_BAUD = 12_000_000
+"""Baud rate of the port; USB devices ignore it."""
 _READ_TIMEOUT_S = 0.05
+"""Longest time that a read waits, s, before the thread looks whether it has to end."""
 _WRITE_TIMEOUT_S = 0.2
+"""Longest time that a write may take, s; commands are short, so that a longer one is a fault."""
 _GARBAGE_BYTES = 256
+"""Bytes without a record within a second beyond which the line counts as garbled."""
 _READ_BYTES = 1 << 16
+"""Largest number of bytes of one read."""
 OPEN_FAILURES = {
     errno.EAGAIN: 'another program uses it',
     errno.EBUSY: 'another program uses it',

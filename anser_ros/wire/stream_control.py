@@ -16,7 +16,10 @@ from anser_ros.wire.frames import (
 )
 
 _REPEAT_NS = 500_000_000
+"""Time (0.5 s) after which a command without effect is sent again; an answer takes far less."""
 _TONE_TOLERANCE_HZ = 1.0
+"""Difference up to which a frequency of the device is that of the setup, Hz; synthesisers
+round."""
 
 
 class StreamControl:
