@@ -8,6 +8,7 @@ import ast
 import importlib
 import inspect
 import pkgutil
+import re
 from pathlib import Path
 
 import pytest
@@ -80,11 +81,11 @@ def test_no_effect_is_a_special_case_outside_its_room(path):
 
 def test_no_site_hides_state_behind_an_underscore():
     """What a term needs to know beside its site is a field of a class of its own."""
-    for path in PACKAGE.rglob('*.py'):
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
-            if isinstance(node, ast.Subscript) and _named(node.value) == 'site':
-                key = getattr(node.slice, 'value', None)
-                assert not str(key).startswith('_'), f'{path}:{node.lineno}'
+    for room in ('effects', 'diagnosis'):
+        for path in (PACKAGE / room).rglob('*.py'):
+            for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+                if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                    assert not re.fullmatch('_[a-z]+', node.value), f'{path}:{node.lineno}'
 
 
 @pytest.mark.parametrize(

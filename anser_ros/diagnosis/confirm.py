@@ -93,7 +93,7 @@ class Confirmation:
         return 'far more stays unexplained than it explains'
 
 
-def confirm(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmation:
+def _checked(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmation:
     """Check one term of a fit; ``noise`` is the variance of the whitened noise."""
     rest = [t for t in fit.terms if t is not term and not t.belongs_to(term)]
     without = evaluate(problem, rest)
@@ -199,7 +199,7 @@ def _checked_open(problem: Problem, fit: Fit, term: Term, noise: float) -> Confi
 def doubtful(problem: Problem, fit: Fit, noise: float) -> list[tuple[Confirmation, Term]]:
     """The effects of a fit that are not confirmed, the one with the least power first."""
     checks = [
-        (confirm(problem, fit, term, noise), term) for term in fit.effects if term.theta.size
+        (_checked(problem, fit, term, noise), term) for term in fit.effects if term.theta.size
     ]
     checks += [
         (_checked_open(problem, fit, term, noise), term)
