@@ -14,7 +14,8 @@ from anser_ros.physics.board import Board, build_board
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit import live_refit
-from anser_ros.refit.live_refit import LiveRefit, RefitSettings
+from anser_ros.refit.live_refit import LiveRefit
+from anser_ros.settings import RefitSettings
 
 
 def reference_ring(count: int, half: float, seed: int = 3) -> SensorTable:

@@ -122,3 +122,14 @@ def test_broad_excepts_are_the_outermost():
             kind = ast.unparse(node.type) if node.type else 'BaseException'
             broad = kind in ('Exception', 'BaseException')
             assert not broad or place(path) in allowed, f'{place(path)}:{node.lineno}'
+
+
+def test_no_class_name_stands_twice():
+    """One name is one concept: a class is found by its name alone."""
+    places = {}
+    for path in FILES:
+        for node in ast.parse(path.read_text(encoding='utf-8')).body:
+            if isinstance(node, ast.ClassDef):
+                places.setdefault(node.name, []).append(place(path))
+    twice = {name: found for name, found in places.items() if len(found) > 1}
+    assert not twice, twice

@@ -22,15 +22,16 @@ from anser_ros.calibration.factors import GramFactor, TriangularFactor, as_compl
 from anser_ros.calibration.layouts import Layout, place
 from anser_ros.calibration.moments import MomentFitter
 from anser_ros.calibration.pose_correction import (
-    Uncertainty,
     most_probable_step,
     moved,
     outlier_weights,
+    pose_precision,
     pose_terms,
 )
 from anser_ros.calibration.pose_whitening import PoseWhitener
 from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
 from anser_ros.errors import FitError
+from anser_ros.settings import Accuracy
 
 LAYER = Layout('layer', 9, 1.3, 0.0)
 
@@ -116,7 +117,7 @@ def test_step_finds_the_jitter(rng):
     terms = pose_terms(world.measurements, world.dipoles, world.moments)
     weights = usable_weights(world.measurements)
     none = np.zeros((len(weights), 6))
-    step, left = most_probable_step(terms, weights, NOISE_T, Uncertainty().pose_precision, none)
+    step, left = most_probable_step(terms, weights, NOISE_T, pose_precision(Accuracy()), none)
     truth = world.position - world.measurements.position
     assert truth.std() > 0.9 * JITTER_M
     assert (step[:, :3] - truth).std() < 0.1 * JITTER_M
@@ -128,10 +129,10 @@ def test_step_finds_the_jitter(rng):
 def test_without_jitter_the_poses_stay(rng):
     world = scene(rng, side=4)
     terms = pose_terms(world.measurements, world.dipoles, world.moments)
-    exact = Uncertainty(position_m=0.0, rotation_rad=0.0)
+    exact = Accuracy(optical_position_m=0.0, optical_rotation_rad=0.0)
     weights = usable_weights(world.measurements)
     step, _ = most_probable_step(
-        terms, weights, NOISE_T, exact.pose_precision, np.zeros((len(weights), 6))
+        terms, weights, NOISE_T, pose_precision(exact), np.zeros((len(weights), 6))
     )
     assert np.abs(step).max() < 1e-9
 
@@ -144,7 +145,7 @@ def field_error(world, model_flux):
 
 def fitted(world, damping=0.0, **options):
     dipoles = world.dipoles
-    fitter = MomentFitter([world.measurements], dipoles, damping, Uncertainty())
+    fitter = MomentFitter([world.measurements], dipoles, damping, Accuracy())
 
     def flux(moments):
         from anser_ros.physics.dipole import flux_basis
@@ -206,7 +207,7 @@ def test_predictive_chi_square_is_one_at_the_truth(rng):
     world = scene(rng, side=12)
     terms = pose_terms(world.measurements, world.dipoles, world.moments)
     weights = usable_weights(world.measurements)
-    white = PoseWhitener(terms.slope, weights, NOISE_T, Uncertainty().pose_precision)
+    white = PoseWhitener(terms.slope, weights, NOISE_T, pose_precision(Accuracy()))
     each = white.chi_square(terms.residual) / terms.residual[0].size
     assert each.mean() == pytest.approx(1.0, abs=0.05)
     assert abs(np.mean(white.excess_power(terms.residual))) < (0.3 * NOISE_T) ** 2
@@ -224,7 +225,7 @@ def test_readings_without_pose_are_left_out(rng):
     assert len(part.time) == 13
     nothing = type(m)(**{**m.__dict__, 'has_pose': np.zeros(16, dtype=bool)})
     with pytest.raises(FitError, match='no reading has a pose'):
-        MomentFitter([nothing], place(LAYER, world.generator), 1e-6, Uncertainty())
+        MomentFitter([nothing], place(LAYER, world.generator), 1e-6, Accuracy())
 
 
 def test_basis_rows_are_in_order_of_frames_and_sensors(rng):

@@ -7,12 +7,12 @@ import pytest
 from calibration_world import scene
 
 from anser_ros.calibration.dipole_sites import DipoleSites
-from anser_ros.calibration.pose_correction import Uncertainty
 from anser_ros.calibration.positions import PositionFitter, position_slopes
 from anser_ros.calibration.readings import usable_weights
 from anser_ros.calibration.sensor_parameters import tangents
 from anser_ros.calibration.sensor_survey import SensorSurveyor
 from anser_ros.physics.dipole import flux_basis
+from anser_ros.settings import Accuracy
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def test_gains_axes_and_lever_arm_are_found(rng):
         flux=world.measurements.flux * gain[:, None],
         sensors=table.with_geometry(axis=wrong),
     )
-    surveyor = SensorSurveyor([told], ('gains', 'axes'), world.generator, Uncertainty())
+    surveyor = SensorSurveyor([told], ('gains', 'axes'), world.generator, Accuracy())
     found = surveyor.fit()['tool']
     assert np.abs(found.gain - gain).max() < 1e-3
     off = np.linalg.norm(np.cross(found.axis, table.axis), axis=1)
@@ -95,7 +95,7 @@ def test_a_lever_arm_shows_when_the_tool_turns(rng):
             position=world.measurements.sensors.position - [0.0, 0.0, 0.004]
         ),
     )  # fmt: skip
-    surveyor = SensorSurveyor([turned], ('lever_arm',), world.generator, Uncertainty())
+    surveyor = SensorSurveyor([turned], ('lever_arm',), world.generator, Accuracy())
     found = surveyor.fit()['tool']
     sigma = np.array(found.records[0].uncertainty['offset_m'])
     assert found.records[0].name == 'lever_arm'

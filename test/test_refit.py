@@ -12,10 +12,11 @@ from refit_world import (
     volume_points,
 )
 
-from anser_ros.errors import FitError
+from anser_ros.errors import FitError, ParameterError
 from anser_ros.frames.intake import Intake
 from anser_ros.refit.baseline import ReadingWindow
-from anser_ros.refit.live_refit import LiveRefit, RefitSettings
+from anser_ros.refit.live_refit import LiveRefit
+from anser_ros.settings import RefitSettings
 
 STEP_NS = 20_000_000
 HEAD = metal_block([0.03, -0.02, -0.11], [0.1, 0.12, 0.06])
@@ -405,14 +406,14 @@ def test_a_change_that_nothing_explains_is_a_state_not_a_confident_model(refit):
 @pytest.mark.parametrize(
     ('change', 'message'),
     [
-        ({'flux_noise_t': 0.0}, 'flux_noise_t'),
+        ({'emitter_drift': -0.1}, 'emitter_drift'),
         ({'min_references': 0}, 'min_references'),
         ({'persistence': 1.0}, 'persistence'),
-        ({'modes': 0}, 'modes'),
+        ({'error_modes': 0}, 'error_modes'),
     ],
 )
 def test_settings_are_checked(change, message):
-    with pytest.raises(FitError, match=message):
+    with pytest.raises(ParameterError, match=message):
         RefitSettings(**change)
 
 

@@ -13,10 +13,11 @@ from anser_ros.refit.clouds import Region, below, default_clouds, overhead
 from anser_ros.refit.excitation import excitation_for, region_of
 from anser_ros.refit.layer import bottom_layer, box_layer
 from anser_ros.refit.modes import error_modes
-from anser_ros.refit.patches import PoseError, clean_reading, has_moved
+from anser_ros.refit.patches import clean_reading, has_moved
 from anser_ros.refit.posterior import STRENGTHS, Bank
 from anser_ros.refit.prior import ORIENTED, UPRIGHT, Response, build_prior
-from anser_ros.refit.references import SurveyError, survey_variants, vector_basis
+from anser_ros.refit.references import survey_variants, vector_basis
+from anser_ros.settings import Accuracy
 
 K = 8
 NOISE = 1.3
@@ -38,7 +39,7 @@ def parts(world):
     priors = [
         build_prior(
             cloud, response, layer, references, excitation.field(cloud.positions),
-            np.array(world.model.frequencies_hz), SurveyError(), rng,
+            np.array(world.model.frequencies_hz), Accuracy(), rng,
         )
         for cloud, response in zip(clouds, (UPRIGHT, ORIENTED), strict=True)
     ]  # fmt: skip
@@ -226,7 +227,7 @@ def test_region_is_where_the_board_is(world):
 def test_survey_variants_are_the_first_order_of_a_wrong_survey(world):
     table = world.references.select([1])
     source = np.array([[0.02, 0.03, -0.08]])
-    survey = SurveyError(position_m=1e-5, rotation_rad=1e-4, gain=0.01)
+    survey = Accuracy(reference_position_m=1e-5, reference_axis_rad=1e-4, reference_gain=0.01)
     plain = vector_basis(table.position, table.axis, table.length, source)
     gain, turn, _, x, _, _ = survey_variants(table, source, survey)
     np.testing.assert_allclose(gain, 0.01 * plain)
@@ -237,7 +238,7 @@ def test_survey_variants_are_the_first_order_of_a_wrong_survey(world):
 
 def test_a_patch_reads_what_the_model_says_with_its_pose_s_error(world):
     coils = world.references.select([0, 4, 9])
-    error = PoseError(2e-4, 3e-3, 0.0)
+    error = Accuracy(patch_position_m=2e-4, patch_rotation_rad=3e-3, reference_gain=0.0)
     flux, sigma = clean_reading(world.model, coils, error)
     np.testing.assert_allclose(
         flux, world.model.flux(coils.position, coils.axis, coils.length), rtol=1e-9
@@ -245,9 +246,9 @@ def test_a_patch_reads_what_the_model_says_with_its_pose_s_error(world):
     rng = np.random.default_rng(1)
     steps = []
     for _ in range(600):
-        turn = rng.normal(0.0, error.rotation_rad, (3, 3))
+        turn = rng.normal(0.0, error.patch_rotation_rad, (3, 3))
         shifted = coils.with_geometry(
-            coils.position + rng.normal(0.0, error.position_m, (3, 3)),
+            coils.position + rng.normal(0.0, error.patch_position_m, (3, 3)),
             coils.axis + np.cross(turn, coils.axis),
         )
         steps.append(world.model.flux(shifted.position, shifted.axis, shifted.length) - flux)
@@ -310,9 +311,7 @@ def test_priors_are_the_covariance_of_their_own_draws(world, parts, response):
     tones = np.array(world.model.frequencies_hz)
     arguments = (cloud, response, layer, references, excitation.field(cloud.positions), tones)
     seeds = range(60)
-    priors = [
-        build_prior(*arguments, SurveyError(), np.random.default_rng(seed)) for seed in seeds
-    ]
+    priors = [build_prior(*arguments, Accuracy(), np.random.default_rng(seed)) for seed in seeds]
     draws = np.concatenate([prior.draw_readings for prior in priors], axis=1)
     moments = np.concatenate([prior.draw_moments for prior in priors], axis=1)
     count = draws.shape[1]

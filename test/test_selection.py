@@ -14,11 +14,11 @@ from anser_ros.calibration.layout_fit import fit_layout
 from anser_ros.calibration.layout_score import LayoutScorer
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.local import Regions
-from anser_ros.calibration.pose_correction import Uncertainty
 from anser_ros.calibration.prior import DrawnBoard, emitter_gains
 from anser_ros.calibration.selection import choose_layout, thin_frames
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
+from anser_ros.settings import Accuracy
 
 EMITTERS = ('a', 'b', 'c')
 TONES = (1000.0, 1100.0, 1200.0)
@@ -117,7 +117,7 @@ def test_the_choice_is_neither_too_coarse_nor_undamped(world):
     thin = thin_frames([world.measurements])
     folds = fold_of_frames([m.position for m in thin])
     scorer = LayoutScorer(
-        thin, folds, place(Layout('layer', 10, 1.25, 0.0), world.generator), Uncertainty()
+        thin, folds, place(Layout('layer', 10, 1.25, 0.0), world.generator), Accuracy()
     )
     scores = {}
     for count in (3, 9):
@@ -134,9 +134,7 @@ def test_selection_finds_a_prior_and_is_deterministic(world):
     thin = thin_frames([world.measurements], 300)
     folds = fold_of_frames([m.position for m in thin])
     board = DrawnBoard(drawn(world, 0.9), thin)
-    runs = [
-        choose_layout(thin, folds, world.generator, Uncertainty(), drawn=board) for _ in range(2)
-    ]
+    runs = [choose_layout(thin, folds, world.generator, Accuracy(), drawn=board) for _ in range(2)]
     assert runs[0].finalists[0].layout == runs[1].finalists[0].layout
     assert runs[0].finalists[0].layout.prior == 'nominal'
     assert len(runs[0].candidates) > 10
@@ -313,7 +311,7 @@ def test_shares_of_regions_add_up_to_one(rng):
 def test_joined_regions_make_the_common_field_where_one_model_does(world):
     layout = Layout('layer', 9, 1.5, 0.0, local=True)
     plain = replace(layout, local=False)
-    common = (Uncertainty(), None, 3, False)
+    common = (Accuracy(), None, 3, False)
     local, whole = (
         fit_layout([world.measurements], one, 1e-3, world.generator, *common)
         for one in (layout, plain)

@@ -12,7 +12,6 @@ from anser_ros.calibration.layout_fit import LayoutFit, fit_layout
 from anser_ros.calibration.layout_score import LayoutCandidate
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.moments import Progress
-from anser_ros.calibration.pose_correction import Uncertainty
 from anser_ros.calibration.prior import DrawnBoard
 from anser_ros.calibration.readings import with_pose
 from anser_ros.calibration.requirements import check_agreement, check_measurements
@@ -27,6 +26,7 @@ from anser_ros.calibration.selection import (
 from anser_ros.calibration.sensor_survey import SensorSurveyor
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel
+from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ class Options:
 
     Attributes
     ----------
-    uncertainty : Uncertainty
+    accuracy : Accuracy
         Flux noise and pose jitter.
     layout : Layout or None
         Layout of the dipoles; chosen by held-out error by default.
@@ -47,7 +47,7 @@ class Options:
         What is estimated of the sensors together with the field, of `sensor_parameters.KINDS`.
     """
 
-    uncertainty: Uncertainty = field(default_factory=Uncertainty)
+    accuracy: Accuracy = field(default_factory=Accuracy)
     layout: Layout | None = None
     damping: float | None = None
     estimate: tuple[str, ...] = ()
@@ -97,7 +97,7 @@ def calibrate(
     folds = fold_of_frames([m.position for m in thin])
     drawn = None if nominal is None else DrawnBoard(nominal, thin)
     selection = choose_layout(
-        thin, folds, generator, options.uncertainty, progress, options.layout, drawn
+        thin, folds, generator, options.accuracy, progress, options.layout, drawn
     )
     tested = [
         (candidate, _tested(candidate, thin, folds, generator, options, nominal, selection))
@@ -106,7 +106,7 @@ def calibrate(
     chosen, held_out = _better(tested)
     damping = chosen.damping if options.damping is None else options.damping
     whole = fit_layout(
-        posed, chosen.layout, damping, generator, options.uncertainty, nominal, progress=progress
+        posed, chosen.layout, damping, generator, options.accuracy, nominal, progress=progress
     )
     dipoles, fit = whole.dipoles, whole.fit
     check_agreement(posed, names, fit, _fitter(chosen, generator, options, nominal))
@@ -132,7 +132,7 @@ def _surveyed(
     """Return the measurements with estimated sensors, and the records of the estimates."""
     if not options.estimate:
         return posed, ()
-    surveyor = SensorSurveyor(posed, options.estimate, generator, options.uncertainty)
+    surveyor = SensorSurveyor(posed, options.estimate, generator, options.accuracy)
     surveys = surveyor.fit()
     records = tuple(record for survey in surveys.values() for record in survey.records)
     return [surveys[m.body].apply(m) for m in posed], records
@@ -145,7 +145,7 @@ def _fitter(
 
     def fit(part: list[Measurements]) -> LayoutFit:
         return fit_layout(
-            part, candidate.layout, damping, generator, options.uncertainty, nominal,
+            part, candidate.layout, damping, generator, options.accuracy, nominal,
             alternations=3, exact=False,
         )  # fmt: skip
 
@@ -165,7 +165,7 @@ def _tested(
     fitter = _fitter(candidate, generator, options, nominal)
     reference = selection.reference
     return predict_held_out(
-        thin, folds, fitter, options.uncertainty, reference.noise_t, reference.quadrature_noise_t
+        thin, folds, fitter, options.accuracy, reference.noise_t, reference.quadrature_noise_t
     )
 
 

@@ -74,7 +74,7 @@ IDENTITY = Shape(-1, 0.0, 0.0)
 """The shape of a map that corrects nothing."""
 
 
-class Correction:
+class PositionMap:
     """What a map of one shape, fitted to some points, adds to tracked positions.
 
     Parameters
@@ -128,7 +128,7 @@ class ErrorMap:
 
     Attributes
     ----------
-    correction : Correction
+    correction : PositionMap
         What it adds to tracked positions.
     n_points : int
         Points that it was learnt from.
@@ -139,7 +139,7 @@ class ErrorMap:
         Every shape with its held-out error (m), by which the shape was chosen.
     """
 
-    correction: Correction
+    correction: PositionMap
     n_points: int
     before_m: float
     after_m: float
@@ -190,7 +190,7 @@ def learn_error_map(tracked: Array, true: Array) -> ErrorMap:
     held_out = _HeldOut(places, errors, fold_of_frames([places])[0], _shapes(places))
     shape = held_out.shapes[held_out.decide(held_out.everything)]
     return ErrorMap(
-        Correction(places, errors, shape),
+        PositionMap(places, errors, shape),
         len(places),
         float(np.sqrt((errors**2).sum(axis=1).mean())),
         float(np.sqrt(held_out.square_of_decisions() / len(places))),
@@ -235,7 +235,7 @@ class _HeldOut:
                 [
                     np.sum((errors[test] - part(places[test])) ** 2)
                     for part in (
-                        Correction(places[train], errors[train], shape) for shape in self.shapes
+                        PositionMap(places[train], errors[train], shape) for shape in self.shapes
                     )
                 ]
             )

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from anser_ros.calibration.factors import ComplexArray
 from anser_ros.calibration.layout_fit import LayoutFit
-from anser_ros.calibration.pose_correction import PoseTerms, Uncertainty, pose_terms
+from anser_ros.calibration.pose_correction import PoseTerms, pose_precision, pose_terms
 from anser_ros.calibration.pose_whitening import PoseWhitener
 from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
 from anser_ros.field.measurements import Measurements
+from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 
@@ -68,7 +69,7 @@ def predict_held_out(
     measurements: Sequence[Measurements],
     folds: Sequence[NDArray[np.int64]],
     fit: Callable[[list[Measurements]], LayoutFit],
-    uncertainty: Uncertainty,
+    accuracy: Accuracy,
     noise_t: float | None = None,
     flux_noise_t: float | None = None,
 ) -> HeldOut:
@@ -82,7 +83,7 @@ def predict_held_out(
         Fold of each frame, an array for each of the measurements.
     fit : callable
         Fits a model to measurements from the start.
-    uncertainty : Uncertainty
+    accuracy : Accuracy
         Flux noise and pose jitter.
     noise_t : float, optional
         Noise of a phasor component, T, that noise and jitter are weighed with and that is
@@ -98,7 +99,7 @@ def predict_held_out(
     noise = min(part.fit.noise_t for _, part in fits) if noise_t is None else noise_t
     quadrature = min(part.fit.quadrature_noise_t for _, part in fits)
     flux_noise = min(noise, quadrature if flux_noise_t is None else flux_noise_t)
-    tally = _Tally(noise, flux_noise, uncertainty, len(fits[0][1].dipoles))
+    tally = _Tally(noise, flux_noise, accuracy, len(fits[0][1].dipoles))
     for fold, fitted in fits:
         for m, f in zip(measurements, folds, strict=True):
             test = with_pose(m.frames(f == fold))
@@ -113,10 +114,10 @@ class _Tally:
     """Gathers held-out residuals of all folds and sums them up."""
 
     def __init__(
-        self, noise_t: float, flux_noise_t: float, uncertainty: Uncertainty, n_dipoles: int
+        self, noise_t: float, flux_noise_t: float, accuracy: Accuracy, n_dipoles: int
     ) -> None:
         self.flux_noise_t, self.n_dipoles = flux_noise_t, n_dipoles
-        self.noise_t, self.precision = noise_t, uncertainty.pose_precision
+        self.noise_t, self.precision = noise_t, pose_precision(accuracy)
         self.error: list[ComplexArray] = []
         self.left: list[ComplexArray] = []
         self.chi: list[Array] = []

@@ -11,11 +11,11 @@ from anser_ros.calibration.factors import ComplexArray
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.local import join_regions
 from anser_ros.calibration.moments import MomentFit, MomentFitter, Progress
-from anser_ros.calibration.pose_correction import Uncertainty
 from anser_ros.calibration.positions import PositionFitter
 from anser_ros.calibration.prior import DrawnBoard
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
+from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 
@@ -126,7 +126,7 @@ def fit_layout(
     layout: Layout,
     damping: float,
     generator: Generator,
-    uncertainty: Uncertainty,
+    accuracy: Accuracy,
     nominal: FieldModel | None = None,
     alternations: int = 6,
     exact: bool = True,
@@ -144,7 +144,7 @@ def fit_layout(
         Damping of the moments.
     generator : Generator
         Places of the coils.
-    uncertainty : Uncertainty
+    accuracy : Accuracy
         Flux noise and pose jitter.
     nominal : FieldModel, optional
         The drawn board, for layouts that are pulled towards it.
@@ -157,11 +157,11 @@ def fit_layout(
     dipoles, prior = placed(layout, generator, drawn)
     if layout.moved:
         layer = place(rich_layout(measurements, generator), generator)
-        rich = MomentFitter(measurements, layer, RICH_DAMPING, uncertainty)
+        rich = MomentFitter(measurements, layer, RICH_DAMPING, accuracy)
         reference = rich.fit(3, exact=False)
         dipoles = optimise_positions(reference.measurements, reference.weights, dipoles, prior)
         prior = prior_of(layout, dipoles, drawn)
-    fitter = MomentFitter(measurements, dipoles, damping, uncertainty, prior)
+    fitter = MomentFitter(measurements, dipoles, damping, accuracy, prior)
     fit = fitter.fit(alternations, progress, exact)
     if not layout.local:
         return LayoutFit(dipoles, prior, fit)

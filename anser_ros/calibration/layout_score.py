@@ -20,11 +20,12 @@ from anser_ros.calibration.factors import ComplexArray, as_real
 from anser_ros.calibration.layout_fit import optimise_positions, prior_of
 from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.moments import MomentFit, MomentFitter
-from anser_ros.calibration.pose_correction import Uncertainty, pose_terms
+from anser_ros.calibration.pose_correction import pose_precision, pose_terms
 from anser_ros.calibration.pose_whitening import PoseWhitener
 from anser_ros.calibration.prior import DrawnBoard
 from anser_ros.calibration.readings import with_pose
 from anser_ros.field.measurements import Measurements
+from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 
@@ -83,7 +84,7 @@ def _body_readings(
     weights: Array,
     dipoles: DipoleSites,
     fit: MomentFit,
-    uncertainty: Uncertainty,
+    accuracy: Accuracy,
 ) -> _BodyReadings:
     terms = pose_terms(corrected, dipoles, fit.moments)
     # The correction is undone to first order, since predictions are judged at measured poses.
@@ -91,7 +92,7 @@ def _body_readings(
     whiteners = {
         int(fold): PoseWhitener(
             terms.slope[folds == fold], weights[folds == fold], fit.noise_t,
-            uncertainty.pose_precision,
+            pose_precision(accuracy),
         )
         for fold in np.unique(folds)
     }  # fmt: skip
@@ -109,7 +110,7 @@ class LayoutScorer:
         Fold of each frame.
     reference : DipoleSites
         A rich set of dipoles for the correction of the poses.
-    uncertainty : Uncertainty
+    accuracy : Accuracy
         Flux noise and pose jitter.
     """
 
@@ -118,15 +119,15 @@ class LayoutScorer:
         measurements: Sequence[Measurements],
         folds: Sequence[NDArray[np.int64]],
         reference: DipoleSites,
-        uncertainty: Uncertainty,
+        accuracy: Accuracy,
     ) -> None:
         kept = [m.usable.any(axis=1) for m in measurements]
         posed = [with_pose(m) for m in measurements]
-        fitter = MomentFitter(posed, reference, REFERENCE_DAMPING, uncertainty)
+        fitter = MomentFitter(posed, reference, REFERENCE_DAMPING, accuracy)
         self.reference = fitter.fit(exact=False)
         self.noise_t = self.reference.noise_t
         self._bodies = [
-            _body_readings(c, m, f[k], w, reference, self.reference, uncertainty)
+            _body_readings(c, m, f[k], w, reference, self.reference, accuracy)
             for c, m, f, k, w in zip(
                 self.reference.measurements, posed, folds, kept, self.reference.weights,
                 strict=True,

@@ -26,16 +26,17 @@ from anser_ros.calibration.factors import (
 )
 from anser_ros.calibration.pose_correction import (
     SMALLEST_NOISE_T,
-    Uncertainty,
     most_probable_step,
     moved,
     outlier_weights,
     pose_freedom,
+    pose_precision,
     pose_terms,
 )
 from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
+from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -112,7 +113,7 @@ class MomentFitter:
         N dipoles.
     damping : float
         Tikhonov's parameter as a fraction of the largest singular value of the scaled matrix.
-    uncertainty : Uncertainty
+    accuracy : Accuracy
         Flux noise to begin with, and pose jitter.
     prior : ndarray, shape (N, K), complex, optional
         Moments towards which the damping pulls, A m^2; zero by default.
@@ -128,12 +129,12 @@ class MomentFitter:
         measurements: Sequence[Measurements],
         dipoles: DipoleSites,
         damping: float,
-        uncertainty: Uncertainty,
+        accuracy: Accuracy,
         prior: ComplexArray | None = None,
     ) -> None:
-        self.dipoles, self.damping, self.uncertainty = dipoles, damping, uncertainty
+        self.dipoles, self.damping, self.accuracy = dipoles, damping, accuracy
         self.prior = None if prior is None else as_real(prior)
-        self.noise_t = self.quadrature_noise_t = uncertainty.flux_t
+        self.noise_t = self.quadrature_noise_t = accuracy.flux_noise_t
         self.states = [self._state(with_pose(m)) for m in measurements]
         count = sum(int(state.usable.sum()) for state in self.states)
         if count == 0:
@@ -197,8 +198,8 @@ class MomentFitter:
 
     def _precision(self, state: _State) -> Array:
         if state.measured.body == 'fg':
-            return Uncertainty(position_m=0.0, rotation_rad=0.0).pose_precision
-        return self.uncertainty.pose_precision
+            return pose_precision(Accuracy(optical_position_m=0.0, optical_rotation_rad=0.0))
+        return pose_precision(self.accuracy)
 
     def fit(
         self, alternations: int = 5, progress: Progress | None = None, exact: bool = True

@@ -10,6 +10,7 @@ from anser_ros.calibration.dipole_sites import DipoleSites
 from anser_ros.calibration.factors import as_real
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_jacobian
+from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -22,30 +23,12 @@ SMALLEST_NOISE_T = 1e-13
 without noise and is far below the tens of picotesla of real electronics."""
 
 
-@dataclass(frozen=True)
-class Uncertainty:
-    """Standard deviations of the measurement errors.
+def pose_precision(accuracy: Accuracy) -> Array:
+    """Inverse variances of the six pose parameters, shape (6,), 1/m^2 and 1/rad^2.
 
-    Attributes
-    ----------
-    flux_t : float
-        Noise of a phasor component, T; fits that estimate the noise start from this value.
-    position_m, rotation_rad : float
-        Jitter of the optical pose, m and rad per axis.
+    A jitter of zero counts as 1e-12, so that the pose stays fixed.
     """
-
-    flux_t: float = 60e-12
-    position_m: float = 0.07e-3
-    rotation_rad: float = 0.4e-3
-
-    @property
-    def pose_precision(self) -> Array:
-        """Inverse variances of the six pose parameters, shape (6,), 1/m^2 and 1/rad^2.
-
-        A jitter of zero counts as 1e-12, so that the pose stays fixed.
-        """
-        sigma = np.array([self.position_m] * 3 + [self.rotation_rad] * 3)
-        return np.asarray(1.0 / np.maximum(sigma, 1e-12) ** 2)
+    return np.asarray(1.0 / np.maximum(accuracy.pose_jitter, 1e-12) ** 2)
 
 
 @dataclass(frozen=True)

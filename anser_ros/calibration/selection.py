@@ -15,10 +15,10 @@ from anser_ros.calibration.layout_fit import lowest_height, rich_layout
 from anser_ros.calibration.layout_score import LayoutCandidate, LayoutScorer
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.moments import MomentFit
-from anser_ros.calibration.pose_correction import Uncertainty
 from anser_ros.calibration.prior import DrawnBoard
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
+from anser_ros.settings import Accuracy
 
 Progress = Callable[[str, float], None]
 
@@ -99,7 +99,7 @@ def choose_layout(
     measurements: Sequence[Measurements],
     folds: Sequence[NDArray[np.int64]],
     generator: Generator,
-    uncertainty: Uncertainty,
+    accuracy: Accuracy,
     progress: Progress | None = None,
     asked: Layout | None = None,
     drawn: DrawnBoard | None = None,
@@ -114,7 +114,7 @@ def choose_layout(
         Fold of each frame.
     generator : Generator
         Places of the coils.
-    uncertainty : Uncertainty
+    accuracy : Accuracy
         Flux noise and pose jitter.
     progress : callable, optional
         Called with the name of the stage and its finished fraction.
@@ -139,7 +139,7 @@ def choose_layout(
     rich = rich_layout(measurements, generator)
     if rows < rich.count**2:
         rich = replace(rich, count=affordable[-1])
-    scorer = LayoutScorer(measurements, folds, place(rich, generator), uncertainty)
+    scorer = LayoutScorer(measurements, folds, place(rich, generator), accuracy)
     search = _Search(scorer, generator, progress, drawn)
     if asked is not None:
         finalists = [search.score(asked)]

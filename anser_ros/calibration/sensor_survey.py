@@ -20,12 +20,13 @@ from anser_ros.calibration.factors import ComplexArray, as_real
 from anser_ros.calibration.layout_fit import RICH_DAMPING, rich_layout
 from anser_ros.calibration.layouts import Generator, place
 from anser_ros.calibration.moments import MomentFitter
-from anser_ros.calibration.pose_correction import Uncertainty, pose_terms
+from anser_ros.calibration.pose_correction import pose_precision, pose_terms
 from anser_ros.calibration.pose_whitening import PoseWhitener
 from anser_ros.calibration.readings import frame_blocks, with_pose
 from anser_ros.calibration.sensor_parameters import BodySurvey, SensorParameters
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_basis, flux_jacobian
+from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 
@@ -52,7 +53,7 @@ class SensorSurveyor:
         What is estimated, of `sensor_parameters.KINDS`.
     generator : Generator
         Places of the coils, for the layer of dipoles that represents the field.
-    uncertainty : Uncertainty
+    accuracy : Accuracy
         Flux noise and pose jitter.
     """
 
@@ -61,10 +62,10 @@ class SensorSurveyor:
         measurements: Sequence[Measurements],
         kinds: Sequence[str],
         generator: Generator,
-        uncertainty: Uncertainty,
+        accuracy: Accuracy,
     ) -> None:
         self.measured = list(measurements)
-        self.uncertainty = uncertainty
+        self.accuracy = accuracy
         self.dipoles: DipoleSites = place(rich_layout(measurements, generator), generator)
         self.parameters = SensorParameters(measurements, kinds)
         size = len(self.parameters)
@@ -99,7 +100,7 @@ class SensorSurveyor:
     def _fitter(self) -> tuple[list[Measurements], MomentFitter]:
         surveys = [self.survey(m.body) for m in self.measured]
         corrected = [with_pose(s.apply(m)) for s, m in zip(surveys, self.measured, strict=True)]
-        return corrected, MomentFitter(corrected, self.dipoles, RICH_DAMPING, self.uncertainty)
+        return corrected, MomentFitter(corrected, self.dipoles, RICH_DAMPING, self.accuracy)
 
     def _step(
         self,
@@ -187,7 +188,7 @@ class SensorSurveyor:
         real = np.concatenate([as_real(columns), terms.residual[:, :, None, :]], axis=2)
         root = np.sqrt(weights)
         if marginal:
-            white = PoseWhitener(terms.slope, weights, noise_t, self.uncertainty.pose_precision)
+            white = PoseWhitener(terms.slope, weights, noise_t, pose_precision(self.accuracy))
             real = np.stack([white.left_over(real[:, :, q]) for q in range(real.shape[2])], axis=2)
         else:
             real = real * root[:, :, None, None]

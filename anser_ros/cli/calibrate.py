@@ -2,13 +2,13 @@
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -16,11 +16,11 @@ from rich.table import Table
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.document import to_document
 from anser_ros.calibration.layouts import Layout
-from anser_ros.calibration.pose_correction import Uncertainty
 from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.cli.calibration_figure import draw_choice
 from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.sessions.calibration import calibrate_sessions, check_same_board
 from anser_ros.sessions.model_file import save_model
@@ -57,9 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--damping', type=float, help='damping of the moments; chosen by held-out error by default'
     )
-    parser.add_argument('--flux-noise', type=float, default=60e-12, help='T a component')
-    parser.add_argument('--pose-jitter-mm', type=float, default=0.07, help='optical, per axis')
-    parser.add_argument('--pose-jitter-mrad', type=float, default=0.4, help='optical, per axis')
+    add_stated_values(parser, 'accuracy')
 
 
 def _layer(text: str) -> Layout:
@@ -79,7 +77,8 @@ def _kinds(text: str) -> tuple[str, ...]:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command and return the exit code."""
-    sessions = [load_session(path) for path in args.sessions]
+    stated = stated_values(args)
+    sessions = [load_session(path).with_stated(stated) for path in args.sessions]
     check_same_board(sessions)
     for path, session in zip(args.sessions, sessions, strict=True):
         if session.lost:
@@ -110,16 +109,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _options(args: argparse.Namespace) -> Options:
-    values = (args.flux_noise, args.pose_jitter_mm, args.pose_jitter_mrad, args.damping or 0.0)
-    if not np.isfinite(values).all() or min(values) < 0.0 or args.flux_noise == 0.0:
-        raise ParameterError(
-            'flux noise must be positive; jitter and damping must not be negative, '
-            f'got {", ".join(f"{v:g}" for v in values)}'
-        )
-    uncertainty = Uncertainty(
-        args.flux_noise, 1e-3 * args.pose_jitter_mm, 1e-3 * args.pose_jitter_mrad
-    )
-    return Options(uncertainty, args.dipoles, args.damping, args.estimate)
+    if not 0.0 <= (args.damping or 0.0) < math.inf:
+        raise ParameterError(f'damping must not be negative, got {args.damping:g}')
+    return Options(layout=args.dipoles, damping=args.damping, estimate=args.estimate)
 
 
 @contextmanager

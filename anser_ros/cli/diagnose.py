@@ -13,6 +13,7 @@ from rich.table import Table
 from anser_ros.cli.diagnosis_report import render
 from anser_ros.cli.diagnosis_words import verdict
 from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.sessions.diagnosis import diagnose_session
 from anser_ros.sessions.diagnosis_document import to_document
 from anser_ros.sessions.model_file import save_model
@@ -30,12 +31,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--out', required=True, type=Path, help='folder for the results, made if missing'
     )
     parser.add_argument('--baseline', help='distortion-free recording of the same board')
+    add_stated_values(parser, 'accuracy', 'refit')
     parser.add_argument('--json', action='store_true', help='print diagnosis.json on stdout')
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
-    session = load_session(args.session)
+    session = load_session(args.session).with_stated(stated_values(args))
     model = model_for(args.model, session)
     baseline = load_session(args.baseline) if args.baseline else None
     make_folder(args.out)

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.evaluation_document import to_document
 from anser_ros.sessions.patches import parse_patches
@@ -50,12 +51,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='largest residual of a pose, in units of the expected one; inf refuses none '
         '(for the error that a wrong model would make, never for use)',
     )
+    add_stated_values(parser, 'accuracy', 'refit')
     parser.add_argument('--json', action='store_true', help='print evaluation.json on stdout')
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
-    session = load_session(args.session)
+    session = load_session(args.session).with_stated(stated_values(args))
     model = model_for(args.model, session)
     baseline = load_session(args.baseline) if args.baseline else None
     make_folder(args.out)

@@ -23,6 +23,7 @@ from anser_ros.errors import DiagnosisError, ParameterError
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.recorded_health import first_warnings, kept_share, overload
 from anser_ros.sessions.session import NANO, load_session
+from anser_ros.settings import Accuracy
 from anser_ros.simulation.effect_draw import CATALOGUE, NONE, RANDOM
 
 ALL = 'all'
@@ -32,8 +33,6 @@ SECOND_SHARE = 0.6
 """Duration of the second run as a fraction of the first one's."""
 OTHER_PATH_RAD = 2.0
 """Phase of the second run's path, rad, so that the correction is tested at other poses."""
-OPTICAL_NOISE_M = 0.07e-3
-"""Jitter of the simulated optical tracker, m an axis, as `calibrate` assumes by default."""
 LAST_DOMAIN = 101
 """Largest ROS domain used. The ports of domains up to this are no ephemeral ports of Linux."""
 LEAST_KEPT = 0.85
@@ -139,7 +138,7 @@ def _round(
     folder.mkdir()
     unit = {'effect': effect, 'effect_seed': seed, 'effect_file': truth_file}
     say(f'{duration_s:g} s with an effect that only truth.json knows')
-    noisy = {'optical_noise_m': OPTICAL_NOISE_M, 'seed': 2}
+    noisy = {'optical_noise_m': Accuracy.optical_position_m, 'seed': 2}
     watched = None
     if is_watched:
         watched = {'model_file': model} | ({'baseline_file': clean} if clean else {})

@@ -15,22 +15,26 @@ from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import field_basis, flux_basis
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-VOLUME_ERROR, REFERENCE_ERROR = 1e-3, 4e-3
-"""Relative errors that the fit allows: of the model in the volume, of a reference's survey."""
+VOLUME_ERROR = 1e-3
+"""Relative error that the fit allows the model in the volume."""
+LEAST_ERROR = 1e-5
+"""Relative error that references are given at least, so that exact ones do not divide by zero."""
 DRAWING_ERROR = 0.05
 """Prior spread of the sheet's moments about the drawn ones, as a share of their rms."""
 
 
 @dataclass(frozen=True)
 class CleanReferences:
-    """Reference sensors and their clean readings, shape (R, K), T."""
+    """Reference sensors, their clean readings, shape (R, K), T, and their relative gain error."""
 
     sensors: SensorTable
     flux: ComplexArray
+    gain_error: float = Accuracy.reference_gain
 
 
 def board_box(model: FieldModel) -> Array:
@@ -73,7 +77,7 @@ def fit_illumination(
         s = references.sensors.select(np.flatnonzero(good))
         sheet = flux_basis(s.position, s.axis, s.length, place, direction)
         clean = references.flux[good]
-        weight = REFERENCE_ERROR * np.sqrt(np.mean(np.abs(clean) ** 2))
+        weight = max(references.gain_error, LEAST_ERROR) * np.sqrt(np.mean(np.abs(clean) ** 2))
         rows.append(sheet / weight)
         values.append((clean - sheet @ start) / weight)
     spread = DRAWING_ERROR * np.sqrt(np.mean(np.abs(start) ** 2))

@@ -88,7 +88,9 @@ def build_problem(
     centres = np.concatenate([tool.placed()[0].reshape(-1, 3) for tool in posed])
     clean = None
     if references is not None:
-        clean = CleanReferences(references.readings.sensors, references.baseline)
+        clean = CleanReferences(
+            references.readings.sensors, references.baseline, spread.accuracy.reference_gain
+        )
     some = centres[:: max(1, centres.shape[0] // POINTS)]
     illumination = fit_illumination(model, drawn, some, clean)
     omega = 2 * np.pi * np.asarray(model.frequencies_hz)

@@ -18,9 +18,6 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 Mask = NDArray[np.bool_]
 
-SURVEY_ERROR = 0.01
-"""Relative error of a change that a surveyed reference sensor sees (0.2 mm, 0.3 deg, 0.4 %)."""
-
 
 @dataclass(frozen=True)
 class References:
@@ -156,8 +153,7 @@ def evaluate(problem: Problem, terms: Sequence[Term]) -> State:
         view = tool_view(tool, terms, problem.fields)
         residual = parts(np.where(good[..., None], tool.flux - view.flux, 0.0))
         weight = _repeat(good / problem.spread.flux_t, tool.flux.shape[2])
-        jitter = np.repeat([problem.spread.position_m, problem.spread.rotation_rad], 3)
-        pose = pose_jacobian(view) * jitter
+        pose = pose_jacobian(view) * problem.spread.accuracy.pose_jitter
         whitener = Whitener.of(weight, _with_free(pose, terms, view), pose.shape[2])
         found.append(Part(view, residual, whitener, whitener(residual), blocks))
     if problem.references is not None and problem.references.readings.time.size:
@@ -189,7 +185,7 @@ def _reference_part(problem: Problem, references: References, terms: Sequence[Te
     size = np.sqrt(np.mean(np.abs(change) ** 2, axis=2, keepdims=True) / 2)
     noise = problem.spread.flux_t / np.sqrt(np.maximum(references.count, 1))
     together = np.sqrt(readings.time.size)
-    survey = SURVEY_ERROR * size * together
+    survey = problem.spread.reference_change * size * together
     gradient = np.zeros_like(view.flux.real)
     for term in terms:
         if term.effect.gradient_error:

@@ -5,15 +5,28 @@ the six columns of the frame's pose Jacobian. Taking that known freedom out lowe
 several times, and shows what plain residuals hide.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.view import View
+from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+
+REFERENCE_CHANGE = 0.01
+"""Relative error of the change that a reference sensor with the default survey errors sees."""
+CHANGE_LENGTH_M = 0.03
+"""Way over which what metal does to a reference changes by its own size, m: a third of the
+distance (a dipole's field falls with its cube), for metal some 10 cm away."""
+
+
+def _survey_share(accuracy: Accuracy) -> float:
+    """Relative error of a change, to first order: gain, axis and place in quadrature."""
+    place = accuracy.reference_position_m / CHANGE_LENGTH_M
+    return float(np.linalg.norm([accuracy.reference_gain, accuracy.reference_axis_rad, place]))
 
 
 @dataclass(frozen=True)
@@ -24,16 +37,22 @@ class Spread:
     ----------
     flux_t : float
         Noise of a phasor component, the model's own error included, T.
-    noise_t : float
-        The part of it that is noise when all is well.
-    position_m, rotation_rad : float
-        Optical jitter of each axis, as it stands after interpolation.
+    accuracy : Accuracy
+        Of the instruments: the noise when all is well, optical jitter, the references' survey.
     """
 
-    flux_t: float = 60e-12
-    noise_t: float = 60e-12
-    position_m: float = 0.07e-3
-    rotation_rad: float = 0.4e-3
+    flux_t: float = Accuracy.flux_noise_t
+    accuracy: Accuracy = field(default_factory=Accuracy)
+
+    @property
+    def noise_t(self) -> float:
+        """The part of ``flux_t`` that is noise when all is well, T."""
+        return self.accuracy.flux_noise_t
+
+    @property
+    def reference_change(self) -> float:
+        """Relative error of the change that a reference sees, in proportion to the survey's."""
+        return REFERENCE_CHANGE * (_survey_share(self.accuracy) / _survey_share(Accuracy()))
 
 
 def parts(values: ComplexArray) -> Array:

@@ -19,12 +19,11 @@ from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.sessions.baseline import baseline_flux
 from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.session import NANO, Session
+from anser_ros.settings import Accuracy
 from anser_ros.tracking.solve import RealField, solve_coil, whitening_of
 
 Array = NDArray[np.float64]
 
-NOISE_T = 60e-12
-"""Flux noise of a phasor component that the solve assumes, T."""
 REACH_M = 0.15
 """Largest distance of a solution from the optical position, m; a wrong model may not lead a pose
 farther astray."""
@@ -134,7 +133,7 @@ def _rmse(session: Session, models: Sequence[FieldModel], every: int) -> float:
     """
     tool = session.tools[0]
     centres, axes = tool.placed()
-    whitening = whitening_of(np.full(2 * tool.flux.shape[2], NOISE_T))
+    whitening = whitening_of(np.full(2 * tool.flux.shape[2], Accuracy.flux_noise_t))
     errors = []
     for step, frame in enumerate(range(0, len(tool.time), every)):
         if not tool.has_pose[frame]:

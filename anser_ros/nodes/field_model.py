@@ -28,10 +28,12 @@ from anser_ros.nodes.model_clouds import ModelWriter
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.patches import Patches, start_refit
+from anser_ros.nodes.stated_parameters import stated, stated_by
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.baseline import ReadingWindow, check_enough
 from anser_ros.refit.change import MOST_RATE_HZ, Pace
-from anser_ros.refit.live_refit import LiveRefit, RefitResult, RefitSettings
+from anser_ros.refit.live_refit import LiveRefit
+from anser_ros.refit.result import RefitResult
 from anser_ros.sessions.baseline import baseline_flux
 from anser_ros.sessions.model_file import load_model, save_model
 from anser_ros.sessions.patches import parse_patches
@@ -68,6 +70,19 @@ class FieldModelParameters:
     save_file: str = parameter(
         'field_model.yaml', 'where the service save writes the model', live=True
     )
+    flux_noise_t: float = stated('flux_noise_t')
+    reference_position_m: float = stated('reference_position_m')
+    reference_axis_rad: float = stated('reference_axis_rad')
+    reference_gain: float = stated('reference_gain')
+    patch_position_m: float = stated('patch_position_m')
+    patch_rotation_rad: float = stated('patch_rotation_rad')
+    emitter_drift: float = stated('emitter_drift')
+    min_references: int = stated('min_references')
+    average_frames: int = stated('average_frames')
+    persistence: float = stated('persistence')
+    hold_frames: int = stated('hold_frames')
+    error_modes: int = stated('error_modes')
+    seed: int = stated('seed')
 
 
 class FieldModelNode(AnserNode):
@@ -79,6 +94,7 @@ class FieldModelNode(AnserNode):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         table = self.parameters
+        self._stated = stated_by(table)
         self._file_model = None if table.model_file == NOMINAL else load_model(table.model_file)
         self._baseline_bag = load_session(table.baseline_file) if table.baseline_file else None
         self._setup_text = ''
@@ -121,8 +137,8 @@ class FieldModelNode(AnserNode):
         if message.data == self._setup_text:
             return
         try:
-            setup = parse_setup(message.data)
-            if self._setup is not None and setup.has_same_board(self._setup):
+            setup = parse_setup(message.data).with_stated(self._stated)
+            if self._setup is not None and setup.follows_as(self._setup):
                 self._setup_text, self._setup = message.data, setup
                 return  # another rate or noise: model and baseline hold
             base = starting_model(setup, self._file_model)
@@ -281,10 +297,10 @@ class FieldModelNode(AnserNode):
         return response
 
     def _on_set_baseline(self, _request: Any, response: Any) -> Any:
-        if self._window is None:
+        if self._window is None or self._setup is None:
             raise FitError('no setup yet')
         baseline = self._window.still_mean()
-        good = check_enough(baseline, RefitSettings().min_references)
+        good = check_enough(baseline, self._setup.refit.min_references)
         self._follow(baseline)
         response.success = True
         response.message = f'baseline of {good} references over {len(self._window)} frames'

@@ -19,6 +19,7 @@ from anser_ros.refit.patches import PatchCoils
 from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.volume import stated_volume
+from anser_ros.settings import RefitSettings
 from anser_ros.tracking.rotations import rotation_of_quaternion
 from anser_ros.wire.setup import Setup
 
@@ -58,8 +59,9 @@ def start_refit(
     drawing, volume = Drawing.of(setup).field, stated_volume(setup)
     moving = tuple(s for s in setup.tool_sensors if s.body in bodies)
     if not moving:
-        return LiveRefit(model, references, baseline, drawing=drawing, volume=volume), None
-    patches = Patches(sensor_table(moving), baseline, setup.frame_id)
+        refit = LiveRefit(model, references, baseline, setup.refit, drawing, volume=volume)
+        return refit, None
+    patches = Patches(sensor_table(moving), baseline, setup.frame_id, setup.refit)
     return patches.started(model, references, drawing=drawing, volume=volume), patches
 
 
@@ -74,10 +76,18 @@ class Patches(PatchCoils):
         Baseline of the fixed references, T.
     frame_id : str
         The poses' frame must be this one.
+    settings : RefitSettings, optional
+        Of the refit that the coils take part in.
     """
 
-    def __init__(self, coils: SensorTable, fixed: ComplexArray, frame_id: str) -> None:
-        super().__init__(coils, fixed)
+    def __init__(
+        self,
+        coils: SensorTable,
+        fixed: ComplexArray,
+        frame_id: str,
+        settings: RefitSettings | None = None,
+    ) -> None:
+        super().__init__(coils, fixed, settings)
         self._frame_id = frame_id
         self._pending: tuple[Future[LiveRefit], SensorTable] | None = None
 

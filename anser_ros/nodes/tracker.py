@@ -25,9 +25,10 @@ from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.pose_output import PoseTopic, transform_message, transform_publisher
 from anser_ros.nodes.readiness import digest_of
+from anser_ros.nodes.stated_parameters import stated, stated_by
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.sessions.model_file import load_model
-from anser_ros.sessions.session import noise_of, sensor_table
+from anser_ros.sessions.session import sensor_table, tracking_noise
 from anser_ros.sessions.starting_model import NOMINAL, check_emitters
 from anser_ros.sessions.volume import pose_volume
 from anser_ros.tracking.estimate import OK, TrackerSettings
@@ -56,21 +57,25 @@ class TrackerParameters:
         'model whose effects apply, and its field until field_model speaks; empty or nominal for '
         'none',
     )
-    flux_noise_t: float = parameter(
-        60e-12, 'noise of a phasor component to start from, T', minimum=1e-15, maximum=1e-3
-    )
+    flux_noise_t: float = stated('flux_noise_t')
     adaptive: bool = parameter(
-        True, 'whether the noise follows the residuals of good poses', live=True
+        TrackerSettings.adaptive,
+        'whether the noise follows the residuals of good poses',
+        live=True,
     )
     gate: float = parameter(
-        4.0,
+        TrackerSettings.gate,
         'largest residual of a pose, in units of the expected one',
         minimum=1.0,
         maximum=1e6,
         live=True,
     )
     max_sigma_m: float = parameter(
-        0.01, 'largest uncertainty of a pose, m', minimum=1e-5, maximum=1.0, live=True
+        TrackerSettings.max_sigma_m,
+        'largest uncertainty of a pose, m',
+        minimum=1e-5,
+        maximum=1.0,
+        live=True,
     )
     volume_low_m: tuple[float, ...] = parameter(
         (), "lower corner of the box where tools may be, m; empty: the setup's volume"
@@ -79,10 +84,17 @@ class TrackerParameters:
         (), "upper corner of the box where tools may be, m; empty: the setup's volume"
     )
     grid_spacing_m: float = parameter(
-        0.035, 'spacing of the cold start at 0.1 m height, m', minimum=0.005, maximum=0.2
+        TrackerSettings.grid_spacing_m,
+        'spacing of the cold start at 0.1 m height, m',
+        minimum=0.005,
+        maximum=0.2,
     )
     warm_age_s: float = parameter(
-        1.0, 'how old a good pose may be to start from, s', minimum=0.01, maximum=60.0, live=True
+        TrackerSettings.warm_age_s,
+        'how old a good pose may be to start from, s',
+        minimum=0.01,
+        maximum=60.0,
+        live=True,
     )
     stale_after_s: float = parameter(
         0.3, 'a sensor without fluxes for so long is stale, s', minimum=0.02, live=True
@@ -115,7 +127,6 @@ def settings_of(table: TrackerParameters) -> TrackerSettings:
                 raise ParameterError(f'parameter {name}: three numbers needed')
         volume = TrackedVolume((low[0], low[1], low[2]), (high[0], high[1], high[2]))
     return TrackerSettings(
-        flux_noise_t=table.flux_noise_t,
         adaptive=table.adaptive,
         volume=volume,
         grid_spacing_m=table.grid_spacing_m,
@@ -135,6 +146,7 @@ class TrackerNode(AnserNode):
         super().__init__(**options)
         table = self.parameters
         self._settings = settings_of(table)
+        self._stated = stated_by(table)
         has_file = table.model_file not in ('', NOMINAL)
         self._file_model = load_model(table.model_file) if has_file else None
         self._setup_text = ''
@@ -172,9 +184,9 @@ class TrackerNode(AnserNode):
         if message.data == self._setup_text:
             return
         try:
-            setup = parse_setup(message.data)
+            setup = parse_setup(message.data).with_stated(self._stated)
             sensors = sensor_table(setup.tool_sensors)
-            self._flux_noise_t = noise_of(setup)
+            self._flux_noise_t = tracking_noise(setup)
             self._volume = pose_volume(setup)
             tracker = Tracker(None, sensors, self._wanted_settings())
         except AnserError as error:
@@ -307,12 +319,10 @@ class TrackerNode(AnserNode):
             self.publish_diagnostics()
 
     def _wanted_settings(self) -> TrackerSettings:
-        """The settings: the setup's volume where no parameter says another, the larger noise."""
+        """The settings, with the setup's noise, and its volume where no parameter says another."""
         settings = self._settings
         return replace(
-            settings,
-            flux_noise_t=max(settings.flux_noise_t, self._flux_noise_t),
-            volume=settings.volume or self._volume,
+            settings, flux_noise_t=self._flux_noise_t, volume=settings.volume or self._volume
         )
 
     # What is told -------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from anser_ros.nodes.model_clouds import NANO
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.sighting_words import figures_of, plain_text, title_of, words_of
+from anser_ros.nodes.stated_parameters import stated, stated_by
 from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.session import Session, empty_session, load_session
 from anser_ros.sessions.sliding_window import LIVE, SlidingWindow
@@ -53,6 +54,12 @@ class WatcherParameters:
     cpu_share: float = parameter(
         0.2, 'most of one processor that it takes on average', minimum=0.01, maximum=1.0, live=True
     )
+    flux_noise_t: float = stated('flux_noise_t')
+    optical_position_m: float = stated('optical_position_m')
+    optical_rotation_rad: float = stated('optical_rotation_rad')
+    reference_position_m: float = stated('reference_position_m')
+    reference_axis_rad: float = stated('reference_axis_rad')
+    reference_gain: float = stated('reference_gain')
 
 
 @dataclass(frozen=True)
@@ -77,6 +84,7 @@ class Watcher(AnserNode):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         table = self.parameters
+        self._stated = stated_by(table)
         self._baseline_bag = load_session(table.baseline_file) if table.baseline_file else None
         self._setup_text = ''
         self._window: SlidingWindow | None = None
@@ -104,7 +112,7 @@ class Watcher(AnserNode):
         if message.data == self._setup_text:
             return
         try:
-            setup = parse_setup(message.data)
+            setup = parse_setup(message.data).with_stated(self._stated)
             # An empty window has a session's setup already, and a model must fit that.
             empty = empty_session(setup, LIVE)
             model = model_for(self.parameters.model_file, empty)

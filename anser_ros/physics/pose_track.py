@@ -8,6 +8,11 @@ from scipy.spatial.transform import Rotation, Slerp
 
 Array = NDArray[np.float64]
 
+LONGEST_GAP_S = 0.25
+"""Longest gap between two optical poses, s, over which a pose is interpolated. A tracker at 60 Hz
+that is silent for longer did not see the tool, whose motion meanwhile is not known; a hand moves
+by centimetres in that time."""
+
 
 @dataclass(frozen=True)
 class PoseTrack:
@@ -27,7 +32,9 @@ class PoseTrack:
     position: Array
     quaternion: Array
 
-    def at(self, time: Array, longest_gap: float) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def at(
+        self, time: Array, longest_gap: float = LONGEST_GAP_S
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Interpolate the poses at other times.
 
         Positions are interpolated linearly, rotations by spherical linear interpolation.
@@ -36,7 +43,7 @@ class PoseTrack:
         ----------
         time : ndarray, shape (F,)
             Times on the clock of the track, s.
-        longest_gap : float
+        longest_gap : float, optional
             Between two poses that are farther apart than this (s) nothing is interpolated.
 
         Returns

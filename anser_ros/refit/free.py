@@ -17,7 +17,8 @@ from anser_ros.refit.clouds import default_clouds
 from anser_ros.refit.excitation import FieldFunction, excitation_for
 from anser_ros.refit.layer import Layer, bottom_layer
 from anser_ros.refit.posterior import STRENGTHS
-from anser_ros.refit.references import SurveyError, survey_variants, vector_basis
+from anser_ros.refit.references import survey_variants, vector_basis
+from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -33,7 +34,8 @@ class FreeDipoles:
     baseline : ndarray, shape (S, K), complex
     drawing : callable, optional
         Only says where the board is.
-    flux_noise_t : float
+    accuracy : Accuracy, optional
+        Of the references and their readings.
     """
 
     def __init__(
@@ -42,11 +44,12 @@ class FreeDipoles:
         references: SensorTable,
         baseline: ComplexArray,
         drawing: FieldFunction | None = None,
-        flux_noise_t: float = 60e-12,
+        accuracy: Accuracy | None = None,
     ) -> None:
+        accuracy = accuracy or Accuracy()
         excitation, region = excitation_for(model, drawing)
         clouds = [cloud for cloud in default_clouds(region) if not cloud.overhead]
-        self.model, self.baseline, self._noise = model, baseline, flux_noise_t
+        self.model, self.baseline, self._noise = model, baseline, accuracy.flux_noise_t
         self._layer = bottom_layer(model, region, excitation, clouds[0].positions)
         self._spectra, self._bases, self._transfers = [], [], []
         for cloud in clouds:
@@ -55,7 +58,7 @@ class FreeDipoles:
             basis = vector_basis(table.position, table.axis, table.length, cloud.positions)
             rows = basis.reshape(len(table), -1) * root
             covariance = rows @ rows.T
-            for variant in survey_variants(table, cloud.positions, SurveyError()):
+            for variant in survey_variants(table, cloud.positions, accuracy):
                 wrong = variant.reshape(len(table), -1) * root
                 covariance[np.diag_indices_from(covariance)] += (wrong**2).sum(axis=1)
             scale = np.trace(covariance) / len(covariance)

@@ -33,12 +33,10 @@ from anser_ros.refit.result import (
     REFIT,
     Metal,
     RefitResult,
-    RefitSettings,
 )
 from anser_ros.refit.slots import SLOTS, BodySlots
 from anser_ros.refit.tables import build_tables
-
-__all__ = ['LiveRefit', 'Metal', 'RefitResult', 'RefitSettings']
+from anser_ros.settings import RefitSettings
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -109,11 +107,13 @@ class LiveRefit:
         model, references, baseline = self.model, self.references, self.baseline
         k = len(model.emitters)
         turned = self.baseline * self._tables.excitation.phase.conj()
-        scale = self.settings.drift / self.settings.flux_noise_t
+        scale = self.settings.emitter_drift / self.settings.accuracy.flux_noise_t
         self._drift = np.zeros((baseline.size, k))
         for emitter in range(k):
             self._drift[emitter::k, emitter] = np.nan_to_num(turned[:, emitter].real) * scale
-        self._to_noise_units = self._tables.excitation.phase.conj() / self.settings.flux_noise_t
+        self._to_noise_units = (
+            self._tables.excitation.phase.conj() / self.settings.accuracy.flux_noise_t
+        )
         self._banks: dict[bytes, tuple[Bank, BodySlots]] = {}
         self._intake = Intake(references.channel, error=FitError)
         self._baseline_check = BaselineCheck(self.baseline)
@@ -127,7 +127,7 @@ class LiveRefit:
     def reset(self) -> None:
         """Forget everything seen; the calibrated model is in force again."""
         settings = self.settings
-        self._noise = NoiseLevel(settings.flux_noise_t)
+        self._noise = NoiseLevel(settings.accuracy.flux_noise_t)
         self._average = Average(settings.average_frames)
         self._watch = ReferenceWatch(len(self.references), settings.hold_frames)
         self._weights = _fresh_weights(1 + len(self._tables.priors) + SLOTS)
@@ -221,7 +221,7 @@ class LiveRefit:
             ordered = ordered - baseline + self.baseline
         excluded = self._watch.excluded
         used = np.where(excluded[:, None], np.nan, ordered) if excluded.any() else ordered
-        mean, frames = self._average.update(used, level * self.settings.flux_noise_t)
+        mean, frames = self._average.update(used, level * self.settings.accuracy.flux_noise_t)
         if used is not ordered:
             mean = np.where(np.isfinite(mean), mean, ordered)
         noise = level / math.sqrt(frames)
@@ -298,16 +298,16 @@ class LiveRefit:
         best = int(weights.argmax())
         typical = health.typical(self._distance) / (2 * bank.width)
         mean, variance = bank.drifts(seen, best)
-        drift = self.settings.drift * (mean @ np.array([1.0, 1.0j]))
+        drift = self.settings.emitter_drift * (mean @ np.array([1.0, 1.0j]))
         sure = (np.abs(mean) > DRIFT_SIGMAS * np.sqrt(np.maximum(variance, 1e-30))).any(axis=1)
         moving = weights[0] < NOTHING
         if not moving:
             drift[~sure] = 0.0
         model, state, reason = self.model, FROZEN, ''
         if moving or sure.any():
-            phase, unit = self._tables.excitation.phase, self.settings.flux_noise_t
+            phase, unit = self._tables.excitation.phase, self.settings.accuracy.flux_noise_t
             model = self._assembly.model(bank, seen, weights, drift, typical, phase, unit,
-                                         self.settings.modes)  # fmt: skip
+                                         self.settings.error_modes)  # fmt: skip
             state = REFIT
         if moving and typical > POOR:
             state = POOR_FIT
@@ -321,7 +321,7 @@ class LiveRefit:
                 self._healths(),
                 float(np.log(max(1.0 - weights[0], 1e-300)) - np.log(max(weights[0], 1e-300))),
                 dict(zip(bank.names, weights.tolist(), strict=True)),
-                level * self.settings.flux_noise_t,
+                level * self.settings.accuracy.flux_noise_t,
                 drift,
                 reason,
                 (lambda: self._metal(bank, seen, weights)) if moving else None,
@@ -348,7 +348,7 @@ class LiveRefit:
                 self._healths(),
                 0.0,
                 {},
-                level * self.settings.flux_noise_t,
+                level * self.settings.accuracy.flux_noise_t,
                 np.zeros(len(self.model.emitters), dtype=complex),
                 f'{count} usable references, {need} are needed',
             )
@@ -366,14 +366,14 @@ class LiveRefit:
         size, apart = np.full(len(used), np.nan), np.full(len(used), np.nan)
         if len(distance):
             rms = np.sqrt((residual**2).mean(axis=(1, 2)))
-            size[used] = rms * self.settings.flux_noise_t
+            size[used] = rms * self.settings.accuracy.flux_noise_t
             apart[used] = np.sqrt(distance / (2 * len(self.model.emitters)))
         rows = (self.references.name, reason, size.tolist(), apart.tolist())
         return tuple(map(ReferenceHealth, *rows))
 
     def _metal(self, bank: Bank, seen: FrameEvidence, weights: Array) -> Metal | None:
         best = 1 + int(weights[1:].argmax())
-        values = bank.sources(seen, best) * self.settings.flux_noise_t
+        values = bank.sources(seen, best) * self.settings.accuracy.flux_noise_t
         polarisability = values[:, 0] + 1j * values[:, 1]
         cloud = bank.prior(best).cloud
         power = np.abs(polarisability) ** 2 / cloud.volumes

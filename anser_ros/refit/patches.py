@@ -18,6 +18,7 @@ from anser_ros.physics.dipole import flux_jacobian
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.result import RefitResult
+from anser_ros.settings import Accuracy, RefitSettings
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -27,17 +28,8 @@ TURNED_RAD = 0.03
 """How far a coil may be from where the refit was worked out for before that is done again."""
 
 
-@dataclass(frozen=True)
-class PoseError:
-    """Standard deviations of a patch's pose (m, rad per axis) and of its coils' gain."""
-
-    position_m: float = 0.15e-3
-    rotation_rad: float = 2e-3
-    gain: float = 0.004
-
-
 def clean_reading(
-    model: FieldModel, coils: SensorTable, error: PoseError
+    model: FieldModel, coils: SensorTable, accuracy: Accuracy
 ) -> tuple[ComplexArray, Array]:
     """What placed coils read without metal, and how uncertain that is.
 
@@ -47,7 +39,8 @@ def clean_reading(
         Calibrated.
     coils : SensorTable
         Places and axes in fg.
-    error : PoseError
+    accuracy : Accuracy
+        Of the patches' poses and of their coils' gains.
 
     Returns
     -------
@@ -59,12 +52,12 @@ def clean_reading(
     flux, d_position, d_axis = flux_jacobian(
         coils.position, coils.axis, coils.length, model.positions, model.directions, model.moments
     )
-    power = (np.abs(error.gain * flux) ** 2).mean(axis=1)
-    power += (np.abs(error.position_m * d_position) ** 2).sum(axis=1).mean(axis=1)
+    power = (np.abs(accuracy.reference_gain * flux) ** 2).mean(axis=1)
+    power += (np.abs(accuracy.patch_position_m * d_position) ** 2).sum(axis=1).mean(axis=1)
     # Turns across the axis only: a turn about it changes nothing.
     along = np.einsum('sa,sak->sk', coils.axis, d_axis)
     across = (np.abs(d_axis) ** 2).sum(axis=1) - np.abs(along) ** 2
-    power += error.rotation_rad**2 * across.mean(axis=1)
+    power += accuracy.patch_rotation_rad**2 * across.mean(axis=1)
     return flux, np.sqrt(power)
 
 
@@ -105,11 +98,16 @@ class PatchCoils:
         Places and axes in their bodies' frames.
     fixed : ndarray, shape (R, K), complex
         Baseline of the fixed references, T.
+    settings : RefitSettings, optional
+        Of the refit that the coils take part in; its accuracy is also that of their poses.
     """
 
-    def __init__(self, coils: SensorTable, fixed: ComplexArray) -> None:
+    def __init__(
+        self, coils: SensorTable, fixed: ComplexArray, settings: RefitSettings | None = None
+    ) -> None:
         self.coils = coils
         self.fixed = fixed
+        self.settings = settings or RefitSettings()
         self._poses: dict[str, tuple[int, Array, Array]] = {}
         self._intake = Intake(coils.channel, error=FitError)
         self._flux = np.full((len(coils), fixed.shape[1]), np.nan, dtype=np.complex128)
@@ -148,7 +146,7 @@ class PatchCoils:
     def frame(self, stamp_ns: int, model: FieldModel) -> Placed:
         """The coils' readings and what they should read at a time."""
         now, known = self.where(stamp_ns)
-        clean, _ = clean_reading(model, now, PoseError())
+        clean, _ = clean_reading(model, now, self.settings.accuracy)
         usable = known & (abs(stamp_ns - self._flux_ns) < FLUX_AGE_NS)
         if self._built_at is None:
             usable[:] = False
@@ -178,11 +176,13 @@ class PatchCoils:
         references : SensorTable
             The fixed ones.
         options
-            Of `LiveRefit`.
+            Of `LiveRefit`, but for its settings.
         """
         start = self.start_table()
-        clean = np.concatenate([self.fixed, clean_reading(model, start, PoseError())[0]])
-        return LiveRefit(model, references.joined(start), clean, **options)
+        clean = np.concatenate(
+            [self.fixed, clean_reading(model, start, self.settings.accuracy)[0]]
+        )
+        return LiveRefit(model, references.joined(start), clean, self.settings, **options)
 
     def rebuilt(self, refit: LiveRefit, now: SensorTable) -> LiveRefit:
         """The refit for where the patches are now; `settle` puts it in force."""
@@ -201,6 +201,6 @@ def noise_of(sigma: Array, n_fixed: int, nominal_t: float) -> Array:
 def _rebuild(refit: LiveRefit, now: SensorTable, fixed: ComplexArray) -> LiveRefit:
     count = len(refit.references) - len(now)
     table = refit.references.select(np.arange(count)).joined(now)
-    clean, sigma = clean_reading(refit.model, now, PoseError())
-    noise = noise_of(sigma, count, refit.settings.flux_noise_t)
+    clean, sigma = clean_reading(refit.model, now, refit.settings.accuracy)
+    noise = noise_of(sigma, count, refit.settings.accuracy.flux_noise_t)
     return refit.moved(table, np.concatenate([fixed, clean]), noise)

@@ -14,15 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.metal.body import FREQUENCY_SLOPE
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import Cloud
 from anser_ros.refit.layer import Layer
-from anser_ros.refit.references import SurveyError, survey_variants, vector_basis
+from anser_ros.refit.references import survey_variants, vector_basis
+from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 
-FREQUENCY_SLOPE = 0.5
-"""Deviation of d(ln p)/d(ln f); a sphere's parts have slopes between -1/2 and 1."""
 N_SAMPLES = 48
 """Draws from the prior, from which the posterior's uncertainty is made."""
 
@@ -188,7 +188,7 @@ def build_prior(
     references: SensorTable,
     excitation: Array,
     frequencies_hz: Array,
-    survey: SurveyError,
+    accuracy: Accuracy,
     rng: np.random.Generator,
 ) -> CloudPrior:
     """Compute a hypothesis for a set of references.
@@ -203,7 +203,8 @@ def build_prior(
     excitation : ndarray, shape (M, K, 3)
         Field of the emitters at the sources, T.
     frequencies_hz : ndarray, shape (K,)
-    survey : SurveyError
+    accuracy : Accuracy
+        Of the references' survey.
     rng : numpy Generator
         For the draws.
     """
@@ -214,7 +215,7 @@ def build_prior(
     basis = vector_basis(references.position, references.axis, references.length, cloud.positions)
     covariance = sources.covariance(basis, basis) * alike[:, None, :]
     blocks = np.zeros((n_refs, k, k))
-    for variant in survey_variants(references, cloud.positions, survey):
+    for variant in survey_variants(references, cloud.positions, accuracy):
         blocks += sources.blocks(variant)
     blocks *= alike
     for s in range(n_refs):

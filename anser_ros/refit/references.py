@@ -7,26 +7,17 @@ displaced, turned and scaled copies of the coil (`survey_variants`).
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 
 STEP_M = 1e-4
-
-
-@dataclass(frozen=True)
-class SurveyError:
-    """Standard deviations of the survey: position (m) and tilt (rad) per axis, gain."""
-
-    position_m: float = 0.2e-3
-    rotation_rad: float = float(np.deg2rad(0.3))
-    gain: float = 0.004
 
 
 def vector_basis(points: Array, axes: Array, lengths: Array | None, sources: Array) -> Array:
@@ -48,18 +39,18 @@ def tangents(axes: Array) -> Array:
 
 
 def survey_variants(
-    references: SensorTable, sources: Array, survey: SurveyError
+    references: SensorTable, sources: Array, accuracy: Accuracy
 ) -> Iterator[Array]:
     """Change of `vector_basis` by one standard deviation of each survey error, (S, M, 3) each."""
     p, n, lengths = references.position, references.axis, references.length
-    if survey.gain > 0.0:
-        yield survey.gain * vector_basis(p, n, lengths, sources)
-    if survey.rotation_rad > 0.0:
+    if accuracy.reference_gain > 0.0:
+        yield accuracy.reference_gain * vector_basis(p, n, lengths, sources)
+    if accuracy.reference_axis_rad > 0.0:
         across = tangents(n)
         for side in range(2):
-            yield survey.rotation_rad * vector_basis(p, across[:, side], lengths, sources)
-    if survey.position_m > 0.0:
+            yield accuracy.reference_axis_rad * vector_basis(p, across[:, side], lengths, sources)
+    if accuracy.reference_position_m > 0.0:
         for unit in np.eye(3) * STEP_M:
             ahead = vector_basis(p + unit, n, lengths, sources)
             ahead -= vector_basis(p - unit, n, lengths, sources)
-            yield ahead * (survey.position_m / (2.0 * STEP_M))
+            yield ahead * (accuracy.reference_position_m / (2.0 * STEP_M))

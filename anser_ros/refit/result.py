@@ -1,4 +1,4 @@
-"""What the live refit is told, and what it reports."""
+"""What the live refit reports of a frame."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -7,11 +7,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.refit import health
 from anser_ros.refit.health import ReferenceHealth
-from anser_ros.refit.references import SurveyError
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -22,50 +20,6 @@ FEW_REFERENCES = 'few_references'
 POOR_FIT = 'poor_fit'
 STATES = (FROZEN, REFIT, FEW_REFERENCES, POOR_FIT)
 """No change; the model follows one; too few references to know; a change that nothing explains."""
-
-
-@dataclass(frozen=True)
-class RefitSettings:
-    """What the refit may assume; nothing here belongs to a particular board or metal.
-
-    Attributes
-    ----------
-    flux_noise_t : float
-        Noise of a phasor component to start from, T; it is then measured.
-    survey : SurveyError
-        How well the references' places, axes and gains are known.
-    drift : float
-        Standard deviation of an emitter's relative strength against its measured current.
-    min_references : int
-        Coils below which the calibrated model is kept.
-    average_frames : int
-        Most frames that readings are averaged over while they don't change.
-    persistence : float
-        Probability that the hypothesis of one frame still holds in the next.
-    hold_frames : int
-        Frames that a coil which was left out must agree for before it is used again.
-    modes : int
-        Rank of the uncertainty that is handed on with the model.
-    seed : int
-        Of the draws that the uncertainty is made from.
-    """
-
-    flux_noise_t: float = 60e-12
-    survey: SurveyError = field(default_factory=SurveyError)
-    drift: float = 0.003
-    min_references: int = 4
-    average_frames: int = 5
-    persistence: float = 0.98
-    hold_frames: int = 25
-    modes: int = 12
-    seed: int = 1
-
-    def __post_init__(self) -> None:
-        for name in ('flux_noise_t', 'min_references', 'average_frames', 'hold_frames'):
-            if not getattr(self, name) > 0:
-                raise FitError(f'refit: {name} must be positive, got {getattr(self, name)}')
-        if not 0.0 < self.persistence < 1.0 or self.drift < 0.0 or self.modes < 1:
-            raise FitError('refit: persistence must be in (0, 1), drift >= 0 and modes >= 1')
 
 
 @dataclass(frozen=True)

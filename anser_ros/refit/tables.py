@@ -26,8 +26,8 @@ from anser_ros.refit.prior import (
     Response,
     build_prior,
 )
-from anser_ros.refit.result import RefitSettings
 from anser_ros.refit.search import COARSE, body_factor
+from anser_ros.settings import RefitSettings
 
 Array = NDArray[np.float64]
 Hypothesis = tuple[Cloud, Response, Layer]
@@ -89,7 +89,7 @@ class RefitTables:
             self.references,
             self.excitation.field(cloud.positions),
             np.array(self.frequencies_hz),
-            self.settings.survey,
+            self.settings.accuracy,
             np.random.default_rng([self.settings.seed, body]),
         )
 
@@ -162,7 +162,7 @@ def _priors(
             references,
             excitation.field(cloud.positions),
             np.array(frequencies_hz),
-            settings.survey,
+            settings.accuracy,
             rng,
         )
         for cloud, response, layer in hypotheses

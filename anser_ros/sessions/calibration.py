@@ -1,6 +1,7 @@
 """Calibration of recorded sessions: boards checked, tools gathered, the drawing as a prior."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,11 +55,12 @@ def calibrate_sessions(
     """Calibrate on all tool sensors of the sessions.
 
     Reference sensors are left out: their survey is less accurate than the field model becomes.
+    How accurate fluxes and poses are is what the first session's setup states.
     """
     setup = sessions[0].setup
     measurements = [tool for session in sessions for tool in session.tools]
     names = [Path(session.path).name for session in sessions for _ in session.tools]
     return calibrate(
         measurements, names, generator_of(setup), setup.emitter_names, setup.frequencies_hz,
-        options, Drawing.of(setup).model, progress,
+        replace(options, accuracy=setup.accuracy), Drawing.of(setup).model, progress,
     )  # fmt: skip

@@ -28,9 +28,6 @@ from anser_ros.tracking.estimate import TrackerSettings
 
 Array = NDArray[np.float64]
 
-DEFAULT_NOISE_T = 60e-12
-"""Noise of a phasor component, T, where the setup states none; the diagnosis then measures it, and
-says so when it has grown."""
 ROOM = 2.0
 """Gate of the held-out part's tracking over the flux residual there. With less, poses that a wrong
 model makes would be refused instead of counted; with much more, wrong minima would be taken for
@@ -139,8 +136,9 @@ def problem_of(corrected: PreparedSession, spread: Spread | None = None) -> Prob
 
 def spread_of(prepared: PreparedSession) -> Spread:
     """How far readings and poses may be from what a right model says."""
-    noise_t = prepared.noise_t or DEFAULT_NOISE_T
-    return Spread(flux_t=float(np.hypot(noise_t, prepared.model.flux_error_t)), noise_t=noise_t)
+    accuracy = prepared.session.setup.accuracy
+    accuracy = replace(accuracy, flux_noise_t=prepared.noise_t or accuracy.flux_noise_t)
+    return Spread(float(np.hypot(accuracy.flux_noise_t, prepared.model.flux_error_t)), accuracy)
 
 
 def held_out_part(session: Session, problem: Problem) -> Session:

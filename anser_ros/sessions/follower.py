@@ -7,8 +7,9 @@ from anser_ros.errors import BagError, FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.refit.baseline import check_enough
 from anser_ros.refit.change import Pace
-from anser_ros.refit.live_refit import LiveRefit, RefitResult, RefitSettings
-from anser_ros.sessions.frames import Frame
+from anser_ros.refit.live_refit import LiveRefit
+from anser_ros.refit.result import RefitResult
+from anser_ros.sessions.frames import SessionFrame
 from anser_ros.sessions.patches import PatchFollower
 from anser_ros.sessions.prepared import PreparedSession
 from anser_ros.sessions.volume import stated_volume
@@ -58,7 +59,7 @@ class ModelFollower:
                 'a refit needs --baseline, a distortion-free recording of the same board'
             )
         try:
-            check_enough(baseline.flux, RefitSettings().min_references)
+            check_enough(baseline.flux, session.setup.refit.min_references)
         except FitError as error:
             raise BagError(f'{baseline.path}: {error}') from error
         self._patches = PatchFollower(prepared, patches) if patches else None
@@ -66,13 +67,14 @@ class ModelFollower:
             prepared.model,
             session.reference.sensors,
             baseline.flux,
-            drawing=prepared.drawing.field,
+            session.setup.refit,
+            prepared.drawing.field,
             volume=stated_volume(session.setup),
         )
         self._pace = Pace()
         self.summary = RefitSummary()
 
-    def model_at(self, frame: Frame) -> FieldModel | None:
+    def model_at(self, frame: SessionFrame) -> FieldModel | None:
         """The model for a frame and those after it; None where the one in force stays."""
         if self._patches is not None and frame.tools is not None:
             tools = frame.tools

@@ -13,7 +13,7 @@ ComplexArray = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
-class Readings:
+class FrameReadings:
     """What S sensors read in one frame.
 
     Attributes
@@ -30,31 +30,31 @@ class Readings:
     flux: ComplexArray
     flags: NDArray[np.int64]
 
-    def in_phase(self) -> 'Readings':
+    def in_phase(self) -> 'FrameReadings':
         """The same without the fluxes' quadrature parts."""
         return replace(self, flux=self.flux.real.astype(complex))
 
 
 @dataclass(frozen=True)
-class Frame:
+class SessionFrame:
     """All that was measured under one stamp.
 
     Attributes
     ----------
     stamp_ns : int
         Stamp of the flux messages.
-    tools : Readings or None
+    tools : FrameReadings or None
         Of all tool sensors; None where only the references were read.
-    reference : Readings or None
+    reference : FrameReadings or None
         Of the reference sensors; None where only tools were read.
     """
 
     stamp_ns: int
-    tools: Readings | None
-    reference: Readings | None
+    tools: FrameReadings | None
+    reference: FrameReadings | None
 
 
-def frames_of(session: Session) -> Iterator[Frame]:
+def frames_of(session: Session) -> Iterator[SessionFrame]:
     """Every stamp of a session in order, with what was measured under it."""
     rows: dict[float, tuple[list[tuple[Measurements, int]], list[int]]] = {}
     for tool in session.tools:
@@ -68,13 +68,13 @@ def frames_of(session: Session) -> Iterator[Frame]:
         reference = None
         if session.reference is not None and references:
             reference = _readings([(session.reference, references[0])])
-        yield Frame(
+        yield SessionFrame(
             session.start_ns + round(time / NANO), _readings(tools) if tools else None, reference
         )
 
 
-def _readings(rows: list[tuple[Measurements, int]]) -> Readings:
-    return Readings(
+def _readings(rows: list[tuple[Measurements, int]]) -> FrameReadings:
+    return FrameReadings(
         np.concatenate([body.sensors.channel for body, _ in rows]),
         np.concatenate([body.flux[row] for body, row in rows]),
         np.concatenate([body.flags[row] for body, row in rows]),

@@ -66,7 +66,7 @@ class PatchFollower:
             if poses.stamp_ns.size == 0:
                 raise BagError(f'{session.path}: no pose on the topic {topic}')
         self._poses: dict[str, PublishedPoses] = {b: found[t] for b, t in topics.items()}
-        self._patches = PatchCoils(sensor_table(moving), baseline.flux)
+        self._patches = PatchCoils(sensor_table(moving), baseline.flux, session.setup.refit)
         self._intake = Intake(session.reference.sensors.channel, error=FitError)
         self._refit = self._patches.started(
             prepared.model,

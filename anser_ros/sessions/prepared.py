@@ -17,7 +17,7 @@ from anser_ros.physics.volume import TrackedVolume
 from anser_ros.sessions.baseline import Baseline, baseline_of
 from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.recorded_drift import is_recorded
-from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, Session, noise_of
+from anser_ros.sessions.session import Session, measured_noise
 from anser_ros.sessions.starting_model import check_fits
 from anser_ros.sessions.volume import pose_volume
 
@@ -35,7 +35,8 @@ class PreparedSession:
     drawing : Drawing
         The emitters as the setup draws them.
     noise_t : float
-        What the setup says that the fluxes' components scatter by, T; 0 where it says nothing.
+        Noise of the fluxes' components as the acquisition measured it, T; 0 where it did not, and
+        where the setup's accuracy states the noise, which goes before.
     volume : TrackedVolume
         The box in which poses are accepted.
     baseline : Baseline or None
@@ -114,7 +115,7 @@ def prepare(
         session,
         model,
         Drawing.of(session.setup),
-        noise_of(session.setup),
+        measured_noise(session.setup),
         pose_volume(session.setup),
         clean,
         _correction(model, session),
@@ -159,5 +160,5 @@ def with_truth(measurements: Measurements, correction: Correction) -> Measuremen
     if measurements.track is None:
         return out
     track = correction.optical(measurements.track)
-    position, rotation, has_pose = track.at(measurements.time, LONGEST_OPTICAL_GAP_S)
+    position, rotation, has_pose = track.at(measurements.time)
     return replace(out, track=track, position=position, rotation=rotation, has_pose=has_pose)

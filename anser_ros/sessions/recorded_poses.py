@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.errors import BagError
 from anser_ros.field.measurements import Measurements
 from anser_ros.sessions.prepared import PreparedSession, with_truth
-from anser_ros.sessions.session import LONGEST_OPTICAL_GAP_S, NANO, Session
+from anser_ros.sessions.session import NANO, Session
 from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages, stamp_ns
 from anser_ros.wire.setup import topic_of
 
@@ -106,7 +106,7 @@ def _compared(
     if tool.track is None:
         raise BagError(f'{session.path}: no optical poses of {tool.body}')
     time = np.asarray((poses.stamp_ns - session.start_ns) * NANO, dtype=np.float64)
-    position, rotation, valid = tool.track.at(time, LONGEST_OPTICAL_GAP_S)
+    position, rotation, valid = tool.track.at(time)
     turned = Rotation.from_quat(poses.quaternion[valid]).as_matrix() if valid.any() else None
     frames = int(tool.has_pose.sum())
     if turned is None:

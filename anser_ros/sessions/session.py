@@ -1,7 +1,8 @@
 """A recorded session as arrays: the messages of a bag on one time axis."""
 
 import os
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +18,6 @@ from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
 
 NANO = 1e-9
 """Seconds in a nanosecond."""
-LONGEST_OPTICAL_GAP_S = 0.25
-"""Longest gap between two optical poses, s, over which a pose is interpolated.
-
-A tracker at 60 Hz that is silent for longer did not see the tool, whose motion meanwhile is not
-known; a hand moves by centimetres in that time.
-"""
 MOST_NOISE_T = 1e-3
 """Noise, T, from which on a setup's statement is taken for a mistake and not used. The emitters
 make microtesla at most, so that nothing could be tracked in so much noise."""
@@ -60,6 +55,16 @@ class Session:
         """All tool sensors, one body after the other."""
         return sensor_table(()).joined(*(tool.sensors for tool in self.tools))
 
+    def with_stated(self, stated: Mapping[str, float]) -> 'Session':
+        """The session with values stated that go before its setup document's.
+
+        Raises
+        ------
+        ParameterError
+            As `anser_ros.settings.settings_from`.
+        """
+        return replace(self, setup=self.setup.with_stated(stated))
+
 
 def sensor_table(specs: tuple[SensorSpec, ...]) -> SensorTable:
     """The specified sensors as a table, in the given order."""
@@ -73,11 +78,21 @@ def sensor_table(specs: tuple[SensorSpec, ...]) -> SensorTable:
     )
 
 
-def noise_of(setup: Setup) -> float:
-    """Noise of a phasor component that a setup states, T; 0 where it states none that can be."""
+def measured_noise(setup: Setup) -> float:
+    """Noise of the fluxes' components that the acquisition measured when it wrote the setup, T.
+
+    It is 0 where the setup tells none, and where ``flux_noise_t`` is stated, which goes before.
+    """
+    if 'flux_noise_t' in setup.stated:
+        return 0.0
     told = setup.extra.get('flux_noise_t', 0.0)
     is_number = isinstance(told, (int, float)) and not isinstance(told, bool)
     return float(told) if is_number and 0.0 < told < MOST_NOISE_T else 0.0
+
+
+def tracking_noise(setup: Setup) -> float:
+    """Noise that tracking starts from, T: what is stated, or was measured where that is larger."""
+    return max(setup.accuracy.flux_noise_t, measured_noise(setup))
 
 
 def pose_track(stream: PoseStream, start_ns: int) -> PoseTrack:
@@ -112,7 +127,7 @@ def _tool(
     has_pose, track = np.zeros(count, dtype=bool), None
     if body in bag.optical:
         track = pose_track(bag.optical[body], start)
-        position, rotation, has_pose = track.at(time, LONGEST_OPTICAL_GAP_S)
+        position, rotation, has_pose = track.at(time)
     return Measurements(
         body, sensors, time, flux, valid, flags, position, rotation, has_pose, track
     )

@@ -9,6 +9,7 @@ from anser_ros.field.model import FieldModel
 from anser_ros.sessions.follower import ModelFollower, RefitSummary
 from anser_ros.sessions.frames import frames_of
 from anser_ros.sessions.prepared import PreparedSession
+from anser_ros.sessions.session import tracking_noise
 from anser_ros.tracking.tracker import PoseEstimate, Tracker, TrackerSettings
 
 Progress = Callable[[float], None]
@@ -55,7 +56,7 @@ def track(
     prepared : PreparedSession
         The session and its model.
     settings : TrackerSettings, optional
-        Noise that the setup states is used where it is more than that of the settings.
+        The noise is that of the session's setup.
     follower : ModelFollower, optional
         Refits the model on the way.
     in_phase : bool
@@ -97,7 +98,7 @@ def _tracker(prepared: PreparedSession, settings: TrackerSettings, *, follows: b
         prepared.sensors,
         replace(
             settings,
-            flux_noise_t=max(settings.flux_noise_t, prepared.noise_t),
+            flux_noise_t=tracking_noise(prepared.session.setup),
             recorded_drift=prepared.recorded_drift and not follows,
             volume=settings.volume or prepared.volume,
         ),

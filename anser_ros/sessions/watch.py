@@ -154,7 +154,9 @@ class Watch:
         # The model's own effects are taken off already.
         by = replace(by, effects=by.effects[len(seen.model.effects) :])
         tools = tuple(_posed_by_itself(tool, by) for tool in seen.session.tools)
-        spread = replace(spread_of(seen), position_m=FREE_POSE_M, rotation_rad=FREE_POSE_RAD)
+        spread = spread_of(seen)
+        free = {'optical_position_m': FREE_POSE_M, 'optical_rotation_rad': FREE_POSE_RAD}
+        spread = replace(spread, accuracy=replace(spread.accuracy, **free))
         return problem_of(seen.with_session(replace(seen.session, tools=tools)), spread)
 
     def _judged(

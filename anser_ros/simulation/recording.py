@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.settings import Accuracy
 from anser_ros.simulation.motion import Pose
 from anser_ros.simulation.world import World
 from anser_ros.wire.bag_writer import SessionWriter
@@ -38,9 +39,9 @@ class Errors:
         Jitter of each axis of the optical pose, m and rad.
     """
 
-    flux_noise_t: float = 60e-12
-    optical_jitter_m: float = 0.07e-3
-    optical_jitter_rad: float = 0.4e-3
+    flux_noise_t: float = Accuracy.flux_noise_t
+    optical_jitter_m: float = Accuracy.optical_position_m
+    optical_jitter_rad: float = Accuracy.optical_rotation_rad
 
 
 @dataclass(frozen=True)

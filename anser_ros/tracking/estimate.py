@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from anser_ros.errors import TrackingError
 from anser_ros.frames import faults
 from anser_ros.physics.volume import TrackedVolume
+from anser_ros.settings import Accuracy
 from anser_ros.tracking.uncertainty import ROLL_VARIANCE
 
 Array = NDArray[np.float64]
@@ -69,7 +70,7 @@ class TrackerSettings:
         session that they were found on, and with a model that doesn't follow the references.
     """
 
-    flux_noise_t: float = 60e-12
+    flux_noise_t: float = Accuracy.flux_noise_t
     adaptive: bool = True
     volume: TrackedVolume | None = None
     grid_spacing_m: float = 0.035

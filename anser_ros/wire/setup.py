@@ -7,13 +7,15 @@ are given in the frame of the sensor's body; the body ``fg`` is the field genera
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import yaml
 
-from anser_ros.errors import SetupError
+from anser_ros.errors import ParameterError, SetupError
+from anser_ros.settings import SECTIONS, Accuracy, RefitSettings, settings_from
 
 SCHEMA = 'anser_setup/1'
 FIELD_GENERATOR = 'fg'
@@ -74,7 +76,30 @@ class Setup:
     emitter: Emitter
     sensors: tuple[SensorSpec, ...]
     volume: tuple[Vector, Vector] | None = None
+    stated: Mapping[str, float] = field(default_factory=dict)
     extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def refit(self) -> RefitSettings:
+        """How the refit follows, by what is stated and the defaults of the rest."""
+        return settings_from(self.stated)
+
+    @property
+    def accuracy(self) -> Accuracy:
+        """How accurate the instruments are, by what is stated and the defaults of the rest."""
+        return self.refit.accuracy
+
+    def with_stated(self, stated: Mapping[str, float]) -> 'Setup':
+        """The setup with further values stated, which go before the document's own.
+
+        Raises
+        ------
+        ParameterError
+            As `settings_from`.
+        """
+        together = {**self.stated, **stated}
+        settings_from(together)
+        return replace(self, stated=together)
 
     @property
     def tool_sensors(self) -> tuple[SensorSpec, ...]:
@@ -100,6 +125,10 @@ class Setup:
     def frequencies_hz(self) -> tuple[float, ...]:
         """Drive frequencies, Hz, in the order of the flux fields."""
         return tuple(coil.frequency_hz for coil in self.emitter.coils)
+
+    def follows_as(self, other: 'Setup') -> bool:
+        """Whether a refit by another setup, and its baseline, hold for this one too."""
+        return self.has_same_board(other) and self.refit == other.refit
 
     def has_same_board(self, other: 'Setup') -> bool:
         """Whether two setups have the same emitters, sensors and tracked volume."""
@@ -237,8 +266,40 @@ def _parse_volume(item: Any) -> tuple[Vector, Vector]:
     return low, high
 
 
+def _parse_stated(root: dict[str, Any]) -> dict[str, float]:
+    """The values of the sections `SECTIONS`, checked."""
+    stated: dict[str, float] = {}
+    for section, names in SECTIONS.items():
+        given = _mapping(root.get(section, {}), section)
+        unknown = sorted(set(map(str, given)) - set(names))
+        if unknown:
+            raise SetupError(
+                f'setup: {section} has no key {", ".join(unknown)}; it may have {", ".join(names)}'
+            )
+        try:
+            settings_from(given)
+        except ParameterError as error:
+            raise SetupError(f'setup: {section}: {error}') from error
+        stated |= given
+    return stated
+
+
+def _stated_sections(stated: Mapping[str, float]) -> dict[str, dict[str, float]]:
+    """The sections that `_parse_stated` reads back; none that would be empty."""
+    sections = {
+        section: {name: stated[name] for name in names if name in stated}
+        for section, names in SECTIONS.items()
+    }
+    return {section: values for section, values in sections.items() if values}
+
+
 def parse_setup(text: str) -> Setup:
     """Read and check a setup document.
+
+    Two sections are optional: ``accuracy`` states how accurate the instruments are and ``refit``
+    how the live refit follows. Their keys, with units and defaults, are the fields of
+    `anser_ros.settings.Accuracy` and `anser_ros.settings.RefitSettings`; what is not stated has
+    its default. Any other key is kept in ``extra``.
 
     Parameters
     ----------
@@ -280,7 +341,10 @@ def parse_setup(text: str) -> Setup:
     _unique(
         [topic_of(name) for name in [s.name for s in tools] + bodies], 'topic of sensor or body'
     )
-    known = ('schema', 'frame_id', 'flux_rate_hz', 'flux_unit', 'emitter', 'sensors', 'volume')
+    known = (
+        'schema', 'frame_id', 'flux_rate_hz', 'flux_unit', 'emitter', 'sensors', 'volume',
+        *SECTIONS,
+    )  # fmt: skip
     return Setup(
         frame_id=frame_id,
         flux_rate_hz=_number(
@@ -289,6 +353,7 @@ def parse_setup(text: str) -> Setup:
         emitter=_parse_emitter(_take(root, 'emitter', 'the document')),
         sensors=parsed,
         volume=_parse_volume(root['volume']) if 'volume' in root else None,
+        stated=_parse_stated(root),
         extra={k: v for k, v in root.items() if k not in known},
     )
 
@@ -325,6 +390,7 @@ def dump_setup(setup: Setup) -> str:
         'emitter': {'kind': setup.emitter.kind, **setup.emitter.geometry, 'coils': coils},
         'sensors': sensors,
         **({'volume': volume} if volume else {}),
+        **_stated_sections(setup.stated),
         **setup.extra,
     }
     return yaml.safe_dump(document, sort_keys=False)

@@ -1,0 +1,217 @@
+"""What an installation may state about itself: how accurate it is, and how the refit follows.
+
+Every value has one name and one default, and both stand here. The name is the key in the setup
+document's sections ``accuracy`` and ``refit``, the parameter of a node, and the name in
+``--set NAME=VALUE`` of a command. An option or a node's parameter goes before the setup document,
+and the document before the default.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import ParameterError
+
+
+def _value(default: float, meaning: str, low: float, high: float) -> Any:
+    """A value that may be stated: its default, its meaning in a line, and its range."""
+    return field(default=default, metadata={'meaning': meaning, 'low': low, 'high': high})
+
+
+def _check(settings: object) -> None:
+    """Raise `ParameterError` when a value is no number or out of its range."""
+    for item in fields(settings):  # type: ignore[arg-type]
+        if not item.metadata:
+            continue
+        value, whole = getattr(settings, item.name), item.type is int
+        kinds = int if whole else (int, float)
+        if isinstance(value, bool) or not isinstance(value, kinds) or not math.isfinite(value):
+            what = 'a whole number' if whole else 'a number'
+            hint = ' (YAML takes 6e-11 for text, and 6.0e-11 for a number)'
+            hint = hint if isinstance(value, str) else ''
+            raise ParameterError(f'{item.name} must be {what}, got {value!r}{hint}')
+        low, high = item.metadata['low'], item.metadata['high']
+        if not low <= value <= high:
+            raise ParameterError(f'{item.name} must be in [{low:g}, {high:g}], got {value:g}')
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """How accurate an installation's instruments are: one standard deviation of each error.
+
+    The defaults are those of the Anser sessions that this package was developed on: their noise
+    and jitter, and the accuracy that their survey of the reference sensors states. A value that
+    is too small makes what it describes look like an effect or like metal; one that is too large
+    hides such effects and makes poses less certain than they are.
+
+    Raises
+    ------
+    ParameterError
+        When a value is no number or out of its range.
+
+    Attributes
+    ----------
+    flux_noise_t : float
+        Noise of a phasor component of one flux reading, T. Where it is measured (the refit, the
+        tracker's adaptive scale, the calibration) the estimate starts here.
+    optical_position_m, optical_rotation_rad : float
+        Jitter of an optical pose along and about each axis, m and rad, as it stands after
+        interpolation to the fluxes' stamps.
+    reference_position_m, reference_axis_rad : float
+        Error of a reference sensor's surveyed place along each axis, m, and of its direction
+        along both tangents, rad.
+    reference_gain : float
+        Relative error of a reference sensor's gain.
+    patch_position_m, patch_rotation_rad : float
+        Error of the tracked pose of a patch of reference coils along and about each axis, m and
+        rad; its coils' gains have ``reference_gain``.
+    """
+
+    flux_noise_t: float = _value(60e-12, 'noise of a phasor component, T', 1e-15, 1e-3)
+    optical_position_m: float = _value(
+        0.07e-3, 'jitter of an optical position along each axis, m', 0.0, 0.1
+    )
+    optical_rotation_rad: float = _value(
+        0.4e-3, 'jitter of an optical orientation about each axis, rad', 0.0, 1.0
+    )
+    reference_position_m: float = _value(
+        0.2e-3, "error of a reference sensor's surveyed place along each axis, m", 0.0, 0.1
+    )
+    reference_axis_rad: float = _value(
+        math.radians(0.3), "error of a reference sensor's surveyed axis, rad a tangent", 0.0, 1.0
+    )
+    reference_gain: float = _value(0.004, "relative error of a reference sensor's gain", 0.0, 1.0)
+    patch_position_m: float = _value(
+        0.15e-3, "error of a patch's tracked position along each axis, m", 0.0, 0.1
+    )
+    patch_rotation_rad: float = _value(
+        2e-3, "error of a patch's tracked orientation about each axis, rad", 0.0, 1.0
+    )
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+    @property
+    def pose_jitter(self) -> NDArray[np.float64]:
+        """Jitter of an optical pose along (m) and about (rad) the three axes, shape (6,)."""
+        return np.repeat([self.optical_position_m, self.optical_rotation_rad], 3)
+
+
+@dataclass(frozen=True)
+class RefitSettings:
+    """How the live refit follows; nothing here belongs to a particular board or metal.
+
+    Raises
+    ------
+    ParameterError
+        When a value is no number or out of its range.
+
+    Attributes
+    ----------
+    emitter_drift : float
+        Standard deviation of an emitter's strength relative to its measured current, which has a
+        gain error of its own. A larger one lets a change of one emitter explain more of what
+        metal does.
+    min_references : int
+        Reference sensors in use below which the calibrated model is kept. Eight emitters give
+        eight complex readings a sensor; with fewer than four sensors the place of metal is open.
+    average_frames : int
+        Most frames that readings are averaged over while they do not change. More make the refit
+        quieter at rest; movement ends the average at once.
+    persistence : float
+        Probability that the hypothesis of one frame still holds in the next: the closer to 1, the
+        longer a fresh hypothesis waits for its evidence.
+    hold_frames : int
+        Frames that a sensor which was left out must agree for before it is used again; 25 are
+        half a second at 50 Hz.
+    error_modes : int
+        Rank of the uncertainty that is handed on with the model. Fewer are cheaper to send and to
+        use; what they leave out is added as noise.
+    seed : int
+        Of the random draws that the uncertainty is made from.
+    accuracy : Accuracy
+        Of the references and their readings.
+    """
+
+    emitter_drift: float = _value(
+        0.003, "deviation of an emitter's strength relative to its measured current", 0.0, 1.0
+    )
+    min_references: int = _value(
+        4, 'reference sensors below which the calibrated model is kept', 1, 10_000
+    )
+    average_frames: int = _value(
+        5, 'most frames that unchanging readings are averaged over', 1, 10_000
+    )
+    persistence: float = _value(
+        0.98, 'probability that a hypothesis still holds in the next frame', 0.01, 0.9999
+    )
+    hold_frames: int = _value(
+        25, 'frames of agreement after which a sensor left out is used again', 1, 1_000_000
+    )
+    error_modes: int = _value(12, "rank of the model's uncertainty", 1, 96)
+    seed: int = _value(1, 'seed of the draws that the uncertainty is made from', 1, 2**31)
+    accuracy: Accuracy = field(default_factory=Accuracy)
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
+SECTIONS = {
+    'accuracy': {item.name: item for item in fields(Accuracy)},
+    'refit': {item.name: item for item in fields(RefitSettings) if item.metadata},
+}
+"""The values that may be stated, by section of the setup document and by name."""
+VALUES = {name: item for section in SECTIONS.values() for name, item in section.items()}
+"""The same without the sections: no name stands twice."""
+
+
+def settings_from(stated: Mapping[str, Any]) -> RefitSettings:
+    """The settings with some values stated, and the default of every other.
+
+    Parameters
+    ----------
+    stated : mapping of str to number
+        By the names in `VALUES`. A whole number will do for a float.
+
+    Raises
+    ------
+    ParameterError
+        When a name is unknown, or a value is no number or out of its range.
+    """
+    unknown = sorted(set(map(str, stated)) - set(VALUES))
+    if unknown:
+        raise ParameterError(
+            f'there is no value {", ".join(unknown)} to state; there are: {", ".join(VALUES)}'
+        )
+    accuracy = {name: stated[name] for name in SECTIONS['accuracy'] if name in stated}
+    refit = {name: stated[name] for name in SECTIONS['refit'] if name in stated}
+    return RefitSettings(**refit, accuracy=Accuracy(**accuracy))
+
+
+def parse_entries(entries: list[str]) -> dict[str, float]:
+    """Values from entries ``NAME=VALUE``, as `settings_from` takes them.
+
+    Raises
+    ------
+    ParameterError
+        When an entry is not of that form, a name is unknown or twice there, or a value is bad.
+    """
+    stated: dict[str, float] = {}
+    for entry in entries:
+        name, _, text = entry.partition('=')
+        if name in stated:
+            raise ParameterError(f'{name} is stated twice')
+        try:
+            stated[name] = int(text) if _is_whole(name) else float(text)
+        except ValueError:
+            raise ParameterError(f'{entry!r} must be NAME=VALUE with a number') from None
+    settings_from(stated)
+    return stated
+
+
+def _is_whole(name: str) -> bool:
+    return name in VALUES and VALUES[name].type is int
