@@ -10,6 +10,8 @@ ENVIRONMENT = OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE
 # Two processes run the tests, as test/conftest.py shares them out. ARGS='-n 0' has one alone.
 WORKERS = -n 2 --dist loadgroup --no-loadscope-reorder
 ARGS ?=
+# What the installation is made of: a new command or version installs anew.
+PACKAGING = setup.py package.xml anser_ros/cli/commands.py
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test test-quick test-oldest lint format types parameters bench paper loop measured docs clean
@@ -23,11 +25,11 @@ help:
 	@echo 'make docs                the documentation as a site, out/docs/index.html'
 	@echo 'make paper|loop|measured the studies; options with ARGS=...'
 
-$(READY): .ci/requirements-newest.txt .ci/requirements-oldest.txt .ci/bootstrap setup.py
+$(READY): .ci/requirements-newest.txt .ci/requirements-oldest.txt .ci/bootstrap $(PACKAGING)
 	@.ci/bootstrap $(VENV) newest
 	@touch $@
 
-$(READY_OLDEST): .ci/requirements-oldest.txt .ci/bootstrap setup.py
+$(READY_OLDEST): .ci/requirements-oldest.txt .ci/bootstrap $(PACKAGING)
 	@.ci/bootstrap $(VENV_OLDEST) oldest
 	@touch $@
 
