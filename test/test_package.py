@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import REPO, Process
+from conftest import REPO, Process, spin_until
 
 from anser_ros.cli import main as cli
 from anser_ros.cli.commands import NODES, OFFLINE
@@ -83,16 +83,16 @@ def test_the_table_lists_every_module_that_is_a_command():
     assert set(OFFLINE) == modules('cli', '\ndef add_arguments(')
 
 
-def test_an_installed_node_runs(installed, overlay, tmp_path):
+def test_an_installed_node_runs(installed, overlay, ros, tmp_path):
     """As `ros2 run anser_ros tracker` starts it: by its executable, from anywhere."""
     command = [sys.executable, str(installed / 'lib' / 'anser_ros' / 'tracker')]
     asked = Process([*command, '--help'], tmp_path / 'help.log', env=overlay, cwd=tmp_path)
     assert asked.popen.wait(90) == 0, asked.output
     assert 'parameters' in asked.output
     process = Process(command, tmp_path / 'tracker.log', env=overlay, cwd=tmp_path)
+    peer = ros.create_node('peer')
     try:
-        with pytest.raises(subprocess.TimeoutExpired):
-            process.popen.wait(2.5)
+        assert spin_until(peer, lambda: 'tracker' in peer.get_node_names(), 30.0), process.output
         assert process.interrupt(timeout_s=20.0) == 0, process.output
     finally:
         process.kill_group()
