@@ -110,6 +110,7 @@ class TestWatch:
         assert seen.truth == truth and seen.is_clear and seen.findings == ()
         assert 0.7 < seen.excess < 1.2 and watch.searches == 0
 
+    @pytest.mark.long
     @pytest.mark.parametrize('truth', [OPTICAL, RIGID])
     def test_a_gain_is_named_once_and_cleared(self, moving, watch, truth):
         optical = truth == OPTICAL
