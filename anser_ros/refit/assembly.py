@@ -1,4 +1,4 @@
-"""The refitted model: calibrated dipoles, the layer's moments on top, and their uncertainty."""
+"""The refitted model: calibrated dipoles, the layer's added moments, and their uncertainty."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -47,12 +47,12 @@ class Geometry:
 
     @property
     def name(self) -> tuple[str, ...]:
-        """The same for the same dipoles."""
+        """Names of the layers, which are equal for the same dipoles."""
         return tuple(self.layer_rows)
 
     @classmethod
     def of(cls, base: FieldModel, layers: Sequence[Layer]) -> 'Geometry':
-        """Put them together; a layer that uses the model's own dipoles adds the others only."""
+        """Join a model and layers; a layer that uses dipoles of the model adds only the others."""
         positions, directions = [base.positions], [base.directions]
         rows: dict[str, NDArray[np.int64]] = {}
         size = len(base.positions)
@@ -66,12 +66,12 @@ class Geometry:
         return cls(np.concatenate(positions), np.concatenate(directions), rows)
 
     def rows(self, bank: Bank, hypothesis: int) -> NDArray[np.int64]:
-        """Rows of a hypothesis' layer."""
+        """Return the rows of the dipoles of a hypothesis' layer."""
         return self.layer_rows[bank.prior(hypothesis).layer.name]
 
 
 class Assembly:
-    """Puts refitted models together.
+    """Assembles refitted models from the calibrated model and the hypotheses' layers.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ class Assembly:
         self._geometry: Geometry | None = None
 
     def _place(self, layers: Sequence[Layer]) -> Geometry:
-        """Dipoles with some layers; the same arrays while these stay the same."""
+        """Return the dipoles with some layers, in the same arrays while the layers stay."""
         told = self._geometry
         if told is None or told.name != tuple(layer.name for layer in layers):
             told = self._geometry = Geometry.of(self.base, layers)
@@ -104,7 +104,7 @@ class Assembly:
         unit: float,
         n_modes: int,
     ) -> FieldModel:
-        """The model of one frame.
+        """Return the refitted model of one frame.
 
         Parameters
         ----------
@@ -152,7 +152,7 @@ class Assembly:
         n_modes: int,
         place: Geometry,
     ) -> Uncertainty:
-        """All modes and the rest; the same array for a while, so that receivers keep theirs."""
+        """Return all modes and the remaining error, unchanged for a while to spare receivers."""
         ranked = sorted(parts, key=lambda h: -float(weights[h]))
         rival = next((h for h in ranked[1:] if float(weights[h]) > RIVAL), None)
         steps = max(0, round(np.log(max(typical, 1.0)) / (2.0 * np.log(INFLATION_STEP))))
@@ -186,7 +186,7 @@ class Assembly:
         return whole
 
     def _error(self, bank: Bank, hypothesis: int, level: ErrorLevel, count: int) -> PosteriorModes:
-        """A hypothesis' own error, in noise units."""
+        """Return the error of one hypothesis in units of the noise."""
         key = (bank.rows.tobytes(), bank.prior(hypothesis).name, level, count)
         if key not in self._modes:
             if len(self._modes) >= MOST_MODES:
@@ -196,7 +196,7 @@ class Assembly:
 
 
 def _padded(modes: ComplexArray, size: int) -> ComplexArray:
-    """Modes (R, N, K) with rows of zeros for the dipoles that were added."""
+    """Return modes (R, N, K) with rows of zeros for the dipoles that were added."""
     out = np.zeros((modes.shape[0], size, modes.shape[2]), dtype=complex)
     out[:, : modes.shape[1]] = modes
     return out

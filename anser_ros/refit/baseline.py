@@ -22,7 +22,7 @@ MOST_FRAMES = 2000
 
 
 class ReadingWindow:
-    """The newest readings of a set of sensors.
+    """The most recent readings of a set of sensors.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class ReadingWindow:
             self._frames.popleft()
 
     def still_mean(self) -> ComplexArray:
-        """Mean reading as `mean`, of readings that do not change.
+        """Return the mean reading, as `mean` does, of readings that do not change.
 
         Raises
         ------
@@ -100,7 +100,7 @@ class ReadingWindow:
         return mean
 
     def mean(self) -> ComplexArray:
-        """Mean reading, shape (S, K), T; NaN for a sensor without a good one in half the frames.
+        """Return the mean reading (S, K), T, with NaN for sensors that are bad in half the frames.
 
         Raises
         ------
@@ -125,7 +125,7 @@ class ReadingWindow:
 
 
 def check_enough(baseline: ComplexArray, needed: int) -> int:
-    """Number of sensors that have a baseline, shape (S, K).
+    """Return the number of sensors that have a value in a baseline of shape (S, K).
 
     Raises
     ------

@@ -17,14 +17,14 @@ STEP = 1.1
 """Noise levels are rounded to powers of this, so that tables made for one serve for a while."""
 
 BURST = 5
-"""Readings that may follow each other faster than the rate; they don't come evenly."""
+"""Frames that may follow each other faster than the rate, since they do not arrive evenly."""
 MOST_RATE_HZ = 50.0
 """Default of the frame rate, Hz, which turns times into numbers of frames."""
 
 
 @dataclass
 class Pace:
-    """Which frames are refitted, so that there are not more than ``rate_hz`` a second.
+    """Selects the frames that are refitted, at most ``rate_hz`` of them a second.
 
     Counted in the frames' own stamps: a recording that is replayed at another speed, or read from
     its file, has the same frames refitted.
@@ -35,7 +35,7 @@ class Pace:
     _next_ns: float = 0.0
 
     def is_due(self, stamp_ns: int) -> bool:
-        """Whether the frame of this stamp is to be refitted."""
+        """Return whether the frame of this stamp is to be refitted."""
         period = 1e9 / self.rate_hz
         if stamp_ns < self._last_ns:
             self._next_ns = 0.0
@@ -48,7 +48,7 @@ class Pace:
 
 @dataclass
 class NoiseLevel:
-    """Noise of a phasor component, from second differences in time (what moves smoothly cancels).
+    """Estimates the noise from second differences in time, in which smooth changes cancel.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class NoiseLevel:
     _ratio: float = 1.0
 
     def update(self, flux: ComplexArray) -> float:
-        """Take in one frame, shape (S, K), NaN where unknown; returns noise over nominal."""
+        """Take in one frame (S, K), NaN where unknown, and return the noise over the nominal."""
         if len(self._previous) == 2:
             # The median over coils, so that a coil that jumps does not count.
             now = bend_power(flux, self._previous[1], self._previous[0])
@@ -80,7 +80,7 @@ class NoiseLevel:
 
 @dataclass
 class Average:
-    """Running mean of the readings over the frames in which they don't change.
+    """The running mean of the readings over the frames in which they do not change.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Average:
     _frames: int = 0
 
     def update(self, flux: ComplexArray, sigma_t: float) -> tuple[ComplexArray, int]:
-        """Take in one frame (S, K); returns the mean and the number of frames in it."""
+        """Take in one frame (S, K) and return the mean with the number of frames in it."""
         if self._mean is None or self._mean.shape != flux.shape:
             self._mean, self._frames = flux.copy(), 1
             return flux, 1

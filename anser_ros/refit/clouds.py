@@ -1,4 +1,4 @@
-"""Where unknown metal may be: clouds of candidate sources, one a hypothesis.
+"""Hypotheses about the place of unknown metal, each a cloud of candidate sources.
 
 A cloud fills a region of space with point sources of independent polarisability, each of a
 variance proportional to the volume it stands for: the prior is then white in space and does not
@@ -51,7 +51,7 @@ class Region:
 
     @cached_property
     def volume(self) -> TrackedVolume:
-        """Where tools are tracked."""
+        """The volume in which tools are tracked."""
         return self.stated or TrackedVolume.over_board(self.centre, self.half)
 
 
@@ -80,7 +80,7 @@ class Cloud:
 
 
 def below(region: Region, standoff: float) -> Cloud:
-    """Layers of sources from ``standoff`` under the board down to more than the board's size."""
+    """Return layers of sources from ``standoff`` under the board to beyond the board's size."""
     deepest = max(2.7 * region.half, 3.0 * standoff)
     count = max(3, 1 + int(math.log(deepest / standoff) / math.log(LAYER_RATIO)))
     depths = standoff * LAYER_RATIO ** np.arange(count)
@@ -104,7 +104,7 @@ def below(region: Region, standoff: float) -> Cloud:
 
 
 def overhead(region: Region, standoff: float) -> Cloud:
-    """Sources beside and over the tracked volume, at least ``standoff`` away from it.
+    """Return sources beside and over the tracked volume, at least ``standoff`` away from it.
 
     Shells of growing thickness, each on a lattice as fine as the distance to the volume asks for.
     """
@@ -127,7 +127,7 @@ def overhead(region: Region, standoff: float) -> Cloud:
 
 
 def _shell(region: Region, inner: float, outer: float, spacing: float) -> Array:
-    """Lattice points between two boxes around the tracked volume that are open at the bottom."""
+    """Return lattice points between two boxes around the volume that are open at the bottom."""
     volume, deep = region.volume, 0.3 * region.half
     side = volume.reach
     flat = [_centred(reach + outer, spacing) for reach in side.tolist()]
@@ -141,13 +141,13 @@ def _shell(region: Region, inner: float, outer: float, spacing: float) -> Array:
 
 
 def _centred(reach: float, spacing: float) -> Array:
-    """Lattice over -reach..reach, symmetric about 0."""
+    """Return a lattice over -reach..reach that is symmetric about 0."""
     count = int(reach / spacing)
     return np.asarray(spacing * np.arange(-count, count + 1))
 
 
 def bodies(region: Region) -> tuple[Cloud, ...]:
-    """Compact bodies on a lattice around the middle of the tracked volume, and in its outer part.
+    """Return compact bodies on a lattice around and in the outer part of the tracked volume.
 
     A cloud over a whole region expects as much metal everywhere; one piece of metal beside or over
     the volume is told far better by a ball of sources where it is. Below the board the layers do
@@ -175,7 +175,7 @@ def bodies(region: Region) -> tuple[Cloud, ...]:
 
 
 def default_clouds(region: Region) -> tuple[Cloud, ...]:
-    """Hypotheses for any board: standoffs in a geometric series, from nearly touching to far."""
+    """Return the hypotheses for a board, with standoffs in a geometric series."""
     near = 0.08 * region.half
     standoffs = near * 1.55 ** np.arange(8)
     around = region.half * np.array([0.25, 0.5, 0.9])

@@ -1,4 +1,4 @@
-"""The field that drives the metal: the emitters' own, below and around the board.
+"""The field of the emitters below and around the board, which drives the metal there.
 
 A calibrated model is fitted where tools are, over the board. Carried on to below the board it is
 off by tens of percent near the coils, while the coils' drawing gives that field to a percent. So
@@ -34,7 +34,7 @@ SEARCH_HEIGHT_M = 0.02
 
 @dataclass(frozen=True)
 class Excitation:
-    """The driving field, in phase with each emitter's own.
+    """The driving field, in phase with the current of each emitter.
 
     Attributes
     ----------
@@ -54,18 +54,18 @@ class Excitation:
     raw: FieldFunction
 
     def field(self, points: Array) -> Array:
-        """Field at points (P, 3), m, shape (P, K, 3), T."""
+        """Return the field at points (P, 3), m, shape (P, K, 3), T."""
         return np.asarray(self.raw(points) * self.strength[None, :, None])
 
 
 def model_field(model: FieldModel, points: Array) -> ComplexArray:
-    """Field of a model's emitters, shape (P, K, 3), T."""
+    """Return the field of a model's emitters, shape (P, K, 3), T."""
     basis = field_basis(points, model.positions, model.directions)
     return np.asarray(np.einsum('pna,nk->pka', basis, model.moments, optimize=True))
 
 
 def region_of(field: Callable[[Array], NDArray[np.generic]]) -> Region:
-    """Where the board is: the square that 98 % of its field's power over the surface lies in.
+    """Return the board's extent: the square with 98 % of its field's power over the surface.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def region_of(field: Callable[[Array], NDArray[np.generic]]) -> Region:
 def excitation_for(
     model: FieldModel, drawing: FieldFunction | None, volume: TrackedVolume | None = None
 ) -> tuple[Excitation, Region]:
-    """The drawing's field scaled to the model, or the model's own where that is not this board's.
+    """Return the drawing's field scaled to the model, or the model's if the drawing is another's.
 
     ``volume`` is the tracked volume as stated; None: the default over the board.
 

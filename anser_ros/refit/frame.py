@@ -29,7 +29,7 @@ QUIET = 0.05
 
 
 class BaselineCheck:
-    """Knows which readings can be compared with a baseline.
+    """Determines which readings can be compared with a baseline.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class BaselineCheck:
     def read(
         self, frame: Frame, baseline: ComplexArray | None = None
     ) -> tuple[NDArray[np.bool_], list[str]]:
-        """Return which readings (S,) of a judged frame can be used, and why others can't.
+        """Return which readings (S,) of a judged frame can be used, and why others cannot.
 
         ``baseline`` (S, K) are the clean readings of this frame, where coils move.
         """
@@ -54,6 +54,6 @@ class BaselineCheck:
 
 
 def _least_power(baseline: ComplexArray) -> NDArray[np.float64]:
-    """Power of a reading below which a coil is silent, shape (S,), T^2; NaN without a baseline."""
+    """Return the power (S,), T^2, below which a coil is silent, with NaN without a baseline."""
     power = np.asarray((np.abs(baseline) ** 2).sum(axis=1), dtype=np.float64)
     return np.where(np.isfinite(power), QUIET**2 * power, np.nan)

@@ -1,4 +1,4 @@
-"""Which references can be believed: each is judged by what all the others say.
+"""Faults of reference coils, each of which is judged by what the others predict for it.
 
 A reference that is dead, moved, saturated or unplugged changes alone; metal changes many readings
 at once, in the proportions that the emitters' fields have at one place. So "coil s is at fault" is
@@ -77,7 +77,7 @@ def typical(values: Array) -> float:
 
 
 def fault_odds(bank: Bank, seen: FrameEvidence, coils: NDArray[np.int64]) -> float:
-    """Logarithm of the odds that all of some coils in use are at fault, each in its own way."""
+    """Return the log odds that all of some coils in use are at fault, each in a different way."""
     others, residuals = bank.without(seen, coils)
     broad = 0.0
     for residual in residuals:
@@ -93,7 +93,7 @@ def fault_odds(bank: Bank, seen: FrameEvidence, coils: NDArray[np.int64]) -> flo
 def find_faults(
     bank: Bank, seen: FrameEvidence, suspects: list[NDArray[np.int64]]
 ) -> NDArray[np.int64]:
-    """The set of suspects that is most surely at fault; empty when none is."""
+    """Return the set of suspects that is most probably at fault, or the empty set."""
     best, margin = np.empty(0, dtype=np.int64), 0.0
     for coils in suspects:
         beyond = fault_odds(bank, seen, coils) - FAULT_ODDS * len(coils)
@@ -104,7 +104,7 @@ def find_faults(
 
 @dataclass
 class ReferenceWatch:
-    """Keeps account of which coils are left out, and for how long.
+    """Keeps account of the excluded coils and of the time for which they are excluded.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ class ReferenceWatch:
         self._good = np.zeros(self.count, dtype=np.int64)
 
     def note(self, readable: NDArray[np.bool_], reasons: list[str], least: int = 0) -> None:
-        """Leave out what can't be read; an unreadable coil starts its waiting time again.
+        """Exclude unreadable coils, whose waiting time starts again with every such frame.
 
         Where fewer than `least` can be read, samples were lost and no coil is at fault: with the
         next frame all is as it was before.
@@ -147,22 +147,22 @@ class ReferenceWatch:
             self._good[coil] = 0
 
     def exclude(self, coil: int) -> None:
-        """Leave out a coil that disagrees with the others."""
+        """Exclude a coil that disagrees with the others."""
         self.excluded[coil], self.reason[coil], self._good[coil] = True, DISAGREES, 0
 
     def agreed(self, coil: int, agrees: bool) -> None:
-        """Count a frame in which an excluded coil could be compared; it returns in the end."""
+        """Count a frame in which an excluded coil was compared; enough good ones end its exclusion."""
         self._good[coil] = self._good[coil] + 1 if agrees else 0
         if self._good[coil] >= self.hold_frames:
             self.excluded[coil], self.reason[coil] = False, OK
 
     def wait(self, readable: NDArray[np.bool_]) -> None:
-        """Count a frame with too few coils to compare: who was only unreadable returns in time."""
+        """Count a frame with too few coils to compare; coils once unreadable return in time."""
         for coil in np.flatnonzero(self.excluded & readable):
             self.agreed(int(coil), self.reason[coil] != DISAGREES)
 
     def suspects(self, chi2: Array, power: Array, freedom: int) -> list[NDArray[np.int64]]:
-        """Sets of coils in use whose common fault is worth the computation; often none.
+        """Return the sets of coils in use whose common fault is worth computing, often none.
 
         Coils that are far from what the others predict are suspected one by one; several that are
         wrong at once hide each other, so those whose readings stand out are suspected together.

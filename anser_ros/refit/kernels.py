@@ -28,7 +28,7 @@ def fill_products(matrix, columns, out):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model='numpy', fastmath=FAST)
 def _fill_probabilities(curve, probability):  # type: ignore[no-untyped-def]
-    """Write the weights of log likelihoods (A,); returns the logarithm of their mean."""
+    """Write the weights of log likelihoods (A,) and return the logarithm of their mean."""
     top, total = curve[0], 0.0
     for a in range(curve.shape[0]):
         top = max(top, curve[a])
@@ -135,7 +135,7 @@ def fill_left_out(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model='numpy')
 def bend_power(flux, previous, before):  # type: ignore[no-untyped-def]
-    """Median over coils of the mean squared second difference of fluxes (S, K); NaN for none."""
+    """Return the median over coils of the mean squared second difference of fluxes (S, K)."""
     power, count = np.empty(flux.shape[0]), 0
     for s in range(flux.shape[0]):
         total = 0.0

@@ -1,4 +1,4 @@
-"""The equivalent layer: a few dipoles whose field in the tracked volume is that of any cloud.
+"""The equivalent layer: a few dipoles that make the field of any cloud in the tracked volume.
 
 A field whose sources are all below a plane is also the field of dipoles on that plane (the
 equivalent layer of potential theory; Blakely, Potential Theory in Gravity and Magnetic
@@ -46,7 +46,7 @@ INNER = 0.83
 
 @dataclass(frozen=True)
 class Layer:
-    """Dipoles that stand for a cloud.
+    """The dipoles that represent the field of a cloud.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class Layer:
     _projected: dict[bytes, Array] = field(default_factory=dict, repr=False, compare=False)
 
     def project(self, sources: Array) -> Array:
-        """Moments of the layer per unit moment of each source's component, shape (N, 3M)."""
+        """Return the layer's moments per unit moment of each source's component, (N, 3M)."""
         if self.inverse is None:
             return np.eye(3 * len(sources))
         told = sources.tobytes()
@@ -91,7 +91,7 @@ class Layer:
         return self._projected[told]
 
     def misfit(self, sources: Array, points: Array | None = None) -> float:
-        """Relative rms error of the field that the layer makes in place of the sources.
+        """Return the relative rms error of the layer's field compared with the sources'.
 
         At the samples that it was fitted at, or at other points (P, 3).
         """
@@ -106,7 +106,7 @@ def _axes_at(points: Array) -> tuple[Array, Array]:
 
 
 def _field_rows(points: Array, sources: Array) -> Array:
-    """Field samples per unit moment component, shape (3P, 3M)."""
+    """Return the field samples per unit moment component, shape (3P, 3M)."""
     out = np.empty((3 * len(points), 3 * len(sources)))
     fill_dipole_tensors(np.ascontiguousarray(points), np.ascontiguousarray(sources), out)
     return out
@@ -136,7 +136,7 @@ def _build(
 
 
 def pose_weight(points: Array, excitation: Excitation) -> Array:
-    """How far an error of the field moves a pose at each point (P,), in some unit."""
+    """Return how far an error of the field moves a pose at each point (P,), up to a factor."""
     weight = points[:, 2] / np.linalg.norm(excitation.field(points), axis=(1, 2))
     return np.asarray(weight / weight.mean())
 
@@ -149,7 +149,7 @@ def _metric(basis: Array, weight: Array) -> Array:
 
 
 def _middle(points: Array, half: float) -> NDArray[np.int64]:
-    """Rows of some samples in the middle of the volume, three a sample."""
+    """Return the rows of some samples in the middle of the volume, three a sample."""
     there = np.flatnonzero((points[:, 2] > 0.5 * half) & (points[:, 2] < half))
     if not there.size:  # a stated volume may be all above or all below
         there = np.arange(len(points))
@@ -158,7 +158,7 @@ def _middle(points: Array, half: float) -> NDArray[np.int64]:
 
 
 def body_layer(region: Region, weight: Array, cloud: Cloud) -> Layer:
-    """A compact body's own sources as dipoles: exact wherever the body is.
+    """Return the sources of a compact body as dipoles, which are exact wherever the body is.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def _upright(positions: Array) -> Array:
 def bottom_layer(
     model: FieldModel, region: Region, excitation: Excitation, sources: Array
 ) -> Layer:
-    """The layer for clouds below the board.
+    """Return the layer for clouds below the board.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def bottom_layer(
 
 
 def box_layer(region: Region, excitation: Excitation) -> Layer:
-    """Dipoles on the faces of a box around the tracked volume, pointing inwards."""
+    """Return dipoles on the faces of a box around the tracked volume, pointing inwards."""
     gap = 0.8 * region.half
     volume = region.volume
     sides = volume.reach + gap

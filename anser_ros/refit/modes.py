@@ -1,4 +1,4 @@
-"""The refit's own uncertainty: a few fields of one standard deviation each, and what is left."""
+"""The uncertainty of the refit: a few fields of one standard deviation each, and a remainder."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class PosteriorModes:
-    """Error of a hypothesis' posterior, in noise units.
+    """The error of a hypothesis' posterior in units of the noise.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class PosteriorModes:
 
 
 def error_modes(bank: Bank, hypothesis: int, level: ErrorLevel, count: int) -> PosteriorModes:
-    """Principal modes of the posterior's error of one hypothesis, as far as poses feel it.
+    """Return the principal modes of a posterior's error, weighted by its effect on poses.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""From the references' change to the field's change: evidence, posterior mean and uncertainty.
+"""Evidence of the hypotheses, and the field's change with its uncertainty, from the references.
 
 Every cloud's hypothesis is a Gaussian of the readings, ``y ~ N(0, a C + s^2 N)``: metal of a total
 strength ``a`` as the cloud has it, the survey's errors in proportion, and noise. In the
@@ -33,7 +33,7 @@ STRENGTHS = 10.0 ** np.arange(-2.0, 11.0, 0.5)
 
 @dataclass(frozen=True)
 class FrameEvidence:
-    """What one frame says about the hypotheses.
+    """The evidence of one frame for the hypotheses.
 
     Attributes
     ----------
@@ -63,26 +63,26 @@ MOST_TABLES, MOST_BLOCKS = 12, 128
 
 @dataclass(frozen=True)
 class ErrorLevel:
-    """Noise, and index of the strength of the real and the imaginary part."""
+    """The noise with the indices of the strengths of the real and the imaginary part."""
 
     noise: float
     strengths: tuple[int, int]
 
 
 def _make_room(table: dict[Any, Any], most: int) -> None:
-    """Forget the oldest entry when a table is full."""
+    """Drop the oldest entry of a table that is full."""
     if len(table) >= most:
         del table[next(iter(table))]
 
 
 def log_sum(values: Array) -> float:
-    """Logarithm of the sum of exponentials."""
+    """Return the logarithm of the sum of exponentials."""
     top = float(values.max())
     return top + float(np.log(np.exp(values - top).sum()))
 
 
 def _over_strengths(curve: Array) -> tuple[Array, Array]:
-    """Log evidence (H,) and strength probabilities (H, 2, A) from the curves (H, A, 2)."""
+    """Return log evidence (H,) and strength probabilities (H, 2, A) of the curves (H, A, 2)."""
     top = curve.max(axis=1, keepdims=True)
     weight = np.exp(curve - top)
     total = weight.sum(axis=1, keepdims=True)
@@ -159,7 +159,7 @@ class Bank:
         self._name()
 
     def occupy(self, hypothesis: int, prior: CloudPrior) -> None:
-        """Put a prior in a slot; what was there is forgotten."""
+        """Put a prior into a slot in place of the former one."""
         self.priors[hypothesis - 1] = prior
         self._decompose(hypothesis, prior)
         self._synthesis.pop(hypothesis, None)
@@ -168,18 +168,18 @@ class Bank:
             del self._blocks[key]
 
     def _name(self) -> None:
-        """Write down what each hypothesis says."""
+        """Fill the tables of each hypothesis."""
         slots = (f'slot {i}' if p is None else p.name for i, p in enumerate(self.priors))
         self.names: tuple[str, ...] = ('nothing', *slots)
 
     def prior(self, hypothesis: int) -> CloudPrior:
-        """The prior of a hypothesis that is not 0 and not an empty slot."""
+        """Return the prior of a hypothesis other than 0 and empty slots."""
         prior = self.priors[hypothesis - 1]
         assert prior is not None
         return prior
 
     def precision(self, noise: float) -> tuple[Single, Array]:
-        """Inverse variances (H, A, n) and log determinants (H, A) at a noise level."""
+        """Return inverse variances (H, A, n) and log determinants (H, A) at a noise level."""
         if noise not in self._tables:
             variance = STRENGTHS[None, :, None] * self.spectra[:, None, :] + noise**2
             _make_room(self._tables, MOST_TABLES)
@@ -188,7 +188,7 @@ class Bank:
         return self._tables[noise]
 
     def evaluate(self, readings: Array, noise: float) -> FrameEvidence:
-        """Evidence of every hypothesis.
+        """Return the evidence of every hypothesis.
 
         Parameters
         ----------
@@ -210,7 +210,7 @@ class Bank:
         return FrameEvidence(projected, evidence, curve, strength, noise)
 
     def coefficients(self, seen: FrameEvidence, hypothesis: int) -> Array:
-        """Coordinates (n, 2) of the posterior mean in a hypothesis' eigenvectors."""
+        """Return the coordinates (n, 2) of the posterior mean in a hypothesis' eigenvectors."""
         precision, _ = self.precision(seen.noise)
         shrink = (seen.strength[hypothesis] * STRENGTHS) @ precision[hypothesis]
         return np.asarray(seen.projected[hypothesis] * shrink.T)
@@ -222,14 +222,14 @@ class Bank:
         return self._synthesis[hypothesis]
 
     def moments(self, seen: FrameEvidence, hypothesis: int) -> NDArray[np.complex128]:
-        """Posterior mean of the layer's moments (N, K) in noise units."""
+        """Return the posterior mean of the layer's moments (N, K) in units of the noise."""
         synthesis = self._to_moments(hypothesis)
         out = np.empty((len(synthesis), 2))
         fill_products(synthesis, _rows(self.coefficients(seen, hypothesis)), out)
         return out.view(np.complex128).reshape(-1, self.width)
 
     def drifts(self, seen: FrameEvidence, hypothesis: int) -> tuple[Array, Array]:
-        """Emitters' drift, mean (K, 2) and variance (K, 2), in prior deviations."""
+        """Return mean (K, 2) and variance (K, 2) of the emitters' drift in prior deviations."""
         precision, _ = self.precision(seen.noise)
         scale, along = seen.noise**2, self._drift_seen[hypothesis]
         inverse = (seen.strength[hypothesis] @ precision[hypothesis]).T
@@ -237,12 +237,12 @@ class Bank:
         return mean, scale * (1.0 - scale * (along**2 @ inverse))
 
     def sources(self, seen: FrameEvidence, hypothesis: int) -> Array:
-        """Posterior mean polarisability (M, 2) of a cloud's sources, in noise units."""
+        """Return the mean polarisability (M, 2) of a cloud's sources in units of the noise."""
         weights = self.bases[hypothesis] @ self.coefficients(seen, hypothesis)
         return np.asarray(self.prior(hypothesis).coupling[self.rows].T @ weights)
 
     def left_out(self, seen: FrameEvidence, hypothesis: int) -> tuple[Array, Array]:
-        """How far each coil's readings are from what all others predict.
+        """Return how far each coil's readings are from what all others predict.
 
         Returns
         -------
@@ -264,7 +264,7 @@ class Bank:
         return chi2, residual
 
     def _block(self, noise: float, hypothesis: int, strength: int) -> Array:
-        """Covariance of each coil's readings given all others, (S, K, K)."""
+        """Return the covariance of each coil's readings given all others, (S, K, K)."""
         key = (noise, hypothesis, strength)
         if key not in self._blocks:
             precision, _ = self.precision(noise)
@@ -275,7 +275,7 @@ class Bank:
         return self._blocks[key]
 
     def without(self, seen: FrameEvidence, coils: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Evidence of all hypotheses from the other coils alone, and what these are then off.
+        """Return the evidence from the other coils alone, and the coils' errors by it.
 
         By the rules of the conditional normal distribution no matrix is decomposed again.
 
@@ -318,7 +318,7 @@ class Bank:
         readings: Array,
         noise: float,
     ) -> float:
-        """How far readings of a coil that is not in use are from what those in use predict.
+        """Return how far readings of an excluded coil are from what those in use predict.
 
         Parameters
         ----------
@@ -353,14 +353,14 @@ class Bank:
         return total
 
     def error_level(self, seen: FrameEvidence, hypothesis: int) -> ErrorLevel:
-        """Noise and strengths, rounded up, that an uncertainty is worked out for."""
+        """Return the noise and strengths, rounded up, for which an uncertainty is computed."""
         noise = 2.0 ** float(np.ceil(np.log2(seen.noise) - 0.1))
         real, imaginary = (int(part.argmax()) for part in seen.strength[hypothesis])
         strengths = min(real + real % 2, MOST), min(imaginary + imaginary % 2, MOST)
         return ErrorLevel(noise, strengths)
 
     def error_draws(self, hypothesis: int, noise: float, strength: int, part: int) -> Array:
-        """Draws of the posterior's error of the layer's moments, (N K, D), in noise units.
+        """Return draws (N K, D) of the posterior's error of the layer's moments in noise units.
 
         A draw from the prior minus the posterior mean of its own noisy readings is a draw of the
         posterior's error (Matheron's rule; Wilson et al., JMLR 22 (2021) 105).
@@ -376,12 +376,12 @@ class Bank:
 
 
 def _rows(columns: Array) -> Single:
-    """Two columns (n, 2) as rows (2, n) for the kernels."""
+    """Return two columns (n, 2) as rows (2, n) for the kernels."""
     return np.ascontiguousarray(columns.T, dtype=np.float32)
 
 
 def _whitening(drift: Array, noise: Array) -> Array:
-    """Matrix W with ``W^T (diag(noise)^2 + drift drift^T) W = 1``.
+    """Return a matrix W with ``W^T (diag(noise)^2 + drift drift^T) W = 1``.
 
     The columns of ``drift`` are one emitter's readings each, so they are orthogonal.
     """
@@ -395,7 +395,7 @@ def _whitening(drift: Array, noise: Array) -> Array:
 
 
 def _noise_draws(count: int, drift: Array, noise: Array, part: int) -> Array:
-    """Repeatable draws of the readings' noise and drift, (n, D)."""
+    """Return repeatable draws of the readings' noise and drift, (n, D)."""
     rng = np.random.default_rng(1 + part)
     white = noise[:, None] * rng.standard_normal((len(drift), count))
     return np.asarray(white + drift @ rng.standard_normal((drift.shape[1], count)))

@@ -1,4 +1,4 @@
-"""Which compact bodies are worth a full hypothesis: a cheap look at hundreds of places.
+"""A cheap search of hundreds of places for the compact bodies that merit a full hypothesis.
 
 A body's readings lie in a few directions of the space of readings. With them alone, and one
 variance for all that they leave, its evidence costs a hundredth of the full one; the best few
@@ -27,7 +27,7 @@ REMAINDER = 1e-3
 
 
 def _symmetric() -> Array:
-    """Orthonormal basis of symmetric tensors, (6, 3, 3)."""
+    """Return an orthonormal basis of the symmetric tensors, (6, 3, 3)."""
     out = np.zeros((6, 3, 3))
     for component, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
         out[component, i, j] = out[component, j, i] = 1.0 if i == j else np.sqrt(0.5)
@@ -35,7 +35,7 @@ def _symmetric() -> Array:
 
 
 def body_factor(cloud: Cloud, references: SensorTable, excitation: Array) -> Single:
-    """Readings of a body's coarse sources, one column a tensor component, mean variance 1.
+    """Return the readings of a body's coarse sources, a column for each tensor component.
 
     Parameters
     ----------
@@ -48,6 +48,7 @@ def body_factor(cloud: Cloud, references: SensorTable, excitation: Array) -> Sin
     Returns
     -------
     ndarray, shape (S K, 6 COARSE)
+        Scaled so that the readings have a mean variance of 1.
     """
     basis = vector_basis(
         references.position, references.axis, references.length, cloud.positions[:COARSE]
@@ -60,7 +61,7 @@ def body_factor(cloud: Cloud, references: SensorTable, excitation: Array) -> Sin
 
 @dataclass
 class BodySearch:
-    """The bodies' directions for the coils in use.
+    """The directions of the bodies' readings for the coils in use.
 
     Attributes
     ----------
@@ -95,7 +96,7 @@ class BodySearch:
         self._left = REMAINDER * float(np.mean((white**2).sum(axis=1)))
 
     def _table(self, noise: float) -> tuple[Single, Array, Array]:
-        """Precisions (L, A, r) and (A,) of the rest, and log determinants (L, A)."""
+        """Return precisions (L, A, r), those (A,) of the rest, and log determinants (L, A)."""
         if noise not in self._tables:
             self._tables.clear()
             rest = self.strengths * self._left + noise**2
@@ -106,7 +107,7 @@ class BodySearch:
         return self._tables[noise]
 
     def scores(self, readings: Array, noise: float) -> Array:
-        """Approximate log evidence of every body, (L,).
+        """Return the approximate log evidence of every body, (L,).
 
         Parameters
         ----------

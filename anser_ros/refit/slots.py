@@ -1,4 +1,4 @@
-"""The few compact bodies that are full hypotheses at the moment, chosen frame by frame."""
+"""The few compact bodies that are full hypotheses at present, chosen frame by frame."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +16,11 @@ BETTER = 3.0
 EVERY = 4
 """Frames from one look at all bodies to the next."""
 PRESENT = 1.15
-"""Power of the readings over the noise's below which no body is looked for."""
+"""Ratio of the readings' power to that of the noise below which no body is looked for."""
 
 
 class BodySlots:
-    """Fills the slots of a bank with the bodies that the readings speak for.
+    """Fills the slots of a bank with the bodies that the readings support.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class BodySlots:
             self._bank.vacate(self._first + slot)
 
     def fill(self, readings: Array, noise: float) -> None:
-        """Take in one frame; now and then, one body gives way to a better one.
+        """Take in one frame; every few frames a body may be replaced by a better one.
 
         Parameters
         ----------
