@@ -151,7 +151,7 @@ class ReferenceWatch:
         self.excluded[coil], self.reason[coil], self._good[coil] = True, DISAGREES, 0
 
     def agreed(self, coil: int, agrees: bool) -> None:
-        """Count a frame in which an excluded coil was compared; enough good ones end its exclusion."""
+        """Count a frame in which an excluded coil was compared; enough good ones readmit it."""
         self._good[coil] = self._good[coil] + 1 if agrees else 0
         if self._good[coil] >= self.hold_frames:
             self.excluded[coil], self.reason[coil] = False, OK

@@ -42,9 +42,11 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 MOST_BANKS = 4
+"""Banks of hypotheses, one for each set of usable coils, that are kept; the oldest is dropped."""
 NOTHING = 0.99
 """Probability of no change from which on the calibrated model is in force."""
 DRIFT_SIGMAS = 5.0
+"""Standard deviations from which on a coil's drift counts as certain."""
 POOR = 4.0
 """Typical left-out distance from which on the state is `POOR_FIT`."""
 
@@ -121,7 +123,7 @@ class LiveRefit:
 
     @property
     def excitation_source(self) -> str:
-        """``board`` where the drawing drives the metal, ``model`` where the model itself does."""
+        """Name of what drives the metal: ``board`` for the drawing, ``model`` for the model."""
         return self._tables.excitation.source
 
     def reset(self) -> None:

@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 MOVED_M = 3e-3
+"""Shift of a patch's coil, m, from which on its tables are built anew."""
 TURNED_RAD = 0.03
 """How far a coil may be from where the refit was worked out for before that is done again."""
 
@@ -70,7 +71,9 @@ def has_moved(then: SensorTable, now: SensorTable) -> NDArray[np.bool_]:
 
 
 POSE_AGE_NS = 200_000_000
+"""Largest difference between the stamps of a patch's pose and of a frame (0.2 s)."""
 FLUX_AGE_NS = 100_000_000
+"""Largest difference between the stamps of a patch's flux and of a frame (0.1 s)."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +158,7 @@ class PatchCoils:
         return Placed(np.where(usable[:, None], self._flux, np.nan), clean)
 
     def must_rebuild(self, now: SensorTable) -> bool:
+        """Return whether coils have moved so far that the refit has to be built anew."""
         return self._built_at is None or bool(has_moved(self._built_at, now).any())
 
     def start_table(self) -> SensorTable:

@@ -54,7 +54,9 @@ class Response:
 
 
 UPRIGHT = Response('upright', 1.0, 1.0, 0.0)
+"""Metal that answers in every direction, and more along the normal of the board."""
 ORIENTED = Response('oriented', 1.0, 0.0, 0.25)
+"""Metal whose answer depends moderately on the direction of the field."""
 BODY = Response('', 1.0, 0.0, 0.5)
 """Dense pieces that drive each other answer in any direction."""
 

@@ -18,6 +18,7 @@ from anser_ros.settings import Accuracy
 Array = NDArray[np.float64]
 
 STEP_M = 1e-4
+"""Step of the numerical derivative by a reference's position, m."""
 
 
 def vector_basis(points: Array, axes: Array, lengths: Array | None, sources: Array) -> Array:

@@ -38,7 +38,7 @@ MOST_ORIENTED = 1000
 
 @dataclass(frozen=True)
 class RefitTables:
-    """The pieces.
+    """The precomputed tables of a refit.
 
     Attributes
     ----------

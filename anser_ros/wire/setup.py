@@ -20,6 +20,7 @@ from anser_ros.settings import SECTIONS, Accuracy, RefitSettings, settings_from
 SCHEMA = 'anser_setup/1'
 FIELD_GENERATOR = 'fg'
 AXIS_TOLERANCE = 1e-3
+"""Largest deviation of an axis' length from one; axes with three written digits pass."""
 LOWEST_VOLUME_M = 1e-3
 """A tracked volume ends at least so far over the board's copper (z = 0), m: nearer than the copper
 is thick, no model of its field holds, and heights are sampled in a geometric series."""
