@@ -33,6 +33,7 @@ def pooled(evaluation):
     return np.concatenate([s.position_error for s in evaluation.sensors.values()])
 
 
+@pytest.mark.long
 def test_tools_are_tracked_on_while_metal_comes(followed):
     errors = pooled(followed)
     assert np.isfinite(errors).mean() > 0.99
@@ -44,6 +45,7 @@ def test_tools_are_tracked_on_while_metal_comes(followed):
     assert (score[np.isfinite(score)] > 3.0).mean() <= 0.01
 
 
+@pytest.mark.long
 def test_without_metal_the_poses_are_the_frozen_model_s(model):
     session, base = load_session(BAGS / 'moving.mcap'), load_model(model)
     baseline = load_session(BAGS / 'factory.mcap')
