@@ -1,4 +1,4 @@
-"""The rival of the shared polarisability: free dipoles, a set of its own for every emitter.
+"""Free dipoles, a separate set for every emitter, as a rival of the shared polarisability.
 
 This is what a refit without the physics of metal does: each emitter's change is fitted by sources
 of its own, with nothing in common but where they may be. Clouds, noise, evidence for standoff and
@@ -69,7 +69,7 @@ class FreeDipoles:
             self._transfers.append(transfer @ vectors / scale)
 
     def update(self, flux: ComplexArray) -> FieldModel:
-        """The model for one frame of all references, shape (S, K), T."""
+        """Return the model for one frame of all references, shape (S, K), T."""
         change = (flux - self.baseline) / self._noise
         values = np.concatenate([change.real, change.imag], axis=1)
         best, kept = -np.inf, np.zeros((len(self._layer.positions), values.shape[1]))

@@ -52,7 +52,7 @@ POOR = 4.0
 
 
 class LiveRefit:
-    """Makes a field model follow what reference coils see.
+    """Makes a field model follow the readings of reference coils.
 
     Parameters
     ----------
@@ -99,13 +99,13 @@ class LiveRefit:
         self._warm_up()
 
     def _warm_up(self) -> None:
-        """Have tables and kernels ready before the first frame."""
+        """Prepare tables and kernels before the first frame."""
         bank, _ = self._bank()
         seen = bank.evaluate(np.zeros((len(bank.rows), 2)), 1.0)
         bank.left_out(seen, int(seen.log_evidence.argmax()))
 
     def _prepare(self) -> None:
-        """Work out what depends on the baseline and the references' places."""
+        """Compute what depends on the baseline and the references' places."""
         model, references, baseline = self.model, self.references, self.baseline
         k = len(model.emitters)
         turned = self.baseline * self._tables.excitation.phase.conj()
@@ -127,7 +127,7 @@ class LiveRefit:
         return self._tables.excitation.source
 
     def reset(self) -> None:
-        """Forget everything seen; the calibrated model is in force again."""
+        """Forget all frames, so that the calibrated model is in force again."""
         settings = self.settings
         self._noise = NoiseLevel(settings.accuracy.flux_noise_t)
         self._average = Average(settings.average_frames)
@@ -141,7 +141,7 @@ class LiveRefit:
     def moved(
         self, references: SensorTable, baseline: ComplexArray, noise: Array | None = None
     ) -> 'LiveRefit':
-        """The same refit for references that are elsewhere now; what was learnt is kept.
+        """Return the same refit for references at other places, with what it has learnt.
 
         Parameters
         ----------
@@ -169,7 +169,7 @@ class LiveRefit:
         flags: NDArray[np.generic] | None = None,
         baseline: ComplexArray | None = None,
     ) -> RefitResult:
-        """Take in one frame of reference fluxes.
+        """Take in one frame of reference fluxes and return the result of the refit.
 
         Parameters
         ----------
@@ -240,7 +240,7 @@ class LiveRefit:
         return np.asarray(~self._watch.excluded)
 
     def _bank(self) -> tuple[Bank, BodySlots]:
-        """The hypotheses for the coils in use; decomposed again only when those change."""
+        """Return the hypotheses for the coils in use, computed anew only when these change."""
         key = self._watch.excluded.tobytes()
         if key not in self._banks:
             k = len(self.model.emitters)
@@ -284,7 +284,7 @@ class LiveRefit:
         readable: NDArray[np.bool_],
         level: float,
     ) -> None:
-        """Let coils return that agree with the others again."""
+        """Readmit excluded coils that agree with the others again."""
         best, k = int(seen.log_evidence.argmax()), bank.width
         for coil in np.flatnonzero(self._watch.excluded & readable):
             rows = coil * k + np.arange(k)
@@ -335,7 +335,7 @@ class LiveRefit:
         return result
 
     def _too_few(self, stamp_ns: int, level: float) -> RefitResult:
-        """Back to the calibrated model."""
+        """Return to the calibrated model."""
         self._weights = _fresh_weights(len(self._weights))
         self._average.forget()
         count = int(self._in_use().sum())
@@ -357,7 +357,7 @@ class LiveRefit:
         )
 
     def _healths(self) -> Callable[[], tuple[ReferenceHealth, ...]]:
-        """Works out the references' health in this frame when it is asked for."""
+        """Compute the references' health in this frame, which is done only on request."""
         distance, residual, used = self._distance, self._residual, self._in_use()
         reason = self._watch.reason.copy()
         return lambda: self._judge_references(distance, residual, used, reason)
@@ -386,7 +386,7 @@ class LiveRefit:
 
 
 def _checked_noise(noise: Array | None, count: int, width: int) -> Array:
-    """Noise of every reading, (S K,), from that of every coil."""
+    """Return the noise of every reading, (S K,), from that of every coil."""
     given = np.ones(count) if noise is None else np.asarray(noise, dtype=np.float64)
     if given.shape != (count,) or not (given >= 1.0).all() or not np.isfinite(given).all():
         raise FitError(f'refit: noise must be {count} finite numbers of at least 1, got {given}')

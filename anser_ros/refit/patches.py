@@ -26,13 +26,13 @@ ComplexArray = NDArray[np.complex128]
 MOVED_M = 3e-3
 """Shift of a patch's coil, m, from which on its tables are built anew."""
 TURNED_RAD = 0.03
-"""How far a coil may be from where the refit was worked out for before that is done again."""
+"""Rotation of a patch's coil, rad, and shift above, within which a refit's tables stay valid."""
 
 
 def clean_reading(
     model: FieldModel, coils: SensorTable, accuracy: Accuracy
 ) -> tuple[ComplexArray, Array]:
-    """What placed coils read without metal, and how uncertain that is.
+    """Return the readings of placed coils without metal, with their uncertainty.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def clean_reading(
 
 
 def has_moved(then: SensorTable, now: SensorTable) -> NDArray[np.bool_]:
-    """Which coils are too far from where they were for what was worked out there, (S,)."""
+    """Return which coils (S,) have moved too far for the tables of their former places."""
     shift = np.linalg.norm(now.position - then.position, axis=1)
     turn = np.linalg.norm(np.cross(now.axis, then.axis), axis=1)
     opposite = (now.axis * then.axis).sum(axis=1) < 0.0
@@ -93,7 +93,7 @@ class Placed:
 
 
 class PatchCoils:
-    """Keeps the patches' coils where their poses say.
+    """Keeps the places of the patches' coils by their poses, and their readings.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ class PatchCoils:
         self._built_at: SensorTable | None = None
 
     def put(self, body: str, stamp_ns: int, position: Array, rotation: Array) -> None:
-        """Keep a body's pose: place (m) and rotation matrix in fg."""
+        """Take in a body's pose, its place (m) and rotation matrix in fg."""
         self._poses[body] = (stamp_ns, position, rotation)
 
     def take_flux(
@@ -128,13 +128,13 @@ class PatchCoils:
         flux: ComplexArray,
         flags: NDArray[np.int64],
     ) -> None:
-        """Keep the fluxes of the patches' coils among the tools'."""
+        """Take in the fluxes of the patches' coils, which are among those of the tools."""
         frame = self._intake.judge(stamp_ns, channels, flux, flags, self.fixed.shape[1])
         self._flux = np.where(frame.usable[:, None], frame.flux, np.nan)
         self._flux_ns = stamp_ns
 
     def where(self, stamp_ns: int) -> tuple[SensorTable, NDArray[np.bool_]]:
-        """Coils in fg by the poses of about now, and which of them have such a pose."""
+        """Return the coils in fg by their present poses, and which of them have such a pose."""
         position, axis = self.coils.position.copy(), self.coils.axis.copy()
         known = np.zeros(len(self.coils), dtype=bool)
         for coil, body in enumerate(self.coils.body):
@@ -147,7 +147,7 @@ class PatchCoils:
         return self.coils.with_geometry(position, axis), known
 
     def frame(self, stamp_ns: int, model: FieldModel) -> Placed:
-        """The coils' readings and what they should read at a time."""
+        """Return the coils' readings at a time, and those that they would have without metal."""
         now, known = self.where(stamp_ns)
         clean, _ = clean_reading(model, now, self.settings.accuracy)
         usable = known & (abs(stamp_ns - self._flux_ns) < FLUX_AGE_NS)
@@ -162,17 +162,17 @@ class PatchCoils:
         return self._built_at is None or bool(has_moved(self._built_at, now).any())
 
     def start_table(self) -> SensorTable:
-        """Coils somewhere over the board, for a first refit that leaves them out."""
+        """Return the coils at some place over the board, for a first refit without them."""
         return self.coils.with_geometry(self.coils.position + np.array([0.0, 0.0, 0.3]))
 
     def follow(self, refit: LiveRefit, frame: Frame) -> RefitResult:
-        """Refit to a frame of the fixed references, and to the patches' coils as they are now."""
+        """Refit to a frame of the fixed references and to the patches' coils at their places."""
         placed = self.frame(frame.stamp_ns, refit.model)
         both = frame.joined(self.coils.channel, placed.flux)
         return refit.follow(both, np.concatenate([self.fixed, placed.baseline]))
 
     def started(self, model: FieldModel, references: SensorTable, **options: Any) -> LiveRefit:
-        """A first refit, in which the patches' coils have no place yet.
+        """Return a first refit, in which the patches' coils have no place yet.
 
         Parameters
         ----------
@@ -189,16 +189,16 @@ class PatchCoils:
         return LiveRefit(model, references.joined(start), clean, self.settings, **options)
 
     def rebuilt(self, refit: LiveRefit, now: SensorTable) -> LiveRefit:
-        """The refit for where the patches are now; `settle` puts it in force."""
+        """Return the refit for the present places of the patches; `settle` puts it in force."""
         return _rebuild(refit, now, self.fixed)
 
     def settle(self, at: SensorTable) -> None:
-        """From now on the refit that was worked out for these places is in force."""
+        """Put the refit that was computed for the patches' present places in force."""
         self._built_at = at
 
 
 def noise_of(sigma: Array, n_fixed: int, nominal_t: float) -> Array:
-    """Noise of all references over the nominal one, the fixed ones' being 1."""
+    """Return the noise of all references relative to that of the fixed ones."""
     return np.concatenate([np.ones(n_fixed), np.hypot(1.0, sigma / nominal_t)])
 
 

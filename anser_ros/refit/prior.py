@@ -1,4 +1,4 @@
-"""What one hypothesis predicts: covariance of the references' readings, and the way to the field.
+"""The predictions of one hypothesis: the covariance of readings, and the map to the field.
 
 With the excitation B_k(r_j) of emitter k at source j and the coupling G_s(r_j) of coil s, a source
 of the polarisability tensor P_j changes the reading by ``G_s(r_j)^T P_j B_k(r_j)``: the same P_j
@@ -29,7 +29,7 @@ N_SAMPLES = 48
 
 @dataclass(frozen=True)
 class Response:
-    """How a source's polarisability tensor is distributed: variances of its independent parts.
+    """The prior of a source's polarisability tensor, as variances of its independent parts.
 
     A compact piece answers alike in all directions. A flat piece answers across its face only,
     and pieces that touch drive each other: in recordings, metal below a board answers differently
@@ -58,12 +58,12 @@ UPRIGHT = Response('upright', 1.0, 1.0, 0.0)
 ORIENTED = Response('oriented', 1.0, 0.0, 0.25)
 """Metal whose answer depends moderately on the direction of the field."""
 BODY = Response('', 1.0, 0.0, 0.5)
-"""Dense pieces that drive each other answer in any direction."""
+"""Dense pieces of metal that drive each other and answer in any direction."""
 
 
 @dataclass(frozen=True)
 class CloudPrior:
-    """One hypothesis about the readings.
+    """One hypothesis about the change of the readings.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class CloudPrior:
 
 
 class _Sources:
-    """A cloud with its excitation and response, and the products that all covariances need."""
+    """A cloud with its excitation and response, with the products that covariances share."""
 
     def __init__(self, cloud: Cloud, excitation: Array, response: Response) -> None:
         self.excitation = excitation
@@ -108,15 +108,15 @@ class _Sources:
         self.likeness = np.einsum('mka,mla->mkl', excitation, excitation)
 
     def along(self, basis: Array) -> Array:
-        """Readings (R, K, M) of unit isotropic sources, from a basis (R, M, 3)."""
+        """Return the readings (R, K, M) of unit isotropic sources, from a basis (R, M, 3)."""
         return np.asarray(np.einsum('rma,mka->rkm', basis, self.excitation, optimize=True))
 
     def upright(self, basis: Array) -> Array:
-        """Readings (R, K, M) of unit sources that answer along z only."""
+        """Return the readings (R, K, M) of unit sources that answer along z only."""
         return np.asarray(np.einsum('rm,mk->rkm', basis[:, :, 2], self.excitation[:, :, 2]))
 
     def covariance(self, first: Array, second: Array) -> Array:
-        """Covariance (R1, K, R2, K) of what two sets of rows (R, M, 3) read."""
+        """Return the covariance (R1, K, R2, K) of the readings of two sets of rows (R, M, 3)."""
         mine, theirs = self.along(first), self.along(second)
         out = self.response.isotropic * self._product(mine, theirs)
         if self.response.upright > 0.0:
@@ -143,7 +143,7 @@ class _Sources:
         return np.asarray(product.reshape(*first.shape[:2], *second.shape[:2]))
 
     def blocks(self, basis: Array) -> Array:
-        """Covariance of each row with itself alone, (R, K, K)."""
+        """Return the covariance (R, K, K) of the readings of each row among themselves."""
         rows = self.along(basis)
         alike = (rows * self.volumes) @ rows.swapaxes(1, 2)
         out = (self.response.isotropic + 0.5 * self.response.tensor) * alike
@@ -157,7 +157,7 @@ class _Sources:
         return np.asarray(out)
 
     def coupling(self, basis: Array) -> Array:
-        """Covariance (R K, M) of readings with a third of each source's trace."""
+        """Return the covariance (R K, M) of readings with a third of each source's trace."""
         mean = self.response.isotropic + self.response.tensor / 3.0
         out = mean * self.along(basis)
         if self.response.upright > 0.0:
@@ -165,7 +165,7 @@ class _Sources:
         return np.asarray((out * self.volumes).reshape(-1, len(self.volumes)))
 
     def draws(self, rng: np.random.Generator, count: int) -> Array:
-        """Random polarisability tensors, (M, 3, 3, D)."""
+        """Return random polarisability tensors, (M, 3, 3, D)."""
         m, response = len(self.volumes), self.response
         out = np.zeros((m, 3, 3, count))
         isotropic = np.sqrt(response.isotropic) * rng.standard_normal((m, count))
@@ -247,7 +247,7 @@ def build_prior(
 def _draws(
     sources: _Sources, basis: Array, projected: Array, tilt: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Readings (S K, D) and moments of the layer (N K, D) of draws from the prior."""
+    """Return readings (S K, D) and moments of the layer (N K, D) of draws from the prior."""
     plain, tilted = (sources.draws(rng, N_SAMPLES) for _ in range(2))
     readings = np.empty((len(basis), sources.width, N_SAMPLES))
     moments = np.empty((len(projected), sources.width, N_SAMPLES))

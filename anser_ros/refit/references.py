@@ -1,4 +1,4 @@
-"""The reference coils: what a source does to their readings, and what their survey is worth.
+"""The readings of reference coils by sources, and the errors of their survey.
 
 A surveyed coil is a little elsewhere, points a little elsewhere and has a little other gain than
 the table says. In a clean room that is part of its baseline and cancels; of the change that metal
@@ -22,7 +22,7 @@ STEP_M = 1e-4
 
 
 def vector_basis(points: Array, axes: Array, lengths: Array | None, sources: Array) -> Array:
-    """Flux of each coil per unit moment along x, y and z of each source, shape (S, M, 3)."""
+    """Return each coil's flux per unit moment along x, y and z of each source, (S, M, 3)."""
     out = np.empty((points.shape[0], sources.shape[0], 3))
     for component, unit in enumerate(np.eye(3)):
         directions = np.broadcast_to(unit, sources.shape)
@@ -31,7 +31,7 @@ def vector_basis(points: Array, axes: Array, lengths: Array | None, sources: Arr
 
 
 def tangents(axes: Array) -> Array:
-    """Two unit vectors across each axis, shape (S, 2, 3)."""
+    """Return two unit vectors across each axis, shape (S, 2, 3)."""
     least = np.zeros_like(axes)
     least[np.arange(len(axes)), np.abs(axes).argmin(axis=1)] = 1.0
     first = np.cross(axes, least)
@@ -42,7 +42,7 @@ def tangents(axes: Array) -> Array:
 def survey_variants(
     references: SensorTable, sources: Array, accuracy: Accuracy
 ) -> Iterator[Array]:
-    """Change of `vector_basis` by one standard deviation of each survey error, (S, M, 3) each."""
+    """Yield the change (S, M, 3) of `vector_basis` by one deviation of each survey error."""
     p, n, lengths = references.position, references.axis, references.length
     if accuracy.reference_gain > 0.0:
         yield accuracy.reference_gain * vector_basis(p, n, lengths, sources)

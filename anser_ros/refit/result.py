@@ -1,4 +1,4 @@
-"""What the live refit reports of a frame."""
+"""The results that the live refit reports of a frame."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -24,7 +24,7 @@ STATES = (FROZEN, REFIT, FEW_REFERENCES, POOR_FIT)
 
 @dataclass(frozen=True)
 class Metal:
-    """Where the change comes from, as the most likely cloud has it.
+    """The sources of the change, as the most likely cloud has them.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Metal:
 
 @dataclass(frozen=True)
 class RefitResult:
-    """What one frame of the references gave.
+    """The result of one frame of the references.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class RefitResult:
 
     @cached_property
     def references(self) -> tuple[ReferenceHealth, ...]:
-        """Every reference's health, worked out when first asked for."""
+        """Health of every reference, computed when first asked for."""
         return self.judge()
 
     @property
@@ -102,5 +102,5 @@ class RefitResult:
 
     @cached_property
     def metal(self) -> Metal | None:
-        """The sources found, worked out when first asked for; None without a change."""
+        """The sources found, computed when first asked for; None without a change."""
         return self.find() if self.find is not None else None

@@ -1,4 +1,4 @@
-"""What a refit computes once: the driving field, the layers and what every cloud predicts."""
+"""The tables that a refit computes once: driving field, layers and predictions of all clouds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 Hypothesis = tuple[Cloud, Response, Layer]
 
 MOST_ORIENTED = 1000
-"""A cloud of more sources than this gets no tensors: they cost most where they matter least."""
+"""Number of sources from which on a cloud has no tensors, whose cost grows with the sources."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class RefitTables:
     weight: Array
 
     def moved(self, references: SensorTable, settings: RefitSettings) -> 'RefitTables':
-        """The tables for references that are elsewhere."""
+        """Return the tables for references at other places."""
         priors = _priors(
             self.hypotheses, references, self.excitation, self.frequencies_hz, settings
         )
@@ -80,7 +80,7 @@ class RefitTables:
         return replace(self, priors=priors, factors=factors, references=references)
 
     def body_prior(self, body: int) -> CloudPrior:
-        """The full hypothesis of a compact body; the same whenever it is asked for."""
+        """Return the full hypothesis of a compact body, which is computed once."""
         cloud = self.bodies[body]
         return build_prior(
             cloud,
@@ -135,7 +135,7 @@ def _factors(
 
 
 def _hypotheses(clouds: Sequence[Cloud], bottom: Layer, box: Layer) -> tuple[Hypothesis, ...]:
-    """Every cloud with the responses that are worth their time."""
+    """Return every cloud with each response that is worth its time."""
     out: list[Hypothesis] = []
     for cloud in clouds:
         layer = box if cloud.overhead else bottom

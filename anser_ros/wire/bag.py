@@ -51,7 +51,7 @@ class RawMessage(NamedTuple):
 
 @dataclass
 class Salvage:
-    """What a reader had to leave behind; filled while the messages are iterated."""
+    """The losses of a reader, filled in while the messages are iterated."""
 
     lost: str = ''
     bad_chunks: int = 0
@@ -101,7 +101,7 @@ class Bag:
 
 
 def bag_file(path: str | os.PathLike[str]) -> str:
-    """Path of the MCAP file that ``path`` names: the file itself, or the one in a bag's folder.
+    """Return the MCAP file that ``path`` names, the file itself or the one in a bag's folder.
 
     Raises
     ------
@@ -120,7 +120,7 @@ def bag_file(path: str | os.PathLike[str]) -> str:
 
 
 def _indexed(stream: io.BufferedReader) -> Iterator[RawMessage] | None:
-    """The messages of a complete bag in log time order, or None where the index is missing."""
+    """Return a complete bag's messages in log time order, or None where the index is missing."""
     reader = make_reader(stream, validate_crcs=True)
     try:
         summary = reader.get_summary()
@@ -136,7 +136,7 @@ def _indexed(stream: io.BufferedReader) -> Iterator[RawMessage] | None:
 
 
 def _records(stream: io.BufferedReader, salvage: Salvage, size: int) -> Iterator[Any]:
-    """Records of a bag without index, chunk by chunk, as far as it reads."""
+    """Yield the records of a bag without index, chunk by chunk, as far as it can be read."""
     reader = StreamReader(stream, emit_chunks=True, record_size_limit=_RECORD_LIMIT)
     whole = 0
     try:
@@ -186,7 +186,7 @@ def _streamed(stream: io.BufferedReader, salvage: Salvage, size: int) -> list[Ra
 
 
 def iter_messages(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[RawMessage]:
-    """Messages of a bag by ascending log time.
+    """Yield the messages of a bag by ascending log time.
 
     Parameters
     ----------
@@ -256,7 +256,7 @@ class MessageDecoder:
 
 
 def stamp_ns(message: Any) -> int:
-    """Header stamp of a decoded message, ns."""
+    """Return the header stamp of a decoded message, ns."""
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 

@@ -44,7 +44,7 @@ class _Segments:
         return self._written + len(self._waiting)
 
     def flush(self) -> None:
-        """Write what is waiting; when that fails, the file has none of it and all still waits."""
+        """Write all that waits; when that fails, the file has none of it and all of it waits."""
         view = memoryview(bytes(self._waiting))
         try:
             done = 0
@@ -161,7 +161,7 @@ class BagWriter:
         self._writer.flush()
 
     def close(self) -> None:
-        """Write the index and close; raises OSError when even the kept space does not do.
+        """Write the index and close; raises OSError when the reserved space does not suffice.
 
         Also the way out after a :meth:`flush` that failed. The file holds whole chunks only,
         with the index where there was room for it.

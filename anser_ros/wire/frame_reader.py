@@ -1,4 +1,4 @@
-"""Finds records in a byte stream, and finds them again after garbage."""
+"""The search for records in a byte stream, also after garbage."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SHORTEST_PAYLOAD = 4096
 
 @dataclass
 class FrameCounters:
-    """What the reader has met so far, in records unless the name says otherwise."""
+    """Counters of the reader, in records unless the name has another unit."""
 
     records: int = 0
     bad_header: int = 0
@@ -129,7 +129,7 @@ class FrameReader:
 
 
 def _magic_prefix(buffer: bytes, position: int) -> int:
-    """How many bytes at the end of the buffer may be the begin of a magic."""
+    """Return how many bytes at the end of the buffer may begin a record's magic number."""
     for length in range(min(len(MAGIC) - 1, len(buffer) - position), 0, -1):
         if buffer.endswith(MAGIC[:length]):
             return length

@@ -364,7 +364,7 @@ TYPE_OF = {layout[0]: number for number, layout in _LAYOUTS.items()}
 
 
 def knows(number: int) -> bool:
-    """Whether this version of the protocol defines record type `number`."""
+    """Return whether this version of the protocol defines record type `number`."""
     return number in _LAYOUTS
 
 
@@ -387,7 +387,7 @@ def encode(payload: Payload, tag: int = 0) -> bytes:
 
 
 def header_check(head: bytes | memoryview) -> int:
-    """Check value of a header: the low half of the CRC-32 of its first ten bytes."""
+    """Return the check value of a header, the low half of the CRC-32 of its first ten bytes."""
     return zlib.crc32(head[:10]) & 0xFFFF
 
 

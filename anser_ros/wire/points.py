@@ -32,7 +32,7 @@ _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'
 
 @dataclass(frozen=True)
 class FluxPoints:
-    """One demodulation window: a row a sensor.
+    """The fluxes of one demodulation window with a row for each sensor.
 
     Attributes
     ----------
@@ -164,7 +164,7 @@ def decode_flux(
 
 
 def flux_fields(n_emitters: int) -> tuple[list[PointFieldTuple], int]:
-    """Fields and point_step of the packed flux layout (92 bytes with eight emitters)."""
+    """Return the fields and point_step of the flux layout (92 bytes with eight emitters)."""
     fields = [
         (name, 4 * i, FLOAT32, 1) for i, name in enumerate(('x', 'y', 'z', 'nx', 'ny', 'nz'))
     ]

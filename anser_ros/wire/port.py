@@ -43,7 +43,7 @@ OPEN_FAILURES = {
     errno.ENOTTY: 'it is no serial port',
     errno.EACCES: 'no permission (is the user in its group, often dialout?)',
 }
-"""Words for what the system calls otherwise."""
+"""Plain words for messages of the operating system."""
 
 
 class PortState(Enum):
@@ -90,7 +90,7 @@ class Batch:
 
 
 class ControlUnitPort:
-    """Reads the control unit in a thread of its own.
+    """Reads the control unit in a separate thread.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ class ControlUnitPort:
             self._thread.join(timeout_s)
 
     def get(self, timeout_s: float) -> Batch | None:
-        """Wait for the next batch; None when none came in time."""
+        """Wait for the next batch and return it, or None when none arrived in time."""
         try:
             return self._queue.get(timeout=timeout_s)
         except queue.Empty:
@@ -181,7 +181,7 @@ class ControlUnitPort:
 
     @property
     def last_refusal(self) -> str:
-        """Why the last refused record was refused."""
+        """The reason why the last refused record was refused."""
         return self._reader.last_refusal
 
     def _run(self) -> None:
@@ -298,7 +298,7 @@ def _open(device: str, baud: int) -> serial.SerialBase:
 
 
 def _cause(error: BaseException) -> str:
-    """Say why in a few words: pyserial quotes the system's words, and itself, several times."""
+    """Return the reason in a few words, since pyserial quotes the system several times."""
     root = error
     while isinstance(root.__context__, Exception):
         root = root.__context__

@@ -1,4 +1,4 @@
-"""Which command the control unit needs next, so that it streams what the host wants."""
+"""The next command that the control unit needs in order to stream what the host wants."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ round."""
 
 
 class StreamControl:
-    """Follows the records of one connection and says what to send.
+    """Follows the records of one connection and determines the commands to send.
 
     The order is: hello, right tones, start, samples. Each command is repeated every half second
     until the control unit does what it asks; a refusal is kept as text and not repeated. Samples
@@ -60,7 +60,7 @@ class StreamControl:
         return self.hello is not None and self._agree(self.hello)
 
     def take(self, record: Record, arrival_ns: int) -> None:
-        """Note what a received record says."""
+        """Take in a received record."""
         payload = record.payload
         if isinstance(payload, SampleBlock):
             self._last_block_ns = arrival_ns
