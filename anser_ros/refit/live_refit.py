@@ -357,7 +357,7 @@ class LiveRefit:
         )
 
     def _healths(self) -> Callable[[], tuple[ReferenceHealth, ...]]:
-        """Compute the references' health in this frame, which is done only on request."""
+        """Return a function that computes the references' health in this frame."""
         distance, residual, used = self._distance, self._residual, self._in_use()
         reason = self._watch.reason.copy()
         return lambda: self._judge_references(distance, residual, used, reason)
