@@ -50,8 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--out', type=Path, default=Path('recordings'), metavar='DIR',
-        help='folder in which a folder with bag, picture and logs is made '
-        '(%(default)s)',
+        help='folder, made if missing, for a new folder with bag, picture and logs (%(default)s)',
     )  # fmt: skip
     parser.add_argument('--rate', type=float, default=50.0, metavar='HZ', help='poses a second')
     parser.add_argument('--no-metal', action='store_true', help='simulate no steel disc')

@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--out', type=Path, default=Path('recordings'), metavar='DIR',
-        help='folder in which a folder with all results is made (%(default)s)',
+        help='folder, made if missing, for a new folder with all results (%(default)s)',
     )  # fmt: skip
     parser.add_argument('--json', action='store_true', help='print only the result, as JSON')
 
