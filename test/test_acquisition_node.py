@@ -13,8 +13,8 @@ from anser_ros.simulation.faults import FaultInjector
 from anser_ros.simulation.pseudo_port import PseudoPort
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.config_folder import read_config
-from anser_ros.wire.frames import Channel, ChannelKind, Hello, SampleBlock
 from anser_ros.wire.points import DROPPED, SATURATED, STALE, decode_flux
+from anser_ros.wire.records import Channel, ChannelKind, Hello, SampleBlock
 from anser_ros.wire.setup import parse_setup
 
 SETUP = parse_setup(read_config('demo_setup.yaml'))

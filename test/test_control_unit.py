@@ -21,7 +21,8 @@ from anser_ros.simulation.world import World
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.config_folder import config_path, read_config
 from anser_ros.wire.frame_reader import FrameReader
-from anser_ros.wire.frames import (
+from anser_ros.wire.frames import encode
+from anser_ros.wire.records import (
     DeviceState,
     DeviceStatus,
     Hello,
@@ -33,7 +34,6 @@ from anser_ros.wire.frames import (
     SetFrequencies,
     Start,
     Stop,
-    encode,
 )
 from anser_ros.wire.setup import parse_setup
 

@@ -2,7 +2,7 @@
 
 from anser_ros.nodes.diagnostics import Level
 from anser_ros.nodes.fault_memory import MEMORY_S, RecentFaults, device_words
-from anser_ros.wire.frames import DeviceState, DeviceStatus, StatusFlag
+from anser_ros.wire.records import DeviceState, DeviceStatus, StatusFlag
 
 
 def test_a_fault_is_told_with_its_count_and_forgotten_in_time():

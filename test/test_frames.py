@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from anser_ros.errors import FrameError
 from anser_ros.wire import frames
 from anser_ros.wire.frame_reader import FrameReader
-from anser_ros.wire.frames import (
+from anser_ros.wire.frames import encode
+from anser_ros.wire.records import (
     Channel,
     ChannelKind,
     DeviceState,
@@ -29,7 +30,6 @@ from anser_ros.wire.frames import (
     Start,
     StatusFlag,
     Stop,
-    encode,
 )
 
 DOCS = Path(__file__).resolve().parents[1] / 'docs'

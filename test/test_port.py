@@ -11,7 +11,9 @@ import pytest
 
 from anser_ros.errors import PortError
 from anser_ros.wire.frame_reader import FrameReader
-from anser_ros.wire.frames import (
+from anser_ros.wire.frames import encode
+from anser_ros.wire.port import ControlUnitPort, PortState, find_port
+from anser_ros.wire.records import (
     Channel,
     ChannelKind,
     Hello,
@@ -22,9 +24,7 @@ from anser_ros.wire.frames import (
     SampleBlock,
     SetFrequencies,
     Start,
-    encode,
 )
-from anser_ros.wire.port import ControlUnitPort, PortState, find_port
 from anser_ros.wire.stream_control import StreamControl
 
 TONES = (6000.0, 6170.0)

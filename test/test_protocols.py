@@ -9,8 +9,10 @@ import pytest
 from test_port import HELLO, TONES, Wire, receive, wait
 
 from anser_ros.nodes.acquisition import AcquisitionParameters
-from anser_ros.wire.frames import (
-    TYPE_OF,
+from anser_ros.wire.frames import TYPE_OF
+from anser_ros.wire.port import ControlUnitPort, PortState, find_port
+from anser_ros.wire.protocols import PROTOCOLS, SerialProtocol
+from anser_ros.wire.records import (
     Identify,
     Record,
     Reply,
@@ -19,8 +21,6 @@ from anser_ros.wire.frames import (
     SetFrequencies,
     Start,
 )
-from anser_ros.wire.port import ControlUnitPort, PortState, find_port
-from anser_ros.wire.protocols import PROTOCOLS, SerialProtocol
 from anser_ros.wire.stream_control import StreamControl
 
 VERBS = {Identify: 'who', Start: 'go'}

@@ -8,13 +8,15 @@ from refit_world import anser_world
 from scipy.stats import multivariate_normal
 
 from anser_ros.refit import health
+from anser_ros.refit.agreement import distance_of, evidence_without, left_out
 from anser_ros.refit.change import Average, NoiseLevel, Pace
 from anser_ros.refit.clouds import Region, below, default_clouds, overhead
+from anser_ros.refit.evidence import STRENGTHS
 from anser_ros.refit.excitation import excitation_for, region_of
 from anser_ros.refit.layer import bottom_layer, box_layer
-from anser_ros.refit.modes import error_modes
+from anser_ros.refit.modes import error_level, error_modes
 from anser_ros.refit.patches import clean_reading, has_moved
-from anser_ros.refit.posterior import STRENGTHS, Bank
+from anser_ros.refit.posterior import Bank
 from anser_ros.refit.prior import ORIENTED, UPRIGHT, Response, build_prior
 from anser_ros.refit.references import survey_variants, vector_basis
 from anser_ros.settings import Accuracy
@@ -125,15 +127,15 @@ def test_leaving_out_needs_no_new_decomposition(bank, parts, drift, loudness, re
         rows = (rest[:, None] * K + np.arange(K)).ravel()
         other = Bank(parts[4], rows, drift, loudness)
         direct = other.evaluate(readings[rows], NOISE)
-        evidence, residual = bank.without(seen, np.array(coils))
+        evidence, residual = evidence_without(bank, seen, np.array(coils))
         shift = evidence - direct.log_evidence
         np.testing.assert_allclose(shift, shift[0], atol=2e-3 * np.abs(evidence).max())
         gone = (np.array(coils)[:, None] * K + np.arange(K)).ravel()
         assert residual.shape == (len(coils), K, 2)
         if len(coils) == 1:
             best = int(direct.log_evidence.argmax())
-            chi2 = other.distance(direct, best, gone, readings[gone], NOISE)
-            here, _ = bank.left_out(seen, best)
+            chi2 = distance_of(other, direct, best, gone, readings[gone], NOISE)
+            here, _ = left_out(bank, seen, best)
             assert here[coils[0]] == pytest.approx(chi2, rel=0.02)
 
 
@@ -149,7 +151,7 @@ def test_a_healthy_coil_is_not_at_fault_and_a_wild_one_is(bank, readings):
 
 def test_error_modes_have_the_posterior_s_power(bank, parts, drift, loudness, readings):
     seen = bank.evaluate(readings, NOISE)
-    level = bank.error_level(seen, 1)
+    level = error_level(bank, seen, 1)
     assert level.noise >= NOISE
     modes = error_modes(bank, 1, level, 90)
     prior = parts[4][0]

@@ -25,9 +25,9 @@ from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.stream_status import emitter_statuses, sensor_statuses, signal_troubles
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.config_folder import read_config
-from anser_ros.wire.frames import DeviceStatus, Hello, Record, SampleBlock, Stop
 from anser_ros.wire.port import DEFAULT_BAUD, Batch, ControlUnitPort, PortState, find_port
 from anser_ros.wire.protocols import PROTOCOLS
+from anser_ros.wire.records import DeviceStatus, Hello, Record, SampleBlock, Stop
 from anser_ros.wire.setup import Setup, dump_setup, parse_setup
 from anser_ros.wire.stream_control import StreamControl
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from anser_ros.nodes.diagnostics import Level
-from anser_ros.wire.frames import DeviceStatus, StatusFlag
+from anser_ros.wire.records import DeviceStatus, StatusFlag
 
 MEMORY_S = 5.0
 """How long, s, a fault is remembered: several diagnostics, so that an operator sees it."""

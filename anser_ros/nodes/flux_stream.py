@@ -15,8 +15,8 @@ from anser_ros.signals.flux import FluxConverter, FluxWindow
 from anser_ros.signals.motion import FluxRates
 from anser_ros.signals.window import Window, WindowCutter
 from anser_ros.wire.channel_calibration import ChannelCalibration
-from anser_ros.wire.frames import ChannelKind, Hello, SampleBlock
 from anser_ros.wire.points import DROPPED, SATURATED, STALE, FluxPoints
+from anser_ros.wire.records import ChannelKind, Hello, SampleBlock
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
 
 

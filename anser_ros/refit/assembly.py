@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.model import FieldModel
+from anser_ros.refit.evidence import FrameEvidence
 from anser_ros.refit.layer import Layer
-from anser_ros.refit.modes import PosteriorModes, error_modes
-from anser_ros.refit.posterior import Bank, ErrorLevel, FrameEvidence
+from anser_ros.refit.modes import ErrorLevel, PosteriorModes, error_level, error_modes
+from anser_ros.refit.posterior import Bank
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -156,7 +157,7 @@ class Assembly:
         ranked = sorted(parts, key=lambda h: -float(weights[h]))
         rival = next((h for h in ranked[1:] if float(weights[h]) > RIVAL), None)
         steps = max(0, round(np.log(max(typical, 1.0)) / (2.0 * np.log(INFLATION_STEP))))
-        level = bank.error_level(seen, ranked[0]) if ranked else None
+        level = error_level(bank, seen, ranked[0]) if ranked else None
         names = tuple(bank.prior(h).name for h in ranked[:1] + ([] if rival is None else [rival]))
         key = (bank.rows.tobytes(), names, level, steps, place.name)
         self._count += 1

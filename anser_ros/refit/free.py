@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import default_clouds
+from anser_ros.refit.evidence import STRENGTHS
 from anser_ros.refit.excitation import FieldFunction, excitation_for
 from anser_ros.refit.layer import Layer, bottom_layer
-from anser_ros.refit.posterior import STRENGTHS
 from anser_ros.refit.references import survey_variants, vector_basis
 from anser_ros.settings import Accuracy
 

@@ -13,7 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.refit.posterior import Bank, FrameEvidence, log_sum
+from anser_ros.refit.agreement import evidence_without
+from anser_ros.refit.evidence import FrameEvidence, log_sum
+from anser_ros.refit.posterior import Bank
 
 Array = NDArray[np.float64]
 
@@ -78,7 +80,7 @@ def typical(values: Array) -> float:
 
 def fault_odds(bank: Bank, seen: FrameEvidence, coils: NDArray[np.int64]) -> float:
     """Return the log odds that all of some coils in use are at fault, each in a different way."""
-    others, residuals = bank.without(seen, coils)
+    others, residuals = evidence_without(bank, seen, coils)
     broad = 0.0
     for residual in residuals:
         size = float((residual**2).sum())

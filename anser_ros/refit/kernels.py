@@ -44,7 +44,7 @@ def _fill_probabilities(curve, probability):  # type: ignore[no-untyped-def]
 def fill_evidence(  # type: ignore[no-untyped-def]
     analysis, readings, precision, log_det, there, projected, curve, strength, log_evidence
 ):  # fmt: skip
-    """Write what readings (2, n) say about all hypotheses; see `refit.posterior.Evaluation`.
+    """Write what readings (2, n) say about all hypotheses; see `refit.evidence.FrameEvidence`.
 
     ``analysis`` (H n, n), ``precision`` (H, A, n), ``log_det`` (H, A); ``there`` (H,) is False for
     empty slots.
@@ -108,7 +108,7 @@ def fill_left_out(  # type: ignore[no-untyped-def]
     analysis, projected, real_precision, imaginary_precision, real_block, imaginary_block, chi2,
     residual,
 ):  # fmt: skip
-    """Write how far each coil is from what the others predict; see `refit.posterior.Bank`.
+    """Write how far each coil is from what the others predict; see `refit.agreement`.
 
     ``analysis`` (n, n): a row an eigenvector; ``projected`` (n, 2); blocks (S, K, K).
     """

@@ -19,13 +19,15 @@ from anser_ros.frames.intake import Frame, Intake
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit import health
+from anser_ros.refit.agreement import distance_of, left_out
 from anser_ros.refit.assembly import Assembly
 from anser_ros.refit.baseline import checked_baseline
 from anser_ros.refit.change import Average, NoiseLevel
+from anser_ros.refit.evidence import FrameEvidence
 from anser_ros.refit.excitation import FieldFunction
 from anser_ros.refit.frame import BaselineCheck
 from anser_ros.refit.health import ReferenceHealth, ReferenceWatch
-from anser_ros.refit.posterior import Bank, FrameEvidence
+from anser_ros.refit.posterior import Bank
 from anser_ros.refit.result import (
     FEW_REFERENCES,
     FROZEN,
@@ -102,7 +104,7 @@ class LiveRefit:
         """Prepare tables and kernels before the first frame."""
         bank, _ = self._bank()
         seen = bank.evaluate(np.zeros((len(bank.rows), 2)), 1.0)
-        bank.left_out(seen, int(seen.log_evidence.argmax()))
+        left_out(bank, seen, int(seen.log_evidence.argmax()))
 
     def _prepare(self) -> None:
         """Compute what depends on the baseline and the references' places."""
@@ -263,7 +265,7 @@ class LiveRefit:
             slots.fill(used, noise)
             seen = bank.evaluate(used, noise)
             best = int(seen.log_evidence.argmax())
-            self._distance, self._residual = bank.left_out(seen, best)
+            self._distance, self._residual = left_out(bank, seen, best)
             if len(coils) <= self.settings.min_references:
                 return bank, seen
             loudness = noise * self._row_noise[:: bank.width][coils]
@@ -288,7 +290,7 @@ class LiveRefit:
         best, k = int(seen.log_evidence.argmax()), bank.width
         for coil in np.flatnonzero(self._watch.excluded & readable):
             rows = coil * k + np.arange(k)
-            distance = bank.distance(seen, best, rows, values[coil], level)
+            distance = distance_of(bank, seen, best, rows, values[coil], level)
             self._watch.agreed(int(coil), distance < health.AGREES * 2 * k)
 
     def _result(self, stamp_ns: int, bank: Bank, seen: FrameEvidence, level: float) -> RefitResult:

@@ -1,14 +1,31 @@
-"""The uncertainty of the refit: a few fields of one standard deviation each, and a remainder."""
+"""The uncertainty of the refit: a few modes and a remainder.
+
+A *mode* is one direction in which the refitted model may be wrong: a set of moments whose field
+has the size of one standard deviation. Modes are independent of each other. They are the principal
+directions of random draws of the posterior's error; what they leave is told by one number.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.refit.posterior import Bank, ErrorLevel
+from anser_ros.refit.evidence import STRENGTHS, FrameEvidence
+from anser_ros.refit.posterior import Bank
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+
+MOST = len(STRENGTHS) - 1
+"""Index of the largest of the `STRENGTHS`."""
+
+
+@dataclass(frozen=True)
+class ErrorLevel:
+    """The noise with the indices of the strengths of the real and the imaginary part."""
+
+    noise: float
+    strengths: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -28,6 +45,37 @@ class PosteriorModes:
     rest: float
 
 
+def error_level(bank: Bank, seen: FrameEvidence, hypothesis: int) -> ErrorLevel:
+    """Return the noise and strengths, rounded up, for which an uncertainty is computed."""
+    noise = 2.0 ** float(np.ceil(np.log2(seen.noise) - 0.1))
+    real, imaginary = (int(part.argmax()) for part in seen.strength[hypothesis])
+    strengths = min(real + real % 2, MOST), min(imaginary + imaginary % 2, MOST)
+    return ErrorLevel(noise, strengths)
+
+
+def error_draws(bank: Bank, hypothesis: int, noise: float, strength: int, part: int) -> Array:
+    """Return draws (N K, D) of the posterior's error of the layer's moments in noise units.
+
+    A draw from the prior minus the posterior mean of its own noisy readings is a draw of the
+    posterior's error (Matheron's rule; Wilson et al., JMLR 22 (2021) 105).
+    """
+    precision, _ = bank.precision(noise)
+    prior, root = bank.prior(hypothesis), np.sqrt(STRENGTHS[strength])
+    count = prior.draw_readings.shape[1]
+    drawn = noise * _noise_draws(count, bank.drift, bank.row_noise, part)
+    readings = root * prior.draw_readings[bank.rows] + drawn
+    gain = (STRENGTHS[strength] * precision[hypothesis, strength])[:, None]
+    weights = gain * (bank.bases[hypothesis].T @ readings)
+    return np.asarray(root * prior.draw_moments - bank.to_moments(hypothesis) @ weights)
+
+
+def _noise_draws(count: int, drift: Array, noise: Array, part: int) -> Array:
+    """Return repeatable draws of the readings' noise and drift, (n, D)."""
+    rng = np.random.default_rng(1 + part)
+    white = noise[:, None] * rng.standard_normal((len(drift), count))
+    return np.asarray(white + drift @ rng.standard_normal((drift.shape[1], count)))
+
+
 def error_modes(bank: Bank, hypothesis: int, level: ErrorLevel, count: int) -> PosteriorModes:
     """Return the principal modes of a posterior's error, weighted by its effect on poses.
 
@@ -37,14 +85,14 @@ def error_modes(bank: Bank, hypothesis: int, level: ErrorLevel, count: int) -> P
     hypothesis : int
         Not 0.
     level : ErrorLevel
-        From `Bank.error_level`.
+        From `error_level`.
     count : int
         Modes R.
     """
     layer = bank.prior(hypothesis).layer
     draws = []
     for part in range(2):
-        error = bank.error_draws(hypothesis, level.noise, level.strengths[part], part)
+        error = error_draws(bank, hypothesis, level.noise, level.strengths[part], part)
         draws.append(error.reshape(len(layer.positions), bank.width, -1))
     half = draws[0].shape[2]
     gram = np.zeros((2 * half, 2 * half))

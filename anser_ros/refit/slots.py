@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.refit.posterior import STRENGTHS, Bank
+from anser_ros.refit.evidence import STRENGTHS
+from anser_ros.refit.posterior import Bank
 from anser_ros.refit.search import BodySearch
 from anser_ros.refit.tables import RefitTables
 

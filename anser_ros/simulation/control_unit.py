@@ -15,8 +15,8 @@ from anser_ros.simulation.sampling import FrontEnd, Sampler
 from anser_ros.simulation.world import World
 from anser_ros.wire.channel_calibration import ChannelCalibration
 from anser_ros.wire.frame_reader import FrameReader
-from anser_ros.wire.frames import (
-    TYPE_OF,
+from anser_ros.wire.frames import TYPE_OF, encode
+from anser_ros.wire.records import (
     Channel,
     ChannelKind,
     DeviceState,
@@ -33,7 +33,6 @@ from anser_ros.wire.frames import (
     Start,
     StatusFlag,
     Stop,
-    encode,
 )
 
 TICK_HZ = 1e6

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from anser_ros.simulation.raw_effects import RawEffect, chained_volts
 from anser_ros.simulation.world import World
 from anser_ros.wire.channel_calibration import ChannelCalibration
-from anser_ros.wire.frames import FULL_SCALE_CODE
+from anser_ros.wire.records import FULL_SCALE_CODE
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

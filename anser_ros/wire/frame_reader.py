@@ -10,15 +10,13 @@ from anser_ros.wire.frames import (
     CRC,
     HEADER,
     MAGIC,
-    MAX_PAYLOAD,
     OVERHEAD,
     VERSION,
-    Hello,
-    Record,
     decode_payload,
     header_check,
     knows,
 )
+from anser_ros.wire.records import MAX_PAYLOAD, Hello, Record
 
 _SHORTEST_PAYLOAD = 4096
 """Bytes that are waited for at least: a status with its text is longer than small blocks."""

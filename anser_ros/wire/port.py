@@ -24,8 +24,8 @@ import serial
 from serial.tools import list_ports
 
 from anser_ros.errors import PortError
-from anser_ros.wire.frames import Hello, Payload, Record, SampleBlock
 from anser_ros.wire.protocols import ANSER, SerialProtocol
+from anser_ros.wire.records import Hello, Payload, Record, SampleBlock
 
 DEFAULT_BAUD = 12_000_000
 """Baud rate of the port; USB devices ignore it."""

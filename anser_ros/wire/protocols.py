@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from anser_ros.wire.frame_reader import FrameReader
-from anser_ros.wire.frames import Payload, Record, encode
+from anser_ros.wire.frames import encode
+from anser_ros.wire.records import Payload, Record
 
 
 class RecordReader(Protocol):

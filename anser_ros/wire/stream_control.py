@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from anser_ros.wire.frames import (
-    TYPE_OF,
+from anser_ros.wire.frames import TYPE_OF
+from anser_ros.wire.records import (
     Hello,
     Identify,
     Payload,

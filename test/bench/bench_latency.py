@@ -29,7 +29,8 @@ from anser_ros.simulation.pseudo_port import PseudoPort
 from anser_ros.simulation.world import World
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.config_folder import config_path, read_config
-from anser_ros.wire.frames import Start, encode
+from anser_ros.wire.frames import encode
+from anser_ros.wire.records import Start
 from anser_ros.wire.setup import parse_setup, topic_of
 
 for _variable in ('OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):  # as `anser` does for its nodes
