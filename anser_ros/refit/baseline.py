@@ -1,4 +1,8 @@
-"""Distortion-free readings of reference sensors, averaged over the last moments."""
+"""The baseline: the reading of each reference sensor while no metal is near.
+
+It is the mean over the last moments before the refit starts. The live refit works on the change
+of the readings since then, so that the errors of the survey cancel in it.
+"""
 
 from collections import deque
 
@@ -74,6 +78,11 @@ class ReadingWindow:
 
     def still_mean(self) -> ComplexArray:
         """Return the mean reading, as `mean` does, of readings that do not change.
+
+        The window is judged as a whole, its last third against its first, so that a drift too slow
+        to show from one frame to the next is noticed: metal that creeps must not enter a baseline.
+        `change.Average` asks another question, whether the newest frame still belongs to a mean,
+        and must answer it at once. So the two have tests of their own.
 
         Raises
         ------

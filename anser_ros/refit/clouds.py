@@ -1,10 +1,15 @@
 """Hypotheses about the place of unknown metal, each a cloud of candidate sources.
 
-A cloud fills a region of space with point sources of independent polarisability, each of a
+A *cloud* fills a part of space with point sources of independent polarisability, each of a
 variance proportional to the volume it stands for: the prior is then white in space and does not
-depend on how finely the region is sampled. The one thing that a cloud asserts is that no metal is
-nearer to the field generator (or to the tracked volume) than its standoff. Which standoff is right
-is told by the evidence, frame by frame (see `refit.posterior`).
+depend on how finely that part is sampled. The one thing that a cloud asserts is that no metal is
+nearer than its *standoff*: the distance from the board for clouds below it, from the tracked
+volume for clouds around it. Which standoff is right is told by the evidence, frame by frame (see
+`refit.posterior`).
+
+A *compact body* is a small cloud, a ball of sources at one place: the hypothesis of one piece of
+metal beside or over the tracked volume. Where the board is and what its tracked volume is, all
+clouds learn from the `Region`.
 
 The frame ``fg`` has its board at z = 0 with z up towards the patient, so "below" is z < 0.
 """

@@ -45,7 +45,7 @@ class BaselineCheck:
     ) -> tuple[NDArray[np.bool_], list[str]]:
         """Return which readings (S,) of a judged frame can be used, and why others cannot.
 
-        ``baseline`` (S, K) are the clean readings of this frame, where coils move.
+        ``baseline`` (S, K) is the baseline of this frame, where coils move.
         """
         least = self._least if baseline is None else _least_power(baseline)
         codes = frame.codes.copy()

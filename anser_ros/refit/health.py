@@ -7,6 +7,7 @@ odds against "all is well" come from the same evidence. A coil that is left out 
 returns when it has agreed with the others for a while.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -69,6 +70,33 @@ class ReferenceHealth(NamedTuple):
     state: str
     residual_t: float
     distance: float
+
+
+def judge_references(
+    names: Sequence[str],
+    reasons: Sequence[str],
+    used: NDArray[np.bool_],
+    chi2: Array,
+    residual: Array,
+    flux_noise_t: float,
+) -> tuple[ReferenceHealth, ...]:
+    """Return the health of every reference in one frame.
+
+    Parameters
+    ----------
+    names, reasons : sequence of str, length S
+        The references, and ``ok`` or why each is left out.
+    used : ndarray of bool, shape (S,)
+    chi2, residual : ndarray, shape (U,) and (U, K, 2)
+        From `agreement.left_out`, for the coils in use; empty where they were not compared.
+    flux_noise_t : float
+        Nominal noise, T, in whose units the residuals are.
+    """
+    size, apart = np.full(len(used), np.nan), np.full(len(used), np.nan)
+    if len(chi2):
+        size[used] = np.sqrt((residual**2).mean(axis=(1, 2))) * flux_noise_t
+        apart[used] = np.sqrt(chi2 / (2 * residual.shape[1]))
+    return tuple(map(ReferenceHealth, names, reasons, size.tolist(), apart.tolist()))
 
 
 def typical(values: Array) -> float:

@@ -33,8 +33,8 @@ from anser_ros.refit.result import (
     FROZEN,
     POOR_FIT,
     REFIT,
-    Metal,
     RefitResult,
+    locate_metal,
 )
 from anser_ros.refit.slots import SLOTS, BodySlots
 from anser_ros.refit.tables import build_tables
@@ -184,7 +184,7 @@ class LiveRefit:
         flags : ndarray, shape (S,), optional
             Flag bits; a flagged reading is not used.
         baseline : ndarray, shape (S, K), complex, optional
-            Clean readings in this frame, in the order of the references, where some of them move.
+            The baseline at this moment, in the order of the references, where some of them move.
 
         Returns
         -------
@@ -221,7 +221,7 @@ class LiveRefit:
             self._watch.wait(readable)
             return self._too_few(stamp_ns, level)
         if baseline is not None:
-            # What is averaged is the change; the clean part moves with the coil.
+            # What is averaged is the change; the baseline moves with the coil.
             ordered = ordered - baseline + self.baseline
         excluded = self._watch.excluded
         used = np.where(excluded[:, None], np.nan, ordered) if excluded.any() else ordered
@@ -308,8 +308,9 @@ class LiveRefit:
         if not moving:
             drift[~sure] = 0.0
         model, state, reason = self.model, FROZEN, ''
+        unit = self.settings.accuracy.flux_noise_t
         if moving or sure.any():
-            phase, unit = self._tables.excitation.phase, self.settings.accuracy.flux_noise_t
+            phase = self._tables.excitation.phase
             model = self._assembly.model(bank, seen, weights, drift, typical, phase, unit,
                                          self.settings.error_modes)  # fmt: skip
             state = REFIT
@@ -328,7 +329,7 @@ class LiveRefit:
                 level * self.settings.accuracy.flux_noise_t,
                 drift,
                 reason,
-                (lambda: self._metal(bank, seen, weights)) if moving else None,
+                (lambda: locate_metal(bank, seen, weights, unit)) if moving else None,
             )
         )
 
@@ -362,29 +363,8 @@ class LiveRefit:
         """Return a function that computes the references' health in this frame."""
         distance, residual, used = self._distance, self._residual, self._in_use()
         reason = self._watch.reason.copy()
-        return lambda: self._judge_references(distance, residual, used, reason)
-
-    def _judge_references(
-        self, distance: Array, residual: Array, used: NDArray[np.bool_], reason: list[str]
-    ) -> tuple[ReferenceHealth, ...]:
-        size, apart = np.full(len(used), np.nan), np.full(len(used), np.nan)
-        if len(distance):
-            rms = np.sqrt((residual**2).mean(axis=(1, 2)))
-            size[used] = rms * self.settings.accuracy.flux_noise_t
-            apart[used] = np.sqrt(distance / (2 * len(self.model.emitters)))
-        rows = (self.references.name, reason, size.tolist(), apart.tolist())
-        return tuple(map(ReferenceHealth, *rows))
-
-    def _metal(self, bank: Bank, seen: FrameEvidence, weights: Array) -> Metal | None:
-        best = 1 + int(weights[1:].argmax())
-        values = bank.sources(seen, best) * self.settings.accuracy.flux_noise_t
-        polarisability = values[:, 0] + 1j * values[:, 1]
-        cloud = bank.prior(best).cloud
-        power = np.abs(polarisability) ** 2 / cloud.volumes
-        if not power.sum() > 0.0:
-            return None
-        centroid = (cloud.positions * power[:, None]).sum(axis=0) / power.sum()
-        return Metal(cloud.positions, polarisability, cloud.volumes, centroid, cloud.standoff_m)
+        names, noise_t = self.references.name, self.settings.accuracy.flux_noise_t
+        return lambda: health.judge_references(names, reason, used, distance, residual, noise_t)
 
 
 def _checked_noise(noise: Array | None, count: int, width: int) -> Array:

@@ -1,6 +1,6 @@
-"""Reference coils on patches that move: their clean reading follows from their pose.
+"""Reference coils on patches that move: their baseline follows from their pose.
 
-Such a coil has no baseline of its own. What it should read without metal is the calibrated model's
+Such a coil has no recorded baseline. What it should read without metal is the calibrated model's
 flux where a tracker says that it is, and the tracker's error becomes noise of that reading, far
 above a fixed coil's. It still tells of strong metal from where no fixed coil can be.
 """

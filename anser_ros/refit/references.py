@@ -1,7 +1,7 @@
 """The readings of reference coils by sources, and the errors of their survey.
 
 A surveyed coil is a little elsewhere, points a little elsewhere and has a little other gain than
-the table says. In a clean room that is part of its baseline and cancels; of the change that metal
+the table says. Without metal that is part of its baseline and cancels; of the change that metal
 makes it leaves an error proportional to the change. To first order it is the reading of a few
 displaced, turned and scaled copies of the coil (`survey_variants`).
 """

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from anser_ros.field.model import FieldModel
 from anser_ros.refit import health
+from anser_ros.refit.evidence import FrameEvidence
 from anser_ros.refit.health import ReferenceHealth
+from anser_ros.refit.posterior import Bank
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -46,6 +48,31 @@ class Metal:
     volumes: Array
     centroid: Array
     standoff_m: float
+
+
+def locate_metal(
+    bank: Bank, seen: FrameEvidence, weights: Array, flux_noise_t: float
+) -> Metal | None:
+    """Return the sources under the most probable hypothesis with metal; None when all are zero.
+
+    Parameters
+    ----------
+    bank : Bank
+    seen : FrameEvidence
+    weights : ndarray, shape (H,)
+        Probability of each hypothesis; the first, that nothing has changed, is passed over.
+    flux_noise_t : float
+        Nominal noise, T.
+    """
+    best = 1 + int(weights[1:].argmax())
+    values = bank.sources(seen, best) * flux_noise_t
+    polarisability = values[:, 0] + 1j * values[:, 1]
+    cloud = bank.prior(best).cloud
+    power = np.abs(polarisability) ** 2 / cloud.volumes
+    if not power.sum() > 0.0:
+        return None
+    centroid = (cloud.positions * power[:, None]).sum(axis=0) / power.sum()
+    return Metal(cloud.positions, polarisability, cloud.volumes, centroid, cloud.standoff_m)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,9 @@
-"""The few compact bodies that are full hypotheses at present, chosen frame by frame."""
+"""The few compact bodies that are full hypotheses at present, chosen frame by frame.
+
+Hundreds of compact bodies (`refit.clouds`) are too many to be judged in full in every frame. So
+the bank has a few *slots*, places for one body each; a body that explains the readings better
+takes over the slot of the one that explains them worst.
+"""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,6 +1,6 @@
 """The serial protocols of control units that a port can speak.
 
-A protocol turns bytes into records and commands into bytes. The records (`frames.Hello`,
+A protocol turns bytes into records and commands into bytes. The records (`records.Hello`,
 `SampleBlock`, `DeviceStatus`, `Reply`) are what the rest of the package knows of any control unit:
 another unit's reader translates what it receives into them. Everything above the port stays as
 it is.
