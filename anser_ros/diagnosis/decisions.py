@@ -1,7 +1,8 @@
 """The numbers by which explanations are accepted, compared and named.
 
-Three currencies are compared here, and all count in the whitened sum of squares, where noise alone
-has a mean of one a value:
+Three currencies are compared here, and all count in the whitened sum of squares, where noise
+and the field model's own error, as large as they are expected, have a mean of one a value (noise
+alone has less):
 
 - the *gain* of an effect, what it takes off the cross-validated sum of squares of blocks of time
   that took no part in fitting it;
@@ -66,8 +67,8 @@ SITES_PER_EFFECT = 2
 # --- which of several explanations is taken ----------------------------------------------------
 AS_GOOD, AS_GOOD_PER_PARAMETER = 10.0, 4.0
 """Gain, in units of the misfit, that a simpler explanation may lack: so much, and so much for each
-parameter that it spares. The second lies below what a parameter must gain to be accepted, so no
-explanation is given up for one that would have been refused beside it."""
+parameter that it spares. Together they are less than what a further effect with as many parameters
+must gain (`LEAST_GAIN`, `PER_PARAMETER`), so what is given up would not have been accepted as one."""
 ALIKE = 0.02
 """Share of a gain by which two explanations may differ that the data don't tell apart: metal of an
 unknown shape leaves about as much. Within it a rival is listed, and metal rests."""
@@ -104,14 +105,19 @@ TIME_PARTS = 6
 """Parts of the session in which an effect is fitted again: enough to see a change, few enough that
 each has the poses that tell the parameters."""
 LARGEST_VARIATION = 0.1
-"""Share of an effect's power that refits in parts of the data may take off besides. An effect that
-truly is there varies by what its model is wrong by, 1 % of the power and less."""
+"""Share of an effect's power that refits in parts of the data may take off besides. What is
+truly there varies by what its model is wrong by (`Effect.inexact`: 1 % for most), and by chance:
+normal noise alone lets the refits of six parts of the time take off some 3 with one parameter each
+and 8 with six, which is a share only of an effect of little power. Larger confirms what stands in
+for another effect; smaller refuses effects whose model is only near the truth, as metal's is."""
 LEAST_OF_THE_REST = 0.2
 """An effect that takes off less than this share of what stays unexplained is not named: something
 larger is unknown, and the effect is probably its trace."""
 CLEAR = 6.0
-"""Standard deviations of the noise's power from which a remainder counts: noise passes it once in
-1e9, and there are some hundred cells to test."""
+"""Standard deviations of the noise's power from which a remainder counts. A normal variable passes
+it once in 1e9, the power of normal noise in one cell of 400 frames once in 5e7. Where the median
+cell is taken its spread is a quarter larger, and a normal variable passes once in 1e6. Noise that
+depends on its neighbours passes oftener. One test an effect is made."""
 WRONG_BY = 1.3
 """Variance over the noise's up to which a field model may be wrong, whatever it says: of a board
 beyond what was scanned. It is not held against an effect on everything."""
@@ -125,7 +131,8 @@ reads of one emitter): taking the pose out spreads a trace of each change over a
 NOISIER = 1.15
 """Factor from which noise counts as grown."""
 FEWEST_OUTLIERS = 0.004
-"""Share of frames from which outliers are named; noise makes none in a session (1e-6)."""
+"""Share of frames from which outliers are named. Normal noise makes none in a session: a reading
+of 16 values passes its limit once in 5e12, one of 8 values once in 1e7."""
 BESIDE_OUTLIERS = 0.3
 """Unexplained power over the floor's up to which frames that stand out are outliers: a model that
 is wrong by more makes some itself."""

@@ -17,7 +17,8 @@ WINDOW = 11
 bad ones in a row are seen, and motion changes little over so many."""
 READING_RATIO, FRAME_RATIO = 6.0, 2.5
 """Mean squares over the neighbours' median from which a reading (16 values with 8 emitters) or a
-frame (ten times as many) is no member of the same distribution; noise passes once in 1e6."""
+frame (ten times as many) is no member of the same distribution; normal noise in 8 values
+or more passes less than once in 1e6."""
 JUMP_RATIO = 40.0
 """The same for a frame whose pose's own directions are left in: the optical jitter along them is
 larger than the noise and differs from pose to pose, so only a glitch stands out so far."""
