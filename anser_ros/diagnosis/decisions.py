@@ -68,7 +68,7 @@ SITES_PER_EFFECT = 2
 AS_GOOD, AS_GOOD_PER_PARAMETER = 10.0, 4.0
 """Gain, in units of the misfit, that a simpler explanation may lack: so much, and so much for each
 parameter that it spares. Together they are less than what a further effect with as many parameters
-must gain (`LEAST_GAIN`, `PER_PARAMETER`), so what is given up would not have been accepted as one."""
+must gain (`LEAST_GAIN`, `PER_PARAMETER`), so what is given up would not have been accepted."""
 ALIKE = 0.02
 """Share of a gain by which two explanations may differ that the data don't tell apart: metal of an
 unknown shape leaves about as much. Within it a rival is listed, and metal rests."""
