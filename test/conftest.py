@@ -53,23 +53,25 @@ def _note_start(event: str, arguments: tuple[Any, ...]) -> None:
 sys.addaudithook(_note_start)
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that take a ROS domain, before `-m` chooses among them, and share them out.
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Mark a test that takes a ROS domain, and name the group that one worker takes as a whole.
 
     Of two workers one takes the tests with processes, which mostly wait, and the other the files
-    that calculate, longest first: so only one set of nodes runs at a time, and a file's fixtures
-    are made once.
+    that calculate: so only one set of nodes runs at a time, and a file's fixtures are made once.
+    This must be done as soon as a test is known: later, pytest-xdist has read the groups already.
     """
-    for item in items:
-        if 'domain' in getattr(item, 'fixturenames', ()):
-            item.add_marker('processes')
+    if 'domain' in getattr(item, 'fixturenames', ()):
+        item.add_marker('processes')
+    if 'PYTEST_XDIST_WORKER' in os.environ:
+        group = 'processes' if _has_processes(item) else item.path.stem
+        item.add_marker(pytest.mark.xdist_group(group))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the tests with processes first, and then the files that calculate for long."""
     if 'PYTEST_XDIST_WORKER' in os.environ:
         long = {item.path for item in items if item.get_closest_marker('long')}
         items.sort(key=lambda item: (not _has_processes(item), item.path not in long))
-        for item in items:
-            group = 'processes' if _has_processes(item) else item.path.stem
-            item.add_marker(pytest.mark.xdist_group(group))
 
 
 _begun: list[pytest.Item] = []
