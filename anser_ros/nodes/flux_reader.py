@@ -7,7 +7,7 @@ from sensor_msgs.msg import PointCloud2
 
 from anser_ros.errors import LayoutError
 from anser_ros.frames.intake import Count
-from anser_ros.nodes.model_clouds import NANO, layout_of, stamp_of, width_of
+from anser_ros.nodes.model_clouds import SECOND_NS, layout_of, stamp_of, width_of
 from anser_ros.wire.points import FluxPoints, decode_flux
 
 
@@ -19,7 +19,7 @@ def read_flux(message: PointCloud2) -> tuple[int, FluxPoints]:
     LayoutError
         When the stamp is zero or none, or the cloud is no flux cloud.
     """
-    if message.header.stamp.nanosec >= NANO:
+    if message.header.stamp.nanosec >= SECOND_NS:
         raise LayoutError(
             f'the stamp has {message.header.stamp.nanosec} nanoseconds, a second or more'
         )
@@ -56,6 +56,6 @@ def read_frame(message: PointCloud2, frame_id: str, count: Count) -> tuple[int, 
         raise LayoutError(
             f'fluxes in the frame {message.header.frame_id!r}, the setup is in {frame_id!r}'
         )
-    if stamp_of(message) <= 0 or message.header.stamp.nanosec >= NANO:
+    if stamp_of(message) <= 0 or message.header.stamp.nanosec >= SECOND_NS:
         count('fluxes_without_stamp', 1)
     return read_flux(message)

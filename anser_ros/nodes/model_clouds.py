@@ -16,7 +16,7 @@ from anser_ros.wire.points import (
     encode_field_model,
 )
 
-NANO = 1_000_000_000
+SECOND_NS = 1_000_000_000
 """Nanoseconds in a second."""
 MOST_BYTES = 64_000_000
 """Size of a message, bytes, beyond which it is refused: far more than any sensible model has, and
@@ -45,7 +45,7 @@ class CloudMaker:
             ]
         message = PointCloud2()
         message.header.frame_id = frame_id
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, NANO)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, SECOND_NS)
         message.height, message.width = 1, len(data) // step
         message.fields = self._fields[key]
         message.point_step, message.row_step = step, len(data)
@@ -70,7 +70,7 @@ class ModelWriter:
         if self._told is not None and self._told[0] is model:
             message = self._told[1]
             message.header.frame_id = frame_id
-            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, NANO)
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, SECOND_NS)
             return message
         points = DipolePoints(model.positions, model.directions, model.moments)
         message = self._maker.message(encode_field_model(points), frame_id, stamp_ns)
@@ -105,7 +105,7 @@ class ModelWriter:
 
 def stamp_of(message: PointCloud2) -> int:
     """Stamp of a message, ns."""
-    return int(message.header.stamp.sec) * NANO + int(message.header.stamp.nanosec)
+    return int(message.header.stamp.sec) * SECOND_NS + int(message.header.stamp.nanosec)
 
 
 def layout_of(message: PointCloud2) -> list[PointFieldTuple]:

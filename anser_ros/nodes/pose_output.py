@@ -10,7 +10,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformS
 
 from anser_ros.nodes import qos
 from anser_ros.nodes.diagnostics import Level, Status
-from anser_ros.nodes.model_clouds import NANO
+from anser_ros.nodes.model_clouds import SECOND_NS
 from anser_ros.tracking.estimate import OK, STALE, PoseEstimate
 from anser_ros.tracking.rotations import quaternion_of_axis, quaternion_of_rotation
 from anser_ros.wire.setup import topic_of
@@ -81,7 +81,7 @@ class PoseTopic:
         if estimate.state == OK:
             self._publish(estimate)
             self.tally.poses += 1
-            latency_s = (now_ns - estimate.stamp_ns) / NANO
+            latency_s = (now_ns - estimate.stamp_ns) / SECOND_NS
             # A recorded bag's stamps are of another day.
             if 0.0 <= latency_s < LONGEST_LATENCY_S:
                 self.tally.latency_s = latency_s
@@ -93,7 +93,7 @@ class PoseTopic:
         else:
             x, y, z, w = quaternion_of_rotation(estimate.rotation)
         px, py, pz = estimate.position.tolist()
-        sec, nanosec = divmod(estimate.stamp_ns, NANO)
+        sec, nanosec = divmod(estimate.stamp_ns, SECOND_NS)
         for message, pose in ((self._plain, self._plain.pose), (self._full, self._full.pose.pose)):
             message.header.stamp.sec, message.header.stamp.nanosec = sec, nanosec
             pose.position.x, pose.position.y, pose.position.z = px, py, pz

@@ -19,7 +19,7 @@ from anser_ros.nodes.answered_frames import AnsweredFrames
 from anser_ros.nodes.backlog import Backlog, take_waiting
 from anser_ros.nodes.diagnostics import Trouble
 from anser_ros.nodes.flux_reader import read_frame
-from anser_ros.nodes.model_clouds import NANO, stamp_of
+from anser_ros.nodes.model_clouds import SECOND_NS, stamp_of
 from anser_ros.nodes.model_intake import GivenModel, ModelIntake
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
@@ -255,8 +255,8 @@ class TrackerNode(AnserNode):
         now_ns, stamp_ns = time.time_ns(), stamp_of(message)
         self._backlog.arrived(received_ns, stamp_ns)
         # Nobody steers by a recording that is played: it is worked off whole.
-        live = abs(now_ns - stamp_ns) < LIVE_WITHIN_S * NANO
-        if live and received_ns and self._backlog.is_hopeless((now_ns - received_ns) / NANO):
+        live = abs(now_ns - stamp_ns) < LIVE_WITHIN_S * SECOND_NS
+        if live and received_ns and self._backlog.is_hopeless((now_ns - received_ns) / SECOND_NS):
             waiting = take_waiting(self._fluxes)
             if waiting:
                 self.count('frames_skipped', len(waiting))

@@ -16,7 +16,7 @@ from anser_ros.errors import AnserError
 from anser_ros.field.model import EffectRecord
 from anser_ros.nodes import qos
 from anser_ros.nodes.flux_reader import read_flux
-from anser_ros.nodes.model_clouds import NANO
+from anser_ros.nodes.model_clouds import SECOND_NS
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.sighting_words import figures_of, plain_text, title_of, words_of
@@ -136,7 +136,7 @@ class Watcher(AnserNode):
                 p, q = message.pose.position, message.pose.orientation
                 stamp = message.header.stamp
                 pose = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
-                self._window.take_pose(body, stamp.sec * NANO + stamp.nanosec, pose)
+                self._window.take_pose(body, stamp.sec * SECOND_NS + stamp.nanosec, pose)
 
         return take
 
