@@ -74,6 +74,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         items.sort(key=lambda item: (not _has_processes(item), item.path not in long))
 
 
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Refuse a pytest whose test names do not carry the groups: both workers would start nodes."""
+    if 'PYTEST_XDIST_WORKER' in os.environ and session.items:
+        if '@' not in session.items[0].nodeid:
+            raise pytest.UsageError('this pytest and pytest-xdist do not know groups together')
+
+
 _begun: list[pytest.Item] = []
 
 
