@@ -13,7 +13,9 @@ Gains are judged in units of the *misfit*, the mean square of the residuals that
 unexplained residuals a gain must be larger by as much to mean anything.
 
 What an explanation's parameters cost is declared by its effect (`Effect.complexity`), and so is
-the share of its power that its model may miss (`Effect.inexact`).
+the share of its power that its model may miss (`Effect.inexact`). Schwarz's penalty as the price
+of a fluctuation, and the spread by noise for `as_good`, named the few cases that were tried alike
+and none better (`docs/log.md`).
 
 Unless a number says otherwise, it was chosen by hand on injected effects with seeds below 100
 (`test/injection.py`); cases of later seeds that led to a rule are named in `docs/diagnosis.md`.
