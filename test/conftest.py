@@ -76,9 +76,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Refuse a pytest whose test names do not carry the groups: both workers would start nodes."""
-    if 'PYTEST_XDIST_WORKER' in os.environ and session.items:
-        if '@' not in session.items[0].nodeid:
-            raise pytest.UsageError('this pytest and pytest-xdist do not know groups together')
+    names = [item.nodeid for item in session.items]
+    if 'PYTEST_XDIST_WORKER' in os.environ and not all('@' in name for name in names):
+        raise pytest.UsageError('this pytest and pytest-xdist do not know groups together')
 
 
 _begun: list[pytest.Item] = []
