@@ -81,6 +81,24 @@ def pytest_collection_finish(session: pytest.Session) -> None:
         raise pytest.UsageError('this pytest and pytest-xdist do not know groups together')
 
 
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """Give a test marked ``realtime`` the machine alone: the other worker waits between its tests.
+
+    All tests of a run share a lock that such a test takes for itself. A gate before the lock keeps
+    those that come later from passing the one that waits.
+    """
+    if 'PYTEST_XDIST_WORKER' not in os.environ:
+        return (yield)
+    alone = item.get_closest_marker('realtime') is not None
+    shared = item.config._tmp_path_factory.getbasetemp().parent  # the workers' folders are in it
+    with open(shared / 'gate.lock', 'w') as gate, open(shared / 'tests.lock', 'w') as lock:
+        fcntl.flock(gate, fcntl.LOCK_EX)
+        fcntl.flock(lock, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
+        fcntl.flock(gate, fcntl.LOCK_UN)
+        return (yield)
+
+
 _begun: list[pytest.Item] = []
 
 

@@ -183,6 +183,7 @@ def test_bad_usage_is_one_clear_line(words, capsys, tmp_path):
     assert 'must be' in capsys.readouterr().err
 
 
+@pytest.mark.realtime
 def test_demo_runs_and_reports(start, tmp_path):
     demo = start('demo', '--duration', '5', '--out', tmp_path, '--json')
     assert demo.popen.wait(90) == 0, demo.output

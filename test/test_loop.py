@@ -37,6 +37,7 @@ ATTEMPTS = 2
 
 
 @pytest.mark.timeout(300)
+@pytest.mark.realtime
 def test_an_effect_is_found_and_the_next_run_is_better(domain, tmp_path, capsys):
     """Over a pseudo-terminal, DDS, bags and model files, each node in its own process."""
     arguments = ['--effect', 'sensor_gain', '--seed', str(GAIN_SEED), '--duration', '10']
