@@ -1,8 +1,8 @@
 """Effects put into recorded arrays, exactly: what a diagnosis must find, or must not name.
 
 An injection changes the readings and the optical track of a `Subject`, and says what it did.
-Those in `LISTED` are of the contract's table; those in `UNLISTED` are of no table, with the new
-names that would describe them rightly, if any.
+Those in `LISTED` are of the table in `docs/interfaces.md`; those in `UNLISTED` are of no table,
+with the new names that would describe them rightly, if any.
 """
 
 from collections.abc import Callable, Mapping
@@ -125,7 +125,7 @@ class Injection:
         Changes a subject, with a random generator and a relative size; returns the truth.
     stage : int
     allowed : tuple of str
-        Names beside the contract's that describe it rightly.
+        Names beside the listed ones that describe it rightly.
     """
 
     name: str
@@ -194,7 +194,7 @@ def _moved(s: Subject, rows: list[int], offset: np.ndarray) -> None:
     s.flux(flux)
 
 
-# --- the contract's table -------------------------------------------------------------------
+# --- listed effects -----------------------------------------------------------------------
 @_listed(CHANNEL)
 def sensor_gain(s: Subject, rng: np.random.Generator, size: float) -> Truth:
     row, channel = _channel(s, rng)
@@ -645,7 +645,7 @@ def weak_stray_field(s: Subject, rng: np.random.Generator, size: float) -> Truth
 
 @_unlisted(CHANNEL, 'sensor_gain')
 def reference_gain(s: Subject, rng: np.random.Generator, size: float) -> Truth:
-    """One reference channel's gain is off; the contract's name fits it."""
+    """One reference channel's gain is off; the listed name fits it."""
     row = int(rng.integers(len(s.reference.sensors)))
     flux = s.reference.flux.copy()
     gain = 1 + size * _signed(rng, 0.01, 0.04)
@@ -690,7 +690,7 @@ CATALOGUE = (
     'saturation', 'phase_delay', 'static_metal', 'conductive_plate', 'moving_metal',
     'excess_noise', 'outliers',
 )  # fmt: skip
-"""The contract's names."""
+"""The listed names."""
 TOLERANCE: Mapping[str, float] = {
     'gain': 1e-3, 'offset_s': 5e-4, 'offset_m': 1e-4, 'rotation_deg': 0.05,
     'translation_m': 1e-4, 'amount': 1e-3, 'full_scale_t': 0.1,

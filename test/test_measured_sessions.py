@@ -1,4 +1,4 @@
-"""Sessions of measured data: what was measured stands in the bag, in the contract's layout."""
+"""Sessions of measured data: what was measured stands in the bag, in the layout of sessions."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The point layouts: packed as the contract says, read by name and offset, refused when broken."""
+"""The point layouts: packed as the interface says, read by name and offset, refused if broken."""
 
 import numpy as np
 import pytest

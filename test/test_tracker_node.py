@@ -380,10 +380,13 @@ def test_every_kind_of_bad_flux_has_its_counter(tracker):
 @pytest.mark.parametrize('live', [True, False])
 def test_only_live_frames_too_fast_to_solve_are_skipped(tracker, monkeypatch, live):
     """A pause loses none, and neither does a recording that is played faster than it is solved."""
+    from rclpy.parameter import Parameter
+
     rng = np.random.default_rng(9)
     if live:
         tracker.stamp_ns = time.time_ns()
     ready(tracker)
+    tracker.node.set_parameters([Parameter('stale_after_s', value=30.0)])
     flux = fluxes(certain_model(), SENSORS, *random_pose(rng), rng)
     node, whole, pause_s = tracker.node, Tracker.estimates, [0.2]
 

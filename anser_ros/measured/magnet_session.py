@@ -1,8 +1,8 @@
 """Sessions of the magnet data: the magnet is the field generator, the patch the tool.
 
-By reciprocity the contract fits as it stands: frame `fg` is the magnet's own, its one emitter is a
-constant dipole (written as a tone of 1 Hz, since a tone is asked for; all phasors are real), and
-every axis of every sensor is a tool sensor of the rigid body `patch`.
+By reciprocity the layout of sessions fits as it stands: frame `fg` is the magnet's own, its one
+emitter is a constant dipole (written as a tone of 1 Hz, since a tone is asked for; all phasors are
+real), and every axis of every sensor is a tool sensor of the rigid body `patch`.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Frames of somebody else's measurement, written as an MCAP session in the contract's layout."""
+"""Frames of somebody else's measurement, written as an MCAP session that any command reads."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

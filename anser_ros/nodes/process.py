@@ -9,6 +9,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Sequence
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import rclpy
@@ -93,6 +94,15 @@ class _Interrupted(BaseException):
     """A signal came while the node was still being made."""
 
 
+def _is_compiling(frame: FrameType | None) -> bool:
+    """Return whether the compiler is at work: exceptions in its callbacks are printed and lost."""
+    while frame is not None:
+        if str(frame.f_globals.get('__name__', '')).startswith('llvmlite.'):
+            return True
+        frame = frame.f_back
+    return False
+
+
 class _Signals:
     """Catches SIGINT and SIGTERM from now on.
 
@@ -120,9 +130,9 @@ class _Signals:
         for number in ENDING:
             signal.signal(number, signal.SIG_IGN)
 
-    def _catch(self, number: int, _frame: Any) -> None:
+    def _catch(self, number: int, frame: FrameType | None) -> None:
         self.caught.append(number)
-        if not self.is_node_made:
+        if not self.is_node_made and not _is_compiling(frame):
             raise _Interrupted
 
     def _watch(self) -> None:
