@@ -69,6 +69,10 @@ class Accuracy:
     patch_position_m, patch_rotation_rad : float
         Error of the tracked pose of a patch of reference coils along and about each axis, m and
         rad; its coils' gains have ``reference_gain``.
+    stamp_sigma_s : float
+        Error of a flux stamp against the moment that it names, s: a tool at a speed v is where
+        its pose says to v times this. The default is that of a line which delivers in frames of
+        1 ms, as USB does: a delay spread evenly over a frame.
     """
 
     flux_noise_t: float = _value(60e-12, 'noise of a phasor component, T', 1e-15, 1e-3)
@@ -91,6 +95,8 @@ class Accuracy:
     patch_rotation_rad: float = _value(
         2e-3, "error of a patch's tracked orientation about each axis, rad", 0.0, 1.0
     )
+
+    stamp_sigma_s: float = _value(0.3e-3, 'error of a flux stamp, s', 0.0, 0.1)
 
     def __post_init__(self) -> None:
         _check(self)

@@ -24,7 +24,12 @@ from anser_ros.refit.prior import UPRIGHT, build_prior
 from anser_ros.sessions.diagnosis import spread_of
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.prepared import prepare
-from anser_ros.sessions.session import load_session, measured_noise, tracking_noise
+from anser_ros.sessions.session import (
+    load_session,
+    measured_noise,
+    stamp_sigma,
+    tracking_noise,
+)
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.settings import (
     SECTIONS,
@@ -47,6 +52,7 @@ OTHER = {
     'reference_gain': 0.02,
     'patch_position_m': 1e-3,
     'patch_rotation_rad': 0.02,
+    'stamp_sigma_s': 2e-3,
     'emitter_drift': 0.05,
     'min_references': 8,
     'average_frames': 1,
@@ -146,6 +152,16 @@ class TestStating:
         assert tracking_noise(quiet) == Accuracy.flux_noise_t
         stated = told.with_stated({'flux_noise_t': 5e-11})
         assert (measured_noise(stated), tracking_noise(stated)) == (0.0, 5e-11)
+
+
+    def test_the_stamps_error_that_was_measured_gives_way_to_what_is_stated(self):
+        assert stamp_sigma(setup_with()) == Accuracy.stamp_sigma_s
+        assert stamp_sigma(setup_with(stamp_sigma_s=1e-3)) == 1e-3
+        assert stamp_sigma(setup_with(stamp_sigma_s=0)) == 0.0
+        for nonsense in (-1e-3, 'late', True, 5.0, float('nan')):
+            assert stamp_sigma(setup_with(stamp_sigma_s=nonsense)) == Accuracy.stamp_sigma_s
+        stated = setup_with(stamp_sigma_s=1e-3).with_stated({'stamp_sigma_s': 2e-3})
+        assert stamp_sigma(stated) == 2e-3
 
 
 class TestEffect:
@@ -292,9 +308,12 @@ class TestNodes:
     @pytest.mark.parametrize(
         ('table', 'names'),
         [
-            (FieldModelParameters, [n for n in VALUES if not n.startswith('optical')]),
-            (WatcherParameters, [n for n in SECTIONS['accuracy'] if not n.startswith('patch')]),
-            (TrackerParameters, ['flux_noise_t']),
+            (FieldModelParameters, [n for n in VALUES if not n.startswith(('optical', 'stamp'))]),
+            (
+                WatcherParameters,
+                [n for n in SECTIONS['accuracy'] if not n.startswith(('patch', 'stamp'))],
+            ),
+            (TrackerParameters, ['flux_noise_t', 'stamp_sigma_s']),
         ],
     )
     def test_parameters_state_what_their_node_uses(self, table, names):

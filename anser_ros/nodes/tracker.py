@@ -58,6 +58,7 @@ class TrackerParameters:
         'none',
     )
     flux_noise_t: float = stated('flux_noise_t')
+    stamp_sigma_s: float = stated('stamp_sigma_s')
     adaptive: bool = parameter(
         TrackerSettings.adaptive,
         'whether the noise follows the residuals of good poses',

@@ -21,6 +21,9 @@ NANO = 1e-9
 MOST_NOISE_T = 1e-3
 """Noise, T, from which on a setup's statement is taken for a mistake and not used. The emitters
 make microtesla at most, so that nothing could be tracked in so much noise."""
+MOST_STAMP_SIGMA_S = 0.1
+"""Error of the stamps, s, from which on a setup's statement is taken for a mistake and not used: a
+hand at 0.1 m/s would be a centimetre off. Smaller, a slow recorder could not say what it is."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,18 @@ def measured_noise(setup: Setup) -> float:
 def tracking_noise(setup: Setup) -> float:
     """Noise that tracking starts from, T: what is stated, or was measured where that is larger."""
     return max(setup.accuracy.flux_noise_t, measured_noise(setup))
+
+
+def stamp_sigma(setup: Setup) -> float:
+    """Error of the fluxes' stamps, s: what is stated, else what the acquisition measured.
+
+    Where the setup tells neither, it is the default of `anser_ros.settings.Accuracy`.
+    """
+    told = setup.extra.get('stamp_sigma_s', -1.0)
+    is_number = isinstance(told, (int, float)) and not isinstance(told, bool)
+    if 'stamp_sigma_s' not in setup.stated and is_number and 0.0 <= told <= MOST_STAMP_SIGMA_S:
+        return float(told)
+    return setup.accuracy.stamp_sigma_s
 
 
 def pose_track(stream: PoseStream, start_ns: int) -> PoseTrack:
