@@ -153,7 +153,6 @@ class TestStating:
         stated = told.with_stated({'flux_noise_t': 5e-11})
         assert (measured_noise(stated), tracking_noise(stated)) == (0.0, 5e-11)
 
-
     def test_the_stamps_error_that_was_measured_gives_way_to_what_is_stated(self):
         assert stamp_sigma(setup_with()) == Accuracy.stamp_sigma_s
         assert stamp_sigma(setup_with(stamp_sigma_s=1e-3)) == 1e-3
