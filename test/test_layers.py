@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 FILES = sorted(PACKAGE.rglob('*.py'))
 CORE = {
     'physics', 'signals', 'wire', 'frames', 'field', 'metal', 'calibration', 'refit', 'effects',
-    'tracking', 'diagnosis', 'sessions',
+    'tracking', 'diagnosis', 'sessions', 'integrity',
 }  # fmt: skip
 # What each layer may import of ours, itself and the errors aside.
 ALLOWED = {
@@ -23,13 +23,14 @@ ALLOWED = {
     'field': {'physics'},
     'metal': {'field', 'physics'},
     'calibration': {'field', 'physics'},
-    'refit': {'frames', 'field', 'metal', 'physics'},
+    'integrity': {'frames', 'field', 'physics'},
+    'refit': {'integrity', 'frames', 'field', 'metal', 'physics'},
     'effects': {'field', 'metal', 'physics'},
-    'tracking': {'frames', 'effects', 'field', 'physics'},
+    'tracking': {'integrity', 'frames', 'effects', 'field', 'physics'},
     'diagnosis': {'effects', 'field', 'metal', 'physics'},
     'sessions': {
-        'wire', 'frames', 'diagnosis', 'tracking', 'calibration', 'refit', 'effects', 'field',
-        'metal', 'physics',
+        'wire', 'frames', 'integrity', 'diagnosis', 'tracking', 'calibration', 'refit', 'effects',
+        'field', 'metal', 'physics',
     },
     'simulation': {'sessions', 'effects', 'field', 'metal', 'physics', 'signals', 'wire'},
     'measured': CORE,

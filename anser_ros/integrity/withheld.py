@@ -1,0 +1,25 @@
+"""Why no pose is given though one could be solved: a state, and the reason in words."""
+
+from typing import NamedTuple
+
+REFERENCES_LOST = 'references_lost'
+"""The references were silent, or too few, for longer than a model holds without them."""
+REFERENCES_DOUBTFUL = 'references_doubtful'
+"""The references contradict each other, and which of them are right cannot be told."""
+STATES = (REFERENCES_LOST, REFERENCES_DOUBTFUL)
+"""The states in which the whole chain gives no pose; their places are their codes, from 1."""
+
+
+class Withheld(NamedTuple):
+    """One reason for which all poses of a frame are withheld.
+
+    Attributes
+    ----------
+    state : str
+        One of `STATES`.
+    reason : str
+        What `/diagnostics` says of it, with figures.
+    """
+
+    state: str
+    reason: str
