@@ -46,3 +46,7 @@ class ParameterError(AnserError):
 
 class DiagnosisError(AnserError):
     """A session that can't be diagnosed."""
+
+
+class PlausibilityError(AnserError):
+    """Data that contradict their own units, clocks or conventions."""

@@ -12,7 +12,8 @@ from rich.console import Console
 
 from anser_ros.calibration.error_map import ErrorMap, learn_error_map
 from anser_ros.cli.output import make_folder, say_written
-from anser_ros.errors import FitError, ParameterError
+from anser_ros.errors import FitError, ParameterError, PlausibilityError
+from anser_ros.sessions.plausibility import check_points
 
 SCHEMA = 'anser_error_map/1'
 TRACKED = ('x_m', 'y_m', 'z_m')
@@ -42,9 +43,12 @@ def run(args: argparse.Namespace) -> int:
     """Run the command and return the exit code."""
     rows, _ = _read(args.points)
     make_folder(args.out)
-    error_map = learn_error_map(
-        _columns(rows, TRACKED, args.points), _columns(rows, TRUE, args.points)
-    )
+    tracked, true = (_columns(rows, names, args.points) for names in (TRACKED, TRUE))
+    try:
+        check_points(tracked, true)
+    except PlausibilityError as error:
+        raise PlausibilityError(f'{args.points}: {error}') from error
+    error_map = learn_error_map(tracked, true)
     if args.apply is not None:
         poses, names = _read(args.apply)
         corrected = error_map.apply(_columns(poses, TRACKED, args.apply))

@@ -69,13 +69,19 @@ def build_problem(
     Raises
     ------
     DiagnosisError
-        When fewer than 30 frames have fluxes and a pose.
+        When fewer than 30 frames have fluxes and a pose, or all poses are the same.
     """
     posed = tuple(t for t in (_with_pose(tool) for tool in tools) if t.time.size)
     count = sum(tool.time.size for tool in posed)
     if count < FEWEST_FRAMES:
         raise DiagnosisError(
             f'a diagnosis needs at least {FEWEST_FRAMES} frames with an optical pose, got {count}'
+        )
+    if not any(
+        np.ptp(t.position, axis=0).any() or np.ptp(t.rotation, axis=0).any() for t in posed
+    ):
+        raise DiagnosisError(
+            f'all {count} optical poses are the same: a diagnosis needs a tool that moves'
         )
     ends = [tool.time for tool in posed]
     start, end = min(t[0] for t in ends), max(t[-1] for t in ends)

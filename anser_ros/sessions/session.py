@@ -12,6 +12,7 @@ from anser_ros.field.measurements import Measurements
 from anser_ros.frames.faults import GOOD, value_codes
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.sessions.plausibility import plausible_tools
 from anser_ros.wire.bag import Bag, PoseStream, RecordedFluxes, read_bag
 from anser_ros.wire.points import STALE
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
@@ -186,8 +187,22 @@ def session_of(bag: Bag) -> Session:
 
 
 def load_session(path: str | os.PathLike[str]) -> Session:
-    """Read a bag as a session; raises `BagError`."""
-    return session_of(read_bag(path))
+    """Read a bag as a session that is plausible.
+
+    Poses of an optical tracker that stood still while the tool moved are left out; `Session.lost`
+    says so.
+
+    Raises
+    ------
+    BagError
+        When the bag can't be read.
+    PlausibilityError
+        When units, clocks or the order of quaternions contradict what was recorded.
+    """
+    bag = read_bag(path)
+    session = session_of(bag)
+    tools, left_out = plausible_tools(bag.path, bag.setup, session.tools, bag.refused)
+    return replace(session, tools=tools, lost='; '.join(filter(None, (session.lost, left_out))))
 
 
 def empty_session(setup: Setup, path: str) -> Session:

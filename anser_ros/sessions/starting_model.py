@@ -1,5 +1,7 @@
 """The field model that a command starts from: a file, or the nominal one of the setup."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from anser_ros.errors import ModelFileError
@@ -7,8 +9,10 @@ from anser_ros.field.model import FieldModel
 from anser_ros.field.nominal import nominal_model
 from anser_ros.physics.board import Board, build_board
 from anser_ros.sessions.model_file import load_model
-from anser_ros.sessions.session import Session
 from anser_ros.wire.setup import Setup
+
+if TYPE_CHECKING:  # a session is checked against the drawing that is made here
+    from anser_ros.sessions.session import Session
 
 NOMINAL = 'nominal'
 """Name of the model of the setup's own geometry, given where a model file's path may stand."""
@@ -52,7 +56,7 @@ def check_emitters(setup: Setup, given: FieldModel) -> None:
         )
 
 
-def model_for(name: str, session: Session) -> FieldModel:
+def model_for(name: str, session: 'Session') -> FieldModel:
     """The model that ``name`` stands for: a file's path, or ``nominal``.
 
     Raises
@@ -69,7 +73,7 @@ def model_for(name: str, session: Session) -> FieldModel:
     return model
 
 
-def check_fits(model: FieldModel, session: Session) -> None:
+def check_fits(model: FieldModel, session: 'Session') -> None:
     """Raise `ModelFileError` when the model's emitters are not the session's."""
     names = session.setup.emitter_names
     if model.emitters != names:

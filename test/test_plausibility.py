@@ -1,0 +1,228 @@
+"""Units, orders and clocks that contradict a recording are named before anything works on it.
+
+The recordings are those of bags/, written down wrongly in ways that people do.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from anser_ros.cli.main import main
+from anser_ros.errors import DiagnosisError, PlausibilityError
+from anser_ros.physics.pose_track import PoseTrack
+from anser_ros.sessions.diagnosis import diagnose_session
+from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.plausibility import check_points, plausible_tools
+from anser_ros.sessions.session import load_session
+from anser_ros.sessions.units import FLUX_UNITS, LENGTH_UNITS, unit_words
+from anser_ros.wire.bag import read_bag
+from anser_ros.wire.bag_writer import SessionWriter
+from anser_ros.wire.points import FluxPoints, encode_flux
+
+ROOT = Path(__file__).resolve().parents[1]
+MODEL = ROOT / 'config' / 'demo_model.yaml'
+
+
+@pytest.fixture(scope='module')
+def moving():
+    return load_session(ROOT / 'bags' / 'moving.mcap')
+
+
+def checked(session, tool, refused=None):
+    tools, left_out = plausible_tools('bag', session.setup, (tool,), refused or {})
+    return tools[0], left_out
+
+
+def with_track(tool, time=None, position=None, quaternion=None):
+    """The tool with optical poses that were written down another way."""
+    old = tool.track
+    track = PoseTrack(
+        old.time if time is None else time,
+        old.position if position is None else position,
+        old.quaternion if quaternion is None else quaternion,
+    )
+    place, turn, has_pose = track.at(tool.time)
+    return replace(tool, track=track, position=place, rotation=turn, has_pose=has_pose)
+
+
+def says(session, tool, *words, refused=None):
+    with pytest.raises(PlausibilityError) as caught:
+        checked(session, tool, refused)
+    text = str(caught.value)
+    assert all(word in text for word in words), text
+    assert '\n' not in text
+
+
+def test_what_is_right_passes_unchanged(moving):
+    (tool,) = moving.tools
+    same, left_out = checked(moving, tool)
+    assert same is tool and left_out == '' and moving.lost == ''
+
+
+@pytest.mark.parametrize('unit', LENGTH_UNITS)
+def test_positions_in_another_unit(moving, unit):
+    (tool,) = moving.tools
+    wrong = with_track(tool, position=LENGTH_UNITS[unit] * tool.track.position)
+    says(moving, wrong, f'positions in {unit}', 'span')
+    also = with_track(wrong, quaternion=tool.track.quaternion[:, [3, 0, 1, 2]])
+    says(moving, also, f'positions in {unit} and quaternions with w first')
+
+
+def test_positions_far_away_need_no_drawing(moving):
+    """A board that can't be drawn explains no flux; its tracked volume still bounds the poses."""
+    (tool,) = moving.tools
+    emitter = replace(moving.setup.emitter, kind='somebody_elses')
+    undrawn = replace(moving, setup=replace(moving.setup, emitter=emitter))
+    assert Drawing.of(undrawn.setup).field is None
+    assert checked(undrawn, tool)[1] == ''
+    far = with_track(tool, position=1e3 * tool.track.position)
+    says(undrawn, far, 'span', 'millimetres?')
+
+
+def test_quaternions_in_another_order(moving):
+    (tool,) = moving.tools
+    first = with_track(tool, quaternion=tool.track.quaternion[:, [3, 0, 1, 2]])
+    says(moving, first, 'quaternions with w first', '100 %')
+    inverse = with_track(tool, quaternion=tool.track.quaternion * [-1, -1, -1, 1])
+    says(moving, inverse, 'rotations from fg to the body')
+
+
+def test_what_cannot_be_decided_is_not_said(moving):
+    """An optical frame that is not the board's explains nothing in any order."""
+    (tool,) = moving.tools
+    turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    elsewhere = with_track(tool, position=tool.track.position @ turn.T + 0.3)
+    assert checked(moving, elsewhere)[1] == ''
+    # Nor is a tool whose every third coil is wired the other way round.
+    flip = np.where(np.arange(len(tool.sensors)) % 3 == 0, -1.0, 1.0)[:, None]
+    assert checked(moving, replace(tool, flux=flip * tool.flux))[1] == ''
+
+
+@pytest.mark.parametrize('unit', FLUX_UNITS)
+def test_fluxes_in_another_unit(moving, unit):
+    (tool,) = moving.tools
+    larger = replace(tool, flux=FLUX_UNITS[unit] * tool.flux)
+    says(moving, larger, f'{unit}?', 'drawn board')
+    blind = replace(larger, track=None, has_pose=np.zeros_like(tool.has_pose))
+    if unit == 'millitesla':  # without poses, so much could still be near a coil
+        assert checked(moving, blind)[1] == ''
+    else:
+        says(moving, blind, '?', 'drawn board')
+
+
+def test_clocks_that_do_not_overlap(moving):
+    (tool,) = moving.tools
+    says(moving, with_track(tool, time=tool.track.time + 3600.0), 'after the last flux', 'clocks')
+    says(moving, with_track(tool, time=tool.track.time - 3600.0), 'before the first flux')
+
+
+def test_a_frozen_optical_tracker(moving):
+    """It repeats its last pose; such poses are left out, and most of them are too many."""
+    (tool,) = moving.tools
+    track = tool.track
+    size = track.time.size
+
+    def frozen(first, last):
+        rows = np.arange(size)
+        rows[first:last] = first
+        return with_track(tool, position=track.position[rows], quaternion=track.quaternion[rows])
+
+    some = frozen(size // 2, size // 2 + size // 4)
+    kept, left_out = checked(moving, some)
+    inside = (tool.time > track.time[size // 2 + 5]) & (
+        tool.time < track.time[size // 2 + size // 4 - 5]
+    )
+    assert 'bit for bit' in left_out and not kept.has_pose[inside].any()
+    assert kept.has_pose[~inside].sum() > 0.9 * tool.has_pose[~inside].sum()
+    says(moving, frozen(10, size), 'bit for bit', 'frozen?')
+    # A tool at rest has the same pose for a good reason.
+    rest = replace(frozen(0, size), flux=np.broadcast_to(tool.flux[:1], tool.flux.shape))
+    assert checked(moving, rest)[1] == ''
+
+
+def test_quaternions_that_are_none(moving):
+    (tool,) = moving.tools
+    reason = f'/optical/{tool.body}/pose: a quaternion not of unit length'
+    none = replace(tool, track=None, has_pose=np.zeros_like(tool.has_pose))
+    says(moving, none, 'all 7 optical poses', 'unit length', refused={reason: 7})
+    assert '7 optical poses' in checked(moving, tool, {reason: 7})[1]
+
+
+def test_a_diagnosis_of_one_pose_ends_at_once(moving):
+    (tool,) = moving.tools
+    track = tool.track
+    rest = with_track(
+        tool,
+        position=np.broadcast_to(track.position[:1], track.position.shape),
+        quaternion=np.broadcast_to(track.quaternion[:1], track.quaternion.shape),
+    )
+    with pytest.raises(DiagnosisError, match='optical poses are the same'):
+        diagnose_session(replace(moving, tools=(rest,)), load_model(MODEL))
+
+
+def test_commands_say_it_in_one_line(tmp_path, capsys):
+    bag = read_bag(ROOT / 'bags' / 'moving.mcap')
+    path = tmp_path / 'millimetres.mcap'
+    with SessionWriter(path) as writer:
+        writer.write_setup(bag.setup_text, int(bag.tool.stamp_ns[0]))
+        _copy_fluxes(writer, bag)
+        for body, stream in bag.optical.items():
+            rows = zip(stream.stamp_ns.tolist(), stream.position, stream.quaternion, strict=True)
+            for stamp, position, quaternion in rows:
+                writer.write_pose(f'/optical/{body}/pose', stamp, 1e3 * position, quaternion)
+    out = ['--out', str(tmp_path / 'out')]
+    for command in (
+        ['calibrate', str(path), *out],
+        ['evaluate', str(path), '--model', str(MODEL), *out],
+        ['diagnose', str(path), '--model', str(MODEL), *out],
+        ['evaluate', str(ROOT / 'bags' / 'moving.mcap'), '--model', str(MODEL), *out,
+         '--baseline', str(path)],
+    ):  # fmt: skip
+        assert main(command) == 2
+        said = capsys.readouterr().err
+        assert 'millimetres' in said and said.count('\n') == 1, said
+
+
+def _copy_fluxes(writer, bag):
+    empty = np.full((bag.tool.channel.size, 3), np.nan)
+    for stamp, flux in zip(bag.tool.stamp_ns.tolist()[::10], bag.tool.flux[::10], strict=True):
+        points = FluxPoints(bag.tool.channel, np.zeros(len(empty), int), flux, empty, empty)
+        fields, step, data = encode_flux(points)
+        writer.write_flux('/anser/tool/flux', stamp, fields, step, len(empty), data)
+
+
+def test_points_of_an_error_map():
+    rng = np.random.default_rng(2)
+    true = rng.uniform(-0.1, 0.1, (30, 3))
+    tracked = true + 1e-3 * rng.standard_normal((30, 3))
+    check_points(tracked, true)
+    check_points(np.full((3, 3), np.nan), np.zeros((3, 3)))
+    for unit, size in LENGTH_UNITS.items():
+        for one, other in ((tracked, size * true), (size * tracked, true)):
+            with pytest.raises(PlausibilityError, match=unit):
+                check_points(one, other)
+    with pytest.raises(PlausibilityError, match=r'span 3.*millimetres'):
+        check_points(1e3 * tracked, 1e3 * true)
+    with pytest.raises(PlausibilityError, match='all 30 true positions are the same'):
+        check_points(tracked, np.tile(true[:1], (30, 1)))
+
+
+def test_an_error_map_in_two_units_is_one_line(tmp_path, capsys):
+    rng = np.random.default_rng(3)
+    rows = rng.uniform(0.0, 0.2, (20, 3))
+    path = tmp_path / 'points.csv'
+    lines = ['x_m,y_m,z_m,true_x_m,true_y_m,true_z_m']
+    lines += [','.join(f'{v:.6f}' for v in (*row, *(1e3 * row))) for row in rows]
+    path.write_text('\n'.join(lines) + '\n')
+    assert main(['error_map', str(path), '--out', str(tmp_path / 'out')]) == 2
+    assert 'millimetres?' in capsys.readouterr().err
+
+
+def test_units_are_told_by_their_size():
+    assert unit_words(850.0, LENGTH_UNITS) == 'millimetres'
+    assert unit_words(2.0e6, FLUX_UNITS) == 'microtesla'
+    assert unit_words(5.0, LENGTH_UNITS) == unit_words(0.0, LENGTH_UNITS) == ''
+    assert unit_words(float('inf'), FLUX_UNITS) == ''
