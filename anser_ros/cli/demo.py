@@ -17,9 +17,9 @@ import time
 from pathlib import Path
 
 from anser_ros.cli.demo_report import FROZEN, MEANINGS, draw, load, summarise
-from anser_ros.cli.kernels import compile_kernels
 from anser_ros.cli.output import make_folder
 from anser_ros.cli.supervisor import Supervisor, tail
+from anser_ros.cli.warm_up import compile_kernels
 from anser_ros.errors import ParameterError
 from anser_ros.wire.bag_metadata import told
 from anser_ros.wire.config_folder import config_path
@@ -98,12 +98,7 @@ def _run_in(folder: Path, args: argparse.Namespace, stopped: list[int]) -> int:
     failed = ''
     try:
         with Supervisor(folder / 'logs') as supervisor:
-            ended = compile_kernels(
-                supervisor, lambda text: _say(text, args), lambda: bool(stopped)
-            )
-            if ended is not None:
-                print(f'anser demo: no kernels\n{tail(ended)}', file=sys.stderr)
-                return 1
+            compile_kernels(lambda text: _say(text, args), lambda: bool(stopped))
             if stopped:
                 return _report(folder, args, interrupted=True)
             for name, command in _commands(folder, ports / 'cu', args):

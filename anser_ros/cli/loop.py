@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from anser_ros.cli.kernels import compile_kernels
 from anser_ros.cli.loop_result import parameter_errors, second_run, table, verdict
 from anser_ros.cli.loop_run import AFTER, LoopFiles, Run, make_world, record
 from anser_ros.cli.output import make_folder, say_written
-from anser_ros.cli.supervisor import Supervisor, tail
+from anser_ros.cli.warm_up import compile_kernels
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import DiagnosisError, ParameterError
 from anser_ros.sessions.model_file import load_model
@@ -86,10 +85,7 @@ def run(args: argparse.Namespace) -> int:
     folder = args.out / time.strftime('loop_%Y%m%d_%H%M%S')
     make_folder(folder)
     say = Console(stderr=True, highlight=False)
-    with Supervisor(folder / 'logs') as supervisor:
-        failed = compile_kernels(supervisor, say.print, lambda: False)
-        if failed is not None:
-            raise DiagnosisError(f'no kernels: {tail(failed)}')
+    compile_kernels(say.print)
     world, clean = make_world(folder), None
     if args.clean:
         say.print(f'a clean recording, {args.clean:g} s')

@@ -111,6 +111,7 @@ class CuSimulator(AnserNode):
 
     NAME = 'cu_simulator'
     PARAMETERS = CuSimulatorParameters
+    HAS_KERNELS = True
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

@@ -90,6 +90,7 @@ class FieldModelNode(AnserNode):
 
     NAME = 'field_model'
     PARAMETERS = FieldModelParameters
+    HAS_KERNELS = True
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

@@ -213,7 +213,7 @@ class Monitor(AnserNode):
 
     def _title(self) -> str:
         if self._first_s is None:
-            return 'waiting for the first pose'
+            return f'waiting for the first pose: {self._problems()}'
         end_s = self.parameters.duration_s
         ran_s = time.monotonic() - self._first_s
         return f'{ran_s:.0f} s' + (f' of {end_s:.0f} s' if end_s else '')

@@ -35,6 +35,7 @@ from rclpy.parameter import Parameter
 from anser_ros.errors import AnserError
 from anser_ros.nodes import parameters, qos
 from anser_ros.nodes.diagnostics import Level, Status, Throttle, diagnostic_array
+from anser_ros.nodes.kernel_start import wait_for_kernels
 from anser_ros.nodes.process import main
 
 NAMESPACE = 'anser'
@@ -67,6 +68,8 @@ class AnserNode(Node):
 
     NAME: ClassVar[str]
     PARAMETERS: ClassVar[type] = NoParameters
+    HAS_KERNELS: ClassVar[bool] = False
+    """Whether the node calculates with compiled kernels, and waits until all are there."""
 
     def __init__(self, **options: Any) -> None:
         # The base class already creates services, so what guards them must be there first.
@@ -83,6 +86,10 @@ class AnserNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.EVENTS)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(DIAGNOSTICS_PERIOD_S, self.publish_diagnostics, clock=self.steady_clock)
+        if self.HAS_KERNELS:
+            trouble = wait_for_kernels(self._say_starting)
+            if trouble:
+                self.warn('kernels_not_compiled', trouble)
 
     # What a node may override -------------------------------------------------------------
 
@@ -130,6 +137,12 @@ class AnserNode(Node):
         self._send_statuses(
             replace(self._status_with_counters(), level=Level.STALE, message='ended')
         )
+
+    def _say_starting(self, text: str) -> None:
+        """Say what the start waits for, in the log once and in ``/diagnostics``."""
+        if self._throttle.admit('start', text, time.monotonic()) is not None:
+            self.get_logger().info(text)
+        self._send_statuses(Status('', Level.WARN, text))
 
     def _status_with_counters(self) -> Status:
         own = self.status()

@@ -142,6 +142,7 @@ class TrackerNode(AnserNode):
 
     NAME = 'tracker'
     PARAMETERS = TrackerParameters
+    HAS_KERNELS = True
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

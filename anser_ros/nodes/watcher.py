@@ -80,6 +80,7 @@ class Watcher(AnserNode):
 
     NAME = 'watcher'
     PARAMETERS = WatcherParameters
+    HAS_KERNELS = True
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)

@@ -1,0 +1,203 @@
+"""Compile all numerical kernels once, so that no later start of a node or command waits for them.
+
+Nodes do this by themselves when they start with an empty cache. For the image of a machine, or an
+installer, it can be done before: as the user who will run the nodes.
+"""
+
+import argparse
+import contextlib
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numba.core.event
+from numba.core.dispatcher import Dispatcher
+
+from anser_ros.errors import ParameterError
+from anser_ros.field.model import FieldModel
+from anser_ros.frames.intake import fill_frame
+from anser_ros.kernel_cache import KernelCache, folder_of
+from anser_ros.wire.config_folder import config_path, read_config
+from anser_ros.wire.setup import parse_setup
+
+POLL_S = 0.2
+"""Time from one look at the processes to the next, s: how late their end is noticed."""
+SAY_S = 5.0
+"""Time from one line about the progress to the next, s."""
+SECOND_NS = 1_000_000_000
+"""Nanoseconds in a second."""
+PACKAGE = 'anser_ros.'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command line, which has no options."""
+
+
+def run(_args: argparse.Namespace) -> int:
+    """Compile what is not there yet, and say how far that is.
+
+    Raises
+    ------
+    ParameterError
+        When a kernel can't be compiled.
+    """
+    compile_kernels(lambda text: print(text, flush=True))
+    print('all kernels are compiled')
+    return 0
+
+
+def compile_kernels(
+    say: Callable[[str], None], is_stopped: Callable[[], bool] = lambda: False
+) -> None:
+    """Let processes compile all kernels, unless they are there.
+
+    Parameters
+    ----------
+    say : callable
+        Gets a line at the start and every few seconds, none where all is there.
+    is_stopped : callable
+        Whether to give up, which is no error.
+
+    Raises
+    ------
+    ParameterError
+        When a process fails, with its last line.
+    """
+    cache = KernelCache(folder_of(fill_frame))
+    if cache.is_full:
+        return
+    with cache.locked():
+        if cache.is_full:
+            return
+        cache.begin()
+        begin_s = said_s = time.monotonic()
+        say(f'compiling {cache.total} kernels, once after an installation')
+        with _processes() as running:
+            while any(process.poll() is None for process in running):
+                if is_stopped():
+                    return
+                if time.monotonic() - said_s > SAY_S:
+                    said_s = time.monotonic()
+                    say(f'{cache.done} of {cache.total} kernels, {said_s - begin_s:.0f} s')
+                time.sleep(POLL_S)
+            for process in running:
+                if process.returncode:
+                    lines = process.communicate()[1].splitlines() or ['no word']
+                    raise ParameterError(f'kernels cannot be compiled: {lines[-1]}')
+        cache.finish()
+
+
+@contextlib.contextmanager
+def _processes() -> Iterator[list['subprocess.Popen[str]']]:
+    """Start a process for each part; end those that are left."""
+    command = [sys.executable, '-P', '-m', 'anser_ros.cli.warm_up']
+    running = [
+        subprocess.Popen(
+            [*command, part], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE, text=True,
+        )
+        for part in PARTS
+    ]  # fmt: skip
+    try:
+        yield running
+    finally:
+        for process in running:
+            if process.poll() is None:
+                process.kill()
+            process.communicate()
+
+
+class _Listener(numba.core.event.Listener):
+    """Notes every kernel of the package that has been compiled."""
+
+    def __init__(self, cache: KernelCache) -> None:
+        self._cache = cache
+
+    def on_start(self, event: Any) -> None:
+        """Do nothing: a kernel counts when it is there."""
+
+    def on_end(self, event: Any) -> None:
+        """Note a kernel."""
+        function = event.data['dispatcher'].py_func
+        if function.__module__.startswith(PACKAGE):
+            self._cache.add(f'{function.__module__}.{function.__qualname__}')
+
+
+def kernels() -> dict[str, Dispatcher]:
+    """Return all kernels of the modules that have been imported, by name."""
+    rooms = [module for name, module in sys.modules.items() if name.startswith(PACKAGE)]
+    found = [v for room in rooms for v in vars(room).values() if isinstance(v, Dispatcher)]
+    return {f'{k.py_func.__module__}.{k.py_func.__qualname__}': k for k in found}
+
+
+def main(part: str) -> int:
+    """Call the kernels of one part the way that nodes and commands do."""
+    cache = KernelCache(folder_of(fill_frame))
+    numba.core.event.register('numba:compile', _Listener(cache))
+    for step in PARTS[part]:
+        step()
+    for name, kernel in kernels().items():
+        if kernel.signatures:
+            cache.add(name)
+    return 0
+
+
+def _track() -> None:
+    from anser_ros.tracking.warm_up import warm_up
+
+    warm_up()
+
+
+def _solve_body() -> None:
+    import numpy as np
+
+    from anser_ros.tracking.estimate import TrackerSettings
+    from anser_ros.tracking.rigid import BodyCoils, solve_body, start_from_grid
+    from anser_ros.tracking.solve_context import build_context
+
+    model = _demo_model()
+    context = build_context(model, TrackerSettings())
+    coils = BodyCoils(np.zeros((3, 3)), np.eye(3), np.zeros(3))
+    flux = model.flux(coils.offsets + [0.0, 0.0, 0.15], coils.axes, coils.lengths).view(np.float64)
+    weights = np.tile(1.0 / context.sigma, (3, 1))
+    common = np.zeros((0, weights.size))
+    for start in start_from_grid(context.grid, context.field, coils, flux):
+        solve_body(context.field, coils, flux, weights, common, *start, context.low, context.high)
+
+
+def _refit() -> None:
+
+    from anser_ros.refit.live_refit import LiveRefit
+    from anser_ros.sessions.session import sensor_table
+    from anser_ros.sessions.starting_model import board_of
+    from anser_ros.simulation.board_source import board_source
+    from anser_ros.simulation.metal import steel_disc
+    from anser_ros.simulation.motion import Approach
+    from anser_ros.simulation.world import World
+
+    setup = parse_setup(read_config('demo_setup.yaml'))
+    source, near = board_source(setup), Approach(start_s=-1e3, travel_s=1.0, stay_s=1e6)
+    references = sensor_table(setup.reference_sensors)
+    clean, bent = (
+        World(setup, source, metal=metal).flux(0.0)[len(setup.tool_sensors) :]
+        for metal in ([], [steel_disc(near)])
+    )
+    refit = LiveRefit(_demo_model(), references, clean, drawing=board_of(setup).field)
+    for frame, flux in enumerate((clean, bent, bent, bent)):
+        refit.update(SECOND_NS + frame * 20_000_000, references.channel, flux)
+
+
+def _demo_model() -> FieldModel:
+    from anser_ros.sessions.model_file import load_model
+
+    return load_model(config_path('demo_model.yaml'))
+
+
+PARTS = {'coils': (_track,), 'metal and bodies': (_refit, _solve_body, _track)}
+"""What each of the processes does. What one has compiled the other one loads."""
+
+
+if __name__ == '__main__':
+    sys.exit(main(sys.argv[1]))

@@ -1,0 +1,54 @@
+"""The first start of a node after an installation: it waits until all kernels are compiled."""
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+from anser_ros.frames.intake import fill_frame
+from anser_ros.kernel_cache import KernelCache, folder_of
+
+POLL_S = 0.1
+"""Time from one look at the compiling process to the next, s: how late its end is noticed."""
+SAY_S = 1.0
+"""Time from one word about the progress to the next, s, as of a node that runs."""
+
+
+def wait_for_kernels(say: Callable[[str], None]) -> str:
+    """Have all kernels compiled if they are not, and tell meanwhile how far that is.
+
+    Of nodes that start together one process compiles, and the others wait for it.
+
+    Parameters
+    ----------
+    say : callable
+        Gets a line at once and every second, none where all kernels are there.
+
+    Returns
+    -------
+    str
+        Why it failed, empty when all is there. The node may go on all the same: it then compiles
+        what it needs when it needs it.
+    """
+    cache = KernelCache(folder_of(fill_frame))
+    if cache.is_full:
+        return ''
+    command = [sys.executable, '-P', '-m', 'anser_ros.cli.main', 'warm_up']
+    process = subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+        text=True,
+    )  # fmt: skip
+    said_s = -SAY_S
+    try:
+        while process.poll() is None:
+            if time.monotonic() - said_s >= SAY_S:
+                said_s = time.monotonic()
+                say(
+                    f'compiling kernels, once after an installation: {cache.done} of {cache.total}'
+                )
+            time.sleep(POLL_S)
+    finally:
+        if process.poll() is None:
+            process.terminate()
+        words = process.communicate()[1].strip().splitlines()
+    return (words or ['no kernels'])[-1] if process.returncode else ''
