@@ -6,9 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from anser_ros.errors import LayoutError
+from anser_ros.wire.cdr import cloud_bytes, cloud_head
 from anser_ros.wire.points import (
     DROPPED,
     FLOAT32,
+    MOST_POINTS,
     SATURATED,
     STALE,
     DipolePoints,
@@ -17,6 +19,7 @@ from anser_ros.wire.points import (
     decode_flux,
     encode_field_model,
     encode_flux,
+    flux_fields,
 )
 
 
@@ -153,3 +156,19 @@ def test_hostile_clouds_raise_only_layout_errors(fields, step, width, data):
     for decode in (decode_flux, decode_field_model):
         with pytest.raises(LayoutError):
             decode(fields, step, width, data)
+
+
+def test_more_points_than_channels_are_refused_before_they_are_read():
+    fields, step = flux_fields(8)
+    count = MOST_POINTS + 1
+    with pytest.raises(LayoutError, match=f'{count} points are refused'):
+        decode_flux(fields, step, count, bytes(step * count))
+
+
+def test_the_head_of_a_cloud_is_read_without_the_rest():
+    fields, step, data = encode_flux(flux_points())
+    whole = cloud_bytes(5, 'a frame of any length', fields, step, 4, data)
+    assert cloud_head(whole) == (1, 4, len(fields))
+    assert cloud_head(whole[:60]) == (1, 4, len(fields))
+    with pytest.raises(LayoutError, match='no cloud in 30 bytes'):
+        cloud_head(whole[:30])

@@ -57,7 +57,7 @@ class Backlog:
 
 
 def take_waiting(subscription: Any) -> list[Any]:
-    """Messages that wait in a subscription's queue, oldest first; they are out of it then."""
+    """Messages, as bytes, that wait in a subscription's queue, oldest first; they leave it so."""
     taken = []
     with subscription.handle:
         while True:

@@ -18,9 +18,6 @@ from anser_ros.wire.points import (
 
 SECOND_NS = 1_000_000_000
 """Nanoseconds in a second."""
-MOST_BYTES = 64_000_000
-"""Size of a message, bytes, beyond which it is refused: far more than any sensible model has, and
-far less than would exhaust the memory."""
 
 
 class CloudMaker:
@@ -119,12 +116,10 @@ def width_of(message: PointCloud2) -> int:
     Raises
     ------
     LayoutError
-        When the cloud has more rows or is far too big.
+        When the cloud has more rows.
     """
     if message.height != 1:
         raise LayoutError(f'the cloud must have height 1, got {message.height}')
-    if len(message.data) > MOST_BYTES:
-        raise LayoutError(f'{len(message.data)} bytes are too many for a cloud')
     return int(message.width)
 
 

@@ -33,7 +33,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from anser_ros.errors import AnserError
-from anser_ros.nodes import parameters, qos
+from anser_ros.nodes import incoming, parameters, qos
 from anser_ros.nodes.diagnostics import Level, Status, Throttle, diagnostic_array
 from anser_ros.nodes.kernel_start import wait_for_kernels
 from anser_ros.nodes.process import main
@@ -161,8 +161,14 @@ class AnserNode(Node):
     # Guarded callbacks --------------------------------------------------------------------
 
     def create_subscription(self, msg_type, topic, callback, qos_profile, **options):
-        """Subscribe as rclpy does, with the callback guarded."""
-        guarded = self._guard(callback)
+        """Subscribe as rclpy does, with the callback guarded, and what is too large refused."""
+        bounded = incoming.is_bounded(msg_type) and not options.get('raw', False)
+
+        @functools.wraps(callback)
+        def opened(message, *info):
+            return callback(incoming.opened(message, msg_type) if bounded else message, *info)
+
+        guarded = self._guard(opened)
 
         @functools.wraps(callback)
         def unpacked(*args):
@@ -171,6 +177,8 @@ class AnserNode(Node):
                 args = args[0]
             return guarded(*args)
 
+        if bounded:
+            options['raw'] = True
         return super().create_subscription(msg_type, topic, unpacked, qos_profile, **options)
 
     def create_timer(self, timer_period_sec, callback, *args, **options):

@@ -31,6 +31,8 @@ SPIN_SLICE_S = 0.1
 # Where Fast DDS looks for profiles; the user's own ones hold.
 PROFILE_VARIABLES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
 PROFILES = 'fastdds.xml'
+# Without it, rmw_fastrtps sets how the memory of messages is kept itself; the ROS QoS hold anyway.
+READ_PROFILES = 'RMW_FASTRTPS_USE_QOS_FROM_XML'
 ENDING = (signal.SIGINT, signal.SIGTERM)
 # How long a busy one may take to notice it.
 NOTICE_S = 1.5
@@ -48,7 +50,7 @@ def main(node_class: 'type[AnserNode]', argv: Sequence[str] | None = None) -> in
     try:
         own = _parse(node_class, _without_ros(arguments))
         signals = _Signals()
-        _announce_often()
+        _choose_profile()
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         return _run(node_class, own, arguments, signals)
     except AnserError as error:
@@ -63,10 +65,15 @@ def main(node_class: 'type[AnserNode]', argv: Sequence[str] | None = None) -> in
         rclpy.try_shutdown()
 
 
-def _announce_often() -> None:
-    """Let the middleware announce nodes more often, so that they find each other at once."""
+def _choose_profile() -> None:
+    """Let the middleware announce nodes more often, and give back the memory of messages.
+
+    The first is so that nodes find each other at once, the second so that a huge message leaves
+    nothing behind.
+    """
     if not any(os.environ.get(variable) for variable in PROFILE_VARIABLES):
         os.environ[PROFILE_VARIABLES[0]] = str(config_path(PROFILES))
+        os.environ.setdefault(READ_PROFILES, '1')
 
 
 def _without_ros(arguments: Sequence[str]) -> list[str]:

@@ -19,6 +19,7 @@ from anser_ros.nodes.answered_frames import AnsweredFrames
 from anser_ros.nodes.backlog import Backlog, take_waiting
 from anser_ros.nodes.diagnostics import Trouble
 from anser_ros.nodes.flux_reader import read_frame
+from anser_ros.nodes.incoming import opened
 from anser_ros.nodes.model_clouds import SECOND_NS, stamp_of
 from anser_ros.nodes.model_intake import GivenModel, ModelIntake
 from anser_ros.nodes.node import AnserNode, Level, Status, main
@@ -265,7 +266,7 @@ class TrackerNode(AnserNode):
                 self._trouble.say(
                     'frames skipped: they come faster than they can be tracked', time.monotonic()
                 )
-                message = waiting[-1]
+                message = opened(waiting[-1], PointCloud2)
         frame = self._read(message)
         if frame is not None:
             wait_s = self.parameters.model_wait_s

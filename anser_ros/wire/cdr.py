@@ -15,6 +15,7 @@ Source: OMG Common Data Representation, as DDS-XTypes 1.3 (section 7.4.1) takes 
 import struct
 from collections.abc import Sequence
 
+from anser_ros.errors import LayoutError
 from anser_ros.wire.points import PointFieldTuple
 
 HEADER = b'\x00\x01\x00\x00'
@@ -143,3 +144,24 @@ def cloud_bytes(
     out.body += data
     out.add('B', 0)  # not dense: the position of a tool sensor is NaN
     return out.done()
+
+
+def cloud_head(data: bytes) -> tuple[int, int, int]:
+    """Return height, width and number of fields of a serialised ``sensor_msgs/PointCloud2``.
+
+    Nothing behind them is looked at, so that the size of a message costs nothing.
+
+    Raises
+    ------
+    LayoutError
+        When the bytes end before.
+    """
+    order = '<' if data[1:2] == b'\x01' else '>'
+    body = memoryview(data)[len(HEADER) :]
+    try:
+        (length,) = struct.unpack_from(f'{order}I', body, 8)
+        place = 12 + length
+        height, width, fields = struct.unpack_from(f'{order}III', body, place + -place % 4)
+    except struct.error as error:
+        raise LayoutError(f'no cloud in {len(data)} bytes') from error
+    return height, width, fields

@@ -24,6 +24,9 @@ STALE = 2
 DROPPED = 4
 """Flag bit of a reading with samples missing inside its window."""
 
+MOST_POINTS = 1 << 16
+"""Most points of a cloud. Channels, and dipoles of a model's uncertainty, are unsigned 16-bit
+numbers, so that more points repeat one; a smaller bound would refuse what the layouts allow."""
 UINT16, UINT32, FLOAT32, FLOAT64 = 4, 6, 7, 8
 """Numbers of the data types of sensor_msgs/PointField that are used here."""
 _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
@@ -92,6 +95,8 @@ def _records(
 ) -> NDArray[np.void]:
     if point_step <= 0 or width < 0:
         raise LayoutError(f'point_step {point_step} and width {width} make no cloud')
+    if width > MOST_POINTS:
+        raise LayoutError(f'{width} points are refused, the most is {MOST_POINTS}')
     size = memoryview(data).nbytes
     if size != point_step * width:
         raise LayoutError(
@@ -145,9 +150,9 @@ def decode_flux(
     Raises
     ------
     LayoutError
-        When a field is missing, doubled, of an unknown type or outside the point, when the number
-        of bytes is not ``width * point_step``, when a channel appears twice, or when a channel or
-        flag is no integer.
+        When a field is missing, doubled, of an unknown type or outside the point, when there are
+        too many points, or not ``width * point_step`` bytes, when a channel appears twice, or when
+        a channel or flag is no integer.
     """
     records = _records(fields, point_step, width, data, is_bigendian)
     geometry = _columns(records, ('x', 'y', 'z', 'nx', 'ny', 'nz'))

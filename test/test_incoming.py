@@ -1,0 +1,93 @@
+"""Messages that are too large are refused by their bytes, before they become objects."""
+
+import time
+
+import pytest
+
+from anser_ros.errors import LayoutError
+from anser_ros.wire.cdr import cloud_bytes, string_bytes
+from anser_ros.wire.points import FLOAT32, MOST_POINTS, flux_fields
+
+
+@pytest.fixture
+def opened():
+    from anser_ros.nodes.incoming import opened
+
+    return opened
+
+
+def cloud(width=1, count=None, size=None):
+    fields, step = flux_fields(8)
+    if count is not None:
+        fields, step = [(f'f{i}', 0, FLOAT32, 1) for i in range(count)], 4
+    data = bytes(step * width if size is None else size)
+    return cloud_bytes(7, 'fg', fields, step, width, data)
+
+
+def test_a_message_within_its_bounds_is_opened(opened):
+    from sensor_msgs.msg import PointCloud2
+    from std_msgs.msg import String
+
+    assert opened(string_bytes('a setup'), String).data == 'a setup'
+    message = opened(cloud(9), PointCloud2)
+    assert (message.width, len(message.fields), len(message.data)) == (9, 24, 9 * 92)
+
+
+def test_what_is_too_large_is_refused_unopened(opened, monkeypatch):
+    from sensor_msgs.msg import PointCloud2
+    from std_msgs.msg import String
+
+    from anser_ros.nodes import incoming
+
+    monkeypatch.setattr(incoming, 'deserialize_message', None)  # would fail if it were called
+    with pytest.raises(LayoutError, match='bytes is refused'):
+        opened(string_bytes('x' * 1_000_001), String)
+    with pytest.raises(LayoutError, match='bytes is refused'):
+        opened(cloud(size=20_000_000), PointCloud2)
+    with pytest.raises(LayoutError, match=f'a cloud of 1 x {MOST_POINTS + 1} points'):
+        opened(cloud(MOST_POINTS + 1, size=8), PointCloud2)
+    with pytest.raises(LayoutError, match='with 5000 fields is refused'):
+        opened(cloud(count=5000), PointCloud2)
+
+
+def test_a_node_counts_what_it_refuses_and_goes_on(ros):
+    """Over DDS come a cloud of a million points, a huge text and a good one, which is taken."""
+    from rclpy.executors import SingleThreadedExecutor
+    from sensor_msgs.msg import PointCloud2
+    from std_msgs.msg import String
+
+    from anser_ros.nodes import qos
+    from anser_ros.nodes.node import AnserNode
+
+    class Taker(AnserNode):
+        NAME = 'taker'
+
+        def __init__(self):
+            super().__init__()
+            self.texts, self.clouds = [], []
+            self.create_subscription(String, 'text', self._on_text, qos.STREAM)
+            self.create_subscription(PointCloud2, 'cloud', self.clouds.append, qos.STREAM)
+
+        def _on_text(self, message, info):
+            self.texts.append((message.data, bool(info)))
+
+    node, peer = Taker(), ros.create_node('peer', namespace='anser')
+    text = peer.create_publisher(String, 'text', qos.STREAM)
+    clouds = peer.create_publisher(PointCloud2, 'cloud', qos.STREAM)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    executor.add_node(peer)
+    end = time.monotonic() + 10.0
+
+    def spin_until(condition):
+        while not condition():
+            assert time.monotonic() < end, node.counters
+            executor.spin_once(timeout_sec=0.05)
+
+    spin_until(lambda: text.get_subscription_count() and clouds.get_subscription_count())
+    clouds.publish(PointCloud2(height=1, width=10**6, point_step=1))
+    text.publish(String(data='x' * 1_100_000))
+    text.publish(String(data='good'))
+    spin_until(lambda: node.texts and node.counters['refused_LayoutError'] == 2)
+    assert node.texts == [('good', True)] and not node.clouds
+    executor.shutdown()
