@@ -134,6 +134,10 @@ class RefitSettings:
     hold_frames : int
         Frames that a sensor which was left out must agree for before it is used again; 25 are
         half a second at 50 Hz.
+    references_age_s : float
+        How long, s, poses are given while the references are silent. A C-arm that comes at 10 cm/s
+        is 5 cm nearer after half a second, and metal that comes anew has not come far. Shorter,
+        and a hiccup of the line costs poses; longer, and poses are given that nobody vouches for.
     error_modes : int
         Rank of the uncertainty that is handed on with the model. Fewer are cheaper to send and to
         use; what they leave out is added as noise.
@@ -157,6 +161,9 @@ class RefitSettings:
     )
     hold_frames: int = _value(
         25, 'frames of agreement after which a sensor left out is used again', 1, 1_000_000
+    )
+    references_age_s: float = _value(
+        0.5, 'longest time for which poses are given without references, s', 0.02, 60.0
     )
     error_modes: int = _value(12, "rank of the model's uncertainty", 1, 96)
     seed: int = _value(1, 'seed of the draws that the uncertainty is made from', 1, 2**31)

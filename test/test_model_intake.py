@@ -7,7 +7,7 @@ pytest.importorskip('sensor_msgs')
 
 from dataclasses import replace
 
-from tracking_world import certain_model
+from tracking_world import certain_model, setup_of, triaxial_tool
 
 from anser_ros.nodes.model_clouds import ModelWriter
 from anser_ros.nodes.model_intake import ModelIntake
@@ -62,3 +62,35 @@ def test_what_is_not_said_yet_is_unknown():
     intake = ModelIntake()
     assert intake.take(messages([0])[1][0]).error is None
     assert not intake.has_error
+
+
+def test_the_model_in_force_ages_by_the_clock_of_the_frames():
+    from anser_ros.nodes.model_in_force import ModelInForce
+    from anser_ros.physics.volume import TrackedVolume
+
+    model, maker, intake = certain_model(), ModelWriter(), ModelIntake()
+    setup = setup_of(triaxial_tool())
+    force = ModelInForce(setup, TrackedVolume(), None)
+    assert force.at(10**9).model is None and force.at(10**9).withheld is None
+
+    def publish(stamp_ns, follows=True, withheld=0):
+        intake.take_error(maker.error(model, 'fg', stamp_ns, follows, withheld))
+        given = intake.take(maker.dipoles(model, 'fg', stamp_ns))
+        force.put(given, force.field_of(given))
+
+    first, second = 10**12, 10**9
+    publish(first, follows=False)
+    assert force.at(first + 100 * second).withheld is None, 'it follows nothing'
+    publish(first)
+    assert force.at(first + second // 4).withheld is None
+    assert force.at(first + second).withheld.state == 'references_lost'
+    publish(first + second, withheld=1)
+    assert 'too few references' in force.at(first + second).withheld.reason
+    publish(first + 2 * second)
+    assert force.at(first + 2 * second).withheld is None
+    publish(first + 2 * second + 1, withheld=2)
+    assert force.at(first + 2 * second + 1).withheld.state == 'references_doubtful'
+    # The server's own stamp while a recording of another day is played: of no age to the frames.
+    publish(10**18)
+    assert force.at(first + 2 * second + second // 4).withheld is None
+    assert force.at(first + 3 * second).withheld.state == 'references_lost'

@@ -405,3 +405,26 @@ def test_markers_of_nothing_and_of_one_source(ros):
     assert [m.type for m in markers[1:]] == [Marker.SPHERE_LIST, Marker.SPHERE]
     assert markers[1].scale.x == pytest.approx(0.008)
     assert centroid_message(metal, 'fg', 7_000_000_001).header.stamp.nanosec == 1
+
+
+def test_lost_references_are_told_to_the_trackers_and_to_the_operator(make):
+    from anser_ros.nodes.model_intake import ModelIntake
+
+    rig, intake, given = make(references_age_s=0.05, refit_rate_hz=1000.0), ModelIntake(), []
+    rig.node._errors.publish = lambda message: intake.take_error(message)
+    rig.node._models.publish = lambda message: given.append(intake.take(message))
+    rig.start()
+    change = rig.world.metal(HEAD)
+    for _ in range(3):
+        rig.say(change)
+    assert given[-1].follows and given[-1].withheld == ''
+    near = given[-1]
+    gone = np.where(np.arange(len(change))[:, None] < 3, change, np.nan)
+    rig.say(gone)
+    assert rig.node.status().message.startswith('few_references: 3 usable')
+    assert given[-1].withheld == 'references_lost'
+    np.testing.assert_array_equal(given[-1].points.moments, near.points.moments)
+    rig.say(change)
+    assert given[-1].withheld == ''
+    rig.until(lambda: rig.node.status().level == Level.ERROR)
+    assert rig.node.status().message.startswith('references_lost: no reference fluxes for 0.')

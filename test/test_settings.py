@@ -58,6 +58,7 @@ OTHER = {
     'average_frames': 1,
     'persistence': 0.5,
     'hold_frames': 3,
+    'references_age_s': 2.0,
     'error_modes': 5,
     'seed': 9,
 }
@@ -312,7 +313,7 @@ class TestNodes:
                 WatcherParameters,
                 [n for n in SECTIONS['accuracy'] if not n.startswith(('patch', 'stamp'))],
             ),
-            (TrackerParameters, ['flux_noise_t', 'stamp_sigma_s']),
+            (TrackerParameters, ['flux_noise_t', 'stamp_sigma_s', 'references_age_s']),
         ],
     )
     def test_parameters_state_what_their_node_uses(self, table, names):

@@ -10,6 +10,16 @@ STATES = (REFERENCES_LOST, REFERENCES_DOUBTFUL)
 """The states in which the whole chain gives no pose; their places are their codes, from 1."""
 
 
+def code_of(state: str) -> int:
+    """Return the code of a state on the wire; 0 for an empty one."""
+    return 1 + STATES.index(state) if state else 0
+
+
+def state_of(code: int) -> str:
+    """Return the state of a code; a code of a later version counts as the last state known."""
+    return '' if code == 0 else STATES[min(code, len(STATES)) - 1]
+
+
 class Withheld(NamedTuple):
     """One reason for which all poses of a frame are withheld.
 

@@ -3,6 +3,7 @@
 ``field_model`` carries the dipoles, ``field_model_error`` their uncertainty with the same stamp.
 """
 
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from std_srvs.srv import SetBool, Trigger
 from anser_ros.errors import AnserError, FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
+from anser_ros.integrity.withheld import REFERENCES_LOST, code_of
 from anser_ros.nodes import qos, refit_status
 from anser_ros.nodes.diagnostics import Trouble
 from anser_ros.nodes.flux_reader import read_frame
@@ -62,7 +64,7 @@ class FieldModelParameters:
         1.0, 'time that a baseline is averaged over, s', minimum=0.05, maximum=60.0
     )
     refit_rate_hz: float = parameter(
-        MOST_RATE_HZ, 'most refits a second, by the stamps', minimum=0.1, maximum=1000.0, live=True
+        MOST_RATE_HZ, 'most refits a second, by the stamps', minimum=2.0, maximum=1000.0, live=True
     )
     patches: tuple[str, ...] = parameter(
         (), 'reference coils that move: entries body=topic, the topic a PoseStamped of that body'
@@ -81,6 +83,7 @@ class FieldModelParameters:
     average_frames: int = stated('average_frames')
     persistence: float = stated('persistence')
     hold_frames: int = stated('hold_frames')
+    references_age_s: float = stated('references_age_s')
     error_modes: int = stated('error_modes')
     seed: int = stated('seed')
 
@@ -111,6 +114,7 @@ class FieldModelNode(AnserNode):
         self._frames: Intake | None = None
         self._stamp_ns = 0
         self._refit_s = 0.0
+        self._heard_s = 0.0
         self._pace = Pace(table.refit_rate_hz)
         self._writer = ModelWriter()
         self._models = self.create_publisher(PointCloud2, 'field_model', qos.MODELS)
@@ -208,11 +212,11 @@ class FieldModelNode(AnserNode):
         Every frame is answered by the model in force for it, even where that is as before: so the
         tracker knows what to track a frame with, and gives the poses that are found offline.
         """
-        stamp_ns = frame.stamp_ns
+        stamp_ns, self._heard_s = frame.stamp_ns, time.monotonic()
         if not self._pace.is_due(stamp_ns):
             self.count('frames_between_refits')
             if self._model is not None:
-                self._serve(self._model, stamp_ns)
+                self._serve(self._model, stamp_ns, self._withheld)
             return
         begin_s = time.monotonic()
         if self._patches is None:
@@ -224,7 +228,9 @@ class FieldModelNode(AnserNode):
                 self.count('patch_moves')
             self._result = self._patches.follow(refit, frame)
         self.count('refits')
-        self._serve(self._result.model, stamp_ns)
+        model = self._result.model if self._result.is_answer else self._model
+        if model is not None:
+            self._serve(model, stamp_ns, self._withheld)
         self._refit_s = time.monotonic() - begin_s
         self._metal.show(self._result, self._frame_id, stamp_ns)
 
@@ -233,21 +239,29 @@ class FieldModelNode(AnserNode):
         return self._setup.frame_id if self._setup is not None else 'fg'
 
     @property
+    def _withheld(self) -> str:
+        """State for which trackers are to give no pose for the present frame."""
+        return '' if self._result is None or self._result.is_answer else REFERENCES_LOST
+
+    @property
     def _follows(self) -> bool:
         """Whether every frame of the references is answered by a model of its own."""
         return self._refit is not None and self.parameters.refit and not self._frozen
 
     # The model and its baseline -----------------------------------------------------------
 
-    def _serve(self, model: FieldModel, stamp_ns: int) -> None:
+    def _serve(self, model: FieldModel, stamp_ns: int, withheld: str = '') -> None:
         """Put a model in force under a stamp that the last one did not have.
 
-        The model of a frame of readings has their stamp, which may be of another day.
+        The model of a frame of readings has their stamp, which may be of another day. ``withheld``
+        is the state for which trackers are to give no pose, or not for long.
         """
         self._stamp_ns = stamp_ns if stamp_ns != self._stamp_ns else stamp_ns + 1
         frame_id = self._frame_id
         # The uncertainty goes first, so that a receiver has both when the model comes.
-        error = self._writer.new_error(model, frame_id, self._stamp_ns, self._follows)
+        error = self._writer.new_error(
+            model, frame_id, self._stamp_ns, self._follows, code_of(withheld)
+        )
         if error is not None:
             self._errors.publish(error)
         self._models.publish(self._writer.dipoles(model, frame_id, self._stamp_ns))
@@ -267,7 +281,7 @@ class FieldModelNode(AnserNode):
         self._refit, self._patches = start_refit(
             self._setup, self._base, self._references, baseline, tuple(self._patch_topics)
         )
-        self._result = None
+        self._result, self._heard_s = None, time.monotonic()
         self._tell_following()
         self.count('baselines')
 
@@ -338,8 +352,17 @@ class FieldModelNode(AnserNode):
         trouble = self._trouble.recent(time.monotonic())
         if trouble:
             return Status('', Level.WARN, f'{activity}; lately: {trouble}', values)
+        silent_s = time.monotonic() - self._heard_s
+        if self._follows and silent_s > self._longest_s:
+            said = f'{REFERENCES_LOST}: no reference fluxes for {silent_s:.1f} s'
+            return Status('', Level.ERROR, said, values)
         level = Level.WARN if values.get('refit_state') in refit_status.TROUBLED else Level.OK
         return Status('', level, activity, values)
+
+    @property
+    def _longest_s(self) -> float:
+        setup = self._setup
+        return math.inf if setup is None else setup.refit.references_age_s
 
     def _activity(self, values: dict[str, object]) -> str:
         if self._frozen:

@@ -60,7 +60,7 @@ class ModelWriter:
     def __init__(self) -> None:
         self._maker = CloudMaker()
         self._told: tuple[FieldModel, PointCloud2] | None = None
-        self._uncertainty: tuple[object, float, int, bool] | None = None
+        self._uncertainty: tuple[object, float, int, bool, int] | None = None
 
     def dipoles(self, model: FieldModel, frame_id: str, stamp_ns: int) -> PointCloud2:
         """Return the ``field_model`` message; for the model of the last one, that one renamed."""
@@ -75,29 +75,34 @@ class ModelWriter:
         return message
 
     def new_error(
-        self, model: FieldModel, frame_id: str, stamp_ns: int, follows: bool
+        self, model: FieldModel, frame_id: str, stamp_ns: int, follows: bool, withheld: int = 0
     ) -> PointCloud2 | None:
         """Return the ``field_model_error`` message; None where the last one still holds."""
         told = self._uncertainty
-        now = (model.modes, model.flux_error_t, len(model.positions), follows)
+        now = (model.modes, model.flux_error_t, len(model.positions), follows, withheld)
         if told is not None and told[0] is now[0] and told[1:] == now[1:]:
             return None
         self._uncertainty = now
-        return self.error(model, frame_id, stamp_ns, follows)
+        return self.error(model, frame_id, stamp_ns, follows, withheld)
 
     def has_told(self, follows: bool) -> bool:
         """Return whether receivers know, if anything, whether the model follows the references."""
         return self._uncertainty is None or self._uncertainty[3] == follows
 
     def error(
-        self, model: FieldModel, frame_id: str, stamp_ns: int, follows: bool = False
+        self,
+        model: FieldModel,
+        frame_id: str,
+        stamp_ns: int,
+        follows: bool = False,
+        withheld: int = 0,
     ) -> PointCloud2:
         """Return the ``field_model_error`` message."""
         modes = model.modes
         if modes is None:
             modes = np.zeros((0, *model.moments.shape), dtype=complex)
-        packed = encode_model_error(ModelError(float(model.flux_error_t), modes, follows))
-        return self._maker.message(packed, frame_id, stamp_ns)
+        error = ModelError(float(model.flux_error_t), modes, follows, withheld)
+        return self._maker.message(encode_model_error(error), frame_id, stamp_ns)
 
 
 def stamp_of(message: PointCloud2) -> int:

@@ -7,6 +7,7 @@ from sensor_msgs.msg import PointCloud2
 
 from anser_ros.errors import LayoutError
 from anser_ros.field.model import FieldModel
+from anser_ros.integrity.withheld import state_of
 from anser_ros.nodes.model_clouds import read_dipoles, read_error, stamp_of
 from anser_ros.wire.model_error import ModelError
 from anser_ros.wire.points import DipolePoints
@@ -29,6 +30,12 @@ class GivenModel:
     def follows(self) -> bool:
         """Whether every frame of the references is answered by a model of its stamp."""
         return self.error is not None and self.error.follows
+
+    @property
+    def withheld(self) -> str:
+        """State for which the server wants no pose to be given; empty where there is none."""
+        code = 0 if self.error is None else self.error.withheld
+        return state_of(code)
 
     def is_same_as(self, other: 'GivenModel | None') -> bool:
         """Whether only the stamp differs."""

@@ -14,6 +14,7 @@ from std_msgs.msg import String
 
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.field.model import FieldModel
+from anser_ros.integrity.withheld import Withheld
 from anser_ros.nodes import qos
 from anser_ros.nodes.answered_frames import AnsweredFrames
 from anser_ros.nodes.backlog import Backlog, take_waiting
@@ -21,6 +22,7 @@ from anser_ros.nodes.diagnostics import Trouble
 from anser_ros.nodes.flux_reader import read_frame
 from anser_ros.nodes.incoming import opened
 from anser_ros.nodes.model_clouds import SECOND_NS, stamp_of
+from anser_ros.nodes.model_in_force import ModelInForce
 from anser_ros.nodes.model_intake import GivenModel, ModelIntake
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
@@ -60,6 +62,7 @@ class TrackerParameters:
     )
     flux_noise_t: float = stated('flux_noise_t')
     stamp_sigma_s: float = stated('stamp_sigma_s')
+    references_age_s: float = stated('references_age_s')
     adaptive: bool = parameter(
         TrackerSettings.adaptive,
         'whether the noise follows the residuals of good poses',
@@ -159,10 +162,12 @@ class TrackerNode(AnserNode):
         self._tracker: Tracker | None = None
         self._topics: dict[str, PoseTopic] = {}
         self._intake = ModelIntake()
-        self._in_force: GivenModel | None = None
+        self._in_force: ModelInForce | None = None
+        self._given: GivenModel | None = None
         self._frames = AnsweredFrames[GivenModel, tuple[int, FluxPoints]](
             self._put_in_force, self._track
         )
+        self._withheld: Withheld | None = None
         self._trouble = Trouble()
         self._solve_s = 0.0
         self._backlog = Backlog()
@@ -191,11 +196,15 @@ class TrackerNode(AnserNode):
             sensors = sensor_table(setup.tool_sensors)
             self._flux_noise_t = tracking_noise(setup)
             self._volume = pose_volume(setup)
-            tracker = Tracker(None, sensors, self._wanted_settings())
+            settings = self._wanted_settings()
+            tracker = Tracker(None, sensors, settings)
+            if self._file_model is not None:
+                check_emitters(setup, self._file_model)
         except AnserError as error:
             self._refuse('setups_refused', error)
             return
         self._setup_text, self._setup, self._tracker = message.data, setup, tracker
+        self._in_force = ModelInForce(setup, settings.box, self._file_model)
         for topic in self._topics.values():
             topic.destroy(self)
         self._topics = {
@@ -225,32 +234,34 @@ class TrackerNode(AnserNode):
 
     def _put_in_force(self, given: GivenModel) -> None:
         """Track with another model from now on."""
-        before, self._in_force = self._in_force, given
-        if self._tracker is not None and given.is_same_as(before):
-            self._tracker = self._tracker.renamed(str(given.stamp_ns))
-        else:
-            self._use_model()
+        self._given = given
+        self._use_model()
 
     def _use_model(self) -> None:
         """Give the tracker the model in force, once the setup is known too."""
-        if self._tracker is None or self._setup is None:
+        given, in_force = self._given, self._in_force
+        if in_force is None:
             return
         try:
-            model, model_id = self._model(self._setup)
-            if model is not None:
-                self._tracker = self._tracker.with_model(model, model_id)
-                self.count('models')
+            field = in_force.field if given is None else in_force.field_of(given)
+            if field is not None:
+                new = field is not in_force.field or given is None
+                self._track_with(field, given)
+                if given is not None:
+                    in_force.put(given, field)
+                self.count('models', new)
         except AnserError as error:
             self._refuse('models_refused', error)
 
-    def _model(self, setup: Setup) -> tuple[FieldModel | None, str]:
-        """The model in force and its name: the published one, or that of the file."""
-        given = self._file_model
-        if given is not None:
-            check_emitters(setup, given)
-        if self._in_force is None:
-            return given, self.parameters.model_file
-        return self._in_force.field_model(setup, given), str(self._in_force.stamp_ns)
+    def _track_with(self, field: FieldModel, given: GivenModel | None) -> None:
+        """Have the tracker use a model under the name of the published one, or the file's."""
+        name = self.parameters.model_file if given is None else str(given.stamp_ns)
+        if self._tracker is None:
+            return
+        if self._tracker.model is field:
+            self._tracker = self._tracker.renamed(name)
+        else:
+            self._tracker = self._tracker.with_model(field, name)
 
     def _on_flux(self, message: PointCloud2, info: dict[str, int]) -> None:
         """Take a frame; one that is late beyond hope gives way to the newest."""
@@ -294,15 +305,20 @@ class TrackerNode(AnserNode):
 
     def _track(self, frame: tuple[int, FluxPoints]) -> None:
         """Track a frame with the model in force, and publish what is good."""
-        tracker = self._tracker
-        if tracker is None:
+        if self._tracker is None or self._in_force is None:
             return
         begin_s = time.perf_counter()
         stamp_ns, points = frame
         estimates, changed = [], False
+        standing = self._in_force.at(stamp_ns)
+        self._withheld = standing.withheld
         try:
+            if standing.model is not None and standing.model is not self._tracker.model:
+                self._track_with(standing.model, self._given)
             # Each pose goes out before the next is worked on.
-            for estimate in tracker.estimates(stamp_ns, points.channel, points.flux, points.flags):
+            for estimate in self._tracker.estimates(
+                stamp_ns, points.channel, points.flux, points.flags, standing.withheld
+            ):
                 now_ns = self.get_clock().now().nanoseconds
                 changed |= self._topics[estimate.name].take(estimate, now_ns)
                 estimates.append(estimate)
@@ -367,6 +383,8 @@ class TrackerNode(AnserNode):
         values['dead_emitters'] = dead
         # A drift takes no recorded course here: field_model follows it where references tell.
         values['left_to_references'] = ', '.join(tracker.drifting_effects)
+        if self._withheld is not None:
+            return Status('', Level.ERROR, ': '.join(self._withheld), values)
         if dead:
             return Status('', Level.WARN, f'no flux of {dead}', values)
         tracked = f'{good} of {len(self._topics)} tracked'

@@ -117,6 +117,11 @@ class RefitResult:
     reason: str = ''
     find: Callable[[], Metal | None] | None = field(default=None, repr=False)
 
+    @property
+    def is_answer(self) -> bool:
+        """Whether the references told the model of this frame; else it is only the last resort."""
+        return self.state != FEW_REFERENCES
+
     @cached_property
     def references(self) -> tuple[ReferenceHealth, ...]:
         """Health of every reference, computed when first asked for."""

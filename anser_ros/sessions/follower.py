@@ -4,12 +4,12 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from anser_ros.errors import BagError, FitError
-from anser_ros.field.model import FieldModel
+from anser_ros.integrity.ageing import ModelAge, Standing
 from anser_ros.refit.baseline import check_enough
 from anser_ros.refit.change import Pace
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.result import RefitResult
-from anser_ros.sessions.frames import SessionFrame
+from anser_ros.sessions.frames import FrameReadings, SessionFrame
 from anser_ros.sessions.patches import PatchFollower
 from anser_ros.sessions.prepared import PreparedSession
 from anser_ros.sessions.volume import stated_volume
@@ -72,18 +72,26 @@ class ModelFollower:
             volume=stated_volume(session.setup),
         )
         self._pace = Pace()
+        self._age = ModelAge(session.setup.refit.references_age_s, prepared.volume)
+        self._result: RefitResult | None = None
         self.summary = RefitSummary()
 
-    def model_at(self, frame: SessionFrame) -> FieldModel | None:
-        """The model for a frame and those after it; None where the one in force stays."""
+    def at(self, frame: SessionFrame) -> Standing:
+        """What a frame is tracked with: the model of its references, or the last one, aged."""
         if self._patches is not None and frame.tools is not None:
             tools = frame.tools
             self._patches.take_flux(frame.stamp_ns, tools.channels, tools.flux, tools.flags)
-        reference = frame.reference
-        if reference is None or not self._pace.is_due(frame.stamp_ns):
-            return None
-        result = self._refit.update(
-            frame.stamp_ns, reference.channels, reference.flux, reference.flags
-        )
-        self.summary.add(result)
-        return result.model
+        if frame.reference is not None:
+            self._follow(frame.stamp_ns, frame.reference)
+        why = '' if frame.reference is None or self._result is None else self._result.reason
+        return self._age.at(frame.stamp_ns, why)
+
+    def _follow(self, stamp_ns: int, reference: FrameReadings) -> None:
+        """Take in one frame of the references."""
+        if self._pace.is_due(stamp_ns):
+            self._result = self._refit.update(
+                stamp_ns, reference.channels, reference.flux, reference.flags
+            )
+            self.summary.add(self._result)
+        if self._result is not None and self._result.is_answer:
+            self._age.answered(stamp_ns, self._result.model)

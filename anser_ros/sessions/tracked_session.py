@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from anser_ros.errors import BagError
 from anser_ros.field.model import FieldModel
+from anser_ros.integrity.ageing import AS_IT_IS
 from anser_ros.sessions.follower import ModelFollower, RefitSummary
 from anser_ros.sessions.frames import frames_of
 from anser_ros.sessions.prepared import PreparedSession
@@ -76,12 +77,14 @@ def track(
     frames = list(frames_of(prepared.session))
     start = time.perf_counter()
     for count, frame in enumerate(frames, start=1):
-        model = None if follower is None else follower.model_at(frame)
-        if model is not None:
-            tracker = tracker.with_model(model)
+        standing = AS_IT_IS if follower is None else follower.at(frame)
+        if standing.model is not None and standing.model is not tracker.model:
+            tracker = tracker.with_model(standing.model)
         if frame.tools is not None:
             seen = frame.tools.in_phase() if in_phase else frame.tools
-            found = tracker.update(frame.stamp_ns, seen.channels, seen.flux, seen.flags)
+            found = tracker.update(
+                frame.stamp_ns, seen.channels, seen.flux, seen.flags, standing.withheld
+            )
             for estimate in found:
                 estimates.setdefault(estimate.name, []).append(estimate)
         if progress is not None:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
 from anser_ros.frames import faults
+from anser_ros.integrity import withheld
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.settings import Accuracy
 from anser_ros.tracking.uncertainty import ROLL_VARIANCE
@@ -25,6 +26,7 @@ SATURATED = faults.SATURATED.state
 DROPPED = faults.DROPPED.state
 STATES = (
     OK, NO_MODEL, NO_SIGNAL, RESIDUAL, OUTSIDE_VOLUME, AMBIGUOUS, STALE, SATURATED, DROPPED,
+    *withheld.STATES,
 )  # fmt: skip
 
 USUAL_GATE = 4.0

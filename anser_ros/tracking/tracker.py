@@ -17,6 +17,7 @@ from anser_ros.errors import TrackingError
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.frames.faults import FAULTS, GOOD, value_codes
 from anser_ros.frames.intake import BACK, NANO, Frame, Intake
+from anser_ros.integrity.withheld import Withheld
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.tracking import estimate as states
 from anser_ros.tracking.body_track import BodyTrack, track_body
@@ -179,9 +180,10 @@ class Tracker:
         channels: NDArray[np.generic],
         flux: NDArray[np.generic],
         flags: NDArray[np.generic] | None = None,
+        withheld: Withheld | None = None,
     ) -> list[PoseEstimate]:
         """Estimate all poses from one frame; arguments and errors are those of `estimates`."""
-        return list(self.estimates(stamp_ns, channels, flux, flags))
+        return list(self.estimates(stamp_ns, channels, flux, flags, withheld))
 
     def estimates(
         self,
@@ -189,6 +191,7 @@ class Tracker:
         channels: NDArray[np.generic],
         flux: NDArray[np.generic],
         flags: NDArray[np.generic] | None = None,
+        withheld: Withheld | None = None,
     ) -> Iterator[PoseEstimate]:
         """Estimate the poses of one frame, each given out before the next is worked on.
 
@@ -202,6 +205,8 @@ class Tracker:
             T.
         flags : ndarray, shape (S,), optional
             Flag bits of `wire.points`.
+        withheld : Withheld, optional
+            Why no pose may be given for this frame.
 
         Yields
         ------
@@ -219,15 +224,17 @@ class Tracker:
             stamp_ns, channels, flux, flags, names, self.settings.warm_age_s
         )
         if frame is not None:
-            yield from self.track(frame)
+            yield from self.track(frame, withheld)
 
-    def track(self, frame: Frame) -> Iterator[PoseEstimate]:
+    def track(self, frame: Frame, withheld: Withheld | None = None) -> Iterator[PoseEstimate]:
         """Estimate the poses of a frame that has been judged; yields what `estimates` does.
 
         Parameters
         ----------
         frame : Frame
             Of an `Intake` of this tracker's sensors that spares dead emitters.
+        withheld : Withheld, optional
+            Why no pose may be given for it.
         """
         if frame.jump == BACK:
             self.reset()
@@ -236,6 +243,11 @@ class Tracker:
         context = self._context
         if context is None:
             yield from self._without_poses(frame, states.NO_MODEL, '', 'no field model yet')
+            return
+        if withheld is not None:
+            yield from self._without_poses(
+                frame, withheld.state, context.model_id, withheld.reason
+            )
             return
         living = frame.living
         if living is not None:

@@ -2,7 +2,8 @@
 
 A point for every dipole that a mode moves: ``mode`` and ``dipole`` uint16, ``flux_error`` float32
 (T: what the model leaves unexplained) and ``follows`` uint32 (1 while every frame of
-``reference/flux`` is answered by a model of its stamp), both the same in all points; then
+``reference/flux`` is answered by a model of its stamp) and ``withheld`` uint32 (0, or the code of
+the state for which no pose may be given), all three the same in all points; then
 ``m<k>_re``, ``m<k>_im`` float32 (A m^2). The moments are wrong by the sum of all modes, each times
 an independent unit normal number. The message has the stamp of the ``field_model`` message that
 it belongs to, and holds for later models of that size until there is another one: the uncertainty
@@ -23,7 +24,8 @@ ComplexArray = NDArray[np.complex128]
 MOST_VALUES = 50_000_000
 """Largest number of values of the modes that are unpacked, 400 MB; more means a damaged
 message."""
-_HEAD = [('mode', '<u2'), ('dipole', '<u2'), ('flux_error', '<f4'), ('follows', '<u4')]
+_HEAD = [('mode', '<u2'), ('dipole', '<u2'), ('flux_error', '<f4'), ('follows', '<u4'),
+         ('withheld', '<u4')]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -31,11 +33,13 @@ class ModelError:
     """Unexplained flux (T) and modes (R, N, K), complex, A m^2; R may be 0.
 
     ``follows`` says whether the model follows the references: each of their frames has its own.
+    ``withheld`` is 0, or the code of the state for which the server wants no pose to be given.
     """
 
     flux_error_t: float
     modes: ComplexArray
     follows: bool = False
+    withheld: int = 0
 
 
 def _layout(n_emitters: int) -> tuple[list[PointFieldTuple], 'np.dtype[np.void]']:
@@ -44,10 +48,11 @@ def _layout(n_emitters: int) -> tuple[list[PointFieldTuple], 'np.dtype[np.void]'
         ('dipole', 2, UINT16, 1),
         ('flux_error', 4, FLOAT32, 1),
         ('follows', 8, UINT32, 1),
+        ('withheld', 12, UINT32, 1),
     ]
     for k in range(n_emitters):
-        fields.append((f'm{k}_re', 12 + 8 * k, FLOAT32, 1))
-        fields.append((f'm{k}_im', 16 + 8 * k, FLOAT32, 1))
+        fields.append((f'm{k}_re', 16 + 8 * k, FLOAT32, 1))
+        fields.append((f'm{k}_im', 20 + 8 * k, FLOAT32, 1))
     return fields, np.dtype([*_HEAD, ('m', '<f4', 2 * n_emitters)])
 
 
@@ -68,7 +73,7 @@ def encode_model_error(error: ModelError) -> tuple[list[PointFieldTuple], int, b
         mode, dipole = np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.intp)
     out = np.zeros(mode.size, dtype=record)
     out['mode'], out['dipole'], out['flux_error'] = mode, dipole, error.flux_error_t
-    out['follows'] = error.follows
+    out['follows'], out['withheld'] = error.follows, error.withheld
     if modes.shape[0]:
         chosen = modes[mode, dipole]
         out['m'][:, 0::2], out['m'][:, 1::2] = chosen.real, chosen.imag
@@ -111,4 +116,5 @@ def decode_model_error(
     modes = np.zeros((count, n_dipoles, n_emitters), dtype=np.complex128)
     if count:
         modes[points['mode'], points['dipole']] = moments
-    return ModelError(flux_error, modes, bool(points['follows'][0]))
+    follows, withheld = bool(points['follows'][0]), int(points['withheld'][0])
+    return ModelError(flux_error, modes, follows, withheld)

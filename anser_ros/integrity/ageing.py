@@ -1,0 +1,142 @@
+"""A model that followed the references, while they are silent: it ages, and is then given up.
+
+Metal goes on moving when nobody tells of it any more. So the model in force becomes less certain
+from frame to frame, by what the metal made of the field while it was still seen, and past a bound
+it is no model of the field at all.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from anser_ros.field.model import FieldModel
+from anser_ros.integrity.withheld import REFERENCES_LOST, Withheld
+from anser_ros.physics.volume import TrackedVolume
+
+NANO = 1e-9
+"""Seconds in a nanosecond."""
+SPEED_S = 0.3
+"""Time over which the last speed of the metal is taken, s. Shorter, and the noise of the refit is
+taken for speed; longer, and metal that comes near counts as slow: its effect grows with the sixth
+power of its distance, as it is driven less and heard less from afar."""
+STEPS = 10
+"""Steps that a model ages in, from fresh to given up. More make trackers lay the model out anew
+more often; fewer make it older than it is."""
+FASTER = 2.0
+"""How many times as fast as before metal may move on. With 1, metal that comes nearer is not
+covered, since its effect grows faster than its way; more makes poses uncertain for nothing."""
+SAMPLES = 3, 3
+"""Points across and up the volume at which the size of a change is taken: enough for a mean."""
+ELSEWHERE = 0.5
+"""Part of the field's expected change that may have any other shape than the last one, since
+metal may turn aside. With 0 that is not covered; more makes poses uncertain for nothing."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What a frame may be tracked with.
+
+    Attributes
+    ----------
+    model : FieldModel or None
+        None where there never was an answer: the model in force stays as it is.
+    withheld : Withheld or None
+        Why no pose may be given; None where it may.
+    """
+
+    model: FieldModel | None
+    withheld: Withheld | None = None
+
+
+AS_IT_IS = Standing(None)
+"""Of a model that follows nothing."""
+
+
+class ModelAge:
+    """Keeps the last answers of the references, and ages the newest while there is no other.
+
+    Parameters
+    ----------
+    longest_s : float
+        Age, s, from which on no pose is given.
+    volume : TrackedVolume
+        Where the size of a change of the field is taken.
+    """
+
+    def __init__(self, longest_s: float, volume: TrackedVolume) -> None:
+        self._longest_ns = round(longest_s / NANO)
+        points = volume.samples(*SAMPLES)
+        self._points = np.repeat(points, 3, axis=0)
+        self._axes = np.tile(np.eye(3), (len(points), 1))
+        self._answers: deque[tuple[int, FieldModel]] = deque()
+        self._aged: tuple[int, FieldModel] | None = None
+
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the newest answer, ns; 0 before there was one."""
+        return self._answers[-1][0] if self._answers else 0
+
+    def forget(self) -> None:
+        """Drop all answers: the model in force is no answer of the references."""
+        self._answers.clear()
+        self._aged = None
+
+    def answered(self, stamp_ns: int, model: FieldModel) -> None:
+        """Take the model that the references of a frame gave; a jump back in time starts anew."""
+        answers = self._answers
+        if answers and stamp_ns < answers[-1][0]:
+            answers.clear()
+        while len(answers) > 1 and (stamp_ns - answers[1][0]) * NANO >= SPEED_S:
+            answers.popleft()
+        answers.append((stamp_ns, model))
+        self._aged = None
+
+    def at(self, stamp_ns: int, why: str = '') -> Standing:
+        """Return what a frame may be tracked with.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Of the frame.
+        why : str
+            Why the references gave no answer, where that is known.
+        """
+        if not self._answers:
+            return Standing(None, Withheld(REFERENCES_LOST, why)) if why else AS_IT_IS
+        last_ns, model = self._answers[-1]
+        age_ns = stamp_ns - last_ns
+        if age_ns > self._longest_ns:
+            words = why or 'no reference fluxes'
+            longest_s = self._longest_ns * NANO
+            reason = f'{words} for {age_ns * NANO:.2f} s, {longest_s:g} s at most'
+            return Standing(model, Withheld(REFERENCES_LOST, reason))
+        if age_ns <= 0:
+            return Standing(model)
+        step = math.ceil(STEPS * age_ns / self._longest_ns)
+        if self._aged is None or self._aged[0] != step:
+            self._aged = step, self._older(step * self._longest_ns / STEPS)
+        return Standing(self._aged[1])
+
+    def _older(self, age_ns: float) -> FieldModel:
+        """Return the newest model with the error that it has after so long."""
+        (first_ns, before), (last_ns, model) = self._answers[0], self._answers[-1]
+        if before is model:
+            return model
+        share = FASTER * age_ns / (last_ns - first_ns)
+        if np.array_equal(model.positions, before.positions) and np.array_equal(
+            model.directions, before.directions
+        ):
+            change = model.moments - before.moments
+        else:
+            grown = model.with_dipoles(
+                before.positions, before.directions, np.zeros_like(before.moments)
+            )
+            change = np.concatenate([model.moments, -before.moments])
+            model = grown
+        mode = (share * change)[None]
+        modes = mode if model.modes is None else np.concatenate([model.modes, mode])
+        moved = replace(model, moments=mode[0]).flux(self._points, self._axes)
+        rest = ELSEWHERE * float(np.sqrt(0.5 * (np.abs(moved) ** 2).mean()))
+        return replace(model, modes=modes, flux_error_t=math.hypot(model.flux_error_t, rest))

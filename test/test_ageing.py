@@ -1,0 +1,101 @@
+"""A model whose references fell silent: less certain while it ages, then given up."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tracking_world import certain_model
+
+from anser_ros.integrity.ageing import ModelAge
+from anser_ros.integrity.withheld import REFERENCES_DOUBTFUL, REFERENCES_LOST, STATES, code_of
+from anser_ros.integrity.withheld import state_of as state_of_code
+from anser_ros.physics.volume import TrackedVolume
+from anser_ros.sessions.evaluation import track_session
+from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.session import load_session
+
+ROOT = Path(__file__).resolve().parents[1]
+STEP_NS = 20_000_000
+LONGEST_S = 0.5
+
+
+def model_with_metal(time_s, speed_m_s=0.1, added=False):
+    """A board's model while a small body comes up from below, which changes what it induces."""
+    base = certain_model()
+    height = -0.3 + speed_m_s * time_s
+    strength = 3e-4 / abs(height) ** 3 * np.ones((1, len(base.emitters)), dtype=complex)
+    place = np.array([[0.02, 0.0, height if added else -0.1]])
+    return base.with_dipoles(place, np.array([[0.0, 0.0, 1.0]]), strength)
+
+
+@pytest.mark.parametrize('added', [False, True])
+def test_what_moves_on_unseen_stays_within_what_the_aged_model_says(added):
+    age = ModelAge(LONGEST_S, TrackedVolume())
+    for frame in range(60):
+        age.answered(1 + frame * STEP_NS, model_with_metal(frame * 0.02, added=added))
+    points = TrackedVolume().samples(4, 3)
+    axes = np.tile([0.0, 0.6, 0.8], (len(points), 1))
+    last_ns, fresh = age.newest_ns, age.at(age.newest_ns).model
+    assert fresh is age.at(last_ns - 5).model, (
+        'a model that is no older than its frame is as it was'
+    )
+    sigmas = []
+    for later_s in (0.1, 0.3, 0.5):
+        standing = age.at(last_ns + round(later_s * 1e9))
+        assert standing.withheld is None
+        true = model_with_metal(1.18 + later_s, added=added).flux(points, axes)
+        error = true - standing.model.flux(points, axes)
+        variance = np.full(error.shape, standing.model.flux_error_t**2)
+        for mode in standing.model.modes:
+            variance += np.abs(replace(standing.model, moments=mode).flux(points, axes)) ** 2
+        assert (np.abs(error) < 3.0 * np.sqrt(variance)).mean() > 0.98
+        sigmas.append(np.sqrt(variance.mean()))
+    assert sigmas[0] < sigmas[1] < sigmas[2] < 20.0 * np.abs(error).max(), 'no more than needed'
+    lost = age.at(last_ns + round(0.51e9)).withheld
+    assert lost == (REFERENCES_LOST, 'no reference fluxes for 0.51 s, 0.5 s at most')
+
+
+def test_what_rests_keeps_its_certainty_until_it_is_given_up():
+    model, age = certain_model(), ModelAge(LONGEST_S, TrackedVolume())
+    assert age.at(7).model is None and age.at(7).withheld is None, 'it never followed anything'
+    assert age.at(7, '2 usable references').withheld.state == REFERENCES_LOST
+    for frame in range(100):
+        age.answered(1 + frame * STEP_NS, model)
+    assert age.at(age.newest_ns + 400_000_000).model is model
+    assert 'too few' in age.at(age.newest_ns + 600_000_000, 'too few').withheld.reason
+    age.answered(age.newest_ns + 10**9, model)
+    assert age.at(age.newest_ns).withheld is None, 'they are back'
+    age.answered(5, model)
+    assert age.at(10).withheld is None, 'a recording begins anew'
+    age.forget()
+    assert age.at(10**12).withheld is None
+
+
+def test_states_and_codes():
+    assert [state_of_code(code_of(state)) for state in ('', *STATES)] == ['', *STATES]
+    assert state_of_code(999) == STATES[-1]
+    assert code_of(REFERENCES_DOUBTFUL) != code_of(REFERENCES_LOST)
+
+
+@pytest.mark.long
+def test_a_session_whose_references_stop_near_metal_has_no_wrong_pose():
+    session = load_session(ROOT / 'bags/metal.mcap')
+    model, clean = load_model(ROOT / 'config/demo_model.yaml'), ROOT / 'bags/factory.mcap'
+    reference = session.reference
+    stop_s = 4.0
+    kept = reference.time < stop_s
+    names = ('time', 'flux', 'valid', 'flags', 'position', 'rotation', 'has_pose')
+    cut = replace(reference, **{name: getattr(reference, name)[kept] for name in names})
+    found = track_session(
+        replace(session, reference=cut), model, baseline=load_session(clean), refit=True
+    )
+    time = session.tools[0].time
+    for series in found.sensors.values():
+        states = np.array([e.state for e in series.estimates])
+        sigma = np.array([e.sigma_position_m for e in series.estimates])
+        assert (states[time > stop_s + LONGEST_S] == REFERENCES_LOST).all()
+        held = time < stop_s
+        assert (states[held] == 'ok').mean() > 0.98
+        wrong = series.position_error > np.maximum(3.0 * sigma, 1e-3)
+        assert not (wrong & (states == 'ok')).any()
