@@ -38,6 +38,9 @@ DEEP = (7, 2.5, 1.0)
 SAMPLES = (12, 7)
 """Samples across and up that a layer is fitted at. With half as many across it is right at the
 samples and, of metal that touches the board, 40 % wrong between them."""
+AT_ONCE = 64
+"""Sources whose field at the samples is worked out at once, 5 MB: with many more, the time goes
+into waiting for memory, with many fewer, into beginning anew."""
 MOST_MIDDLE = 60
 """Samples in the middle that tell what the uncertainty's modes leave."""
 CLEAR = 0.35
@@ -89,7 +92,10 @@ class Layer:
         if told not in self._projected:
             # Clouds are asked for in turn, each for all of its responses.
             self._projected.clear()
-            self._projected[told] = self.inverse @ _field_rows(self.points, sources)
+            parts = np.array_split(sources, -(-len(sources) // AT_ONCE) or 1)
+            self._projected[told] = np.hstack(
+                [self.inverse @ _field_rows(self.points, part) for part in parts]
+            )
         return self._projected[told]
 
     def misfit(self, sources: Array, points: Array | None = None) -> float:
