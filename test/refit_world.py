@@ -14,7 +14,9 @@ from anser_ros.physics.board import Board, build_board
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit import live_refit
+from anser_ros.refit.layer import Layer
 from anser_ros.refit.live_refit import LiveRefit
+from anser_ros.refit.tables import RefitTables
 from anser_ros.settings import RefitSettings
 
 
@@ -126,21 +128,40 @@ def volume_points(count: int = 60, seed: int = 11):
     return points, axes / np.linalg.norm(axes, axis=1)[:, None]
 
 
+TABLES: dict[tuple, RefitTables] = {}
+PROJECTED: dict[tuple, np.ndarray] = {}
+PLACES = np.array([[0.03, -0.02, 0.05], [-0.07, 0.04, -0.06], [0.01, 0.09, 0.2]])
+
+
 @contextmanager
 def tables_made_once():
     """Within it, refits of one board with the same references and settings share their tables.
 
-    For tests that make many refits of the same drawing, which is not compared.
+    So do refits that only the references tell apart share what layers make of clouds. Both are
+    functions of what they are kept by, and are worked out once for all tests of a process.
     """
-    build, made = live_refit.build_tables, {}
+    build, project = live_refit.build_tables, Layer.project
 
     def shared(model, references, settings, drawing, *rest):
-        arrays = model.positions, model.moments, references.position, references.axis
-        key = (*(array.tobytes() for array in arrays), drawing is None, repr((settings, rest)))
-        if key not in made:
-            made[key] = build(model, references, settings, drawing, *rest)
-        return made[key]
+        arrays = model.positions, model.directions, model.moments, references.position
+        arrays += references.axis, references.length, references.channel
+        if drawing is not None:
+            arrays += (drawing(PLACES),)
+        told = references.name, model.frequencies_hz, settings, rest
+        key = (*(array.tobytes() for array in arrays), repr(told))
+        if key not in TABLES:
+            TABLES[key] = build(model, references, settings, drawing, *rest)
+        return TABLES[key]
+
+    def projected(layer, sources):
+        if layer.inverse is None:
+            return project(layer, sources)
+        key = tuple(hash(a.tobytes()) for a in (layer.inverse, layer.points, sources))
+        if key not in PROJECTED:
+            PROJECTED[key] = project(layer, sources)
+        return PROJECTED[key]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(live_refit, 'build_tables', shared)
+        patch.setattr(Layer, 'project', projected)
         yield

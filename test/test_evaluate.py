@@ -22,6 +22,8 @@ from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.tracking.estimate import TrackerSettings
 
+pytestmark = pytest.mark.usefixtures('shared_tables')
+
 BAGS = Path(__file__).resolve().parents[1] / 'bags'
 OPTICAL_JITTER_M = 0.12e-3
 FIGURES = {

@@ -18,12 +18,14 @@ from anser_ros.refit.baseline import ReadingWindow
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.settings import RefitSettings
 
+pytestmark = pytest.mark.usefixtures('shared_tables')
+
 STEP_NS = 20_000_000
 HEAD = metal_block([0.03, -0.02, -0.11], [0.1, 0.12, 0.06])
 
 
 @pytest.fixture(scope='module')
-def refit():
+def refit(shared_tables):
     """One refit for the module: its geometry is worked out once."""
     return anser_world().refit()
 

@@ -12,6 +12,8 @@ from anser_ros.refit.free import FreeDipoles
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import board_of
 
+pytestmark = pytest.mark.usefixtures('shared_tables')
+
 BAGS = Path(__file__).resolve().parents[1] / 'bags'
 
 

@@ -9,6 +9,8 @@ from anser_ros.physics.dipole import flux_basis
 from anser_ros.refit.clouds import BODY_RADIUS, Region, bodies
 from anser_ros.refit.search import REMAINDER, BodySearch, body_factor
 
+pytestmark = pytest.mark.usefixtures('shared_tables')
+
 BESIDE = metal_block([0.24, 0.03, 0.12], [0.06, 0.06, 0.06])
 STRONG = -6000.0 + 800.0j
 

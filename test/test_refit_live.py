@@ -13,6 +13,8 @@ from anser_ros.sessions.session import load_session
 from anser_ros.tracking.estimate import OK
 from anser_ros.wire.setup import topic_of
 
+pytestmark = pytest.mark.usefixtures('shared_tables')
+
 BAGS = Path(__file__).resolve().parents[1] / 'bags'
 JITTER_M = 0.12e-3
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from refit_world import anser_world, metal_block, tables_made_once
+from refit_world import anser_world, metal_block
 from tracking_world import CENTRES_MM, GEOMETRY, TURNED
 
 from anser_ros.errors import FitError, FrameError, ParameterError
@@ -16,6 +16,8 @@ from anser_ros.refit.result import Metal
 from anser_ros.sessions.model_file import save_model
 from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup, dump_setup
+
+pytestmark = pytest.mark.usefixtures('shared_tables')
 
 HEAD = metal_block([0.03, -0.02, -0.11], [0.1, 0.12, 0.06])
 FIRST_NS = 1_750_000_000_000_000_000
@@ -45,12 +47,6 @@ def setup_text(world):
         sensors.append(SensorSpec(40 + i, f'patch/{i}', 'patch', place, axis, 0.0))
     emitter = Emitter('square_spiral_pcb', GEOMETRY, coils)
     return dump_setup(Setup('fg', 50.0, emitter, tuple(sensors)))
-
-
-@pytest.fixture(scope='module', autouse=True)
-def shared_tables():
-    with tables_made_once():
-        yield
 
 
 class Rig:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from refit_world import anser_world, metal_block, metal_flux, tables_made_once
+from refit_world import anser_world, metal_block, metal_flux
 from test_refit_node import setup_text
 
 from anser_ros.cli.main import main
@@ -18,6 +18,8 @@ from anser_ros.sessions.session import load_session
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
 
+pytestmark = pytest.mark.usefixtures('shared_tables')
+
 START_NS = 1_750_000_000_000_000_000
 STEP_NS = 40_000_000
 TOPIC = '/navigation/patch'
@@ -25,12 +27,6 @@ OFFSETS = np.array([[0.01, 0.0, 0.0], [-0.01, 0.0, 0.0]])
 AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 METAL = metal_block([0.02, 0.05, 0.36], [0.08, 0.08, 0.03])
 STRONG = -6000.0 + 800.0j
-
-
-@pytest.fixture(scope='module', autouse=True)
-def shared_tables():
-    with tables_made_once():
-        yield
 
 
 def say(bag, topic, stamp, channels, flux):

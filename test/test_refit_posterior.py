@@ -21,6 +21,8 @@ from anser_ros.refit.prior import ORIENTED, UPRIGHT, Response, build_prior
 from anser_ros.refit.references import survey_variants, vector_basis
 from anser_ros.settings import Accuracy
 
+pytestmark = pytest.mark.usefixtures('shared_tables')
+
 K = 8
 NOISE = 1.3
 

@@ -36,6 +36,8 @@ from anser_ros.sessions.recorded_drift import FOUND_ON, date_drifts
 from anser_ros.sessions.session import empty_session, load_session
 from anser_ros.sessions.tracked_session import track
 
+pytestmark = pytest.mark.usefixtures('shared_tables')
+
 ROOT = Path(__file__).resolve().parents[1]
 CHANNEL, GAIN = 4, 0.97
 LIGHT = SearchSettings(most_effects=1, finalists=2, iterations=4)

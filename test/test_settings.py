@@ -42,6 +42,8 @@ from anser_ros.settings import (
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.wire.setup import dump_setup, parse_setup
 
+pytestmark = pytest.mark.usefixtures('shared_tables')
+
 BAGS = Path(__file__).resolve().parents[1] / 'bags'
 OTHER = {
     'flux_noise_t': 1.5e-10,
