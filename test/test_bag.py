@@ -46,7 +46,7 @@ def write(path: Path, frames: int = 50, setup: str | None = SETUP) -> Path:
             writer.write_flux('/anser/tool/flux', stamp, *cloud([2, 4], frame))
             writer.write_flux('/anser/reference/flux', stamp, *cloud([9], frame))
             for half in (0, STEP // 2):
-                x = (frame * STEP + half) * 1e-9
+                x = 0.01 * (frame * STEP + half) * 1e-9
                 writer.write_pose('/optical/t/pose', stamp + half, [x, 0, 0.1], [0, 0, 0, 1.0])
     return path
 
@@ -62,7 +62,7 @@ def test_a_session_is_read_in_the_order_of_the_setup(whole):
     assert tool.sensors.name == ('t/y', 't/z')
     assert tool.flux.shape == (FRAMES, 2, 2)
     np.testing.assert_allclose(tool.flux[3, :, 1], [401e-9 + 3e-9j, 201e-9 + 3e-9j], rtol=1e-6)
-    np.testing.assert_allclose(tool.position[:-1, 0], tool.time[:-1], atol=1e-12)
+    np.testing.assert_allclose(tool.position[:-1, 0], 0.01 * tool.time[:-1], atol=1e-12)
     assert tool.usable.all()
     assert session.reference.flux.shape == (FRAMES, 1, 2)
     assert session.lost == ''
@@ -176,3 +176,13 @@ def test_another_number_of_emitters_than_the_setups_is_refused(tmp_path):
         writer.write_flux('/anser/tool/flux', START, *cloud([2, 4], 0, emitters=3))
     with pytest.raises(BagError, match='the setup has 2 emitters, the fluxes 3'):
         load_session(path)
+
+
+def test_a_chunk_that_declares_too_much_is_never_unpacked(whole, tmp_path, monkeypatch):
+    """With a small bound, a bag whose chunks are larger gives nothing, and says so."""
+    monkeypatch.setattr('anser_ros.wire.bag._RECORD_LIMIT', 1000)
+    monkeypatch.setattr('anser_ros.wire.bag.breakup_chunk', None)  # would fail if it were called
+    salvage = Salvage()
+    with pytest.raises(BagError, match='not one message can be read'):
+        list(iter_messages(whole, salvage))
+    assert salvage.lost

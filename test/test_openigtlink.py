@@ -1,5 +1,6 @@
 """Poses and states over TCP to a real OpenIGTLink client."""
 
+import contextlib
 import re
 import socket
 import time
@@ -10,7 +11,12 @@ import pytest
 from conftest import spin_until
 
 from anser_ros.errors import PortError
-from anser_ros.nodes.igtl_server import IgtlServer, device_name, transform_bytes
+from anser_ros.nodes.igtl_server import (
+    MOST_CLIENTS,
+    IgtlServer,
+    device_name,
+    transform_bytes,
+)
 
 SETUP = """
 schema: anser_setup/1
@@ -165,6 +171,41 @@ class TestServer:
                 assert time.monotonic() - began < 2.0
                 assert server.dropped > 0
                 wait_until(lambda: server.n_clients == 0)
+        finally:
+            server.close()
+
+    def test_more_clients_than_there_may_be_are_refused(self):
+        server = IgtlServer('127.0.0.1', 0)
+        clients = []
+        try:
+            for _ in range(MOST_CLIENTS + 3):
+                clients.append(socket.create_connection(('127.0.0.1', server.port)))
+            wait_until(lambda: server.refused == 3)
+            assert server.n_clients == MOST_CLIENTS
+            assert clients[-1].recv(1) == b'', 'a refused connection is closed'
+            clients[0].close()
+            wait_until(lambda: server.n_clients == MOST_CLIENTS - 1)
+            clients.append(socket.create_connection(('127.0.0.1', server.port)))
+            wait_until(lambda: server.n_clients == MOST_CLIENTS)
+        finally:
+            for client in clients:
+                client.close()
+            server.close()
+
+    def test_a_client_that_never_stops_talking_still_gets_its_poses(self):
+        server = IgtlServer('127.0.0.1', 0)
+        try:
+            with socket.create_connection(('127.0.0.1', server.port)) as client:
+                wait_until(lambda: server.n_clients == 1)
+                client.setblocking(False)
+                end, sent = time.monotonic() + 0.5, 0
+                while time.monotonic() < end:
+                    with contextlib.suppress(BlockingIOError):
+                        sent += client.send(bytes(65536))
+                    server.send(b'pose')
+                    time.sleep(0.001)
+                client.settimeout(2.0)
+                assert client.recv(4) == b'pose' and sent > 65536
         finally:
             server.close()
 

@@ -24,6 +24,16 @@ POLL_S = 0.1
 QUEUE_LENGTH = 256
 """Messages that may wait for a slow client; then the oldest is dropped. A second's or so, for ten
 sensors at 25 Hz: older poses are of no use to it."""
+MOST_CLIENTS = 16
+"""Clients that are served at once; each has a thread and a queue. A room has a few screens; more
+connections than this are a mistake or an attack, and are closed as they come."""
+HEARD_BYTES = 1 << 14
+"""Bytes that are read of a client at a time, and thrown away, since nothing is asked of clients. A
+client that sends without end is slowed down by the system, and takes no time from the others."""
+IDLE_S, PROBE_S, PROBES = 10, 5, 3
+"""Time, s, after which a silent connection is probed, time between probes, and how many go
+unanswered before it counts as gone: a machine that is switched off is forgotten in half a
+minute."""
 DEVICE_NAME_LENGTH = 20
 """Bytes that the header of an OpenIGTLink message has for the device's name."""
 MM_PER_M = 1e3
@@ -99,11 +109,21 @@ class _Client:
                 self._connection.sendall(waiting)
 
     def _has_left(self) -> bool:
-        """Read what the client says, all of which is ignored, until it has nothing more to say."""
-        while select.select([self._connection], [], [], 0.0)[0]:
-            if not self._connection.recv(4096):
-                return True
+        """Read some of what the client says, all of which is ignored."""
+        if select.select([self._connection], [], [], 0.0)[0]:
+            return not self._connection.recv(HEARD_BYTES)
         return False
+
+
+def _set_options(connection: socket.socket) -> None:
+    """Send at once, and find out when the other end is no longer there."""
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for name, value in (
+        ('TCP_KEEPIDLE', IDLE_S), ('TCP_KEEPINTVL', PROBE_S), ('TCP_KEEPCNT', PROBES),
+    ):  # fmt: skip
+        if hasattr(socket, name):
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
 
 class IgtlServer:
@@ -115,6 +135,11 @@ class IgtlServer:
         Address to listen on.
     port : int
         TCP port; 0 for a free one.
+
+    Attributes
+    ----------
+    refused : int
+        Connections closed because there were `MOST_CLIENTS` already.
 
     Raises
     ------
@@ -133,6 +158,7 @@ class IgtlServer:
         self._lock = threading.Lock()
         self._ending = threading.Event()
         self._dropped_before = 0
+        self.refused = 0
         self._thread = threading.Thread(target=self._accept, name='igtl server', daemon=True)
         self._thread.start()
 
@@ -172,8 +198,12 @@ class IgtlServer:
                 continue
             except OSError:  # the client was gone before it was accepted
                 continue
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._forget_the_gone()
+            if len(self._clients) >= MOST_CLIENTS:
+                self.refused += 1
+                connection.close()
+                continue
+            _set_options(connection)
             with self._lock:
                 self._clients.append(_Client(connection))
 

@@ -65,6 +65,7 @@ class OpenIGTLink(AnserNode):
         values = {
             'address': f'{self.parameters.host}:{self._server.port}',
             'clients': self._server.n_clients,
+            'clients_refused': self._server.refused,
             'messages_dropped': self._server.dropped,
             'sensors_ok': sum(state == OK for state in self._states.values()),
         }

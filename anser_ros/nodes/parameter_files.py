@@ -8,6 +8,8 @@ from typing import Any
 
 import yaml
 
+from anser_ros.wire.yaml_text import read_yaml
+
 OPTION = '--params-file'
 LEAF = 'ros__parameters'
 WILDCARDS = ('*', '**')
@@ -31,7 +33,7 @@ def complaints(arguments: Sequence[str], node: str) -> list[str]:
         if option != OPTION:
             continue
         try:
-            document = yaml.safe_load(Path(value).read_text(encoding='utf-8'))
+            document = read_yaml(Path(value).read_text(encoding='utf-8'))
         except (OSError, ValueError, yaml.YAMLError):
             continue
         keys = list(_sections(document))

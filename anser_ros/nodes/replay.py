@@ -21,6 +21,7 @@ from anser_ros.nodes.definitions import message_class
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.readiness import Readiness
 from anser_ros.wire.bag import RawMessage, Salvage, iter_messages
+from anser_ros.wire.yaml_text import read_yaml
 
 BAG_NAMESPACE = '/anser/'
 FLUX_ENDINGS = ('/tool/flux', '/reference/flux')
@@ -305,7 +306,7 @@ def _is_latched(message: RawMessage) -> bool:
     if message.topic.endswith(('/setup', '/field_model')):
         return True
     try:
-        offered = yaml.safe_load(message.channel.metadata.get('offered_qos_profiles', ''))
+        offered = read_yaml(message.channel.metadata.get('offered_qos_profiles', ''))
         return any(profile['durability'] in ('transient_local', 1) for profile in offered)
     except (yaml.YAMLError, TypeError, KeyError):
         return False

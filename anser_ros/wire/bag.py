@@ -31,8 +31,8 @@ _BROKEN = (
     OverflowError, OSError, zstandard.ZstdError, RuntimeError,
 )  # fmt: skip
 _RECORD_LIMIT = 256 * 2**20
-"""Largest record of a bag that is read, bytes; a larger length means a damaged file, and memory
-for it is never asked for."""
+"""Largest record of a bag that is read, and chunk once it is unpacked, bytes; a larger length
+means a damaged or a hostile file, and memory for it is never asked for."""
 
 FLUX_TYPE = 'sensor_msgs/msg/PointCloud2'
 POSE_TYPE = 'geometry_msgs/msg/PoseStamped'
@@ -128,6 +128,11 @@ def _indexed(stream: io.BufferedReader) -> Iterator[RawMessage] | None:
         return None
     if summary is None or not summary.chunk_indexes:
         return None
+    if any(
+        max(chunk.uncompressed_size, chunk.compressed_size, chunk.chunk_length) > _RECORD_LIMIT
+        for chunk in summary.chunk_indexes
+    ):
+        return None  # what is whole is found chunk by chunk
     return (
         RawMessage(channel.topic, schema.name, message.log_time, message.data, channel, schema)
         for schema, channel, message in reader.iter_messages(log_time_order=True)
@@ -147,6 +152,9 @@ def _records(stream: io.BufferedReader, salvage: Salvage, size: int) -> Iterator
             if not isinstance(record, Chunk):
                 yield record
                 continue
+            if record.uncompressed_size > _RECORD_LIMIT:
+                salvage.bad_chunks += 1
+                continue
             try:
                 inner = breakup_chunk(record, validate_crc=True)
             except _BROKEN:
@@ -159,7 +167,7 @@ def _records(stream: io.BufferedReader, salvage: Salvage, size: int) -> Iterator
             f'({type(error).__name__}: {" ".join(str(error).split())[:120]})'
         )
     if salvage.bad_chunks:
-        text = f'{salvage.bad_chunks} chunks with a bad checksum left out'
+        text = f'{salvage.bad_chunks} chunks with a bad checksum or size left out'
         salvage.lost = f'{salvage.lost}; {text}' if salvage.lost else text
 
 

@@ -7,6 +7,8 @@ from typing import Any
 
 import yaml
 
+from anser_ros.wire.yaml_text import read_yaml
+
 METADATA_VERSION = 9
 """Version of rosbag2's metadata.yaml that is written, as ROS 2 Jazzy reads it."""
 # What rosbag2 calls "for ever".
@@ -104,7 +106,7 @@ def told(folder: Path) -> dict[str, Any]:
     A bag that was not closed holds more than that: its readers don't look here.
     """
     try:
-        document = yaml.load((folder / 'metadata.yaml').read_text('utf-8'), Loader=_Loader)
+        document = read_yaml((folder / 'metadata.yaml').read_text('utf-8'))
         info = document['rosbag2_bagfile_information']
         return {
             'duration_s': 1e-9 * float(info['duration']['nanoseconds']),
@@ -120,8 +122,7 @@ def plain_yaml(document: Any) -> str:
     return yaml.dump(document, Dumper=_Dumper, sort_keys=False)
 
 
-# libyaml's are several times as fast, where they are there.
-_Loader: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+# libyaml's is several times as fast, where it is there.
 _SafeDumper: Any = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 

@@ -17,6 +17,7 @@ import yaml
 from numpy.typing import NDArray
 
 from anser_ros.errors import SetupError
+from anser_ros.wire.yaml_text import read_yaml
 
 SCHEMA = 'anser_channels/1'
 _KEYS = ('area_m2', 'delay_s')
@@ -87,7 +88,7 @@ def parse_channels(text: str) -> ChannelCalibration:
         With the rule that is broken and where.
     """
     try:
-        root = yaml.safe_load(text)
+        root = read_yaml(text)
     except (yaml.YAMLError, ValueError) as error:
         raise SetupError(f'channels: not YAML: {" ".join(str(error).split())}') from error
     if not isinstance(root, dict) or root.get('schema') != SCHEMA:

@@ -7,8 +7,8 @@ from typing import Any
 import yaml
 
 from anser_ros.errors import ModelFileError
+from anser_ros.wire.yaml_text import MOST_CHARACTERS, read_yaml
 
-_LOADER = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 _DUMPER = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
 
 
@@ -17,7 +17,7 @@ def read_document(path: str | os.PathLike[str]) -> Any:
     name = os.fspath(path)
     try:
         with open(name, encoding='utf-8') as stream:
-            return yaml.load(stream, Loader=_LOADER)
+            return read_yaml(stream.read(MOST_CHARACTERS + 1))
     except (OSError, UnicodeError) as error:
         raise ModelFileError(f'{name}: {error}') from error
     except (yaml.YAMLError, ValueError) as error:

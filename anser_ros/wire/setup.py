@@ -16,6 +16,7 @@ import yaml
 
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.settings import SECTIONS, Accuracy, RefitSettings, settings_from
+from anser_ros.wire.yaml_text import read_yaml
 
 SCHEMA = 'anser_setup/1'
 FIELD_GENERATOR = 'fg'
@@ -317,7 +318,7 @@ def parse_setup(text: str) -> Setup:
         With the rule that is broken and the key where it is.
     """
     try:
-        document = yaml.load(text, Loader=getattr(yaml, 'CSafeLoader', yaml.SafeLoader))
+        document = read_yaml(text)
     except (yaml.YAMLError, UnicodeError, ValueError) as error:
         raise SetupError(f'setup: not YAML: {" ".join(str(error).split())}') from error
     root = _mapping(document, 'the document')
