@@ -108,6 +108,43 @@ class Accuracy:
 
 
 @dataclass(frozen=True)
+class ToolSettings:
+    """How well tools are known, and how fast they may be.
+
+    Raises
+    ------
+    ParameterError
+        When a value is no number or out of its range.
+
+    Attributes
+    ----------
+    tool_position_m, tool_axis_rad : float
+        Error of a tool coil's place along each axis, m, and of its direction along both tangents,
+        rad: one standard deviation. Too small, and sound coils contradict their body; too large,
+        and a coil may be wrong by some times this before its body notices.
+    tool_gain : float
+        Relative error of a tool coil's gain, one standard deviation.
+    max_speed_m_s, max_acceleration_m_s2 : float
+        Poses that would take more are not published until the frames after them confirm them. The
+        defaults are a hand's: it reaches over a table at 1 to 1.5 m/s, and jerks at 3 g. Too
+        small, and fast movements lose frames; too large, and wrong poses look like movements.
+    """
+
+    tool_position_m: float = _value(
+        0.12e-3, "error of a tool coil's place along each axis, m", 0.0, 0.1
+    )
+    tool_axis_rad: float = _value(
+        math.radians(0.5), "error of a tool coil's axis, rad a tangent", 0.0, 1.0
+    )
+    tool_gain: float = _value(0.002, "relative error of a tool coil's gain", 0.0, 1.0)
+    max_speed_m_s: float = _value(2.0, 'largest speed of a tool, m/s', 1e-3, 1e4)
+    max_acceleration_m_s2: float = _value(40.0, 'largest acceleration of a tool, m/s^2', 1e-3, 1e6)
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
+@dataclass(frozen=True)
 class RefitSettings:
     """How the live refit follows; nothing here belongs to a particular board or metal.
 
@@ -145,6 +182,9 @@ class RefitSettings:
         Of the random draws that the uncertainty is made from.
     accuracy : Accuracy
         Of the references and their readings.
+    tools : ToolSettings
+        Of the tools, which the refit itself has no use for: two settings that differ in it only
+        are the same.
     """
 
     emitter_drift: float = _value(
@@ -168,6 +208,7 @@ class RefitSettings:
     error_modes: int = _value(12, "rank of the model's uncertainty", 1, 96)
     seed: int = _value(1, 'seed of the draws that the uncertainty is made from', 1, 2**31)
     accuracy: Accuracy = field(default_factory=Accuracy)
+    tools: ToolSettings = field(default_factory=ToolSettings, compare=False)
 
     def __post_init__(self) -> None:
         _check(self)
@@ -176,6 +217,7 @@ class RefitSettings:
 SECTIONS = {
     'accuracy': {item.name: item for item in fields(Accuracy)},
     'refit': {item.name: item for item in fields(RefitSettings) if item.metadata},
+    'tools': {item.name: item for item in fields(ToolSettings)},
 }
 """The values that may be stated, by section of the setup document and by name."""
 VALUES = {name: item for section in SECTIONS.values() for name, item in section.items()}
@@ -202,7 +244,8 @@ def settings_from(stated: Mapping[str, Any]) -> RefitSettings:
         )
     accuracy = {name: stated[name] for name in SECTIONS['accuracy'] if name in stated}
     refit = {name: stated[name] for name in SECTIONS['refit'] if name in stated}
-    return RefitSettings(**refit, accuracy=Accuracy(**accuracy))
+    tools = {name: stated[name] for name in SECTIONS['tools'] if name in stated}
+    return RefitSettings(**refit, accuracy=Accuracy(**accuracy), tools=ToolSettings(**tools))
 
 
 def parse_entries(entries: list[str]) -> dict[str, float]:

@@ -63,6 +63,11 @@ OTHER = {
     'references_age_s': 2.0,
     'error_modes': 5,
     'seed': 9,
+    'tool_position_m': 1e-3,
+    'tool_axis_rad': 0.05,
+    'tool_gain': 0.02,
+    'max_speed_m_s': 0.5,
+    'max_acceleration_m_s2': 5.0,
 }
 """Another value of everything that may be stated."""
 
@@ -76,7 +81,8 @@ def entries(stated):
 
 
 def read(settings, name):
-    return getattr(settings if name in SECTIONS['refit'] else settings.accuracy, name)
+    part = next(key for key, names in SECTIONS.items() if name in names)
+    return getattr(settings if part == 'refit' else getattr(settings, part), name)
 
 
 @pytest.fixture(scope='module')
@@ -103,7 +109,7 @@ class TestStating:
         others = [other for other in VALUES if other != name]
         assert all(read(setup.refit, other) == VALUES[other].default for other in others)
         assert parse_setup(dump_setup(setup)) == setup
-        assert 'accuracy' not in setup.extra and 'refit' not in setup.extra
+        assert not set(SECTIONS) & set(setup.extra)
 
     def test_an_option_goes_before_the_document_and_that_before_the_default(self):
         setup = setup_with(accuracy={'reference_gain': 0.01, 'flux_noise_t': 1e-10})
@@ -310,12 +316,22 @@ class TestNodes:
     @pytest.mark.parametrize(
         ('table', 'names'),
         [
-            (FieldModelParameters, [n for n in VALUES if not n.startswith(('optical', 'stamp'))]),
+            (
+                FieldModelParameters,
+                [
+                    n
+                    for n in VALUES
+                    if n not in SECTIONS['tools'] and not n.startswith(('optical', 'stamp'))
+                ],
+            ),
             (
                 WatcherParameters,
                 [n for n in SECTIONS['accuracy'] if not n.startswith(('patch', 'stamp'))],
             ),
-            (TrackerParameters, ['flux_noise_t', 'stamp_sigma_s', 'references_age_s']),
+            (
+                TrackerParameters,
+                ['flux_noise_t', 'stamp_sigma_s', 'references_age_s', *SECTIONS['tools']],
+            ),
         ],
     )
     def test_parameters_state_what_their_node_uses(self, table, names):

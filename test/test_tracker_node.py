@@ -11,6 +11,7 @@ from tracking_world import certain_model, fluxes, random_pose, setup_of, triaxia
 from anser_ros.errors import ParameterError
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.sessions.model_file import load_model, save_model
+from anser_ros.sessions.tracker_settings import settings_for
 from anser_ros.tracking.rotations import rotation_of_quaternion
 from anser_ros.tracking.tracker import Tracker
 from anser_ros.wire.points import DipolePoints, FluxPoints, encode_field_model
@@ -387,7 +388,7 @@ def test_only_live_frames_too_fast_to_solve_are_skipped(tracker, monkeypatch, li
         tracker.stamp_ns = time.time_ns()
     ready(tracker)
     tracker.node.set_parameters([Parameter('stale_after_s', value=30.0)])
-    flux = fluxes(certain_model(), SENSORS, *random_pose(rng), rng)
+    place = random_pose(rng)
     node, whole, pause_s = tracker.node, Tracker.estimates, [0.2]
 
     def slow(self, *arguments):
@@ -397,7 +398,7 @@ def test_only_live_frames_too_fast_to_solve_are_skipped(tracker, monkeypatch, li
     monkeypatch.setattr(Tracker, 'estimates', slow)
     work_s = 0.0
     for _ in range(20):
-        tracker.say_flux(flux)
+        tracker.say_flux(fluxes(certain_model(), SENSORS, *place, rng))
     wait_frame(tracker, 20)
     assert node.counters['frames_skipped'] == 0
     work_s, late_s = 0.05, []
@@ -405,7 +406,7 @@ def test_only_live_frames_too_fast_to_solve_are_skipped(tracker, monkeypatch, li
     def send():
         for _ in range(100):
             time.sleep(0.02)
-            tracker.say_flux(flux)
+            tracker.say_flux(fluxes(certain_model(), SENSORS, *place, rng))
             late_s.append(1e-9 * (tracker.stamp_ns - node._tracker.last_stamp_ns))
 
     sender = threading.Thread(target=send)
@@ -470,8 +471,8 @@ def test_the_volume_of_the_setup_holds_unless_a_parameter_says_another(tracker):
     node.publish_diagnostics()
     tracker.spin_until(lambda: tracker.state('anser/tracker: tool_a') == 'outside_volume')
     low, high = (-0.1, -0.1, 0.05), (0.1, 0.1, 0.3)
-    node._settings = settings_of(TrackerParameters(volume_low_m=low, volume_high_m=high))
-    assert node._wanted_settings().box == TrackedVolume(low, high)
+    stated = settings_of(TrackerParameters(volume_low_m=low, volume_high_m=high))
+    assert settings_for(node._setup, stated).box == TrackedVolume(low, high)
     with pytest.raises(ParameterError, match='volume_high_m: three numbers'):
         settings_of(TrackerParameters(volume_low_m=low))
 

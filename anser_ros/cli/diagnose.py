@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--out', required=True, type=Path, help='folder for the results, made if missing'
     )
     parser.add_argument('--baseline', help='distortion-free recording of the same board')
-    add_stated_values(parser, 'accuracy', 'refit')
+    add_stated_values(parser, 'accuracy', 'refit', 'tools')
     parser.add_argument('--json', action='store_true', help='print diagnosis.json on stdout')
 
 

@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='largest residual of a pose, in units of the expected one; inf refuses none '
         '(for the error that a wrong model would make, never for use)',
     )
-    add_stated_values(parser, 'accuracy', 'refit')
+    add_stated_values(parser, 'accuracy', 'refit', 'tools')
     parser.add_argument('--json', action='store_true', help='print evaluation.json on stdout')
 
 

@@ -36,6 +36,8 @@ MISSING_CODE, SATURATED_CODE, STALE_CODE, DROPPED_CODE, FLAGGED_CODE = 1, 2, 3, 
 """Codes of what the frame itself says: no such channel, or a flag."""
 NOT_FINITE_CODE, ABSURD_CODE = 6, 7
 """Codes of what the values say."""
+STUCK_CODE = 8
+"""Code of what earlier readings say: this one repeats one of them."""
 
 MISSING = Fault('missing', 'stale', 'its channel is not in the frame')
 SATURATED = Fault('saturated', 'saturated', 'flagged saturated by the acquisition')
@@ -44,9 +46,10 @@ DROPPED = Fault('dropped', 'dropped', 'flagged dropped by the acquisition')
 FLAGGED = Fault('flagged', 'no_signal', 'flagged by the acquisition with an unknown bit')
 NOT_FINITE = Fault('not_finite', 'no_signal', 'the fluxes are not finite')
 ABSURD = Fault('absurd', 'no_signal', f'fluxes beyond {LARGEST_FLUX_T:g} T are absurd')
+STUCK = Fault('stuck', 'stale', 'stuck: the same reading as before')
 
 FAULTS: tuple[Fault | None, ...] = (
-    None, MISSING, SATURATED, STALE, DROPPED, FLAGGED, NOT_FINITE, ABSURD,
+    None, MISSING, SATURATED, STALE, DROPPED, FLAGGED, NOT_FINITE, ABSURD, STUCK,
 )  # fmt: skip
 
 

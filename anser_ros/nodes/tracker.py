@@ -6,7 +6,7 @@ A pose is published only while its state is ``ok``; why there is none stands in 
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from sensor_msgs.msg import PointCloud2
@@ -31,9 +31,9 @@ from anser_ros.nodes.readiness import digest_of
 from anser_ros.nodes.stated_parameters import stated, stated_by
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.sessions.model_file import load_model
-from anser_ros.sessions.session import sensor_table, tracking_noise
+from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.starting_model import NOMINAL, check_emitters
-from anser_ros.sessions.volume import pose_volume
+from anser_ros.sessions.tracker_settings import settings_for
 from anser_ros.tracking.estimate import OK, TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 from anser_ros.tracking.warm_up import warm_up
@@ -63,6 +63,11 @@ class TrackerParameters:
     flux_noise_t: float = stated('flux_noise_t')
     stamp_sigma_s: float = stated('stamp_sigma_s')
     references_age_s: float = stated('references_age_s')
+    tool_position_m: float = stated('tool_position_m')
+    tool_axis_rad: float = stated('tool_axis_rad')
+    tool_gain: float = stated('tool_gain')
+    max_speed_m_s: float = stated('max_speed_m_s')
+    max_acceleration_m_s2: float = stated('max_acceleration_m_s2')
     adaptive: bool = parameter(
         TrackerSettings.adaptive,
         'whether the noise follows the residuals of good poses',
@@ -157,8 +162,6 @@ class TrackerNode(AnserNode):
         self._file_model = load_model(table.model_file) if has_file else None
         self._setup_text = ''
         self._setup: Setup | None = None
-        self._flux_noise_t = 0.0
-        self._volume: TrackedVolume | None = None
         self._tracker: Tracker | None = None
         self._topics: dict[str, PoseTopic] = {}
         self._intake = ModelIntake()
@@ -194,9 +197,7 @@ class TrackerNode(AnserNode):
         try:
             setup = parse_setup(message.data).with_stated(self._stated)
             sensors = sensor_table(setup.tool_sensors)
-            self._flux_noise_t = tracking_noise(setup)
-            self._volume = pose_volume(setup)
-            settings = self._wanted_settings()
+            settings = settings_for(setup, self._settings)
             tracker = Tracker(None, sensors, settings)
             if self._file_model is not None:
                 check_emitters(setup, self._file_model)
@@ -315,7 +316,6 @@ class TrackerNode(AnserNode):
         try:
             if standing.model is not None and standing.model is not self._tracker.model:
                 self._track_with(standing.model, self._given)
-            # Each pose goes out before the next is worked on.
             for estimate in self._tracker.estimates(
                 stamp_ns, points.channel, points.flux, points.flags, standing.withheld
             ):
@@ -337,13 +337,6 @@ class TrackerNode(AnserNode):
         if changed and time.monotonic() - self._told_s > EARLIEST_DIAGNOSTICS_S:
             self.publish_diagnostics()
 
-    def _wanted_settings(self) -> TrackerSettings:
-        """The settings, with the setup's noise, and its volume where no parameter says another."""
-        settings = self._settings
-        return replace(
-            settings, flux_noise_t=self._flux_noise_t, volume=settings.volume or self._volume
-        )
-
     # What is told -------------------------------------------------------------------------
 
     def _refuse(self, counter: str, error: AnserError) -> None:
@@ -353,8 +346,8 @@ class TrackerNode(AnserNode):
     def on_parameters(self, old: TrackerParameters, new: TrackerParameters) -> None:
         """Track on with the new settings, from where the tools were."""
         self._settings = settings_of(new)
-        if self._tracker is not None:
-            self._tracker = self._tracker.with_settings(self._wanted_settings())
+        if self._tracker is not None and self._setup is not None:
+            self._tracker = self._tracker.with_settings(settings_for(self._setup, self._settings))
 
     def status(self) -> Status:
         """Return what the tracker lacks, if anything, and its counters."""

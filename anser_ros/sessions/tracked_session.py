@@ -10,7 +10,7 @@ from anser_ros.integrity.ageing import AS_IT_IS
 from anser_ros.sessions.follower import ModelFollower, RefitSummary
 from anser_ros.sessions.frames import frames_of
 from anser_ros.sessions.prepared import PreparedSession
-from anser_ros.sessions.session import tracking_noise
+from anser_ros.sessions.tracker_settings import settings_for
 from anser_ros.tracking.tracker import PoseEstimate, Tracker, TrackerSettings
 
 Progress = Callable[[float], None]
@@ -100,8 +100,7 @@ def _tracker(prepared: PreparedSession, settings: TrackerSettings, *, follows: b
         prepared.model,
         prepared.sensors,
         replace(
-            settings,
-            flux_noise_t=tracking_noise(prepared.session.setup),
+            settings_for(prepared.session.setup, settings),
             recorded_drift=prepared.recorded_drift and not follows,
             volume=settings.volume or prepared.volume,
         ),

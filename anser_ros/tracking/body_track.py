@@ -75,18 +75,29 @@ class BodyTrack:
 
 
 @dataclass(frozen=True)
-class _Fit:
+class BodyFit:
+    """A body's solution, the coils (indices) that took part, and the degrees of freedom."""
+
     solution: BodySolution
     used: NDArray[np.int64]
     freedom: int
 
     @property
     def ratio(self) -> float:
+        """Chi-square over the degrees of freedom."""
         return self.solution.chi2 / self.freedom
 
     def good(self, gate: float) -> bool:
         """Whether the descent has ended, and below the gate."""
         return self.solution.converged and self.ratio <= gate**2
+
+
+@dataclass(frozen=True)
+class BodyResult:
+    """An estimate with the fit behind it; None where nothing was solved."""
+
+    estimate: PoseEstimate
+    fit: BodyFit | None = None
 
 
 @dataclass(frozen=True)
@@ -140,17 +151,17 @@ class _BodyFrame:
         return position, rotation
 
 
-def _solve(frame: _BodyFrame, used: NDArray[np.int64], start: Start) -> _Fit:
+def _solve(frame: _BodyFrame, used: NDArray[np.int64], start: Start) -> BodyFit:
     part, context = frame.coils.subset(used), frame.context
     weights = np.tile(frame.inverse_sigma, (len(used), 1))
     solution = solve_body(
         context.field, part, np.ascontiguousarray(frame.flux[used]), weights,
         frame.common(used, start), *start, context.low - part.reach, context.high + part.reach,
     )  # fmt: skip
-    return _Fit(solution, used, max(weights.size - 6, 1))
+    return BodyFit(solution, used, max(weights.size - 6, 1))
 
 
-def _without_disagreeing(fit: _Fit, frame: _BodyFrame, gate: float) -> _Fit:
+def _without_disagreeing(fit: BodyFit, frame: _BodyFrame, gate: float) -> BodyFit:
     """Leave out, one by one, up to a third of the coils while one of them spoils the fit."""
     for _ in range(len(fit.used) // 3):
         if fit.ratio <= gate**2:
@@ -197,7 +208,7 @@ def track_body(
     single: list[CoilResult],
     context: SolveContext,
     settings: TrackerSettings,
-) -> PoseEstimate:
+) -> BodyResult:
     """Estimate a body's pose from the fluxes, shape (S, 2K), of its usable coils."""
     used = np.flatnonzero(usable)
     if len(used) < 2 or not coils.subset(used).observable:
@@ -205,7 +216,7 @@ def track_body(
         worst = next(
             (s.estimate.state for i, s in enumerate(single) if not usable[i]), states.STALE
         )
-        return no_pose(name, stamp_ns, worst, context.model_id, reason)
+        return BodyResult(no_pose(name, stamp_ns, worst, context.model_id, reason))
     frame = _BodyFrame(coils, flux, single, context)
     fits = _from_good(track, stamp_ns, frame, used, settings)
     if not fits:
@@ -214,7 +225,7 @@ def track_body(
         fits[:1] = [_without_disagreeing(f, frame, settings.gate) for f in fits[:1]]
     if not fits:
         reason = 'no coil of this body has a pose to start from'
-        return no_pose(name, stamp_ns, states.RESIDUAL, context.model_id, reason)
+        return BodyResult(no_pose(name, stamp_ns, states.RESIDUAL, context.model_id, reason))
     fit = fits[0]
     result = _judge(track, name, stamp_ns, fit, fits[1:], coils, context, settings)
     if result.state == states.OK:
@@ -229,7 +240,7 @@ def track_body(
         left_out = frozenset(used.tolist()) - frozenset(fit.used.tolist())
         if left_out != track.left_out:
             track.left_out, track.again_ns = left_out, stamp_ns + round(LEFT_OUT_S / NANO)
-    return result
+    return BodyResult(result, fit)
 
 
 def _from_good(
@@ -238,7 +249,7 @@ def _from_good(
     frame: _BodyFrame,
     used: NDArray[np.int64],
     settings: TrackerSettings,
-) -> list[_Fit]:
+) -> list[BodyFit]:
     """The fit near the last good pose, when there is one that passes the gate."""
     if track.good is None or (stamp_ns - track.good_ns) * NANO > settings.warm_age_s:
         return []
@@ -260,8 +271,8 @@ def _judge(
     track: BodyTrack,
     name: str,
     stamp_ns: int,
-    fit: _Fit,
-    rivals: list[_Fit],
+    fit: BodyFit,
+    rivals: list[BodyFit],
     coils: BodyCoils,
     context: SolveContext,
     settings: TrackerSettings,

@@ -1,16 +1,16 @@
 """What tracking reports, and what it is told: states, pose estimates, settings."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
 from anser_ros.frames import faults
-from anser_ros.integrity import withheld
+from anser_ros.integrity import verdict, withheld
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.settings import Accuracy
+from anser_ros.settings import Accuracy, ToolSettings
 from anser_ros.tracking.uncertainty import ROLL_VARIANCE
 
 Array = NDArray[np.float64]
@@ -24,14 +24,21 @@ AMBIGUOUS = 'ambiguous'
 STALE = faults.STALE.state
 SATURATED = faults.SATURATED.state
 DROPPED = faults.DROPPED.state
+INCONSISTENT = verdict.INCONSISTENT
+UNCONFIRMED = verdict.UNCONFIRMED
+MODEL_DOUBTFUL = verdict.MODEL_DOUBTFUL
 STATES = (
     OK, NO_MODEL, NO_SIGNAL, RESIDUAL, OUTSIDE_VOLUME, AMBIGUOUS, STALE, SATURATED, DROPPED,
     *withheld.STATES,
+    INCONSISTENT, UNCONFIRMED, MODEL_DOUBTFUL,
 )  # fmt: skip
 
 USUAL_GATE = 4.0
 """Largest residual of a pose in units of the expected one, unless a setting says another. Smaller,
 and poses are lost to the model's own small errors; larger, and distorted poses pass."""
+
+NO_GATE = 1e6
+"""A gate of so much or more is none: no pose is refused for what it contradicts."""
 
 HIDDEN = 4.0
 """How much more of a distortion's power goes into the pose than its share of the dimensions.
@@ -55,8 +62,9 @@ class TrackerSettings:
     grid_spacing_m : float
         Spacing of the cold start's grid at 0.1 m height.
     gate : float
-        A pose whose residual is more than so many times the expected one is refused; infinite: no
-        pose is refused for what the model lacks (to measure what that costs, never for use).
+        A pose whose residual is more than so many times the expected one is refused; from
+        `NO_GATE` on no pose is refused for what it contradicts (to measure what that costs, never
+        for use).
     odds : float
         A second pose that is more likely than one to so many makes the first ambiguous.
     max_sigma_m : float
@@ -70,6 +78,10 @@ class TrackerSettings:
     recorded_drift : bool
         Whether an emitter's drift takes the course that the model's effects recorded: only on the
         session that they were found on, and with a model that doesn't follow the references.
+    stamp_sigma_s : float
+        Error of a flux stamp, s.
+    tools : ToolSettings
+        How well tools are known, and how fast they may be.
     """
 
     flux_noise_t: float = Accuracy.flux_noise_t
@@ -83,6 +95,8 @@ class TrackerSettings:
     warm_age_s: float = 1.0
     roll_variance: float = ROLL_VARIANCE
     recorded_drift: bool = False
+    stamp_sigma_s: float = Accuracy.stamp_sigma_s
+    tools: ToolSettings = field(default_factory=ToolSettings)
 
     def __post_init__(self) -> None:
         for name in (
@@ -91,8 +105,15 @@ class TrackerSettings:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0) and not (name == 'gate' and value > 0):
                 raise TrackingError(f'setting {name} must be positive and finite, got {value}')
+        if not 0.0 <= self.stamp_sigma_s < math.inf:
+            raise TrackingError(f'setting stamp_sigma_s is an error, got {self.stamp_sigma_s}')
         if not self.odds >= 1 or not self.min_signal >= 0:
             raise TrackingError('settings: odds must be at least 1, min_signal at least 0')
+
+    @property
+    def has_gate(self) -> bool:
+        """Whether poses are refused for what they contradict."""
+        return self.gate < NO_GATE
 
     @property
     def box(self) -> TrackedVolume:

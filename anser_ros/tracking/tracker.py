@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import TrackingError
 from anser_ros.field.model import EffectRecord, FieldModel
-from anser_ros.frames.faults import FAULTS, GOOD, value_codes
+from anser_ros.frames.faults import FAULTS, GOOD, STUCK_CODE, value_codes
 from anser_ros.frames.intake import BACK, NANO, Frame, Intake
+from anser_ros.integrity.freshness import Freshness
 from anser_ros.integrity.withheld import Withheld
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.tracking import estimate as states
@@ -24,9 +25,11 @@ from anser_ros.tracking.body_track import BodyTrack, track_body
 from anser_ros.tracking.coil_track import CoilResult, CoilTrack, prepare, track_coil
 from anser_ros.tracking.emitters import FEWEST_EMITTERS, ReducedScene, without_dead
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
+from anser_ros.tracking.judgement import Judgement, RigidBody
 from anser_ros.tracking.rigid import BodyCoils
 from anser_ros.tracking.solve_context import SolveContext, build_context
 
+Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 __all__ = ['PoseEstimate', 'Tracker', 'TrackerSettings']
@@ -51,7 +54,8 @@ class Tracker:
         ``frames``, ``cold_starts``, ``duplicates``; ``time_jumps`` back, ``time_jumps_forward``
         beyond the age of a warm start; ``frames_empty``; ``frames_dead_emitter``; and sensors'
         readings that were not used: ``readings_missing``, ``readings_saturated``,
-        ``readings_stale``, ``readings_dropped``, ``readings_not_finite``, ``readings_absurd``.
+        ``readings_stale``, ``readings_dropped``, ``readings_not_finite``, ``readings_absurd``,
+        ``readings_stuck``.
 
     Raises
     ------
@@ -80,6 +84,8 @@ class Tracker:
         self._coil_tracks = {name: CoilTrack() for name in sensors.name}
         self._body_tracks = {name: BodyTrack() for name in dict.fromkeys(sensors.body)}
         self._intake = Intake(sensors.channel, self._count, spares_dead=True, error=TrackingError)
+        self._freshness = Freshness()
+        self._judgement = Judgement()
         self._first_ns: list[int] = []
         self._context: SolveContext | None = None
         self._reduced: ReducedScene | None = None
@@ -168,7 +174,8 @@ class Tracker:
         return other
 
     def reset(self) -> None:
-        """Forget all warm starts."""
+        """Forget all warm starts, and what was seen of the sensors and bodies so far."""
+        self._judgement.forget()
         for coil in self._coil_tracks.values():
             coil.forget()
         for body in self._body_tracks.values():
@@ -193,7 +200,7 @@ class Tracker:
         flags: NDArray[np.generic] | None = None,
         withheld: Withheld | None = None,
     ) -> Iterator[PoseEstimate]:
-        """Estimate the poses of one frame, each given out before the next is worked on.
+        """Estimate the poses of one frame.
 
         Parameters
         ----------
@@ -238,6 +245,7 @@ class Tracker:
         """
         if frame.jump == BACK:
             self.reset()
+        frame = self._freshness.judged(frame, self.settings.flux_noise_t)
         if not self._first_ns:
             self._first_ns.append(frame.stamp_ns)
         context = self._context
@@ -271,16 +279,36 @@ class Tracker:
     def _solved(
         self, stamp_ns: int, flux: ComplexArray, codes: NDArray[np.int64], context: SolveContext
     ) -> Iterator[PoseEstimate]:
-        """Yield the poses of fluxes (S, K) whose readings are good or bad by ``codes`` (S,)."""
-        table, values = self._table, flux.view(np.float64)
-        results: list[CoilResult] = []
+        """Yield the poses of fluxes (S, K) whose readings are good or bad by ``codes`` (S,).
+
+        None is given out before all are known, for they are judged by each other.
+        """
+        values = flux.view(np.float64)
+        coils = self._solved_coils(stamp_ns, values, codes, context)
+        bodies = []
+        for name, (rows, table) in self._bodies.items():
+            single = [coils[i] for i in rows]
+            usable = np.array([coil.usable for coil in single])
+            result = track_body(
+                self._body_tracks[name], name, table, stamp_ns, values[rows], usable, single,
+                context, self.settings,
+            )  # fmt: skip
+            bodies.append(RigidBody(rows, table, result))
+        yield from self._judgement.judged(stamp_ns, coils, bodies, self.settings)
+
+    def _solved_coils(
+        self, stamp_ns: int, values: Array, codes: NDArray[np.int64], context: SolveContext
+    ) -> list[CoilResult]:
+        """Solve each sensor by itself, from flux components (S, 2K)."""
+        table, results = self._table, []
         tracks = [self._coil_tracks[name] for name in table.name]
         prepare(tracks, table.length, stamp_ns, context, self.settings)
         for i, (name, code) in enumerate(zip(table.name, codes.tolist(), strict=True)):
             fault = FAULTS[code]
             if fault is not None:
                 self.counters[f'readings_{fault.kind}'] += 1
-                bad = no_pose(name, stamp_ns, fault.state, context.model_id, fault.reason)
+                reason = self._freshness.reason(i) if code == STUCK_CODE else fault.reason
+                bad = no_pose(name, stamp_ns, fault.state, context.model_id, reason)
                 result = CoilResult(bad, None)
             else:
                 result = track_coil(
@@ -289,20 +317,7 @@ class Tracker:
                 )  # fmt: skip
                 self.counters['cold_starts'] += result.cold
             results.append(result)
-            yield result.estimate
-        for body, (members, coils) in self._bodies.items():
-            usable = np.array([results[i].usable for i in members])
-            yield track_body(
-                self._body_tracks[body],
-                body,
-                coils,
-                stamp_ns,
-                values[members],
-                usable,
-                [results[i] for i in members],
-                context,
-                self.settings,
-            )
+        return results
 
     def _without_poses(
         self, frame: Frame, state: str, model_id: str, reason: str

@@ -32,7 +32,10 @@ def warm_up() -> None:
             positions, directions, moments, names, tuple(1000.0 + k for k in range(9)), 0.0,
             uncertainty,
         )  # fmt: skip
+        rng = np.random.default_rng(0)
         flux = model.flux(sensors.position + [0.01, 0.02, 0.15], sensors.axis, sensors.length)
         tracker = Tracker(model, sensors, settings)
         for stamp_ns in (1, 2, 3):
-            tracker.update(stamp_ns, sensors.channel, flux)
+            # New noise each time, for a reading that repeats is no reading.
+            noise = settings.flux_noise_t * rng.standard_normal((2, *flux.shape))
+            tracker.update(stamp_ns, sensors.channel, flux + noise[0] + 1j * noise[1])

@@ -1,0 +1,166 @@
+"""One sensor's or body's poses through time: how far it may have moved, and when a track begins.
+
+A single residual that passes the gate proves little when most of its neighbours in time do not:
+of wrong poses a few pass by chance. So after refusals a pose needs others before it that are
+consistent with it. Points that were recorded one by one, further apart than `STREAM_GAP_S`, have
+no neighbours in time, and each is judged alone.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.frames.intake import NANO
+
+Array = NDArray[np.float64]
+
+STREAM_GAP_S = 0.5
+"""Frames further apart than this, s, are single points and no stream. Smaller, and a stream with
+gaps loses its memory; larger, and points that a robot visits once a second are taken for one."""
+RECORD_S = 1.0
+"""How far back refusals count, s. Smaller, and poses that slip through from time to time are taken
+for good ones; larger, and a tool is long without a pose after a distortion has ended."""
+MOST_REFUSED = 0.5
+"""Share of refused frames in the record from which on a good one needs confirmation."""
+START_FRAMES = 3
+"""Fewest consecutive frames, the last one included, that confirm a pose: 60 ms at 50 Hz. Fewer,
+and two wrong poses that pass one after the other are published; more, and a tool that appears is
+shown later."""
+LONGEST_RUN_S = 0.25
+"""Longest run that is asked for, s; the run is as long as the refusal before it up to this."""
+SIGMAS = 3.0
+"""Allowance for the poses' own errors, in units of `Place.sigma_m`, when they are compared with
+the bounds of the motion. Smaller, and an uncertain pose at rest is said to leap; larger, and the
+leaps of uncertain poses pass."""
+
+
+@dataclass(frozen=True)
+class MotionBounds:
+    """The largest speed (m/s) and acceleration (m/s^2) of a tool."""
+
+    speed_m_s: float
+    acceleration_m_s2: float
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where something was, and how well that is known: stamp, position (m), and its sigma, m."""
+
+    stamp_ns: int
+    position: Array
+    sigma_m: float
+
+
+def leap(before: list[Place], now: Place, bounds: MotionBounds) -> str:
+    """Say how a place contradicts the places before it, oldest first; empty if it does not.
+
+    Of the last two places and this one: for an acceleration of at most a, the place is no further
+    than ``a dt (dt + dt_before) / 2`` from where the mean velocity before leads.
+    """
+    if not before:
+        return ''
+    last = before[-1]
+    dt = (now.stamp_ns - last.stamp_ns) * NANO
+    away = math.dist(now.position, last.position)
+    error = SIGMAS * math.hypot(now.sigma_m, last.sigma_m)
+    if away > bounds.speed_m_s * dt + error:
+        return f'{1e3 * away:.3g} mm in {1e3 * dt:.3g} ms are {away / dt:.3g} m/s'
+    if len(before) < 2:
+        return ''
+    first = before[-2]
+    dt_before = (last.stamp_ns - first.stamp_ns) * NANO
+    steps = dt / dt_before
+    apart = now.position - last.position - steps * (last.position - first.position)
+    bent = math.sqrt(float(apart @ apart))
+    parts = now.sigma_m, (1.0 + steps) * last.sigma_m, steps * first.sigma_m
+    time = 0.5 * dt * (dt + dt_before)
+    if bent > bounds.acceleration_m_s2 * time + SIGMAS * math.hypot(*parts):
+        return f'an acceleration of {bent / time:.3g} m/s^2'
+    return ''
+
+
+class Continuity:
+    """Judges one sensor's or body's poses through time."""
+
+    def __init__(self) -> None:
+        self._track: list[Place] = []
+        self._run: list[Place] = []
+        self._frames = 0
+        self._began_ns = 0
+        self._last_ns = 0
+        self._record: deque[tuple[int, bool]] = deque()
+        self._refused = 0
+
+    @property
+    def refused_share(self) -> float:
+        """Share of the last second's frames that were refused although there were signals."""
+        return self._refused / max(len(self._record), 1)
+
+    def forget(self) -> None:
+        """Forget all frames that were judged so far."""
+        self._track, self._run, self._frames, self._last_ns = [], [], 0, 0
+        self._record.clear()
+        self._refused = 0
+
+    def judge(
+        self, stamp_ns: int, place: Place | None, refused: bool, bounds: MotionBounds
+    ) -> str:
+        """Judge the next frame.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            Of the frame.
+        place : Place or None
+            Of the pose, where it is good by itself.
+        refused : bool
+            Whether there is no pose although there are signals.
+        bounds : MotionBounds
+
+        Returns
+        -------
+        str
+            Why the pose is not confirmed; empty where it is, and where there is none.
+        """
+        last_ns = self._last_ns
+        alone = not last_ns or not 0 < stamp_ns - last_ns <= STREAM_GAP_S / NANO
+        if alone:
+            self.forget()
+        self._last_ns = stamp_ns
+        self._note(stamp_ns, place is None and refused, place is not None or refused)
+        if place is None:
+            self._run, self._frames = [], 0
+            return ''
+        contradiction = leap(self._track, place, bounds)
+        old = not self._track or stamp_ns - self._track[-1].stamp_ns > RECORD_S / NANO
+        goes_on = not (old or contradiction or self.refused_share > MOST_REFUSED)
+        if self._frames and leap(self._run, place, bounds):
+            self._run, self._frames = [], 0
+        if not self._frames:
+            self._began_ns = stamp_ns
+        self._run, self._frames = [*self._run[-1:], place], self._frames + 1
+        if goes_on or alone or self._is_confirmed(stamp_ns):
+            self._track = [*self._track[-1:], place] if goes_on else list(self._run)
+            return ''
+        if contradiction and not old:
+            return contradiction
+        return (
+            f'{100 * self.refused_share:.0f} % of the last second refused; '
+            f'{self._frames} good frames in a row are not enough'
+        )
+
+    def _is_confirmed(self, stamp_ns: int) -> bool:
+        """Whether the run is long enough: as long as refusals were lately, up to a bound."""
+        needed_s = min(self.refused_share * RECORD_S, LONGEST_RUN_S)
+        return self._frames >= START_FRAMES and (stamp_ns - self._began_ns) * NANO >= needed_s
+
+    def _note(self, stamp_ns: int, refused: bool, counts: bool) -> None:
+        record = self._record
+        while record and stamp_ns - record[0][0] > RECORD_S / NANO:
+            self._refused -= record.popleft()[1]
+        if counts:
+            record.append((stamp_ns, refused))
+            self._refused += refused

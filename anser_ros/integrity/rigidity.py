@@ -1,0 +1,136 @@
+"""What the coils of a rigid body say of each other.
+
+A body's pose says where each of its coils is, and each coil says so itself. The two may differ by
+their errors, by what the body's survey has wrong, and by what the coil's gain has wrong; a coil
+that differs by more is somewhere else, or another coil.
+
+A coil that took part in the body's solve shares its noise with it: the difference of an estimate
+and one that makes better use of the same data has the *difference* of their covariances (Hausman,
+Econometrica 1978), which the coil's own bounds from above. A coil that was left out shares
+nothing, and the covariances add up.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+Array = NDArray[np.float64]
+
+SELDOM = 1e-6
+"""Probability that a sound coil contradicts its body. Larger, and good poses are lost; smaller,
+and a coil has to be further away to be noticed."""
+GATE = float(chdtri(5, SELDOM))
+"""Squared Mahalanobis distance (three of the position, two of the axis) from which on a coil
+contradicts its body; 36, six sigma in one direction."""
+
+
+@dataclass(frozen=True)
+class SurveyErrors:
+    """How well a tool is known: its coils' places, m an axis, their axes, rad, and their gains.
+
+    A field over a board falls with the third power of the distance, so that a coil whose gain is
+    wrong by g seems to be g/3 of its distance from the board elsewhere.
+    """
+
+    position_m: float
+    axis_rad: float
+    gain: float
+
+
+@numba.njit(cache=True, error_model='numpy')
+def _tangent(n, t):  # type: ignore[no-untyped-def]
+    """Write two unit vectors across the unit vector n (Duff et al., JCGT 2017)."""
+    sign = 1.0 if n[2] >= 0.0 else -1.0
+    a = -1.0 / (sign + n[2])
+    b = n[0] * n[1] * a
+    t[0, 0], t[0, 1], t[0, 2] = 1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0]
+    t[1, 0], t[1, 1], t[1, 2] = b, sign + n[1] * n[1] * a, -n[1]
+
+
+@numba.njit(cache=True, error_model='numpy')
+def fill_distances(  # type: ignore[no-untyped-def]
+    position, rotation, covariance, offsets, axes, positions, directions, covariances, took_part,
+    survey, distances,
+):  # fmt: skip
+    """Write the squared Mahalanobis distance of each coil from its place in the body, (S,).
+
+    ``position`` (3,), ``rotation`` (3, 3), ``covariance`` (6, 6): the body's. ``offsets``,
+    ``axes`` (S, 3): the coils in the body. ``positions``, ``directions`` (S, 3), ``covariances``
+    (S, 6, 6): what the coils say. ``took_part`` (S,). ``survey`` (3,): m, rad, relative gain.
+    """
+    t, slopes, wide = np.empty((2, 3)), np.zeros((5, 6)), np.zeros((5, 6))
+    apart = np.empty(5)
+    arms, turned = np.dot(offsets, rotation.T), np.dot(axes, rotation.T)
+    for s in range(offsets.shape[0]):
+        n, m = turned[s], directions[s]
+        _tangent(m, t)
+        cross = np.cross(n, m)
+        sine = math.sqrt(np.dot(cross, cross))
+        angle = math.atan2(sine, np.dot(n, m))
+        for i in range(3):
+            apart[i] = positions[s, i] - position[i] - arms[s, i]
+        for j in range(2):
+            # The rotation vector from n to m lies across m; half a turn is about any such vector.
+            along = np.dot(t[j], cross) / sine if sine > 1e-12 else 1.0 - j
+            apart[3 + j] = along * angle
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            wide[i, i] = slopes[i, i] = 1.0
+            wide[i, 3 + j], wide[i, 3 + k] = arms[s, k], -arms[s, j]
+            wide[3, 3 + i] = slopes[3, 3 + i] = t[0, i]
+            wide[4, 3 + i] = slopes[4, 3 + i] = t[1, i]
+        total = np.dot(np.dot(slopes, covariances[s]), slopes.T)
+        if not took_part[s]:
+            total += np.dot(np.dot(wide, covariance), wide.T)
+        radial = survey[2] * positions[s, 2] / 3.0
+        for i in range(3):
+            total[i, i] += survey[0] * survey[0] + radial * radial
+        for i in range(3, 5):
+            total[i, i] += survey[1] * survey[1]
+        distances[s] = np.dot(apart, np.linalg.solve(total, apart))
+
+
+def distances(
+    body: tuple[Array, Array, Array],
+    offsets: Array,
+    axes: Array,
+    coils: tuple[Array, Array, Array],
+    took_part: NDArray[np.bool_],
+    survey: SurveyErrors,
+) -> Array:
+    """Squared Mahalanobis distance of each coil's own pose from its place in the body.
+
+    Parameters
+    ----------
+    body : position (3,), rotation (3, 3), covariance (6, 6)
+        m and rad, frame fg.
+    offsets, axes : ndarray, shape (S, 3)
+        Of the coils, in the body's frame, m and unit vectors.
+    coils : positions (S, 3), axes (S, 3), covariances (S, 6, 6)
+        What the coils say of themselves, frame fg.
+    took_part : ndarray of bool, shape (S,)
+        Whether the body's pose made use of the coil.
+    survey : SurveyErrors
+
+    Returns
+    -------
+    ndarray, shape (S,)
+        To be compared with `GATE`.
+    """
+    found = np.empty(len(offsets))
+    told = np.array([survey.position_m, survey.axis_rad, survey.gain])
+    fill_distances(*body, offsets, axes, *coils, took_part, told, found)
+    return found
+
+
+def reason(distance: float, away_m: float, turned_rad: float) -> str:
+    """What is said of a coil that contradicts its body."""
+    sigmas = math.sqrt(distance)
+    return (
+        f'{1e3 * away_m:.2g} mm and {math.degrees(turned_rad):.2g} deg from its place in the '
+        f'body, {sigmas:.2g} sigma'
+    )

@@ -1,0 +1,152 @@
+"""A frame's poses, judged by each other and by the frames before, before any is given out.
+
+Each pose has passed its own frame's gate. Here a coil has to agree with its body, a pose with
+where it came from, and the model with most of what is measured; see `anser_ros.integrity`.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.frames.intake import NANO
+from anser_ros.integrity import rigidity
+from anser_ros.integrity.continuity import Continuity, MotionBounds, Place
+from anser_ros.integrity.model_record import ModelRecord
+from anser_ros.integrity.rigidity import SurveyErrors
+from anser_ros.tracking import estimate as states
+from anser_ros.tracking.body_track import BodyResult
+from anser_ros.tracking.coil_track import CoilResult
+from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
+from anser_ros.tracking.rigid import BodyCoils
+from anser_ros.tracking.rotations import rotation_between
+
+Array = NDArray[np.float64]
+Estimates = list[PoseEstimate]
+
+CONTRADICTS = (states.RESIDUAL, states.INCONSISTENT)
+"""States of a pose that the model, or the body, does not explain although there are signals."""
+
+
+@dataclass(frozen=True)
+class RigidBody:
+    """A body's coils: their rows among the sensors, their places, and what was found."""
+
+    rows: NDArray[np.int64]
+    coils: BodyCoils
+    result: BodyResult
+
+
+class Judgement:
+    """What the judges remember of a tracker's sensors and bodies."""
+
+    def __init__(self) -> None:
+        self._continuity: dict[str, Continuity] = {}
+        self._last: dict[str, PoseEstimate] = {}
+        self.record = ModelRecord()
+
+    def forget(self) -> None:
+        """Forget all frames that were judged so far."""
+        self._continuity.clear()
+        self._last.clear()
+        self.record.forget()
+
+    def judged(
+        self,
+        stamp_ns: int,
+        coils: Sequence[CoilResult],
+        bodies: Sequence[RigidBody],
+        settings: TrackerSettings,
+    ) -> Estimates:
+        """Return the estimates of a frame, sensors first, with what the judges say of them."""
+        found = [result.estimate for result in coils]
+        if settings.has_gate:
+            for body in bodies:
+                _judge_coils(found, body, settings)
+        found += [body.result.estimate for body in bodies]
+        if settings.has_gate:
+            self._add_to_record(stamp_ns, found[: len(coils)])
+            found = [self._judged_in_time(estimate, settings) for estimate in found]
+        return [self._with_stamp_error(e, settings) if e.state == states.OK else e for e in found]
+
+    def _add_to_record(self, stamp_ns: int, coils: Estimates) -> None:
+        refused = [math.sqrt(e.chi2) for e in coils if e.state in CONTRADICTS]
+        total = len(refused) + sum(e.state == states.OK for e in coils)
+        typical = sorted(refused)[len(refused) // 2] if refused else math.nan
+        self.record.add(stamp_ns, len(refused), total, typical)
+
+    def _judged_in_time(self, estimate: PoseEstimate, settings: TrackerSettings) -> PoseEstimate:
+        """The estimate, or why it is not given out: its own past, or that of the whole model."""
+        place = None
+        if estimate.state == states.OK:
+            place = Place(estimate.stamp_ns, estimate.position, estimate.sigma_position_m)
+        continuity = self._continuity.setdefault(estimate.name, Continuity())
+        tools = settings.tools
+        bounds = MotionBounds(tools.max_speed_m_s, tools.max_acceleration_m_s2)
+        refused = estimate.state in CONTRADICTS
+        reason = continuity.judge(estimate.stamp_ns, place, refused, bounds)
+        if place is not None and self.record.is_doubtful:
+            return replace(estimate, state=states.MODEL_DOUBTFUL, reason=self.record.reason)
+        if reason:
+            return replace(estimate, state=states.UNCONFIRMED, reason=reason)
+        return estimate
+
+    def _with_stamp_error(self, estimate: PoseEstimate, settings: TrackerSettings) -> PoseEstimate:
+        """The estimate with what the stamp's error makes of its motion in the covariance."""
+        last = self._last.get(estimate.name)
+        self._last[estimate.name] = estimate
+        if last is None or settings.stamp_sigma_s == 0.0:
+            return estimate
+        seconds = (estimate.stamp_ns - last.stamp_ns) * NANO
+        if not 0.0 < seconds <= settings.warm_age_s:
+            return estimate
+        move = np.empty(6)
+        move[:3] = estimate.position - last.position
+        if estimate.rotation is not None and last.rotation is not None:
+            move[3:] = rotation_between(last.rotation, estimate.rotation)
+        else:
+            move[3:] = np.cross(last.axis, estimate.axis)
+        move *= settings.stamp_sigma_s / seconds
+        covariance = estimate.covariance + np.outer(move, move)
+        sigma = math.sqrt(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
+        return replace(estimate, covariance=covariance, sigma_position_m=sigma)
+
+
+def _judge_coils(found: Estimates, body: RigidBody, settings: TrackerSettings) -> None:
+    """Withhold, in ``found``, the poses of coils that contradict their body.
+
+    Where all coils together fit the model in no pose, also with those left out that disagree most,
+    nobody knows which of them are right: a smooth distortion can look like a pose to each.
+    """
+    estimate, fit = body.result.estimate, body.result.fit
+    members = [i for i, row in enumerate(body.rows.tolist()) if found[row].state == states.OK]
+    if fit is not None and estimate.state == states.RESIDUAL:
+        reason = f"the body's coils fit no pose together: {estimate.reason}"
+        for row in body.rows[members].tolist():
+            found[row] = replace(found[row], state=states.INCONSISTENT, reason=reason)
+        return
+    if fit is None or estimate.state not in (states.OK, states.OUTSIDE_VOLUME) or not members:
+        return
+    own = [found[body.rows[i]] for i in members]
+    coils = body.coils.subset(np.array(members))
+    tools = settings.tools
+    took_part = np.isin(members, fit.used)
+    places = np.array([e.position for e in own])
+    axes = np.array([e.axis for e in own])
+    distances = rigidity.distances(
+        (estimate.position, fit.solution.rotation, estimate.covariance),
+        coils.offsets, coils.axes,
+        (places, axes, np.array([e.covariance for e in own])),
+        took_part,
+        SurveyErrors(tools.tool_position_m, tools.tool_axis_rad, tools.tool_gain),
+    )  # fmt: skip
+    for i in np.flatnonzero(~(distances <= rigidity.GATE)).tolist():
+        turned = fit.solution.rotation @ coils.axes[i]
+        expected = estimate.position + fit.solution.rotation @ coils.offsets[i]
+        sine = float(np.linalg.norm(np.cross(turned, axes[i])))
+        angle = math.atan2(sine, float(turned @ axes[i]))
+        reason = rigidity.reason(float(distances[i]), math.dist(expected, places[i]), angle)
+        row = int(body.rows[members[i]])
+        found[row] = replace(own[i], state=states.INCONSISTENT, reason=reason)

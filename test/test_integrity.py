@@ -1,0 +1,232 @@
+"""Faults that one frame's residual does not see: copies, swaps, leaps, other models."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_tracker import CHANNELS, MODEL, STEP_NS, TOOL, path
+from tracking_world import NOISE_T, fluxes, random_pose
+
+from anser_ros.errors import TrackingError
+from anser_ros.frames.intake import Intake
+from anser_ros.integrity.continuity import Continuity, MotionBounds, Place
+from anser_ros.integrity.freshness import Freshness
+from anser_ros.tracking import estimate as states
+from anser_ros.tracking.estimate import TrackerSettings
+from anser_ros.tracking.rotations import rotation_of_vector
+from anser_ros.tracking.tracker import Tracker
+
+HANDS = MotionBounds(2.0, 40.0)
+FAULT = 30
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)
+
+
+def wrong_and_ok(estimates, position, rotation):
+    """Names whose pose is published although it is wrong by more than max(3 sigma, 1 mm)."""
+    truth = dict(zip(TOOL.name, TOOL.placed(position, rotation)[0], strict=True))
+    truth['tool_a'] = position
+    return [
+        e.name for e in estimates
+        if e.state == states.OK
+        and np.linalg.norm(e.position - truth[e.name]) > max(3 * e.sigma_position_m, 1e-3)
+    ]  # fmt: skip
+
+
+def track_with(fault, rng, count=80, settings=None, model=MODEL):
+    """Track a moving tool whose fluxes (all so far, newest last) a fault changes.
+
+    Returns all estimates by frame; none of them may be wrong and ok.
+    """
+    tracker, seen, all_found = Tracker(model, TOOL, settings), [], []
+    for i, (stamp, position, rotation) in enumerate(path(count)):
+        seen.append(fluxes(MODEL, TOOL, position, rotation, rng))
+        found = tracker.update(stamp, CHANNELS, fault(i, seen))
+        assert wrong_and_ok(found, position, rotation) == [], i
+        all_found.append({e.name: e for e in found})
+    return all_found
+
+
+# Freshness ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('length', [1, 5, 40])
+def test_a_ring_of_old_frames_is_stuck_at_once_and_new_ones_are_good_at_once(rng, length):
+    def ring(i, seen):
+        return seen[50 - length + (i - 50) % length if 50 <= i < 70 else i]
+
+    found = track_with(ring, rng, 90)
+    for i, frame in enumerate(found):
+        state = {e.state for e in frame.values()}
+        assert state == ({'stale'} if 50 <= i < 70 else {'ok'}), i
+    assert 'stuck: the same reading as' in found[50]['tool_a/0/x'].reason
+
+
+def test_a_frozen_column_divided_by_a_noisy_current_is_stuck(rng):
+    """The voltages stay to the last bit; the measured currents, 3 A, have their own noise."""
+    frozen = TOOL.name[3]
+
+    def column(i, seen):
+        flux = seen[i].copy()
+        if i >= FAULT:
+            noise = 7e-6 * (rng.normal(size=8) + 1j * rng.normal(size=8))
+            flux[3] = seen[FAULT][3] / (1.0 + noise)
+        return flux
+
+    found = track_with(column, rng)
+    assert all(frame[frozen].state == 'stale' for frame in found[FAULT + 8 :])
+    assert all(frame['tool_a'].state == 'ok' for frame in found)
+
+
+@pytest.mark.parametrize('emitters', [1, 3, 8])
+@pytest.mark.parametrize('noise_t', [NOISE_T / 8, NOISE_T])
+def test_a_still_tool_is_never_stuck(rng, emitters, noise_t):
+    """Also where the stated noise is eight times the true one; fluxes travel as float32."""
+    intake, fresh = Intake(np.arange(9)), Freshness()
+    still = 1e-6 * (rng.normal(size=(9, emitters)) + 1j * rng.normal(size=(9, emitters)))
+    for stamp in range(1, 400):
+        noise = rng.normal(size=(2, 9, emitters))
+        flux = (still + noise_t * (noise[0] + 1j * noise[1])).astype(np.complex64)
+        frame = fresh.judged(intake.admit(stamp * STEP_NS, np.arange(9), flux), NOISE_T)
+        assert frame.usable.all(), stamp
+
+
+@pytest.mark.parametrize(('emitters', 'most'), [(1, 8), (3, 3), (8, 1)])
+def test_few_emitters_only_need_more_copies(rng, emitters, most):
+    intake, fresh = Intake(np.arange(1)), Freshness()
+    flux = 1e-6 * (rng.normal(size=(1, emitters)) + 1j * rng.normal(size=(1, emitters)))
+    states_seen = [
+        fresh.judged(intake.admit(stamp * STEP_NS, [0], flux), NOISE_T).usable[0]
+        for stamp in range(1, 20)
+    ]
+    assert states_seen[0] and not any(states_seen[most:])
+
+
+# Rigidity -------------------------------------------------------------------------------
+
+
+def test_swapped_columns_give_no_pose_and_their_body_goes_on(rng):
+    def swap(i, seen):
+        order = [0, 1, 2, 3, 4, 8, 6, 7, 5] if i >= FAULT else range(9)
+        return seen[i][list(order)]
+
+    found = track_with(swap, rng)
+    for frame in found[FAULT + 1 :]:
+        assert {frame[name].state for name in ('tool_a/1/z', 'tool_a/2/z')} == {'inconsistent'}
+        assert frame['tool_a'].state == 'ok' and frame['tool_a/0/x'].state == 'ok'
+    assert 'from its place in the body' in found[-1]['tool_a/1/z'].reason
+
+
+def test_a_survey_as_wrong_as_is_stated_contradicts_nothing(rng):
+    """Places 0.12 mm, axes 0.5 degrees and gains 0.2 % off, as the settings have them."""
+    off = 0.12e-3 * rng.normal(size=(9, 3))
+    turned = [
+        rotation_of_vector(np.radians(0.5) * rng.normal(size=3)) @ axis for axis in TOOL.axis
+    ]
+    real = replace(TOOL, position=TOOL.position + off, axis=np.array(turned))
+    gain = 1.0 + 0.002 * rng.normal(size=(9, 1))
+    tracker, seen = Tracker(MODEL, TOOL, TrackerSettings(gate=40.0)), []
+    for stamp, position, rotation in path(60):
+        flux = gain * fluxes(MODEL, real, position, rotation, rng)
+        seen += [e.state for e in tracker.update(stamp, CHANNELS, flux)]
+    assert states.INCONSISTENT not in seen
+
+
+# Continuity -----------------------------------------------------------------------------
+
+
+def judged(places, bounds=HANDS, step_s=0.02, sigma_m=1e-4):
+    """Whether each of some places (None: refused), a step apart, is confirmed."""
+    one, found = Continuity(), []
+    for i, x in enumerate(places, start=1):
+        stamp = round(i * step_s * 1e9)
+        place = None if x is None else Place(stamp, np.array([x, 0.0, 0.0]), sigma_m)
+        found.append(one.judge(stamp, place, x is None, bounds) == '')
+    return found
+
+
+def test_what_slips_through_a_long_refusal_is_not_confirmed():
+    places = [0.0] * 10 + ([None] * 6 + [0.1]) * 30
+    found = judged(places)
+    assert all(found[:10])
+    late = [good for x, good in zip(places[60:], found[60:], strict=True) if x is not None]
+    assert not any(late)
+
+
+def test_a_track_begins_again_after_a_run():
+    found = judged([0.0] * 10 + [None] * 100 + [0.1] * 40)
+    assert not any(found[110:122]) and all(found[123:])
+
+
+def test_a_leap_waits_for_three_frames_and_a_jerk_too():
+    found = judged([0.0] * 10 + [0.2] * 10)
+    assert found == [True] * 10 + [False, False] + [True] * 8
+    smooth = [0.5 * 20.0 * (0.02 * i) ** 2 for i in range(6)]
+    assert all(judged(smooth))
+    jerk = [0.0, 0.0, 0.0, 0.030, 0.060]
+    assert judged(jerk) == [True, True, True, False, False], 'below 2 m/s, above 40 m/s^2'
+    assert all(judged(jerk, MotionBounds(2.0, 200.0)))
+
+
+def test_points_a_second_apart_are_judged_alone():
+    assert all(judged([0.0, 0.3, None, None, None, None, 0.0, 0.3], step_s=1.0))
+
+
+def test_a_tool_that_is_carried_elsewhere_unseen_takes_up_again(rng):
+    """Half of the frames between two places miss: after three frames there the poses are back."""
+    tracker = Tracker(MODEL, TOOL)
+    here, there = random_pose(rng), random_pose(rng)
+    found = []
+    for i in range(40):
+        flux = fluxes(MODEL, TOOL, *(here if i < 20 else there), rng)
+        found.append({e.state for e in tracker.update((i + 1) * STEP_NS, CHANNELS, flux)})
+    assert found == [{'ok'}] * 20 + [{'unconfirmed'}] * 2 + [{'ok'}] * 18
+
+
+# The model ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('factor', [0.98, 1.01])
+def test_a_model_of_other_moments_gives_no_pose(rng, factor):
+    found = track_with(
+        lambda i, seen: seen[i], rng, 60, model=replace(MODEL, moments=factor * MODEL.moments)
+    )
+    last = {e.state for frame in found[20:] for e in frame.values()}
+    assert 'ok' not in last
+    assert last <= {'residual', 'inconsistent', 'model_doubtful', 'unconfirmed'}
+
+
+# Stamps ---------------------------------------------------------------------------------
+
+
+def test_the_stamp_s_error_is_part_of_the_covariance_along_the_motion(rng):
+    sure, unsure = (
+        Tracker(MODEL, TOOL, TrackerSettings(stamp_sigma_s=s, adaptive=False)) for s in (0.0, 2e-3)
+    )
+    places = []
+    for stamp, position, rotation in path(20):
+        places.append(position)
+        flux = fluxes(MODEL, TOOL, position, rotation, rng)
+        a, b = (
+            {e.name: e for e in tracker.update(stamp, CHANNELS, flux)}
+            for tracker in (sure, unsure)
+        )
+    velocity = (places[-1] - places[-2]) / 0.02
+    more = (b['tool_a'].covariance - a['tool_a'].covariance)[:3, :3]
+    expected = 2e-3**2 * np.outer(velocity, velocity)
+    assert np.linalg.norm(more - expected) < 0.3 * np.linalg.norm(expected)
+    turn = (b['tool_a'].covariance - a['tool_a'].covariance)[3:, 3:]
+    assert np.trace(turn) > 0.0
+    with pytest.raises(TrackingError, match='stamp_sigma_s'):
+        TrackerSettings(stamp_sigma_s=-1.0)
+
+
+def test_without_a_gate_nothing_is_withheld_for_what_it_contradicts(rng):
+    tracker = Tracker(MODEL, TOOL, TrackerSettings(gate=np.inf))
+    for stamp, position, rotation in path(5):
+        flux = fluxes(MODEL, TOOL, position, rotation, rng)[[0, 1, 2, 3, 4, 8, 6, 7, 5]]
+        found = tracker.update(stamp, CHANNELS, flux)
+    assert {e.state for e in found} == {'ok'}
