@@ -207,13 +207,15 @@ class TestStream:
         rng = np.random.default_rng(seed)
         return rng.integers(-500, 500, (samples, columns)).astype(np.int16)
 
-    def frames(self, stream, blocks, edit=lambda codes: None, skip=()):
+    def frames(self, stream, blocks, edit=lambda codes: None, skip=(), ticks=lambda k: 1000 * k):
+        """Frames of blocks of 1 ms, after a start that was answered at once."""
+        stream.restart(10**12)
         found = []
         for k in range(blocks):
             codes = self.codes(k)
             edit(codes)
             if k not in skip:
-                found += stream.push(SampleBlock(k, 1000 * k, codes), 10**12 + 10**6 * (k + 1))
+                found += stream.push(SampleBlock(k, ticks(k), codes), 10**12 + 10**6 * (k + 1))
         return found
 
     def test_flags(self):
@@ -225,7 +227,86 @@ class TestStream:
         first, second = self.frames(stream, 40, edit, skip={25})
         assert first.tool.flags.tolist() == [0, 0, SATURATED, 0, STALE, 0, 0, 0, 0]
         assert (second.flags & DROPPED).all()
-        assert first.host_ns == 10**12 + 10**7
+        assert first.host_ns == pytest.approx(10**12 + 10**7, abs=10**4)
+
+    @pytest.mark.parametrize('column', [0, 20, 41])
+    def test_a_column_that_repeats_itself_is_stale(self, column):
+        """It says what it said 30 ms ago; where it is that of the currents, all fluxes are old."""
+
+        blocks = iter(range(1000))
+
+        def edit(codes):
+            k = next(blocks)
+            codes[:, column] = self.codes(k if k < 40 else 10 + (k - 40) % 30)[:, column]
+
+        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        frames = self.frames(stream, 100, edit)
+        stale = np.array([frame.flags & STALE > 0 for frame in frames])
+        rows = slice(None) if column == 41 else [column]
+        assert not stale[:2].any() and stale[2:, rows].all()
+        assert stale[2:].sum() == 3 * (41 if column == 41 else 1)
+        assert frames[-1].staleness.age_s[rows] == pytest.approx(0.03)
+        assert not frames[-1].repeats
+
+    def test_a_unit_that_repeats_itself_moves_no_clock(self):
+        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        stream.restart(10**12)
+        frames = []
+        for k in range(400):
+            codes = self.codes(k if k < 100 else k % 50)
+            late_ns = 0 if k < 120 else 50_000_000
+            arrival_ns = 10**12 + 10**6 * (k + 1) + late_ns
+            frames += stream.push(SampleBlock(k, 1000 * k, codes), arrival_ns)
+        assert [frame.repeats for frame in frames] == 5 * [False] + 15 * [True]
+        assert all((frame.flags == STALE).all() for frame in frames[5:])
+        assert frames[-1].host_ns == pytest.approx(10**12 + 390 * 10**6, abs=10**5)
+
+    @pytest.mark.parametrize(
+        ('ticks', 'words'),
+        [
+            (lambda k: 1000 * min(k, 30), 'stand still'),
+            (lambda k: 2000 * k, 'run at 2 times'),
+            (lambda k: 500 * k, 'run at 0.5 times'),
+            (lambda k: 1010 * k, 'run at 1.01 times'),
+            (lambda k: 1000 * k + 300_000 * (k > 195), 'jumped by 0.3 s'),
+            (lambda k: 1000 * k if k < 195 else 1000 * (k - 195), 'jumped by -0.195 s'),
+            (lambda k: (2**32 - 50_000 + 1000 * k) % 2**32, ''),
+        ],
+    )
+    def test_ticks_move_no_stamps(self, ticks, words):
+        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        frames = self.frames(stream, 200, ticks=ticks)
+        assert len(frames) == 10
+        times = np.array([frame.host_ns for frame in frames]) - 10**12
+        assert times == pytest.approx(10**7 * (2 * np.arange(10) + 1), abs=10**5)
+        assert stream.ticks.words.startswith(words) and bool(words) == bool(stream.ticks.words)
+        assert stream.ticks.disagreements == bool(words)
+
+    def test_a_late_window_waits_and_is_withheld(self):
+        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        assert len(self.frames(stream, 100)) == 5
+
+        def push(k, late_ms):
+            block = SampleBlock(k, 1000 * k, self.codes(k))
+            return stream.push(block, 10**12 + 10**6 * (k + 1 + late_ms))
+
+        assert not any(push(k, 50) for k in range(100, 120))
+        (frame,) = push(120, 0)
+        assert frame.host_ns == pytest.approx(10**12 + 110 * 10**6, abs=10**5)
+        assert not any(push(k, 900) for k in range(121, 1000))
+        assert stream.waiting.withheld > 20 and stream.clock.wants_answer
+
+    def test_a_restarted_stream_has_new_stamps(self):
+        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        assert len(self.frames(stream, 110)) == 5
+        frames = []
+        for k in range(40):
+            block = SampleBlock(k, 7000 + 1000 * k, self.codes(500 + k))
+            frames += stream.push(block, 2 * 10**12 + 10**6 * (k + 1))
+        assert stream.counters.restarts == 1 and not frames, 'nothing bounds the new line yet'
+        stream.answered(2 * 10**12 + 39 * 10**6)
+        (frame, _) = stream.push(SampleBlock(40, 47_000, self.codes(540)), 2 * 10**12 + 41 * 10**6)
+        assert frame.host_ns == pytest.approx(2 * 10**12 + 10**7, abs=10**5)
 
     def test_emitter_without_current_gives_nan_and_other_emitters_go_on(self):
         stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)

@@ -10,6 +10,8 @@ from anser_ros.physics.constants import MU_0
 from anser_ros.physics.dipole import field_basis
 from anser_ros.signals.demodulation import Demodulator
 from anser_ros.signals.flux import FluxConverter
+from anser_ros.signals.repetition import RepetitionWatch
+from anser_ros.signals.ticks import TickCheck
 from anser_ros.signals.window import WindowCutter
 from anser_ros.simulation import raw_effects
 from anser_ros.simulation.control_unit import ControlUnit
@@ -92,7 +94,8 @@ def fluxes(unit, seconds=0.1, window=800):
         nominal_currents_a=np.array(hello.currents_a),
         current_delay_s=CHANNELS.current_delay_s,
     )
-    cutter = WindowCutter(window, window, columns + 1, 0.04)
+    watch, ticks = RepetitionWatch(columns + 1, 40e3), TickCheck(40e3, 1e6)
+    cutter = WindowCutter(window, window, watch, ticks)
     found = []
     for _ in range(round(seconds / 0.005)):
         for block in decode(unit.advance(200)):

@@ -57,6 +57,7 @@ def test_only_one_compiles_at_a_time(tmp_path):
 def test_every_kernel_of_the_package_is_counted():
     from anser_ros.metal import scattering
     from anser_ros.refit import live_refit  # noqa: F401
+    from anser_ros.signals import repetition  # noqa: F401
     from anser_ros.tracking import tracker  # noqa: F401
 
     assert scattering

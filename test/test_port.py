@@ -131,9 +131,12 @@ def test_records_arrive_in_order(wire, port):
 
 
 def test_commands_reach_the_wire_with_their_tag(wire, port):
+    begin = time.monotonic_ns()
     tag = port.send(SetFrequencies(TONES))
     (record,) = FrameReader().feed(wire.read())
     assert record == Record(SetFrequencies(TONES), tag)
+    assert begin < port.sent_ns(tag) < time.monotonic_ns()
+    assert port.sent_ns(tag + 1) is None
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from anser_ros.errors import ParameterError
+from anser_ros.signals.repetition import RepetitionWatch
+from anser_ros.signals.ticks import TickCheck
 from anser_ros.signals.window import WindowCutter
+
+
+def cutter_of(window, hop, columns):
+    """A cutter for 40 kS/s and ticks of a microsecond."""
+    return WindowCutter(window, hop, RepetitionWatch(columns, 40e3), TickCheck(40e3, 1e6))
 
 
 class TestWindows:
@@ -26,27 +33,27 @@ class TestWindows:
     )
     def test_every_window_is_the_right_part_of_the_stream(self, window, hop):
         samples = self.stream(400)
-        cutter = WindowCutter(window, hop, 2, 0.04)
+        cutter = cutter_of(window, hop, 2)
         windows = self.feed(cutter, samples)
         assert len(windows) == (len(samples) - window) // hop + 1
         for k, one in enumerate(windows):
             assert np.array_equal(one.codes, samples[k * hop : k * hop + window])
             assert not one.dropped and one.present.all()
-            assert one.middle_ticks == pytest.approx((k * hop + window / 2) / 0.04)
+            assert one.middle_sample == k * hop + window / 2
 
     def test_sequence_wraps_around(self):
-        windows = self.feed(WindowCutter(200, 200, 2, 0.04), self.stream(20), start=2**32 - 7)
+        windows = self.feed(cutter_of(200, 200, 2), self.stream(20), start=2**32 - 7)
         assert len(windows) == 4 and not any(w.dropped for w in windows)
 
     def test_a_hole_keeps_the_grid_and_is_flagged(self):
         samples = self.stream(100)
-        cutter = WindowCutter(400, 400, 2, 0.04)
+        cutter = cutter_of(400, 400, 2)
         windows = self.feed(cutter, samples, skip={14, 15, 25})
         assert [w.dropped for w in windows] == [False, True, True] + [False] * 7
         for k, one in enumerate(windows):
             expected = samples[400 * k : 400 * k + 400]
             assert np.array_equal(one.codes[one.present], expected[one.present])
-            assert one.middle_ticks == pytest.approx((400 * k + 200) / 0.04)
+            assert one.middle_sample == 400 * k + 200
         assert (~windows[1].present).sum() == 80
         assert cutter.counters.missing_samples == 120
         assert cutter.counters.windows_dropped_samples == 2
@@ -54,21 +61,21 @@ class TestWindows:
     @pytest.mark.parametrize('hole', [8, 30, 61, 95])
     def test_a_long_hole_loses_windows_and_the_grid_stays(self, hole):
         samples = self.stream(120)
-        cutter = WindowCutter(400, 200, 2, 0.04)
+        cutter = cutter_of(400, 200, 2)
         windows = self.feed(cutter, samples, skip=set(range(11, 11 + hole)))
         assert len(windows) + cutter.counters.windows_lost == (len(samples) - 400) // 200 + 1
         last = windows[-1]
         assert np.array_equal(last.codes[last.present], samples[-400:][last.present])
-        assert last.middle_ticks == pytest.approx((len(samples) - 200) / 0.04)
+        assert last.middle_sample == len(samples) - 200
 
     def test_duplicates_are_dropped_and_a_restart_begins_anew(self):
         samples = self.stream(12)
-        cutter = WindowCutter(200, 200, 2, 0.04)
+        cutter = cutter_of(200, 200, 2)
         cutter.push(0, 0, samples[:40])
         cutter.push(1, 1000, samples[40:80])
         assert cutter.push(1, 1000, samples[40:80]) == []
         assert cutter.counters.duplicate_blocks == 1
-        windows = []
+        windows, samples = [], self.stream(12) + 1
         for k in range(5):
             part = samples[40 * k : 40 * k + 40]
             windows += cutter.push(k, 9000 + 1000 * k, part)
@@ -79,7 +86,7 @@ class TestWindows:
     def test_a_restart_whose_begin_was_lost_is_no_hole(self, sequence):
         """A hole of the wrong length would join pieces whose phases do not fit."""
         samples = self.stream(30)
-        cutter = WindowCutter(400, 400, 2, 0.04)
+        cutter = cutter_of(400, 400, 2)
         self.feed(cutter, samples[:920])
         windows = []
         for k in range(10):
@@ -101,7 +108,7 @@ class TestWindows:
         )
     )
     def test_no_order_of_blocks_breaks_it(self, blocks):
-        cutter = WindowCutter(200, 77, 2, 0.04)
+        cutter = cutter_of(200, 77, 2)
         for sequence, ticks, samples in blocks:
             for window in cutter.push(sequence, ticks, np.ones((samples, 2), np.int16)):
                 assert window.codes.shape == (200, 2)
@@ -112,12 +119,12 @@ class TestWindows:
         samples[17, 1] = 32767
         samples[90, 2] = -32768
         samples[:, 3] = 5
-        (window,) = self.feed(WindowCutter(200, 200, 4, 0.04), samples)
+        (window,) = self.feed(cutter_of(200, 200, 4), samples)
         assert window.saturated.tolist() == [False, True, True, False]
         assert window.stuck.tolist() == [False, False, False, True]
 
     def test_refusals(self):
         with pytest.raises(ParameterError, match='hop of 0'):
-            WindowCutter(200, 0, 2, 0.04)
+            cutter_of(200, 0, 2)
         with pytest.raises(ParameterError, match='block of 3 channels'):
-            WindowCutter(200, 200, 2, 0.04).push(0, 0, np.zeros((40, 3), np.int16))
+            cutter_of(200, 200, 2).push(0, 0, np.zeros((40, 3), np.int16))

@@ -189,13 +189,24 @@ def _refit() -> None:
         refit.update(SECOND_NS + frame * 20_000_000, references.channel, flux)
 
 
+def _watch_samples() -> None:
+    import numpy as np
+
+    from anser_ros.signals.repetition import RepetitionWatch
+
+    watch = RepetitionWatch(2, 40e3)
+    for _ in range(2):
+        watch.take(np.random.default_rng(0).integers(-99, 99, (2000, 2)).astype(np.int16))
+    watch.ages(0)
+
+
 def _demo_model() -> FieldModel:
     from anser_ros.sessions.model_file import load_model
 
     return load_model(config_path('demo_model.yaml'))
 
 
-PARTS = {'coils': (_track,), 'metal and bodies': (_refit, _solve_body, _track)}
+PARTS = {'coils': (_track, _watch_samples), 'metal and bodies': (_refit, _solve_body, _track)}
 """What each of the processes does. What one has compiled the other one loads."""
 
 

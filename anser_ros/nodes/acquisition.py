@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,21 +19,42 @@ from anser_ros.errors import AnserError, PortError
 from anser_ros.nodes import qos
 from anser_ros.nodes.clouds import FluxCloud
 from anser_ros.nodes.fault_memory import FAULTS, RecentFaults, device_words
-from anser_ros.nodes.flux_stream import FluxFrame, FluxStream, StreamOptions
+from anser_ros.nodes.flux_frame import FluxFrame, Staleness
+from anser_ros.nodes.flux_stream import FluxStream, StreamOptions
+from anser_ros.nodes.measured_accuracy import MeasuredAccuracy
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
-from anser_ros.nodes.stream_status import emitter_statuses, sensor_statuses, signal_troubles
+from anser_ros.nodes.stream_status import (
+    clock_troubles,
+    clock_values,
+    emitter_statuses,
+    sensor_statuses,
+    signal_troubles,
+)
+from anser_ros.nodes.wall_clock import WallClock
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.config_folder import read_config
+from anser_ros.wire.frames import TYPE_OF
 from anser_ros.wire.port import DEFAULT_BAUD, Batch, ControlUnitPort, PortState, find_port
 from anser_ros.wire.protocols import PROTOCOLS
-from anser_ros.wire.records import DeviceStatus, Hello, Record, SampleBlock, Stop
+from anser_ros.wire.records import (
+    DeviceStatus,
+    Hello,
+    Identify,
+    Record,
+    Reply,
+    ReplyCode,
+    SampleBlock,
+    Start,
+    Stop,
+)
 from anser_ros.wire.setup import Setup, dump_setup, parse_setup
 from anser_ros.wire.stream_control import StreamControl
 
 AUTO = 'auto'
-FLUX_NOISE = 'flux_noise_t'
-"""Key of the setup document: what the fluxes' components scatter by, T."""
+ASK_NS = 200_000_000
+"""Time (0.2 s) from one question to the device about its time to the next, while its answer would
+help. Each costs it a hello of some hundred bytes."""
 MANY_BLOCKS = 8
 """Blocks still wanted by a window, above which the node is woken one block early, so that what
 takes most of the time is done when the last block arrives."""
@@ -94,6 +115,9 @@ class Interval:
     delay_sum_s: float = 0.0
     delay_max_s: float = 0.0
     flags: np.ndarray | None = None
+    staleness: Staleness | None = None
+    repeats: int = 0
+    duplicates: int = 0
 
     def add(self, frame: FluxFrame, delay_s: float) -> None:
         """Note a published frame."""
@@ -102,6 +126,9 @@ class Interval:
         self.delay_max_s = max(self.delay_max_s, delay_s)
         known = self.flags is not None and self.flags.shape == frame.flags.shape
         self.flags = self.flags | frame.flags if known else frame.flags
+        now = frame.staleness
+        self.staleness = self.staleness | now if known and self.staleness else now
+        self.repeats += frame.repeats
 
 
 class Acquisition(AnserNode):
@@ -133,8 +160,13 @@ class Acquisition(AnserNode):
         self._interval = Interval(time.monotonic())
         self._sensor_flags: np.ndarray | None = None
         self._past: Counter[str] = Counter()
+        self._duplicates = 0
         self._published_setup = ''
-        self._noise_told = False
+        self._accuracy = MeasuredAccuracy()
+        self._wall_clock = WallClock()
+        self._asked_ns = 0
+        self._start_sent_ns: int | None = None
+        self._staleness: Staleness | None = None
         self._faults = RecentFaults()
         self._publish_setup(self._setup)
         self._port: ControlUnitPort | None = None
@@ -164,6 +196,16 @@ class Acquisition(AnserNode):
         command = self._control.due(time.monotonic_ns())
         if command is not None and self._port.state not in (PortState.ABSENT, PortState.CLOSED):
             self._port.send(command)
+        self._ask()
+
+    def _ask(self) -> None:
+        """Ask the device for an answer, from which follows what time it is, where that helps."""
+        stream, port, now_ns = self._stream, self._port, time.monotonic_ns()
+        if stream is None or port is None or port.state is not PortState.RECEIVING:
+            return
+        if stream.clock.wants_answer and now_ns - self._asked_ns > ASK_NS:
+            self._asked_ns = now_ns
+            port.send(Identify())
 
     def _open(self) -> None:
         table = self.parameters
@@ -225,6 +267,18 @@ class Acquisition(AnserNode):
             self._hello = payload
         elif isinstance(payload, DeviceStatus):
             self._device = payload
+        elif isinstance(payload, Reply) and payload.code is ReplyCode.OK:
+            self._take_answer(payload.command, record.tag)
+
+    def _take_answer(self, command: int, tag: int) -> None:
+        """Take from an answer that what follows it was sampled after the command had left."""
+        sent_ns = self._port.sent_ns(tag) if self._port is not None else None
+        if command == TYPE_OF[Start]:
+            self._start_sent_ns = sent_ns
+            if self._stream is not None:
+                self._stream.restart(sent_ns)
+        elif sent_ns is not None and self._stream is not None:
+            self._stream.answered(sent_ns)
 
     def _drop_stream(self) -> None:
         """Forget windows and refusal; the next block makes a new stream."""
@@ -234,7 +288,12 @@ class Acquisition(AnserNode):
 
     @staticmethod
     def _stream_counters(stream: FluxStream) -> dict[str, int]:
-        return {**vars(stream.counters), 'clock_jumps': stream.clock.jumps}
+        return {
+            **vars(stream.counters),
+            'windows_withheld': stream.waiting.withheld,
+            'clock_jumps': stream.clock.jumps,
+            'tick_faults': stream.ticks.disagreements,
+        }
 
     def _make_stream(self) -> None:
         if self._hello is None or not self._control.tones_agree:
@@ -248,7 +307,9 @@ class Acquisition(AnserNode):
         except AnserError as error:
             self._refusal = str(error)
             raise
-        self._noise_told = False
+        self._accuracy.reset()
+        if self._start_sent_ns is not None:
+            self._stream.clock.bound(0, self._start_sent_ns)
 
     def _publish_setup(self, setup: Setup) -> None:
         text = dump_setup(setup)
@@ -257,11 +318,13 @@ class Acquisition(AnserNode):
             self._setup_publisher.publish(String(data=text))
 
     def _publish_frame(self, frame: FluxFrame, arrival_ns: int) -> None:
-        if not self._noise_told and self._stream is not None:
-            self._noise_told = True
-            self._publish_setup(_with_noise(self._setup, self._stream.rate_hz, frame))
+        stream = self._stream
+        if stream is not None and self._accuracy.is_news(
+            frame, stream.clock.sigma_s, time.monotonic()
+        ):
+            self._publish_setup(self._accuracy.stated_in(self._setup, stream.rate_hz))
         # The system's clock may be set while we run; the offset is taken anew for every stamp.
-        stamp_ns = frame.host_ns + time.time_ns() - time.monotonic_ns()
+        stamp_ns = frame.host_ns + self._wall_clock.offset_ns()
         if len(frame.tool.channel):
             self._tool_publisher.publish(self._cloud.message(frame.tool, stamp_ns))
         if len(frame.reference.channel):
@@ -294,11 +357,14 @@ class Acquisition(AnserNode):
             'processing_ms_mean': 1e3 * interval.delay_sum_s / max(interval.frames, 1),
             'processing_ms_max': 1e3 * interval.delay_max_s,
         }
-        self._sensor_flags = interval.flags
+        self._sensor_flags, self._staleness = interval.flags, interval.staleness
         port, stream, device = self._port, self._stream, self._device
         if port is not None:
             values |= {'device': port.device, 'port': port.state.value, **port.fault_counters()}
         live = self._stream_counters(stream) if stream is not None else {}
+        if stream is not None:
+            values |= clock_values(stream)
+        values['system_clock_set'] = self._wall_clock.sets
         values |= {name: live.get(name, 0) + self._past[name] for name in {*live, *self._past}}
         if device is not None:
             values |= {
@@ -307,12 +373,14 @@ class Acquisition(AnserNode):
                 'device_dropped_blocks': device.dropped_blocks,
                 'device_temperature_deg_c': device.temperature_deg_c,
             }
+        duplicates = self._past['duplicate_blocks'] + live.get('duplicate_blocks', 0)
+        interval.duplicates, self._duplicates = duplicates - self._duplicates, duplicates
         counters = {name: int(values.get(name, 0)) for name in FAULTS}  # type: ignore[call-overload]
         self._faults.note(counters, time.monotonic())
-        level, message = self._verdict(interval.frames)
+        level, message = self._verdict(interval)
         return Status('', level, message, values)
 
-    def _verdict(self, frames: int) -> tuple[Level, str]:
+    def _verdict(self, interval: Interval) -> tuple[Level, str]:
         port = self._port
         if self._refusal or self._control.refusal:
             return Level.ERROR, self._refusal or self._control.refusal
@@ -322,12 +390,18 @@ class Acquisition(AnserNode):
             reason = f': {port.reason}' if port.reason else ''
             words = [f'{port.state.value}{reason}', self._faults.words]
             return Level.ERROR, '; '.join(filter(None, words))
+        frames = interval.frames
+        if interval.repeats == frames and max(frames, interval.duplicates) > 0:
+            return Level.ERROR, 'the control unit repeats itself'
         troubles = [(self._faults.level, self._faults.words)] if self._faults.words else []
         if self._device is not None and self._device.flags:
             troubles.append((Level.WARN, f'control unit: {device_words(self._device)}'))
         if self._stream is not None:
             coils = self._setup.emitter.coils
-            troubles += signal_troubles(coils, self._stream, self._frame, self._sensor_flags)
+            troubles += clock_troubles(self._stream)
+            troubles += signal_troubles(
+                coils, self._stream, self._frame, self._sensor_flags, self._staleness
+            )
         if troubles:
             return max(level for level, _ in troubles), '; '.join(words for _, words in troubles)
         if frames == 0:
@@ -341,17 +415,8 @@ class Acquisition(AnserNode):
             return []
         return [
             *emitter_statuses(self._setup.emitter.coils, stream, frame),
-            *sensor_statuses(stream, frame, self._sensor_flags),
+            *sensor_statuses(stream, frame, self._sensor_flags, self._staleness),
         ]
-
-
-def _with_noise(setup: Setup, rate_hz: float, frame: FluxFrame) -> Setup:
-    """The setup with what only the stream tells: its true rate, and the noise of its fluxes."""
-    sigma = frame.window.sigma[np.isfinite(frame.window.sigma)]
-    if not sigma.size or not np.median(sigma) > 0:
-        return replace(setup, flux_rate_hz=rate_hz)
-    noise_t = float(f'{np.median(sigma):.2g}')
-    return replace(setup, flux_rate_hz=rate_hz, extra={**setup.extra, FLUX_NOISE: noise_t})
 
 
 if __name__ == '__main__':

@@ -19,7 +19,7 @@ from anser_ros.errors import ParameterError
 from anser_ros.nodes import qos
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
-from anser_ros.signals.clock import DeviceClock
+from anser_ros.signals.clock import SampleClock
 from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.control_unit import ControlUnit, Piece
 from anser_ros.simulation.effect_draw import NONE as NO_EFFECT
@@ -147,7 +147,7 @@ class CuSimulator(AnserNode):
             effects=effects,
             seed=table.seed,
         )
-        self._unit_clock = DeviceClock(1.0)
+        self._unit_clock = SampleClock(1.0)
         self._rng = np.random.default_rng(table.seed + 1)
         self._injector = FaultInjector(table.fault, table.fault_period_s, table.seed)
         self._port = PseudoPort(Path(table.link))

@@ -19,7 +19,11 @@ FAULTS = {
     'wrong_version': 'records of another protocol version',
     'skipped_bytes': 'bytes of garbage',
     'windows_lost': 'windows not published',
-    'clock_jumps': "jumps of the device's clock",
+    'windows_withheld': 'windows withheld: no stamp was good',
+    'clock_jumps': 'the device lost time that it did not count',
+    'tick_faults': "the device's ticks and samples disagree",
+    'duplicate_blocks': 'blocks that came twice',
+    'system_clock_set': "the system's clock was set",
 }
 """Counters that only faults raise, the gravest first, with their meaning."""
 GRAVE = ('unplug', 'silence', 'wrong_baud')

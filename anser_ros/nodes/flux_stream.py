@@ -9,10 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import FitError, SetupError
-from anser_ros.signals.clock import DeviceClock
+from anser_ros.nodes.flux_frame import FluxFrame, Staleness, WaitingFrames
+from anser_ros.signals.clock import SampleClock
 from anser_ros.signals.demodulation import Demodulator, ToneFit
 from anser_ros.signals.flux import FluxConverter, FluxWindow
 from anser_ros.signals.motion import FluxRates
+from anser_ros.signals.repetition import RepetitionWatch
+from anser_ros.signals.ticks import TickCheck
 from anser_ros.signals.window import Window, WindowCutter
 from anser_ros.wire.channel_calibration import ChannelCalibration
 from anser_ros.wire.points import DROPPED, SATURATED, STALE, FluxPoints
@@ -27,25 +30,6 @@ class StreamOptions:
     window_s: float
     rate_hz: float
     mains_hz: float = 0.0
-
-
-@dataclass(frozen=True)
-class FluxFrame:
-    """The fluxes of one window.
-
-    Attributes
-    ----------
-    tool, reference : points of the two topics
-    host_ns : middle of the window in the clock of the arrivals
-    window : conversion with noise and currents, sensors in the order of `FluxStream.sensors`
-    flags : flag bits of these sensors
-    """
-
-    tool: FluxPoints
-    reference: FluxPoints
-    host_ns: int
-    window: FluxWindow
-    flags: NDArray[np.int64]
 
 
 class FluxStream:
@@ -63,6 +47,8 @@ class FluxStream:
     sensors : those of the setup that the control unit has a channel for, tools first
     missing : those that it has none for
     rate_hz : windows a second, a whole number of samples apart
+    clock, ticks : host time of the samples, and what the device's own clock says beside them
+    waiting : frames whose stamps are not confirmed yet
 
     Raises
     ------
@@ -96,16 +82,21 @@ class FluxStream:
         window = round(options.window_s * rate)
         hop = max(1, round(rate / options.rate_hz))
         self.rate_hz = rate / hop
-        self._tick_hz, self._sample_rate_hz = hello.tick_hz, rate
+        self._sample_rate_hz = rate
         self._block_samples = hello.block_samples
         self._demodulator = Demodulator(
             rate, self.tones_hz, window, mains_hz=options.mains_hz or None
         )
         self._converter = _converter(hello, self, columns, calibration)
         self._rates = None if self._demodulator.follows_motion else FluxRates()
-        self._cutter = WindowCutter(window, hop, len(hello.channels), rate / hello.tick_hz)
+        watch = RepetitionWatch(len(hello.channels), rate, self.tones_hz)
+        self.ticks = TickCheck(rate, hello.tick_hz)
+        self._cutter = WindowCutter(window, hop, watch, self.ticks)
+        self._watch = watch
         self.counters = self._cutter.counters
-        self.clock = DeviceClock(hello.tick_hz)
+        self.clock = SampleClock(rate)
+        self.waiting = WaitingFrames(self.clock)
+        self._current_column = _current_column(hello)
         self._newest: Window | None = None
         self._columns = np.array([columns[s.channel] for s in self.sensors])
         self._split = sum(s.body != FIELD_GENERATOR for s in self.sensors)
@@ -117,21 +108,43 @@ class FluxStream:
         """Blocks until the next window is complete."""
         return -(-self._cutter.samples_wanted // self._block_samples)
 
+    def restart(self, sent_ns: int | None) -> None:
+        """Begin anew: the device has answered a start, sent at a host time, with sample 0."""
+        self.waiting.forget()
+        self._cutter.reset()
+        self.clock.restart()
+        if sent_ns is not None:
+            self.clock.bound(0, sent_ns)
+
+    def answered(self, sent_ns: int) -> None:
+        """Take in that the device has just answered a command that was sent at a host time."""
+        self.clock.bound(self._cutter.end_sample + self._block_samples, sent_ns)
+
     def push(self, block: SampleBlock, arrival_ns: int) -> list[FluxFrame]:
-        """Take a block and return the frames that it completes."""
+        """Take a block and return the frames that are complete and whose stamps are good.
+
+        A frame may wait for its stamp, and be withheld; see `WaitingFrames`.
+        """
         if block.codes.shape[1] != self._cutter.columns:
             return []
-        end_ticks = block.timestamp_ticks + len(block.codes) * self._tick_hz / self._sample_rate_hz
-        self.clock.observe(end_ticks, arrival_ns)
+        restarts, before = self.counters.restarts, self._cutter.end_sample
         windows = self._cutter.push(block.sequence, block.timestamp_ticks, block.codes)
-        frames = []
+        if self.counters.restarts != restarts:
+            self.waiting.forget()
+            self.clock.restart()
+        # What comes twice tells nothing of now.
+        if self._cutter.end_sample != before and not self._watch.repeats:
+            self.clock.observe(self._cutter.end_sample, arrival_ns)
         for window in windows:
             try:
-                frames.append(self._frame(window))
+                frame = self._frame(window)
             except FitError:
                 self.counters.windows -= 1
                 self.counters.windows_lost += 1
-        return frames
+                continue
+            end = window.middle_sample + len(window.codes) / 2
+            self.waiting.add(frame, window.middle_sample, end, arrival_ns)
+        return self.waiting.release(arrival_ns)
 
     def rehearse(self) -> None:
         """Demodulate the newest window once more for nothing but speed, see `Acquisition`."""
@@ -142,18 +155,34 @@ class FluxStream:
     def _frame(self, window: Window) -> FluxFrame:
         self._newest = window
         fit = self._demodulator.demodulate(window.codes, window.present)
-        converted = self._converted(fit, window.middle_ticks / self._tick_hz)
-        flags = np.where(window.saturated[self._columns], SATURATED, 0)
-        flags |= np.where(window.stuck[self._columns], STALE, 0)
+        converted = self._converted(fit, window.middle_sample / self._sample_rate_hz)
+        staleness = self._staleness(window)
+        saturated = window.saturated[self._columns]
+        stale = window.stuck[self._columns] | window.stuck[self._current_column]
+        stale |= ((staleness.age_s > 0) | staleness.noiseless) & ~saturated
+        flags = np.where(saturated, SATURATED, 0) | np.where(stale, STALE, 0)
         if window.dropped:
             flags |= DROPPED
         split = self._split
         return FluxFrame(
             _points(self._tool, converted.flux[:split], flags[:split]),
             _points(self._reference, converted.flux[split:], flags[split:]),
-            self.clock.host_ns(window.middle_ticks),
+            0,
             converted,
             flags,
+            staleness,
+            window.repeats,
+        )
+
+    def _staleness(self, window: Window) -> Staleness:
+        """Why sensors are stale: with the currents all are, since fluxes are divided by them."""
+        # What is constant is stuck without further words.
+        ages = np.where(window.stuck, 0, window.ages)
+        noiseless = window.noiseless & ~window.stuck
+        current = self._current_column
+        age = np.where(ages > 0, ages, ages[current])[self._columns]
+        return Staleness(
+            age / self._sample_rate_hz, (noiseless | noiseless[current])[self._columns]
         )
 
     def _converted(self, fit: ToneFit, middle_s: float) -> FluxWindow:
@@ -190,6 +219,11 @@ def _points(
     return FluxPoints(geometry.channel, flags, flux, geometry.position, geometry.axis)
 
 
+def _current_column(hello: Hello) -> int:
+    """Column of the sum of the emitters' currents."""
+    return [channel.kind for channel in hello.channels].index(ChannelKind.CURRENT)
+
+
 def _nominal_currents(setup: Setup, hello: Hello) -> NDArray[np.float64]:
     """Currents that the setup's field is given for; the control unit's where it says nothing."""
     current = setup.emitter.geometry.get('current_a')
@@ -202,8 +236,7 @@ def _converter(
     hello: Hello, stream: FluxStream, columns: dict[int, int], calibration: ChannelCalibration
 ) -> FluxConverter:
     per_code = np.array([channel.full_scale / 32768 for channel in hello.channels])
-    kinds = [channel.kind for channel in hello.channels]
-    current = kinds.index(ChannelKind.CURRENT)
+    current = _current_column(hello)
     numbers = [sensor.channel for sensor in stream.sensors]
     chosen = np.array([columns[number] for number in numbers])
     return FluxConverter(

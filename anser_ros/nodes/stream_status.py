@@ -5,7 +5,9 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from anser_ros.nodes.diagnostics import Level, Status
-from anser_ros.nodes.flux_stream import FluxFrame, FluxStream
+from anser_ros.nodes.flux_frame import FluxFrame, Staleness
+from anser_ros.nodes.flux_stream import FluxStream
+from anser_ros.signals.clock import ClockState
 from anser_ros.wire.points import DROPPED, SATURATED, STALE
 from anser_ros.wire.setup import Coil
 
@@ -20,7 +22,11 @@ STATES = (
 
 
 def signal_troubles(
-    coils: Sequence[Coil], stream: FluxStream, frame: FluxFrame | None, flags: np.ndarray | None
+    coils: Sequence[Coil],
+    stream: FluxStream,
+    frame: FluxFrame | None,
+    flags: np.ndarray | None,
+    staleness: Staleness | None = None,
 ) -> list[tuple[Level, str]]:
     """What is wrong with the signals, by the names of emitters and sensors.
 
@@ -29,6 +35,8 @@ def signal_troubles(
     flags : ndarray, shape (S,), or None
         Flag bits that the sensors had since the last look. Lost samples are not told here: the
         counters of the line say where they were lost.
+    staleness : Staleness, optional
+        Why they were stale.
     """
     found = []
     if stream.missing:
@@ -42,9 +50,52 @@ def signal_troubles(
         return found
     for bit, level, word, _ in STATES[:2]:
         bad = [s.name for s, flag in zip(stream.sensors, flags, strict=True) if flag & bit]
-        if bad:
+        if bad and bit == STALE and staleness is not None:
+            found += _stuck(stream, flags, staleness)
+        elif bad:
             found.append((level, f'{word}: {_named(bad)}'))
     return found
+
+
+def _stuck(stream: FluxStream, flags: np.ndarray, staleness: Staleness) -> list[tuple[Level, str]]:
+    """Name the stuck sensors, those of one reason together."""
+    names: dict[str, list[str]] = {}
+    for row in np.flatnonzero(flags & STALE):
+        names.setdefault(_why_stale(staleness, row), []).append(stream.sensors[row].name)
+    return [(Level.ERROR, f'stuck: {_named(bad)} {why}'.strip()) for why, bad in names.items()]
+
+
+def _why_stale(staleness: Staleness | None, row: int) -> str:
+    """What a stale sensor does; empty where it is constant."""
+    if staleness is not None and staleness.age_s[row] > 0:
+        return f'repeats what it said {staleness.age_s[row]:.2g} s ago'
+    if staleness is not None and staleness.noiseless[row]:
+        return 'has no noise that tells new samples from old'
+    return ''
+
+
+def clock_troubles(stream: FluxStream) -> list[tuple[Level, str]]:
+    """What is wrong with the stamps, and with the device's own clock."""
+    clock, found = stream.clock, []
+    if clock.state is ClockState.LATE and clock.wants_answer:
+        words = f'clock: everything arrives {clock.lateness_s:.2g} s late, no stamp is good'
+        found.append((Level.ERROR, words))
+    elif clock.state is ClockState.SETTLING and stream.waiting.withheld:
+        found.append((Level.ERROR, 'clock: settling, no stamp is good yet'))
+    if stream.ticks.words:
+        words = f"clock: the device's ticks {stream.ticks.words}; stamps follow its samples"
+        found.append((Level.WARN, words))
+    return found
+
+
+def clock_values(stream: FluxStream) -> dict[str, object]:
+    """Figures of the clock."""
+    clock = stream.clock
+    return {
+        'clock': clock.state.value,
+        'lateness_s': clock.lateness_s,
+        'stamp_sigma_s': clock.sigma_s,
+    }
 
 
 def emitter_statuses(coils: Sequence[Coil], stream: FluxStream, frame: FluxFrame) -> list[Status]:
@@ -72,13 +123,18 @@ def emitter_statuses(coils: Sequence[Coil], stream: FluxStream, frame: FluxFrame
 
 
 def sensor_statuses(
-    stream: FluxStream, frame: FluxFrame, flags: np.ndarray | None
+    stream: FluxStream,
+    frame: FluxFrame,
+    flags: np.ndarray | None,
+    staleness: Staleness | None = None,
 ) -> list[Status]:
     """State and noise of each sensor, by the flags since the last look."""
     seen = frame.flags if flags is None or len(flags) != len(frame.flags) else flags
     statuses = []
     for row, sensor in enumerate(stream.sensors):
-        level, message = _sensor_state(int(seen[row]))
+        level, message = _sensor_state(
+            int(seen[row]), _why_stale(staleness or frame.staleness, row)
+        )
         values = {
             'channel': sensor.channel,
             'flux_rms_t': _rms(frame.window.flux[row]),
@@ -88,9 +144,10 @@ def sensor_statuses(
     return statuses
 
 
-def _sensor_state(flags: int) -> tuple[Level, str]:
-    for bit, level, word, why in STATES:
+def _sensor_state(flags: int, why_stale: str) -> tuple[Level, str]:
+    for bit, level, word, usual in STATES:
         if flags & bit:
+            why = (why_stale if bit == STALE else '') or usual
             return level, f'{word}: {why}' if why else word
     return Level.OK, 'ok'
 

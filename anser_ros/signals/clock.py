@@ -1,152 +1,242 @@
-"""The map from the device's clock to the host's, by the records that arrive earliest."""
+"""The map from a device's samples to the host's time, by the records that arrive earliest."""
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Sequence
-from itertools import pairwise
+from enum import Enum
 
-FOLLOWED_SHARE = 1e-4
-"""Largest relative rate difference at which a device clock is followed. Two quartz clocks differ
-by less; a larger value would follow slow changes of the host's load."""
-_JUMP_NS = 1_000_000_000
-"""A difference between device and host time beyond this (1 s) is no delay of the line."""
-_STALL_NS = 3_000_000_000
-"""Time (3 s) that all arrivals must be later than `_JUMP_NS` before the clock counts as changed;
-a host that stalls catches up within it."""
-_STRETCH_NS = 500_000_000
-"""Length (0.5 s) of a stretch of which only the earliest arrival is kept. Shorter stretches keep
-more late arrivals, longer ones give the line fewer points."""
-_MEMORY = 120
-"""Stretches whose earliest arrivals are kept, together a minute. A longer memory makes the rate
-more certain and follows its changes with temperature more slowly."""
-_FEWEST = 6
-"""Stretches from which on the rate is estimated: with fewer, delays look like a rate."""
-_TYPICAL_SHARE = 3e-5
-"""Standard deviation of the relative rate difference of two quartz clocks, a prior of the rate."""
+from anser_ros.signals.envelope import FOLLOWED_SHARE, Envelope
+
+LARGEST_LATENESS_S = 4e-3
+"""Lateness, s, up to which an arrival confirms the line; one that is so much too early refutes it.
+It bounds what a stamp may be wrong by when the device lost time that it did not count: 5 ms less
+what the line itself is uncertain by. Smaller, a busy host confirms nothing for long."""
+_SETTLE_NS = 200_000_000
+"""Time (0.2 s) that a new line must stand, where no answer of the device bounds it. Bytes that had
+piled up are worked off faster than new ones come, and push the line down meanwhile."""
+_SETTLED_NS = 1_000_000.0
+"""Fall of a new line (1 ms) that begins the time anew; less is how arrivals scatter."""
+_ANSWER_S = 0.15
+"""Longest time, s, that an answer of the device may take to bound nothing: it has 100 ms for it,
+and the line the rest. If it takes longer, the line itself is late."""
+_ANSWER_HOLDS_NS = 60e9
+"""Device time (60 s) after which an answer says nothing any more: two clocks may have drifted
+apart by 6 ms, more than a stamp may be wrong by."""
+_DOUBT_NS = 100_000_000
+"""Time (0.1 s) without a confirmation, while blocks arrive, from which on the device is asked. A
+stall of the host ends with a burst that confirms the line at once."""
+_GIVE_UP_NS = 10_000_000_000
+"""Time (10 s) of unchanged lateness after which a device that does not answer is believed to have
+lost time. A line that is late for longer is taken for such a device."""
+_BUCKET_NS = 50_000_000
+"""Time (50 ms) of arrivals of which the earliest one tells how well the line is confirmed."""
+_BUCKETS = 10
+"""Such times that are looked back on. Times in which nothing arrives do not count: a host that
+stalls is no evidence against the line."""
+_FLOOR_S = 1e-4
+"""Least uncertainty of a stamp, s: what reading a byte and taking the time cost even when nothing
+else happens."""
 
 
-class DeviceClock:
-    """Converts timestamps of the device to host time.
+class ClockState(Enum):
+    """What is known of the stamps; the value is the word for an operator."""
 
-    Every record arrives late by an unknown delay that is never negative. Arrival minus device time
-    therefore lies above a line whose slope is the difference of the two clocks' rates, and touches
-    it where a record arrived without delay. The line is estimated by the edge, around the middle
-    of the last minute, of the lower convex hull of the earliest arrivals (Moon, Skelly and
-    Towsley, "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999).
-    A busy host on which nothing arrives early for a while thus does not move the stamps. At first
-    the line rises by `FOLLOWED_SHARE`; a slope that is still uncertain is shrunk towards zero.
+    SETTLING = 'settling'
+    GOOD = 'ok'
+    LATE = 'late'
+
+
+class SampleClock:
+    """Converts sample numbers of a stream to host time.
+
+    Samples come from one oscillator, so between a sample's number and the host's time lies a
+    straight line: its slope is within 100 ppm of the nominal one, and no arrival lies below it.
+    It is estimated by `Envelope`. What could break it is looked for in each arrival:
+
+    - one that comes earlier than it could refutes the line, and a new one begins;
+    - while arrivals come later than `LARGEST_LATENESS_S` all of them, either the line to the host
+      is late or the device lost time. No stamp is good then, until an arrival is in time again,
+      or an answer of the device (`bound`) shows that time was lost.
 
     Parameters
     ----------
-    tick_hz : float
-        Rate of the device's timestamp counter, Hz.
+    sample_rate_hz : float
+        Samples a second, as the device states it.
+
+    Attributes
+    ----------
+    jumps : int
+        How often the line was begun anew because it was refuted.
+    confirmed : float
+        Number of the newest sample that an arrival in time has confirmed; -inf before.
     """
 
-    def __init__(self, tick_hz: float) -> None:
-        self._ns_per_tick = 1e9 / tick_hz
-        self._offset_ns: float | None = None
-        self._slope = FOLLOWED_SHARE
-        self._last_device_ns = 0.0
-        self._late_from_ns: float | None = None
-        self._earliest: deque[tuple[float, float]] = deque(maxlen=_MEMORY)
-        self._stretch_end_ns = 0.0
+    def __init__(self, sample_rate_hz: float) -> None:
+        self._ns_per_sample = 1e9 / sample_rate_hz
         self.jumps = 0
+        self.restart()
 
-    def observe(self, ticks: float, arrival_ns: int) -> None:
-        """Take in the arrival of a record with a device timestamp.
+    def restart(self) -> None:
+        """Begin a new stream of samples, with numbers that have nothing to do with the last."""
+        self._lower: tuple[float, float] | None = None
+        self._begin_anew()
 
-        A device time that runs backwards, or jumps ahead of the host's by more than a second,
-        starts the estimate anew. If it falls behind by a second, the host may have stalled; only
-        when that lasts for three seconds does the clock count as changed.
+    def _begin_anew(self) -> None:
+        self._line: Envelope | None = None
+        self.confirmed = -math.inf
+        self._settled = False
+        self._stands: tuple[int, float] = (0, 0.0)
+        self._earliest: deque[tuple[int, float]] = deque(maxlen=_BUCKETS)
+        self._late_from_ns: int | None = None
+        self._newest_ns = 0
+        self._newest_offset = 0.0
+        self._is_line_late = False
+
+    def observe(self, sample: float, arrival_ns: int) -> None:
+        """Take in the arrival of a block.
 
         Parameters
         ----------
-        ticks : float
-            Device time, already past at the arrival, in ticks of its counter.
+        sample : float
+            Number of the sample behind the block's last one.
         arrival_ns : int
-            Host time of the arrival, ns.
+            Host time of the arrival, ns, monotonic.
         """
-        device_ns = ticks * self._ns_per_tick
-        offset = arrival_ns - device_ns
-        if self._offset_ns is None:
-            self._begin(device_ns, offset)
-            return
-        elapsed = device_ns - self._last_device_ns
-        risen = self._offset_ns + self._slope * max(elapsed, 0.0)
-        if elapsed < 0 or risen - offset > _JUMP_NS or self._is_behind(offset - risen, device_ns):
+        time_ns = sample * self._ns_per_sample
+        offset = arrival_ns - time_ns
+        late = 0.0 if self._line is None else offset - self._line.offset_at(time_ns)
+        if self._line is not None and (
+            time_ns < self._line.newest_ns or (self._settled and late < -1e9 * LARGEST_LATENESS_S)
+        ):
             self.jumps += 1
-            self._begin(device_ns, offset)
+            self._begin_anew()
+            late = 0.0
+        if self._line is None:
+            self._line = Envelope(time_ns, offset)
+            self._stands = arrival_ns, offset
+        self._newest_ns, self._newest_offset = arrival_ns, offset
+        self._note_lateness(late, arrival_ns)
+        if late > 1e9 * LARGEST_LATENESS_S and self._settled:
+            self._doubt(arrival_ns)
             return
-        self._remember(device_ns, offset)
-        self._offset_ns = min(offset, risen)
-        self._last_device_ns = device_ns
-        if device_ns >= self._stretch_end_ns:
-            self._draw(device_ns)
-
-    def _begin(self, device_ns: float, offset_ns: float) -> None:
-        """Start the estimate anew with a first arrival."""
         self._late_from_ns = None
-        self._slope = FOLLOWED_SHARE
-        self._offset_ns, self._last_device_ns = offset_ns, device_ns
-        self._earliest.clear()
-        self._earliest.append((device_ns, offset_ns))
-        self._stretch_end_ns = device_ns + _STRETCH_NS
+        self._line.take(time_ns, offset)
+        self.confirmed = sample
+        if not self._settled:
+            self._settle(time_ns, arrival_ns)
 
-    def _remember(self, device_ns: float, offset_ns: float) -> None:
-        """Keep an arrival as the earliest one of the present stretch if it is."""
-        before = self._earliest[-1]
-        if offset_ns - before[1] < self._slope * (device_ns - before[0]):
-            self._earliest[-1] = (device_ns, offset_ns)
+    def bound(self, sample: float, sent_ns: int) -> None:
+        """Take in that a sample was not yet taken when a command was sent that is now answered.
 
-    def _draw(self, device_ns: float) -> None:
-        """Draw the line anew at the end of a stretch, and begin another one."""
-        if len(self._earliest) >= _FEWEST:
-            self._slope = _slope_below(self._earliest)
-        self._offset_ns = min(o + self._slope * (device_ns - d) for d, o in self._earliest)
-        # Nothing has come in the new stretch yet: any arrival is earlier than none.
-        self._earliest.append((device_ns, float('inf')))
-        self._stretch_end_ns = device_ns + _STRETCH_NS
+        Parameters
+        ----------
+        sample : float
+            Number of a sample that the device took after it had answered.
+        sent_ns : int
+            Host time before the command left, ns, monotonic.
+        """
+        time_ns = sample * self._ns_per_sample
+        known = self._lower_offset(time_ns)
+        lower = max(sent_ns - time_ns, known) if known is not None else sent_ns - time_ns
+        self._lower = time_ns, lower
+        # The answer came with the newest block, and took as long as that is above the bound.
+        self._is_line_late = self._newest_offset - lower > 1e9 * _ANSWER_S
+        if self._line is None:
+            return
+        if lower > self._line.offset_at(time_ns) + 1e9 * LARGEST_LATENESS_S:
+            if self._settled:
+                self.jumps += 1
+            self._begin_anew()
+        elif not self._settled and self._newest_ns:
+            self._settle(time_ns, self._newest_ns)
 
-    def _is_behind(self, late_ns: float, device_ns: float) -> bool:
-        """Whether all arrivals for long have been so late that the clock must have changed."""
-        if late_ns <= _JUMP_NS:
-            self._late_from_ns = None
-        elif self._late_from_ns is None:
-            self._late_from_ns = device_ns
-        return self._late_from_ns is not None and device_ns - self._late_from_ns > _STALL_NS
+    def _lower_offset(self, time_ns: float) -> float | None:
+        """Least offset, ns, that the line can have at a time, by the last answer."""
+        if self._lower is None:
+            return None
+        at, lower = self._lower
+        if abs(time_ns - at) > _ANSWER_HOLDS_NS:
+            return None
+        return lower - FOLLOWED_SHARE * abs(time_ns - at)
 
-    def host_ns(self, ticks: float) -> int:
-        """Return the host time (ns) of device time `ticks`; 0 before the first arrival."""
-        if self._offset_ns is None:
+    def _slack_ns(self, time_ns: float) -> float | None:
+        """How far the line lies above the least that it can be, ns; None without an answer."""
+        lower = self._lower_offset(time_ns)
+        return (
+            None if lower is None or self._line is None else self._line.offset_at(time_ns) - lower
+        )
+
+    def _settle(self, time_ns: float, arrival_ns: int) -> None:
+        """See whether a new line can be relied on."""
+        assert self._line is not None
+        slack = self._slack_ns(time_ns)
+        offset = self._line.offset_at(time_ns)
+        since, stood = self._stands
+        if offset < stood - _SETTLED_NS:
+            self._stands = arrival_ns, offset
+        elif slack is None or slack < 1e9 * _ANSWER_S:
+            self._settled = arrival_ns - since > _SETTLE_NS
+        if slack is not None and slack < 1e9 * LARGEST_LATENESS_S:
+            self._settled = True
+
+    def _doubt(self, arrival_ns: int) -> None:
+        """Note an arrival that is late."""
+        if self._late_from_ns is None:
+            self._late_from_ns = arrival_ns
+            self._is_line_late = False
+        elif arrival_ns - self._late_from_ns > _GIVE_UP_NS and not self._is_line_late:
+            self.jumps += 1
+            self._begin_anew()
+
+    def _note_lateness(self, late_ns: float, arrival_ns: int) -> None:
+        recent = self._earliest
+        if recent and arrival_ns - recent[-1][0] < _BUCKET_NS:
+            recent[-1] = recent[-1][0], min(recent[-1][1], late_ns)
+        else:
+            recent.append((arrival_ns, late_ns))
+
+    @property
+    def wants_answer(self) -> bool:
+        """Whether an answer of the device would help: the line is new, or late for a while."""
+        if self._line is None:
+            return False
+        late_from = self._late_from_ns
+        return not self._settled or (
+            late_from is not None and self._newest_ns - late_from > _DOUBT_NS
+        )
+
+    @property
+    def state(self) -> ClockState:
+        """What is known of the stamps now."""
+        if not self._settled:
+            return ClockState.SETTLING
+        return ClockState.LATE if self._late_from_ns is not None else ClockState.GOOD
+
+    @property
+    def lateness_s(self) -> float:
+        """By how much the earliest of the recent arrivals was late, s."""
+        return max(min((late for _, late in self._earliest), default=0.0), 0.0) / 1e9
+
+    @property
+    def sigma_s(self) -> float:
+        """Standard deviation of a confirmed stamp, s; infinite while the line is not settled."""
+        if not self._settled:
+            return math.inf
+        return math.hypot(_FLOOR_S, self.lateness_s)
+
+    def is_good(self, sample: float) -> bool:
+        """Whether the host time of a sample is known to 5 ms."""
+        return self._settled and self.confirmed >= sample
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the line is relied on, apart from how late the newest arrivals are."""
+        return self._settled
+
+    def host_ns(self, sample: float) -> int:
+        """Return the host time (ns) of a sample's number; 0 before the first arrival."""
+        if self._line is None:
             return 0
-        return round(ticks * self._ns_per_tick + self._offset_ns)
-
-
-def _slope_below(points: Sequence[tuple[float, float]]) -> float:
-    """Return the most probable slope of the line below points, with `_TYPICAL_SHARE` as prior.
-
-    Two points determine a line; the distances of the next ones above it tell how certain it is.
-    """
-    slope = _hull_slope(points)
-    above = sorted(y - slope * x for x, y in points)
-    sigma = 2.0 * (above[3] - above[0]) / (points[-1][0] - points[0][0])
-    shrunk = slope / (1.0 + (sigma / _TYPICAL_SHARE) ** 2)
-    return min(max(shrunk, -FOLLOWED_SHARE), FOLLOWED_SHARE)
-
-
-def _hull_slope(points: Sequence[tuple[float, float]]) -> float:
-    """Return the slope of the lower convex hull's edge at the middle of the abscissae."""
-    hull: list[tuple[float, float]] = []
-    for x, y in points:
-        while len(hull) > 1:
-            (x0, y0), (x1, y1) = hull[-2:]
-            if (y1 - y0) * (x - x0) < (y - y0) * (x1 - x0):
-                break
-            hull.pop()
-        hull.append((x, y))
-    middle = 0.5 * (points[0][0] + points[-1][0])
-    for (x0, y0), (x1, y1) in pairwise(hull):
-        if x1 >= middle:
-            return (y1 - y0) / (x1 - x0)
-    return 0.0
+        time_ns = sample * self._ns_per_sample
+        return round(time_ns + self._line.offset_at(time_ns))

@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError
+from anser_ros.signals.repetition import RepetitionWatch
+from anser_ros.signals.ticks import TickCheck
 
 _SEQUENCES = 2**32
 """Number after which the blocks' sequence number begins again (an unsigned 32-bit counter)."""
-_CLOCK_TOLERANCE = 0.01
-"""Relative difference up to which a hole's length by device time and by sequence number agree. It
-is far above the rate error of any clock and below one block in a hundred."""
 _FULL_SCALE = (-32768, 32767)
 """Ends of the range of the 16-bit converter; a code at either end counts as saturated."""
 
@@ -28,19 +27,29 @@ class Window:
         Converter codes.
     present : ndarray of bool, shape (N,)
         False where a sample was lost.
-    middle_ticks : float
-        Device time of the middle of the window, ticks.
+    middle_sample : float
+        Number of the sample in the middle of the window, since the stream began.
     saturated : ndarray of bool, shape (C,)
         Whether a sample lies at an end of the converter's range.
     stuck : ndarray of bool, shape (C,)
         Whether all samples are the same.
+    ages : ndarray of int, shape (C,)
+        How long before, samples, a column said what it says in the window, or a part of it; 0
+        where all of it is new.
+    noiseless : ndarray of bool, shape (C,)
+        Whether a column holds too little noise to tell new samples from old ones.
+    repeats : bool
+        Whether no column says anything new.
     """
 
     codes: NDArray[np.int16]
     present: NDArray[np.bool_]
-    middle_ticks: float
+    middle_sample: float
     saturated: NDArray[np.bool_]
     stuck: NDArray[np.bool_]
+    ages: NDArray[np.int64]
+    noiseless: NDArray[np.bool_]
+    repeats: bool
 
     @property
     def dropped(self) -> bool:
@@ -65,7 +74,7 @@ class WindowCutter:
 
     Lost blocks leave a hole of the right length, so that the windows keep their grid. A window
     with less than half of its samples counts as lost. A sequence number that does not fit the
-    device time begins a new stream.
+    device's ticks begins a new stream, and so does one that was there before with other samples.
 
     Parameters
     ----------
@@ -73,10 +82,15 @@ class WindowCutter:
         Samples in a window.
     hop_samples : int
         Samples from one window to the next; a hop longer than the window leaves samples out.
-    columns : int
-        Number of channels.
-    samples_per_tick : float
-        Sample rate over the tick rate of the device.
+    watch : RepetitionWatch
+        Keeps the samples of the stream and finds what comes again in them.
+    ticks : TickCheck
+        Compares the device's ticks with the samples.
+
+    Attributes
+    ----------
+    end_sample : int
+        Number of the sample behind the newest block, since the device began to count.
 
     Raises
     ------
@@ -85,18 +99,18 @@ class WindowCutter:
     """
 
     def __init__(
-        self, window_samples: int, hop_samples: int, columns: int, samples_per_tick: float
+        self, window_samples: int, hop_samples: int, watch: RepetitionWatch, ticks: TickCheck
     ) -> None:
         if min(hop_samples, window_samples) < 1:
             raise ParameterError(
                 f'a window of {window_samples} and a hop of {hop_samples} samples: both need one'
             )
         self.counters = CutterCounters()
-        self.columns = columns
+        self.columns = watch.columns
         self._window = window_samples
         self._hop = hop_samples
-        self._samples_per_tick = samples_per_tick
-        self._codes = np.zeros((max(4 * window_samples, 8192), columns), np.int16)
+        self._watch, self._ticks = watch, ticks
+        self._codes = np.zeros((max(4 * window_samples, 8192), watch.columns), np.int16)
         self._present = np.zeros(len(self._codes), bool)
         self.reset()
 
@@ -105,7 +119,9 @@ class WindowCutter:
         self._filled = 0
         self._until_next = self._window
         self._expected: int | None = None
-        self._last_ticks = 0
+        self.end_sample = self._begin_sample = 0
+        self._watch.reset()
+        self._ticks.reset()
 
     @property
     def samples_wanted(self) -> int:
@@ -133,34 +149,42 @@ class WindowCutter:
             raise ParameterError(
                 f'a block of {codes.shape[1]} channels in a stream of {self._codes.shape[1]}'
             )
-        missing = self._missing_blocks(sequence, timestamp_ticks, len(codes)) * len(codes)
+        missing = self._missing_blocks(sequence, timestamp_ticks, codes) * len(codes)
         if missing < 0:
             self.counters.duplicate_blocks += 1
             return []
+        if self._expected is None:
+            self.end_sample = self._begin_sample = sequence * len(codes)
+        first = self.end_sample + missing
         self._expected = (sequence + 1) % _SEQUENCES
-        self._last_ticks = timestamp_ticks
         windows: list[Window] = []
         if missing:
             self.counters.missing_samples += missing
-            hole_ticks = timestamp_ticks - missing / self._samples_per_tick
-            missing -= self._skip_whole_windows(missing)
-            windows += self._advance(None, missing, hole_ticks)
-        return windows + self._advance(codes, len(codes), timestamp_ticks)
+            self._watch.skip(missing)
+            self._ticks.take_after_hole(first, timestamp_ticks)
+            skipped = self._skip_whole_windows(missing)
+            windows += self._advance(None, missing - skipped, first - missing + skipped)
+        else:
+            self._ticks.take(first, timestamp_ticks)
+        self._watch.take(codes)
+        self.end_sample = first + len(codes)
+        return windows + self._advance(codes, len(codes), first)
 
-    def _missing_blocks(self, sequence: int, ticks: int, block: int) -> int:
+    def _missing_blocks(self, sequence: int, ticks: int, codes: NDArray[np.int16]) -> int:
         """Return the number of blocks lost before this one; -1 for a block that came before.
 
-        Sequence number and device time must agree on the size of a hole; otherwise the device has
-        started a new stream, and its first blocks were lost.
+        Sequence number and ticks must agree on the size of a hole; otherwise the device has
+        started a new stream, and its first blocks were lost. A block that came before has the
+        samples that it had then, or fills a hole too late.
         """
         if self._expected is None or sequence == self._expected:
             return 0
-        ahead = (sequence - self._expected) % _SEQUENCES
-        elapsed = (ticks - self._last_ticks) * self._samples_per_tick
-        if ahead >= _SEQUENCES // 2 and elapsed <= 0:
-            return -1
-        span = (ahead + 1) * block
-        if abs(elapsed - span) <= 1 + _CLOCK_TOLERANCE * span:
+        ahead, block = (sequence - self._expected) % _SEQUENCES, len(codes)
+        if ahead >= _SEQUENCES // 2:
+            place = self._watch.position - (_SEQUENCES - ahead) * block
+            if self._watch.recalls(place, codes) is not False:
+                return -1
+        elif self._ticks.confirms((ahead + 1) * block, ticks):
             return ahead
         self.counters.restarts += 1
         self.reset()
@@ -174,9 +198,7 @@ class WindowCutter:
         self.counters.windows_lost += hops
         return hops * self._hop
 
-    def _advance(
-        self, codes: NDArray[np.int16] | None, count: int, first_ticks: float
-    ) -> list[Window]:
+    def _advance(self, codes: NDArray[np.int16] | None, count: int, first: int) -> list[Window]:
         """Append samples, or a hole where `codes` is None, and return the completed windows."""
         windows: list[Window] = []
         done = 0
@@ -187,7 +209,7 @@ class WindowCutter:
             self._until_next -= step
             if self._until_next == 0:
                 self._until_next = self._hop
-                windows += self._cut(first_ticks + done / self._samples_per_tick)
+                windows += self._cut(first + done)
         return windows
 
     def _append(self, codes: NDArray[np.int16] | None, count: int) -> None:
@@ -203,7 +225,7 @@ class WindowCutter:
             self._codes[place] = codes
         self._filled += count
 
-    def _cut(self, end_ticks: float) -> list[Window]:
+    def _cut(self, end: int) -> list[Window]:
         """Return the window that ends with the newest sample, unless too little of it arrived."""
         place = slice(self._filled - self._window, self._filled)
         codes, present = self._codes[place].copy(), self._present[place].copy()
@@ -217,5 +239,10 @@ class WindowCutter:
             self.counters.windows_dropped_samples += 1
         low, high = seen.min(axis=0), seen.max(axis=0)
         saturated = (low <= _FULL_SCALE[0]) | (high >= _FULL_SCALE[1])
-        middle = end_ticks - self._window / 2 / self._samples_per_tick
-        return [Window(codes, present, middle, saturated, low == high)]
+        watch, first = self._watch, end - self._window - self._begin_sample
+        return [
+            Window(
+                codes, present, end - self._window / 2, saturated, low == high,
+                watch.ages(first), watch.noiseless, watch.repeats,
+            )
+        ]  # fmt: skip

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import ParameterError
-from anser_ros.signals.clock import FOLLOWED_SHARE
+from anser_ros.signals.envelope import FOLLOWED_SHARE
 from anser_ros.simulation.metal import MetalBody
 from anser_ros.simulation.raw_effects import (
     ChannelGain,

@@ -33,6 +33,9 @@ _READ_TIMEOUT_S = 0.05
 """Longest time that a read waits, s, before the thread looks whether it has to end."""
 _WRITE_TIMEOUT_S = 0.2
 """Longest time that a write may take, s; commands are short, so that a longer one is a fault."""
+_COMMANDS = 64
+"""Commands that may wait to be written, and of which the time is remembered; they are answered
+within a second, and asked at most a few times a second."""
 _GARBAGE_BYTES = 256
 """Bytes without a record within a second beyond which the line counts as garbled."""
 _READ_BYTES = 1 << 16
@@ -133,7 +136,8 @@ class ControlUnitPort:
         self._protocol = protocol
         self._reader = protocol.make_reader()
         self._queue: queue.SimpleQueue[Batch] = queue.SimpleQueue()
-        self._commands: deque[bytes] = deque(maxlen=64)
+        self._commands: deque[tuple[int, bytes]] = deque(maxlen=_COMMANDS)
+        self._sent_ns: deque[tuple[int, int]] = deque(maxlen=_COMMANDS)
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self._next_sequence: int | None = None
@@ -171,8 +175,15 @@ class ControlUnitPort:
         It is lost when the port closes before; whoever sends it watches for the reply.
         """
         self._tag = self._tag % 0xFFFF + 1
-        self._commands.append(self._protocol.encode(command, self._tag))
+        self._commands.append((self._tag, self._protocol.encode(command, self._tag)))
         return self._tag
+
+    def sent_ns(self, tag: int) -> int | None:
+        """Return the monotonic time right before a command left, None for one long ago."""
+        for known, sent_ns in reversed(tuple(self._sent_ns)):
+            if known == tag:
+                return sent_ns
+        return None
 
     def fault_counters(self) -> dict[str, int]:
         """All counters by name, the frame reader's included."""
@@ -225,7 +236,9 @@ class ControlUnitPort:
         receive = _receiver(port)
         while not self._stopping.is_set():
             while self._commands:
-                port.write(self._commands.popleft())
+                tag, command = self._commands.popleft()
+                self._sent_ns.append((tag, time.monotonic_ns()))
+                port.write(command)
             data = receive()
             # The stamps hang on this time: it is taken before anything is made of the bytes.
             arrival_ns = time.monotonic_ns()

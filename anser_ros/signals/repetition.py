@@ -1,0 +1,223 @@
+"""Repeated samples: a column whose newest samples equal, bit for bit, what it said before.
+
+Fresh samples carry new noise, so that a long run of them never equals an earlier one. How long a
+run must be follows from the noise that a column is seen to have: at the lag at which its tones
+return most nearly, two fresh samples coincide with a probability q, which is counted, and a run of
+n of them with q^n. A column in n samples of which there is too little chance proves nothing, and
+is called noiseless: of what never changes, new and old cannot be told apart.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import ParameterError
+from anser_ros.signals.repetition_kernels import (
+    FINGERPRINT_SAMPLES,
+    MOST_ROWS,
+    PROBE_SAMPLES,
+    SLOTS,
+    count_coincidences,
+    search,
+)
+
+EVIDENCE_BITS = 80.0
+"""Bits of surprise that a run must hold to count as repeated. A unit of 42 columns at 40 kS/s with
+two seconds of history compares 2^37 pairs of runs a second and 2^65 in ten years, so that one
+false alarm in ten years has a probability of 2^-15 even if all tones returned at every lag. Fewer
+bits give false alarms, more need longer runs: a column of 3 bits a sample needs 27 samples for
+80."""
+LONGEST_RUN_S = 0.025
+"""Longest run, s, that a column may need. One that needs more has less than 80 bits of noise in it
+(0.08 bits a sample at 40 kS/s, 0.06 codes rms) and is noiseless; a longer one would let whole
+windows of repeated samples pass before they are found."""
+HISTORY_S = 2.5
+"""How far back a repetition is found, s. Buffers that a fault of a driver or a cable can repeat
+are far shorter; a longer history costs 3.4 MB a second at 42 columns."""
+MOST_BYTES = 64_000_000
+"""Most memory of the history, bytes; that of a unit with very many channels is shorter."""
+_LONGEST_STEP = 2048
+"""Most samples, and a power of 2, that wait to be searched; less than any history has."""
+_JUDGED_SAMPLES = 2 * _LONGEST_STEP
+"""Samples after which it is worked out anew how long runs must be: every 0.1 s at 40 kS/s, far
+less than `FORGETS_S`. More often only costs time."""
+SHORTEST_LAG_S = 1e-3
+"""Shortest lag, s, at which fresh samples are compared: over a shorter one a tone at 1 kHz or less
+is no other than it was."""
+FORGETS_S = 1.0
+"""Time constant, s, with which coincidences are forgotten. A longer one keeps a tool's movement,
+which makes coincidences rarer, in mind when it rests; a shorter one counts few."""
+_PRIOR = 32.0
+"""Samples that the prior of the coincidences counts for, half of which coincide (one bit each). It
+holds the first 0.1 s, until there are samples at the worst lag; more would slow the start down."""
+_PRIOR_RUNS = 4.0
+"""Coincidences that the prior of what follows one counts for: that noise is so correlated that
+every further sample is worth half of its own surprise."""
+_RAILS = np.array([-32768, 32767], np.int16)
+"""Ends of the range of the 16-bit converter."""
+
+
+class RepetitionWatch:
+    """Keeps the last samples of a stream, and finds in them what comes again.
+
+    Parameters
+    ----------
+    columns : int
+        Number of columns, C.
+    sample_rate_hz : float
+        Samples a second and column.
+    tones_hz : ndarray, shape (K,), optional
+        Tones of the signals, Hz: fresh samples are most alike where all of them return together.
+
+    Raises
+    ------
+    ParameterError
+        When there is no column, or the rate is not positive.
+
+    Attributes
+    ----------
+    position : int
+        Samples since the last reset, holes included.
+    """
+
+    def __init__(
+        self, columns: int, sample_rate_hz: float, tones_hz: NDArray[np.float64] | None = None
+    ) -> None:
+        if columns < 1 or not sample_rate_hz > 0:
+            raise ParameterError(
+                f'repetitions need columns and a rate, not {columns} at {sample_rate_hz:g} S/s'
+            )
+        rows = min(int(HISTORY_S * sample_rate_hz), MOST_BYTES // (2 * columns), MOST_ROWS)
+        self._rate_hz = sample_rate_hz
+        self._history = np.zeros((max(rows, 2 * _LONGEST_STEP), columns), np.int16)
+        self._slots = np.zeros((columns, SLOTS), np.uint32)
+        self._worst_lag = _worst_lag(len(self._history), sample_rate_hz, tones_hz)
+        self._longest = max(int(LONGEST_RUN_S * sample_rate_hz), 2 * FINGERPRINT_SAMPLES)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all samples and what they were found to be."""
+        columns = self._history.shape[1]
+        self.position = self._searched = self._contiguous_from = 0
+        self._slots[:] = 0
+        self._fingerprint = np.zeros(columns, np.uint32)
+        self._probes = np.zeros((len(PROBE_SAMPLES), columns), np.uint32)
+        self._probed_at = np.zeros(len(PROBE_SAMPLES), np.int64)
+        self._lag, self._run, self._until, self._age = np.zeros((4, columns), np.int64)
+        self._equal = np.zeros(columns, np.int64)
+        self._tried, self._same, self._continued = np.zeros((3, columns))
+        self._judge()
+
+    @property
+    def columns(self) -> int:
+        """How many columns a sample has."""
+        return self._history.shape[1]
+
+    @property
+    def noiseless(self) -> NDArray[np.bool_]:
+        """Columns whose samples hold too little noise to tell new from old, shape (C,)."""
+        return self._needed > self._longest
+
+    @property
+    def needed(self) -> NDArray[np.int64]:
+        """Samples that a run of each column must have to count as repeated, shape (C,)."""
+        return self._needed
+
+    @property
+    def repeats(self) -> bool:
+        """Whether no column said anything new lately, and one repeats what it said."""
+        repeating = self._run >= self._needed
+        return bool(np.all(repeating | self.noiseless) and np.any(repeating))
+
+    def take(self, codes: NDArray[np.int16]) -> None:
+        """Keep the samples (n, C) that follow those before."""
+        history, count = self._history, len(codes)
+        first = self.position % len(history)
+        step = min(count, len(history) - first)
+        history[first : first + step] = codes[:step]
+        if step < count:
+            history[: count - step] = codes[step:]
+        self.position += count
+        if self.position - self._searched >= _LONGEST_STEP:
+            self._search()
+
+    def skip(self, samples: int) -> None:
+        """Leave a hole for samples that were lost."""
+        self._search()
+        rows = len(self._history)
+        cleared = min(samples, rows)
+        self._history[(self.position + samples - cleared + np.arange(cleared)) % rows] = 0
+        self.position += samples
+        self._searched = self._contiguous_from = self.position
+        self._run[:] = self._lag[:] = 0
+
+    def ages(self, first: int) -> NDArray[np.int64]:
+        """Return how old the samples from a position on are, shape (C,), samples.
+
+        It is 0 for a column whose samples are all new, and else how long before it said the same.
+        """
+        self._search()
+        return np.where(self._until > first, self._age, 0)
+
+    def recalls(self, position: int, codes: NDArray[np.int16]) -> bool | None:
+        """Whether the samples at a position were these (n, C); None where they are a hole."""
+        rows = len(self._history)
+        if position < max(0, self.position - rows) or position + len(codes) > self.position:
+            return False
+        known = self._history[(position + np.arange(len(codes))) % rows]
+        if not known.any() and codes.any():
+            return None
+        return bool(np.array_equal(known, codes))
+
+    def _search(self) -> None:
+        """Look at the samples that have come since the last look."""
+        rows = len(self._history)
+        while self._searched < self.position:
+            at = self._searched
+            first = at % rows
+            until_judged = _JUDGED_SAMPLES - at % _JUDGED_SAMPLES
+            count = min(self.position - at, rows - first, until_judged)
+            contiguous = at - self._contiguous_from
+            search(
+                self._history, first, count, at, contiguous, self._fingerprint, self._probes,
+                self._probed_at, self._slots, self._needed, self._lag, self._run, self._until,
+                self._age,
+            )  # fmt: skip
+            if contiguous > self._worst_lag:
+                is_new = (self._run < self._needed).astype(np.int64)
+                count_coincidences(
+                    self._history, first, count, at, self._worst_lag, _RAILS, is_new,
+                    self._equal, self._tried, self._same, self._continued,
+                )  # fmt: skip
+            self._searched = at + count
+            if count == until_judged:
+                self._judge()
+
+    def _judge(self) -> None:
+        """Work out how long a run must be, from the coincidences of samples that are fresh."""
+        same = (self._same + 0.5 * _PRIOR) / (self._tried + _PRIOR)
+        followed = self._continued + _PRIOR_RUNS * np.sqrt(same)
+        surprise = -np.log2(np.maximum(same, followed / (self._same + _PRIOR_RUNS)))
+        samples = np.ceil(EVIDENCE_BITS / np.maximum(surprise, 1e-6))
+        self._needed = np.maximum(samples, FINGERPRINT_SAMPLES).astype(np.int64)
+        kept = math.exp(-_JUDGED_SAMPLES / (FORGETS_S * self._rate_hz))
+        for counted in (self._tried, self._same, self._continued):
+            counted *= kept
+
+
+def _worst_lag(rows: int, sample_rate_hz: float, tones_hz: NDArray[np.float64] | None) -> int:
+    """Return the lag, samples, at which all tones are most nearly where they were.
+
+    The shortest of equally good ones is taken: the less time passes, the less has moved.
+    """
+    shortest = max(int(SHORTEST_LAG_S * sample_rate_hz), 1)
+    lags = np.arange(shortest, max(rows - _LONGEST_STEP, shortest + 1))
+    if tones_hz is None or not len(tones_hz):
+        return int(lags[0])
+    agreement = np.zeros(len(lags))
+    for tone in tones_hz:
+        agreement += np.cos(2 * np.pi * tone / sample_rate_hz * lags)
+    return int(lags[np.argmax(np.round(agreement, 6))])

@@ -1,0 +1,39 @@
+"""When the setup document is told anew what the stream measures of itself."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from anser_ros.nodes.measured_accuracy import MeasuredAccuracy
+from anser_ros.sessions.session import measured_noise, stamp_sigma
+from anser_ros.settings import Accuracy
+from anser_ros.wire.config_folder import read_config
+from anser_ros.wire.setup import parse_setup
+
+SETUP = parse_setup(read_config('demo_setup.yaml'))
+FRAME = SimpleNamespace(window=SimpleNamespace(sigma=np.array([7e-11, np.nan, 8.12e-11, 9e-11])))
+
+
+def told(accuracy, sigmas_s, seconds, begin_s=0.0):
+    """Times at which the setup is told anew, with one frame every 20 ms."""
+    times = begin_s + 0.02 * np.arange(round(seconds / 0.02))
+    return [t for t in times if accuracy.is_news(FRAME, sigmas_s(t), t)]
+
+
+def test_the_noise_is_told_with_the_first_frame_and_the_stamps_only_if_they_differ():
+    accuracy = MeasuredAccuracy()
+    assert told(accuracy, lambda t: 0.4e-3, 60.0) == [0.0]
+    setup = accuracy.stated_in(SETUP, 50.0)
+    assert measured_noise(setup) == 8.1e-11 and setup.flux_rate_hz == 50.0
+    assert stamp_sigma(setup) == Accuracy.stamp_sigma_s and 'stamp_sigma_s' not in setup.extra
+
+
+def test_stamps_that_are_worse_or_better_are_told_at_most_every_ten_seconds():
+    accuracy = MeasuredAccuracy()
+    times = told(accuracy, lambda t: np.inf if t < 2 else 2e-3 if t % 2 < 1 else 1.9e-3, 60.0)
+    assert len(times) == 2 and 10.0 <= times[1] < 10.1
+    assert stamp_sigma(accuracy.stated_in(SETUP, 50.0)) == 2e-3
+    assert len(told(accuracy, lambda t: 0.2e-3, 60.0, 60.0)) == 1
+    assert stamp_sigma(accuracy.stated_in(SETUP, 50.0)) == 0.2e-3
+    wild = told(accuracy, lambda t: 1e-2 if t % 20 > 10 else 1e-4, 60.0, 120.0)
+    assert (np.diff(wild) >= 10.0).all()
