@@ -63,22 +63,22 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 def pytest_itemcollected(item: pytest.Item) -> None:
     """Mark a test that takes a ROS domain, and name the group that one worker takes as a whole.
 
-    Of two workers one takes the tests with processes, which mostly wait, and the other the files
-    that calculate: so only one set of nodes runs at a time, and a file's fixtures are made once.
+    Of two workers one takes the tests with nodes, which mostly wait, and the other the files that
+    calculate: so only one set of nodes runs at a time, and a file's fixtures are made once.
     This must be done as soon as a test is known: later, pytest-xdist has read the groups already.
     """
-    if 'domain' in getattr(item, 'fixturenames', ()):
+    if _has_nodes(item):
         item.add_marker('processes')
     if 'PYTEST_XDIST_WORKER' in os.environ:
-        group = 'processes' if _has_processes(item) else item.path.stem
+        group = 'nodes' if _has_nodes(item) else item.path.stem
         item.add_marker(pytest.mark.xdist_group(group))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the tests with processes first, and then the files that calculate for long."""
+    """Put the tests with nodes first, and then the files that calculate for long."""
     if 'PYTEST_XDIST_WORKER' in os.environ:
         long = {item.path for item in items if item.get_closest_marker('long')}
-        items.sort(key=lambda item: (not _has_processes(item), item.path not in long))
+        items.sort(key=lambda item: (not _has_nodes(item), item.path not in long))
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
@@ -111,9 +111,13 @@ _begun: list[pytest.Item] = []
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Let the worker that calculates give way to the nodes that the other one has started."""
-    if 'PYTEST_XDIST_WORKER' in os.environ and not _begun and not _has_processes(item):
+    if 'PYTEST_XDIST_WORKER' in os.environ and not _begun and not _has_nodes(item):
         os.nice(10)
     _begun.append(item)
+
+
+def _has_nodes(item: pytest.Item) -> bool:
+    return 'domain' in getattr(item, 'fixturenames', ())
 
 
 def _has_processes(item: pytest.Item) -> bool:

@@ -175,6 +175,7 @@ def test_fiducials_are_read_aligned_and_mapped(tmp_path):
         board_runs(tmp_path)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not board_folder().is_dir(), reason='the measured board is not at hand')
 def test_the_measured_board_in_blocks_that_took_no_part():
     files = [board_folder() / f'{name}.fcsv' for name in ('standard_data_grid', 'steel_shield')]

@@ -173,6 +173,7 @@ def test_error_modes_have_the_posterior_s_power(bank, parts, drift, loudness, re
     assert few.rest > modes.rest
 
 
+@pytest.mark.long
 def test_layers_stand_for_their_clouds_also_between_their_samples(world, parts):
     excitation, region, layer, _, _ = parts
     rng, half = np.random.default_rng(1), region.half

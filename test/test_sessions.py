@@ -174,6 +174,7 @@ class TestTrack:
 
 
 class TestFollow:
+    @pytest.mark.long
     def test_the_model_follows_metal_frame_by_frame(self, metal, model, factory):
         follower = ModelFollower(prepare(metal, model, factory))
         frames = [frame for frame in frames_of(metal) if frame.reference is not None]
@@ -246,6 +247,7 @@ class TestDiagnose:
         held = np.isin(screened.training(100).blocks[0], held_out_blocks())
         assert held.size and not held.any()
 
+    @pytest.mark.long
     def test_search(self, search):
         assert [term.effect.name for term in search.fit.terms] == ['sensor_gain']
 
