@@ -14,7 +14,7 @@ ARGS ?=
 PACKAGING = setup.py package.xml anser_ros/cli/commands.py
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-quick test-oldest lint format types parameters bench paper loop measured docs clean
+.PHONY: help demo test test-quick test-oldest lint format types parameters bench chaos soak paper loop measured docs clean
 
 help:
 	@echo 'make demo [DURATION=30]  watch a simulated tool being tracked'
@@ -22,6 +22,8 @@ help:
 	@echo 'make test-quick          the same without the tests that start processes or take long'
 	@echo 'make test-oldest         tests with the oldest dependencies (needs Python 3.12)'
 	@echo 'make bench               speed and accuracy beside rivals, writes bench.json'
+	@echo 'make chaos               faults on the running nodes, with exact truth; ARGS=--list names them'
+	@echo 'make soak DURATION=3600  growth of memory, files, threads and latency of every node'
 	@echo 'make docs                the documentation as a site, out/docs/index.html'
 	@echo 'make paper|loop|measured the studies; options with ARGS=...'
 
@@ -70,6 +72,12 @@ test-oldest: $(READY_OLDEST)
 
 bench: $(READY)
 	@$(ENVIRONMENT) $(VENV)/bin/python test/bench/run.py $(ARGS)
+
+chaos: $(READY)
+	@$(ENVIRONMENT) $(VENV)/bin/python test/chaos/run.py $(ARGS)
+
+soak: $(READY)
+	@$(ENVIRONMENT) $(VENV)/bin/python test/chaos/soak.py $(if $(DURATION),--duration $(DURATION)) $(ARGS)
 
 # -W: a warning is a fault; nothing is fetched from anywhere.
 docs: $(READY)

@@ -1,0 +1,204 @@
+"""A man in the middle of the serial line: every record passes through whatever is put on it.
+
+The simulated control unit has one pseudo-terminal, the acquisition opens another; between them a
+thread cuts the unit's stream into records and hands them to tampers, which give back what arrives.
+"""
+
+import contextlib
+import os
+import select
+import threading
+import time
+import tty
+import zlib
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+from anser_ros.simulation.control_unit import Piece
+from anser_ros.simulation.pseudo_port import PseudoPort
+from anser_ros.wire.frames import CRC, HEADER, MAGIC, OVERHEAD, decode_payload, encode
+from anser_ros.wire.records import Hello, SampleBlock
+
+Tamper = Callable[[list[bytes], float], list[bytes]]
+"""Takes the records that came and the time, s, that it has been on; gives what arrives."""
+
+HELLO, SAMPLES = 0x01, 0x02
+"""Numbers of the two types of records that tampers change."""
+IDLE_S = 0.002
+"""Longest wait for bytes, s: a block lasts as long, so that nothing is late by more."""
+REOPEN_S = 0.05
+"""Time between attempts to open the control unit's port, s."""
+
+
+def kind(record: bytes) -> int:
+    """Return the type number of a record."""
+    return record[5]
+
+
+def opened(record: bytes) -> object:
+    """Return what a record carries."""
+    return decode_payload(kind(record), memoryview(record)[HEADER.size : -CRC.size])
+
+
+def blocks(change: Callable[[SampleBlock], SampleBlock | None]) -> Tamper:
+    """Return a tamper that changes blocks of samples, or swallows them, and nothing else."""
+
+    def tamper(records: list[bytes], _on_s: float) -> list[bytes]:
+        out = []
+        for record in records:
+            if kind(record) == SAMPLES:
+                block = opened(record)
+                assert isinstance(block, SampleBlock)
+                changed = change(block)
+                if changed is None:
+                    continue
+                record = record if changed is block else encode(changed)
+            out.append(record)
+        return out
+
+    return tamper
+
+
+def hellos(change: Callable[[Hello], Hello]) -> Tamper:
+    """Return a tamper that changes what the control unit says of itself, and nothing else."""
+
+    def tamper(records: list[bytes], _on_s: float) -> list[bytes]:
+        out = []
+        for record in records:
+            if kind(record) == HELLO:
+                hello = opened(record)
+                assert isinstance(hello, Hello)
+                record = encode(change(hello))
+            out.append(record)
+        return out
+
+    return tamper
+
+
+def with_crc(body: bytes) -> bytes:
+    """Return a record whose last four bytes are its right checksum."""
+    return body[: -CRC.size] + CRC.pack(zlib.crc32(body[: -CRC.size]))
+
+
+class Line:
+    """The line between a control unit and a host.
+
+    Parameters
+    ----------
+    unit : Path
+        Link of the control unit's port.
+    host : Path
+        Link that the host opens.
+    """
+
+    def __init__(self, unit: Path, host: Path) -> None:
+        self._unit_link = unit
+        self._port = PseudoPort(host)
+        self._unit: int | None = None
+        self._rest = b''
+        self._tampers: dict[str, tuple[Tamper, float]] = {}
+        self._held: deque[bytes] = deque()
+        self.is_held = False
+        self._lock = threading.Lock()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name='line', daemon=True)
+        self._thread.start()
+
+    def put(self, name: str, tamper: Tamper) -> None:
+        """Put a tamper on the line, behind those that are on it already."""
+        with self._lock:
+            self._tampers[name] = (tamper, time.monotonic())
+
+    def take_off(self, name: str) -> None:
+        """Take a tamper off the line."""
+        with self._lock:
+            self._tampers.pop(name, None)
+
+    def inject(self, data: bytes) -> None:
+        """Let bytes arrive at the host that nobody sent."""
+        with self._lock:
+            self._port.write([Piece(data)])
+
+    def unplug(self) -> None:
+        """Pull the host's cable out."""
+        with self._lock:
+            self._port.unplug()
+
+    def plug(self) -> None:
+        """Plug the host's cable in."""
+        with self._lock:
+            if not self._port.plugged:
+                self._port.plug()
+
+    def close(self) -> None:
+        """End the line."""
+        self._ending.set()
+        self._thread.join(2.0)
+        self._port.close()
+        if self._unit is not None:
+            os.close(self._unit)
+
+    def _run(self) -> None:
+        while not self._ending.is_set():
+            if self._unit is None and not self._open():
+                self._ending.wait(REOPEN_S)
+                continue
+            with self._lock:
+                commands = self._port.read()
+            with contextlib.suppress(OSError):
+                if commands:
+                    os.write(self._unit, commands)
+            came = self._read()
+            with self._lock:
+                self._pass(came)
+            if not came and self._unit is not None:
+                select.select([self._unit], [], [], IDLE_S)
+
+    def _open(self) -> bool:
+        try:
+            descriptor = os.open(self._unit_link, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+            tty.setraw(descriptor)
+        except OSError:
+            return False
+        self._unit, self._rest = descriptor, b''
+        return True
+
+    def _read(self) -> bytes:
+        parts = []
+        try:
+            while part := os.read(self._unit, 65536):
+                parts.append(part)
+        except BlockingIOError:
+            pass
+        except OSError:  # the unit has gone
+            os.close(self._unit)
+            self._unit = None
+        return b''.join(parts)
+
+    def _pass(self, came: bytes) -> None:
+        records = self._cut(came)
+        now = time.monotonic()
+        for tamper, begin in list(self._tampers.values()):
+            records = tamper(records, now - begin)
+        self._held.extend(records)
+        if not self.is_held and self._held:
+            self._port.write([Piece(record, True) for record in self._held])
+            self._held.clear()
+        self._port.write([])
+
+    def _cut(self, came: bytes) -> list[bytes]:
+        """Return whole records; the unit's own end of the line is never damaged."""
+        data, records, place = self._rest + came, [], 0
+        while True:
+            start = data.find(MAGIC, place)
+            if start < 0 or len(data) - start < HEADER.size:
+                break
+            length = HEADER.unpack_from(data, start)[3]
+            end = start + OVERHEAD + length
+            if end > len(data):
+                break
+            records.append(data[start:end])
+            place = end
+        self._rest = data[place if start < 0 else max(place, start) :][-(1 << 17) :]
+        return records

@@ -1,0 +1,277 @@
+"""Puts faults on the real nodes, one after the other, and says what came of each.
+
+Every fault is put on a running chain (simulated control unit, a line that can be damaged,
+acquisition, field_model, tracker), watched for a while, and taken off again. The truth is exact:
+the simulated unit publishes the pose that it works its samples out from. A pose that was published
+and is wrong by more than max(3 sigma, 1 mm) is the worst that can happen; then come a node that
+ends, and poses that are not back a second after the fault has gone.
+"""
+
+import argparse
+import dataclasses
+import fcntl
+import itertools
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from fault import Command, Fault
+from faults_files import COMMANDS
+from faults_graph import GRAPH, MODELS, PROCESSES
+from faults_line import CLOCK, REFERENCES, SERIAL
+from rig import RATE_HZ, Rig
+from table import Row, line, write_docs
+from witness import WINDOW_S, is_wrong
+
+DOCUMENT = Path(__file__).resolve().parents[2] / 'docs' / 'faults.md'
+
+QUIET = Fault('nothing', 'nothing', lambda rig, rng: lambda: None, 5.0)
+QUIET_METAL = Fault(
+    'nothing-metal', 'nothing, metal moves', lambda rig, rng: lambda: None, 9.0, 'metal'
+)
+GROUPS: dict[str, tuple[Fault, ...]] = {
+    'control': (QUIET, QUIET_METAL),
+    'serial': SERIAL,
+    'clock': CLOCK,
+    'references': REFERENCES,
+    'models': MODELS,
+    'graph': GRAPH,
+    'processes': PROCESSES,
+}
+RECOVERY_S = 12.0
+"""Longest wait for poses after a fault has gone, s; then the chain is started anew."""
+ALLOWED_S = 1.0
+"""Time within which poses have to be back after a fault has gone, s."""
+AFTER_S = 1.0
+"""Time after poses are back in which wrong ones still count for the fault, s."""
+TOGETHER = (2, 3)
+"""Least and most faults of a random combination."""
+
+
+@dataclass
+class Chain:
+    """The running chain of the present world, started anew when it is asked for another."""
+
+    folder: Path
+    domain: int
+    rig: Rig | None = None
+
+    def of(self, world: str) -> Rig:
+        """Return a whole chain in a world."""
+        if self.rig is not None and (self.rig.world != world or not self._is_sound()):
+            self.end()
+        if self.rig is None:
+            self.rig = Rig(self.folder, self.domain, world)
+        return self.rig
+
+    def _is_sound(self) -> bool:
+        assert self.rig is not None
+        try:
+            self.rig.wait_until(self.rig.is_whole, RECOVERY_S, 'poses')
+        except RuntimeError:
+            return False
+        return not self.rig.crashed()
+
+    def end(self) -> None:
+        """End the chain."""
+        if self.rig is not None:
+            self.rig.close()
+            self.rig = None
+
+
+def tried(chain: Chain, faults: Sequence[Fault], seed: int, lasts_s: float | None) -> Row:
+    """Put faults on together, watch, take them off, and return what came of it."""
+    worlds = {fault.world for fault in faults}
+    rig = chain.of('metal' if 'metal' in worlds else 'clean')
+    rng = np.random.default_rng(seed)
+    witness = rig.witness
+    before = {state.name: state.words for state in witness.states}
+    time.sleep(WINDOW_S)
+    begin = time.monotonic()
+    offs = [fault.on(rig, rng) for fault in faults]
+    time.sleep(lasts_s or max(fault.lasts_s for fault in faults))
+    for off in reversed(offs):
+        off()
+    gone = time.monotonic()
+    while not rig.is_whole() and time.monotonic() < gone + RECOVERY_S:
+        time.sleep(0.02)
+    whole = rig.is_whole()
+    # What the last window began with is when poses were back.
+    back = max(0.0, time.monotonic() - gone - WINDOW_S) if whole else None
+    time.sleep(AFTER_S)
+    judged = witness.errors(begin, time.monotonic() - 0.1)
+    bad = [(pose, error) for pose, error in judged if is_wrong(pose, error)]
+    said = next(
+        (
+            s for s in witness.states
+            if s.arrival_s > begin and s.level > 0 and before.get(s.name) != s.words
+        ),
+        None,
+    )  # fmt: skip
+    crashed = tuple(rig.crashed())
+    if any(fault.spoils for fault in faults):
+        chain.end()
+    worst = max(bad, key=lambda one: one[1], default=None)
+    group = next((g for g, all_ in GROUPS.items() if faults[0] in all_), 'together')
+    return Row(
+        group,
+        '+'.join(fault.name for fault in faults),
+        ' and '.join(fault.what for fault in faults),
+        '' if said is None else f'{said.name.removeprefix("anser/")}: {said.words}',
+        None if said is None else said.arrival_s - begin,
+        len(judged),
+        len(bad),
+        None if worst is None else worst[1],
+        None if worst is None else worst[0].sigma_m,
+        back,
+        crashed,
+    )
+
+
+def commanded(chain: Chain, command: Command) -> Row:
+    """Give a command its input, and return how it took it."""
+    with tempfile.TemporaryDirectory() as folder:
+        arguments = command.arguments(Path(folder))
+        begin = time.monotonic()
+        code, said = Rig.run(*arguments)
+        took = time.monotonic() - begin
+    good = code == 2 and command.says in said
+    crashed = () if good else (f'exit {code}: {said}',)
+    return Row('files', command.name, command.what, said, took, 0, 0, None, None, 0.0, crashed)
+
+
+def minimised(chain: Chain, faults: Sequence[Fault], seed: int, lasts_s: float | None) -> str:
+    """Return the shortest command line that still fails as a combination of faults did."""
+    for count in range(1, len(faults)):
+        for some in itertools.combinations(faults, count):
+            row = tried(chain, some, seed, lasts_s)
+            print('    ' + line(row), flush=True)
+            if row.failed(ALLOWED_S):
+                return _command(some, seed, lasts_s)
+    return _command(faults, seed, lasts_s)
+
+
+def _command(faults: Sequence[Fault], seed: int, lasts_s: float | None) -> str:
+    names = '+'.join(fault.name for fault in faults)
+    duration = '' if lasts_s is None else f' --duration {lasts_s:g}'
+    return f"make chaos ARGS='--only {names} --seed {seed}{duration}'"
+
+
+def chosen(args: argparse.Namespace) -> tuple[list[list[Fault]], list[Command]]:
+    """Return the faults to be tried, each alone or together, and the commands."""
+    known = {fault.name: fault for group in GROUPS.values() for fault in group}
+    commands = {command.name: command for command in COMMANDS}
+    if args.only:
+        trials: list[list[Fault]] = []
+        asked: list[Command] = []
+        for names in args.only:
+            if names in GROUPS:
+                trials += [[fault] for fault in GROUPS[names]]
+            elif names == 'files':
+                asked += COMMANDS
+            elif names in commands:
+                asked.append(commands[names])
+            else:
+                missing = [name for name in names.split('+') if name not in known]
+                if missing:
+                    raise SystemExit(f'chaos: no fault {missing[0]}; --list names them')
+                trials.append([known[name] for name in names.split('+')])
+        return trials, asked
+    return [[fault] for fault in known.values()], list(COMMANDS)
+
+
+def combinations(seed: int, count: int) -> list[list[Fault]]:
+    """Return random combinations of faults that may come together."""
+    rng = np.random.default_rng(seed)
+    pool = [f for group in GROUPS.values() for f in group if f.combines]
+    return [
+        [pool[i] for i in rng.choice(len(pool), int(rng.integers(TOGETHER[0], TOGETHER[1] + 1)),
+                                     replace=False)]
+        for _ in range(count)
+    ]  # fmt: skip
+
+
+def domain() -> tuple[int, int]:
+    """Return a ROS domain that nobody on this machine has, and the lock that keeps it ours."""
+    folder = Path(tempfile.gettempdir()) / 'anser_ros_test_domains'  # as the tests share them
+    folder.mkdir(exist_ok=True)
+    for number in np.random.default_rng().permutation(np.arange(1, 101)).tolist():
+        lock = os.open(folder / f'{number}', os.O_CREAT | os.O_RDONLY, 0o644)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            os.close(lock)
+            continue
+        return number, lock
+    raise SystemExit('chaos: all ROS domains are taken')
+
+
+def main() -> int:
+    """Run the trial; 1 when a wrong pose said ok, a node ended, or poses did not come back."""
+    parser = argparse.ArgumentParser(description=(__doc__ or '').split('\n\n')[0])
+    parser.add_argument(
+        '--only', nargs='+', metavar='NAME', help='groups, faults, or A+B together'
+    )
+    parser.add_argument('--seed', type=int, default=1, help='of what is random in a fault')
+    parser.add_argument('--duration', type=float, help='how long each fault lasts, s')
+    parser.add_argument('--random', type=int, default=0, metavar='N', help='so many combinations')
+    parser.add_argument('--write-docs', action='store_true', help='write docs/faults.md anew')
+    parser.add_argument('--out', type=Path, default=Path('chaos.json'), help='file with all rows')
+    parser.add_argument('--list', action='store_true', help='name all faults and end')
+    args = parser.parse_args()
+    trials, commands = chosen(args)
+    if args.list:
+        for fault in itertools.chain.from_iterable(trials):
+            print(f'{fault.name:24} {fault.what}')
+        for command in commands:
+            print(f'{command.name:24} {command.what}')
+        return 0
+    if args.random:
+        trials, commands = combinations(args.seed, args.random), []
+    # Faults of one world share a chain.
+    trials.sort(key=lambda faults: max(fault.world == 'metal' for fault in faults))
+    number, lock = domain()
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory(prefix='anser_chaos_') as folder:
+        chain = Chain(Path(folder), number)
+        try:
+            for command in commands:
+                rows.append(commanded(chain, command))
+                print(line(rows[-1]), flush=True)
+            for faults in trials:
+                rows.append(_tried_surely(chain, faults, args))
+                print(line(rows[-1]), flush=True)
+                if len(faults) > 1 and args.random and rows[-1].failed(ALLOWED_S):
+                    print('  ' + minimised(chain, faults, args.seed, args.duration), flush=True)
+        finally:
+            chain.end()
+            os.close(lock)
+            args.out.write_text(
+                json.dumps([dataclasses.asdict(row) for row in rows], indent=1) + '\n'
+            )
+    failed = [row for row in rows if row.failed(ALLOWED_S)]
+    poses, wrong = sum(row.poses for row in rows), sum(row.wrong for row in rows)
+    print(f'{len(rows)} faults, {len(failed)} failed; {wrong} of {poses} poses wrong and ok')
+    if args.write_docs:
+        write_docs(DOCUMENT, rows, args.seed, RATE_HZ)
+    return 1 if failed else 0
+
+
+def _tried_surely(chain: Chain, faults: Sequence[Fault], args: argparse.Namespace) -> Row:
+    """Try faults; a chain that does not come up is a failure of the fault, not of the trial."""
+    try:
+        return tried(chain, faults, args.seed, args.duration)
+    except (RuntimeError, OSError) as error:
+        chain.end()
+        names = '+'.join(fault.name for fault in faults)
+        return Row('together', names, names, '', None, 0, 0, None, None, None, (str(error),))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,104 @@
+"""The rows of the trial, as a line for whoever watches and as a table of the documents."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+BEGIN, END = '<!-- chaos: begin -->', '<!-- chaos: end -->'
+WORDS = 90
+"""Characters of a state's words that the table shows."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What came of one fault.
+
+    Attributes
+    ----------
+    group, name, what : str
+        Which fault.
+    said : str
+        The first state that told of it.
+    detected_s : float or None
+        Time until then, s.
+    poses, wrong : int
+        Poses that were published from the beginning on, and those that were wrong.
+    worst_m, sigma_m : float or None
+        The largest error of a wrong pose, and the sigma that it stated, m.
+    back_s : float or None
+        Time from the fault's end until poses were back, s; None when they did not come.
+    crashed : tuple of str
+        What ended by itself, or answered as it should not.
+    """
+
+    group: str
+    name: str
+    what: str
+    said: str
+    detected_s: float | None
+    poses: int
+    wrong: int
+    worst_m: float | None
+    sigma_m: float | None
+    back_s: float | None
+    crashed: tuple[str, ...] = ()
+
+    def failed(self, allowed_s: float) -> bool:
+        """Return whether this must not be."""
+        late = self.back_s is None or self.back_s > allowed_s
+        return bool(self.wrong or self.crashed or late)
+
+
+def _worst(row: Row) -> str:
+    if row.worst_m is None:
+        return ''
+    if row.worst_m == float('inf'):
+        return 'stamped where no truth is'
+    return f'{1e3 * row.worst_m:.1f} mm at sigma {1e3 * (row.sigma_m or 0.0):.2f}'
+
+
+def _seconds(value: float | None, otherwise: str) -> str:
+    return otherwise if value is None else f'{value:.1f}'
+
+
+def line(row: Row) -> str:
+    """Return a row as one line."""
+    parts = [
+        f'{"FAILED" if row.failed(1.0) else "ok":6} {row.name:24}',
+        f'wrong {row.wrong}/{row.poses} {_worst(row)}',
+        f'said after {_seconds(row.detected_s, "-")} s: {row.said[:WORDS] or "nothing"}',
+        f'back after {_seconds(row.back_s, "NEVER")} s',
+        *row.crashed,
+    ]
+    return ' | '.join(parts)
+
+
+def write_docs(path: Path, rows: Sequence[Row], seed: int, rate_hz: float) -> None:
+    """Write the table between its two marks of a document."""
+    out = [
+        BEGIN,
+        '',
+        f'Written by `make chaos ARGS=--write-docs` (seed {seed}, {rate_hz:g} Hz).',
+        '',
+    ]
+    for group, some in groupby(rows, key=lambda row: row.group):
+        out += [f'### {group.capitalize()}', '']
+        out += [
+            '| fault | said | after, s | wrong of ok poses | back after, s |',
+            '|---|---|---|---|---|',
+        ]
+        for row in some:
+            said = row.said.replace('|', '/').replace('<', '&lt;')[:WORDS] or 'nothing'
+            wrong = f'{row.wrong} of {row.poses}' + (f', {_worst(row)}' if row.wrong else '')
+            out.append(
+                f'| {row.what} | {said} | {_seconds(row.detected_s, "-")} | {wrong} '
+                f'| {_seconds(row.back_s, "never")} |'
+            )
+        out.append('')
+    out.append(END)
+    text = path.read_text(encoding='utf-8') if path.is_file() else f'{BEGIN}\n{END}\n'
+    if BEGIN not in text:
+        text += f'\n{BEGIN}\n{END}\n'
+    head, rest = text.split(BEGIN, 1)
+    path.write_text(head + '\n'.join(out) + rest.split(END, 1)[1], encoding='utf-8')

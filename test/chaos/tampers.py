@@ -1,0 +1,341 @@
+"""What can happen to samples and records between the control unit and the host."""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from line import HELLO, SAMPLES, Tamper, blocks, hellos, kind, opened, with_crc
+
+from anser_ros.wire.frames import encode
+from anser_ros.wire.records import Channel, ChannelKind, Hello, SampleBlock
+
+TOOL, REFERENCE = slice(0, 9), slice(9, 41)
+"""Columns of the demo's nine tool coils, and of its 32 reference coils; the current is last."""
+
+
+def columns(change: Callable[[np.ndarray, float], np.ndarray], where: object) -> Tamper:
+    """Change the codes (n, C) of some columns; the change gets the samples that went before."""
+    seen = [0]
+
+    def block(given: SampleBlock) -> SampleBlock:
+        codes = np.array(given.codes)
+        altered = change(codes[:, where].astype(float), seen[0])
+        codes[:, where] = np.clip(np.rint(altered), -32768, 32767).astype(np.int16)
+        seen[0] += len(codes)
+        return replace(given, codes=codes)
+
+    return blocks(block)
+
+
+def gain(factor: float, where: object) -> Tamper:
+    """Multiply columns."""
+    return columns(lambda codes, _: factor * codes, where)
+
+
+def offset(codes_up: float, where: object) -> Tamper:
+    """Shift columns by a constant."""
+    return columns(lambda codes, _: codes + codes_up, where)
+
+
+def hum(amplitude: float, where: object, rate_hz: float, mains_hz: float = 50.0) -> Tamper:
+    """Add mains hum."""
+
+    def change(codes: np.ndarray, seen: float) -> np.ndarray:
+        time = (seen + np.arange(len(codes))) / rate_hz
+        wave = sum(np.sin(2 * np.pi * k * mains_hz * time) / k for k in (1, 3, 5))
+        return codes + amplitude * wave[:, None]
+
+    return columns(change, where)
+
+
+def noise(sigma: float, where: object, rng: np.random.Generator) -> Tamper:
+    """Add white noise, codes rms."""
+    return columns(lambda codes, _: codes + sigma * rng.standard_normal(codes.shape), where)
+
+
+def dead(where: object, rng: np.random.Generator) -> Tamper:
+    """Leave noise only."""
+    return columns(lambda codes, _: 2.4 * rng.standard_normal(codes.shape), where)
+
+
+def constant(value: int, where: object) -> Tamper:
+    """Replace columns by one code."""
+    return columns(lambda codes, _: np.full_like(codes, value), where)
+
+
+def clipped(share: float, where: object) -> Tamper:
+    """Clip columns at the ends of the range, as an amplifier that is driven too far."""
+    return columns(lambda codes, _: codes / share, where)
+
+
+def swapped(one: int, other: int) -> Tamper:
+    """Exchange two columns."""
+
+    def block(given: SampleBlock) -> SampleBlock:
+        codes = np.array(given.codes)
+        codes[:, [one, other]] = codes[:, [other, one]]
+        return replace(given, codes=codes)
+
+    return blocks(block)
+
+
+def mixed(target: int, source: int, share: float) -> Tamper:
+    """Let one column leak into another."""
+
+    def block(given: SampleBlock) -> SampleBlock:
+        codes = np.array(given.codes)
+        sum_ = codes[:, target] + share * codes[:, source].astype(float)
+        codes[:, target] = np.clip(np.rint(sum_), -32768, 32767)
+        return replace(given, codes=codes)
+
+    return blocks(block)
+
+
+def ring(samples: int, where: object = slice(None)) -> Tamper:
+    """Repeat the last samples of some columns for ever, under fresh numbers and stamps."""
+    kept: deque[np.ndarray] = deque()
+    state = {'have': 0, 'next': 0}
+
+    def block(given: SampleBlock) -> SampleBlock:
+        if state['have'] < samples:
+            kept.append(np.array(given.codes))
+            state['have'] += len(given.codes)
+            return given
+        memory = np.concatenate(kept)[-samples:]
+        rows = (state['next'] + np.arange(len(given.codes))) % samples
+        state['next'] += len(given.codes)
+        codes = np.array(given.codes)
+        codes[:, where] = memory[rows][:, where]
+        return replace(given, codes=codes)
+
+    return blocks(block)
+
+
+def without_columns(where: Sequence[int]) -> Tamper:
+    """Take channels away from hellos and blocks: a board of inputs that was unplugged."""
+    gone = set(where)
+
+    def tamper(records: list[bytes], _on_s: float) -> list[bytes]:
+        out = []
+        for record in records:
+            if kind(record) == HELLO:
+                hello = opened(record)
+                assert isinstance(hello, Hello)
+                left = tuple(c for i, c in enumerate(hello.channels) if i not in gone)
+                record = encode(replace(hello, channels=left))
+            elif kind(record) == SAMPLES:
+                given = opened(record)
+                assert isinstance(given, SampleBlock)
+                left = [i for i in range(given.codes.shape[1]) if i not in gone]
+                record = encode(replace(given, codes=np.array(given.codes)[:, left]))
+            out.append(record)
+        return out
+
+    return tamper
+
+
+def with_column() -> Tamper:
+    """Add a channel that the setup does not know."""
+
+    def tamper(records: list[bytes], _on_s: float) -> list[bytes]:
+        out = []
+        for record in records:
+            if kind(record) == HELLO:
+                hello = opened(record)
+                assert isinstance(hello, Hello)
+                more = Channel(999, ChannelKind.SENSE, 1.0)
+                record = encode(replace(hello, channels=(more, *hello.channels)))
+            elif kind(record) == SAMPLES:
+                given = opened(record)
+                assert isinstance(given, SampleBlock)
+                codes = np.array(given.codes)
+                record = encode(replace(given, codes=np.hstack([codes[:, :1], codes])))
+            out.append(record)
+        return out
+
+    return tamper
+
+
+def ticks(change: Callable[[int, int], int]) -> Tamper:
+    """Change the blocks' time stamps: a function of the ticks and of those at the beginning."""
+    first: list[int] = []
+
+    def block(given: SampleBlock) -> SampleBlock:
+        first.append(given.timestamp_ticks)
+        del first[1:]
+        return replace(given, timestamp_ticks=change(given.timestamp_ticks, first[0]) % 2**64)
+
+    return blocks(block)
+
+
+def numbers(change: Callable[[int, int], int]) -> Tamper:
+    """Change the blocks' sequence numbers: a function of the number and of the first one."""
+    first: list[int] = []
+
+    def block(given: SampleBlock) -> SampleBlock:
+        first.append(given.sequence)
+        del first[1:]
+        return replace(given, sequence=change(given.sequence, first[0]) % 2**32)
+
+    return blocks(block)
+
+
+def each(change: Callable[[bytes], list[bytes]], share: float, rng: np.random.Generator) -> Tamper:
+    """Change a share of the records, as bytes."""
+
+    def tamper(records: list[bytes], _on_s: float) -> list[bytes]:
+        out: list[bytes] = []
+        for record in records:
+            out += change(record) if rng.random() < share else [record]
+        return out
+
+    return tamper
+
+
+def bit_flips(share: float, rng: np.random.Generator, *, hidden: bool = False) -> Tamper:
+    """Flip a bit in a share of the records; hidden: with a checksum that is right again."""
+
+    def change(record: bytes) -> list[bytes]:
+        damaged = bytearray(record)
+        place = int(rng.integers(12, len(record) - 4))
+        damaged[place] ^= 1 << int(rng.integers(8))
+        return [with_crc(bytes(damaged)) if hidden else bytes(damaged)]
+
+    return each(change, share, rng)
+
+
+def torn(share: float, rng: np.random.Generator) -> Tamper:
+    """Lose the rest of a share of the records."""
+    return each(lambda record: [record[: int(rng.integers(1, len(record)))]], share, rng)
+
+
+def garbage(share: float, rng: np.random.Generator) -> Tamper:
+    """Put bytes that are nothing in front of a share of the records."""
+    return each(lambda record: [rng.bytes(int(rng.integers(1, 900))), record], share, rng)
+
+
+def noise_only(rng: np.random.Generator) -> Tamper:
+    """Let nothing but noise arrive."""
+    return lambda records, _on_s: [rng.bytes(len(record)) for record in records]
+
+
+def nothing() -> Tamper:
+    """Let nothing arrive."""
+    return lambda _records, _on_s: []
+
+
+def lost(share: float, rng: np.random.Generator) -> Tamper:
+    """Lose a share of the records."""
+    return each(lambda _record: [], share, rng)
+
+
+def doubled(share: float, rng: np.random.Generator) -> Tamper:
+    """Let a share of the records arrive twice."""
+    return each(lambda record: [record, record], share, rng)
+
+
+def replayed(seconds: float) -> Tamper:
+    """Let all records of the first seconds arrive again and again in place of the live ones."""
+    kept: list[bytes] = []
+    at = [0]
+
+    def tamper(records: list[bytes], on_s: float) -> list[bytes]:
+        if on_s < seconds:
+            kept.extend(records)
+            return records
+        out = [kept[(at[0] + i) % len(kept)] for i in range(len(records))] if kept else []
+        at[0] += len(records)
+        return out
+
+    return tamper
+
+
+def shuffled(depth: int, rng: np.random.Generator) -> Tamper:
+    """Let blocks arrive in another order."""
+    waiting: list[bytes] = []
+
+    def tamper(records: list[bytes], _on_s: float) -> list[bytes]:
+        waiting.extend(records)
+        out = []
+        while len(waiting) > depth:
+            out.append(waiting.pop(int(rng.integers(len(waiting)))))
+        return out
+
+    return tamper
+
+
+def late(seconds: float) -> Tamper:
+    """Let everything arrive later by a constant."""
+    waiting: deque[tuple[float, bytes]] = deque()
+
+    def tamper(records: list[bytes], on_s: float) -> list[bytes]:
+        waiting.extend((on_s + seconds, record) for record in records)
+        out = []
+        while waiting and waiting[0][0] <= on_s:
+            out.append(waiting.popleft()[1])
+        return out
+
+    return tamper
+
+
+def creeping(per_second: float) -> Tamper:
+    """Let everything arrive later and later, by so many seconds a second."""
+    waiting: deque[tuple[float, bytes]] = deque()
+
+    def tamper(records: list[bytes], on_s: float) -> list[bytes]:
+        waiting.extend((on_s + per_second * on_s, record) for record in records)
+        out = []
+        while waiting and waiting[0][0] <= on_s:
+            out.append(waiting.popleft()[1])
+        return out
+
+    return tamper
+
+
+def in_bursts(period_s: float) -> Tamper:
+    """Let everything arrive in bursts, as from a host that is busy."""
+    waiting: list[bytes] = []
+    next_s = [period_s]
+
+    def tamper(records: list[bytes], on_s: float) -> list[bytes]:
+        waiting.extend(records)
+        if on_s < next_s[0]:
+            return []
+        next_s[0] = on_s + period_s
+        out = waiting[:]
+        waiting.clear()
+        return out
+
+    return tamper
+
+
+def hello(**changes: object) -> Tamper:
+    """Change what hellos state."""
+    return hellos(lambda given: replace(given, **changes))
+
+
+def hello_scaled(**factors: float) -> Tamper:
+    """Multiply figures of hellos."""
+    return hellos(
+        lambda given: replace(
+            given, **{key: getattr(given, key) * factor for key, factor in factors.items()}
+        )
+    )
+
+
+def scaled_channels(factor: float) -> Callable[[Hello], Hello]:
+    """Return what multiplies the full scale of all channels."""
+    return lambda given: replace(
+        given, channels=tuple(replace(c, full_scale=factor * c.full_scale) for c in given.channels)
+    )
+
+
+def reordered_channels() -> Callable[[Hello], Hello]:
+    """Return what moves the first channel to the end of the tool's."""
+
+    def change(given: Hello) -> Hello:
+        first, *rest = given.channels[:9]
+        return replace(given, channels=(*rest, first, *given.channels[9:]))
+
+    return change

@@ -1,0 +1,106 @@
+"""The standing trial: its line damages what it should and nothing else; a sample of it runs."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from anser_ros.wire.frame_reader import FrameReader
+from anser_ros.wire.frames import encode
+from anser_ros.wire.records import SampleBlock
+
+CHAOS = Path(__file__).resolve().parent / 'chaos'
+SAMPLE = ('nothing', 'torn', 'unplugged')
+"""Faults of the sample: none, one that costs frames, one that costs the connection."""
+
+
+@pytest.fixture(scope='module', autouse=True)
+def chaos():
+    """The trial's modules import one another by their names."""
+    sys.path.insert(0, str(CHAOS))
+    yield
+    sys.path.remove(str(CHAOS))
+
+
+def records(count=20, columns=42):
+    rng = np.random.default_rng(3)
+    blocks = [
+        SampleBlock(i, 2000 * i, rng.integers(-999, 999, (40, columns)).astype(np.int16))
+        for i in range(count)
+    ]
+    return blocks, [encode(block) for block in blocks]
+
+
+def read(data):
+    return [record.payload for record in FrameReader().feed(b''.join(data))]
+
+
+def test_every_fault_has_a_name_of_its_own():
+    from faults_files import COMMANDS
+    from run import GROUPS
+
+    names = [fault.name for group in GROUPS.values() for fault in group]
+    names += [command.name for command in COMMANDS]
+    assert len(names) == len(set(names)) > 90
+    assert not {'+', ' '} & set(''.join(names))
+
+
+def test_a_tamper_changes_its_columns_and_keeps_records_whole():
+    import tampers
+
+    blocks, given = records()
+    out = read(tampers.gain(2.0, [4])(given, 0.0))
+    for was, now in zip(blocks, out, strict=True):
+        assert (now.codes[:, 4] == 2 * was.codes[:, 4]).all()
+        assert (np.delete(now.codes, 4, 1) == np.delete(was.codes, 4, 1)).all()
+        assert (now.sequence, now.timestamp_ticks) == (was.sequence, was.timestamp_ticks)
+    ring = read(tampers.ring(80)(given, 0.0))
+    assert (ring[2].codes == blocks[0].codes).all() and ring[2].sequence == 2
+    swapped = read(tampers.swapped(0, 7)(given, 0.0))
+    assert (swapped[3].codes[:, 7] == blocks[3].codes[:, 0]).all()
+    assert replace(swapped[0], codes=blocks[0].codes) != blocks[1]
+
+
+def test_the_line_cuts_records_wherever_bytes_end(tmp_path):
+    from line import Line
+
+    _, given = records(5)
+    line = Line(tmp_path / 'absent', tmp_path / 'host')
+    try:
+        data, out = b''.join(given), []
+        for start in range(0, len(data), 777):
+            out += line._cut(data[start : start + 777])
+        assert out == given
+    finally:
+        line.close()
+
+
+def test_a_random_combination_is_the_same_for_the_same_seed():
+    from run import combinations
+
+    names = [[fault.name for fault in some] for some in combinations(7, 5)]
+    assert names == [[fault.name for fault in some] for some in combinations(7, 5)]
+    assert names != [[fault.name for fault in some] for some in combinations(8, 5)]
+    assert all(2 <= len(set(some)) <= 3 for some in names)
+
+
+@pytest.mark.processes
+def test_a_sample_of_the_trial_passes(tmp_path):
+    out = tmp_path / 'rows.json'
+    command = [sys.executable, str(CHAOS / 'run.py'), '--only', *SAMPLE, '--duration', '1.0']
+    environment = {k: v for k, v in os.environ.items() if k != 'ROS_DOMAIN_ID'}
+    done = subprocess.run(
+        [*command, '--out', str(out)],
+        capture_output=True, text=True, timeout=150, check=False, env=environment,
+    )  # fmt: skip
+    rows = {row['name']: row for row in json.loads(out.read_text())}
+    assert set(rows) == set(SAMPLE), done.stderr
+    assert all(row['wrong'] == 0 and not row['crashed'] for row in rows.values()), done.stdout
+    assert rows['nothing']['poses'] > 200
+    assert rows['unplugged']['poses'] < rows['nothing']['poses']
+    assert 'unplug' in rows['unplugged']['said']
