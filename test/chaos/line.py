@@ -7,6 +7,7 @@ thread cuts the unit's stream into records and hands them to tampers, which give
 import contextlib
 import os
 import select
+import struct
 import threading
 import time
 import tty
@@ -15,7 +16,7 @@ from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
-from anser_ros.simulation.control_unit import Piece
+from anser_ros.simulation.control_unit import TICK_HZ, Piece
 from anser_ros.simulation.pseudo_port import PseudoPort
 from anser_ros.wire.frames import CRC, HEADER, MAGIC, OVERHEAD, decode_payload, encode
 from anser_ros.wire.records import Hello, SampleBlock
@@ -27,6 +28,11 @@ HELLO, SAMPLES = 0x01, 0x02
 """Numbers of the two types of records that tampers change."""
 IDLE_S = 0.002
 """Longest wait for bytes, s: a block lasts as long, so that nothing is late by more."""
+SLICE_S = 0.1
+"""Slices of time, s, of which the least delay of the unit is kept."""
+SLICES = 10
+"""Slices before a pose's arrival in which the unit must not have been late: a second, in which the
+host's clock finds the earliest arrivals again."""
 REOPEN_S = 0.05
 """Time between attempts to open the control unit's port, s."""
 
@@ -100,6 +106,7 @@ class Line:
         self._tampers: dict[str, tuple[Tamper, float]] = {}
         self._held: deque[bytes] = deque()
         self.is_held = False
+        self._lateness: dict[int, float] = {}
         self._lock = threading.Lock()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name='line', daemon=True)
@@ -162,6 +169,7 @@ class Line:
         except OSError:
             return False
         self._unit, self._rest = descriptor, b''
+        self._lateness.clear()
         return True
 
     def _read(self) -> bytes:
@@ -176,9 +184,32 @@ class Line:
             self._unit = None
         return b''.join(parts)
 
+    def late(self, at_s: float, more_than_s: float) -> bool:
+        """Return whether the simulated unit itself was late at a monotonic time.
+
+        On a busy machine it works its samples out late, as no device does; what the host then
+        makes of their stamps is nobody's fault. Late is what came later, by the unit's clock, than
+        the earliest that ever came.
+        """
+        best = min(self._lateness.values(), default=0.0)
+        slice_ = int(at_s / SLICE_S)
+        near = [self._lateness.get(slice_ - back) for back in range(SLICES)]
+        known = [value for value in near if value is not None]
+        return not known or max(known) > best + more_than_s
+
+    def _note_lateness(self, records: list[bytes], now: float) -> None:
+        """Keep the least delay, by the unit's clock, of each slice of time."""
+        for record in records:
+            if kind(record) == SAMPLES:
+                _, ticks = struct.unpack_from('<IQ', record, HEADER.size)
+                slice_ = int(now / SLICE_S)
+                delay = now - ticks / TICK_HZ
+                self._lateness[slice_] = min(delay, self._lateness.get(slice_, delay))
+
     def _pass(self, came: bytes) -> None:
         records = self._cut(came)
         now = time.monotonic()
+        self._note_lateness(records, now)
         for tamper, begin in list(self._tampers.values()):
             records = tamper(records, now - begin)
         self._held.extend(records)

@@ -30,6 +30,8 @@ class Row:
         Time from the fault's end until poses were back, s; None when they did not come.
     crashed : tuple of str
         What ended by itself, or answered as it should not.
+    skipped : int
+        Poses that were not judged, since the simulated unit itself was late.
     """
 
     group: str
@@ -43,6 +45,7 @@ class Row:
     sigma_m: float | None
     back_s: float | None
     crashed: tuple[str, ...] = ()
+    skipped: int = 0
 
     def failed(self, allowed_s: float) -> bool:
         """Return whether this must not be."""
@@ -69,6 +72,7 @@ def line(row: Row) -> str:
         f'wrong {row.wrong}/{row.poses} {_worst(row)}',
         f'said after {_seconds(row.detected_s, "-")} s: {row.said[:WORDS] or "nothing"}',
         f'back after {_seconds(row.back_s, "NEVER")} s',
+        *([f'{row.skipped} not judged'] if row.skipped else []),
         *row.crashed,
     ]
     return ' | '.join(parts)
