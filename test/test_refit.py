@@ -102,7 +102,7 @@ def test_far_metal_is_corrected_too_and_the_uncertainty_is_honest(refit):
     world = anser_world()
     for depth in (0.2, 0.12, 0.06):
         points = metal_block([-0.04, 0.03, -depth - 0.02], [0.08, 0.08, 0.04])
-        result = run(refit, world, world.metal(points), frames=6, start=1 + int(1e4 * depth))
+        result = run(refit, world, world.metal(points), frames=12, start=1 + int(1e4 * depth))
         before, after, sigma, error = errors(world, result.model, points)
         assert after < 0.1 * before
         score = np.abs(error) / sigma

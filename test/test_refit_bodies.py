@@ -91,7 +91,11 @@ def test_metal_beside_the_volume_is_found_corrected_and_honest(refit):
 @pytest.mark.long
 def test_slots_follow_metal_that_moves_and_are_emptied_by_a_reset(refit):
     names = [
-        {name for name in follow(refit, BESIDE + [0.0, shift, 0.0]).weights if 'body' in name}
+        {
+            name
+            for name in follow(refit, BESIDE + [0.0, shift, 0.0], frames=16).weights
+            if 'body' in name
+        }
         for shift in (-0.12, 0.12)
     ]
     assert len(names[0]) == len(names[1]) == 3

@@ -155,7 +155,7 @@ def test_error_modes_have_the_posterior_s_power(bank, parts, drift, loudness, re
     seen = bank.evaluate(readings, NOISE)
     level = error_level(bank, seen, 1)
     assert level.noise >= NOISE
-    modes = error_modes(bank, 1, level, 90)
+    modes = error_modes(bank, bank.posterior(1), level, 90)
     prior = parts[4][0]
     strength = STRENGTHS[level.strengths[0]]
     covariance = strength * prior.covariance
@@ -168,7 +168,7 @@ def test_error_modes_have_the_posterior_s_power(bank, parts, drift, loudness, re
     real = (modes.moments.real**2).sum()
     assert real == pytest.approx(after, rel=0.5)
     assert modes.rest >= 0.0
-    few = error_modes(bank, 1, level, 4)
+    few = error_modes(bank, bank.posterior(1), level, 4)
     assert len(few.moments) == 4
     assert few.rest > modes.rest
 

@@ -2,13 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.model import FieldModel
+from anser_ros.refit.beside import Beside
 from anser_ros.refit.evidence import FrameEvidence
-from anser_ros.refit.layer import Layer
+from anser_ros.refit.layer import Layer, component_rows
 from anser_ros.refit.modes import ErrorLevel, PosteriorModes, error_level, error_modes
 from anser_ros.refit.posterior import Bank
 
@@ -29,6 +32,11 @@ KEEP_FRAMES = 25
 """Frames for which an inflation is kept at least before it may fall."""
 RIVAL = 0.05
 """Probability from which on a second hypothesis adds what it disagrees about."""
+
+
+SPARSE = 10
+"""Every so many of a layer's sample points tells the size of an error until it is known: a
+millisecond's work."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +91,16 @@ class Assembly:
     def __init__(self, model: FieldModel) -> None:
         self.base = model
         self._modes: dict[tuple[object, ...], PosteriorModes] = {}
+        self._coming: dict[tuple[object, ...], Beside[PosteriorModes]] = {}
+        self._last: _ErrorBefore | None = None
+        self._interim: tuple[object, Uncertainty] | None = None
         self._whole: dict[tuple[object, ...], tuple[int, Uncertainty]] = {}
         self._count = 0
         self._geometry: Geometry | None = None
+
+    def forget(self) -> None:
+        """Forget what was told last: the next frame is of another time."""
+        self._last = self._interim = None
 
     def _place(self, layers: Sequence[Layer]) -> Geometry:
         """Return the dipoles with some layers, in the same arrays while the layers stay."""
@@ -96,6 +111,7 @@ class Assembly:
 
     def model(
         self,
+        stamp_ns: int,
         bank: Bank,
         seen: FrameEvidence,
         weights: Array,
@@ -109,6 +125,8 @@ class Assembly:
 
         Parameters
         ----------
+        stamp_ns : int
+            Of the frame.
         bank, seen
             The hypotheses and what they say.
         weights : ndarray, shape (H,)
@@ -132,7 +150,8 @@ class Assembly:
         parts = {h: bank.moments(seen, h) * scale for h in active}
         for h, part in parts.items():
             moments[place.rows(bank, h)] += weights[h] * part
-        modes, rest = self._uncertainty(bank, seen, weights, parts, typical, scale, n_modes, place)
+        change = _Change(stamp_ns, bank, seen, weights, parts, scale, place)
+        modes, rest = self._uncertainty(change, typical, n_modes)
         return replace(
             self.base,
             positions=place.positions,
@@ -142,58 +161,163 @@ class Assembly:
             flux_error_t=rest,
         )
 
-    def _uncertainty(
-        self,
-        bank: Bank,
-        seen: FrameEvidence,
-        weights: Array,
-        parts: dict[int, ComplexArray],
-        typical: float,
-        scale: ComplexArray,
-        n_modes: int,
-        place: Geometry,
-    ) -> Uncertainty:
+    def _uncertainty(self, change: '_Change', typical: float, n_modes: int) -> Uncertainty:
         """Return all modes and the remaining error, unchanged for a while to spare receivers."""
-        ranked = sorted(parts, key=lambda h: -float(weights[h]))
+        bank, place, weights = change.bank, change.place, change.weights
+        ranked = sorted(change.parts, key=lambda h: -float(weights[h]))
         rival = next((h for h in ranked[1:] if float(weights[h]) > RIVAL), None)
         steps = max(0, round(np.log(max(typical, 1.0)) / (2.0 * np.log(INFLATION_STEP))))
-        level = error_level(bank, seen, ranked[0]) if ranked else None
+        if not ranked:
+            return self._with_base(np.zeros((0, *change.shape), dtype=complex), 0.0)
+        best = ranked[0]
+        level = error_level(bank, change.seen, best)
         names = tuple(bank.prior(h).name for h in ranked[:1] + ([] if rival is None else [rival]))
         key = (bank.rows.tobytes(), names, level, steps, place.name)
         self._count += 1
         kept = self._whole.get(key)
         if kept is not None and self._count - kept[0] < KEEP_FRAMES:
             return kept[1]
-        size = len(place.positions)
-        shape = (size, len(scale))
-        modes = [] if self.base.modes is None else [_padded(self.base.modes, size)]
-        rest = 0.0
-        if ranked and level is not None:
-            own = np.zeros((n_modes, *shape), dtype=complex)
-            rows = place.rows(bank, ranked[0])
-            errors = self._error(bank, ranked[0], level, n_modes - 1)
-            own[: len(errors.moments), rows] = errors.moments * (INFLATION_STEP**steps * scale)
-            rest = errors.rest * INFLATION_STEP**steps * float(np.abs(scale[0]))
-            if rival is not None:
-                part = np.sqrt(weights[ranked[0]] * weights[rival])
-                own[-1, rows] += part * parts[ranked[0]]
-                own[-1, place.rows(bank, rival)] -= part * parts[rival]
-            modes.append(own)
-        flux_error = float(np.hypot(self.base.flux_error_t, rest))
-        whole = (np.concatenate(modes) if modes else None, flux_error)
+        inflation = INFLATION_STEP**steps
+        errors = self._error(change, best, level, n_modes - 1)
+        if errors is None:
+            if self._interim is None or self._interim[0] != key:
+                own, rest = self._until_known(change, best, level, n_modes)
+                self._interim = key, self._with_base(own * inflation, rest * inflation)
+            return self._interim[1]
+        self._last, self._interim = (
+            _ErrorBefore(bank.rows.tobytes(), best, names[0], level, errors),
+            None,
+        )
+        own, rest = change.modes(errors, best, n_modes)
+        own, rest = own * inflation, rest * inflation
+        if rival is not None:
+            own[-1] += np.sqrt(weights[best] * weights[rival]) * change.between(best, rival)
+        whole = self._with_base(own, rest)
         if len(self._whole) >= MOST_MODES:
             del self._whole[next(iter(self._whole))]
         self._whole[key] = (self._count, whole)
         return whole
 
-    def _error(self, bank: Bank, hypothesis: int, level: ErrorLevel, count: int) -> PosteriorModes:
-        """Return the error of one hypothesis in units of the noise."""
+    def _with_base(self, own: ComplexArray, rest: float) -> Uncertainty:
+        """Join the error of the change with that of the calibrated model."""
+        base = self.base.modes
+        parts = [] if base is None else [_padded(base, own.shape[1])]
+        modes = np.concatenate([*parts, own]) if parts or len(own) else None
+        return modes, float(np.hypot(self.base.flux_error_t, rest))
+
+    def _error(
+        self, change: '_Change', hypothesis: int, level: ErrorLevel, count: int
+    ) -> PosteriorModes | None:
+        """Return the error of a hypothesis in units of the noise; None until it is known."""
+        bank = change.bank
         key = (bank.rows.tobytes(), bank.prior(hypothesis).name, level, count)
-        if key not in self._modes:
-            if len(self._modes) >= MOST_MODES:
-                del self._modes[next(iter(self._modes))]
-            self._modes[key] = error_modes(bank, hypothesis, level, count)
+        if key in self._modes:
+            return self._modes[key]
+        if key not in self._coming:
+            _make_room(self._coming)
+            work = partial(error_modes, bank, bank.posterior(hypothesis), level, count)
+            self._coming[key] = Beside(work, change.stamp_ns)
+        if not self._coming[key].is_due(change.stamp_ns):
+            return None
+        _make_room(self._modes)
+        self._modes[key] = self._coming.pop(key).result()
         return self._modes[key]
+
+    def _until_known(
+        self, change: '_Change', best: int, level: ErrorLevel, n_modes: int
+    ) -> tuple[ComplexArray, float]:
+        """Return an error for as long as that of the best hypothesis is being worked out.
+
+        It is that of the hypothesis before, as large as the strength may be now, and the whole
+        difference between the two, in any direction. Where there is none before, all of the change
+        may be wrong.
+        """
+        last = self._last
+        if last is None or not last.holds(change):
+            own, rest = np.zeros((n_modes, *change.shape), dtype=complex), 0.0
+            own[-1] = change.between(best)
+        else:
+            own, rest = change.modes(last.errors, last.hypothesis, n_modes)
+            if last.hypothesis == best:
+                growth = last.level.growth(level)
+                return own * growth, rest * growth
+            own[-1] += change.between(best, last.hypothesis)
+        return own, float(np.hypot(rest, change.size(best, own[-1])))
+
+
+@dataclass(frozen=True)
+class _Change:
+    """One frame's hypotheses and what each of them adds to the calibrated model, A m^2."""
+
+    stamp_ns: int
+    bank: Bank
+    seen: FrameEvidence
+    weights: Array
+    parts: dict[int, ComplexArray]
+    scale: ComplexArray
+    place: Geometry
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Dipoles N and emitters K of the model."""
+        return len(self.place.positions), len(self.scale)
+
+    def rows(self, hypothesis: int) -> NDArray[np.int64]:
+        """Return the rows of the dipoles of a hypothesis' layer."""
+        return self.place.rows(self.bank, hypothesis)
+
+    def modes(
+        self, errors: PosteriorModes, hypothesis: int, n_modes: int
+    ) -> tuple[ComplexArray, float]:
+        """Return a hypothesis' error as modes (R, N, K) of the model, and what they leave, T."""
+        own = np.zeros((n_modes, *self.shape), dtype=complex)
+        own[: len(errors.moments), self.rows(hypothesis)] = errors.moments * self.scale
+        return own, errors.rest * float(np.abs(self.scale[0]))
+
+    def between(self, hypothesis: int, other: int | None = None) -> ComplexArray:
+        """Return what two hypotheses, or one and that of no change, disagree about, (N, K)."""
+        out = np.zeros(self.shape, dtype=complex)
+        out[self.rows(hypothesis)] += self._part(hypothesis)
+        if other is not None:
+            out[self.rows(other)] -= self._part(other)
+        return out
+
+    def size(self, hypothesis: int, moments: ComplexArray) -> float:
+        """Return the rms of a component of the field of moments (N, K) in the volume, T."""
+        points = self.bank.prior(hypothesis).layer.points[::SPARSE]
+        field = component_rows(points, self.place.positions, self.place.directions) @ moments
+        return float(np.sqrt(np.mean(np.abs(field) ** 2) / 2.0))
+
+    def _part(self, hypothesis: int) -> ComplexArray:
+        if hypothesis in self.parts:
+            return self.parts[hypothesis]
+        return self.bank.moments(self.seen, hypothesis) * self.scale
+
+
+@dataclass(frozen=True)
+class _ErrorBefore:
+    """The error that was told last, and of which hypothesis it is."""
+
+    coils: bytes
+    hypothesis: int
+    name: str
+    level: ErrorLevel
+    errors: PosteriorModes
+
+    def holds(self, change: _Change) -> bool:
+        """Whether the hypothesis is still there, and its dipoles are among the model's."""
+        bank = change.bank
+        return (
+            self.coils == bank.rows.tobytes()
+            and bank.names[self.hypothesis] == self.name
+            and bank.prior(self.hypothesis).layer.name in change.place.layer_rows
+        )
+
+
+def _make_room(table: dict[tuple[object, ...], Any]) -> None:
+    """Drop the oldest entry of a table that is full."""
+    if len(table) >= MOST_MODES:
+        del table[next(iter(table))]
 
 
 def _padded(modes: ComplexArray, size: int) -> ComplexArray:

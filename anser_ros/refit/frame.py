@@ -12,15 +12,15 @@ ComplexArray = NDArray[np.complex128]
 
 SILENT_CODE, NO_BASELINE_CODE = len(faults.FAULTS), len(faults.FAULTS) + 1
 """Codes of what only a baseline tells, after those of `frames.faults`."""
+_OF_KIND = {
+    'missing': health.MISSING,
+    'not_finite': health.NOT_FINITE,
+    'absurd': health.ABSURD,
+    'stuck': health.STUCK,
+}
 _REASONS = (
     health.OK,
-    health.MISSING,
-    health.FLAGGED,
-    health.FLAGGED,
-    health.FLAGGED,
-    health.FLAGGED,
-    health.NOT_FINITE,
-    health.ABSURD,
+    *(_OF_KIND.get(fault.kind, health.FLAGGED) for fault in faults.FAULTS if fault is not None),
     health.SILENT,
     health.NO_BASELINE,
 )

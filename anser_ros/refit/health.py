@@ -28,6 +28,7 @@ NO_BASELINE = 'no baseline'
 SILENT = 'silent'
 ABSURD = 'absurd'
 DISAGREES = 'disagrees'
+STUCK = 'stuck'
 
 FAULT_SCALES = 10.0 ** np.arange(0.0, 6.1, 0.5)
 """Sizes of a faulty reading's error, in noise deviations, all as likely."""
@@ -58,7 +59,7 @@ class ReferenceHealth(NamedTuple):
     name : str
     state : str
         ``ok``, or why it was left out: ``flagged``, ``not finite``, ``missing``, ``no baseline``,
-        ``silent``, ``absurd``, ``disagrees``.
+        ``silent``, ``absurd``, ``stuck``, ``disagrees``.
     residual_t : float
         Root mean square of measured minus predicted by all others, T a component; NaN where the
         coil has no reading.

@@ -105,7 +105,7 @@ class Layer:
         """
         at = self.points if points is None else points
         wanted = _field_rows(at, sources)
-        made = _component_rows(at, self.positions, self.directions) @ self.project(sources)
+        made = component_rows(at, self.positions, self.directions) @ self.project(sources)
         return float(np.linalg.norm(made - wanted) / np.linalg.norm(wanted))
 
 
@@ -120,7 +120,8 @@ def _field_rows(points: Array, sources: Array) -> Array:
     return out
 
 
-def _component_rows(points: Array, positions: Array, directions: Array) -> Array:
+def component_rows(points: Array, positions: Array, directions: Array) -> Array:
+    """Return the field samples per unit moment of dipoles (N, 3), shape (3P, N)."""
     at, axes = _axes_at(points)
     return flux_basis(at, axes, None, positions, directions)
 
@@ -134,7 +135,7 @@ def _build(
     excitation: Excitation,
     half: float,
 ) -> Layer:
-    basis = _component_rows(points, positions, directions)
+    basis = component_rows(points, positions, directions)
     scale = np.linalg.norm(basis, axis=0)
     u, s, vt = np.linalg.svd(basis / scale, full_matrices=False)
     inverse = (vt.T * (s / (s**2 + (RIDGE * s[0]) ** 2))) @ u.T / scale[:, None]
@@ -182,7 +183,7 @@ def body_layer(region: Region, weight: Array, cloud: Cloud) -> Layer:
     points = points[clear]
     positions = np.repeat(cloud.positions, 3, axis=0)
     directions = np.tile(np.eye(3), (len(cloud.positions), 1))
-    basis = _component_rows(points, positions, directions)
+    basis = component_rows(points, positions, directions)
     metric = _metric(basis, weight[clear])
     middle = basis[_middle(points, region.half)]
     return Layer(cloud.name, None, positions, directions, None, points, metric, middle)

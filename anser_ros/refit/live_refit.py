@@ -22,6 +22,7 @@ from anser_ros.refit import health
 from anser_ros.refit.agreement import distance_of, left_out
 from anser_ros.refit.assembly import Assembly
 from anser_ros.refit.baseline import checked_baseline
+from anser_ros.refit.beside import begin_beside
 from anser_ros.refit.change import Average, NoiseLevel
 from anser_ros.refit.evidence import FrameEvidence
 from anser_ros.refit.excitation import FieldFunction
@@ -137,6 +138,7 @@ class LiveRefit:
         self._weights = _fresh_weights(1 + len(self._tables.priors) + SLOTS)
         for _, slots in self._banks.values():
             slots.clear()
+        self._assembly.forget()
         self._last_ns = 0
         self._last_model = self.model
 
@@ -231,7 +233,7 @@ class LiveRefit:
         noise = level / math.sqrt(frames)
         change = (mean - self.baseline) * self._to_noise_units
         values = change.view(np.float64).reshape(*change.shape, 2)
-        bank, seen = self._judged(values, noise)
+        bank, seen = self._judged(stamp_ns, values, noise)
         if np.count_nonzero(self._in_use()) < self.settings.min_references:
             return self._too_few(stamp_ns, level)
         result = self._result(stamp_ns, bank, seen, level)
@@ -255,14 +257,15 @@ class LiveRefit:
                 tables.priors, rows, self._drift, self._row_noise, SLOTS, len(tables.bodies)
             )
             self._banks[key] = (bank, BodySlots(bank, self._tables))
+            begin_beside(bank.make_ready)
         return self._banks[key]
 
-    def _judged(self, values: Array, noise: float) -> tuple[Bank, FrameEvidence]:
+    def _judged(self, stamp_ns: int, values: Array, noise: float) -> tuple[Bank, FrameEvidence]:
         """Evaluate the hypotheses, leaving out coils that are at fault, the worst first."""
         while True:
             (bank, slots), coils = self._bank(), np.flatnonzero(self._in_use())
             used = values[coils].reshape(-1, 2)
-            slots.fill(used, noise)
+            slots.fill(used, noise, stamp_ns)
             seen = bank.evaluate(used, noise)
             best = int(seen.log_evidence.argmax())
             self._distance, self._residual = left_out(bank, seen, best)
@@ -311,8 +314,10 @@ class LiveRefit:
         unit = self.settings.accuracy.flux_noise_t
         if moving or sure.any():
             phase = self._tables.excitation.phase
-            model = self._assembly.model(bank, seen, weights, drift, typical, phase, unit,
-                                         self.settings.error_modes)  # fmt: skip
+            model = self._assembly.model(
+                stamp_ns, bank, seen, weights, drift, typical, phase, unit,
+                self.settings.error_modes,
+            )  # fmt: skip
             state = REFIT
         if moving and typical > POOR:
             state = POOR_FIT

@@ -5,13 +5,14 @@ has the size of one standard deviation. Modes are independent of each other. The
 directions of random draws of the posterior's error; what they leave is told by one number.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.refit.evidence import STRENGTHS, FrameEvidence
-from anser_ros.refit.posterior import Bank
+from anser_ros.refit.posterior import Bank, Eigenbasis
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -26,6 +27,12 @@ class ErrorLevel:
 
     noise: float
     strengths: tuple[int, int]
+
+    def growth(self, other: 'ErrorLevel') -> float:
+        """Return by how much an error may be larger at another level, at least 1."""
+        steps = [STRENGTHS[b] / STRENGTHS[a]
+                 for a, b in zip(self.strengths, other.strengths, strict=True)]  # fmt: skip
+        return max(1.0, other.noise / self.noise, math.sqrt(max(steps)))
 
 
 @dataclass(frozen=True)
@@ -53,20 +60,21 @@ def error_level(bank: Bank, seen: FrameEvidence, hypothesis: int) -> ErrorLevel:
     return ErrorLevel(noise, strengths)
 
 
-def error_draws(bank: Bank, hypothesis: int, noise: float, strength: int, part: int) -> Array:
+def error_draws(
+    bank: Bank, posterior: Eigenbasis, noise: float, strength: int, part: int
+) -> Array:
     """Return draws (N K, D) of the posterior's error of the layer's moments in noise units.
 
     A draw from the prior minus the posterior mean of its own noisy readings is a draw of the
     posterior's error (Matheron's rule; Wilson et al., JMLR 22 (2021) 105).
     """
-    precision, _ = bank.precision(noise)
-    prior, root = bank.prior(hypothesis), np.sqrt(STRENGTHS[strength])
+    prior, power = posterior.prior, STRENGTHS[strength]
     count = prior.draw_readings.shape[1]
     drawn = noise * _noise_draws(count, bank.drift, bank.row_noise, part)
-    readings = root * prior.draw_readings[bank.rows] + drawn
-    gain = (STRENGTHS[strength] * precision[hypothesis, strength])[:, None]
-    weights = gain * (bank.bases[hypothesis].T @ readings)
-    return np.asarray(root * prior.draw_moments - bank.to_moments(hypothesis) @ weights)
+    readings = np.sqrt(power) * prior.draw_readings[bank.rows] + drawn
+    gain = power / (power * posterior.values + noise**2)
+    weights = gain[:, None] * (posterior.basis.T @ readings)
+    return np.asarray(np.sqrt(power) * prior.draw_moments - posterior.synthesis @ weights)
 
 
 def _noise_draws(count: int, drift: Array, noise: Array, part: int) -> Array:
@@ -76,23 +84,27 @@ def _noise_draws(count: int, drift: Array, noise: Array, part: int) -> Array:
     return np.asarray(white + drift @ rng.standard_normal((drift.shape[1], count)))
 
 
-def error_modes(bank: Bank, hypothesis: int, level: ErrorLevel, count: int) -> PosteriorModes:
+def error_modes(
+    bank: Bank, posterior: Eigenbasis, level: ErrorLevel, count: int
+) -> PosteriorModes:
     """Return the principal modes of a posterior's error, weighted by its effect on poses.
+
+    It takes long and changes nothing, so any thread may do it.
 
     Parameters
     ----------
     bank : Bank
-    hypothesis : int
-        Not 0.
+    posterior : Eigenbasis
+        From `Bank.posterior`.
     level : ErrorLevel
         From `error_level`.
     count : int
         Modes R.
     """
-    layer = bank.prior(hypothesis).layer
+    layer = posterior.prior.layer
     draws = []
     for part in range(2):
-        error = error_draws(bank, hypothesis, level.noise, level.strengths[part], part)
+        error = error_draws(bank, posterior, level.noise, level.strengths[part], part)
         draws.append(error.reshape(len(layer.positions), bank.width, -1))
     half = draws[0].shape[2]
     gram = np.zeros((2 * half, 2 * half))

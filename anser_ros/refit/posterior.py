@@ -18,6 +18,7 @@ Readings are in units of the nominal noise throughout this module.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,27 @@ def _make_room(table: dict[Any, Any], most: int) -> None:
     """Drop the oldest entry of a table that is full."""
     if len(table) >= most:
         del table[next(iter(table))]
+
+
+@dataclass(frozen=True)
+class Eigenbasis:
+    """What a prior's covariance is made of, for the readings in use.
+
+    Attributes
+    ----------
+    prior : CloudPrior
+    values : ndarray, shape (n,)
+        Eigenvalues, whitened readings.
+    basis : ndarray, shape (n, n)
+        Eigenvectors in columns, from readings.
+    synthesis : ndarray, shape (N K, n)
+        From coordinates in the eigenvectors to the layer's moments, single precision.
+    """
+
+    prior: CloudPrior
+    values: Array
+    basis: Array
+    synthesis: Single
 
 
 class Bank:
@@ -98,7 +120,9 @@ class Bank:
         self.is_slot = np.arange(count) >= count - slots
         self._set(0, self.whitening)
         for hypothesis, prior in enumerate(priors, start=1):
-            self._decompose(hypothesis, prior)
+            values, basis = self._decomposed(prior)
+            self.spectra[hypothesis] = values
+            self._set(hypothesis, basis)
         self._synthesis: dict[int, Single] = {}
         self._blocks: dict[tuple[float, int, int], Array] = {}
         self._tables: dict[float, tuple[Single, Array]] = {}
@@ -111,11 +135,10 @@ class Bank:
         self.log_prior[hypothesis] = self._chosen if self.is_slot[hypothesis] else 0.0
         self._name()
 
-    def _decompose(self, hypothesis: int, prior: CloudPrior) -> None:
+    def _decomposed(self, prior: CloudPrior) -> tuple[Array, Array]:
         block = prior.covariance[np.ix_(self.rows, self.rows)]
         values, vectors = eigh(self.whitening.T @ block @ self.whitening, driver='evd')
-        self.spectra[hypothesis] = np.maximum(values, 0.0)
-        self._set(hypothesis, self.whitening @ vectors)
+        return np.maximum(values, 0.0), self.whitening @ vectors
 
     def vacate(self, hypothesis: int) -> None:
         """Empty a slot of the bank."""
@@ -123,14 +146,28 @@ class Bank:
         self.log_prior[hypothesis] = -np.inf
         self._name()
 
-    def occupy(self, hypothesis: int, prior: CloudPrior) -> None:
+    def eigenbasis(self, prior: CloudPrior) -> Eigenbasis:
+        """Return what `occupy` needs; takes long and changes nothing, so any thread may do it."""
+        values, basis = self._decomposed(prior)
+        return Eigenbasis(prior, values, basis, self._to_moments(prior, basis))
+
+    def occupy(self, hypothesis: int, eigenbasis: Eigenbasis) -> None:
         """Put a prior into a slot in place of the former one."""
-        self.priors[hypothesis - 1] = prior
-        self._decompose(hypothesis, prior)
-        self._synthesis.pop(hypothesis, None)
+        self.priors[hypothesis - 1] = eigenbasis.prior
+        self.spectra[hypothesis] = eigenbasis.values
+        self._set(hypothesis, eigenbasis.basis)
+        self._synthesis[hypothesis] = eigenbasis.synthesis
         self._tables.clear()
         for key in [key for key in self._blocks if key[1] == hypothesis]:
             del self._blocks[key]
+
+    def posterior(self, hypothesis: int) -> Eigenbasis:
+        """Return a hypothesis as it is now, other than 0, whatever becomes of a slot."""
+        basis = self.bases[hypothesis]
+        return Eigenbasis(
+            self.prior(hypothesis), self.spectra[hypothesis].copy(),
+            basis.copy() if self.is_slot[hypothesis] else basis, self.to_moments(hypothesis),
+        )  # fmt: skip
 
     def _name(self) -> None:
         """Name the hypotheses anew after one of them has changed."""
@@ -183,9 +220,18 @@ class Bank:
     def to_moments(self, hypothesis: int) -> Single:
         """Return the map (N K, n) from coordinates in the eigenvectors to the layer's moments."""
         if hypothesis not in self._synthesis:
-            transfer = self.prior(hypothesis).transfer[:, self.rows]
-            self._synthesis[hypothesis] = (transfer @ self.bases[hypothesis]).astype(np.float32)
+            prior, basis = self.prior(hypothesis), self.bases[hypothesis]
+            self._synthesis[hypothesis] = self._to_moments(prior, basis)
         return self._synthesis[hypothesis]
+
+    def make_ready(self) -> None:
+        """Work out what `to_moments` would in the frame that first needs it; any thread may."""
+        for hypothesis, prior in enumerate(self.priors, start=1):
+            if prior is not None and not self.is_slot[hypothesis]:
+                self.to_moments(hypothesis)
+
+    def _to_moments(self, prior: CloudPrior, basis: Array) -> Single:
+        return np.asarray(prior.transfer[:, self.rows] @ basis, dtype=np.float32)
 
     def moments(self, seen: FrameEvidence, hypothesis: int) -> NDArray[np.complex128]:
         """Return the posterior mean of the layer's moments (N, K) in units of the noise."""

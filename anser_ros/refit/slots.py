@@ -5,11 +5,15 @@ the bank has a few *slots*, places for one body each; a body that explains the r
 takes over the slot of the one that explains them worst.
 """
 
+from functools import partial
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.refit.beside import Beside
 from anser_ros.refit.evidence import STRENGTHS
-from anser_ros.refit.posterior import Bank
+from anser_ros.refit.posterior import Bank, Eigenbasis
 from anser_ros.refit.search import BodySearch
 from anser_ros.refit.tables import RefitTables
 
@@ -23,6 +27,14 @@ EVERY = 4
 """Frames from one look at all bodies to the next."""
 PRESENT = 1.15
 """Ratio of the readings' power to that of the noise below which no body is looked for."""
+
+
+class _Coming(NamedTuple):
+    """A body whose hypothesis is being worked out, and the slot that it is for."""
+
+    slot: int
+    body: int
+    eigenbasis: Beside[Eigenbasis]
 
 
 class BodySlots:
@@ -40,16 +52,20 @@ class BodySlots:
         self._first = len(bank.priors) - SLOTS + 1
         self._search = BodySearch(tables.factors, bank.rows, bank.whitening, STRENGTHS[::2])
         self._bodies: list[int] = []
+        self._coming: _Coming | None = None
         self._wait = 0
 
     def clear(self) -> None:
         """Empty all slots of bodies."""
-        self._bodies, self._wait = [], 0
+        self._bodies, self._coming, self._wait = [], None, 0
         for slot in range(SLOTS):
             self._bank.vacate(self._first + slot)
 
-    def fill(self, readings: Array, noise: float) -> None:
+    def fill(self, readings: Array, noise: float, stamp_ns: int) -> None:
         """Take in one frame; every few frames a body may be replaced by a better one.
+
+        The chosen body's hypothesis is worked out beside the frames, and takes its slot with a
+        later one.
 
         Parameters
         ----------
@@ -57,21 +73,38 @@ class BodySlots:
             Change since the baseline in nominal noise deviations, real and imaginary part.
         noise : float
             Noise in units of the nominal one.
+        stamp_ns : int
+            Of the frame.
         """
+        self._put_in(stamp_ns)
         if float((readings**2).mean()) < PRESENT * noise**2:
             return
         self._wait -= 1
-        if self._wait > 0:
+        if self._wait > 0 or self._coming is not None:
             return
         self._wait = EVERY
-        scores = self._search.scores(readings, noise)
+        chosen = self._choose(self._search.scores(readings, noise))
+        if chosen is not None:
+            slot, body = chosen
+            self._coming = _Coming(slot, body, Beside(partial(self._eigenbasis, body), stamp_ns))
+
+    def _eigenbasis(self, body: int) -> Eigenbasis:
+        return self._bank.eigenbasis(self._tables.body_prior(body))
+
+    def _put_in(self, stamp_ns: int) -> None:
+        """Put a body into its slot whose time has come."""
+        coming = self._coming
+        if coming is None or not coming.eigenbasis.is_due(stamp_ns):
+            return
+        self._bank.occupy(self._first + coming.slot, coming.eigenbasis.result())
+        self._bodies[coming.slot : coming.slot + 1] = [coming.body]
+        self._coming = None
+
+    def _choose(self, scores: Array) -> tuple[int, int] | None:
+        """Return the next slot to be filled and the body for it, if there is a better one."""
         order = np.argsort(-scores, kind='stable').tolist()
-        while len(self._bodies) < SLOTS:
-            body = next(b for b in order if b not in self._bodies)
-            self._bank.occupy(self._first + len(self._bodies), self._tables.body_prior(body))
-            self._bodies.append(body)
-        best = next(b for b in order if b not in self._bodies)
+        best = next(body for body in order if body not in self._bodies)
+        if len(self._bodies) < SLOTS:
+            return len(self._bodies), best
         worst = min(range(SLOTS), key=lambda slot: float(scores[self._bodies[slot]]))
-        if scores[best] > scores[self._bodies[worst]] + BETTER:
-            self._bank.occupy(self._first + worst, self._tables.body_prior(best))
-            self._bodies[worst] = best
+        return (worst, best) if scores[best] > scores[self._bodies[worst]] + BETTER else None

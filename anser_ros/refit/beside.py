@@ -1,0 +1,52 @@
+"""What takes longer than a frame may, worked out beside the frames by one thread of the process.
+
+A result comes into use at a fixed time after it was asked for, told by the stamps of the frames:
+so what the refit says does not depend on how busy the machine is, and a recording gives what was
+said live. Only where the thread has not finished by then is it waited for.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache
+from typing import Generic, TypeVar
+
+DELAY_NS = 80_000_000
+"""Time from asking for a result to its use, ns: four frames at 50 Hz. The longest work takes 20 ms
+of a free processor. Shorter, and frames wait for the thread on a busy machine; longer, and the
+interim answer, with its larger uncertainty, holds for longer."""
+
+Result = TypeVar('Result')
+
+
+@cache
+def _worker() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max_workers=1, thread_name_prefix='refit')
+
+
+def begin_beside(work: Callable[[], None]) -> None:
+    """Let the thread do what spares a later frame some time and changes no result."""
+    _worker().submit(work)
+
+
+class Beside(Generic[Result]):
+    """One piece of work that has been given to the thread.
+
+    Parameters
+    ----------
+    work : callable
+        Must only read what nobody changes.
+    stamp_ns : int
+        Of the frame that asks.
+    """
+
+    def __init__(self, work: Callable[[], Result], stamp_ns: int) -> None:
+        self._begin_ns = stamp_ns
+        self._future: Future[Result] = _worker().submit(work)
+
+    def is_due(self, stamp_ns: int) -> bool:
+        """Return whether the result may be used in a frame; at once where the stamps went back."""
+        return not self._begin_ns <= stamp_ns < self._begin_ns + DELAY_NS
+
+    def result(self) -> Result:
+        """Return the result, and wait for it where that is necessary."""
+        return self._future.result()
