@@ -22,6 +22,8 @@ SCHEMA = 'anser_setup/1'
 FIELD_GENERATOR = 'fg'
 AXIS_TOLERANCE = 1e-3
 """Largest deviation of an axis' length from one; axes with three written digits pass."""
+LARGEST_NUMBER = 1e300
+"""Size from which on a number counts as infinite, in any unit."""
 LOWEST_VOLUME_M = 1e-3
 """A tracked volume ends at least so far over the board's copper (z = 0), m: nearer than the copper
 is thick, no model of its field holds, and heights are sampled in a geometric series."""
@@ -155,11 +157,11 @@ def topic_of(name: str) -> str:
 def _number(value: Any, where: str, low: float = -math.inf, high: float = math.inf) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise SetupError(f'setup: {where} must be a number, got {value!r}')
-    number = float(value)
+    # A whole number may be too large for a float; its digits then are too many to be told.
+    number = float(value) if abs(value) < LARGEST_NUMBER else math.inf
     if not math.isfinite(number) or not low <= number <= high:
-        raise SetupError(
-            f'setup: {where} must be finite and in [{low:g}, {high:g}], got {value!r}'
-        )
+        told = repr(value) if math.isfinite(number) else 'what is not'
+        raise SetupError(f'setup: {where} must be finite and in [{low:g}, {high:g}], got {told}')
     return number
 
 

@@ -1,0 +1,132 @@
+"""Writes config/sros2_policy.xml: what each node publishes, hears and serves, and nothing more.
+
+The nodes are made in this process, told a setup, and asked what they have on the graph. With a
+setup of your own as argument the policy is of its sensors and bodies: `.ci/write_policy.py
+SETUP.yaml`.
+"""
+
+import os
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+
+POLICY = Path(__file__).resolve().parents[1] / 'config' / 'sros2_policy.xml'
+NODES = ('acquisition', 'field_model', 'tracker', 'openigtlink', 'recorder', 'watcher', 'monitor')
+"""Nodes of an installation; simulation and replay belong on no graph that is secured."""
+SETTLES_S = 20.0
+"""Longest time, s, for all topics of a setup to appear."""
+KINDS = (
+    ('topics', 'publish', 'topic', 'get_publisher_names_and_types_by_node'),
+    ('topics', 'subscribe', 'topic', 'get_subscriber_names_and_types_by_node'),
+    ('services', 'reply', 'service', 'get_service_names_and_types_by_node'),
+)
+"""Groups of a profile: tags, verb, and the question that fills it."""
+
+
+def policy(setup_file: str = 'demo_setup.yaml') -> str:
+    """Return the policy of a setup; rclpy must be initialised."""
+    graph = _graph(setup_file)
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        '<!-- Written by .ci/write_policy.py; docs/security.md says how it is used. -->',
+        '<policy version="0.2.0">',
+        '  <enclaves>',
+    ]
+    for node in NODES:
+        lines += [f'    <enclave path="/anser/{node}">', '      <profiles>']
+        lines += [f'        <profile ns="/anser" node="{node}">']
+        for tag, verb, item, _ in KINDS:
+            names = graph[node, verb]
+            if names:
+                lines.append(f'          <{tag} {verb}="ALLOW">')
+                lines += [f'            <{item}>{name}</{item}>' for name in names]
+                lines.append(f'          </{tag}>')
+        lines += ['        </profile>', '      </profiles>', '    </enclave>']
+    return '\n'.join([*lines, '  </enclaves>', '</policy>', ''])
+
+
+def _graph(setup_file: str) -> dict[tuple[str, str], list[str]]:
+    import importlib
+
+    import rclpy
+    from geometry_msgs.msg import PoseStamped
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.parameter import Parameter
+    from std_msgs.msg import String
+
+    from anser_ros.nodes import qos
+    from anser_ros.nodes.node import AnserNode
+    from anser_ros.wire.config_folder import read_config
+    from anser_ros.wire.setup import parse_setup, topic_of
+
+    text = read_config(setup_file)
+    bodies = parse_setup(text).bodies
+    peer = rclpy.create_node('policy_writer')
+    setup = peer.create_publisher(String, '/anser/setup', qos.LATCHED)
+    for body in bodies:
+        peer.create_publisher(PoseStamped, f'/optical/{topic_of(body)}/pose', qos.STREAM)
+    executor = SingleThreadedExecutor()
+    executor.add_node(peer)
+    made: list[Any] = []
+    with tempfile.TemporaryDirectory() as folder:
+        given = {
+            'acquisition': {'device': '/nowhere', 'setup_file': setup_file},
+            'openigtlink': {'port': 0},
+            'recorder': {'directory': folder},
+        }
+        for name in NODES:
+            module = importlib.import_module(f'anser_ros.nodes.{name}')
+            (kind,) = (
+                k for k in vars(module).values()
+                if isinstance(k, type) and issubclass(k, AnserNode) and vars(k).get('NAME') == name
+            )  # fmt: skip
+            values = [Parameter(key, value=value) for key, value in given.get(name, {}).items()]
+            made.append(kind(parameter_overrides=values))
+            executor.add_node(made[-1])
+        setup.publish(String(data=text))
+        found, since = _asked(peer), time.monotonic()
+        end = since + SETTLES_S
+        while time.monotonic() < min(end, since + 3.0):  # until nothing new has come for a while
+            executor.spin_once(timeout_sec=0.1)
+            now = _asked(peer)
+            if now != found:
+                found, since = now, time.monotonic()
+        for node in made:
+            node.close()
+        executor.shutdown()
+    return found
+
+
+def _asked(peer: Any) -> dict[tuple[str, str], list[str]]:
+    found = {}
+    for node in NODES:
+        for _, verb, _, question in KINDS:
+            try:
+                names = {name for name, _ in getattr(peer, question)(node, '/anser')}
+            except Exception:  # noqa: BLE001 - the graph does not know the node yet
+                names = set()
+            found[node, verb] = sorted(names - {'/anser/policy_writer'})
+    return found
+
+
+def main() -> int:
+    """Write the file, or that of another setup to stdout."""
+    import rclpy
+
+    rclpy.init()
+    try:
+        if len(sys.argv) > 1:
+            print(policy(sys.argv[1]), end='')
+        else:
+            POLICY.write_text(policy(), encoding='utf-8')
+    finally:
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
