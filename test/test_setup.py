@@ -89,6 +89,8 @@ def edited(path: tuple, value: object) -> str:
         (('sensors', 0, 'axis'), [0, 0, 2.0], 'unit vector'),
         (('sensors', 0, 'length_m'), -1.0, 'must be finite and in'),
         (('sensors', 0), 'coil', 'must be a mapping'),
+        (('acuracy',), {'flux_noise_t': 1e-10}, "is 'accuracy' meant"),
+        (('Volume',), {'low_m': [0, 0, 0.1]}, "is 'volume' meant"),
     ],
 )
 def test_a_broken_rule_is_named(path, value, message):
@@ -101,6 +103,11 @@ def test_a_broken_rule_is_named(path, value, message):
 def test_garbage_is_no_setup(text):
     with pytest.raises(SetupError):
         parse_setup(text)
+
+
+def test_keys_of_somebody_else_are_kept():
+    setup = parse_setup(edited(('clinic',), {'room': 3}))
+    assert parse_setup(dump_setup(setup)).extra['clinic'] == {'room': 3}
 
 
 def test_topics_are_legal_ros_names():

@@ -4,6 +4,7 @@ The YAML text travels in every bag and on the latched topic ``setup``. Sensor po
 are given in the frame of the sensor's body; the body ``fg`` is the field generator itself.
 """
 
+import difflib
 import math
 import re
 from collections.abc import Mapping
@@ -19,6 +20,12 @@ from anser_ros.settings import SECTIONS, Accuracy, RefitSettings, settings_from
 from anser_ros.wire.yaml_text import read_yaml
 
 SCHEMA = 'anser_setup/1'
+KEYS = (
+    'schema', 'frame_id', 'flux_rate_hz', 'flux_unit', 'emitter', 'sensors', 'volume', *SECTIONS,
+)  # fmt: skip
+LIKENESS = 0.8
+"""Ratio of equal letters (`difflib`) from which an unknown key is taken for a misspelt one: one
+letter off in a short key, two in a long one. Smaller, and somebody's own keys are refused."""
 FIELD_GENERATOR = 'fg'
 AXIS_TOLERANCE = 1e-3
 """Largest deviation of an axis' length from one; axes with three written digits pass."""
@@ -297,13 +304,21 @@ def _stated_sections(stated: Mapping[str, float]) -> dict[str, dict[str, float]]
     return {section: values for section, values in sections.items() if values}
 
 
+def _no_misspelt(extra: Mapping[str, Any]) -> None:
+    """Refuse a key that is nearly one of ours: its values would be passed over in silence."""
+    for key in map(str, extra):
+        meant = difflib.get_close_matches(key.lower(), KEYS, n=1, cutoff=LIKENESS)
+        if meant:
+            raise SetupError(f'setup: unknown key {key!r}: is {meant[0]!r} meant?')
+
+
 def parse_setup(text: str) -> Setup:
     """Read and check a setup document.
 
     Two sections are optional: ``accuracy`` states how accurate the instruments are and ``refit``
     how the live refit follows. Their keys, with units and defaults, are the fields of
     `anser_ros.settings.Accuracy` and `anser_ros.settings.RefitSettings`; what is not stated has
-    its default. Any other key is kept in ``extra``.
+    its default. Any other key is kept in ``extra``, unless it is nearly one of these.
 
     Parameters
     ----------
@@ -345,10 +360,8 @@ def parse_setup(text: str) -> Setup:
     _unique(
         [topic_of(name) for name in [s.name for s in tools] + bodies], 'topic of sensor or body'
     )
-    known = (
-        'schema', 'frame_id', 'flux_rate_hz', 'flux_unit', 'emitter', 'sensors', 'volume',
-        *SECTIONS,
-    )  # fmt: skip
+    extra = {key: value for key, value in root.items() if key not in KEYS}
+    _no_misspelt(extra)
     return Setup(
         frame_id=frame_id,
         flux_rate_hz=_number(
@@ -358,7 +371,7 @@ def parse_setup(text: str) -> Setup:
         sensors=parsed,
         volume=_parse_volume(root['volume']) if 'volume' in root else None,
         stated=_parse_stated(root),
-        extra={k: v for k, v in root.items() if k not in known},
+        extra=extra,
     )
 
 
