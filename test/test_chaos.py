@@ -89,6 +89,21 @@ def test_a_random_combination_is_the_same_for_the_same_seed():
     assert all(2 <= len(set(some)) <= 3 for some in names)
 
 
+def test_growth_is_a_trend_and_no_step():
+    from soak import Series
+
+    rng = np.random.default_rng(5)
+    for hourly_mb in (0.0, 20.0):
+        series = Series()
+        for second in range(600):
+            step = 2.0 if second > 560 else 0.0  # an allocator takes a piece, once
+            memory = 200.0 + hourly_mb * second / 3600.0 + step + 0.01 * rng.standard_normal()
+            series.rows.append((float(second), memory, 12, 9))
+        growth, error = series.hourly(1)
+        assert abs(growth - hourly_mb) < max(1.0, 4.0 * error)
+        assert series.hourly(2)[0] == 0.0
+
+
 @pytest.mark.processes
 def test_a_sample_of_the_trial_passes(tmp_path):
     out = tmp_path / 'rows.json'

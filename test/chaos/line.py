@@ -30,9 +30,10 @@ IDLE_S = 0.002
 """Longest wait for bytes, s: a block lasts as long, so that nothing is late by more."""
 SLICE_S = 0.1
 """Slices of time, s, of which the least delay of the unit is kept."""
-SLICES = 10
-"""Slices before a pose's arrival in which the unit must not have been late: a second, in which the
-host's clock finds the earliest arrivals again."""
+SLICES = 20
+"""Slices before a pose's arrival in which the unit must not have been late: two seconds, in which
+the host's clock finds the earliest arrivals again. A unit that is late answers commands before it
+works out samples that were due earlier, which no device does, and so misleads that clock."""
 REOPEN_S = 0.05
 """Time between attempts to open the control unit's port, s."""
 

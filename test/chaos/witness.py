@@ -148,9 +148,10 @@ class Witness:
                 self._words[status.name] = seen
                 self.states.append(SeenState(now, status.name, *seen))
 
-    def state(self, name: str) -> str:
-        """Return the newest words of a status line."""
-        return self._words.get(name, (0, ''))[1]
+    def forget_truth(self) -> None:
+        """Forget the true poses so far."""
+        for rows in self._truth.values():
+            rows.clear()
 
     def count(self, since_s: float, until_s: float) -> dict[str, int]:
         """Return the number of poses by name that came in a time."""
