@@ -143,7 +143,7 @@ def judged(places, bounds=HANDS, step_s=0.02, sigma_m=1e-4):
     one, found = Continuity(), []
     for i, x in enumerate(places, start=1):
         stamp = round(i * step_s * 1e9)
-        place = None if x is None else Place(stamp, np.array([x, 0.0, 0.0]), sigma_m)
+        place = None if x is None else Place(stamp, (x, 0.0, 0.0), sigma_m)
         found.append(one.judge(stamp, place, x is None, bounds) == '')
     return found
 

@@ -8,14 +8,10 @@ no neighbours in time, and each is judged alone.
 
 import math
 from collections import deque
-from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Sequence
+from typing import NamedTuple
 
 from anser_ros.frames.intake import NANO
-
-Array = NDArray[np.float64]
 
 STREAM_GAP_S = 0.5
 """Frames further apart than this, s, are single points and no stream. Smaller, and a stream with
@@ -37,20 +33,18 @@ the bounds of the motion. Smaller, and an uncertain pose at rest is said to leap
 leaps of uncertain poses pass."""
 
 
-@dataclass(frozen=True)
-class MotionBounds:
+class MotionBounds(NamedTuple):
     """The largest speed (m/s) and acceleration (m/s^2) of a tool."""
 
     speed_m_s: float
     acceleration_m_s2: float
 
 
-@dataclass(frozen=True)
-class Place:
+class Place(NamedTuple):
     """Where something was, and how well that is known: stamp, position (m), and its sigma, m."""
 
     stamp_ns: int
-    position: Array
+    position: Sequence[float]
     sigma_m: float
 
 
@@ -73,11 +67,11 @@ def leap(before: list[Place], now: Place, bounds: MotionBounds) -> str:
     first = before[-2]
     dt_before = (last.stamp_ns - first.stamp_ns) * NANO
     steps = dt / dt_before
-    apart = now.position - last.position - steps * (last.position - first.position)
-    bent = math.sqrt(float(apart @ apart))
-    parts = now.sigma_m, (1.0 + steps) * last.sigma_m, steps * first.sigma_m
+    led = [b + steps * (b - a) for a, b in zip(first.position, last.position, strict=True)]
+    bent = math.dist(now.position, led)
+    error = SIGMAS * math.hypot(now.sigma_m, (1.0 + steps) * last.sigma_m, steps * first.sigma_m)
     time = 0.5 * dt * (dt + dt_before)
-    if bent > bounds.acceleration_m_s2 * time + SIGMAS * math.hypot(*parts):
+    if bent > bounds.acceleration_m_s2 * time + error:
         return f'an acceleration of {bent / time:.3g} m/s^2'
     return ''
 
@@ -136,14 +130,14 @@ class Continuity:
             return ''
         contradiction = leap(self._track, place, bounds)
         old = not self._track or stamp_ns - self._track[-1].stamp_ns > RECORD_S / NANO
-        goes_on = not (old or contradiction or self.refused_share > MOST_REFUSED)
-        if self._frames and leap(self._run, place, bounds):
-            self._run, self._frames = [], 0
-        if not self._frames:
-            self._began_ns = stamp_ns
+        if not (old or contradiction or self._refused > MOST_REFUSED * len(self._record)):
+            self._track, self._frames = [self._track[-1], place], 0
+            return ''
+        if not self._frames or leap(self._run, place, bounds):
+            self._run, self._frames, self._began_ns = [], 0, stamp_ns
         self._run, self._frames = [*self._run[-1:], place], self._frames + 1
-        if goes_on or alone or self._is_confirmed(stamp_ns):
-            self._track = [*self._track[-1:], place] if goes_on else list(self._run)
+        if alone or self._is_confirmed(stamp_ns):
+            self._track = list(self._run)
             return ''
         if contradiction and not old:
             return contradiction

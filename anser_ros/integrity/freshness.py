@@ -14,7 +14,6 @@ from dataclasses import replace
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from anser_ros.frames.faults import STUCK_CODE
 from anser_ros.frames.intake import BACK, NANO, Frame
@@ -43,55 +42,70 @@ HOPELESS = -60.0
 
 
 @numba.njit(cache=True, error_model='numpy')
-def _odds(now, then, width, weakest, least):  # type: ignore[no-untyped-def]
-    """Logarithm of the odds that a reading repeats another: exactly, and but for its currents."""
-    exact, scaled = 0.0, 0.0
-    for i in range(width):
-        # The weakest emitter tells most of noise: it comes first, and mostly ends the comparison.
-        k = (weakest + i) % width
+def _fill_terms(now, least, terms):  # type: ignore[no-untyped-def]
+    """Write what makes the odds of a repetition of ``now`` (K,): a place and four numbers a row.
+
+    The weakest emitter comes first: it tells most of noise, and mostly ends the comparison. The
+    rows hold, exactly and but for the currents, the odds of no difference at all, and by how much
+    they fall with a squared difference. Returns how many emitters tell anything.
+    """
+    count, weakest, smallest = 0, 0, math.inf
+    for k in range(now.shape[0]):
         size = math.hypot(now[k].real, now[k].imag)
-        if not size > 0.0 or not math.isfinite(then[k].real + then[k].imag):
+        if not size > 0.0:
             continue
-        x, y = now[k].real - then[k].real, now[k].imag - then[k].imag
-        square = (x * x + y * y) / (4.0 * least * least)
+        terms[count, 0] = k
         for way in range(2):
             relative = ROUNDING if way == 0 else CURRENT_NOISE
             share = min((relative * size / least) ** 2, 1.0)
-            odds = -math.log(share) - square * (1.0 / share - 1.0)
-            exact, scaled = (exact + odds, scaled) if way == 0 else (exact, scaled + odds)
-        if exact < HOPELESS and scaled < HOPELESS:
-            break
-    return exact, scaled
+            terms[count, 1 + 2 * way] = -math.log(share)
+            terms[count, 2 + 2 * way] = (1.0 / share - 1.0) / (4.0 * least * least)
+        if size < smallest:
+            weakest, smallest = count, size
+        count += 1
+    for i in range(5):
+        terms[0, i], terms[weakest, i] = terms[weakest, i], terms[0, i]
+    return count
 
 
 @numba.njit(cache=True, error_model='numpy')
-def compare(flux, usable, ring, filled, newest, sums, least, certain, ages):  # type: ignore[no-untyped-def]
-    """Compare readings (S, K) with those of the ring (D, S, K) and write ``ages`` (S,).
+def compare(flux, codes, ring, filled, newest, sums, least, certain, ages):  # type: ignore[no-untyped-def]
+    """Compare readings (S, K) with those of the ring (D, S, K), and put them into it.
 
-    ``filled``: how many frames the ring holds; ``newest``: the place of the last one. ``sums``
-    (S, D, 2), the runs' odds by distance in frames, goes on. ``ages``: how many frames ago the
-    reading was the same, 0 for a new one.
+    ``codes`` (S,): readings with another than 0 are not looked at. ``filled``: how many frames the
+    ring holds; ``newest``: the place of the last one. ``sums`` (S, D, 2), the runs' odds by
+    distance in frames, goes on. ``ages`` (S,): how many frames ago the reading was the same, 0 for
+    a new one. Returns whether there is any that is not new.
     """
-    depth = ring.shape[0]
+    depth, width = ring.shape[0], flux.shape[1]
+    terms, place, some = np.empty((width, 5)), (newest + 1) % depth, False
     for s in range(flux.shape[0]):
         ages[s] = 0
-        if not usable[s]:
+        if codes[s] != 0:
             sums[s] = 0.0
+            ring[place, s] = complex(math.nan, math.nan)
             continue
-        weakest, smallest = 0, math.inf
-        for k in range(flux.shape[1]):
-            size = math.hypot(flux[s, k].real, flux[s, k].imag)
-            if 0.0 < size < smallest:
-                weakest, smallest = k, size
+        count = _fill_terms(flux[s], least, terms)
         for d in range(filled):
-            then = ring[(newest - d) % depth, s]
-            exact, scaled = _odds(flux[s], then, flux.shape[1], weakest, least)
-            for way in range(2):
-                total = max(sums[s, d, way] + (exact if way == 0 else scaled), 0.0)
-                sums[s, d, way] = min(total, 2.0 * certain)
-                if total > certain and ages[s] == 0:
-                    ages[s] = d + 1
-        sums[s, filled:] = 0.0
+            then, exact, scaled = ring[(newest - d) % depth, s], 0.0, 0.0
+            for i in range(count):
+                k = int(terms[i, 0])
+                x, y = flux[s, k].real - then[k].real, flux[s, k].imag - then[k].imag
+                square = x * x + y * y
+                if not square < math.inf:  # the older one was no reading
+                    exact = scaled = HOPELESS
+                    break
+                exact += terms[i, 1] - terms[i, 2] * square
+                scaled += terms[i, 3] - terms[i, 4] * square
+                if exact < HOPELESS and scaled < HOPELESS:
+                    break
+            sums[s, d, 0] = min(max(sums[s, d, 0] + exact, 0.0), 2.0 * certain)
+            sums[s, d, 1] = min(max(sums[s, d, 1] + scaled, 0.0), 2.0 * certain)
+            if ages[s] == 0 and max(sums[s, d, 0], sums[s, d, 1]) > certain:
+                ages[s] = d + 1
+                some = True
+        ring[place, s] = flux[s]
+    return some
 
 
 class Freshness:
@@ -100,17 +114,17 @@ class Freshness:
     Attributes
     ----------
     age_s : ndarray, shape (S,)
-        How long ago the same reading came, s, for the last frame that was judged; 0 for new ones.
+        How long ago the same reading came, s, for the last frame that had any; 0 for new ones.
     """
 
     def __init__(self) -> None:
-        self.age_s: NDArray[np.float64] = np.zeros(0)
         self._forget((0, 0))
 
     def _forget(self, shape: tuple[int, int]) -> None:
         self._ring = np.full((DEPTH, *shape), np.nan, dtype=np.complex128)
         self._stamps = np.zeros(DEPTH, dtype=np.int64)
         self._sums = np.zeros((shape[0], DEPTH, 2))
+        self.age_s = np.zeros(shape[0])
         self._ages = np.zeros(shape[0], dtype=np.int64)
         self._filled, self._newest = 0, -1
 
@@ -126,18 +140,18 @@ class Freshness:
         """
         if frame.jump == BACK or self._ring.shape[1:] != frame.flux.shape:
             self._forget(frame.flux.shape)
-        usable = frame.usable
-        compare(
-            frame.flux, usable, self._ring, self._filled, self._newest, self._sums,
+        some = compare(
+            frame.flux, frame.codes, self._ring, self._filled, self._newest, self._sums,
             LEAST_NOISE * noise_t, CERTAIN, self._ages,
         )  # fmt: skip
-        there = self._stamps[(self._newest + 1 - self._ages) % DEPTH]
-        self.age_s = np.where(self._ages > 0, (frame.stamp_ns - there) * NANO, 0.0)
+        before = self._newest
         self._newest = (self._newest + 1) % DEPTH
-        self._filled = min(self._filled + 1, DEPTH)
-        self._ring[self._newest] = np.where(usable[:, None], frame.flux, np.nan)
+        self._filled = min(self._filled + 1, DEPTH - 1)
+        if some:
+            then = self._stamps[(before + 1 - self._ages) % DEPTH]
+            self.age_s = np.where(self._ages > 0, (frame.stamp_ns - then) * NANO, 0.0)
         self._stamps[self._newest] = frame.stamp_ns
-        if not self._ages.any():
+        if not some:
             return frame
         return replace(frame, codes=np.where(self._ages > 0, STUCK_CODE, frame.codes))
 

@@ -28,6 +28,21 @@ GATE = float(chdtri(5, SELDOM))
 contradicts its body; 36, six sigma in one direction."""
 
 
+HARMFUL_M = 1e-3
+"""An error of a pose that does harm, m, where the pose's own sigma does not say it. Smaller, and
+good poses are lost to the survey's errors; larger, and who relies on a millimetre is misled."""
+SIGMAS = 3.0
+"""How many of its sigmas a pose may be away from where its body says. An error of a sound pose is
+that large once in 10^5 frames: sigma is that of all three directions together."""
+SURVEYS = 6.0
+"""How many times the stated error of the survey a coil may be away, if that is more."""
+
+
+def allowed_m(sigma_m: float, survey_m: float) -> float:
+    """How far, m, a coil may be from its place in the body by its own sigma and the survey's."""
+    return max(SIGMAS * sigma_m, HARMFUL_M, SURVEYS * survey_m)
+
+
 @dataclass(frozen=True)
 class SurveyErrors:
     """How well a tool is known: its coils' places, m an axis, their axes, rad, and their gains.
@@ -54,9 +69,11 @@ def _tangent(n, t):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, error_model='numpy')
 def fill_distances(  # type: ignore[no-untyped-def]
     position, rotation, covariance, offsets, axes, positions, directions, covariances, took_part,
-    survey, distances,
+    survey, found,
 ):  # fmt: skip
-    """Write the squared Mahalanobis distance of each coil from its place in the body, (S,).
+    """Write how far each coil is from its place in the body, ``found`` (3, S).
+
+    The rows are the squared Mahalanobis distance, the distance, m, and the angle, rad.
 
     ``position`` (3,), ``rotation`` (3, 3), ``covariance`` (6, 6): the body's. ``offsets``,
     ``axes`` (S, 3): the coils in the body. ``positions``, ``directions`` (S, 3), ``covariances``
@@ -91,7 +108,9 @@ def fill_distances(  # type: ignore[no-untyped-def]
             total[i, i] += survey[0] * survey[0] + radial * radial
         for i in range(3, 5):
             total[i, i] += survey[1] * survey[1]
-        distances[s] = np.dot(apart, np.linalg.solve(total, apart))
+        found[0, s] = np.dot(apart, np.linalg.solve(total, apart))
+        found[1, s] = math.sqrt(apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2)
+        found[2, s] = angle
 
 
 def distances(
@@ -102,7 +121,7 @@ def distances(
     took_part: NDArray[np.bool_],
     survey: SurveyErrors,
 ) -> Array:
-    """Squared Mahalanobis distance of each coil's own pose from its place in the body.
+    """How far each coil's own pose is from its place in the body.
 
     Parameters
     ----------
@@ -118,10 +137,11 @@ def distances(
 
     Returns
     -------
-    ndarray, shape (S,)
-        To be compared with `GATE`.
+    ndarray, shape (3, S)
+        The squared Mahalanobis distance, to be compared with `GATE`; the distance, m; the angle
+        between the axes, rad.
     """
-    found = np.empty(len(offsets))
+    found = np.empty((3, len(offsets)))
     told = np.array([survey.position_m, survey.axis_rad, survey.gain])
     fill_distances(*body, offsets, axes, *coils, took_part, told, found)
     return found

@@ -12,7 +12,6 @@ from anser_ros.tracking import estimate as states
 from anser_ros.tracking.body_descent import step_to_coils
 from anser_ros.tracking.coil_track import (
     MOST_STEPS,
-    SELDOM,
     SUSPICIOUS_JUMP_M,
     CoilResult,
     take_errors,
@@ -35,6 +34,10 @@ Start = tuple[Array, Array]
 
 DISAGREES = 4.0
 """A coil is left out when its share of the misfit is so many times the mean of the others'."""
+
+RARE = 0.01
+"""Probability of a body's residual beyond which it counts as more than noise. It is smaller than
+that of a coil, for a body's many degrees of freedom make much of a small excess."""
 
 LEFT_OUT_S = 1.0
 """How long a coil that disagreed stays out before it is tried again."""
@@ -280,7 +283,10 @@ def _judge(
     solution = fit.solution
     scale = 1.0
     if settings.adaptive:
-        scale = track.noise.of_frame(fit.ratio, chi2_limit(fit.freedom, SELDOM) / fit.freedom)
+        usual = chi2_limit(fit.freedom, RARE) / fit.freedom
+        scale = track.noise.of_frame(
+            fit.ratio, usual, fit.freedom / 6, context.model_share, context.modes is not None
+        )
     covariance = scale * bounded_inverse(solution.information)
     sigma = math.sqrt(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
     centre = solution.position + solution.rotation @ coils.subset(fit.used).offsets.mean(axis=0)

@@ -341,7 +341,11 @@ def _judge(
     ratio = solution.chi2 / freedom
     scale = 1.0
     if settings.adaptive:
-        scale = track.noise.of_frame(ratio, chi2_limit(freedom, SELDOM) / freedom)
+        usual = chi2_limit(freedom, SELDOM) / freedom
+        context = frame.context
+        scale = track.noise.of_frame(
+            ratio, usual, freedom / 5, context.model_share, context.modes is not None
+        )
     covariance = scale * coil_covariance(
         solution.normal, solution.axis, settings.roll_variance / scale
     )

@@ -40,11 +40,12 @@ and poses are lost to the model's own small errors; larger, and distorted poses 
 NO_GATE = 1e6
 """A gate of so much or more is none: no pose is refused for what it contradicts."""
 
-HIDDEN = 4.0
-"""How much more of a distortion's power goes into the pose than its share of the dimensions.
-
-A smooth distortion looks more like a pose than like anything else.
-"""
+HIDDEN = 20.0 / 11.0
+"""Power of a distortion that goes into the pose over the power that stays in the residual. A
+smooth distortion looks more like a pose than like anything else: of a coil with eight emitters the
+five dimensions of the pose get four times what each of the eleven others gets. Smaller, and
+distorted poses say that they are certain; larger, and slight misfits widen poses that are
+right."""
 
 
 @dataclass(frozen=True)
@@ -180,6 +181,14 @@ class PoseEstimate:
     model_id: str
     reason: str = ''
 
+    def with_sigma(self, sigma_position_m: float) -> 'PoseEstimate':
+        """The same estimate with another sigma of the position."""
+        return PoseEstimate(
+            self.name, self.stamp_ns, self.state, self.position, self.axis, self.rotation,
+            self.covariance, sigma_position_m, self.residual_t, self.chi2, self.model_id,
+            self.reason,
+        )  # fmt: skip
+
 
 def no_pose(name: str, stamp_ns: int, state: str, model_id: str, reason: str) -> PoseEstimate:
     """An estimate without a pose: all figures NaN."""
@@ -213,11 +222,31 @@ class NoiseScale:
         self._weight = keep * self._weight + 1.0
         self._sum = keep * self._sum + min(ratio, 4.0 * self.value)
 
-    def of_frame(self, ratio: float, usual: float) -> float:
+    def of_frame(
+        self, ratio: float, usual: float, share: float, model_share: float, follows: bool
+    ) -> float:
         """Variance scale of one frame: the running one, more when the frame's residual asks for
         it.
 
-        ``usual`` is the ratio that noise of the expected size seldom exceeds. A residual above
-        what is usual for this sensor comes from a bent field.
+        Parameters
+        ----------
+        ratio : float
+            Residual power of the frame per degree of freedom, in units of the expected one.
+        usual : float
+            The ratio that noise of the expected size seldom exceeds. A residual above what is
+            usual for this sensor comes from a bent field.
+        share : float
+            Degrees of freedom for each dimension of the pose: what stays in the former of a bent
+            field tells, as a power, what goes into the latter.
+        model_share : float
+            Part of the expected residual that is the model's own error. It bends the field as
+            metal does, and as much of it goes into the pose, however many readings there are.
+        follows : bool
+            Whether the model states its error by modes. Then no small residual takes that error
+            off the pose, and no persistent misfit is taken for noise.
         """
-        return self.value + HIDDEN * max(0.0, ratio - usual * self.value)
+        hidden = HIDDEN * share
+        scale = max(self.value, 1.0) if follows else self.value
+        scale *= 1.0 + model_share * max(hidden - 1.0, 0.0)
+        expected = min(self.value, 1.0) if follows else self.value
+        return scale + hidden * max(0.0, ratio - usual * expected)

@@ -21,7 +21,7 @@ from anser_ros.tracking.body_track import BodyResult
 from anser_ros.tracking.coil_track import CoilResult
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings
 from anser_ros.tracking.rigid import BodyCoils
-from anser_ros.tracking.rotations import rotation_between
+from anser_ros.tracking.uncertainty import add_motion
 
 Array = NDArray[np.float64]
 Estimates = list[PoseEstimate]
@@ -81,7 +81,8 @@ class Judgement:
         """The estimate, or why it is not given out: its own past, or that of the whole model."""
         place = None
         if estimate.state == states.OK:
-            place = Place(estimate.stamp_ns, estimate.position, estimate.sigma_position_m)
+            where = estimate.position.tolist()
+            place = Place(estimate.stamp_ns, where, estimate.sigma_position_m)
         continuity = self._continuity.setdefault(estimate.name, Continuity())
         tools = settings.tools
         bounds = MotionBounds(tools.max_speed_m_s, tools.max_acceleration_m_s2)
@@ -102,16 +103,15 @@ class Judgement:
         seconds = (estimate.stamp_ns - last.stamp_ns) * NANO
         if not 0.0 < seconds <= settings.warm_age_s:
             return estimate
-        move = np.empty(6)
-        move[:3] = estimate.position - last.position
-        if estimate.rotation is not None and last.rotation is not None:
-            move[3:] = rotation_between(last.rotation, estimate.rotation)
-        else:
-            move[3:] = np.cross(last.axis, estimate.axis)
-        move *= settings.stamp_sigma_s / seconds
-        covariance = estimate.covariance + np.outer(move, move)
-        sigma = math.sqrt(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
-        return replace(estimate, covariance=covariance, sigma_position_m=sigma)
+        before, after = last.rotation, estimate.rotation
+        if before is None or after is None:
+            before, after = last.axis[:, None], estimate.axis[:, None]
+        # The estimate's own matrix is nobody else's.
+        sigma = add_motion(
+            estimate.covariance, last.position, estimate.position, before, after,
+            settings.stamp_sigma_s / seconds,
+        )  # fmt: skip
+        return estimate.with_sigma(sigma)
 
 
 def _judge_coils(found: Estimates, body: RigidBody, settings: TrackerSettings) -> None:
@@ -129,24 +129,23 @@ def _judge_coils(found: Estimates, body: RigidBody, settings: TrackerSettings) -
         return
     if fit is None or estimate.state not in (states.OK, states.OUTSIDE_VOLUME) or not members:
         return
-    own = [found[body.rows[i]] for i in members]
+    rows = body.rows[members].tolist()
+    own = [found[row] for row in rows]
+    used = set(fit.used.tolist())
     coils = body.coils.subset(np.array(members))
     tools = settings.tools
-    took_part = np.isin(members, fit.used)
-    places = np.array([e.position for e in own])
-    axes = np.array([e.axis for e in own])
-    distances = rigidity.distances(
+    away = rigidity.distances(
         (estimate.position, fit.solution.rotation, estimate.covariance),
         coils.offsets, coils.axes,
-        (places, axes, np.array([e.covariance for e in own])),
-        took_part,
+        (
+            np.array([e.position for e in own]), np.array([e.axis for e in own]),
+            np.array([e.covariance for e in own]),
+        ),
+        np.array([i in used for i in members]),
         SurveyErrors(tools.tool_position_m, tools.tool_axis_rad, tools.tool_gain),
     )  # fmt: skip
-    for i in np.flatnonzero(~(distances <= rigidity.GATE)).tolist():
-        turned = fit.solution.rotation @ coils.axes[i]
-        expected = estimate.position + fit.solution.rotation @ coils.offsets[i]
-        sine = float(np.linalg.norm(np.cross(turned, axes[i])))
-        angle = math.atan2(sine, float(turned @ axes[i]))
-        reason = rigidity.reason(float(distances[i]), math.dist(expected, places[i]), angle)
-        row = int(body.rows[members[i]])
-        found[row] = replace(own[i], state=states.INCONSISTENT, reason=reason)
+    for row, one, (distance, away_m, angle) in zip(rows, own, away.T.tolist(), strict=True):
+        allowed_m = rigidity.allowed_m(one.sigma_position_m, tools.tool_position_m)
+        if not (distance <= rigidity.GATE and away_m <= allowed_m):
+            reason = rigidity.reason(distance, away_m, angle)
+            found[row] = replace(one, state=states.INCONSISTENT, reason=reason)

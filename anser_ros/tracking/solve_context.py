@@ -148,6 +148,8 @@ class SolveContext:
     low, high : ndarray, shape (3,)
         Box of the solver, m.
     model_id : str
+    model_share : float
+        Part of the expected residual's power that is the model's own error, the modes aside.
     """
 
     field: RealField
@@ -157,6 +159,7 @@ class SolveContext:
     low: Array
     high: Array
     model_id: str
+    model_share: float
 
     @property
     def grid(self) -> SeedGrid:
@@ -228,4 +231,5 @@ def build_context(
         starts.grid(field, sigma)  # the first frame needs it
     else:
         starts = previous.starts.following()
-    return SolveContext(field, sigma, modes, starts, low, high, name)
+    share = 1.0 - settings.flux_noise_t**2 / variance
+    return SolveContext(field, sigma, modes, starts, low, high, name, share)

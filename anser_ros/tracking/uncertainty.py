@@ -83,3 +83,38 @@ def coil_covariance(normal, axis, roll_variance):  # type: ignore[no-untyped-def
         for j in range(3):
             covariance[3 + i, 3 + j] += roll_variance * axis[i] * axis[j]
     return covariance
+
+
+@numba.njit(cache=True, error_model='numpy')
+def add_motion(covariance, position, next_position, axes, next_axes, share):  # type: ignore[no-untyped-def]
+    """Add to a pose's covariance (6, 6), in place, a part of its last motion as an error.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (6, 6)
+        Of position and rotation vector, fg.
+    position, next_position : ndarray, shape (3,)
+        m.
+    axes, next_axes : ndarray, shape (3, 3) or (3, 1)
+        All axes of a body, or that of a coil, in columns.
+    share : float
+        Standard deviation of the error in units of the motion.
+
+    Returns
+    -------
+    float
+        Square root of the trace of the position's covariance, m.
+    """
+    move = np.zeros(6)
+    # Each axis n turns by w x n; the sum of n x (w x n) over three axes is 2 w, over one it is w.
+    part = share / (2.0 if axes.shape[1] == 3 else 1.0)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        move[i] = share * (next_position[i] - position[i])
+        for c in range(axes.shape[1]):
+            turn = axes[j, c] * next_axes[k, c] - axes[k, c] * next_axes[j, c]
+            move[3 + i] += part * turn
+    for i in range(6):
+        for j in range(6):
+            covariance[i, j] += move[i] * move[j]
+    return math.sqrt(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
