@@ -10,14 +10,19 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from tracking_world import triaxial_tool
 
-from anser_ros.errors import AnserError
+from anser_ros.effects.correction import Correction
+from anser_ros.effects.registry import all_effects
+from anser_ros.errors import AnserError, ModelFileError
+from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.frame_reader import FrameReader
 from anser_ros.wire.setup import parse_setup
 
 CORPUS = Path(__file__).resolve().parent / 'corpus'
+SENSORS = triaxial_tool()
 LONGEST_S = 1.0
 """Longest processor time, s, that any of these small files may take."""
 SOME = settings(
@@ -106,6 +111,17 @@ def test_models(path, tmp_path):
     harmless(lambda: read_model(path.read_bytes(), tmp_path))
 
 
+@pytest.mark.filterwarnings('ignore:Mean of empty slice')
+@pytest.mark.parametrize('name', sorted(all_effects()))
+@pytest.mark.parametrize('value', ['words', None, -1, [[]], 1e400, {}])
+def test_effects_with_parameters_that_make_no_sense(name, value):
+    """A file may hold anything; a term that could be made of it is at least one."""
+    keys = ('channel', 'channels', 'coil', 'coils', 'gain', 'offset_m', 'read_as', 'matrix')
+    for parameters in ({}, dict.fromkeys(keys, value)):
+        record = EffectRecord(name, parameters)
+        harmless(lambda record=record: Correction.of((record,), SENSORS, (1e3, 2e3)))
+
+
 @pytest.mark.parametrize('path', files('bags'), ids=lambda path: path.stem)
 def test_bags(path, tmp_path):
     harmless(lambda: read_session(path.read_bytes(), tmp_path))
@@ -163,3 +179,12 @@ def test_whatever_a_client_says_to_openigtlink():
                 assert heard(client, server) == b'pose', path
     finally:
         server.close()
+
+
+def test_an_effect_that_is_none_is_named():
+    for parameters, words in (
+        ({'coil': 'coil3', 'gain': 1.0, 'phase_deg': 0.0}, 'effect coil_gain: no term'),
+        ({'coil': 0, 'gain': float('nan'), 'phase_deg': 0.0}, 'effect coil_gain'),
+    ):
+        with pytest.raises(ModelFileError, match=words):
+            Correction.of((EffectRecord('coil_gain', parameters),), SENSORS, (1e3, 2e3))

@@ -7,13 +7,15 @@ already, and what can't be corrected is passed over.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Remedy
+from anser_ros.effects.effect import Effect, Remedy
 from anser_ros.effects.registry import effect_named
 from anser_ros.effects.term import Term
+from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
@@ -36,6 +38,20 @@ def drifts(record: EffectRecord) -> bool:
         When no effect has the record's name.
     """
     return effect_named(record.name).drifts
+
+
+def _term(effect: Effect[Any], record: EffectRecord) -> Term:
+    """The term of a record from a file, where anything may stand as a parameter."""
+    try:
+        with np.errstate(invalid='raise', divide='raise'):
+            term: Term = effect.term(record)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise ModelFileError(
+            f'effect {record.name}: no term in its parameters ({type(error).__name__}: {error})'
+        ) from error
+    if not np.isfinite(np.asarray(term.theta, dtype=np.float64)).all():
+        raise ModelFileError(f'effect {record.name}: its parameters are not finite')
+    return term
 
 
 @dataclass(frozen=True)
@@ -63,7 +79,7 @@ class Correction:
         for record in records:
             effect = effect_named(record.name)
             if effect.remedy in (Remedy.FLUX, Remedy.SENSORS, Remedy.OPTICAL):
-                corrected.append(effect.term(record))
+                corrected.append(_term(effect, record))
         omega = 2 * np.pi * np.asarray(frequencies, dtype=np.float64)
         return Correction(tuple(corrected), sensors, omega)
 

@@ -162,6 +162,14 @@ class Line:
                 self._pass(came)
             if not came and self._unit is not None:
                 select.select([self._unit], [], [], IDLE_S)
+                self._leave_a_stranger()
+
+    def _leave_a_stranger(self) -> None:
+        """Close a port that is no longer the unit's: the system gives a dead one's name away."""
+        with contextlib.suppress(OSError):
+            if os.readlink(self._unit_link) != os.ttyname(self._unit):
+                os.close(self._unit)
+                self._unit = None
 
     def _open(self) -> bool:
         try:
