@@ -89,6 +89,17 @@ def test_a_random_combination_is_the_same_for_the_same_seed():
     assert all(2 <= len(set(some)) <= 3 for some in names)
 
 
+def test_what_a_busy_machine_hides_is_no_pass():
+    from table import Row
+
+    good = Row('g', 'n', 'what', 'said', 0.1, 400, 0, None, None, 0.5)
+    assert good.verdict(1.0) == 'ok'
+    assert replace(good, skipped=900).verdict(1.0) == 'BUSY'
+    assert replace(good, skipped=900, wrong=1).verdict(1.0) == 'FAILED'
+    for change in ({'back_s': None}, {'back_s': 1.5}, {'wrong': 1}, {'crashed': ('node',)}):
+        assert replace(good, **change).verdict(1.0) == 'FAILED'
+
+
 def test_growth_is_a_trend_and_no_step():
     from soak import Series
 

@@ -6,6 +6,8 @@ from itertools import groupby
 from pathlib import Path
 
 BEGIN, END = '<!-- chaos: begin -->', '<!-- chaos: end -->'
+ALLOWED_S = 1.0
+"""Time within which poses have to be back after a fault has gone, s."""
 WORDS = 90
 """Characters of a state's words that the table shows."""
 
@@ -47,10 +49,21 @@ class Row:
     crashed: tuple[str, ...] = ()
     skipped: int = 0
 
+    @property
+    def is_judged(self) -> bool:
+        """Whether the machine kept up well enough for this to say something."""
+        return self.skipped <= self.poses
+
     def failed(self, allowed_s: float) -> bool:
-        """Return whether this must not be."""
-        late = self.back_s is None or self.back_s > allowed_s
+        """Return whether this must not be; how soon poses are back says nothing if it is busy."""
+        late = self.back_s is None or (self.is_judged and self.back_s > allowed_s)
         return bool(self.wrong or self.crashed or late)
+
+    def verdict(self, allowed_s: float) -> str:
+        """Return the verdict in a word."""
+        if self.failed(allowed_s):
+            return 'FAILED'
+        return 'ok' if self.is_judged else 'BUSY'
 
 
 def _worst(row: Row) -> str:
@@ -68,7 +81,7 @@ def _seconds(value: float | None, otherwise: str) -> str:
 def line(row: Row) -> str:
     """Return a row as one line."""
     parts = [
-        f'{"FAILED" if row.failed(1.0) else "ok":6} {row.name:24}',
+        f'{row.verdict(ALLOWED_S):6} {row.name:24}',
         f'wrong {row.wrong}/{row.poses} {_worst(row)}',
         f'said after {_seconds(row.detected_s, "-")} s: {row.said[:WORDS] or "nothing"}',
         f'back after {_seconds(row.back_s, "NEVER")} s',
@@ -94,7 +107,8 @@ def write_docs(path: Path, rows: Sequence[Row], seed: int, rate_hz: float) -> No
         ]
         for row in some:
             said = row.said.replace('|', '/').replace('<', '&lt;')[:WORDS] or 'nothing'
-            wrong = f'{row.wrong} of {row.poses}' + (f', {_worst(row)}' if row.wrong else '')
+            wrong = f'{row.wrong} of {row.poses}' if row.is_judged else 'machine too busy'
+            wrong += f', {_worst(row)}' if row.wrong else ''
             out.append(
                 f'| {row.what} | {said} | {_seconds(row.detected_s, "-")} | {wrong} '
                 f'| {_seconds(row.back_s, "never")} |'
