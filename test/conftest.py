@@ -70,7 +70,7 @@ def pytest_itemcollected(item: pytest.Item) -> None:
     if _has_nodes(item):
         item.add_marker('processes')
     if 'PYTEST_XDIST_WORKER' in os.environ:
-        group = 'nodes' if _has_nodes(item) else item.path.stem
+        group = 'nodes' if _has_nodes(item) else _room(item)
         item.add_marker(pytest.mark.xdist_group(group))
 
 
@@ -118,6 +118,12 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 def _has_nodes(item: pytest.Item) -> bool:
     return 'domain' in getattr(item, 'fixturenames', ())
+
+
+def _room(item: pytest.Item) -> str:
+    """Return the file, or what all files have that share the tables of a refit."""
+    shares = 'shared_tables' in getattr(item, 'fixturenames', ())
+    return 'shared_tables' if shares else item.path.stem
 
 
 def _has_processes(item: pytest.Item) -> bool:
