@@ -435,6 +435,9 @@ def test_the_gate_may_change_while_it_runs(tracker):
     results = tracker.node.set_parameters([Parameter('gate', value=7.5)])
     assert results[0].successful
     assert tracker.node._tracker.settings.gate == 7.5
+    assert tracker.node.status().level == 0
+    tracker.node.set_parameters([Parameter('gate', value=1e6)])
+    assert tracker.node.status().level == 1 and 'gate of 1e+06' in tracker.node.status().message
     assert not tracker.node.set_parameters([Parameter('gate', value=-1.0)])[0].successful
     assert not tracker.node.set_parameters([Parameter('publish_tf', value=False)])[0].successful
 

@@ -34,7 +34,7 @@ from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.starting_model import NOMINAL, check_emitters
 from anser_ros.sessions.tracker_settings import settings_for
-from anser_ros.tracking.estimate import OK, TrackerSettings
+from anser_ros.tracking.estimate import OK, USUAL_GATE, TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 from anser_ros.tracking.warm_up import warm_up
 from anser_ros.wire.points import FluxPoints
@@ -46,6 +46,9 @@ flickers from frame to frame must not flood the topic."""
 WAIT_PERIOD_S = 0.02
 """How often, s, frames that wait for a model are looked at beside the arrival of models: a part of
 the parameter ``model_wait_s``, which it makes inexact by as much."""
+WIDE_GATE = 2.0 * USUAL_GATE
+"""A gate that is wider than this is warned of. Smaller, and who has a rough model is warned for
+nothing; larger, and a gate that was opened for a trial stays open unseen."""
 LIVE_WITHIN_S = 60.0
 """Fluxes whose stamps are further from the host's clock, s, are a recording's. Larger than any
 clock's error between two hosts that work together, smaller than the age of any recording."""
@@ -384,6 +387,11 @@ class TrackerNode(AnserNode):
         trouble = self._trouble.recent(time.monotonic())
         if trouble:
             return Status('', Level.WARN, f'{tracked}; lately: {trouble}', values)
+        gate = tracker.settings.gate
+        if gate > WIDE_GATE:
+            return Status(
+                '', Level.WARN, f'{tracked}; a gate of {gate:g} lets wrong poses out', values
+            )
         return Status('', Level.OK, tracked, values)
 
     def _ready_for(self) -> str:
