@@ -52,9 +52,9 @@ from anser_ros.wire.setup import Setup, dump_setup, parse_setup
 from anser_ros.wire.stream_control import StreamControl
 
 AUTO = 'auto'
-ASK_NS = 200_000_000
-"""Time (0.2 s) from one question to the device about its time to the next, while its answer would
-help. Each costs it a hello of some hundred bytes."""
+ASK_NS = 50_000_000
+"""Time (50 ms) from one question to the device about its time to the next, while its answer would
+help: windows wait for it. Each costs the device a hello of some hundred bytes."""
 MANY_BLOCKS = 8
 """Blocks still wanted by a window, above which the node is woken one block early, so that what
 takes most of the time is done when the last block arrives."""

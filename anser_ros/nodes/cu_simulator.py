@@ -196,7 +196,8 @@ class CuSimulator(AnserNode):
         due = []
         while self._prepared and self._due_s(self._prepared[0].end_sample) <= now_s:
             due.append(self._prepared.popleft())
-        self._send([*answers, *due], now_s)
+        # An answer follows the blocks that were complete before it: the host dates them by it.
+        self._send([*due, *answers], now_s)
         if due and due[-1].is_block:
             taken_s = due[-1].end_sample / unit.sample_rate_hz
             delay_ns = round(1e9 * self._delay_s)  # a simulated one is not the machine's

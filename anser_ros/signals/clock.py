@@ -13,8 +13,14 @@ LARGEST_LATENESS_S = 4e-3
 It bounds what a stamp may be wrong by when the device lost time that it did not count: 5 ms less
 what the line itself is uncertain by. Smaller, a busy host confirms nothing for long."""
 _SETTLE_NS = 200_000_000
-"""Time (0.2 s) that a new line must stand, where no answer of the device bounds it. Bytes that had
+"""Time (0.2 s) that a new line must stand where no answer of the device bounds it. Bytes that had
 piled up are worked off faster than new ones come, and push the line down meanwhile."""
+_SETTLE_UNPROVEN_NS = 3_000_000_000
+"""The same (3 s) where answers bound it only loosely, as from a device that is slow to answer. All
+of the time arrivals must be in time, so that a line that a busy host makes late is none."""
+_REFUTED_NS = 1_000_000.0
+"""By how much (1 ms) an answer must show a line to be too early to refute it: what the line itself
+is uncertain by. More lets a device lose so much time unseen."""
 _SETTLED_NS = 1_000_000.0
 """Fall of a new line (1 ms) that begins the time anew; less is how arrivals scatter."""
 _ANSWER_S = 0.15
@@ -23,8 +29,11 @@ and the line the rest. If it takes longer, the line itself is late."""
 _ANSWER_HOLDS_NS = 60e9
 """Device time (60 s) after which an answer says nothing any more: two clocks may have drifted
 apart by 6 ms, more than a stamp may be wrong by."""
-_DOUBT_NS = 100_000_000
-"""Time (0.1 s) without a confirmation, while blocks arrive, from which on the device is asked. A
+_FALSE_ANSWERS = 3
+"""Answers that arrivals have contradicted, after which none is asked for any more: the device
+answers before it has sent the samples that it has."""
+_DOUBT_NS = 30_000_000
+"""Time (30 ms) without a confirmation, while blocks arrive, from which on the device is asked. A
 stall of the host ends with a burst that confirms the line at once."""
 _GIVE_UP_NS = 10_000_000_000
 """Time (10 s) of unchanged lateness after which a device that does not answer is believed to have
@@ -55,9 +64,9 @@ class SampleClock:
     It is estimated by `Envelope`. What could break it is looked for in each arrival:
 
     - one that comes earlier than it could refutes the line, and a new one begins;
-    - while arrivals come later than `LARGEST_LATENESS_S` all of them, either the line to the host
-      is late or the device lost time. No stamp is good then, until an arrival is in time again,
-      or an answer of the device (`bound`) shows that time was lost.
+    - while all arrivals come later than `LARGEST_LATENESS_S`, either the line to the host is late
+      or the device lost time. No stamp is good then, until an arrival is in time again, or an
+      answer of the device (`bound`) shows which of the two it is.
 
     Parameters
     ----------
@@ -69,7 +78,8 @@ class SampleClock:
     jumps : int
         How often the line was begun anew because it was refuted.
     confirmed : float
-        Number of the newest sample that an arrival in time has confirmed; -inf before.
+        Number of the newest sample that an arrival in time, or an answer, has confirmed; -inf
+        before.
     """
 
     def __init__(self, sample_rate_hz: float) -> None:
@@ -80,6 +90,8 @@ class SampleClock:
     def restart(self) -> None:
         """Begin a new stream of samples, with numbers that have nothing to do with the last."""
         self._lower: tuple[float, float] | None = None
+        self._false_answers = 0
+        self._quickest_ns = math.inf
         self._begin_anew()
 
     def _begin_anew(self) -> None:
@@ -90,8 +102,8 @@ class SampleClock:
         self._earliest: deque[tuple[int, float]] = deque(maxlen=_BUCKETS)
         self._late_from_ns: int | None = None
         self._newest_ns = 0
-        self._newest_offset = 0.0
-        self._is_line_late = False
+        self._newest_offset = self._newest_sample = 0.0
+        self._unexplained_from_ns = 0
 
     def observe(self, sample: float, arrival_ns: int) -> None:
         """Take in the arrival of a block.
@@ -116,6 +128,8 @@ class SampleClock:
             self._line = Envelope(time_ns, offset)
             self._stands = arrival_ns, offset
         self._newest_ns, self._newest_offset = arrival_ns, offset
+        self._newest_sample = sample
+        self._contradict(time_ns, offset)
         self._note_lateness(late, arrival_ns)
         if late > 1e9 * LARGEST_LATENESS_S and self._settled:
             self._doubt(arrival_ns)
@@ -129,6 +143,9 @@ class SampleClock:
     def bound(self, sample: float, sent_ns: int) -> None:
         """Take in that a sample was not yet taken when a command was sent that is now answered.
 
+        The answer has taken the same way as the samples: where they come late because the line is,
+        it does too, and where the device lost time, it is quick and shows that.
+
         Parameters
         ----------
         sample : float
@@ -136,20 +153,29 @@ class SampleClock:
         sent_ns : int
             Host time before the command left, ns, monotonic.
         """
+        if self._false_answers >= _FALSE_ANSWERS:
+            return
         time_ns = sample * self._ns_per_sample
-        known = self._lower_offset(time_ns)
-        lower = max(sent_ns - time_ns, known) if known is not None else sent_ns - time_ns
-        self._lower = time_ns, lower
-        # The answer came with the newest block, and took as long as that is above the bound.
-        self._is_line_late = self._newest_offset - lower > 1e9 * _ANSWER_S
+        lower, known = sent_ns - time_ns, self._lower_offset(time_ns)
+        if known is None or lower > known:
+            self._lower = time_ns, lower
         if self._line is None:
             return
-        if lower > self._line.offset_at(time_ns) + 1e9 * LARGEST_LATENESS_S:
-            if self._settled:
-                self.jumps += 1
+        # The answer came with the newest block, and took as long as that is above the bound.
+        took_ns = self._newest_offset - lower
+        self._quickest_ns = min(self._quickest_ns, took_ns)
+        if took_ns > 1e9 * _ANSWER_S:
+            self._unexplained_from_ns = self._newest_ns
+        is_refuted = lower > self._line.offset_at(time_ns) + _REFUTED_NS
+        if is_refuted and (self.is_doubted or not self._settled):
+            self.jumps += self._settled
             self._begin_anew()
-        elif not self._settled and self._newest_ns:
+        elif is_refuted:
+            return
+        elif not self._settled:
             self._settle(time_ns, self._newest_ns)
+        elif self._quickest_ns < 1e9 * LARGEST_LATENESS_S:
+            self.confirmed = self._newest_sample
 
     def _lower_offset(self, time_ns: float) -> float | None:
         """Least offset, ns, that the line can have at a time, by the last answer."""
@@ -159,6 +185,13 @@ class SampleClock:
         if abs(time_ns - at) > _ANSWER_HOLDS_NS:
             return None
         return lower - FOLLOWED_SHARE * abs(time_ns - at)
+
+    def _contradict(self, time_ns: float, offset: float) -> None:
+        """Drop an answer that an arrival shows to be false: it is earlier than it could be."""
+        lower = self._lower_offset(time_ns)
+        if lower is not None and offset < lower - _SETTLED_NS:
+            self._lower = None
+            self._false_answers += 1
 
     def _slack_ns(self, time_ns: float) -> float | None:
         """How far the line lies above the least that it can be, ns; None without an answer."""
@@ -174,18 +207,22 @@ class SampleClock:
         offset = self._line.offset_at(time_ns)
         since, stood = self._stands
         if offset < stood - _SETTLED_NS:
-            self._stands = arrival_ns, offset
-        elif slack is None or slack < 1e9 * _ANSWER_S:
+            self._stands = since, stood = arrival_ns, offset
+        if slack is None:
             self._settled = arrival_ns - since > _SETTLE_NS
-        if slack is not None and slack < 1e9 * LARGEST_LATENESS_S:
+        elif slack < 1e9 * LARGEST_LATENESS_S:
             self._settled = True
+        elif slack > 1e9 * _ANSWER_S or max(late for _, late in self._earliest) > _SETTLED_NS:
+            self._stands = arrival_ns, offset
+        else:
+            self._settled = arrival_ns - since > _SETTLE_UNPROVEN_NS
 
     def _doubt(self, arrival_ns: int) -> None:
         """Note an arrival that is late."""
         if self._late_from_ns is None:
             self._late_from_ns = arrival_ns
-            self._is_line_late = False
-        elif arrival_ns - self._late_from_ns > _GIVE_UP_NS and not self._is_line_late:
+            self._unexplained_from_ns = arrival_ns
+        elif arrival_ns - self._unexplained_from_ns > _GIVE_UP_NS:
             self.jumps += 1
             self._begin_anew()
 
@@ -199,12 +236,15 @@ class SampleClock:
     @property
     def wants_answer(self) -> bool:
         """Whether an answer of the device would help: the line is new, or late for a while."""
-        if self._line is None:
+        if self._line is None or self._false_answers >= _FALSE_ANSWERS:
             return False
+        return not self._settled or self.is_doubted
+
+    @property
+    def is_doubted(self) -> bool:
+        """Whether all blocks have been late for so long that no stall of the host explains it."""
         late_from = self._late_from_ns
-        return not self._settled or (
-            late_from is not None and self._newest_ns - late_from > _DOUBT_NS
-        )
+        return late_from is not None and self._newest_ns - late_from > _DOUBT_NS
 
     @property
     def state(self) -> ClockState:
@@ -223,7 +263,7 @@ class SampleClock:
         """Standard deviation of a confirmed stamp, s; infinite while the line is not settled."""
         if not self._settled:
             return math.inf
-        return math.hypot(_FLOOR_S, self.lateness_s)
+        return math.hypot(_FLOOR_S, min(self.lateness_s, LARGEST_LATENESS_S))
 
     def is_good(self, sample: float) -> bool:
         """Whether the host time of a sample is known to 5 ms."""

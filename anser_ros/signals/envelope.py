@@ -30,7 +30,7 @@ class Envelope:
     of the last minute, of the lower convex hull of the earliest arrivals (Moon, Skelly and
     Towsley, "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999).
     A busy host on which nothing arrives early for a while thus does not move it. At first the line
-    rises by `FOLLOWED_SHARE`; a slope that is still uncertain is shrunk towards zero.
+    is level; a slope that is still uncertain is shrunk towards zero.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class Envelope:
     """
 
     def __init__(self, time_ns: float, offset_ns: float) -> None:
-        self._slope = FOLLOWED_SHARE
+        self._slope = 0.0
         self._offset_ns, self.newest_ns = offset_ns, time_ns
         self._earliest: deque[tuple[float, float]] = deque([(time_ns, offset_ns)], maxlen=_MEMORY)
         self._stretch_end_ns = time_ns + _STRETCH_NS
