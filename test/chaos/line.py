@@ -165,11 +165,14 @@ class Line:
                 self._leave_a_stranger()
 
     def _leave_a_stranger(self) -> None:
-        """Close a port that is no longer the unit's: the system gives a dead one's name away."""
-        with contextlib.suppress(OSError):
-            if os.readlink(self._unit_link) != os.ttyname(self._unit):
-                os.close(self._unit)
-                self._unit = None
+        """Close a port whose unit has gone: it reads as empty, and its name is given away."""
+        try:
+            is_ours = os.readlink(self._unit_link) == os.ttyname(self._unit)
+        except OSError:
+            is_ours = False
+        if not is_ours:
+            os.close(self._unit)
+            self._unit = None
 
     def _open(self) -> bool:
         try:
