@@ -128,7 +128,9 @@ class TestWatch:
 
     def test_a_tool_at_rest_shows_that_but_not_what(self, moving, watch):
         tool = moving.tool
-        still = replace(tool, flux=np.broadcast_to(tool.flux[:1], tool.flux.shape))
+        # At rest, not stuck: each frame has noise of its own.
+        noise = np.random.default_rng(3).normal(scale=60e-12, size=(2, *tool.flux.shape))
+        still = replace(tool, flux=tool.flux[:1] + noise[0] + 1j * noise[1])
         at_rest = replace(moving, optical={}, tool=still)
         window = filled(at_rest, gain=0.9, optical=False)
         seen = watch.look(window.session(), window.first_ns)
