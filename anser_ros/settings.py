@@ -118,11 +118,11 @@ class ToolSettings:
 
     Attributes
     ----------
-    tool_position_m, tool_axis_rad : float
+    tool_coil_position_m, tool_coil_axis_rad : float
         Error of a tool coil's place along each axis, m, and of its direction along both tangents,
         rad: one standard deviation. Too small, and sound coils contradict their body; too large,
         and a coil may be wrong by some times this before its body notices.
-    tool_gain : float
+    tool_coil_gain : float
         Relative error of a tool coil's gain, one standard deviation.
     max_speed_m_s, max_acceleration_m_s2 : float
         Poses that would take more are not published until the frames after them confirm them. The
@@ -130,13 +130,13 @@ class ToolSettings:
         small, and fast movements lose frames; too large, and wrong poses look like movements.
     """
 
-    tool_position_m: float = _value(
+    tool_coil_position_m: float = _value(
         0.12e-3, "error of a tool coil's place along each axis, m", 0.0, 0.1
     )
-    tool_axis_rad: float = _value(
+    tool_coil_axis_rad: float = _value(
         math.radians(0.5), "error of a tool coil's axis, rad a tangent", 0.0, 1.0
     )
-    tool_gain: float = _value(0.002, "relative error of a tool coil's gain", 0.0, 1.0)
+    tool_coil_gain: float = _value(0.002, "relative error of a tool coil's gain", 0.0, 1.0)
     max_speed_m_s: float = _value(2.0, 'largest speed of a tool, m/s', 1e-3, 1e4)
     max_acceleration_m_s2: float = _value(40.0, 'largest acceleration of a tool, m/s^2', 1e-3, 1e6)
 

@@ -63,9 +63,9 @@ OTHER = {
     'references_age_s': 2.0,
     'error_modes': 5,
     'seed': 9,
-    'tool_position_m': 1e-3,
-    'tool_axis_rad': 0.05,
-    'tool_gain': 0.02,
+    'tool_coil_position_m': 1e-3,
+    'tool_coil_axis_rad': 0.05,
+    'tool_coil_gain': 0.02,
     'max_speed_m_s': 0.5,
     'max_acceleration_m_s2': 5.0,
 }

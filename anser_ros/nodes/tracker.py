@@ -66,9 +66,9 @@ class TrackerParameters:
     flux_noise_t: float = stated('flux_noise_t')
     stamp_sigma_s: float = stated('stamp_sigma_s')
     references_age_s: float = stated('references_age_s')
-    tool_position_m: float = stated('tool_position_m')
-    tool_axis_rad: float = stated('tool_axis_rad')
-    tool_gain: float = stated('tool_gain')
+    tool_coil_position_m: float = stated('tool_coil_position_m')
+    tool_coil_axis_rad: float = stated('tool_coil_axis_rad')
+    tool_coil_gain: float = stated('tool_coil_gain')
     max_speed_m_s: float = stated('max_speed_m_s')
     max_acceleration_m_s2: float = stated('max_acceleration_m_s2')
     adaptive: bool = parameter(

@@ -142,10 +142,10 @@ def _judge_coils(found: Estimates, body: RigidBody, settings: TrackerSettings) -
             np.array([e.covariance for e in own]),
         ),
         np.array([i in used for i in members]),
-        SurveyErrors(tools.tool_position_m, tools.tool_axis_rad, tools.tool_gain),
+        SurveyErrors(tools.tool_coil_position_m, tools.tool_coil_axis_rad, tools.tool_coil_gain),
     )  # fmt: skip
     for row, one, (distance, away_m, angle) in zip(rows, own, away.T.tolist(), strict=True):
-        allowed_m = rigidity.allowed_m(one.sigma_position_m, tools.tool_position_m)
+        allowed_m = rigidity.allowed_m(one.sigma_position_m, tools.tool_coil_position_m)
         if not (distance <= rigidity.GATE and away_m <= allowed_m):
             reason = rigidity.reason(distance, away_m, angle)
             found[row] = replace(one, state=states.INCONSISTENT, reason=reason)
