@@ -38,7 +38,7 @@ def fresh(refit):
 
 def run(refit, world, change, frames=3, seed=1, start=1, fault=None, flags=None):
     """Feed frames with noise; the last result."""
-    rng, result = np.random.default_rng(seed), None
+    rng, result = np.random.default_rng([seed, start]), None  # never the same noise again
     for frame in range(frames):
         flux = world.baseline + change + world.noise(rng)
         if fault is not None:
@@ -437,3 +437,51 @@ def test_what_does_not_fit_is_refused(refit):
     dark = replace(world.model, moments=0.0 * world.model.moments)
     with pytest.raises(FitError, match='no field'):
         LiveRefit(dark, table, baseline)
+
+
+def group_of(world, count, seed=4):
+    return np.random.default_rng(seed).permutation(len(world.references))[:count]
+
+
+@pytest.mark.parametrize('near', [False, True])
+@pytest.mark.parametrize(
+    ('count', 'gain', 'state'),
+    [(5, 1.03, ''), (12, 1.02, 'references_doubtful'), (16, 1.05, 'references_doubtful')],
+)
+def test_references_that_go_wrong_together_are_left_out_or_doubted(
+    refit, near, count, gain, state
+):
+    world = anser_world()
+    change, group = world.metal(HEAD) if near else 0.0, group_of(world, count)
+    run(refit, world, change, frames=5)
+
+    def fault(flux):
+        flux[group] *= gain
+
+    result = run(refit, world, change, seed=2, start=6, frames=4, fault=fault)
+    assert result.withheld == state and result.is_answer == (not state)
+    if not state:
+        assert set(result.left_out) == {world.references.name[i] for i in group}
+    result = run(refit, world, change, seed=3, start=10, frames=2)
+    assert result.left_out, 'what has jumped back is watched for a while'
+    result = run(refit, world, change, seed=3, start=12, frames=60)
+    assert result.withheld == '' and result.left_out == ()
+
+
+def test_frozen_references_are_left_out_however_many_they_are(refit):
+    world, held = anser_world(), {}
+    group = group_of(world, 11)
+
+    def fault(flux):
+        held.setdefault('flux', flux[group].copy())
+        flux[group] = held['flux']
+
+    change = world.metal(HEAD)
+    run(refit, world, change)
+    result = run(refit, world, change, seed=2, start=4, frames=4, fault=fault)
+    assert set(result.left_out) == {world.references.name[i] for i in group}
+    assert {r.state for r in result.references if r.name in result.left_out} == {'stuck'}
+    assert result.is_answer
+    held.clear()
+    group = np.arange(len(world.references))
+    assert run(refit, world, change, seed=5, start=9, fault=fault).withheld == 'references_lost'

@@ -241,7 +241,7 @@ class FieldModelNode(AnserNode):
     @property
     def _withheld(self) -> str:
         """State for which trackers are to give no pose for the present frame."""
-        return '' if self._result is None or self._result.is_answer else REFERENCES_LOST
+        return '' if self._result is None else self._result.withheld
 
     @property
     def _follows(self) -> bool:

@@ -4,9 +4,9 @@ import numpy as np
 
 from anser_ros.field.model import FieldModel
 from anser_ros.nodes.node import Level, Status
-from anser_ros.refit.result import FEW_REFERENCES, POOR_FIT, RefitResult
+from anser_ros.refit.result import WITHHELD, RefitResult
 
-TROUBLED = (FEW_REFERENCES, POOR_FIT)
+TROUBLED = tuple(WITHHELD)
 """States of the refit that an operator is warned of."""
 
 

@@ -29,6 +29,7 @@ SILENT = 'silent'
 ABSURD = 'absurd'
 DISAGREES = 'disagrees'
 STUCK = 'stuck'
+RECOVERING = 'recovering'
 
 FAULT_SCALES = 10.0 ** np.arange(0.0, 6.1, 0.5)
 """Sizes of a faulty reading's error, in noise deviations, all as likely."""
@@ -59,7 +60,7 @@ class ReferenceHealth(NamedTuple):
     name : str
     state : str
         ``ok``, or why it was left out: ``flagged``, ``not finite``, ``missing``, ``no baseline``,
-        ``silent``, ``absurd``, ``stuck``, ``disagrees``.
+        ``silent``, ``absurd``, ``stuck``, ``disagrees``, ``recovering``.
     residual_t : float
         Root mean square of measured minus predicted by all others, T a component; NaN where the
         coil has no reading.
@@ -180,6 +181,16 @@ class ReferenceWatch:
     def exclude(self, coil: int) -> None:
         """Exclude a coil that disagrees with the others."""
         self.excluded[coil], self.reason[coil], self._good[coil] = True, DISAGREES, 0
+
+    def recover(self, coil: int) -> None:
+        """Take a coil for sound again whose readings have jumped back; it waits as others do."""
+        if self.excluded[coil] and self.reason[coil] == DISAGREES:
+            self.reason[coil], self._good[coil] = RECOVERING, 0
+
+    @property
+    def is_outvoted(self) -> bool:
+        """Whether more coils disagree than are in use, so that either may be the wrong ones."""
+        return self.reason.count(DISAGREES) > self.count - int(self.excluded.sum())
 
     def agreed(self, coil: int, agrees: bool) -> None:
         """Count a frame in which an excluded coil was compared; enough good ones readmit it."""

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
+from anser_ros.integrity.freshness import Freshness
+from anser_ros.integrity.withheld import REFERENCES_DOUBTFUL
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit import health
@@ -28,6 +30,7 @@ from anser_ros.refit.evidence import FrameEvidence
 from anser_ros.refit.excitation import FieldFunction
 from anser_ros.refit.frame import BaselineCheck
 from anser_ros.refit.health import ReferenceHealth, ReferenceWatch
+from anser_ros.refit.jumps import NOTICED, SUDDEN, Courses, jumped
 from anser_ros.refit.posterior import Bank
 from anser_ros.refit.result import (
     FEW_REFERENCES,
@@ -119,6 +122,9 @@ class LiveRefit:
         self._to_noise_units = (
             self._tables.excitation.phase.conj() / self.settings.accuracy.flux_noise_t
         )
+        known = self.baseline[np.isfinite(self.baseline)]
+        power = float((np.abs(known) ** 2).mean()) if known.size else 0.0
+        self._size = math.sqrt(0.5 * power) / self.settings.accuracy.flux_noise_t
         self._banks: dict[bytes, tuple[Bank, BodySlots]] = {}
         self._intake = Intake(references.channel, error=FitError)
         self._baseline_check = BaselineCheck(self.baseline)
@@ -135,6 +141,8 @@ class LiveRefit:
         self._noise = NoiseLevel(settings.accuracy.flux_noise_t)
         self._average = Average(settings.average_frames)
         self._watch = ReferenceWatch(len(self.references), settings.hold_frames)
+        self._freshness = Freshness()
+        self._courses = Courses(*self.baseline.shape)
         self._weights = _fresh_weights(1 + len(self._tables.priors) + SLOTS)
         for _, slots in self._banks.values():
             slots.clear()
@@ -211,14 +219,19 @@ class LiveRefit:
             As for `update`.
         """
         stamp_ns, ordered = frame.stamp_ns, frame.flux
-        readable, reasons = self._baseline_check.read(frame, baseline)
         if stamp_ns < self._last_ns:
             self._noise.forget()
             self._average.forget()
+            self._freshness = Freshness()
+            self._courses = Courses(*self.baseline.shape)
         self._last_ns = stamp_ns
+        frame = self._freshness.judged(frame, self.settings.accuracy.flux_noise_t)
+        readable, reasons = self._baseline_check.read(frame, baseline)
         self._watch.note(readable, reasons, self.settings.min_references)
         usable = ordered if readable.all() else np.where(readable[:, None], ordered, np.nan)
         level = self._noise.update(usable)
+        self._look_for_jumps(stamp_ns, usable - (self.baseline if baseline is None else baseline),
+                             level)  # fmt: skip
         if np.count_nonzero(self._in_use()) < self.settings.min_references:
             self._watch.wait(readable)
             return self._too_few(stamp_ns, level)
@@ -239,6 +252,32 @@ class LiveRefit:
         result = self._result(stamp_ns, bank, seen, level)
         self._readmit(bank, seen, values, readable, level)
         return result
+
+    def _look_for_jumps(self, stamp_ns: int, change: ComplexArray, level: float) -> None:
+        """Leave out coils whose change (S, K) has just jumped by itself."""
+        jumps = self._courses.follow(stamp_ns, change)
+        off = jumps.off * self._to_noise_units / jumps.spread[:, None]
+        parts = off.view(np.float64).reshape(*off.shape, 2)
+        power = (parts**2).mean(axis=(1, 2)) / (level * self._row_noise[:: off.shape[1]]) ** 2
+        loud = power > NOTICED
+        if not loud.any():
+            return
+        away, coils = self._courses.away(), np.flatnonzero(self._in_use())
+        self._courses.note(jumps, away[loud[away]])
+        for coil in self._courses.returned().tolist():
+            self._watch.recover(coil)
+        # The first frame has no course: metal may be there, and `_judged` asks who disagrees.
+        if not loud[coils].any() or not math.isfinite(jumps.since_s):
+            return
+        bank, _ = self._bank()
+        seen = bank.evaluate(parts[coils].reshape(-1, 2), level)
+        largest = SUDDEN * jumps.since_s * self._size
+        found = coils[jumped(bank, seen, parts[coils], self.settings.emitter_drift, largest)]
+        for coil in found.tolist():
+            self._watch.exclude(coil)
+        if found.size:
+            self._courses.note(jumps, found)
+            self._average.forget()
 
     def _in_use(self) -> NDArray[np.bool_]:
         return np.asarray(~self._watch.excluded)
@@ -319,7 +358,12 @@ class LiveRefit:
                 self.settings.error_modes,
             )  # fmt: skip
             state = REFIT
-        if moving and typical > POOR:
+        if self._watch.is_outvoted:
+            state = REFERENCES_DOUBTFUL
+            reason = (
+                f'{self._watch.reason.count(health.DISAGREES)} of {self._watch.count} disagree'
+            )
+        elif moving and typical > POOR:
             state = POOR_FIT
             reason = f'readings are {np.sqrt(typical):.1f} times as far off as they should be'
         return self._finish(
@@ -343,7 +387,7 @@ class LiveRefit:
         return result
 
     def _too_few(self, stamp_ns: int, level: float) -> RefitResult:
-        """Return to the calibrated model."""
+        """Return to the calibrated model, which is no answer: nobody knows where metal is."""
         self._weights = _fresh_weights(len(self._weights))
         self._average.forget()
         count = int(self._in_use().sum())
@@ -353,7 +397,7 @@ class LiveRefit:
             RefitResult(
                 stamp_ns,
                 self.model,
-                FEW_REFERENCES,
+                REFERENCES_DOUBTFUL if self._watch.is_outvoted else FEW_REFERENCES,
                 self.model is not self._last_model,
                 self._healths(),
                 0.0,

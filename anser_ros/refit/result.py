@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.model import FieldModel
+from anser_ros.integrity.withheld import REFERENCES_DOUBTFUL, REFERENCES_LOST
 from anser_ros.refit import health
 from anser_ros.refit.evidence import FrameEvidence
 from anser_ros.refit.health import ReferenceHealth
@@ -20,8 +21,16 @@ FROZEN = 'frozen'
 REFIT = 'refit'
 FEW_REFERENCES = 'few_references'
 POOR_FIT = 'poor_fit'
-STATES = (FROZEN, REFIT, FEW_REFERENCES, POOR_FIT)
-"""No change; the model follows one; too few references to know; a change that nothing explains."""
+STATES = (FROZEN, REFIT, FEW_REFERENCES, POOR_FIT, REFERENCES_DOUBTFUL)
+"""No change; the model follows one; too few references to know; a change that
+nothing explains; references of which most jumped by themselves."""
+
+WITHHELD = {
+    FEW_REFERENCES: REFERENCES_LOST,
+    POOR_FIT: REFERENCES_DOUBTFUL,
+    REFERENCES_DOUBTFUL: REFERENCES_DOUBTFUL,
+}
+"""What trackers are told in states whose model is none to give poses by."""
 
 
 @dataclass(frozen=True)
@@ -118,9 +127,14 @@ class RefitResult:
     find: Callable[[], Metal | None] | None = field(default=None, repr=False)
 
     @property
+    def withheld(self) -> str:
+        """State for which poses are to be withheld; empty where the model may be used."""
+        return WITHHELD.get(self.state, '')
+
+    @property
     def is_answer(self) -> bool:
         """Whether the references told the model of this frame; else it is only the last resort."""
-        return self.state != FEW_REFERENCES
+        return not self.withheld
 
     @cached_property
     def references(self) -> tuple[ReferenceHealth, ...]:

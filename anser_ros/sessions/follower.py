@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 from anser_ros.errors import BagError, FitError
 from anser_ros.integrity.ageing import ModelAge, Standing
+from anser_ros.integrity.withheld import REFERENCES_LOST, Withheld
 from anser_ros.refit.baseline import check_enough
 from anser_ros.refit.change import Pace
 from anser_ros.refit.live_refit import LiveRefit
@@ -83,8 +84,11 @@ class ModelFollower:
             self._patches.take_flux(frame.stamp_ns, tools.channels, tools.flux, tools.flags)
         if frame.reference is not None:
             self._follow(frame.stamp_ns, frame.reference)
-        why = '' if frame.reference is None or self._result is None else self._result.reason
-        return self._age.at(frame.stamp_ns, why)
+        result = None if frame.reference is None else self._result
+        standing = self._age.at(frame.stamp_ns, '' if result is None else result.reason)
+        if result is not None and result.withheld not in ('', REFERENCES_LOST):
+            return Standing(standing.model, Withheld(result.withheld, result.reason))
+        return standing
 
     def _follow(self, stamp_ns: int, reference: FrameReadings) -> None:
         """Take in one frame of the references."""

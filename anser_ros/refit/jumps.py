@@ -1,0 +1,187 @@
+"""Readings that jump: metal moves steadily and changes all references, faults do neither.
+
+One reference that is wrong contradicts the others. Where many go wrong at one moment, they outvote
+the good ones, and in what they read from then on they may look like metal. The moment itself tells
+them apart: each reading is held against what it was on its way to, and what is left of all of them
+is judged at once, either as metal, which must be in the proportions that the emitters' fields have
+somewhere and cannot have come far since the last frame, or as coils that jumped, each by itself,
+beside others that did not.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.refit.agreement import left_out
+from anser_ros.refit.evidence import STRENGTHS, FrameEvidence, log_sum, over_strengths
+from anser_ros.refit.health import FAULT_ODDS, FAULT_SCALES
+from anser_ros.refit.posterior import Bank
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+NOTICED = 5.0
+"""Power of a jump, in units of what noise makes, from which on jumps are judged. Noise of sixteen
+components is that loud once in a year; lower, and judging costs time for nothing."""
+FARTHEST = 3.0
+"""Steps, in units of the last one, over which a course is carried on. Farther, and the noise of
+the last step is carried on with it."""
+SUDDEN = 0.05
+"""Rate at which metal may take the readings off their course, as a part of the baseline's size
+each second. In recordings of an X-ray head that comes close it stays below the noise, a hundredth
+of this at 25 Hz. Larger, and faults pass for metal by the errors that a survey allows it; smaller,
+and metal that is thrown about is taken for faults."""
+FORETOLD = 0.1
+"""Share of a coil's jump, in power, that may be other than the other coils foretell where metal
+has appeared from one frame to the next, and share of the coils for which it may be more. Smaller,
+and metal that is described badly is taken for faults; larger, and faults that look alike pass for
+metal."""
+COMMON = 0.003
+"""Relative step of all emitters at once from which on it is no drift of theirs. Currents drift
+slowly, each on its own; a gain that all references share, in their amplifier, steps like that."""
+RETURNED = 0.1
+"""Part of a jump that may be left where a reference has jumped back: metal moved meanwhile."""
+NANO = 1e-9
+"""Seconds in a nanosecond."""
+
+
+@dataclass(frozen=True)
+class Jumps:
+    """How far a frame's readings are off their courses.
+
+    Attributes
+    ----------
+    off : ndarray, shape (S, K), complex
+        T; NaN where there is no reading.
+    spread : ndarray, shape (S,)
+        Noise of that, in units of a reading's.
+    since_s : float
+        Time since the last reading of most references, s; infinite where there was none.
+    """
+
+    off: ComplexArray
+    spread: Array
+    since_s: float
+
+
+class Courses:
+    """Where each reference's change is on its way to, and how far those that jumped are off.
+
+    Parameters
+    ----------
+    count, width : int
+        References S and emitters K.
+    """
+
+    def __init__(self, count: int, width: int) -> None:
+        self._last = np.zeros((count, width), dtype=np.complex128)
+        self._step = np.zeros((count, width), dtype=np.complex128)
+        self._last_ns = np.full(count, np.nan)
+        self._step_ns = np.full(count, np.nan)
+        self._away = np.zeros((count, width), dtype=np.complex128)
+        self._farthest = np.zeros(count)
+
+    def follow(self, stamp_ns: int, change: ComplexArray) -> Jumps:
+        """Take in changes (S, K), T, and return how far they are off their courses.
+
+        A reference that has no course yet is expected as in the baseline. One without a reading
+        (NaN) keeps its course.
+        """
+        ahead_ns = stamp_ns - self._last_ns
+        steps = ahead_ns / self._step_ns
+        steps = np.where((steps > 0.0) & (steps <= FARTHEST), steps, 0.0)
+        known = np.isfinite(self._last_ns)
+        variance = np.where(known, 1.0 + (1.0 + steps) ** 2 + steps**2, 1.0)
+        off = change - self._last - steps[:, None] * self._step
+        read = np.isfinite(change).all(axis=1)
+        new = read & known
+        since_s = float(np.median(ahead_ns[new])) * NANO if new.any() else np.inf
+        self._step[new] = (change - self._last)[new]
+        self._step_ns = np.where(new, ahead_ns, np.where(read, np.nan, self._step_ns))
+        self._last[read] = change[read]
+        self._last_ns = np.where(read, float(stamp_ns), self._last_ns)
+        return Jumps(off, np.sqrt(variance), since_s)
+
+    def note(self, jumps: Jumps, coils: NDArray[np.int64]) -> None:
+        """Remember which references have jumped: a jump is no part of a course."""
+        self._step_ns[coils] = np.nan
+        self._away[coils] += jumps.off[coils]
+        size = np.linalg.norm(self._away[coils], axis=1)
+        self._farthest[coils] = np.maximum(self._farthest[coils], size)
+
+    def away(self) -> NDArray[np.int64]:
+        """Return the references that are off by jumps."""
+        return np.flatnonzero(self._farthest > 0.0)
+
+    def returned(self) -> NDArray[np.int64]:
+        """Return the references that have jumped back just now, which is then forgotten."""
+        size = np.linalg.norm(self._away, axis=1)
+        back = np.flatnonzero((self._farthest > 0.0) & (size < RETURNED * self._farthest))
+        self._away[back], self._farthest[back] = 0.0, 0.0
+        return back
+
+
+def _bounded(bank: Bank, seen: FrameEvidence, largest: float) -> FrameEvidence:
+    """Return the evidence for metal that changes readings by no more than so many noise units."""
+    count = max(1, int(np.count_nonzero(largest**2 >= STRENGTHS)))
+    evidence, strength = over_strengths(seen.curve[:, :count])
+    whole = np.zeros_like(seen.strength)
+    whole[:, :, :count] = strength
+    return replace(seen, log_evidence=evidence + bank.log_prior, strength=whole)
+
+
+def _is_foretold(bank: Bank, seen: FrameEvidence, jumps: Array) -> bool:
+    """Return whether each coil's jump is what the others foretell, as when metal is put down."""
+    _, residual = left_out(bank, seen, int(seen.log_evidence.argmax()))
+    noise = NOTICED * jumps[0].size * (seen.noise * bank.row_noise[:: bank.width]) ** 2
+    off = (residual**2).sum(axis=(1, 2))
+    size = (jumps**2).sum(axis=(1, 2)) + ((jumps - residual) ** 2).sum(axis=(1, 2))
+    concerned = size > noise
+    strange = concerned & (off > FORETOLD * size)
+    return int(strange.sum()) <= FORETOLD * int(concerned.sum())
+
+
+def jumped(
+    bank: Bank, seen: FrameEvidence, jumps: Array, drift: float, largest: float
+) -> NDArray[np.int64]:
+    """Return the coils that jumped by themselves, as numbers among those in use; often none.
+
+    Parameters
+    ----------
+    bank : Bank
+    seen : FrameEvidence
+        Of the jumps, as if they were a change.
+    jumps : ndarray, shape (U, K, 2)
+        Of the coils in use, in noise units.
+    drift : float
+        Prior deviation of an emitter's strength.
+    largest : float
+        Size of the readings' change, noise units, that metal may have made since the last frame.
+    """
+    free, seen = seen, _bounded(bank, seen, largest)
+    freedom, noise = bank.width, bank.row_noise[:: bank.width, None]
+    # In phase and quadrature apart: most faults are in one of the two.
+    power = (jumps**2).sum(axis=1) / noise**2
+    quiet = -0.5 * power / seen.noise**2 - freedom * np.log(seen.noise * noise)
+    scales = FAULT_SCALES[:, None, None]
+    curve = -0.5 * power / scales**2 - freedom * np.log(scales * noise)
+    top = curve.max(axis=0)
+    broad = top + np.log(np.exp(curve - top).mean(axis=0))
+    apart = np.maximum(quiet, broad)
+    if apart.sum() - log_sum(seen.log_evidence) > FAULT_ODDS:
+        if _is_foretold(bank, free, jumps):
+            return np.empty(0, dtype=np.int64)
+        return np.flatnonzero((broad > quiet).any(axis=1))
+    if _is_common_gain(bank, seen, jumps, drift):
+        return np.arange(len(jumps))
+    return np.empty(0, dtype=np.int64)
+
+
+def _is_common_gain(bank: Bank, seen: FrameEvidence, jumps: Array, drift: float) -> bool:
+    """Return whether all emitters have stepped alike, which is the references' doing."""
+    mean, _ = bank.drifts(seen, int(seen.log_evidence.argmax()))
+    step = drift * (mean @ np.array([1.0, 1.0j]))
+    left = jumps.reshape(-1, 2) - bank.drift @ mean
+    explained = float((left**2).sum()) < FORETOLD * float((jumps**2).sum())
+    return explained and float(np.abs(step).min()) > COMMON
