@@ -229,13 +229,12 @@ class TestEffects:
         assert real.sensors[2].axis == (0.0, 0.6, 0.8)
         assert real.sensors[3:] == SETUP.sensors[3:]
 
-    def test_gain_ripple_and_late_delivery(self):
+    def test_gain_ripple_and_wrong_gain(self):
         clean, _ = self.codes()
         swung, _ = self.codes(raw_effects.GainRipple(0.1, 0.4))
         assert np.abs(swung[-1, 20] - 1.1 * clean[-1, 20]) <= 1
         scaled, _ = self.codes(raw_effects.ChannelGain(20, 0.5))
         assert np.abs(scaled[:, 20] - 0.5 * clean[:, 20]).max() <= 1
-        assert raw_effects.LateDelivery(0.03).delivery_delay_s() == 0.03
 
     def test_coil_that_weakens_at_constant_current(self):
         unit = ControlUnit(world(), CHANNELS, effects=[raw_effects.CoilWeakens(2, -0.1, 1e-4)])
@@ -267,9 +266,10 @@ class TestEffects:
         expected = clean[:, 20] - 0.02 * np.tanh(volts / 0.02) * 32768 / 5.0
         assert np.abs(crossed[:, 20] - expected).max() <= 2
 
-    def test_slow_clock(self):
-        _, blocks = self.codes(raw_effects.SlowClock(-1000.0))
-        assert blocks[50].timestamp_ticks == round(50_000 * 0.999)
+    def test_optical_clock(self):
+        clock = raw_effects.OpticalClock(early_s=0.03, fast_ppm=1000.0)
+        assert clock.optical_time(0.0) == -0.03
+        assert clock.optical_time(10.0) == pytest.approx(9.98)
 
     def test_base_changes_nothing(self):
         clean, _ = self.codes()
@@ -296,8 +296,8 @@ class TestDraw:
             unit.advance(40_000)
             unit.receive(encode(Start()))
             streams.append(b''.join(piece.data for piece in unit.advance(4000)))
-        late = sum(effect.delivery_delay_s() for effect in drawn.effects)
-        assert (streams[0] != streams[1]) or late > 0
+        optical = [effect.optical_time(10.0) for effect in drawn.effects]
+        assert (streams[0] != streams[1]) or optical != [10.0] * len(optical)
 
     def test_random_is_reproducible_and_none_is_nothing(self):
         first, second = (

@@ -126,7 +126,7 @@ class CuSimulator(AnserNode):
         real = setup
         for effect in effects:
             real = effect.setup(real)
-        self._delay_s = sum(effect.delivery_delay_s() for effect in effects)
+        self._effects = effects
         self._begin_ns = time.monotonic_ns()
         self._stream_begin_s = math.inf
         self._metal = [*_metal(table, lambda: self._stream_begin_s), *drawn.metal]
@@ -176,7 +176,7 @@ class CuSimulator(AnserNode):
 
     def _due_s(self, samples: int) -> float:
         """When so many samples have been taken since power-up, and can go out."""
-        return samples / self._unit.sample_rate_hz + self._delay_s
+        return samples / self._unit.sample_rate_hz
 
     def _next_s(self) -> float:
         """When there is something to do again: a block to be sent, or the next ones to be made."""
@@ -200,8 +200,7 @@ class CuSimulator(AnserNode):
         self._send([*due, *answers], now_s)
         if due and due[-1].is_block:
             taken_s = due[-1].end_sample / unit.sample_rate_hz
-            delay_ns = round(1e9 * self._delay_s)  # a simulated one is not the machine's
-            self._unit_clock.observe(taken_s, time.monotonic_ns() - delay_ns)
+            self._unit_clock.observe(taken_s, time.monotonic_ns())
         if now_s >= self._due_s(unit.samples) - STRETCH_S:
             late_s = now_s - self._due_s(unit.samples) - LONGEST_LAG_S
             if late_s > 0:
@@ -235,6 +234,8 @@ class CuSimulator(AnserNode):
         # The unit's own clock: on a busy machine its samples, and so its world, run late.
         unit_ns = self._unit_clock.host_ns(time_s) or self._begin_ns + round(1e9 * time_s)
         now_ns = unit_ns + time.time_ns() - time.monotonic_ns()
+        for effect in self._effects:
+            now_ns += round(1e9 * (effect.optical_time(time_s) - time_s))
         for body, publisher in self._publishers_of.items():
             position, rotation = self._world.pose(body, time_s)
             if self.parameters.optical_noise_m:

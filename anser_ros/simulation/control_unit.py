@@ -229,10 +229,7 @@ class ControlUnit:
         )
 
     def _ticks(self, sample: int) -> int:
-        time_s = sample / self.sample_rate_hz
-        for effect in self._effects:
-            time_s = effect.device_time(time_s)
-        return round(time_s * TICK_HZ)
+        return round(sample / self.sample_rate_hz * TICK_HZ)
 
     def _piece(self, payload: Payload) -> Piece:
         return Piece(encode(payload))

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import ParameterError
-from anser_ros.signals.envelope import FOLLOWED_SHARE
 from anser_ros.simulation.metal import MetalBody
 from anser_ros.simulation.raw_effects import (
     ChannelGain,
@@ -19,11 +18,10 @@ from anser_ros.simulation.raw_effects import (
     CompressingAmplifier,
     CrossoverAmplifier,
     GainRipple,
-    LateDelivery,
     LooseSensor,
+    OpticalClock,
     RawChannelCrosstalk,
     RawEffect,
-    SlowClock,
     TiltedSensor,
 )
 from anser_ros.wire.channel_calibration import ChannelCalibration
@@ -117,16 +115,13 @@ def _channel_crosstalk(unit: Unit, rng: np.random.Generator) -> Drawn:
 
 
 def _time_offset(unit: Unit, rng: np.random.Generator) -> Drawn:
-    delay = float(rng.uniform(0.015, 0.04))
-    return _known('time_offset', {'offset_s': delay}, LateDelivery(delay))
+    early = float(rng.uniform(0.015, 0.04))
+    return _known('time_offset', {'offset_s': early}, OpticalClock(early_s=early))
 
 
 def _clock_rate(unit: Unit, rng: np.random.Generator) -> Drawn:
-    slow_ppm = float(rng.uniform(2500.0, 6000.0))
-    # The host follows as far as two quartz clocks may differ; only the remainder is visible.
-    rate_ppm = 1e6 * FOLLOWED_SHARE - slow_ppm
-    parameters = {'rate_ppm': rate_ppm, 'device_clock_ppm': -slow_ppm}
-    return _known('clock_rate', parameters, SlowClock(-slow_ppm))
+    fast_ppm = float(rng.uniform(2500.0, 6000.0))
+    return _known('clock_rate', {'rate_ppm': -fast_ppm}, OpticalClock(fast_ppm=fast_ppm))
 
 
 def _sensor_axis(unit: Unit, rng: np.random.Generator) -> Drawn:

@@ -39,13 +39,9 @@ class RawEffect:
         """Return the voltages (n, S), V, at n sampling instants before noise and converter."""
         return volts
 
-    def device_time(self, time_s: float) -> float:
-        """Return the time of the device's clock at a true time, s."""
+    def optical_time(self, time_s: float) -> float:
+        """Return the time that the optical tracker's clock stamps with at a true time, s."""
         return time_s
-
-    def delivery_delay_s(self) -> float:
-        """Return the additional delay of the records on their way to the host, s."""
-        return 0.0
 
 
 @dataclass(frozen=True)
@@ -131,25 +127,15 @@ class LooseSensor(RawEffect):
 
 
 @dataclass(frozen=True)
-class SlowClock(RawEffect):
-    """A device clock whose rate differs from its nominal one by a constant."""
+class OpticalClock(RawEffect):
+    """A clock of the optical tracker that is early by a constant, and runs fast."""
 
-    error_ppm: float
+    early_s: float = 0.0
+    fast_ppm: float = 0.0
 
-    def device_time(self, time_s: float) -> float:
+    def optical_time(self, time_s: float) -> float:
         """Return the time by the wrong clock, s."""
-        return time_s * (1 + 1e-6 * self.error_ppm)
-
-
-@dataclass(frozen=True)
-class LateDelivery(RawEffect):
-    """A filter or buffer that delays all records by the same time."""
-
-    delay_s: float
-
-    def delivery_delay_s(self) -> float:
-        """Return the constant delay, s."""
-        return self.delay_s
+        return time_s * (1.0 + 1e-6 * self.fast_ppm) - self.early_s
 
 
 @dataclass(frozen=True)
