@@ -23,14 +23,14 @@ setup = {
                 for c in range(3)]}  # fmt: skip
 drawn = Model.nominal(setup)
 
-# A simulated scan: poses all over the volume, of a board whose coils are 2 % off in strength.
+# A simulated scan: a pose a second all over the volume; the board's coils are 2 % off in strength.
 rng, count = np.random.default_rng(1), 150
 position = rng.uniform((-0.12, -0.12, 0.08), (0.12, 0.12, 0.22), (count, 3))
 turn = Rotation.random(count, random_state=1)
 coils = np.stack([position + turn.apply([0, 0, 0.01 * c]) for c in range(3)], axis=1)
 flux = drawn.flux(coils, turn.as_matrix().swapaxes(1, 2)) * (1 + 0.02 * rng.normal(size=8))
 flux = flux + 60e-12 * rng.normal(size=(*flux.shape, 2)).view(complex)[..., 0]
-poses = {'pen': (np.arange(count) / 10, position, turn.as_quat())}
+poses = {'pen': (np.arange(float(count)), position, turn.as_quat())}
 write_session(out / 'board.mcap', setup, poses['pen'][0], flux, poses, overwrite=True)
 
 session = load_session(out / 'board.mcap')

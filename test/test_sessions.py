@@ -178,10 +178,13 @@ class TestFollow:
     def test_the_model_follows_metal_frame_by_frame(self, metal, model, factory):
         follower = ModelFollower(prepare(metal, model, factory))
         frames = [frame for frame in frames_of(metal) if frame.reference is not None]
-        models = [follower.model_at(frame) for frame in frames[:3]]
-        assert models[0].emitters == model.emitters
-        assert sum(follower.summary.states.values()) == sum(m is not None for m in models)
-        assert follower.model_at(replace(frames[3], reference=None)) is None
+        standings = [follower.at(frame) for frame in frames[:3]]
+        assert all(s.model.emitters == model.emitters and s.withheld is None for s in standings)
+        assert sum(follower.summary.states.values()) == 3
+        silent = replace(frames[3], reference=None)
+        assert follower.at(silent).withheld is None
+        late = replace(silent, stamp_ns=silent.stamp_ns + 10**9)
+        assert follower.at(late).withheld.state == 'references_lost'
 
     def test_what_is_missing_is_said(self, metal, model, factory):
         with pytest.raises(BagError, match='--baseline'):

@@ -19,7 +19,7 @@ from anser_ros.errors import ParameterError
 from anser_ros.nodes import qos
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
-from anser_ros.signals.clock import SampleClock
+from anser_ros.signals.envelope import Envelope
 from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.control_unit import ControlUnit, Piece
 from anser_ros.simulation.effect_draw import NONE as NO_EFFECT
@@ -44,6 +44,8 @@ from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
 STRETCH_S = 0.005
 """Stretch of samples that is made at a time, s: it bounds how unevenly they are sent."""
+USUAL_LATENESS_NS = 300_000
+"""Time (0.3 ms) by which a block on its way is late at least, until that has been seen."""
 LONGEST_LAG_S = 0.25
 """Lag behind the clock, s, beyond which samples are left out instead of made up for: a machine
 that is so late would hardly catch up, and what it sent would be old."""
@@ -147,7 +149,8 @@ class CuSimulator(AnserNode):
             effects=effects,
             seed=table.seed,
         )
-        self._unit_clock = SampleClock(1.0)
+        self._line = Envelope(0.0, self._begin_ns + USUAL_LATENESS_NS)
+        self._answers: deque[tuple[float, Piece]] = deque()
         self._rng = np.random.default_rng(table.seed + 1)
         self._injector = FaultInjector(table.fault, table.fault_period_s, table.seed)
         self._port = PseudoPort(Path(table.link))
@@ -190,17 +193,16 @@ class CuSimulator(AnserNode):
         now_s = self._elapsed_s()
         self._plug(now_s)
         unit.overload(self._injector.lasts(now_s, SATURATION))
-        answers = unit.receive(self._port.read())
+        self._answers.extend((now_s, answer) for answer in unit.receive(self._port.read()))
         if unit.streaming and self._stream_begin_s == math.inf:
             self._stream_begin_s = now_s
         due = []
         while self._prepared and self._due_s(self._prepared[0].end_sample) <= now_s:
             due.append(self._prepared.popleft())
-        # An answer follows the blocks that were complete before it: the host dates them by it.
-        self._send([*due, *answers], now_s)
+        self._send([*due, *self._due_answers(now_s)], now_s)
         if due and due[-1].is_block:
             taken_s = due[-1].end_sample / unit.sample_rate_hz
-            self._unit_clock.observe(taken_s, time.monotonic_ns())
+            self._line.take(1e9 * taken_s, time.monotonic_ns())
         if now_s >= self._due_s(unit.samples) - STRETCH_S:
             late_s = now_s - self._due_s(unit.samples) - LONGEST_LAG_S
             if late_s > 0:
@@ -208,6 +210,19 @@ class CuSimulator(AnserNode):
                 self.count('lags')
                 unit.skip(int(late_s * unit.sample_rate_hz))
             self._prepared.extend(unit.advance(round(STRETCH_S * unit.sample_rate_hz)))
+
+    def _due_answers(self, now_s: float) -> list[Piece]:
+        """Take the answers to commands that came before the next block is complete.
+
+        The host dates samples by them, so they follow all blocks that a device would have sent
+        before, however late a busy machine makes those.
+        """
+        first = self._prepared[0].end_sample if self._prepared else self._unit.samples
+        until_s = self._due_s(first) if self._unit.streaming else now_s
+        due = []
+        while self._answers and self._answers[0][0] <= until_s:
+            due.append(self._answers.popleft()[1])
+        return due
 
     def _send(self, pieces: list[Piece], now_s: float) -> None:
         arriving = self._injector.apply(pieces, now_s)
@@ -231,8 +246,8 @@ class CuSimulator(AnserNode):
 
     def _publish_truth(self) -> None:
         time_s = self._elapsed_s()
-        # The unit's own clock: on a busy machine its samples, and so its world, run late.
-        unit_ns = self._unit_clock.host_ns(time_s) or self._begin_ns + round(1e9 * time_s)
+        # The host dates samples by the earliest arrivals, which are a little late themselves.
+        unit_ns = round(1e9 * time_s + self._line.offset_at(1e9 * time_s))
         now_ns = unit_ns + time.time_ns() - time.monotonic_ns()
         for effect in self._effects:
             now_ns += round(1e9 * (effect.optical_time(time_s) - time_s))
