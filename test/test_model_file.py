@@ -1,11 +1,14 @@
 """Model files: written whole, read back the same, refused with the rule named."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from anser_ros.cli.output import warn_of_snapshot
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord, FieldModel, from_document, to_document
-from anser_ros.sessions.model_file import load_model, save_model
+from anser_ros.sessions.model_file import as_saved, is_snapshot, load_model, save_model
 
 
 def model() -> FieldModel:
@@ -61,6 +64,7 @@ def test_added_dipoles_add_their_field():
         ({'effects': [{'parameters': {}}]}, 'needs a name'),
         ({'effects': {'name': 'x'}}, 'must be a list'),
         ({'effects': [{'name': 'x', 'parameters': [1]}]}, 'mappings of parameters'),
+        ({'provenance': ['a test']}, 'provenance must be a mapping'),
         ({'modes': [[[0.0] * 4] * 5]}, 'one row a dipole'),
     ],
 )
@@ -80,6 +84,25 @@ def test_a_file_that_is_no_model_is_refused_by_name(tmp_path, text):
 def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(ModelFileError, match=r'absent\.yaml'):
         load_model(tmp_path / 'absent.yaml')
+
+
+def test_a_snapshot_with_metal_in_it_is_no_calibration(tmp_path, capsys):
+    base, path = model(), tmp_path / 'saved.yaml'
+    metal = base.with_dipoles(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.ones((1, 2)) + 0j)
+    save_model(path, as_saved(replace(base, modes=None), base, 7))
+    assert load_model(path).provenance == base.provenance, 'nothing has changed but the error'
+    for changed in (metal, replace(base, moments=1.001 * base.moments)):
+        save_model(path, as_saved(changed, base, 7))
+        with pytest.raises(ModelFileError, match=r'saved\.yaml: a snapshot .*stamp_ns 7.*no cali'):
+            load_model(path)
+        read = load_model(path, snapshot=True)
+        assert is_snapshot(read)
+        assert read.provenance['started_from'] == base.provenance
+        np.testing.assert_array_equal(read.moments, changed.moments)
+    warn_of_snapshot('evaluate', 'a file', base)
+    assert capsys.readouterr().err == ''
+    warn_of_snapshot('evaluate', 'a file', read)
+    assert capsys.readouterr().err.startswith('anser evaluate: a file is a snapshot of a refit')
 
 
 def test_shapes_must_fit():

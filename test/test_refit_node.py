@@ -9,11 +9,11 @@ import pytest
 from refit_world import anser_world, metal_block
 from tracking_world import CENTRES_MM, GEOMETRY, TURNED
 
-from anser_ros.errors import FitError, FrameError, ParameterError
+from anser_ros.errors import FitError, FrameError, ModelFileError, ParameterError
 from anser_ros.nodes.diagnostics import Level
 from anser_ros.nodes.model_clouds import stamp_of
 from anser_ros.refit.result import Metal
-from anser_ros.sessions.model_file import save_model
+from anser_ros.sessions.model_file import load_model, save_model
 from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup, dump_setup
 
@@ -132,11 +132,11 @@ def make(ros, tmp_path):
         rig.close()
 
 
-def test_metal_is_shown_named_and_taken_away_again(make):
+def test_metal_is_shown_named_and_taken_away_again(make, tmp_path):
     from std_srvs.srv import SetBool, Trigger
     from visualization_msgs.msg import Marker
 
-    rig = make(refit_rate_hz=1000.0)
+    rig = make(refit_rate_hz=1000.0, save_file=str(tmp_path / 'saved.yaml'))
     rig.start()
     change = rig.world.metal(HEAD)
     calibrated = rig.node._model
@@ -156,6 +156,10 @@ def test_metal_is_shown_named_and_taken_away_again(make):
     assert named['ref/0'] == 'ok'
     assert rig.node._model is not calibrated
     # Frozen, the model stays; the metal goes, and then so does the marker.
+    reply = rig.node._on_save(Trigger.Request(), Trigger.Response())
+    assert 'snapshot of a refit' in reply.message
+    with pytest.raises(ModelFileError, match='is no calibration'):
+        load_model(tmp_path / 'saved.yaml')
     rig.node._on_freeze(SetBool.Request(data=True), SetBool.Response())
     held = rig.node._model
     rig.say(0.0)
@@ -164,6 +168,9 @@ def test_metal_is_shown_named_and_taken_away_again(make):
     for _ in range(3):
         rig.say(0.0)
     np.testing.assert_array_equal(rig.node._model.moments, calibrated.moments)
+    reply = rig.node._on_save(Trigger.Request(), Trigger.Response())
+    assert reply.message == str(tmp_path / 'saved.yaml')
+    load_model(tmp_path / 'saved.yaml')  # without metal it loads as ever
     rig.until(lambda: rig.markers[-1].markers[0].action == Marker.DELETEALL
               and len(rig.markers[-1].markers) == 1)  # fmt: skip
     for _ in range(2):

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from anser_ros.cli.diagnosis_report import render
 from anser_ros.cli.diagnosis_words import verdict
-from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.output import make_folder, say_written, warn_of_snapshot
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.sessions.diagnosis import diagnose_session
 from anser_ros.sessions.diagnosis_document import to_document
@@ -38,7 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
     session = load_session(args.session).with_stated(stated_values(args))
-    model = model_for(args.model, session)
+    model = model_for(args.model, session, snapshot=True)
+    warn_of_snapshot('diagnose', args.model, model)
     baseline = load_session(args.baseline) if args.baseline else None
     make_folder(args.out)
     console = Console(stderr=True)

@@ -1,9 +1,12 @@
 """The folders that commands write to, and the line that names the files written."""
 
 import os
+import sys
 from pathlib import Path
 
 from anser_ros.errors import ParameterError
+from anser_ros.field.model import FieldModel
+from anser_ros.sessions.model_file import SNAPSHOT, is_snapshot
 
 
 def make_folder(folder: Path) -> None:
@@ -25,3 +28,9 @@ def make_folder(folder: Path) -> None:
 def say_written(*paths: Path) -> None:
     """Print the paths of the results in one line."""
     print(f'wrote {", ".join(map(str, paths))}')
+
+
+def warn_of_snapshot(command: str, name: str, model: FieldModel) -> None:
+    """Say on stderr that a command works with a snapshot of a refit, where it does."""
+    if is_snapshot(model):
+        print(f'anser {command}: {name} is a {SNAPSHOT}, no calibration', file=sys.stderr)

@@ -246,6 +246,9 @@ def from_document(document: Any) -> FieldModel:
     effects = document.get('effects') or []
     if not isinstance(effects, list):
         raise ModelFileError('model: effects must be a list')
+    provenance = document.get('provenance') or {}
+    if not isinstance(provenance, dict):
+        raise ModelFileError('model: provenance must be a mapping')
     return FieldModel(
         positions=table[:, :3].copy(),
         directions=table[:, 3:6].copy(),
@@ -255,5 +258,5 @@ def from_document(document: Any) -> FieldModel:
         flux_error_t=flux_error,
         modes=modes,
         effects=tuple(_effect(item) for item in effects),
-        provenance=document.get('provenance') or {},
+        provenance=provenance,
     )

@@ -37,7 +37,13 @@ from anser_ros.refit.change import MOST_RATE_HZ, Pace
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.result import RefitResult
 from anser_ros.sessions.baseline import baseline_flux
-from anser_ros.sessions.model_file import load_model, save_model
+from anser_ros.sessions.model_file import (
+    SNAPSHOT,
+    as_saved,
+    is_snapshot,
+    load_model,
+    save_model,
+)
 from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session, sensor_table
 from anser_ros.sessions.starting_model import NOMINAL, starting_model
@@ -298,10 +304,12 @@ class FieldModelNode(AnserNode):
         return response
 
     def _on_save(self, _request: Any, response: Any) -> Any:
-        if self._model is None:
+        if self._model is None or self._base is None:
             raise FitError('no model yet')
-        save_model(path := Path(self.parameters.save_file).expanduser().resolve(), self._model)
-        response.success, response.message = True, str(path)
+        saved = as_saved(self._model, self._base, self._stamp_ns)
+        save_model(path := Path(self.parameters.save_file).expanduser().resolve(), saved)
+        what = f' ({SNAPSHOT})' if is_snapshot(saved) else ''
+        response.success, response.message = True, f'{path}{what}'
         return response
 
     def _on_freeze(self, request: Any, response: Any) -> Any:

@@ -56,19 +56,22 @@ def check_emitters(setup: Setup, given: FieldModel) -> None:
         )
 
 
-def model_for(name: str, session: 'Session') -> FieldModel:
+def model_for(name: str, session: 'Session', snapshot: bool = False) -> FieldModel:
     """The model that ``name`` stands for: a file's path, or ``nominal``.
+
+    ``snapshot`` says whether a snapshot of a refit will do, which is no calibration.
 
     Raises
     ------
     ModelFileError
-        When the file is no model, or its emitters are not the session's.
+        When the file is no model or a snapshot that is not wanted, or its emitters are not the
+        session's.
     SetupError
         When the nominal model is asked for and the setup's geometry makes none.
     """
     if name == NOMINAL:
         return nominal_model(board_of(session.setup))
-    model = load_model(name)
+    model = load_model(name, snapshot)
     check_fits(model, session)
     return model
 
