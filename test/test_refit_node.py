@@ -414,7 +414,7 @@ def test_markers_of_nothing_and_of_one_source(ros):
 def test_lost_references_are_told_to_the_trackers_and_to_the_operator(make):
     from anser_ros.nodes.model_intake import ModelIntake
 
-    rig, intake, given = make(references_age_s=0.05, refit_rate_hz=1000.0), ModelIntake(), []
+    rig, intake, given = make(references_age_s=0.5, refit_rate_hz=1000.0), ModelIntake(), []
     rig.node._errors.publish = lambda message: intake.take_error(message)
     rig.node._models.publish = lambda message: given.append(intake.take(message))
     rig.start()

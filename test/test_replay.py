@@ -43,8 +43,8 @@ def make_session(path, count):
 
 
 @pytest.fixture
-def listener(ros):
-    """A node that takes what is replayed; ``delay_s`` makes it slow."""
+def listener(ros, request):
+    """A node that takes what is replayed, with a queue of 5 or so; ``delay_s`` makes it slow."""
     from geometry_msgs.msg import PoseStamped
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -65,7 +65,8 @@ def listener(ros):
         return lambda message: node.got.append((name, message))
 
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    node.create_subscription(PointCloud2, '/anser/tool/flux', on_flux, 5)
+    depth = getattr(request, 'param', 5)
+    node.create_subscription(PointCloud2, '/anser/tool/flux', on_flux, depth)
     node.create_subscription(PointCloud2, '/other/tool/flux', on_flux, 5)
     node.create_subscription(String, '/anser/setup', take('setup'), latched)
     node.create_subscription(PoseStamped, '/optical/tool_a/pose', take('optical'), 1000)
@@ -89,6 +90,7 @@ def listener(ros):
     node.destroy_node()
 
 
+@pytest.mark.parametrize('listener', [100], indirect=True)
 def test_everything_arrives_with_its_stamps_at_its_pace(start, listener, tmp_path):
     bag = make_session(tmp_path / 'a.mcap', 100)
     process = start('replay', bag, '--rate', '2')

@@ -19,7 +19,6 @@ from anser_ros.errors import ParameterError
 from anser_ros.nodes import qos
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
-from anser_ros.signals.envelope import Envelope
 from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.control_unit import ControlUnit, Piece
 from anser_ros.simulation.effect_draw import NONE as NO_EFFECT
@@ -44,8 +43,6 @@ from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
 STRETCH_S = 0.005
 """Stretch of samples that is made at a time, s: it bounds how unevenly they are sent."""
-USUAL_LATENESS_NS = 300_000
-"""Time (0.3 ms) by which a block on its way is late at least, until that has been seen."""
 LONGEST_LAG_S = 0.25
 """Lag behind the clock, s, beyond which samples are left out instead of made up for: a machine
 that is so late would hardly catch up, and what it sent would be old."""
@@ -149,7 +146,7 @@ class CuSimulator(AnserNode):
             effects=effects,
             seed=table.seed,
         )
-        self._line = Envelope(0.0, self._begin_ns + USUAL_LATENESS_NS)
+        self._least_late_ns = math.inf
         self._answers: deque[tuple[float, Piece]] = deque()
         self._rng = np.random.default_rng(table.seed + 1)
         self._injector = FaultInjector(table.fault, table.fault_period_s, table.seed)
@@ -201,8 +198,8 @@ class CuSimulator(AnserNode):
             due.append(self._prepared.popleft())
         self._send([*due, *self._due_answers(now_s)], now_s)
         if due and due[-1].is_block:
-            taken_s = due[-1].end_sample / unit.sample_rate_hz
-            self._line.take(1e9 * taken_s, time.monotonic_ns())
+            due_ns = self._begin_ns + round(1e9 * self._due_s(due[-1].end_sample))
+            self._least_late_ns = min(self._least_late_ns, time.monotonic_ns() - due_ns)
         if now_s >= self._due_s(unit.samples) - STRETCH_S:
             late_s = now_s - self._due_s(unit.samples) - LONGEST_LAG_S
             if late_s > 0:
@@ -247,7 +244,8 @@ class CuSimulator(AnserNode):
     def _publish_truth(self) -> None:
         time_s = self._elapsed_s()
         # The host dates samples by the earliest arrivals, which are a little late themselves.
-        unit_ns = round(1e9 * time_s + self._line.offset_at(1e9 * time_s))
+        late_ns = 0 if math.isinf(self._least_late_ns) else round(self._least_late_ns)
+        unit_ns = self._begin_ns + round(1e9 * time_s) + late_ns
         now_ns = unit_ns + time.time_ns() - time.monotonic_ns()
         for effect in self._effects:
             now_ns += round(1e9 * (effect.optical_time(time_s) - time_s))
