@@ -223,6 +223,70 @@ def test_poses_of_every_sensor_and_body(tracker):
     np.testing.assert_allclose(found, rotation, atol=5e-3)
 
 
+def test_two_publishers_give_no_poses_and_their_models_are_not_obeyed(tracker):
+    from sensor_msgs.msg import PointCloud2
+
+    from anser_ros.nodes import qos
+
+    rng = np.random.default_rng(8)
+    ready(tracker)
+    node, first = tracker.node, tracker.flux
+    places = [random_pose(rng) for _ in range(2)]
+
+    def send(publisher, which):
+        known = node.counters['frames']
+        tracker.flux = publisher
+        tracker.say_flux(fluxes(certain_model(), SENSORS, *places[which], rng))
+        wait_frame(tracker, known + 1)
+
+    for _ in range(3):
+        send(first, 0)
+    tracker.spin_until(
+        lambda: len(tracker.full.get(BODY, [])) == len(tracker.poses.get(BODY, [])) == 3
+    )
+    for poses in (tracker.poses, tracker.full):
+        tracker.spin_until(
+            lambda poses=poses: all(len(poses.get(n, [])) == 3 for n in SENSORS.name)
+        )
+        poses.clear()
+    second = tracker.peer.create_publisher(PointCloud2, 'tool/flux', qos.STREAM)
+    tracker.connect(second)
+    for _ in range(5):
+        send(second, 1)
+        send(first, 0)
+    assert not tracker.poses, 'not even the first frame of the second one has a pose'
+    assert node.status().message == 'two_sources: two publishers of tool/flux'
+    assert int(node.status().level) == 2
+    assert {part.message for part in node.part_statuses()} == {'two_sources'}
+    # One goes; the other is believed within a second, whichever it was.
+    tracker.peer.destroy_publisher(first)
+    gone_s = time.monotonic()
+    while not tracker.poses:
+        assert time.monotonic() - gone_s < 1.3, node.status()
+        send(second, 1)
+    # Another model on the same topic is not obeyed, and whose holds is asked when one has gone.
+    models = node.counters['models']
+    other = tracker.peer.create_publisher(PointCloud2, 'field_model', qos.LATCHED)
+    tracker.connect(other)
+    mine, tracker.model = tracker.model, other
+    wrong = certain_model()
+    tracker.say_model(replace(wrong, moments=1.01 * wrong.moments), stamp_ns=9)
+    tracker.spin_until(
+        lambda: node.status().message.startswith('two_sources: two publishers of f')
+    )
+    tracker.spin_until(lambda: not tracker.executor.spin_once(timeout_sec=0.0))
+    tracker.poses.clear()
+    send(second, 1)
+    assert node.counters['models'] == models
+    assert not tracker.poses
+    tracker.peer.destroy_publisher(other)
+    tracker.model = mine
+    tracker.spin_until(lambda: 'two_sources' not in node.status().message)
+    tracker.spin_until(lambda: node._intake.newest.stamp_ns == 5)
+    while not tracker.poses:
+        send(second, 1)
+
+
 def test_nothing_is_published_unless_ok(tracker):
     rng = np.random.default_rng(2)
     ready(tracker)

@@ -6,8 +6,11 @@ REFERENCES_LOST = 'references_lost'
 """The references were silent, or too few, for longer than a model holds without them."""
 REFERENCES_DOUBTFUL = 'references_doubtful'
 """The references contradict each other, and which of them are right cannot be told."""
+TWO_SOURCES = 'two_sources'
+"""More than one publisher of what poses are made from; said by the tracker itself."""
 STATES = (REFERENCES_LOST, REFERENCES_DOUBTFUL)
-"""The states in which the whole chain gives no pose; their places are their codes, from 1."""
+"""States in which the model's server lets no pose be given; their places are their codes,
+from 1."""
 
 
 def code_of(state: str) -> int:
@@ -26,7 +29,7 @@ class Withheld(NamedTuple):
     Attributes
     ----------
     state : str
-        One of `STATES`.
+        One of `STATES`, or `TWO_SOURCES`.
     reason : str
         What `/diagnostics` says of it, with figures.
     """

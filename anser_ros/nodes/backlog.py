@@ -57,11 +57,14 @@ class Backlog:
 
 
 def take_waiting(subscription: Any) -> list[Any]:
-    """Messages, as bytes, that wait in a subscription's queue, oldest first; they leave it so."""
+    """Messages, as bytes and with their information, that wait in a queue, oldest first.
+
+    They leave the queue so.
+    """
     taken = []
     with subscription.handle:
         while True:
             item = subscription.handle.take_message(subscription.msg_type, subscription.raw)
             if item is None:
                 return taken
-            taken.append(item[0])
+            taken.append((item[0], item[1]))

@@ -21,13 +21,14 @@ from std_srvs.srv import SetBool, Trigger
 from anser_ros.errors import AnserError, FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
-from anser_ros.integrity.withheld import REFERENCES_LOST, code_of
+from anser_ros.integrity.withheld import REFERENCES_LOST, TWO_SOURCES, code_of
 from anser_ros.nodes import qos, refit_status
 from anser_ros.nodes.diagnostics import Trouble
 from anser_ros.nodes.flux_reader import read_frame
 from anser_ros.nodes.metal_view import MetalView
 from anser_ros.nodes.model_clouds import ModelWriter
 from anser_ros.nodes.node import AnserNode, Level, Status, main
+from anser_ros.nodes.one_source import OneSource, said_of
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.patches import Patches, start_refit
 from anser_ros.nodes.stated_parameters import stated, stated_by
@@ -126,14 +127,20 @@ class FieldModelNode(AnserNode):
         self._models = self.create_publisher(PointCloud2, 'field_model', qos.MODELS)
         self._errors = self.create_publisher(PointCloud2, 'field_model_error', qos.MODEL_ERRORS)
         self._metal = MetalView(self)
-        self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
-        self.create_subscription(PointCloud2, 'reference/flux', self._on_flux, qos.STREAM)
+        self._sources = [
+            OneSource(
+                self, String, 'setup', self._on_setup, qos.LATCHED, lasting=lambda text: text.data
+            ),
+            OneSource(self, PointCloud2, 'reference/flux', self._on_flux, qos.STREAM),
+        ]
         self._patch_topics = parse_patches(table.patches)
         self._patches: Patches | None = None
         for body, topic in self._patch_topics.items():
             self.create_subscription(PoseStamped, topic, self._pose_taker(body), qos.STREAM)
         if self._patch_topics:
-            self.create_subscription(PointCloud2, 'tool/flux', self._on_tool_flux, qos.STREAM)
+            self._sources.append(
+                OneSource(self, PointCloud2, 'tool/flux', self._on_tool_flux, qos.STREAM)
+            )
         self.create_service(Trigger, 'field_model/reset', self._on_reset)
         self.create_service(Trigger, 'field_model/save', self._on_save)
         self.create_service(SetBool, 'field_model/freeze', self._on_freeze)
@@ -344,6 +351,9 @@ class FieldModelNode(AnserNode):
         """Return which model is in force, where it comes from, and what the refit does."""
         model = self._model
         values: dict[str, object] = {'last_refusal': self._trouble.last}
+        said = said_of(self._sources)
+        if said:
+            return Status('', Level.ERROR, f'{TWO_SOURCES}: {said}', values)
         if model is None:
             return Status('', Level.WARN, self._trouble.last or 'no setup yet', values)
         values |= {

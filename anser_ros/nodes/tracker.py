@@ -14,7 +14,8 @@ from std_msgs.msg import String
 
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.withheld import Withheld
+from anser_ros.integrity.ageing import Standing
+from anser_ros.integrity.withheld import TWO_SOURCES, Withheld
 from anser_ros.nodes import qos
 from anser_ros.nodes.answered_frames import AnsweredFrames
 from anser_ros.nodes.backlog import Backlog, take_waiting
@@ -25,6 +26,7 @@ from anser_ros.nodes.model_clouds import SECOND_NS, stamp_of
 from anser_ros.nodes.model_in_force import ModelInForce
 from anser_ros.nodes.model_intake import GivenModel, ModelIntake
 from anser_ros.nodes.node import AnserNode, Level, Status, main
+from anser_ros.nodes.one_source import OneSource, said_of
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.pose_output import PoseTopic, transform_message, transform_publisher
 from anser_ros.nodes.readiness import digest_of
@@ -180,15 +182,21 @@ class TrackerNode(AnserNode):
         self._told_s = 0.0
         self._transforms = transform_publisher(self) if table.publish_tf else None
         warm_up()
-        self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
+        setups = OneSource(
+            self, String, 'setup', self._on_setup, qos.LATCHED, lasting=lambda text: text.data
+        )
         # The executor takes topics in this order, so a model finds its uncertainty there.
         self.create_subscription(
             PointCloud2, 'field_model_error', self._on_error, qos.MODEL_ERRORS
         )
-        self.create_subscription(PointCloud2, 'field_model', self._on_model, qos.MODELS)
-        self._fluxes = self.create_subscription(
-            PointCloud2, 'tool/flux', self._on_flux, qos.STREAM
+        models = OneSource(
+            self, PointCloud2, 'field_model', self._on_model, qos.MODELS, lasting=self._lasting
         )
+        self._fluxes = OneSource(
+            self, PointCloud2, 'tool/flux', self._on_flux, qos.STREAM, self._on_doubted,
+            informed=True,
+        )  # fmt: skip
+        self._sources = [setups, models, self._fluxes]
         self._wait = self.create_timer(WAIT_PERIOD_S, self._on_wait, clock=self.steady_clock)
         self._wait.cancel()
 
@@ -275,19 +283,32 @@ class TrackerNode(AnserNode):
         # Nobody steers by a recording that is played: it is worked off whole.
         live = abs(now_ns - stamp_ns) < LIVE_WITHIN_S * SECOND_NS
         if live and received_ns and self._backlog.is_hopeless((now_ns - received_ns) / SECOND_NS):
-            waiting = take_waiting(self._fluxes)
+            waiting = take_waiting(self._fluxes.subscription)
+            believed = [self._fluxes.hears(about) for _, about in waiting]
+            if not all(believed):
+                return
             if waiting:
                 self.count('frames_skipped', len(waiting))
                 self._trouble.say(
                     'frames skipped: they come faster than they can be tracked', time.monotonic()
                 )
-                message = opened(waiting[-1], PointCloud2)
+                message = opened(waiting[-1][0], PointCloud2)
         frame = self._read(message)
         if frame is not None:
             wait_s = self.parameters.model_wait_s
             self._frames.add_frame(frame[0], frame, time.monotonic(), wait_s)
             if self._frames.waiting:
                 self._wait.reset()
+
+    def _on_doubted(self, message: PointCloud2, _info: dict[str, int]) -> None:
+        """Say of a frame that may be another sender's why it has no poses."""
+        frame = self._read(message)
+        if frame is not None:
+            self._track(frame)
+
+    def _lasting(self, message: PointCloud2) -> bytes | None:
+        """Return what a model says until there is another; None while each frame has its own."""
+        return None if self._frames.follows else bytes(message.data.tobytes())
 
     def _on_wait(self) -> None:
         """Go on with frames whose model does not come."""
@@ -314,7 +335,11 @@ class TrackerNode(AnserNode):
         begin_s = time.perf_counter()
         stamp_ns, points = frame
         estimates, changed = [], False
-        standing = self._in_force.at(stamp_ns)
+        said = said_of(self._sources)
+        if said:  # the frame may be another sender's, so the model's age is not told by its stamp
+            standing = Standing(None, Withheld(TWO_SOURCES, said))
+        else:
+            standing = self._in_force.at(stamp_ns)
         self._withheld = standing.withheld
         try:
             if standing.model is not None and standing.model is not self._tracker.model:
@@ -362,6 +387,9 @@ class TrackerNode(AnserNode):
         values['pose_listeners'] = sum(topic.listeners for topic in self._topics.values())
         if tracker is not None:
             values |= {name: count for name, count in tracker.counters.items() if name != 'frames'}
+        said = said_of(self._sources)
+        if said:
+            return Status('', Level.ERROR, f'{TWO_SOURCES}: {said}', values)
         if self._setup is None:
             return Status('', Level.WARN, self._trouble.last or 'no setup yet', values)
         if tracker is None or tracker.model is None:
@@ -379,7 +407,7 @@ class TrackerNode(AnserNode):
         values['dead_emitters'] = dead
         # A drift takes no recorded course here: field_model follows it where references tell.
         values['left_to_references'] = ', '.join(tracker.drifting_effects)
-        if self._withheld is not None:
+        if self._withheld is not None and self._withheld.state != TWO_SOURCES:
             return Status('', Level.ERROR, ': '.join(self._withheld), values)
         if dead:
             return Status('', Level.WARN, f'no flux of {dead}', values)

@@ -14,10 +14,12 @@ from std_msgs.msg import String
 
 from anser_ros.errors import AnserError
 from anser_ros.field.model import EffectRecord
+from anser_ros.integrity.withheld import TWO_SOURCES
 from anser_ros.nodes import qos
 from anser_ros.nodes.flux_reader import read_flux
 from anser_ros.nodes.model_clouds import SECOND_NS
 from anser_ros.nodes.node import AnserNode, Level, Status, main
+from anser_ros.nodes.one_source import OneSource, said_of
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.sighting_words import figures_of, plain_text, title_of, words_of
 from anser_ros.nodes.stated_parameters import stated, stated_by
@@ -99,9 +101,13 @@ class Watcher(AnserNode):
         self._look_s = 0.0
         self._busy = False
         self._tasks: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
-        self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
-        self.create_subscription(PointCloud2, 'tool/flux', self._on_tool, qos.STREAM)
-        self.create_subscription(PointCloud2, 'reference/flux', self._on_reference, qos.STREAM)
+        self._sources = [
+            OneSource(
+                self, String, 'setup', self._on_setup, qos.LATCHED, lasting=lambda text: text.data
+            ),
+            OneSource(self, PointCloud2, 'tool/flux', self._on_tool, qos.STREAM),
+            OneSource(self, PointCloud2, 'reference/flux', self._on_reference, qos.STREAM),
+        ]
         self.create_timer(POLL_S, self._begin_look, clock=self.steady_clock)
         work = self._guard(self._take_look)
         self._thread = threading.Thread(target=self._work, args=(work,), daemon=True)
@@ -212,6 +218,9 @@ class Watcher(AnserNode):
         """Return what is there, in one line, with its figures."""
         window, seen = self._window, self._sighting
         values: dict[str, object] = {'look_cpu_s': self._look_s, 'last_refusal': self._trouble}
+        said = said_of(self._sources)
+        if said:
+            return Status('', Level.ERROR, f'{TWO_SOURCES}: {said}', values)
         if window is None or self._watch is None:
             return Status('', Level.WARN, self._trouble or 'no setup yet', values)
         values |= {'searches': self._watch.searches, 'restarts': window.restarts}

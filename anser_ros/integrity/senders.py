@@ -1,0 +1,113 @@
+"""Whether a topic has one sender, told by the numbers that each sender gives its messages.
+
+The middleware numbers what a publisher sends, 1, 2, 3, but does not say who it was. Messages that
+continue one run of numbers are one stream; a second run is a second sender, known by its first
+message. How many publishers the graph knows tells a loss from another run, and ends what was said
+by a sender that has gone. A sender that crashed stays in the graph for some time: it does not
+count once it has been silent, unless what it said holds until it says otherwise.
+"""
+
+from collections.abc import Hashable
+from dataclasses import dataclass
+
+SILENT_S = 1.0
+"""A sender of a stream that said nothing for so long, s, is taken for gone. Smaller, and two that
+send in turns pass for one; larger, and a sender that was started anew is taken later."""
+
+
+@dataclass
+class _Run:
+    """Consecutive messages of one sender: the last number, when it came, and what holds by it."""
+
+    number: int
+    heard_s: float
+    lasting: Hashable
+
+
+class Senders:
+    """Tells the senders of one topic apart.
+
+    Attributes
+    ----------
+    said : str
+        Why the topic can't be believed now; empty while it has one sender.
+    """
+
+    def __init__(self, topic: str) -> None:
+        self._topic = topic
+        self._runs: list[_Run] = []
+        self._is_numbered = True
+        self.said = ''
+
+    def forget(self) -> None:
+        """Forget all that was heard."""
+        self._runs, self.said = [], ''
+
+    def continues(self, number: int | None) -> bool:
+        """Whether a message is the next one of the only sender that is heard."""
+        return len(self._runs) == 1 and number == self._runs[0].number + 1
+
+    def take(
+        self, number: int | None, publishers: int, now_s: float, lasting: Hashable = None
+    ) -> bool:
+        """Take a message; return whether it may be believed.
+
+        Parameters
+        ----------
+        number : int or None
+            Its sender's number for it; None where the middleware gives none.
+        publishers : int
+            How many the graph knows.
+        now_s : float
+            Monotonic time.
+        lasting : hashable, optional
+            What it says, where that holds until the sender says otherwise. Senders that say the
+            same do not contradict each other.
+        """
+        self._is_numbered = number is not None
+        if number is not None:
+            self._drop_silent(now_s)
+            run = self._run_of(number, publishers)
+            if run is None:
+                if publishers <= 1 and len(self._runs) == 1 and self._is_silent(now_s):
+                    self._runs.clear()  # it has gone, and this is its successor
+                self._runs.append(_Run(number, now_s, lasting))
+            else:
+                run.number, run.heard_s, run.lasting = number, now_s, lasting
+        return not self.look(publishers, now_s)
+
+    def look(self, publishers: int, now_s: float) -> str:
+        """Return `said` as it is now, when no message has come."""
+        self._drop_silent(now_s)
+        said = {run.lasting for run in self._runs}
+        agree = len(said) == 1 and None not in said
+        if not self._is_numbered and publishers > 1:
+            self.said = f'{publishers} publishers of {self._topic}'
+        elif len(self._runs) > 1 and not agree:
+            self.said = f'two publishers of {self._topic}'
+        else:
+            self.said = ''
+        return self.said
+
+    def _drop_silent(self, now_s: float) -> None:
+        """Drop the runs that have ended.
+
+        What lasts outlives its sender's silence. Once one of several senders has gone, it can't be
+        told which, so what they said stays until it is forgotten and asked for anew.
+        """
+        self._runs = [
+            run for run in self._runs if now_s - run.heard_s < SILENT_S or run.lasting is not None
+        ]
+
+    def _is_silent(self, now_s: float) -> bool:
+        return all(now_s - run.heard_s >= SILENT_S for run in self._runs)
+
+    def _run_of(self, number: int, publishers: int) -> _Run | None:
+        """Return the run that a message continues; None for the first of another."""
+        for run in self._runs:
+            if number == run.number + 1:
+                return run
+        if publishers > 1:
+            return None
+        earlier = [run for run in self._runs if run.number < number]
+        return max(earlier, key=lambda run: run.number, default=None)

@@ -1,0 +1,108 @@
+"""A subscription that believes one publisher, and says so where there are more."""
+
+import time
+from collections.abc import Callable, Hashable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from anser_ros.integrity.senders import Senders
+
+if TYPE_CHECKING:
+    from anser_ros.nodes.node import AnserNode
+
+LOOK_S = 0.1
+"""How often the graph is asked at most, s, while messages go on as before: it takes 15 us.
+Smaller costs more; larger, and who only begins to publish is noticed later."""
+NUMBER = 'publication_sequence_number'
+"""Key of a message's information: which of its publisher's messages it is."""
+
+
+class OneSource:
+    """Subscribes to a topic; what comes while it has several senders is not passed on.
+
+    Parameters
+    ----------
+    node : AnserNode
+    message_type, topic, callback, profile
+        As of ``create_subscription``; the callback takes the message alone, or its information
+        too where ``informed``.
+    doubted : callable, optional
+        Takes messages that are not believed.
+    lasting : callable, optional
+        Returns what a message says if that holds until its sender says otherwise, else None.
+    informed : bool
+        Whether callbacks take the message's information too.
+
+    Attributes
+    ----------
+    subscription : Subscription
+        The present one: that of a latched topic is made anew once it has a single sender again.
+    """
+
+    def __init__(
+        self,
+        node: 'AnserNode',
+        message_type: type,
+        topic: str,
+        callback: Callable[..., None],
+        profile: QoSProfile,
+        doubted: Callable[..., None] | None = None,
+        lasting: Callable[[Any], Hashable] | None = None,
+        informed: bool = False,
+    ) -> None:
+        self._node, self._topic = node, topic
+        self._callback, self._doubted, self._lasting = callback, doubted, lasting
+        self._informed = informed
+        self._arguments = message_type, profile
+        self._sources = Senders(topic)
+        self._publishers, self._looked_s = 0, 0.0
+        self._refused = False
+        self.subscription = self._subscribed()
+
+    @property
+    def said(self) -> str:
+        """Why the topic can't be believed now; empty while it has one sender."""
+        now_s = time.monotonic()
+        said = self._sources.look(self._count(now_s), now_s)
+        latched = self._arguments[1].durability == DurabilityPolicy.TRANSIENT_LOCAL
+        if latched and self._refused and self._publishers <= 1:
+            # Who is left says again what holds.
+            self._refused = False
+            self._sources.forget()
+            self._node.destroy_subscription(self.subscription)
+            self.subscription = self._subscribed()
+        return said
+
+    def hears(self, info: Mapping[str, Any], lasting: Hashable = None) -> bool:
+        """Take a message's information; return whether the message may be believed."""
+        now_s, number = time.monotonic(), info.get(NUMBER)
+        if not self._sources.continues(number):
+            self._looked_s = 0.0  # the graph as it is at this moment is needed
+        is_good = self._sources.take(number, self._count(now_s), now_s, lasting)
+        if not is_good:
+            self._refused = True
+            self._node.warn('messages_of_two_sources', self._sources.said)
+        return is_good
+
+    def _subscribed(self) -> Any:
+        message_type, profile = self._arguments
+        return self._node.create_subscription(message_type, self._topic, self._take, profile)
+
+    def _take(self, message: Any, info: Mapping[str, Any]) -> None:
+        lasting = None if self._lasting is None else self._lasting(message)
+        callback = self._callback if self.hears(info, lasting) else self._doubted
+        if callback is not None:
+            callback(message, *([info] if self._informed else []))
+
+    def _count(self, now_s: float) -> int:
+        """How many publishers the graph knows."""
+        if now_s - self._looked_s > LOOK_S:
+            name = self.subscription.topic_name
+            self._publishers, self._looked_s = self._node.count_publishers(name), now_s
+        return self._publishers
+
+
+def said_of(sources: list[OneSource]) -> str:
+    """Return what is said of topics with several senders; empty where each has one."""
+    return '; '.join(filter(None, [source.said for source in sources]))
