@@ -147,7 +147,6 @@ class CuSimulator(AnserNode):
             seed=table.seed,
         )
         self._least_late_ns = math.inf
-        self._answers: deque[tuple[float, Piece]] = deque()
         self._rng = np.random.default_rng(table.seed + 1)
         self._injector = FaultInjector(table.fault, table.fault_period_s, table.seed)
         self._port = PseudoPort(Path(table.link))
@@ -185,18 +184,22 @@ class CuSimulator(AnserNode):
         return self._due_s(self._unit.samples) - STRETCH_S
 
     def _step(self) -> None:
-        """Send what is due. The next stretch is worked out before its time, so nothing is late."""
+        """Send what is due. The next stretch is worked out before its time, so nothing is late.
+
+        Where it is late all the same, on a busy machine, commands wait until the samples before
+        them are there, and answers follow these: the host dates samples by the answers.
+        """
         unit = self._unit
         now_s = self._elapsed_s()
         self._plug(now_s)
         unit.overload(self._injector.lasts(now_s, SATURATION))
-        self._answers.extend((now_s, answer) for answer in unit.receive(self._port.read()))
+        answers = unit.receive(self._port.read()) if self._due_s(unit.samples) >= now_s else []
         if unit.streaming and self._stream_begin_s == math.inf:
             self._stream_begin_s = now_s
         due = []
         while self._prepared and self._due_s(self._prepared[0].end_sample) <= now_s:
             due.append(self._prepared.popleft())
-        self._send([*due, *self._due_answers(now_s)], now_s)
+        self._send([*due, *answers], now_s)
         if due and due[-1].is_block:
             due_ns = self._begin_ns + round(1e9 * self._due_s(due[-1].end_sample))
             self._least_late_ns = min(self._least_late_ns, time.monotonic_ns() - due_ns)
@@ -207,19 +210,6 @@ class CuSimulator(AnserNode):
                 self.count('lags')
                 unit.skip(int(late_s * unit.sample_rate_hz))
             self._prepared.extend(unit.advance(round(STRETCH_S * unit.sample_rate_hz)))
-
-    def _due_answers(self, now_s: float) -> list[Piece]:
-        """Take the answers to commands that came before the next block is complete.
-
-        The host dates samples by them, so they follow all blocks that a device would have sent
-        before, however late a busy machine makes those.
-        """
-        first = self._prepared[0].end_sample if self._prepared else self._unit.samples
-        until_s = self._due_s(first) if self._unit.streaming else now_s
-        due = []
-        while self._answers and self._answers[0][0] <= until_s:
-            due.append(self._answers.popleft()[1])
-        return due
 
     def _send(self, pieces: list[Piece], now_s: float) -> None:
         arriving = self._injector.apply(pieces, now_s)
