@@ -13,7 +13,11 @@ import anser_ros
 from anser_ros import Model, load_session, load_setup, track, write_session
 from anser_ros.errors import BagError, FitError, ParameterError, SetupError
 
-MODULES = ('calibration', 'diagnosis', 'model', 'recording', 'setup', 'tracking')
+MODULES = (
+    pytest.param('calibration', marks=pytest.mark.long),
+    pytest.param('diagnosis', marks=pytest.mark.long),
+    'model', 'recording', 'setup', 'tracking',
+)  # fmt: skip
 # A meta path hook in whose presence nothing of ROS can be imported.
 NO_ROS = """
 import sys

@@ -91,6 +91,7 @@ def test_a_cut_bag_is_read_as_far_as_it_goes(whole, tmp_path, share):
     assert len(messages) > everything * (share - 0.35)
 
 
+@pytest.mark.long
 def test_damage_inside_never_crashes_and_never_reads_wrong(whole, tmp_path):
     data, rng = whole.read_bytes(), np.random.default_rng(5)
     good = read_bag(whole).tool

@@ -82,6 +82,7 @@ def test_no_body_gives_energy(world):
         assert np.linalg.eigvalsh(absorbed).max() < 0
 
 
+@pytest.mark.long
 def test_a_large_sheet_of_a_good_conductor_is_a_mirror(world):
     sheets, omega = world('sheets'), np.array([2 * np.pi * 6500])
     sheet = sheets.Sheet(np.array([0.0, 0.0, -0.05]), np.eye(3), 1.0, 1e-9, cells=26)

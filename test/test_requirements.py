@@ -52,6 +52,7 @@ def package(tag):
     return [element.text for element in ElementTree.parse(REPO / 'package.xml').iter(tag)]
 
 
+@pytest.mark.long
 def test_every_import_is_asked_for_and_nothing_else():
     ros = {name for name in package('exec_depend') if not name.startswith('python3-')}
     known = packages_distributions()

@@ -86,6 +86,7 @@ def test_errors_are_what_their_sigma_says(rng):
         assert 1.3 < np.percentile(values, 95) < 2.3, name
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('noise_t', [20e-12, 100e-12])
 def test_the_noise_is_learnt_from_residuals(rng, noise_t):
     tracker = Tracker(MODEL, TOOL, EXACT)
