@@ -116,6 +116,7 @@ def test_growth_is_a_trend_and_no_step():
 
 
 @pytest.mark.processes
+@pytest.mark.realtime
 def test_a_sample_of_the_trial_passes(tmp_path):
     out = tmp_path / 'rows.json'
     command = [sys.executable, str(CHAOS / 'run.py'), '--only', *SAMPLE, '--duration', '1.0']

@@ -6,9 +6,10 @@ from tracking_world import NOISE_T, certain_model
 
 from anser_ros.errors import TrackingError
 from anser_ros.physics.dipole import flux_jacobian
+from anser_ros.physics.tangent import fill_tangent
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking import rotations
-from anser_ros.tracking.descent import fill_coil_basis, fill_tangent
+from anser_ros.tracking.descent import fill_coil_basis
 from anser_ros.tracking.projection import descend_projected
 from anser_ros.tracking.solve import RealField, solve_coil, whitening_of
 from anser_ros.tracking.uncertainty import (

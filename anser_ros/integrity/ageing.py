@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from anser_ros.field.model import FieldModel
+from anser_ros.frames.intake import NANO
 from anser_ros.integrity.withheld import REFERENCES_LOST, Withheld
 from anser_ros.physics.volume import TrackedVolume
 
-NANO = 1e-9
-"""Seconds in a nanosecond."""
 SPEED_S = 0.3
 """Time over which the last speed of the metal is taken, s. Shorter, and the noise of the refit is
 taken for speed; longer, and metal that comes near counts as slow: its effect grows with the sixth

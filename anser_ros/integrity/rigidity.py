@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from anser_ros.physics.tangent import fill_tangent
+
 Array = NDArray[np.float64]
 
 SELDOM = 1e-6
@@ -57,16 +59,6 @@ class SurveyErrors:
 
 
 @numba.njit(cache=True, error_model='numpy')
-def _tangent(n, t):  # type: ignore[no-untyped-def]
-    """Write two unit vectors across the unit vector n (Duff et al., JCGT 2017)."""
-    sign = 1.0 if n[2] >= 0.0 else -1.0
-    a = -1.0 / (sign + n[2])
-    b = n[0] * n[1] * a
-    t[0, 0], t[0, 1], t[0, 2] = 1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0]
-    t[1, 0], t[1, 1], t[1, 2] = b, sign + n[1] * n[1] * a, -n[1]
-
-
-@numba.njit(cache=True, error_model='numpy')
 def fill_distances(  # type: ignore[no-untyped-def]
     position, rotation, covariance, offsets, axes, positions, directions, covariances, took_part,
     survey, found,
@@ -84,7 +76,7 @@ def fill_distances(  # type: ignore[no-untyped-def]
     arms, turned = np.dot(offsets, rotation.T), np.dot(axes, rotation.T)
     for s in range(offsets.shape[0]):
         n, m = turned[s], directions[s]
-        _tangent(m, t)
+        fill_tangent(m, t)
         cross = np.cross(n, m)
         sine = math.sqrt(np.dot(cross, cross))
         angle = math.atan2(sine, np.dot(n, m))

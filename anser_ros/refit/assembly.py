@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,7 @@ from anser_ros.refit.beside import Beside
 from anser_ros.refit.evidence import FrameEvidence
 from anser_ros.refit.layer import Layer, component_rows
 from anser_ros.refit.modes import ErrorLevel, PosteriorModes, error_level, error_modes
-from anser_ros.refit.posterior import Bank
+from anser_ros.refit.posterior import Bank, make_room
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -165,11 +164,11 @@ class Assembly:
         """Return all modes and the remaining error, unchanged for a while to spare receivers."""
         bank, place, weights = change.bank, change.place, change.weights
         ranked = sorted(change.parts, key=lambda h: -float(weights[h]))
-        rival = next((h for h in ranked[1:] if float(weights[h]) > RIVAL), None)
-        steps = max(0, round(np.log(max(typical, 1.0)) / (2.0 * np.log(INFLATION_STEP))))
         if not ranked:
             return self._with_base(np.zeros((0, *change.shape), dtype=complex), 0.0)
         best = ranked[0]
+        rival = next((h for h in ranked[1:] if float(weights[h]) > RIVAL), None)
+        steps = max(0, round(np.log(max(typical, 1.0)) / (2.0 * np.log(INFLATION_STEP))))
         level = error_level(bank, change.seen, best)
         names = tuple(bank.prior(h).name for h in ranked[:1] + ([] if rival is None else [rival]))
         key = (bank.rows.tobytes(), names, level, steps, place.name)
@@ -184,17 +183,14 @@ class Assembly:
                 own, rest = self._until_known(change, best, level, n_modes)
                 self._interim = key, self._with_base(own * inflation, rest * inflation)
             return self._interim[1]
-        self._last, self._interim = (
-            _ErrorBefore(bank.rows.tobytes(), best, names[0], level, errors),
-            None,
-        )
+        self._last = _ErrorBefore(bank.rows.tobytes(), best, names[0], level, errors)
+        self._interim = None
         own, rest = change.modes(errors, best, n_modes)
         own, rest = own * inflation, rest * inflation
         if rival is not None:
             own[-1] += np.sqrt(weights[best] * weights[rival]) * change.between(best, rival)
         whole = self._with_base(own, rest)
-        if len(self._whole) >= MOST_MODES:
-            del self._whole[next(iter(self._whole))]
+        make_room(self._whole, MOST_MODES)
         self._whole[key] = (self._count, whole)
         return whole
 
@@ -214,12 +210,12 @@ class Assembly:
         if key in self._modes:
             return self._modes[key]
         if key not in self._coming:
-            _make_room(self._coming)
+            make_room(self._coming, MOST_MODES)
             work = partial(error_modes, bank, bank.posterior(hypothesis), level, count)
             self._coming[key] = Beside(work, change.stamp_ns)
         if not self._coming[key].is_due(change.stamp_ns):
             return None
-        _make_room(self._modes)
+        make_room(self._modes, MOST_MODES)
         self._modes[key] = self._coming.pop(key).result()
         return self._modes[key]
 
@@ -312,12 +308,6 @@ class _ErrorBefore:
             and bank.names[self.hypothesis] == self.name
             and bank.prior(self.hypothesis).layer.name in change.place.layer_rows
         )
-
-
-def _make_room(table: dict[tuple[object, ...], Any]) -> None:
-    """Drop the oldest entry of a table that is full."""
-    if len(table) >= MOST_MODES:
-        del table[next(iter(table))]
 
 
 def _padded(modes: ComplexArray, size: int) -> ComplexArray:

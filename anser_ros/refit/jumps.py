@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.frames.intake import NANO
 from anser_ros.refit.agreement import left_out
 from anser_ros.refit.evidence import STRENGTHS, FrameEvidence, log_sum, over_strengths
 from anser_ros.refit.health import FAULT_ODDS, FAULT_SCALES
@@ -42,8 +43,6 @@ COMMON = 0.003
 slowly, each on its own; a gain that all references share, in their amplifier, steps like that."""
 RETURNED = 0.1
 """Part of a jump that may be left where a reference has jumped back: metal moved meanwhile."""
-NANO = 1e-9
-"""Seconds in a nanosecond."""
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ MOST_TABLES, MOST_BLOCKS = 12, 128
 """Noise levels and coil blocks that are kept ready."""
 
 
-def _make_room(table: dict[Any, Any], most: int) -> None:
+def make_room(table: dict[Any, Any], most: int) -> None:
     """Drop the oldest entry of a table that is full."""
     if len(table) >= most:
         del table[next(iter(table))]
@@ -184,7 +184,7 @@ class Bank:
         """Return inverse variances (H, A, n) and log determinants (H, A) at a noise level."""
         if noise not in self._tables:
             variance = STRENGTHS[None, :, None] * self.spectra[:, None, :] + noise**2
-            _make_room(self._tables, MOST_TABLES)
+            make_room(self._tables, MOST_TABLES)
             log_det = np.log(variance).sum(axis=2)
             self._tables[noise] = ((1.0 / variance).astype(np.float32), log_det)
         return self._tables[noise]
@@ -258,7 +258,7 @@ class Bank:
         key = (noise, hypothesis, strength)
         if key not in self._blocks:
             precision, _ = self.precision(noise)
-            _make_room(self._blocks, MOST_BLOCKS)
+            make_room(self._blocks, MOST_BLOCKS)
             rows = self.bases[hypothesis].reshape(-1, self.width, len(self.rows))
             blocks = (rows * precision[hypothesis, strength]) @ rows.swapaxes(1, 2)
             self._blocks[key] = np.linalg.inv(blocks)

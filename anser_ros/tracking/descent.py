@@ -12,6 +12,7 @@ import numpy as np
 
 from anser_ros.physics.constants import DIPOLE_CONSTANT
 from anser_ros.physics.dipole import GAUSS_OFFSET
+from anser_ros.physics.tangent import fill_tangent
 
 LARGEST_MOVE_M, LARGEST_TURN = 0.04, 0.6
 """Longest step of the descent: of the position, m, and of the axis, rad. Over this distance the
@@ -74,19 +75,6 @@ def fill_coil_basis(point, axis, length, dipoles, basis):  # type: ignore[no-unt
                 else:
                     slope[j] += g
                     turn[j] += b
-
-
-@numba.njit(cache=True, error_model='numpy')
-def fill_tangent(n, t):  # type: ignore[no-untyped-def]
-    """Write two unit vectors that complete the unit vector ``n`` to a right-handed frame.
-
-    Duff et al., Building an orthonormal basis, revisited, JCGT 2017: no direction is singular.
-    """
-    sign = 1.0 if n[2] >= 0.0 else -1.0
-    a = -1.0 / (sign + n[2])
-    b = n[0] * n[1] * a
-    t[0, 0], t[0, 1], t[0, 2] = 1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0]
-    t[1, 0], t[1, 1], t[1, 2] = b, sign + n[1] * n[1] * a, -n[1]
 
 
 @numba.njit(cache=True, error_model='numpy')

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from anser_ros.physics.dipole import fill_field_and_gradient
-from anser_ros.tracking.descent import fill_tangent
+from anser_ros.physics.tangent import fill_tangent
 
 LARGEST_MOVE_M = 0.05
 """Longest step of the position, m; beyond it the linearised field is no guide any more."""

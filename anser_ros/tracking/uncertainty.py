@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from anser_ros.tracking.descent import fill_tangent
+from anser_ros.physics.tangent import fill_tangent
 
 Array = NDArray[np.float64]
 

@@ -137,10 +137,10 @@ SERIAL = (
           lambda r, g: t.hello_scaled(sample_rate_hz=1.25)),
     _line('hello-tones', 'the hello states other tones', lambda r, g: t.hello(
         frequencies_hz=tuple(6100.0 + 170.0 * k for k in range(8)))),
-    _line('hello-scale', 'the hello states twice the full scale', lambda r, g: t.hellos(
-        t.scaled_channels(2.0))),
+    _line('hello-scale', 'the hello states twice the full scale',
+          lambda r, g: t.inside(hello=t.scaled_channels(2.0))),
     _line('hello-reordered', 'the hello states the channels in another order',
-          lambda r, g: t.hellos(t.reordered_channels())),
+          lambda r, g: t.inside(hello=t.reordered_channels())),
     _line('channel-gone', 'a channel is gone from hello and blocks',
           lambda r, g: t.without_columns([4])),
     _line('channel-new', 'a channel more in hello and blocks', lambda r, g: t.with_column()),

@@ -5,9 +5,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from line import HELLO, SAMPLES, Tamper, blocks, hellos, kind, opened, with_crc
+from line import Tamper, inside, with_crc
 
-from anser_ros.wire.frames import encode
 from anser_ros.wire.records import Channel, ChannelKind, Hello, SampleBlock
 
 TOOL, REFERENCE = slice(0, 9), slice(9, 41)
@@ -25,7 +24,7 @@ def columns(change: Callable[[np.ndarray, float], np.ndarray], where: object) ->
         seen[0] += len(codes)
         return replace(given, codes=codes)
 
-    return blocks(block)
+    return inside(block=block)
 
 
 def gain(factor: float, where: object) -> Tamper:
@@ -77,7 +76,7 @@ def swapped(one: int, other: int) -> Tamper:
         codes[:, [one, other]] = codes[:, [other, one]]
         return replace(given, codes=codes)
 
-    return blocks(block)
+    return inside(block=block)
 
 
 def mixed(target: int, source: int, share: float) -> Tamper:
@@ -89,7 +88,7 @@ def mixed(target: int, source: int, share: float) -> Tamper:
         codes[:, target] = np.clip(np.rint(sum_), -32768, 32767)
         return replace(given, codes=codes)
 
-    return blocks(block)
+    return inside(block=block)
 
 
 def ring(samples: int, where: object = slice(None)) -> Tamper:
@@ -109,76 +108,58 @@ def ring(samples: int, where: object = slice(None)) -> Tamper:
         codes[:, where] = memory[rows][:, where]
         return replace(given, codes=codes)
 
-    return blocks(block)
+    return inside(block=block)
 
 
 def without_columns(where: Sequence[int]) -> Tamper:
     """Take channels away from hellos and blocks: a board of inputs that was unplugged."""
     gone = set(where)
 
-    def tamper(records: list[bytes], _on_s: float) -> list[bytes]:
-        out = []
-        for record in records:
-            if kind(record) == HELLO:
-                hello = opened(record)
-                assert isinstance(hello, Hello)
-                left = tuple(c for i, c in enumerate(hello.channels) if i not in gone)
-                record = encode(replace(hello, channels=left))
-            elif kind(record) == SAMPLES:
-                given = opened(record)
-                assert isinstance(given, SampleBlock)
-                left = [i for i in range(given.codes.shape[1]) if i not in gone]
-                record = encode(replace(given, codes=np.array(given.codes)[:, left]))
-            out.append(record)
-        return out
+    def hello(given: Hello) -> Hello:
+        left = tuple(c for i, c in enumerate(given.channels) if i not in gone)
+        return replace(given, channels=left)
 
-    return tamper
+    def block(given: SampleBlock) -> SampleBlock:
+        left = [i for i in range(given.codes.shape[1]) if i not in gone]
+        return replace(given, codes=np.array(given.codes)[:, left])
+
+    return inside(hello=hello, block=block)
 
 
 def with_column() -> Tamper:
     """Add a channel that the setup does not know."""
 
-    def tamper(records: list[bytes], _on_s: float) -> list[bytes]:
-        out = []
-        for record in records:
-            if kind(record) == HELLO:
-                hello = opened(record)
-                assert isinstance(hello, Hello)
-                more = Channel(999, ChannelKind.SENSE, 1.0)
-                record = encode(replace(hello, channels=(more, *hello.channels)))
-            elif kind(record) == SAMPLES:
-                given = opened(record)
-                assert isinstance(given, SampleBlock)
-                codes = np.array(given.codes)
-                record = encode(replace(given, codes=np.hstack([codes[:, :1], codes])))
-            out.append(record)
-        return out
+    def hello(given: Hello) -> Hello:
+        more = Channel(999, ChannelKind.SENSE, 1.0)
+        return replace(given, channels=(more, *given.channels))
 
-    return tamper
+    def block(given: SampleBlock) -> SampleBlock:
+        codes = np.array(given.codes)
+        return replace(given, codes=np.hstack([codes[:, :1], codes]))
+
+    return inside(hello=hello, block=block)
 
 
 def ticks(change: Callable[[int, int], int]) -> Tamper:
     """Change the blocks' time stamps: a function of the ticks and of those at the beginning."""
-    first: list[int] = []
-
-    def block(given: SampleBlock) -> SampleBlock:
-        first.append(given.timestamp_ticks)
-        del first[1:]
-        return replace(given, timestamp_ticks=change(given.timestamp_ticks, first[0]) % 2**64)
-
-    return blocks(block)
+    return _counted('timestamp_ticks', 64, change)
 
 
 def numbers(change: Callable[[int, int], int]) -> Tamper:
     """Change the blocks' sequence numbers: a function of the number and of the first one."""
+    return _counted('sequence', 32, change)
+
+
+def _counted(field: str, bits: int, change: Callable[[int, int], int]) -> Tamper:
     first: list[int] = []
 
     def block(given: SampleBlock) -> SampleBlock:
-        first.append(given.sequence)
+        value = getattr(given, field)
+        first.append(value)
         del first[1:]
-        return replace(given, sequence=change(given.sequence, first[0]) % 2**32)
+        return replace(given, **{field: change(value, first[0]) % 2**bits})
 
-    return blocks(block)
+    return inside(block=block)
 
 
 def each(change: Callable[[bytes], list[bytes]], share: float, rng: np.random.Generator) -> Tamper:
@@ -312,13 +293,13 @@ def in_bursts(period_s: float) -> Tamper:
 
 def hello(**changes: object) -> Tamper:
     """Change what hellos state."""
-    return hellos(lambda given: replace(given, **changes))
+    return inside(hello=lambda given: replace(given, **changes))
 
 
 def hello_scaled(**factors: float) -> Tamper:
     """Multiply figures of hellos."""
-    return hellos(
-        lambda given: replace(
+    return inside(
+        hello=lambda given: replace(
             given, **{key: getattr(given, key) * factor for key, factor in factors.items()}
         )
     )
