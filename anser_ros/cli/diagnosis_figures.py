@@ -99,6 +99,39 @@ def maps(before: State, after: State) -> Figure:
     return figure
 
 
+def course(path: dict[str, Any], sigma: Any, state: State) -> Figure:
+    """Draw where something was, from above and over time, with the tool's places and the board.
+
+    Parameters
+    ----------
+    path : mapping
+        ``time_s`` (P,) and ``position_m`` (P, 3) in fg.
+    sigma : array_like, shape (P, 3) or (P,), or None
+        Standard deviation of the positions, m.
+    state : State
+        Holds where the tool was.
+    """
+    figure, (above, over) = plt.subplots(1, 2, figsize=(9, 3.6), layout='constrained')
+    time, place = np.asarray(path['time_s']), 1e3 * np.asarray(path['position_m'])
+    tool = 1e3 * np.concatenate([part.view.position for part in _tools(state)])
+    above.plot(tool[:, 0], tool[:, 1], '.', ms=3, color='0.8', label='tool')
+    above.plot(place[:, 0], place[:, 1], '.-', color=BEFORE, label='path')
+    above.plot(*place[0, :2], 'o', ms=9, mfc='none', color=BEFORE, label='start')
+    above.set(xlabel='x, mm', ylabel='y, mm', aspect='equal')
+    spread = None if sigma is None else 1e3 * np.asarray(sigma).reshape(len(time), -1)
+    for axis, (name, mark) in enumerate((('x', ':'), ('y', '--'), ('z', '-'))):
+        over.plot(time, place[:, axis], mark, color=BEFORE, label=name)
+        if spread is not None:
+            wide = spread[:, min(axis, spread.shape[1] - 1)]
+            low, high = place[:, axis] - wide, place[:, axis] + wide
+            over.fill_between(time, low, high, color=BEFORE, alpha=0.12, lw=0)
+    over.set(xlabel='time, s', ylabel='position, mm')
+    for panel in (above, over):
+        panel.legend(fontsize=8)
+        panel.grid(alpha=0.3)
+    return figure
+
+
 def bars(before: State, after: State) -> Figure:
     """Draw the residual of every channel and of every emitter."""
     figure, panels = plt.subplots(1, 2, figsize=(9, 3), layout='constrained')

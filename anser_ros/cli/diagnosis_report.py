@@ -1,11 +1,11 @@
 """The diagnosis as one self-contained page for readers who do not know the code."""
 
 import html
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-from anser_ros.cli.diagnosis_figures import bars, image, maps, strongest, time_line
-from anser_ros.cli.diagnosis_words import short_ones, value_text, verdict
+from anser_ros.cli.diagnosis_figures import bars, course, image, maps, strongest, time_line
+from anser_ros.cli.diagnosis_words import paths, short_ones, value_text, verdict
 from anser_ros.diagnosis.search import Candidate
 from anser_ros.sessions.diagnosis import SessionDiagnosis
 
@@ -44,6 +44,7 @@ def render(result: SessionDiagnosis, document: dict[str, Any], *, session: str, 
         _held_out(document),
         '<h2>Effects</h2>',
         _effects(document),
+        *_paths(document, result),
         '<h2>Residuals over time</h2><p>In the pictures 1 is what noise alone would give.</p>',
         image(time_line(found.before, found.after)),
         '<h2>Residuals over the volume</h2>',
@@ -113,6 +114,25 @@ def _effects(document: dict[str, Any]) -> str:
     head = ['effect', 'what it is', 'parameters', '1 sigma', 'residual without it, pT',
             'explains nearly as much', 'online']  # fmt: skip
     return _table(head, rows).replace('\n', '<br>')
+
+
+def _paths(document: dict[str, Any], result: SessionDiagnosis) -> Iterator[str]:
+    """Every course that an effect was found to have: a picture, and its numbers on demand."""
+    for effect in document['effects']:
+        for key, path in paths(effect['parameters']):
+            sigma = effect['uncertainty'].get(key)
+            title = f'{effect["name"]}: {key}'
+            yield f'<h3>{html.escape(title)}</h3>'
+            if 'position_m' in path:
+                yield image(course(path, sigma, result.diagnosis.after))
+            columns = {**path, **({'1 sigma': sigma} if sigma is not None else {})}
+            rows = [
+                [value_text(cell) for cell in row] for row in zip(*columns.values(), strict=True)
+            ]
+            yield (
+                f'<details><summary>{len(rows)} points</summary>'
+                f'{_table(list(columns), rows)}</details>'
+            )
 
 
 def _structure(result: SessionDiagnosis) -> str:

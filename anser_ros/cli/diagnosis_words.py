@@ -1,18 +1,41 @@
 """What a diagnosis found, in words for people."""
 
+from collections import Counter
 from typing import Any
 
 LONGEST = 9
-"""Most numbers of a parameter that are shown: those of a 3 x 3 matrix. Longer ones stand in
-diagnosis.json alone."""
+"""Most numbers of a parameter that are shown in a line: those of a 3 x 3 matrix. Longer ones stand
+in diagnosis.json, paths in a table of the report too."""
+MOST_CHARACTERS = 400
+"""Characters that a verdict is kept below: about five lines of a terminal."""
 
 
 def verdict(document: dict[str, Any]) -> str:
-    """Say in one paragraph what was found and what stays unexplained."""
+    """Say in one short paragraph what was found and what stays unexplained.
+
+    Effects are named with their parameters where there is room, else by their names alone.
+    """
+    effects = document['effects']
+    for named in (_with_values, _by_name):
+        text = _paragraph(document, named(effects))
+        if len(text) < MOST_CHARACTERS:
+            return text
+    return _paragraph(document, 'see the table of effects')
+
+
+def _with_values(effects: list[dict[str, Any]]) -> str:
+    return ', '.join(_named(effect) for effect in effects)
+
+
+def _by_name(effects: list[dict[str, Any]]) -> str:
+    counts = Counter(str(effect['name']) for effect in effects)
+    return ', '.join(name if n == 1 else f'{name} ({n} times)' for name, n in counts.items())
+
+
+def _paragraph(document: dict[str, Any], names: str) -> str:
     held, effects = document['held_out'], document['effects']
     before, after = held['flux_rms_before_t'], held['flux_rms_after_t']
     if effects:
-        names = ', '.join(_named(effect) for effect in effects)
         text = (
             f'The model lacks {len(effects)} effect{"s" if len(effects) > 1 else ""}: {names}. '
             f'With {"them" if len(effects) > 1 else "it"} the residual on data that took no part '
@@ -48,11 +71,22 @@ def _named(effect: dict[str, Any]) -> str:
 
 
 def short_ones(parameters: dict[str, Any]) -> list[tuple[str, Any]]:
-    """Parameters that fit a line, by name; long lists are left out."""
+    """Parameters that fit a line, by name; long lists and mappings are left out."""
     return [(key, value) for key, value in parameters.items() if _size(value) <= LONGEST]
 
 
+def paths(parameters: dict[str, Any]) -> list[tuple[str, dict[str, list[Any]]]]:
+    """Parameters that are courses of something over time, by name: columns of equal length."""
+    return [
+        (key, value)
+        for key, value in parameters.items()
+        if isinstance(value, dict) and 'time_s' in value
+    ]
+
+
 def _size(value: Any) -> int:
+    if isinstance(value, dict):
+        return sum(_size(item) for item in value.values())
     return sum(_size(item) for item in value) if isinstance(value, list) else 1
 
 
