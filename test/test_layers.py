@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 FILES = sorted(PACKAGE.rglob('*.py'))
 CORE = {
     'physics', 'signals', 'wire', 'frames', 'field', 'metal', 'calibration', 'refit', 'effects',
-    'tracking', 'diagnosis', 'sessions', 'integrity',
+    'tracking', 'diagnosis', 'sessions', 'integrity', 'poses',
 }  # fmt: skip
 # What each layer may import of ours, itself and the errors aside.
 ALLOWED = {
@@ -32,6 +32,7 @@ ALLOWED = {
         'wire', 'frames', 'integrity', 'diagnosis', 'tracking', 'calibration', 'refit', 'effects',
         'field', 'metal', 'physics',
     },
+    'poses': {'sessions', 'diagnosis', 'calibration', 'effects', 'field', 'physics', 'wire'},
     'simulation': {'sessions', 'effects', 'field', 'metal', 'physics', 'signals', 'wire'},
     'measured': CORE,
     'experiments': {*CORE, 'simulation'},

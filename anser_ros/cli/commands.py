@@ -25,6 +25,7 @@ OFFLINE = {
     'diagnose': 'find what a model leaves unexplained on a session, name the effect, correct it',
     'error_map': 'learn an error map from tracked and true positions, and apply it to others',
     'evaluate': 'track a recorded session and compare its poses with the optical ones',
+    'import_poses': 'files of poses as trackers write them, to a bag',
     'loop': 'put an effect into simulated samples, find it blind, correct it, measure again',
     'measured': "other people's measurements: what they contain, and the error before and after",
     'paper': "redo the article's experiments: Tables II to V, Figs. 2 and 5 to 10",

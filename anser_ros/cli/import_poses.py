@@ -1,0 +1,60 @@
+"""Turn files of tracked and optical poses, in the forms that trackers write, into a bag."""
+
+import argparse
+from pathlib import Path
+
+from anser_ros.cli.output import make_folder, say_written
+from anser_ros.poses.forms import ORDERS, UNITS
+from anser_ros.poses.importing import STAMPS, import_poses
+from anser_ros.poses.recording import write_pose_session
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument(
+        'tracked',
+        nargs='+',
+        type=Path,
+        help='files of tracked poses: ToolTracker .tsv, lines of "Key: numbers", TUM or CSV',
+    )
+    parser.add_argument(
+        '--reference',
+        nargs='+',
+        type=Path,
+        default=[],
+        help='files of the optical reference, as many and in the same order',
+    )
+    parser.add_argument(
+        '--out',
+        required=True,
+        type=Path,
+        help='the .mcap file to write, its folder made if missing',
+    )
+    parser.add_argument(
+        '--stamps', choices=STAMPS, default='host', help='the time that becomes the stamp'
+    )
+    parser.add_argument('--unit', choices=list(UNITS), help='unit of the tracked positions')
+    parser.add_argument(
+        '--quaternion', choices=list(ORDERS), help='how the tracked ones are written'
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; the exit code."""
+    session = import_poses(
+        args.tracked,
+        args.reference,
+        stamps=args.stamps,
+        unit=args.unit,
+        quaternion=args.quaternion,
+    )
+    make_folder(args.out.parent)
+    write_pose_session(args.out, session)
+    sequences = [*session.sensors.values(), *filter(None, [session.reference])]
+    for poses in sequences:
+        print(
+            f'{poses.name}: {poses.size} poses, {poses.missing.size} missing, '
+            f'{poses.unordered} out of order'
+        )
+    say_written(args.out)
+    return 0

@@ -1,0 +1,1 @@
+"""Trackers that give poses only: sessions, hand-eye, diagnosis, correction."""

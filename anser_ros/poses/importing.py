@@ -1,0 +1,130 @@
+"""Rows of tracked and optical poses, from files of any known form, as one session.
+
+Times of receipt (the host's counter) are taken as they stand. A device's own counter is put on
+the host's axis by the smallest delay, or begins at zero where a form has no host's time; where it
+restarts, it goes on from where it was.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import ParameterError
+from anser_ros.poses.forms import ORDERS, UNITS, RawRows, read_form
+from anser_ros.poses.sequence import PoseSequence, PoseSession, sequence_of
+
+Array = NDArray[np.float64]
+
+BETWEEN_FILES_S = 10.0
+"""Pause, s, between recordings without a host's time that are put one after the other. A pose is
+not interpolated over a tenth of it."""
+STAMPS = ('host', 'device')
+"""Which of a file's times become stamps; the other is taken where a file lacks the one."""
+
+
+def import_poses(
+    tracked: Sequence[Path],
+    reference: Sequence[Path] = (),
+    *,
+    stamps: str = 'host',
+    unit: str | None = None,
+    quaternion: str | None = None,
+) -> PoseSession:
+    """Read files of tracked poses, and of the reference's, as one session.
+
+    Parameters
+    ----------
+    tracked, reference : sequence of Path
+        Several of each are recordings one after the other, the n-th of both together.
+    stamps : {'host', 'device'}
+    unit : str, optional
+        Unit of the tracked positions where the form does not tell it rightly (`UNITS`).
+    quaternion : str, optional
+        How the tracked quaternions are written where it is not as usual in their form (`ORDERS`).
+
+    Raises
+    ------
+    ParameterError
+        When a file has no known form, an option no known value, or numbers of files differ.
+    PlausibilityError
+        When quaternions are not of unit length.
+    """
+    for value, known in ((stamps, STAMPS), (unit, UNITS), (quaternion, ORDERS)):
+        if value is not None and value not in known:
+            raise ParameterError(f'must be one of {", ".join(known)}, got {value!r}')
+    if reference and len(reference) != len(tracked):
+        raise ParameterError(
+            f'{len(tracked)} files of tracked poses and {len(reference)} of the reference; '
+            'they belong together one by one'
+        )
+    pieces: list[tuple[str, Array, Array, Array]] = []
+    free = 0.0  # where the next recording without a host's time begins, s
+    for number, path in enumerate(tracked):
+        groups = _named(read_form(path), None, unit, quaternion)
+        if reference:
+            groups |= _named(read_form(reference[number]), 'optical', None, None)
+        times = {label: _times(rows, stamps) for label, (rows, _, _) in groups.items()}
+        own = [time for time, is_host in times.values() if not is_host]
+        for label, (_, position, turn) in groups.items():
+            time, is_host = times[label]
+            begin = 0.0 if is_host else _begin(label, times) - free
+            pieces.append((label, time - begin, position, turn))
+        if own:
+            free = max(float(np.nanmax(p[1])) for p in pieces) + BETWEEN_FILES_S
+    return _session(str(tracked[0]), pieces)
+
+
+def _begin(label: str, times: Mapping[str, tuple[Array, bool]]) -> float:
+    """Where a device's own time begins: two devices that count for themselves start together."""
+    same = [t for key, (t, _) in times.items() if (key == 'optical') == (label == 'optical')]
+    return min(float(np.nanmin(t)) for t in same)
+
+
+def _named(
+    rows: Mapping[str, RawRows], name: str | None, unit: str | None, quaternion: str | None
+) -> dict[str, tuple[RawRows, Array, Array]]:
+    """Positions (m) and quaternions (x y z w) of each group of rows, under its name."""
+    if name is not None:  # of an optical file only the first tool is the reference
+        rows = {name: next(iter(rows.values()))}
+    found = {}
+    for label, one in rows.items():
+        table = np.array(one.values, dtype=np.float64).reshape(-1, 7)
+        order, is_inverse = ORDERS[quaternion or one.form]
+        turn = table[:, 3:][:, list(order)]
+        if is_inverse:
+            turn = turn * np.array([-1.0, -1.0, -1.0, 1.0])
+        found[label] = one, table[:, :3] * UNITS[unit or one.unit], turn
+    return found
+
+
+def _times(rows: RawRows, stamps: str) -> tuple[Array, bool]:
+    """Times of a group of rows, s, and whether they are on the host's axis."""
+    host, device = np.array(rows.host), _continued(np.array(rows.device))
+    if not np.isfinite(host).any():
+        return device, False
+    if stamps == 'host' or not np.isfinite(device).any():
+        return host, True
+    return device + float(np.nanmin(host - device)), True
+
+
+def _continued(counter: Array) -> Array:
+    """A counter that goes on where it restarts: a fall by more than a second is a restart."""
+    steps = np.diff(counter, prepend=counter[:1])
+    falls = np.where(steps < -1.0, -steps, 0.0)
+    return np.asarray(counter + np.cumsum(np.nan_to_num(falls)))
+
+
+def _session(path: str, pieces: Sequence[tuple[str, Array, Array, Array]]) -> PoseSession:
+    start = min(float(np.nanmin(time)) for _, time, _, _ in pieces)
+    sequences: dict[str, PoseSequence] = {}
+    for label in dict.fromkeys(piece[0] for piece in pieces):
+        chosen = [piece for piece in pieces if piece[0] == label]
+        time, position, turn = (np.concatenate([p[i] for p in chosen]) for i in (1, 2, 3))
+        known = np.isfinite(time)
+        sequences[label] = sequence_of(label, time[known] - start, position[known], turn[known])
+    reference = sequences.pop('optical', None)
+    # A bag's stamp of zero means none.
+    start_ns = max(round(start * 1e9), 1_000_000_000)
+    return PoseSession(path, start_ns, sequences, reference)

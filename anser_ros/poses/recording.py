@@ -1,0 +1,122 @@
+"""Sessions of poses in bags: read by topic, and written."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import BagError
+from anser_ros.poses.sequence import PoseSequence, PoseSession, sequence_of
+from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages, stamp_ns
+from anser_ros.wire.bag_writer import SessionWriter
+from anser_ros.wire.setup import topic_of
+
+Array = NDArray[np.float64]
+
+TRACKED, OPTICAL = '/tracked/', '/optical/'
+"""What the topics of tracked and of optical poses begin with."""
+ENDING = '/pose'
+"""What the topics of poses end with."""
+SCHEMA = 'anser_poses/1'
+"""Schema of the setup document of a session of poses."""
+NANO = 1e-9  # s in a nanosecond
+
+
+def read_pose_session(
+    path: str | os.PathLike[str],
+    tracked: Mapping[str, str] | None = None,
+    optical: str | None = None,
+) -> PoseSession:
+    """Read a bag of tracked and optical poses.
+
+    Parameters
+    ----------
+    path : path of the ``.mcap`` file or of the bag's folder
+    tracked : mapping, optional
+        Topic of each sensor by the sensor's name; by default all ``/tracked/<sensor>/pose``.
+    optical : str, optional
+        Topic of the reference; by default the only ``/optical/<body>/pose``.
+
+    Raises
+    ------
+    BagError
+        When the bag can't be read, or has no tracked poses, or several references.
+    PlausibilityError
+        When quaternions are not of unit length.
+    """
+    name, salvage, decoder = os.fspath(path), Salvage(), MessageDecoder()
+    stamps: dict[str, list[int]] = {}
+    rows: dict[str, list[tuple[float, ...]]] = {}
+    for raw in iter_messages(path, salvage):
+        if raw.type_name == POSE_TYPE:
+            message = decoder.decode(raw)
+            p, q = message.pose.position, message.pose.orientation
+            stamps.setdefault(raw.topic, []).append(stamp_ns(message))
+            rows.setdefault(raw.topic, []).append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+    chosen = tracked or {
+        topic[len(TRACKED) : -len(ENDING)]: topic
+        for topic in sorted(rows)
+        if topic.startswith(TRACKED) and topic.endswith(ENDING)
+    }
+    reference = optical or _only_optical(name, list(rows))
+    for topic in (*chosen.values(), *([reference] if reference else [])):
+        if topic not in rows:
+            known = ', '.join(sorted(rows)) or 'none'
+            raise BagError(f'{name}: no poses on {topic}; topics of poses: {known}')
+    if not chosen:
+        raise BagError(f'{name}: no tracked poses, which stand on {TRACKED}<sensor>{ENDING}')
+    start = min(min(stamps[topic]) for topic in (*chosen.values(), *filter(None, [reference])))
+
+    def sequence(label: str, topic: str) -> PoseSequence:
+        table = np.array(rows[topic], dtype=np.float64).reshape(-1, 7)
+        time = np.array([stamp - start for stamp in stamps[topic]]) * NANO
+        return sequence_of(label, time, table[:, :3], table[:, 3:])
+
+    return PoseSession(
+        name,
+        start,
+        {label: sequence(label, topic) for label, topic in chosen.items()},
+        sequence('optical', reference) if reference else None,
+        salvage.lost,
+    )
+
+
+def _only_optical(path: str, topics: list[str]) -> str | None:
+    found = [t for t in topics if t.startswith(OPTICAL) and t.endswith(ENDING)]
+    if len(found) > 1:
+        raise BagError(f'{path}: several references, name one: {", ".join(sorted(found))}')
+    return found[0] if found else None
+
+
+def write_pose_session(path: Path, session: PoseSession, body: str = 'body') -> None:
+    """Write a session of poses as a bag; where a device had no pose, values are NaN.
+
+    Raises
+    ------
+    BagError
+        When the file exists already.
+    """
+    sequences = [(f'{TRACKED}{topic_of(n)}{ENDING}', s) for n, s in session.sensors.items()]
+    if session.reference is not None:
+        sequences.append((f'{OPTICAL}{topic_of(body)}{ENDING}', session.reference))
+    messages: list[tuple[int, str, list[float], list[float]]] = []
+    for topic, poses in sequences:
+        stamp = session.start_ns + np.round(poses.time / NANO).astype(np.int64)
+        messages += zip(
+            stamp.tolist(),
+            [topic] * poses.size,
+            poses.position.tolist(),
+            poses.quaternion.tolist(),
+            strict=True,
+        )
+        for late in (session.start_ns + np.round(poses.missing / NANO).astype(np.int64)).tolist():
+            messages.append((late, topic, [np.nan] * 3, [np.nan] * 4))
+    messages.sort(key=lambda message: message[0])
+    names = ', '.join(session.sensors)
+    with SessionWriter(path, frame_id='tracker') as writer:
+        setup = f'schema: {SCHEMA}\nsensors: [{names}]\nbody: {body}\n'
+        writer.write_setup(setup, messages[0][0] if messages else session.start_ns)
+        for stamp_of, topic, position, quaternion in messages:
+            writer.write_pose(topic, stamp_of, position, quaternion)

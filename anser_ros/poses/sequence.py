@@ -1,0 +1,144 @@
+"""Poses of one sensor or body over time, and a session of several with an optical reference."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from anser_ros.errors import PlausibilityError
+from anser_ros.physics.pose_track import PoseTrack
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+FARTHEST = 1e6
+"""Coordinate, m, from which on it is a device's marker for no pose and no position: no tracker
+sees a thousand kilometres, NDI's marker is 3.7e28."""
+NO_TURN = 0.1
+"""Norm of a quaternion below which it is a marker for no pose; a rounded one has a norm near 1."""
+NOT_UNIT = 0.05
+"""How far the norm of a quaternion may be from one: four digits are given by the coarsest form."""
+
+
+@dataclass(frozen=True)
+class PoseSequence:
+    """Poses of one sensor or body in the order of their stamps.
+
+    Attributes
+    ----------
+    name : str
+    time : ndarray, shape (n,)
+        Stamps, s since the session's start, ascending.
+    position : ndarray, shape (n, 3)
+        m, in the frame of the tracker that gave them.
+    quaternion : ndarray, shape (n, 4)
+        Unit, from the sensor's frame to the tracker's, in the order x y z w.
+    missing : ndarray, shape (k,)
+        Stamps, s, under which the device said that it has no pose.
+    unordered : int
+        Poses whose stamp was before that of the pose written before them.
+    """
+
+    name: str
+    time: Array
+    position: Array
+    quaternion: Array
+    missing: Array
+    unordered: int = 0
+
+    @property
+    def size(self) -> int:
+        """The number of poses."""
+        return int(self.time.size)
+
+    @property
+    def rotation(self) -> Array:
+        """Rotation matrices, shape (n, 3, 3), from the sensor's frame to the tracker's."""
+        return np.asarray(Rotation.from_quat(self.quaternion).as_matrix()).reshape(-1, 3, 3)
+
+    def rows(self, keep: NDArray[np.generic]) -> 'PoseSequence':
+        """The poses that are named by index or mask."""
+        return replace(
+            self,
+            time=self.time[keep],
+            position=self.position[keep],
+            quaternion=self.quaternion[keep],
+        )
+
+    @property
+    def repeated(self) -> Mask:
+        """Mask (n,) of poses that are those before them, number for number."""
+        same = (np.diff(self.position, axis=0) == 0).all(axis=1)
+        same &= (np.diff(self.quaternion, axis=0) == 0).all(axis=1)
+        return np.concatenate([[False], same]) if self.size else np.zeros(0, dtype=bool)
+
+    def track(self) -> PoseTrack:
+        """The first of each run of the same pose, as a track that can be interpolated."""
+        fresh = self.rows(~self.repeated)
+        _, first = np.unique(fresh.time, return_index=True)
+        return PoseTrack(fresh.time[first], fresh.position[first], fresh.quaternion[first])
+
+
+@dataclass(frozen=True)
+class PoseSession:
+    """One recording of a tracker that gives poses, with an optical reference.
+
+    Attributes
+    ----------
+    path : str
+        Where it comes from, for messages.
+    start_ns : int
+        The stamp at time 0.
+    sensors : mapping of str to PoseSequence
+        Tracked poses, all of one rigid body.
+    reference : PoseSequence or None
+        Poses of the body by the optical tracker, in the optical frame and on its own clock.
+    lost : str
+        What could not be read, in words; empty when nothing is missing.
+    """
+
+    path: str
+    start_ns: int
+    sensors: Mapping[str, PoseSequence]
+    reference: PoseSequence | None
+    lost: str = ''
+
+
+def sequence_of(name: str, time: Array, position: Array, quaternion: Array) -> PoseSequence:
+    """A sequence from rows as they were written: sorted, markers for no pose taken out.
+
+    Parameters
+    ----------
+    name : str
+    time : ndarray, shape (n,)
+        s, in any order.
+    position : ndarray, shape (n, 3)
+        m; not finite, or beyond all measure, where there is no pose.
+    quaternion : ndarray, shape (n, 4)
+        In the order x y z w, of unit length up to rounding; zero or not finite for no pose.
+
+    Raises
+    ------
+    PlausibilityError
+        When quaternions that are no markers are not of unit length.
+    """
+    norm = np.linalg.norm(quaternion, axis=1)
+    whole = np.isfinite(position).all(axis=1) & (np.abs(position) < FARTHEST).all(axis=1)
+    whole &= np.isfinite(norm) & (norm > NO_TURN) & (norm < FARTHEST)
+    crooked = whole & (np.abs(norm - 1) > NOT_UNIT)
+    if 2 * int(crooked.sum()) > max(int(whole.sum()), 1):
+        raise PlausibilityError(
+            f'{name}: quaternions have a norm of {np.median(norm[whole]):.3g}, not 1'
+        )
+    whole &= ~crooked
+    order = np.argsort(time[whole], kind='stable')
+    return PoseSequence(
+        name,
+        time[whole][order],
+        position[whole][order],
+        (quaternion[whole] / norm[whole, None])[order],
+        np.sort(time[~whole]),
+        int(np.count_nonzero(np.diff(time) < 0)),
+    )

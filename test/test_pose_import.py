@@ -1,0 +1,157 @@
+"""Files of poses as trackers write them: what each form means, and what is refused."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from anser_ros.cli.main import run_verb
+from anser_ros.errors import BagError, ParameterError, PlausibilityError
+from anser_ros.poses.importing import import_poses
+from anser_ros.poses.recording import read_pose_session
+
+MISSING = '-3.697314E28'
+TURN = Rotation.from_rotvec([0.3, -0.2, 0.5])
+
+
+def write(path, *lines):
+    path.write_text('\n'.join(lines) + '\n', encoding='utf-8')
+    return path
+
+
+def tool_tracker(path, rows, ports=('Port 10: X', 'Port 11: Y')):
+    names = r'Frame\tFace\tState\tQ0\tQx\tQy\tQz\tTx\tTy\tTz\tError\tMarkers'.replace(r'\t', '\t')
+    head = '\t'.join(['Tools', *(f'{port}\t{names}' for port in ports)])
+    lines = [head]
+    for cells in rows:
+        groups = ('\t'.join([p, *c, '0.1', '0']) for p, c in zip(ports, cells, strict=True))
+        lines.append('\t'.join(['2', *groups]))
+    return write(path, *lines)
+
+
+def cell(frame, state='OK', numbers=None, x=1.0):
+    q = TURN.as_quat()
+    numbers = numbers or [str(v) for v in (q[3], *q[:3], x, 20.0, -30.0)]
+    return [str(frame), '1', state, *numbers]
+
+
+def line(sensor, x, q, stamp):
+    return (
+        f'SensorID: {sensor} Position: {x} 2 3 Orientation: {" ".join(map(str, q))} Time: {stamp}'
+    )
+
+
+def test_tool_tracker_counts_field_periods_and_says_what_is_missing(tmp_path):
+    gone = cell(3208, 'Too Few Markers', [MISSING] * 7)
+    path = tool_tracker(tmp_path / 'a.tsv', [
+        (cell(3200), cell(3200)), (cell(3208, x=2.0), gone), (cell(3216), cell(3216, 'Bad Fit')),
+    ])  # fmt: skip
+    session = import_poses([path])
+    one, other = session.sensors['port_10'], session.sensors['port_11']
+    np.testing.assert_allclose(one.time, [0, 0.025, 0.05], atol=1e-12)
+    np.testing.assert_allclose(one.position[1], [0.002, 0.02, -0.03])
+    np.testing.assert_allclose(one.rotation[0], TURN.as_matrix(), atol=1e-12)
+    assert other.size == 1
+    np.testing.assert_allclose(other.missing, [0.025, 0.05])
+
+
+def test_a_counter_that_restarts_goes_on(tmp_path):
+    path = tool_tracker(tmp_path / 'a.tsv', [(cell(n),) for n in (64000, 64008, 8, 16)],
+                        ports=('Port 10: X',))  # fmt: skip
+    time = import_poses([path]).sensors['port_10'].time
+    np.testing.assert_allclose(time, [0, 0.025, 0.025, 0.05], atol=1e-9)
+
+
+def test_lines_of_several_sensors_out_of_order(tmp_path):
+    q = TURN.as_quat()
+    path = write(tmp_path / 'a.txt', line(0, 1, q, 5_000_000_000), line(1, 4, q, 5_100_000_000),
+                 line(0, 3, q, 5_400_000_000), line(0, 2, q, 5_200_000_000),
+                 line(1, MISSING, q, 5_300_000_000), 'end')  # fmt: skip
+    session = import_poses([path])
+    first = session.sensors['sensor_0']
+    np.testing.assert_allclose(first.time, [0, 0.2, 0.4])
+    np.testing.assert_allclose(first.position[:, 0], [0.001, 0.002, 0.003])
+    assert first.unordered == 1
+    assert session.sensors['sensor_1'].missing.size == 1
+    assert session.start_ns == 5_000_000_000
+
+
+def test_ascension_writes_the_scalar_first_and_the_inverse(tmp_path):
+    x, y, z, w = TURN.inv().as_quat()
+    row = line(0, 1, (w, x, y, z), 10**9).replace('Time', 'Quality: 9 DeviceTime: 7.5 NetworkTime')
+    session = import_poses([write(tmp_path / 'a.txt', row)])
+    np.testing.assert_allclose(
+        session.sensors['sensor_0'].rotation[0], TURN.as_matrix(), atol=1e-9
+    )
+
+
+def test_device_stamps_lie_on_the_hosts_axis_by_the_smallest_delay(tmp_path):
+    q = TURN.as_quat()
+    rows = []
+    for k, late in enumerate((0.012, 0.003, 0.009)):
+        row = line(0, 1, q, round(1e9 * (100 + k / 40 + late)))
+        rows.append(row.replace('Time', f'AuroraFrame: {8 * k} Time'))
+    path = write(tmp_path / 'a.txt', *rows)
+    host = import_poses([path]).sensors['sensor_0'].time
+    device = import_poses([path], stamps='device').sensors['sensor_0'].time
+    np.testing.assert_allclose(np.diff(device), 0.025, atol=1e-9)
+    assert np.ptp(np.diff(host)) > 0.01
+
+
+def test_tum_csv_and_static_files_one_after_the_other(tmp_path):
+    q = ' '.join(map(str, TURN.as_quat()))
+    tum = write(tmp_path / 'a.tum', '# t x y z', f'1.5 0.1 0.2 0.3 {q}', f'1.6 0.1 0.2 0.4 {q}')
+    (poses,) = import_poses([tum]).sensors.values()
+    np.testing.assert_allclose(poses.position[:, 2], [0.3, 0.4])
+    table = write(tmp_path / 'a.csv', 'stamp_ns,sensor,x_mm,y_mm,z_mm,qx,qy,qz,qw',
+                  '1000000000,tip,1,2,3,0,0,0,1', '1100000000,tip,,,,,,,')  # fmt: skip
+    poses = import_poses([table]).sensors['tip']
+    np.testing.assert_allclose(poses.position, [[0.001, 0.002, 0.003]])
+    np.testing.assert_allclose(poses.missing, [0.1])
+    files, optical = [], []
+    for n in range(2):
+        rows = [(cell(8),), (cell(16),)], [(cell(3),), (cell(6),)]
+        files.append(tool_tracker(tmp_path / f'{n}.tsv', rows[0], ('Port 1: X',)))
+        optical.append(tool_tracker(tmp_path / f'o{n}.tsv', rows[1], ('Port 1: OT',)))
+    session = import_poses(files, optical)
+    pause = np.diff(session.sensors['port_1'].time)
+    np.testing.assert_allclose(pause[[0, 2]], 0.025, atol=1e-9)
+    assert pause[1] > 5
+    np.testing.assert_allclose(session.reference.time[2], session.sensors['port_1'].time[2])
+
+
+@pytest.mark.parametrize('text', ['', 'some words\nand more', '1 2 3', 'a,b\n1,2'])
+def test_a_file_of_no_known_form_is_refused_in_a_line(tmp_path, text, capsys):
+    path = write(tmp_path / 'a.txt', text)
+    assert run_verb('import_poses', [str(path), '--out', str(tmp_path / 'a.mcap')]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_quaternions_of_another_length_and_odd_files_are_refused(tmp_path):
+    path = write(tmp_path / 'a.txt', line(0, 1, (2, 0, 0, 3), 10**9))
+    with pytest.raises(PlausibilityError, match=r'norm of 3\.6'):
+        import_poses([path])
+    with pytest.raises(ParameterError, match='one by one'):
+        import_poses([path], [path, path])
+
+
+def test_a_bag_keeps_poses_and_what_was_missing(tmp_path, capsys):
+    q = TURN.as_quat()
+    path = write(tmp_path / 'a.txt', line(0, 1, q, 5_000_000_000),
+                 line(0, MISSING, q, 5_100_000_000), line(1, 2, q, 5_200_000_000))  # fmt: skip
+    optical = write(tmp_path / 'o.txt', line(0, 7, q, 5_050_000_000)[len('SensorID: 0 ') :])
+    bag = tmp_path / 'a.mcap'
+    arguments = [str(path), '--reference', str(optical), '--out', str(bag), '--unit', 'inch']
+    assert run_verb('import_poses', arguments) == 0
+    assert '1 missing' in capsys.readouterr().out
+    session = read_pose_session(bag)
+    assert set(session.sensors) == {'sensor_0', 'sensor_1'}
+    np.testing.assert_allclose(
+        session.sensors['sensor_1'].position[0], 0.0254 * np.array([2, 2, 3])
+    )
+    np.testing.assert_allclose(session.sensors['sensor_0'].missing, [0.1])
+    np.testing.assert_allclose(session.reference.position[0], [0.007, 0.002, 0.003])
+    only = read_pose_session(bag, {'tip': '/tracked/sensor_1/pose'}, '/tracked/sensor_0/pose')
+    assert list(only.sensors) == ['tip']
+    assert only.reference.size == 1
+    with pytest.raises(BagError, match='/tracked/sensor_0/pose'):
+        read_pose_session(bag, {'tip': '/nothing'})
