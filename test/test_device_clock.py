@@ -216,6 +216,18 @@ class TestFaults:
         clock.observe(40, SECOND + 1000)
         assert clock.jumps == 1 and clock.host_ns(40) == SECOND + 1000
 
+    def test_a_stream_that_begins_on_a_late_line_waits_for_its_answer(self):
+        """The last block of the old stream comes after the answer to the start and refutes it."""
+        line = Line().run(0.5, answers_s=0.002)
+        line.clock.restart()
+        line.clock.bound(0, int(SECOND * 100.5))
+        line.clock.observe(line.sample + BLOCK, int(SECOND * 101.7))
+        line.clock.restart()
+        new = Line(clock=line.clock, now_s=0.5, delivered_s=1.7).run(2.0, late_by(1.2))
+        assert not any(new.good)
+        new.run(0.2, answers_s=0.002)
+        assert new.good[-1] and new.worst_s < 1e-3
+
     @pytest.mark.parametrize('seed', range(12))
     def test_no_course_of_faults_gives_a_wrong_stamp_that_is_called_good(self, seed):
         """What is confirmed is right to 5 ms, whatever happened before and in what order."""

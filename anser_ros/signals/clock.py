@@ -13,11 +13,12 @@ LARGEST_LATENESS_S = 4e-3
 It bounds what a stamp may be wrong by when the device lost time that it did not count: 5 ms less
 what the line itself is uncertain by. Smaller, a busy host confirms nothing for long."""
 _SETTLE_NS = 200_000_000
-"""Time (0.2 s) that a new line must stand where no answer of the device bounds it. Bytes that had
-piled up are worked off faster than new ones come, and push the line down meanwhile."""
+"""Time (0.2 s) that a new line must stand where the device never answers. Bytes that had piled up
+are worked off faster than new ones come, and push the line down meanwhile."""
 _SETTLE_UNPROVEN_NS = 3_000_000_000
-"""The same (3 s) where answers bound it only loosely, as from a device that is slow to answer. All
-of the time arrivals must be in time, so that a line that a busy host makes late is none."""
+"""The same (3 s) where answers bound it only loosely, as from a device that is slow to answer, or
+where one that did answer has not yet: if everything is late, so is its answer. All of the time
+arrivals must be in time, so that a line that a busy host makes late is none."""
 _REFUTED_NS = 1_000_000.0
 """By how much (1 ms) an answer must show a line to be too early to refute it: what the line itself
 is uncertain by. More lets a device lose so much time unseen."""
@@ -85,6 +86,7 @@ class SampleClock:
     def __init__(self, sample_rate_hz: float) -> None:
         self._ns_per_sample = 1e9 / sample_rate_hz
         self.jumps = 0
+        self._answers = False
         self.restart()
 
     def restart(self) -> None:
@@ -155,6 +157,7 @@ class SampleClock:
         """
         if self._false_answers >= _FALSE_ANSWERS:
             return
+        self._answers = True
         time_ns = sample * self._ns_per_sample
         lower, known = sent_ns - time_ns, self._lower_offset(time_ns)
         if known is None or lower > known:
@@ -209,7 +212,8 @@ class SampleClock:
         if offset < stood - _SETTLED_NS:
             self._stands = since, stood = arrival_ns, offset
         if slack is None:
-            self._settled = arrival_ns - since > _SETTLE_NS
+            awaited = self._answers and self._false_answers < _FALSE_ANSWERS
+            self._settled = arrival_ns - since > (_SETTLE_UNPROVEN_NS if awaited else _SETTLE_NS)
         elif slack < 1e9 * LARGEST_LATENESS_S:
             self._settled = True
         elif slack > 1e9 * _ANSWER_S or max(late for _, late in self._earliest) > _SETTLED_NS:
