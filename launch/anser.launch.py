@@ -1,39 +1,61 @@
 """Launch the full chain: control unit or simulator, field model, tracker, recorder and servers.
 
 ros2 launch anser_ros anser.launch.py device:=/dev/ttyACM0 setup:=my_setup.yaml
-ros2 launch anser_ros anser.launch.py simulate:=true
+ros2 launch anser_ros anser.launch.py simulate:=true baseline:=clean.mcap openigtlink:=true
 """
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, GroupAction
+from launch.actions import DeclareLaunchArgument, GroupAction, OpaqueFunction
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node, PushRosNamespace
+from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
+from anser_ros.cli.commands import NODES
+from anser_ros.nodes.parameter_files import checked
+
 PACKAGE = 'anser_ros'
+DEVICE = '/dev/ttyACM0'
+# Anybody may make a link there; one for each namespace, so that two boards can be simulated.
+SIMULATED = '/tmp/anser_cu_{namespace}'
 ARGUMENTS = {
     'namespace': ('anser', 'namespace of all nodes and topics'),
     'params': ('anser.yaml', 'parameter file: a path, or a file of the package'),
-    'device': ('/dev/ttyACM0', "the control unit's port"),
+    'device': ('', f"the control unit's port; {DEVICE} or, simulated, {SIMULATED} by default"),
     'setup': ('demo_setup.yaml', 'setup document: a path, or a file of the package'),
     'channels': ('demo_channels.yaml', 'channel calibration: a path, or a file of the package'),
     'model': ('nominal', 'model file of calibrate, or nominal'),
+    'baseline': ('', 'distortion-free recording of the board; empty: call set_baseline'),
     'board_seed': ('0', "the simulated unit's board: 0 as drawn, 1 that of demo_model.yaml"),
     'simulate': ('false', 'whether a simulated control unit replaces the real one'),
     'record': ('true', 'whether a bag is recorded'),
     'directory': ('recordings', 'folder of the bags'),
     'watch': ('false', 'whether effects that the model lacks are reported in /diagnostics'),
     'openigtlink': ('false', 'whether poses are served to 3D Slicer'),
+    'igtl_host': ('127.0.0.1', 'address that OpenIGTLink is served on; 0.0.0.0 for all'),
+    'igtl_port': ('18944', 'TCP port of OpenIGTLink'),
     'rviz': ('false', 'whether RViz is started'),
 }
 
 
+def find_files(context):
+    """Put the paths of parameter file and port in place of what was given for them.
+
+    A parameter file that is none, or names a node that there is not, ends the launch with a line.
+    """
+    given = context.launch_configurations
+    given['params'] = checked(given['params'], list(NODES))
+    if not given['device']:
+        # As IfCondition reads it.
+        is_simulated = given['simulate'].lower() in ('true', '1')
+        simulated = SIMULATED.format(namespace=given['namespace'].strip('/').replace('/', '_'))
+        given['device'] = simulated if is_simulated else DEVICE
+
+
 def node(name, condition=None, **parameters):
     """Return one node with the common parameter file, and values that override it."""
-    common = PathJoinSubstitution(
-        [FindPackageShare(PACKAGE), 'config', LaunchConfiguration('params')]
-    )
+    common = LaunchConfiguration('params')
     return Node(
         package=PACKAGE,
         executable=name,
@@ -57,6 +79,7 @@ def generate_launch_description():
                 DeclareLaunchArgument(name, default_value=default, description=text)
                 for name, (default, text) in ARGUMENTS.items()
             ),
+            OpaqueFunction(function=find_files),
             GroupAction(
                 [
                     PushRosNamespace(value('namespace')),
@@ -68,11 +91,20 @@ def generate_launch_description():
                         **board,
                     ),
                     node('acquisition', device=value('device'), **board),
-                    node('field_model', model_file=value('model')),
+                    node(
+                        'field_model',
+                        model_file=value('model'),
+                        baseline_file=ParameterValue(value('baseline'), value_type=str),
+                    ),
                     node('tracker', model_file=value('model')),
                     node('recorder', 'record', directory=value('directory')),
                     node('watcher', 'watch', model_file=value('model')),
-                    node('openigtlink', 'openigtlink'),
+                    node(
+                        'openigtlink',
+                        'openigtlink',
+                        host=value('igtl_host'),
+                        port=value('igtl_port'),
+                    ),
                 ]
             ),
             Node(

@@ -35,7 +35,8 @@ def node(name, remappings=(), output='log', **parameters):
         parameters=[parameters],
         remappings=list(remappings),
         output=output,
-        emulate_tty=output == 'screen',
+        # No terminal: under launch every line has a prefix, which would break a live table.
+        emulate_tty=False,
         sigterm_timeout='5',
     )
 

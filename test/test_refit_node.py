@@ -132,12 +132,15 @@ def make(ros, tmp_path):
         rig.close()
 
 
-def test_metal_is_shown_named_and_taken_away_again(make, tmp_path):
+def test_metal_is_shown_named_and_taken_away_again(make, tmp_path, capfd):
     from std_srvs.srv import SetBool, Trigger
     from visualization_msgs.msg import Marker
 
     rig = make(refit_rate_hz=1000.0, save_file=str(tmp_path / 'saved.yaml'))
     rig.start()
+    said = capfd.readouterr()
+    # Until there is one, the console says why poses will vanish, and what helps.
+    assert 'call /anser/field_model/set_baseline, or give' in said.out + said.err
     change = rig.world.metal(HEAD)
     calibrated = rig.node._model
     for _ in range(4):

@@ -2,6 +2,7 @@
 
 import ast
 import re
+import subprocess
 import sys
 from importlib.metadata import packages_distributions
 from xml.etree import ElementTree
@@ -10,6 +11,8 @@ import pytest
 from conftest import REPO
 
 from anser_ros.cli import main as cli
+from anser_ros.cli import missing
+from anser_ros.cli.commands import NODES
 
 OPTIONAL = {'tf2_msgs', 'launch', 'launch_ros'}
 """ROS packages that no wheel brings: where they are missing, what needs them is left out."""
@@ -21,6 +24,8 @@ ROSDEP = {
     'pyyaml': 'python3-yaml',
     'pyserial': 'python3-serial',
     'matplotlib': 'python3-matplotlib',
+    'numba': 'python3-numba',
+    'rich': 'python3-rich',
 }
 """PyPI's name and rosdep's key, where rosdep has the package."""
 
@@ -64,6 +69,49 @@ def test_every_import_is_asked_for_and_nothing_else():
 def test_package_xml_has_what_rosdep_knows():
     python = {name for name in package('exec_depend') if name.startswith('python3-')}
     assert python == {ROSDEP[name] for name in required() & set(ROSDEP)}
+
+
+def test_what_rosdep_does_not_know_is_asked_for_where_it_is_needed(monkeypatch, capsys):
+    """A package that only PyPI has is missing on an installation by rosdep alone."""
+    assert set(missing.PYPI.values()) == required() - set(ROSDEP) - {SETUPTOOLS}
+    assert set(missing.NEEDED) <= set(NODES)
+    assert {name for names in missing.NEEDED.values() for name in names} <= set(missing.PYPI)
+    found = missing.find_spec
+    monkeypatch.setattr(missing, 'find_spec', lambda name: name != 'mcap' and found(name))
+    assert cli.main(['recorder']) == 2
+    said = capsys.readouterr().err
+    assert said == 'anser recorder: mcap is not installed: pip install mcap\n'
+    missing.check('tracker')
+
+    def load(name):
+        raise ModuleNotFoundError('No module named mcap.reader', name='mcap.reader')
+
+    monkeypatch.setattr(cli.importlib, 'import_module', load)
+    assert cli.main(['evaluate']) == 2
+    said = capsys.readouterr().err
+    assert said == 'anser evaluate: mcap is not installed: pip install mcap\n'
+
+
+# Imports the nodes as where only rosdep's packages are.
+WITHOUT = """
+import importlib, sys
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.split('.')[0] in sys.argv[1].split(','):
+            raise ModuleNotFoundError(name, name=name)
+sys.meta_path.insert(0, Missing())
+for node in sys.argv[2:]:
+    importlib.import_module(f'anser_ros.nodes.{node}')
+"""
+
+
+@pytest.mark.processes
+def test_all_other_nodes_start_without_it():
+    names = [name for name in NODES if name not in missing.NEEDED]
+    assert {'acquisition', 'field_model', 'tracker', 'watcher', 'monitor'} <= set(names)
+    command = [sys.executable, '-c', WITHOUT, ','.join(missing.PYPI), *names]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=REPO)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize('kind', ['newest', 'oldest'])

@@ -13,6 +13,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import NoReturn
 
+from anser_ros.cli import missing
 from anser_ros.cli.commands import NODES, OFFLINE
 from anser_ros.errors import AnserError
 from anser_ros.one_line_parser import OneLineParser
@@ -60,6 +61,11 @@ def _dispatch(arguments: list[str]) -> int:
         return EXIT_OK
     name, rest = arguments[0].replace('-', '_'), arguments[1:]
     if name in NODES:
+        try:
+            missing.check(name)
+        except AnserError as error:
+            print(f'anser {name}: {_one_line(error)}', file=sys.stderr)
+            return EXIT_BAD_INPUT
         exec_node(name, rest)
     if name in OFFLINE:
         return run_verb(name, rest)
@@ -101,6 +107,12 @@ def run_verb(name: str, arguments: Sequence[str]) -> int:
         return EXIT_BAD_INPUT
     except BrokenPipeError:
         raise
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.split('.')[0] not in missing.PYPI:
+            traceback.print_exc()
+            return EXIT_DEFECT
+        print(f'anser {name}: {missing.words_of(error.name)}', file=sys.stderr)
+        return EXIT_BAD_INPUT
     except OSError as error:
         # A file that is not there or can't be written is the caller's input, not a defect.
         if error.filename is None:

@@ -38,13 +38,7 @@ from anser_ros.refit.change import MOST_RATE_HZ, Pace
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.result import RefitResult
 from anser_ros.sessions.baseline import baseline_flux
-from anser_ros.sessions.model_file import (
-    SNAPSHOT,
-    as_saved,
-    is_snapshot,
-    load_model,
-    save_model,
-)
+from anser_ros.sessions.model_file import SNAPSHOT, as_saved, is_snapshot, load_model, save_model
 from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session, sensor_table
 from anser_ros.sessions.starting_model import NOMINAL, starting_model
@@ -176,6 +170,12 @@ class FieldModelNode(AnserNode):
         self._base = base
         if self._baseline_bag is not None and len(self._references):
             self._follow(baseline_flux(self._baseline_bag, self._references))
+        elif (
+            len(self._references)
+            and self.parameters.refit
+            and not self.parameters.baseline_at_start
+        ):
+            self.get_logger().warning(refit_status.no_baseline(self.get_namespace()))
 
     def _pose_taker(self, body: str) -> Callable[[PoseStamped], None]:
         def take(message: PoseStamped) -> None:

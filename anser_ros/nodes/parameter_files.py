@@ -2,12 +2,14 @@
 
 import difflib
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from anser_ros.errors import ParameterError
+from anser_ros.wire.config_folder import config_path, read_config
 from anser_ros.wire.yaml_text import read_yaml
 
 OPTION = '--params-file'
@@ -44,6 +46,34 @@ def complaints(arguments: Sequence[str], node: str) -> list[str]:
         hint = f"is '{keys[names.index(close[0])]}' meant?" if close else f'it has: {_list(keys)}'
         found.append(f'{value} has nothing for {node}; {hint}')
     return found
+
+
+def checked(name: str, nodes: Collection[str]) -> str:
+    """Return the path of a parameter file for several nodes: a path, or a file of `config/`.
+
+    Raises
+    ------
+    SetupError
+        There is no such file.
+    ParameterError
+        It is no YAML, holds no section, or one whose node is none of ``nodes``: with it all would
+        start with their defaults.
+    """
+    path = str(config_path(name))
+    try:
+        document = read_yaml(read_config(name))
+    except (ValueError, yaml.YAMLError) as error:
+        raise ParameterError(f'{path}: no YAML: {" ".join(str(error).split())}') from error
+    keys = list(_sections(document))
+    if not keys:
+        raise ParameterError(f'{path}: no section with {LEAF}')
+    for key in keys:
+        last = key.rsplit('/', 1)[-1]
+        if last not in (*nodes, *WILDCARDS):
+            close = difflib.get_close_matches(last, nodes, n=1)
+            hint = f', is {close[0]} meant?' if close else f'; there are: {", ".join(nodes)}'
+            raise ParameterError(f'{path}: no node {key}{hint}')
+    return path
 
 
 def _sections(document: Any, path: str = '') -> Iterator[str]:

@@ -10,6 +10,15 @@ TROUBLED = tuple(WITHHELD)
 """States of the refit that an operator is warned of."""
 
 
+def no_baseline(namespace: str) -> str:
+    """Words for the console where references are there, but nothing to compare them with."""
+    return (
+        'no baseline of the references, so the model does not follow them, and metal will make '
+        f'poses vanish (state residual): with no metal near, call {namespace}/field_model/'
+        'set_baseline, or give a clean recording as baseline_file'
+    )
+
+
 def model_values(model: FieldModel, name: str) -> dict[str, object]:
     """Return the figures of the model in force; ``name`` is told where its source is not known."""
     return {

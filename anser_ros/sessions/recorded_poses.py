@@ -12,7 +12,6 @@ from anser_ros.errors import BagError
 from anser_ros.field.measurements import Measurements
 from anser_ros.sessions.prepared import PreparedSession, with_truth
 from anser_ros.sessions.session import NANO, Session
-from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages, stamp_ns
 from anser_ros.wire.setup import topic_of
 
 Array = NDArray[np.float64]
@@ -50,6 +49,9 @@ def published_poses(
     path: str | os.PathLike[str], topics: Sequence[str]
 ) -> dict[str, PublishedPoses]:
     """What each PoseStamped topic of a bag carries."""
+    # Nodes that read no bag run where the packages that read bags are not installed.
+    from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages, stamp_ns
+
     rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in topics}
     stamps: dict[str, list[int]] = {topic: [] for topic in topics}
     decoder = MessageDecoder()

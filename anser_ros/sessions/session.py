@@ -13,8 +13,8 @@ from anser_ros.frames.faults import GOOD, value_codes
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.sessions.plausibility import plausible_tools
-from anser_ros.wire.bag import Bag, PoseStream, RecordedFluxes, read_bag
 from anser_ros.wire.points import STALE
+from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
 
 NANO = 1e-9
@@ -199,6 +199,9 @@ def load_session(path: str | os.PathLike[str]) -> Session:
     PlausibilityError
         When units, clocks or the order of quaternions contradict what was recorded.
     """
+    # Nodes that read no bag run where the packages that read bags are not installed.
+    from anser_ros.wire.bag import read_bag
+
     bag = read_bag(path)
     session = session_of(bag)
     tools, left_out = plausible_tools(bag.path, bag.setup, session.tools, bag.refused)

@@ -10,7 +10,7 @@ import os
 import struct
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,11 +20,11 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, DataEnd, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap_ros2.decoder import DecoderFactory
-from numpy.typing import NDArray
 
 from anser_ros.errors import BagError, LayoutError, SetupError
 from anser_ros.wire.points import STALE, FluxPoints, decode_flux
-from anser_ros.wire.setup import Setup, parse_setup
+from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes
+from anser_ros.wire.setup import parse_setup
 
 _BROKEN = (
     McapError, ValueError, struct.error, EOFError, IndexError, KeyError, MemoryError,
@@ -55,49 +55,6 @@ class Salvage:
 
     lost: str = ''
     bad_chunks: int = 0
-
-
-@dataclass(frozen=True)
-class RecordedFluxes:
-    """Fluxes of one topic.
-
-    Attributes
-    ----------
-    stamp_ns : ndarray, shape (F,)
-        Header stamps, ascending.
-    channel : ndarray, shape (S,)
-    flags : ndarray, shape (F, S)
-    flux : ndarray, shape (F, S, K), complex
-        T; NaN (with the flag `STALE`) where a frame lacks the channel.
-    """
-
-    stamp_ns: NDArray[np.int64]
-    channel: NDArray[np.int64]
-    flags: NDArray[np.int64]
-    flux: NDArray[np.complex128]
-
-
-@dataclass(frozen=True)
-class PoseStream:
-    """Poses of one topic: stamps (M,), positions (M, 3) in m, quaternions x y z w (M, 4)."""
-
-    stamp_ns: NDArray[np.int64]
-    position: NDArray[np.float64]
-    quaternion: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Bag:
-    """A recorded session: setup, fluxes, optical poses, and what was refused or lost."""
-
-    path: str
-    setup: Setup
-    setup_text: str
-    tool: RecordedFluxes | None
-    reference: RecordedFluxes | None
-    optical: dict[str, PoseStream]
-    refused: dict[str, int] = field(default_factory=dict)
-    lost: str = ''
 
 
 def bag_file(path: str | os.PathLike[str]) -> str:

@@ -1,0 +1,36 @@
+"""Packages that rosdep does not know: what needs them asks for them in a line."""
+
+from importlib.util import find_spec
+
+from anser_ros.errors import AnserError
+
+PYPI = {
+    'mcap': 'mcap',
+    'mcap_ros2': 'mcap-ros2-support',
+    'zstandard': 'zstandard',
+    'pyigtl': 'pyigtl',
+}
+"""Modules without a key of rosdep, and what they are called on PyPI."""
+NEEDED = {
+    'recorder': ('mcap',),
+    'replay': ('mcap', 'mcap_ros2', 'zstandard'),
+    'openigtlink': ('pyigtl',),
+}
+"""Nodes that do nothing without one of these; all others start where they are missing."""
+
+
+class MissingPackageError(AnserError):
+    """A package that is needed here is not installed."""
+
+
+def check(node: str) -> None:
+    """Raise `MissingPackageError` where a node lacks a package."""
+    for module in NEEDED.get(node, ()):
+        if not find_spec(module):
+            raise MissingPackageError(words_of(module))
+
+
+def words_of(module: str) -> str:
+    """What is missing, with its remedy; the module may be one inside a package."""
+    package = module.split('.')[0]
+    return f'{package} is not installed: pip install {PYPI.get(package, package)}'

@@ -1,0 +1,51 @@
+"""A recorded session as arrays; reading one from a file is the business of `wire.bag`."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.wire.setup import Setup
+
+
+@dataclass(frozen=True)
+class RecordedFluxes:
+    """Fluxes of one topic.
+
+    Attributes
+    ----------
+    stamp_ns : ndarray, shape (F,)
+        Header stamps, ascending.
+    channel : ndarray, shape (S,)
+    flags : ndarray, shape (F, S)
+    flux : ndarray, shape (F, S, K), complex
+        T; NaN (with the flag `STALE`) where a frame lacks the channel.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    channel: NDArray[np.int64]
+    flags: NDArray[np.int64]
+    flux: NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class PoseStream:
+    """Poses of one topic: stamps (M,), positions (M, 3) in m, quaternions x y z w (M, 4)."""
+
+    stamp_ns: NDArray[np.int64]
+    position: NDArray[np.float64]
+    quaternion: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Bag:
+    """A recorded session: setup, fluxes, optical poses, and what was refused or lost."""
+
+    path: str
+    setup: Setup
+    setup_text: str
+    tool: RecordedFluxes | None
+    reference: RecordedFluxes | None
+    optical: dict[str, PoseStream]
+    refused: dict[str, int] = field(default_factory=dict)
+    lost: str = ''

@@ -1,0 +1,72 @@
+"""The launch files, on whose own libraries no wheel exists: what they find is tested without."""
+
+import runpy
+import sys
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
+import pytest
+from conftest import REPO
+
+from anser_ros.errors import AnserError, ParameterError, SetupError
+from anser_ros.nodes.parameter_files import checked
+
+NODES = ('tracker', 'recorder')
+MODULES = (
+    'launch', 'launch.actions', 'launch.conditions', 'launch.substitutions', 'launch_ros',
+    'launch_ros.actions', 'launch_ros.parameter_descriptions', 'launch_ros.substitutions',
+)  # fmt: skip
+
+
+@pytest.fixture
+def launched(monkeypatch, tmp_path):
+    """Return what the launch file makes of the given arguments."""
+    for module in MODULES:
+        monkeypatch.setitem(sys.modules, module, MagicMock())
+    namespace = runpy.run_path(str(REPO / 'launch' / 'anser.launch.py'))
+    monkeypatch.chdir(tmp_path)
+
+    def find(**given):
+        values = {name: default for name, (default, _) in namespace['ARGUMENTS'].items()}
+        context = SimpleNamespace(launch_configurations={**values, **given})
+        namespace['find_files'](context)
+        return context.launch_configurations
+
+    return find
+
+
+def test_a_simulated_unit_has_a_port_that_anybody_may_make(launched):
+    assert launched()['device'] == '/dev/ttyACM0'
+    first, second = (launched(simulate='true', namespace=name) for name in ('anser', '/or/two'))
+    assert first['device'] == '/tmp/anser_cu_anser' and second['device'] == '/tmp/anser_cu_or_two'
+    assert launched(simulate='true', device='mine')['device'] == 'mine'
+
+
+def test_a_parameter_file_is_taken_from_here_or_from_the_package(launched, tmp_path):
+    assert launched()['params'] == str(REPO / 'config' / 'anser.yaml')
+    (tmp_path / 'mine.yaml').write_text('/**/tracker:\n  ros__parameters: {gate: 3.0}\n')
+    assert launched(params='mine.yaml')['params'] == 'mine.yaml'
+    (tmp_path / 'bad.yaml').write_text('/**/trakcer:\n  ros__parameters: {gate: 3.0}\n')
+    for name in ('bad.yaml', 'nowhere.yaml'):
+        with pytest.raises(AnserError):
+            launched(params=name)
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('/anser/trakcer: {ros__parameters: {gate: 3.0}}', 'no node /anser/trakcer, is tracker'),
+        ('gate: 3.0', 'no section with ros__parameters'),
+        ('- 1', 'no section with ros__parameters'),
+        ('a: [', 'no YAML'),
+    ],
+)
+def test_a_file_that_would_leave_all_at_their_defaults_is_refused(tmp_path, text, said):
+    path = tmp_path / 'params.yaml'
+    path.write_text(text)
+    with pytest.raises(ParameterError, match=said):
+        checked(str(path), NODES)
+    with pytest.raises(SetupError, match='no file'):
+        checked(str(tmp_path / 'nowhere.yaml'), NODES)
+    path.write_text('/**:\n  ros__parameters: {use_sim_time: true}\n')
+    assert checked(str(path), NODES) == str(path)
