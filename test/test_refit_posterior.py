@@ -129,7 +129,8 @@ def test_leaving_out_needs_no_new_decomposition(bank, parts, drift, loudness, re
         rows = (rest[:, None] * K + np.arange(K)).ravel()
         other = Bank(parts[4], rows, drift, loudness)
         direct = other.evaluate(readings[rows], NOISE)
-        evidence, residual = evidence_without(bank, seen, np.array(coils))
+        evidences, residuals = evidence_without(bank, seen, np.array(coils))
+        evidence, residual = evidences[-1], residuals[-1].reshape(len(coils), K, 2)
         shift = evidence - direct.log_evidence
         np.testing.assert_allclose(shift, shift[0], atol=2e-3 * np.abs(evidence).max())
         gone = (np.array(coils)[:, None] * K + np.arange(K)).ravel()
@@ -143,12 +144,15 @@ def test_leaving_out_needs_no_new_decomposition(bank, parts, drift, loudness, re
 
 def test_a_healthy_coil_is_not_at_fault_and_a_wild_one_is(bank, readings):
     seen = bank.evaluate(readings, NOISE)
-    assert all(health.fault_odds(bank, seen, np.array([c])) < 5.0 for c in range(6))
+    assert all(health.fault_odds(bank, seen, np.array([c]))[0] < 5.0 for c in range(6))
     wild = readings.copy()
     wild[3 * K : 4 * K] += 3000.0
     seen = bank.evaluate(wild, NOISE)
-    odds = [health.fault_odds(bank, seen, np.array([c])) for c in range(6)]
+    odds = [health.fault_odds(bank, seen, np.array([c]))[0] for c in range(6)]
     assert int(np.argmax(odds)) == 3
+    together = health.fault_odds(bank, seen, np.array([3, 1, 5]))
+    assert together[0] == pytest.approx(odds[3])
+    assert together[2] == pytest.approx(health.fault_odds(bank, seen, np.array([5, 1, 3]))[2])
 
 
 def test_error_modes_have_the_posterior_s_power(bank, parts, drift, loudness, readings):

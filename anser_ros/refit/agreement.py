@@ -7,11 +7,15 @@ normal distribution; no matrix of the size of all readings is decomposed again.
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.refit.evidence import STRENGTHS, FrameEvidence, over_strengths
-from anser_ros.refit.kernels import fill_left_out
+from anser_ros.refit.evidence import STRENGTHS, FrameEvidence
+from anser_ros.refit.kernels import fill_left_out, fill_without
 from anser_ros.refit.posterior import Bank
 
 Array = NDArray[np.float64]
+
+RISE, REACH = 0.5, 1000.0
+"""Rise of a log likelihood from one strength to the next below which its top has been reached, and
+how far behind the best a hypothesis may be to be worked out so: a verdict turns on a hundred."""
 
 
 def left_out(bank: Bank, seen: FrameEvidence, hypothesis: int) -> tuple[Array, Array]:
@@ -39,10 +43,11 @@ def left_out(bank: Bank, seen: FrameEvidence, hypothesis: int) -> tuple[Array, A
 
 def evidence_without(
     bank: Bank, seen: FrameEvidence, coils: NDArray[np.int64]
-) -> tuple[Array, Array]:
-    """Return the evidence from the other coils alone, and the coils' errors by it.
+) -> tuple[Array, list[Array]]:
+    """Return the evidence without the first of some coils, the first two, and so on to all Q.
 
-    By the rules of the conditional normal distribution no matrix is decomposed again.
+    By the rules of the conditional normal distribution no matrix is decomposed again. The evidence
+    is told by the most likely strengths: it changes as the likelihood of these does.
 
     Parameters
     ----------
@@ -51,29 +56,28 @@ def evidence_without(
 
     Returns
     -------
-    log_evidence : ndarray, shape (H,)
-    residual : ndarray, shape (Q, K, 2)
+    log_evidence : ndarray, shape (Q, H)
+    residuals : list of Q ndarrays, of shapes (1 K, 2) to (Q K, 2)
         Measured minus predicted under the most likely hypothesis, in noise units.
     """
     precision, _ = bank.precision(seen.noise)
+    shape = len(bank.bases), len(coils)
+    gain, strength = np.empty(shape), np.zeros((*shape, 2), dtype=np.int64)
+    fill_without(
+        bank.bases, coils, bank.width, seen.projected, precision, seen.curve, seen.log_evidence,
+        (RISE, REACH), gain, strength,
+    )  # fmt: skip
+    evidence, residuals = (seen.log_evidence[:, None] + gain).T, []
     rows = (coils[:, None] * bank.width + np.arange(bank.width)).ravel()
-    curve, residuals = np.empty_like(seen.curve), []
-    for h, basis in enumerate(bank.bases[:, rows]):
-        if not np.isfinite(bank.log_prior[h]):
-            curve[h] = 0.0
-            residuals.append(np.zeros((len(rows), 2)))
-            continue
-        weighted = precision[h][:, None, :] * basis
-        block = weighted @ basis.T
-        q = weighted @ seen.projected[h]
-        r = np.linalg.solve(block, q)
-        log_det = np.linalg.slogdet(block)[1]
-        curve[h] = seen.curve[h] + 0.5 * (q * r).sum(axis=1) - 0.5 * log_det[:, None]
-        best = curve[h].argmax(axis=0)
-        residuals.append(r[best, :, [0, 1]].T)
-    evidence, _ = over_strengths(curve)
-    evidence += bank.log_prior
-    return evidence, residuals[int(evidence.argmax())].reshape(len(coils), bank.width, 2)
+    for q, best in enumerate(evidence.argmax(axis=1).tolist()):
+        basis = bank.bases[best, rows[: (q + 1) * bank.width]]
+        residual = np.empty((len(basis), 2))
+        for part in range(2):
+            weighted = basis * precision[best, strength[best, q, part]]
+            seen_by = weighted @ seen.projected[best, :, part]
+            residual[:, part] = np.linalg.solve(weighted @ basis.T, seen_by)
+        residuals.append(residual)
+    return evidence, residuals
 
 
 def distance_of(

@@ -33,9 +33,9 @@ RIVAL = 0.05
 """Probability from which on a second hypothesis adds what it disagrees about."""
 
 
-SPARSE = 10
-"""Every so many of a layer's sample points tells the size of an error until it is known: a
-millisecond's work."""
+SPARSE = 30
+"""Every so many of a layer's sample points tells the size of an error until it is known: thirty
+points, a millisecond's work at the most."""
 
 
 @dataclass(frozen=True)

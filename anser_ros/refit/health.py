@@ -108,29 +108,37 @@ def typical(values: Array) -> float:
     return float(0.5 * (ordered[middle] + ordered[-1 - middle]))
 
 
-def fault_odds(bank: Bank, seen: FrameEvidence, coils: NDArray[np.int64]) -> float:
-    """Return the log odds that all of some coils in use are at fault, each in a different way."""
-    others, residuals = evidence_without(bank, seen, coils)
-    broad = 0.0
-    for residual in residuals:
-        size = float((residual**2).sum())
-        likelihood = -0.5 * size / FAULT_SCALES**2 - residual.size * np.log(FAULT_SCALES)
-        broad += log_sum(likelihood) - float(np.log(len(FAULT_SCALES)))
-    # A body that only these coils see is no better an explanation than their fault.
-    unseen = bank.is_slot & (others < others[0] + SEEN)
-    well = np.where(unseen, -np.inf, seen.log_evidence)
-    return float(log_sum(others) + broad - log_sum(well))
+def fault_odds(bank: Bank, seen: FrameEvidence, coils: NDArray[np.int64]) -> list[float]:
+    """Return the log odds that the first of some coils in use is at fault, the first two, and on.
+
+    Each coil is then at fault in a different way.
+    """
+    odds: list[float] = []
+    for others, residual in zip(*evidence_without(bank, seen, coils), strict=True):
+        broad = 0.0
+        for own in residual.reshape(-1, bank.width, 2):
+            size = float((own**2).sum())
+            likelihood = -0.5 * size / FAULT_SCALES**2 - own.size * np.log(FAULT_SCALES)
+            broad += log_sum(likelihood) - float(np.log(len(FAULT_SCALES)))
+        # A body that only these coils see is no better an explanation than their fault.
+        unseen = bank.is_slot & (others < others[0] + SEEN)
+        well = np.where(unseen, -np.inf, seen.log_evidence)
+        odds.append(float(log_sum(others) + broad - log_sum(well)))
+    return odds
 
 
 def find_faults(
     bank: Bank, seen: FrameEvidence, suspects: list[NDArray[np.int64]]
 ) -> NDArray[np.int64]:
-    """Return the set of suspects that is most probably at fault, or the empty set."""
+    """Return the suspects that are most probably at fault, or none.
+
+    Of each array of suspects the first one may be at fault, the first two, and so on.
+    """
     best, margin = np.empty(0, dtype=np.int64), 0.0
     for coils in suspects:
-        beyond = fault_odds(bank, seen, coils) - FAULT_ODDS * len(coils)
-        if beyond > margin:
-            best, margin = coils, beyond
+        for count, odds in enumerate(fault_odds(bank, seen, coils), start=1):
+            if odds - FAULT_ODDS * count > margin:
+                best, margin = coils[:count], odds - FAULT_ODDS * count
     return best
 
 
@@ -204,7 +212,7 @@ class ReferenceWatch:
             self.agreed(int(coil), self.reason[coil] != DISAGREES)
 
     def suspects(self, chi2: Array, power: Array, freedom: int) -> list[NDArray[np.int64]]:
-        """Return the sets of coils in use whose common fault is worth computing, often none.
+        """Return the coils in use whose fault is worth computing, often none; for `find_faults`.
 
         Coils that are far from what the others predict are suspected one by one; several that are
         wrong at once hide each other, so those whose readings stand out are suspected together.
@@ -230,7 +238,7 @@ class ReferenceWatch:
         out = by_power[: MOST_AT_ONCE + 1]
         out = out[power[out] > level]
         if 0 < len(out) <= min(MOST_AT_ONCE, len(power) // 3):
-            sets += [np.sort(out[:count]) for count in range(1, len(out) + 1)]
+            sets.append(out)
         if not sets:
             return []
         alarm = (float(chi2[order[0]]) / freedom, len(out))

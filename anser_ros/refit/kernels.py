@@ -13,6 +13,9 @@ import numpy as np
 from anser_ros.physics.constants import DIPOLE_CONSTANT
 
 FAST = {'reassoc', 'contract', 'nsz'}
+TOGETHER = 8
+"""Variances whose product has one logarithm, which takes ten times as long as a product. Variances
+are between 1e-3 and 1e14 of the noise's, so this many are far from the ends of the range."""
 
 
 @numba.njit(cache=True, error_model='numpy', fastmath=FAST)
@@ -24,6 +27,25 @@ def fill_products(matrix, columns, out):  # type: ignore[no-untyped-def]
             first += matrix[i, j] * columns[0, j]
             second += matrix[i, j] * columns[1, j]
         out[i, 0], out[i, 1] = first, second
+
+
+@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+def fill_precision(spectra, strengths, noise, inverse, log_det):  # type: ignore[no-untyped-def]
+    """Write the inverse variances (H, A, n) of spectra (H, n), and their log determinants (H, A).
+
+    ``strengths`` (A,) multiply the spectra, and ``noise`` is the variance that is added.
+    """
+    for h in range(spectra.shape[0]):
+        for a in range(strengths.shape[0]):
+            product, log_det[h, a] = 1.0, 0.0
+            for i in range(spectra.shape[1]):
+                variance = strengths[a] * spectra[h, i] + noise
+                inverse[h, a, i] = 1.0 / variance
+                product *= variance
+                if (i + 1) % TOGETHER == 0:
+                    log_det[h, a] += math.log(product)
+                    product = 1.0
+            log_det[h, a] += math.log(product)
 
 
 @numba.njit(cache=True, error_model='numpy', fastmath=FAST)
@@ -131,6 +153,125 @@ def fill_left_out(  # type: ignore[no-untyped-def]
                     total += block[k, j] * own[j]
                 residual[s, k, part] = total
                 chi2[s] += own[k] * total
+
+
+@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+def _fill_block(rows, precision, weighted, block):  # type: ignore[no-untyped-def]
+    """Write ``rows diag(precision) rows^T`` of rows (m, n) into the lower half of (m, m).
+
+    Two rows by two at a time: fetching them takes longer than arithmetic.
+    """
+    count, n = rows.shape
+    for r in range(0, count, 2):
+        also = min(r + 1, count - 1)
+        for i in range(n):
+            weighted[0, i] = precision[i] * rows[r, i]
+            weighted[1, i] = precision[i] * rows[also, i]
+        for s in range(0, r + 2, 2):
+            beside = min(s + 1, count - 1)
+            first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
+            for i in range(n):
+                first += weighted[0, i] * rows[s, i]
+                second += weighted[0, i] * rows[beside, i]
+                third += weighted[1, i] * rows[s, i]
+                fourth += weighted[1, i] * rows[beside, i]
+            block[r, s], block[r, beside] = first, second
+            block[also, s], block[also, beside] = third, fourth
+
+
+@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+def _fill_gains(rows, width, projected, precision, weighted, block, columns, gains):  # type: ignore[no-untyped-def]
+    """Write by how much a log likelihood grows without the first coil, the first two, and so on.
+
+    ``rows`` (m, n) are those coils' rows of the eigenvectors; ``gains`` (m / width, 2). By the
+    rules of the conditional normal distribution, with a Cholesky factor that all of them share.
+    """
+    _fill_block(rows, precision, weighted, block)
+    for i in range(rows.shape[1]):
+        weighted[0, i] = precision[i] * projected[i, 0]
+        weighted[1, i] = precision[i] * projected[i, 1]
+    half_log_det, power, imaginary_power = 0.0, 0.0, 0.0
+    for r in range(rows.shape[0]):
+        real, imaginary = 0.0, 0.0
+        for i in range(rows.shape[1]):
+            real += weighted[0, i] * rows[r, i]
+            imaginary += weighted[1, i] * rows[r, i]
+        for s in range(r):
+            total = block[r, s]
+            for i in range(s):
+                total -= block[r, i] * block[s, i]
+            block[r, s] = total / block[s, s]
+            real -= block[r, s] * columns[s, 0]
+            imaginary -= block[r, s] * columns[s, 1]
+        total = block[r, r]
+        for i in range(r):
+            total -= block[r, i] * block[r, i]
+        block[r, r] = math.sqrt(total)
+        columns[r, 0], columns[r, 1] = real / block[r, r], imaginary / block[r, r]
+        half_log_det += math.log(block[r, r])
+        power += columns[r, 0] * columns[r, 0]
+        imaginary_power += columns[r, 1] * columns[r, 1]
+        if (r + 1) % width == 0:
+            gains[r // width, 0] = 0.5 * power - half_log_det
+            gains[r // width, 1] = 0.5 * imaginary_power - half_log_det
+
+
+@numba.njit(cache=True, error_model='numpy', fastmath=FAST)
+def fill_without(  # type: ignore[no-untyped-def]
+    bases, coils, width, projected, precision, curve, log_evidence, bounds, gain, strength
+):  # fmt: skip
+    """Write what all hypotheses say without the first coil, the first two, and so on.
+
+    ``bases`` (H, n, n), ``coils`` (Q,); ``curve`` (H, A, 2) and ``log_evidence`` (H,) are those of
+    all coils. ``gain`` (H, Q) is by how much the log likelihood at its top is larger without them,
+    and ``strength`` (H, Q, 2) where that top is. It has one top over the strengths, so only
+    strengths between the top with all coils and that without them are worked out: as far as it
+    rises by more than ``bounds[0]``, and where a hypothesis is within ``bounds[1]`` of the best.
+    """
+    count, grid, n = precision.shape
+    size, sets = len(coils) * width, len(coils)
+    rows, block = np.empty((size, n)), np.empty((size, size))
+    columns, weighted = np.empty((size, 2)), np.empty((2, n))
+    gains, done = np.empty((count, grid, sets, 2)), np.zeros((count, grid), np.bool_)
+    best = np.full(sets, -math.inf)
+    for is_walk in (False, True):
+        for h in range(count):
+            if not is_walk:
+                gain[h] = 0.0
+            if log_evidence[h] == -math.inf:
+                continue
+            if is_walk and (log_evidence[h] + gain[h] - best).max() < -bounds[1]:
+                continue
+            gain[h] = 0.0
+            for q in range(sets):
+                first = coils[q] * width
+                rows[q * width : (q + 1) * width] = bases[h, first : first + width]
+            for part in range(2):
+                start = curve[h, :, part].argmax()
+                for q in range(sets):
+                    top = start
+                    for step in (1, -1):
+                        a = top
+                        while 0 <= a < grid:
+                            if not done[h, a]:
+                                done[h, a] = True
+                                _fill_gains(
+                                    rows, width, projected[h], precision[h, a], weighted, block,
+                                    columns, gains[h, a],
+                                )  # fmt: skip
+                            rise = curve[h, a, part] + gains[h, a, q, part]
+                            rise -= curve[h, top, part] + gains[h, top, q, part]
+                            if not is_walk or (a != top and rise < bounds[0]):
+                                break
+                            top = a
+                            a += step
+                        if not is_walk or top != start:
+                            break
+                    strength[h, q, part] = top
+                    gain[h, q] += curve[h, top, part] + gains[h, top, q, part]
+                    gain[h, q] -= curve[h, start, part]
+            if not is_walk:
+                best = np.maximum(best, log_evidence[h] + gain[h])
 
 
 @numba.njit(cache=True, error_model='numpy')

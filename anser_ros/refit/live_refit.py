@@ -21,7 +21,7 @@ from anser_ros.integrity.withheld import REFERENCES_DOUBTFUL
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit import health
-from anser_ros.refit.agreement import distance_of, left_out
+from anser_ros.refit.agreement import distance_of, evidence_without, left_out
 from anser_ros.refit.assembly import Assembly
 from anser_ros.refit.baseline import checked_baseline
 from anser_ros.refit.beside import begin_beside
@@ -109,6 +109,7 @@ class LiveRefit:
         bank, _ = self._bank()
         seen = bank.evaluate(np.zeros((len(bank.rows), 2)), 1.0)
         left_out(bank, seen, int(seen.log_evidence.argmax()))
+        evidence_without(bank, seen, np.arange(1))
 
     def _prepare(self) -> None:
         """Compute what depends on the baseline and the references' places."""

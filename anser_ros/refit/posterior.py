@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from anser_ros.refit.evidence import STRENGTHS, FrameEvidence
-from anser_ros.refit.kernels import fill_evidence, fill_products
+from anser_ros.refit.kernels import fill_evidence, fill_precision, fill_products
 from anser_ros.refit.prior import CloudPrior
 
 Array = NDArray[np.float64]
@@ -157,7 +157,9 @@ class Bank:
         self.spectra[hypothesis] = eigenbasis.values
         self._set(hypothesis, eigenbasis.basis)
         self._synthesis[hypothesis] = eigenbasis.synthesis
-        self._tables.clear()
+        for noise, (inverse, log_det) in self._tables.items():
+            changed = slice(hypothesis, hypothesis + 1)
+            inverse[changed], log_det[changed] = _precision(self.spectra[changed], noise)
         for key in [key for key in self._blocks if key[1] == hypothesis]:
             del self._blocks[key]
 
@@ -183,10 +185,8 @@ class Bank:
     def precision(self, noise: float) -> tuple[Single, Array]:
         """Return inverse variances (H, A, n) and log determinants (H, A) at a noise level."""
         if noise not in self._tables:
-            variance = STRENGTHS[None, :, None] * self.spectra[:, None, :] + noise**2
             make_room(self._tables, MOST_TABLES)
-            log_det = np.log(variance).sum(axis=2)
-            self._tables[noise] = ((1.0 / variance).astype(np.float32), log_det)
+            self._tables[noise] = _precision(self.spectra, noise)
         return self._tables[noise]
 
     def evaluate(self, readings: Array, noise: float) -> FrameEvidence:
@@ -263,6 +263,14 @@ class Bank:
             blocks = (rows * precision[hypothesis, strength]) @ rows.swapaxes(1, 2)
             self._blocks[key] = np.linalg.inv(blocks)
         return self._blocks[key]
+
+
+def _precision(spectra: Array, noise: float) -> tuple[Single, Array]:
+    """Return inverse variances (H, A, n) and log determinants (H, A) of spectra (H, n)."""
+    shape = (len(spectra), len(STRENGTHS), spectra.shape[1])
+    inverse, log_det = np.empty(shape, dtype=np.float32), np.empty(shape[:2])
+    fill_precision(spectra, STRENGTHS, noise**2, inverse, log_det)
+    return inverse, log_det
 
 
 def _rows(columns: Array) -> Single:
