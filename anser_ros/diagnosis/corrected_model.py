@@ -45,6 +45,7 @@ def corrected_model(
         moments=merged.moments,
         modes=modes,
         effects=(*model.effects, *records),
+        references=None,  # they were read in the field without these
     )
 
 

@@ -29,6 +29,10 @@ leaves of the error about the share that the compression takes of a change of th
 steps settle it wherever a channel is of any use; the bound keeps a hopeless one from looping."""
 
 
+LIVE = (Remedy.FLUX, Remedy.SENSORS)
+"""Remedies of effects that a tracker undoes; those of the field are in the model's dipoles."""
+
+
 def drifts(record: EffectRecord) -> bool:
     """Whether a record's course over time is one that another session doesn't repeat.
 
@@ -38,6 +42,17 @@ def drifts(record: EffectRecord) -> bool:
         When no effect has the record's name.
     """
     return effect_named(record.name).drifts
+
+
+def is_undone(record: EffectRecord) -> bool:
+    """Whether who tracks with a model has to undo a record's effect: the dipoles do not hold it.
+
+    Raises
+    ------
+    ModelFileError
+        When no effect has the record's name.
+    """
+    return effect_named(record.name).remedy in LIVE
 
 
 def _term(effect: Effect[Any], record: EffectRecord) -> Term:
@@ -78,7 +93,7 @@ class Correction:
         corrected = []
         for record in records:
             effect = effect_named(record.name)
-            if effect.remedy in (Remedy.FLUX, Remedy.SENSORS, Remedy.OPTICAL):
+            if effect.remedy in (*LIVE, Remedy.OPTICAL):
                 corrected.append(_term(effect, record))
         omega = 2 * np.pi * np.asarray(frequencies, dtype=np.float64)
         return Correction(tuple(corrected), sensors, omega)

@@ -1,7 +1,8 @@
 """The field model that all rooms share, virtual dipoles with moments for each emitter."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,12 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import ModelFileError
 from anser_ros.field.plain_data import plain
+from anser_ros.field.reference_readings import (
+    ReferenceReadings,
+    parse_readings,
+    readings_document,
+)
+from anser_ros.fingerprint import Identity, fingerprint_of
 from anser_ros.physics.dipole import flux_basis
 
 Array = NDArray[np.float64]
@@ -65,6 +72,11 @@ class FieldModel:
         Effects on the field itself are already in the dipoles.
     provenance : mapping
         How the model was made, with its held-out error.
+    made_for : Identity or None
+        Board and bodies that it was calibrated on, or its effects were found on; None where nobody
+        has told.
+    references : ReferenceReadings or None
+        What the references read when it was calibrated.
 
     Raises
     ------
@@ -81,6 +93,8 @@ class FieldModel:
     modes: ComplexArray | None = None
     effects: tuple[EffectRecord, ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    made_for: Identity | None = None
+    references: ReferenceReadings | None = None
 
     def __post_init__(self) -> None:
         n, k = self.positions.shape[0], len(self.emitters)
@@ -96,6 +110,17 @@ class FieldModel:
             )
         if self.modes is not None and self.modes.shape[1:] != (n, k):
             raise ModelFileError(f'model: modes {self.modes.shape} must be (R, {n}, {k})')
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """The model's short name, of all that poses follow from."""
+        return fingerprint_of(
+            [
+                self.positions, self.directions, self.moments, self.emitters, self.frequencies_hz,
+                self.flux_error_t, self.modes,
+                [[effect.name, plain(dict(effect.parameters))] for effect in self.effects],
+            ]
+        )  # fmt: skip
 
     def flux(self, points: Array, axes: Array, lengths: Array | None = None) -> ComplexArray:
         """Return the flux that each sensor has of each emitter.
@@ -158,6 +183,8 @@ def to_document(model: FieldModel) -> dict[str, Any]:
     )
     document: dict[str, Any] = {
         'schema': SCHEMA,
+        'fingerprint': model.fingerprint,
+        **({} if model.made_for is None else {'made_for': plain(asdict(model.made_for))}),
         'frame_id': 'fg',
         'units': {
             'position': 'm',
@@ -185,6 +212,8 @@ def to_document(model: FieldModel) -> dict[str, Any]:
         + [f'm{k}_{part}' for k in range(len(model.emitters)) for part in ('re', 'im')],
         'dipoles': table.tolist(),
     }
+    if model.references is not None:
+        document['references'] = readings_document(model.references)
     if model.modes is not None:
         parts = np.stack([model.modes.real, model.modes.imag], axis=3)
         document['modes'] = parts.reshape(*model.modes.shape[:2], -1).tolist()
@@ -212,8 +241,19 @@ def _effect(item: Any) -> EffectRecord:
     return EffectRecord(item['name'], *parts)
 
 
+def _made_for(item: Any) -> Identity | None:
+    if item is None:
+        return None
+    bodies = item.get('bodies') if isinstance(item, dict) else None
+    if not isinstance(bodies, dict) or not isinstance(item.get('board'), str):
+        raise ModelFileError(f'model: made_for must name a board and bodies, got {item!r}')
+    return Identity(item['board'], {str(body): str(value) for body, value in bodies.items()})
+
+
 def from_document(document: Any) -> FieldModel:
     """Return the field model that a document of plain data holds.
+
+    A document of an earlier version, without fingerprints, is taken as it is.
 
     Raises
     ------
@@ -249,7 +289,8 @@ def from_document(document: Any) -> FieldModel:
     provenance = document.get('provenance') or {}
     if not isinstance(provenance, dict):
         raise ModelFileError('model: provenance must be a mapping')
-    return FieldModel(
+    references = document.get('references')
+    model = FieldModel(
         positions=table[:, :3].copy(),
         directions=table[:, 3:6].copy(),
         moments=np.ascontiguousarray(table[:, 6::2] + 1j * table[:, 7::2]),
@@ -259,4 +300,13 @@ def from_document(document: Any) -> FieldModel:
         modes=modes,
         effects=tuple(_effect(item) for item in effects),
         provenance=provenance,
+        made_for=_made_for(document.get('made_for')),
+        references=None if references is None else parse_readings(references, k),
     )
+    told = document.get('fingerprint')
+    if told is not None and str(told) != model.fingerprint:
+        raise ModelFileError(
+            f'model: the file says that it is the model {told}, its content is the model '
+            f'{model.fingerprint}; was it changed? Without its key fingerprint it is believed'
+        )
+    return model

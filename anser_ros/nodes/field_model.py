@@ -18,10 +18,10 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from anser_ros.errors import AnserError, FitError
+from anser_ros.errors import AnserError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
-from anser_ros.integrity.withheld import REFERENCES_LOST, TWO_SOURCES, code_of
+from anser_ros.integrity.withheld import OTHER_MODEL, REFERENCES_LOST, TWO_SOURCES, code_of
 from anser_ros.nodes import qos, refit_status
 from anser_ros.nodes.diagnostics import Trouble
 from anser_ros.nodes.flux_reader import read_frame
@@ -110,7 +110,7 @@ class FieldModelNode(AnserNode):
         self._model: FieldModel | None = None
         self._refit: LiveRefit | None = None
         self._result: RefitResult | None = None
-        self._frozen = False
+        self._frozen = self._unfit = False
         self._trouble = Trouble()
         self._frames: Intake | None = None
         self._stamp_ns = 0
@@ -141,6 +141,7 @@ class FieldModelNode(AnserNode):
         self.create_service(Trigger, 'field_model/set_baseline', self._on_set_baseline)
         if self._file_model is not None:
             self._base = self._file_model
+            self._writer.name_origin(self._file_model)
             self._serve(self._file_model, self.get_clock().now().nanoseconds)
 
     # What is subscribed to ----------------------------------------------------------------
@@ -150,12 +151,15 @@ class FieldModelNode(AnserNode):
             return
         try:
             setup = parse_setup(message.data).with_stated(self._stated)
-            if self._setup is not None and setup.follows_as(self._setup):
+            if self._setup is not None and setup.follows_as(self._setup) and not self._unfit:
                 self._setup_text, self._setup = message.data, setup
                 return  # another rate or noise: model and baseline hold
             base = starting_model(setup, self._file_model)
         except AnserError as error:
             self._refuse('setups_refused', error)
+            if isinstance(error, ModelFileError) and self._model is not None:
+                self._unfit = True
+                self._serve(self._model, self.get_clock().now().nanoseconds)
             return
         self._setup_text, self._setup = message.data, setup
         self._trouble.forget()
@@ -165,7 +169,9 @@ class FieldModelNode(AnserNode):
         self._window = ReadingWindow(
             self._references, len(base.emitters), self.parameters.baseline_s
         )
-        if base is not self._model:
+        self._writer.name_origin(base)
+        told, self._unfit = not self._unfit, False
+        if base is not self._model or not told:
             self._serve(base, self.get_clock().now().nanoseconds)
         self._base = base
         if self._baseline_bag is not None and len(self._references):
@@ -269,6 +275,7 @@ class FieldModelNode(AnserNode):
         The model of a frame of readings has their stamp, which may be of another day. ``withheld``
         is the state for which trackers are to give no pose, or not for long.
         """
+        withheld = OTHER_MODEL if self._unfit else withheld
         self._stamp_ns = stamp_ns if stamp_ns != self._stamp_ns else stamp_ns + 1
         frame_id = self._frame_id
         # The uncertainty goes first, so that a receiver has both when the model comes.
@@ -354,9 +361,12 @@ class FieldModelNode(AnserNode):
         said = said_of(self._sources)
         if said:
             return Status('', Level.ERROR, f'{TWO_SOURCES}: {said}', values)
+        if self._unfit:
+            return Status('', Level.ERROR, f'{OTHER_MODEL}: {self._trouble.last}', values)
         if model is None:
             return Status('', Level.WARN, self._trouble.last or 'no setup yet', values)
         values |= {
+            'fingerprint': '' if self._base is None else self._base.fingerprint,
             **refit_status.model_values(model, self.parameters.model_file),
             'stamp_ns': self._stamp_ns,
             'freeze': self._frozen,

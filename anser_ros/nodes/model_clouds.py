@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from sensor_msgs.msg import PointCloud2, PointField
 
+from anser_ros.effects.correction import is_undone
 from anser_ros.errors import LayoutError
 from anser_ros.field.model import FieldModel
 from anser_ros.wire.model_error import ModelError, decode_model_error, encode_model_error
@@ -60,7 +61,12 @@ class ModelWriter:
     def __init__(self) -> None:
         self._maker = CloudMaker()
         self._told: tuple[FieldModel, PointCloud2] | None = None
-        self._uncertainty: tuple[object, float, int, bool, int] | None = None
+        self._uncertainty: tuple[object, float, int, bool, int, str, int] | None = None
+        self._origin = '', 0
+
+    def name_origin(self, base: FieldModel) -> None:
+        """Tell from now on which model the served ones are made from."""
+        self._origin = base.fingerprint, sum(is_undone(record) for record in base.effects)
 
     def dipoles(self, model: FieldModel, frame_id: str, stamp_ns: int) -> PointCloud2:
         """Return the ``field_model`` message; for the model of the last one, that one renamed."""
@@ -79,7 +85,8 @@ class ModelWriter:
     ) -> PointCloud2 | None:
         """Return the ``field_model_error`` message; None where the last one still holds."""
         told = self._uncertainty
-        now = (model.modes, model.flux_error_t, len(model.positions), follows, withheld)
+        size = len(model.positions)
+        now = (model.modes, model.flux_error_t, size, follows, withheld, *self._origin)
         if told is not None and told[0] is now[0] and told[1:] == now[1:]:
             return None
         self._uncertainty = now
@@ -101,7 +108,7 @@ class ModelWriter:
         modes = model.modes
         if modes is None:
             modes = np.zeros((0, *model.moments.shape), dtype=complex)
-        error = ModelError(float(model.flux_error_t), modes, follows, withheld)
+        error = ModelError(float(model.flux_error_t), modes, follows, withheld, *self._origin)
         return self._maker.message(encode_model_error(error), frame_id, stamp_ns)
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from anser_ros.field.model import FieldModel
 from anser_ros.integrity.ageing import ModelAge, Standing
-from anser_ros.integrity.withheld import REFERENCES_LOST, Withheld
+from anser_ros.integrity.withheld import OTHER_MODEL, REFERENCES_LOST, Withheld
 from anser_ros.nodes.model_intake import GivenModel
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.wire.setup import Setup
@@ -40,6 +40,7 @@ class ModelInForce:
         self.field = file_model
         self._age = ModelAge(setup.refit.references_age_s, volume)
         self._frame_ns = 0
+        self._differs = ''
         self.given: GivenModel | None = None
 
     def field_of(self, given: GivenModel) -> FieldModel:
@@ -57,6 +58,7 @@ class ModelInForce:
     def put(self, given: GivenModel, field: FieldModel) -> None:
         """Use another published model from now on, and what `field_of` made of it."""
         self.given, self.field = given, field
+        self._differs = self._difference(given)
         if not given.follows:
             self._age.forget()
         elif not given.withheld:
@@ -65,11 +67,28 @@ class ModelInForce:
                 stamp_ns = self._frame_ns
             self._age.answered(stamp_ns, field)
 
+    def _difference(self, given: GivenModel) -> str:
+        """In what the published model is not the one whose effects are undone; empty where it is.
+
+        What tells no fingerprint passes: there is nothing to compare.
+        """
+        error, own = given.error, self._file_model
+        if error is None or not error.fingerprint:
+            return ''
+        served = f'field_model serves the model {error.fingerprint}'
+        if own is not None and own.fingerprint != error.fingerprint:
+            return f'{served}, the model_file here is the model {own.fingerprint}'
+        if own is None and error.effects:
+            return f'{served}, with {error.effects} effects to be undone: give its model_file here'
+        return ''
+
     def at(self, stamp_ns: int) -> Standing:
         """Return what a frame of fluxes may be tracked with."""
         self._frame_ns = stamp_ns
         if self.field is not None and self._age.newest_ns > stamp_ns + OTHER_CLOCK_NS:
             self._age.answered(stamp_ns, self.field)
+        if self._differs:
+            return Standing(self.field, Withheld(OTHER_MODEL, self._differs))
         state = '' if self.given is None else self.given.withheld
         standing = self._age.at(stamp_ns, REASONS.get(state, ''))
         if standing.model is None:

@@ -12,6 +12,7 @@ from anser_ros.calibration.result import Calibration
 from anser_ros.errors import FitError
 from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.session import Session
+from anser_ros.sessions.starting_model import made_for
 from anser_ros.wire.setup import Setup
 
 
@@ -60,7 +61,11 @@ def calibrate_sessions(
     setup = sessions[0].setup
     measurements = [tool for session in sessions for tool in session.tools]
     names = [Path(session.path).name for session in sessions for _ in session.tools]
-    return calibrate(
+    calibration = calibrate(
         measurements, names, generator_of(setup), setup.emitter_names, setup.frequencies_hz,
         replace(options, accuracy=setup.accuracy), Drawing.of(setup).model, progress,
     )  # fmt: skip
+    model = calibration.model
+    for session in sessions:
+        model = made_for(model, session.setup)
+    return replace(calibration, model=model)

@@ -23,6 +23,7 @@ from anser_ros.sessions.follower import ModelFollower
 from anser_ros.sessions.prepared import PreparedSession, correct, prepare
 from anser_ros.sessions.recorded_drift import date_drifts
 from anser_ros.sessions.session import Session
+from anser_ros.sessions.starting_model import made_for
 from anser_ros.sessions.tracked_session import track
 from anser_ros.tracking.estimate import TrackerSettings
 
@@ -97,7 +98,8 @@ def diagnose_session(
     prepared = prepare(session, model, baseline)
     problem = problem_of(correct(prepared))
     found = diagnose(problem, model, progress=say)
-    found = replace(found, model=date_drifts(found.model, session))
+    dated = date_drifts(found.model, session)
+    found = replace(found, model=made_for(dated, session.setup))
     say('tracking the held-out part')
     unseen = prepared.with_session(held_out_part(session, problem))
     before, after = track_held_out(unseen, found)

@@ -1,5 +1,6 @@
 """The field model that a command starts from: a file, or the nominal one of the setup."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.nominal import nominal_model
+from anser_ros.fingerprint import Identity
 from anser_ros.physics.board import Board, build_board
 from anser_ros.sessions.model_file import load_model
 from anser_ros.wire.setup import Setup
@@ -48,12 +50,13 @@ def starting_model(setup: Setup, given: FieldModel | None) -> FieldModel:
 
 
 def check_emitters(setup: Setup, given: FieldModel) -> None:
-    """Raise `ModelFileError` when a model's emitters are not the setup's."""
+    """Raise `ModelFileError` when a model's emitters are not the setup's, or it is of another."""
     if given.emitters != setup.emitter_names:
         raise ModelFileError(
             f'the model has the emitters {", ".join(given.emitters)}; '
             f'the setup {", ".join(setup.emitter_names)}'
         )
+    check_made_for(given, setup, 'the setup')
 
 
 def model_for(name: str, session: 'Session', snapshot: bool = False) -> FieldModel:
@@ -76,8 +79,56 @@ def model_for(name: str, session: 'Session', snapshot: bool = False) -> FieldMod
     return model
 
 
+def made_for(model: FieldModel, setup: Setup) -> FieldModel:
+    """Return the model as one for a setup: its board, and its bodies beside those from before."""
+    before = {} if model.made_for is None else model.made_for.bodies
+    identity = setup.identity
+    return replace(model, made_for=Identity(identity.board, {**before, **identity.bodies}))
+
+
+def check_made_for(model: FieldModel, setup: Setup, where: str) -> None:
+    """Raise `ModelFileError` when a model is of another board, or its effects of other sensors.
+
+    A tool that the model says nothing of may be another one than it was calibrated with. A model
+    that does not tell what it was made for passes.
+    """
+    made, now = model.made_for, setup.identity
+    if made is None:
+        return
+    if made.board != now.board:
+        raise ModelFileError(
+            f'the model {model.fingerprint} is of the board {made.board}; {where} has the board '
+            f'{now.board}'
+        )
+    for body in sorted(_bodies_of(model, setup)):
+        known = made.bodies.get(body)
+        if known is not None and known != now.bodies[body]:
+            raise ModelFileError(
+                f'effects of the model {model.fingerprint} are of the sensors {known} on {body}; '
+                f'{where} has {now.bodies[body]} there'
+            )
+
+
+def _bodies_of(model: FieldModel, setup: Setup) -> set[str]:
+    """Bodies of the setup whose sensors an effect of the model names."""
+    found = set()
+    for effect in model.effects:
+        told = effect.parameters
+        channels = [told.get('channel'), *_listed(told.get('channels'))]
+        found |= {s.body for s in setup.sensors if s.channel in channels}
+        found |= {s.body for s in setup.sensors if s.body == told.get('body')}
+    return found
+
+
+def _listed(value: object) -> list[object]:
+    return list(value) if isinstance(value, list | tuple) else []
+
+
 def check_fits(model: FieldModel, session: 'Session') -> None:
-    """Raise `ModelFileError` when the model's emitters are not the session's."""
+    """Raise `ModelFileError` when the model's emitters are not the session's, or it is of another.
+
+    What else a model may be of: see `check_made_for`.
+    """
     names = session.setup.emitter_names
     if model.emitters != names:
         raise ModelFileError(
@@ -89,3 +140,4 @@ def check_fits(model: FieldModel, session: 'Session') -> None:
             f'the model drives at {list(model.frequencies_hz)} Hz; '
             f'the session {session.path} at {list(session.setup.frequencies_hz)} Hz'
         )
+    check_made_for(model, session.setup, f'the session {session.path}')

@@ -4,19 +4,23 @@ A point for every dipole that a mode moves: ``mode`` and ``dipole`` uint16, ``fl
 (T: what the model leaves unexplained) and ``follows`` uint32 (1 while every frame of
 ``reference/flux`` is answered by a model of its stamp) and ``withheld`` uint32 (0, or the code of
 the state for which no pose may be given), all three the same in all points; then
-``m<k>_re``, ``m<k>_im`` float32 (A m^2). The moments are wrong by the sum of all modes, each times
-an independent unit normal number. The message has the stamp of the ``field_model`` message that
-it belongs to, and holds for later models of that size until there is another one: the uncertainty
-changes less often than the field. A receiver that does without it still has the field.
+``m<k>_re``, ``m<k>_im`` float32 (A m^2), and, again the same in all points, ``fingerprint`` uint32
+(of the model that the served one was made from; 0 where nobody tells) and ``effects`` uint32 (of
+its effects, how many a receiver has to undo). The moments are wrong by the sum of all modes, each
+times an independent unit normal number. The message has the stamp of the ``field_model`` message
+that it belongs to, and holds for later models of that size until there is another one: the
+uncertainty changes less often than the field. A receiver that does without it still has the field.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import LayoutError
+from anser_ros.fingerprint import DIGITS
 from anser_ros.wire.points import FLOAT32, UINT16, UINT32, PointFieldTuple
 
 ComplexArray = NDArray[np.complex128]
@@ -34,15 +38,22 @@ class ModelError:
 
     ``follows`` says whether the model follows the references: each of their frames has its own.
     ``withheld`` is 0, or the code of the state for which the server wants no pose to be given.
+    ``fingerprint`` is that of the model that the served one was made from, empty where it is not
+    told, and ``effects`` how many of its effects whoever uses it has to undo.
     """
 
     flux_error_t: float
     modes: ComplexArray
     follows: bool = False
     withheld: int = 0
+    fingerprint: str = ''
+    effects: int = 0
 
 
-def _layout(n_emitters: int) -> tuple[list[PointFieldTuple], 'np.dtype[np.void]']:
+def _layout(
+    n_emitters: int, has_origin: bool = True
+) -> tuple[list[PointFieldTuple], 'np.dtype[np.void]']:
+    """Fields and record; what was recorded before 0.2 does not tell which model it is from."""
     fields: list[PointFieldTuple] = [
         ('mode', 0, UINT16, 1),
         ('dipole', 2, UINT16, 1),
@@ -53,7 +64,12 @@ def _layout(n_emitters: int) -> tuple[list[PointFieldTuple], 'np.dtype[np.void]'
     for k in range(n_emitters):
         fields.append((f'm{k}_re', 16 + 8 * k, FLOAT32, 1))
         fields.append((f'm{k}_im', 20 + 8 * k, FLOAT32, 1))
-    return fields, np.dtype([*_HEAD, ('m', '<f4', 2 * n_emitters)])
+    record: list[Any] = [*_HEAD, ('m', '<f4', 2 * n_emitters)]
+    if has_origin:
+        end = 16 + 8 * n_emitters
+        fields += [('fingerprint', end, UINT32, 1), ('effects', end + 4, UINT32, 1)]
+        record += [('fingerprint', '<u4'), ('effects', '<u4')]
+    return fields, np.dtype(record)
 
 
 def encode_model_error(error: ModelError) -> tuple[list[PointFieldTuple], int, bytes]:
@@ -74,6 +90,7 @@ def encode_model_error(error: ModelError) -> tuple[list[PointFieldTuple], int, b
     out = np.zeros(mode.size, dtype=record)
     out['mode'], out['dipole'], out['flux_error'] = mode, dipole, error.flux_error_t
     out['follows'], out['withheld'] = error.follows, error.withheld
+    out['fingerprint'], out['effects'] = int(error.fingerprint or '0', 16), error.effects
     if modes.shape[0]:
         chosen = modes[mode, dipole]
         out['m'][:, 0::2], out['m'][:, 1::2] = chosen.real, chosen.imag
@@ -96,7 +113,8 @@ def decode_model_error(
         When the cloud is not laid out as `encode_model_error` does, names a dipole that the model
         doesn't have, or holds values that are not finite.
     """
-    wanted, record = _layout(n_emitters)
+    has_origin = any(field[0] == 'fingerprint' for field in fields)
+    wanted, record = _layout(n_emitters, has_origin)
     if list(fields) != wanted or point_step != record.itemsize:
         raise LayoutError(f'no model uncertainty for {n_emitters} emitters')
     if width < 1 or memoryview(data).nbytes != point_step * width:
@@ -117,4 +135,7 @@ def decode_model_error(
     if count:
         modes[points['mode'], points['dipole']] = moments
     follows, withheld = bool(points['follows'][0]), int(points['withheld'][0])
-    return ModelError(flux_error, modes, follows, withheld)
+    origin = int(points['fingerprint'][0]) if has_origin else 0
+    effects = int(points['effects'][0]) if has_origin else 0
+    named = f'{origin:0{DIGITS}x}' if origin else ''
+    return ModelError(flux_error, modes, follows, withheld, named, effects)

@@ -8,7 +8,7 @@ import difflib
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -16,12 +16,14 @@ import numpy as np
 import yaml
 
 from anser_ros.errors import ParameterError, SetupError
+from anser_ros.fingerprint import Identity, fingerprint_of
 from anser_ros.settings import SECTIONS, Accuracy, RefitSettings, settings_from
 from anser_ros.wire.yaml_text import read_yaml
 
 SCHEMA = 'anser_setup/1'
 KEYS = (
-    'schema', 'frame_id', 'flux_rate_hz', 'flux_unit', 'emitter', 'sensors', 'volume', *SECTIONS,
+    'schema', 'fingerprint', 'frame_id', 'flux_rate_hz', 'flux_unit', 'emitter', 'sensors',
+    'volume', *SECTIONS,
 )  # fmt: skip
 LIKENESS = 0.8
 """Ratio of equal letters (`difflib`) from which an unknown key is taken for a misspelt one: one
@@ -111,6 +113,25 @@ class Setup:
         together = {**self.stated, **stated}
         settings_from(together)
         return replace(self, stated=together)
+
+    @cached_property
+    def identity(self) -> Identity:
+        """Fingerprints of the board, and of the sensors on each body."""
+        emitter = self.emitter
+        coils = [[c.name, c.centre_m, c.rotation_deg, c.frequency_hz] for c in emitter.coils]
+        sensors = sorted(self.sensors, key=lambda sensor: sensor.channel)
+        return Identity(
+            fingerprint_of([emitter.kind, emitter.geometry, coils]),
+            {
+                body: fingerprint_of(
+                    [
+                        [s.channel, s.name, s.position_m, s.axis, s.length_m]
+                        for s in sensors if s.body == body
+                    ]
+                )
+                for body in sorted({sensor.body for sensor in sensors})
+            },
+        )  # fmt: skip
 
     @property
     def tool_sensors(self) -> tuple[SensorSpec, ...]:
@@ -318,7 +339,8 @@ def parse_setup(text: str) -> Setup:
     Two sections are optional: ``accuracy`` states how accurate the instruments are and ``refit``
     how the live refit follows. Their keys, with units and defaults, are the fields of
     `anser_ros.settings.Accuracy` and `anser_ros.settings.RefitSettings`; what is not stated has
-    its default. Any other key is kept in ``extra``, unless it is nearly one of these.
+    its default. ``fingerprint`` is for other readers and is worked out anew. Any other key is kept
+    in ``extra``, unless it is nearly one of these.
 
     Parameters
     ----------
@@ -401,6 +423,7 @@ def dump_setup(setup: Setup) -> str:
     volume = {key: list(corner) for key, corner in corners}
     document = {
         'schema': SCHEMA,
+        'fingerprint': asdict(setup.identity),
         'frame_id': setup.frame_id,
         'flux_rate_hz': setup.flux_rate_hz,
         'flux_unit': 'T',
