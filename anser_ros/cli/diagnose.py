@@ -13,6 +13,7 @@ from rich.table import Table
 from anser_ros.cli.diagnosis_report import render
 from anser_ros.cli.diagnosis_words import verdict
 from anser_ros.cli.output import make_folder, say_written, warn_of_snapshot
+from anser_ros.cli.pose_session import add_pose_options, need_model, run_diagnosis
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.sessions.diagnosis import diagnose_session
 from anser_ros.sessions.diagnosis_document import to_document
@@ -24,19 +25,21 @@ from anser_ros.sessions.starting_model import model_for
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument('session', help='bag to diagnose (.mcap file or bag folder)')
-    parser.add_argument(
-        '--model', required=True, help="model file, or 'nominal' for the setup's own geometry"
-    )
+    parser.add_argument('--model', help="model file, or 'nominal' for the setup's own geometry")
     parser.add_argument(
         '--out', required=True, type=Path, help='folder for the results, made if missing'
     )
     parser.add_argument('--baseline', help='distortion-free recording of the same board')
+    add_pose_options(parser)
     add_stated_values(parser, 'accuracy', 'refit', 'tools')
     parser.add_argument('--json', action='store_true', help='print diagnosis.json on stdout')
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
+    if args.poses:
+        return run_diagnosis(args)
+    need_model(args)
     session = load_session(args.session).with_stated(stated_values(args))
     model = model_for(args.model, session, snapshot=True)
     warn_of_snapshot('diagnose', args.model, model)

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from anser_ros.cli.output import make_folder, say_written, warn_of_snapshot
+from anser_ros.cli.pose_session import add_pose_options, need_model, run_diagnosis
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.evaluation_document import to_document
@@ -24,9 +25,7 @@ from anser_ros.tracking.estimate import TrackerSettings
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument('session', help='bag to track (.mcap file or bag folder)')
-    parser.add_argument(
-        '--model', required=True, help="model file, or 'nominal' for the setup's own geometry"
-    )
+    parser.add_argument('--model', help="model file, or 'nominal' for the setup's own geometry")
     parser.add_argument(
         '--out', required=True, type=Path, help='folder for the results, made if missing'
     )
@@ -51,12 +50,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='largest residual of a pose, in units of the expected one; inf refuses none '
         '(for the error that a wrong model would make, never for use)',
     )
+    add_pose_options(parser)
     add_stated_values(parser, 'accuracy', 'refit', 'tools')
     parser.add_argument('--json', action='store_true', help='print evaluation.json on stdout')
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
+    if args.poses:
+        return run_diagnosis(args, is_evaluation=True)
+    need_model(args)
     session = load_session(args.session).with_stated(stated_values(args))
     model = model_for(args.model, session, snapshot=True)
     warn_of_snapshot('evaluate', args.model, model)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import PlausibilityError
-from anser_ros.physics.pose_track import PoseTrack
+from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -18,6 +18,10 @@ FARTHEST = 1e6
 sees a thousand kilometres, NDI's marker is 3.7e28."""
 NO_TURN = 0.1
 """Norm of a quaternion below which it is a marker for no pose; a rounded one has a norm near 1."""
+LEAP_M, LEAP_RAD, LEAP_TIMES = 0.01, 0.25, 3.0
+"""How far a pose is from the line between its neighbours if it leaps: m, rad, and in distances of
+these from each other. A hand that shakes turns back within 5 mm at 20 poses a second."""
+LONGEST_LEAP = 3  # rounds; each takes out one pose of a run, or two from its ends
 NOT_UNIT = 0.05
 """How far the norm of a quaternion may be from one: four digits are given by the coarsest form."""
 
@@ -104,6 +108,35 @@ class PoseSession:
     sensors: Mapping[str, PoseSequence]
     reference: PoseSequence | None
     lost: str = ''
+
+
+def leaps(poses: PoseSequence) -> Mask:
+    """Mask (n,) of single poses, or a few, that leap away from those before and after them.
+
+    A marker seen in its other solution does: it is far off between two poses that agree.
+    """
+    away = np.zeros(poses.size, dtype=bool)
+    for _ in range(LONGEST_LEAP):
+        rows = np.flatnonzero(~away)
+        if rows.size < 5:
+            break
+        near = poses.rows(rows)
+        share = (near.time[1:-1] - near.time[:-2]) / np.maximum(
+            near.time[2:] - near.time[:-2], 1e-9
+        )
+        between = near.position[:-2] + share[:, None] * (near.position[2:] - near.position[:-2])
+        far = np.linalg.norm(near.position[1:-1] - between, axis=1)
+        wide = np.linalg.norm(near.position[2:] - near.position[:-2], axis=1)
+        turns = Rotation.from_quat(near.quaternion)
+        turned = (turns[:-2].inv() * turns[1:-1]).magnitude()
+        around = (turns[:-2].inv() * turns[2:]).magnitude()
+        leap = (far > LEAP_M) & (far > LEAP_TIMES * wide)
+        leap |= (turned > LEAP_RAD) & (turned > LEAP_TIMES * around)
+        leap &= near.time[2:] - near.time[:-2] < LONGEST_GAP_S * 4
+        if not leap.any():
+            break
+        away[rows[1:-1][leap]] = True
+    return away
 
 
 def sequence_of(name: str, time: Array, position: Array, quaternion: Array) -> PoseSequence:

@@ -1,0 +1,133 @@
+"""The options of commands that take a session of poses, and what `diagnose --poses` does."""
+
+import argparse
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from rich.console import Console
+from rich.table import Table
+
+from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.pose_report import pose_verdict, render_poses
+from anser_ros.errors import ParameterError
+from anser_ros.poses.diagnosis import PoseDiagnosis, diagnose_poses
+from anser_ros.poses.document import to_document, to_model
+from anser_ros.poses.recording import read_pose_session
+from anser_ros.poses.sequence import PoseSession
+
+
+def add_pose_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of a session of poses."""
+    parser.add_argument(
+        '--poses', action='store_true', help='a session of a tracker that gives poses only'
+    )
+    parser.add_argument(
+        '--tracked', action='append', default=[], metavar='NAME=TOPIC',
+        help='with --poses: a sensor and its topic, by default all /tracked/<sensor>/pose',
+    )  # fmt: skip
+    parser.add_argument(
+        '--optical', metavar='TOPIC',
+        help='with --poses: topic of the reference, by default the only /optical/<body>/pose',
+    )  # fmt: skip
+
+
+def need_model(args: argparse.Namespace) -> None:
+    """Raise `ParameterError` where a session of fluxes has no model."""
+    if args.model is None:
+        raise ParameterError('the following arguments are required: --model (or --poses)')
+
+
+def load_poses(args: argparse.Namespace) -> PoseSession:
+    """The session that the options name."""
+    topics = {}
+    for text in args.tracked:
+        name, _, topic = text.partition('=')
+        if not name or not topic:
+            raise ParameterError(f'--tracked takes NAME=TOPIC, got {text!r}')
+        topics[name] = topic
+    return read_pose_session(args.session, topics or None, args.optical)
+
+
+def run_diagnosis(args: argparse.Namespace, *, is_evaluation: bool = False) -> int:
+    """Diagnose a session of poses, or tell its errors; the exit code."""
+    session = load_poses(args)
+    make_folder(args.out)
+    found = diagnose_poses(session)
+    document = to_document(found)
+    if is_evaluation:
+        document = _evaluation(found, document)
+        _write_poses(args.out / 'poses.csv', found)
+        files = ['evaluation.json', 'poses.csv']
+    else:
+        model = yaml.safe_dump(to_model(found), sort_keys=False)
+        (args.out / 'model.yaml').write_text(model, encoding='utf-8')
+        page = render_poses(found, document, str(args.session))
+        (args.out / 'report.html').write_text(page, encoding='utf-8')
+        files = ['diagnosis.json', 'model.yaml', 'report.html']
+    text = json.dumps(document, indent=1)
+    (args.out / files[0]).write_text(text + '\n', encoding='utf-8')
+    if session.lost:
+        Console(stderr=True).print(f'{args.session}: {session.lost}', highlight=False)
+    if args.json:
+        print(text)
+        return 0
+    Console().print(_table(to_document(found)))
+    print(pose_verdict(to_document(found)))
+    say_written(*(args.out / name for name in files))
+    return 0
+
+
+def _table(document: dict[str, Any]) -> Table:
+    table = Table('sensor', 'registration mm', 'hand-eye mm', 'effects mm', 'effects deg')
+    for name, row in document['sensors'].items():
+        cells = [row[f'position_rmse_{key}_m'] for key in ('registration_only', 'before', 'after')]
+        turn = row['orientation_rmse_after_rad']
+        shown = ['-' if v is None else f'{1e3 * v:.2f}' for v in cells]
+        table.add_row(name, *shown, '-' if turn is None else f'{np.rad2deg(turn):.2f}')
+    return table
+
+
+def _evaluation(found: PoseDiagnosis, document: dict[str, Any]) -> dict[str, Any]:
+    """The errors of every sensor with the frames and effects that were found."""
+    sensors: dict[str, Any] = {}
+    for part in found.fit.state.parts:
+        name = part.view.sensor
+        row: dict[str, Any] = {'n': int(np.count_nonzero(part.used))}
+        poses = found.session.sensors[name]
+        row['tracked_fraction'] = poses.size / max(poses.size + poses.missing.size, 1)
+        for key, unit, columns in (
+            ('position', 'm', slice(0, 3)),
+            ('orientation', 'rad', slice(3, 6)),
+        ):
+            size = np.linalg.norm(part.residual[part.used, columns], axis=1)
+            row |= {
+                f'{key}_rmse_{unit}': float(np.sqrt(np.mean(size**2))),
+                f'{key}_me_{unit}': float(size.mean()),
+                f'{key}_prc50_{unit}': float(np.percentile(size, 50)),
+                f'{key}_prc95_{unit}': float(np.percentile(size, 95)),
+            }
+        sensors[name] = row
+    return {
+        'schema': 'anser_evaluation/1', 'sensors': sensors, 'bodies': {},
+        'held_out': document['held_out'],
+    }  # fmt: skip
+
+
+def _write_poses(path: Path, found: PoseDiagnosis) -> None:
+    """Write the corrected poses in the optical body's prediction frame, a row each."""
+    with path.open('w', encoding='utf-8', newline='') as stream:
+        writer = csv.writer(stream)
+        writer.writerow(['stamp_ns', 'sensor', 'x_m', 'y_m', 'z_m', 'distance_m', 'angle_rad',
+                         'status'])  # fmt: skip
+        for part in found.fit.state.parts:
+            stamps = found.session.start_ns + np.round(1e9 * part.view.time).astype(np.int64)
+            place = part.view.position + part.residual[:, :3]
+            for k, stamp in enumerate(stamps.tolist()):
+                size = [np.linalg.norm(part.residual[k, :3]), np.linalg.norm(part.residual[k, 3:])]
+                status = 'ok' if part.used[k] else 'outlier_or_no_reference'
+                values = [f'{v:.9g}' for v in (*place[k], *size)]
+                writer.writerow([stamp, part.view.sensor, *values, status])

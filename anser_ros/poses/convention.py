@@ -1,0 +1,145 @@
+"""In which order, sense and unit poses were written, found where they do not fit as they stand."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import PlausibilityError
+from anser_ros.field.model import EffectRecord
+from anser_ros.poses.sequence import PoseSequence, PoseSession
+from anser_ros.poses.start import coarse_offset, first_cost, first_fit, pose_problem
+
+Array = NDArray[np.float64]
+
+POOR_M = 8e-3
+"""Median misfit of hand-eye, m and tenths of rad together, from which other readings are tried:
+distorted trackers are off by less, and the inverse of a quaternion makes 25 mm and more."""
+BETTER = 0.5
+"""Share of the misfit as it stands below which another reading is the right one."""
+FEW_POSES = 150  # poses of a sensor by which a reading is judged
+HOPELESS_M = 25e-3
+"""Median misfit, m, with which no reading fits and a session is refused: its files do not belong
+together, or mean something that is not known here."""
+UNITS = {
+    'mm': 1e-3, 'cm': 1e-2, 'inch': 0.0254, 'km': 1e3,
+    'inch taken for mm': 25.4, 'mm taken for inch': 1 / 25.4,
+}  # fmt: skip
+"""What a unit of the numbers is in m when they are taken for m, or for what is said."""
+NEAR_UNIT = 0.12  # relative error of a scale that a unit explains; lever arms make as much
+SAME_SCALE = (0.75, 1.35)  # scales that need no unit
+
+
+@dataclass(frozen=True)
+class PoseReading:
+    """One way to read a stream's numbers, in the terms of `docs/interfaces.md`."""
+
+    stream: str = 'tracked'
+    quaternion: str = 'xyzw'
+    handedness: str = 'right'
+    unit: str = 'm'
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the numbers are what they say."""
+        return (self.quaternion, self.handedness, self.unit) == ('xyzw', 'right', 'm')
+
+    def record(self, before: float, after: float) -> EffectRecord:
+        """The reading as an effect, with the misfits (m) without and with it."""
+        return EffectRecord(
+            'frame_convention',
+            {
+                'stream': self.stream, 'quaternion': self.quaternion,
+                'handedness': self.handedness, 'unit': self.unit,
+            },
+            {},
+            {'misfit_as_written_m': before, 'misfit_so_read_m': after,
+             'summary': 'the stream means something else than it says'},
+        )  # fmt: skip
+
+    def applied(self, session: PoseSession) -> PoseSession:
+        """The session with its numbers read so."""
+        if self.stream == 'optical':
+            assert session.reference is not None
+            return replace(session, reference=self._read(session.reference))
+        return replace(session, sensors={n: self._read(s) for n, s in session.sensors.items()})
+
+    def _read(self, poses: PoseSequence) -> PoseSequence:
+        turn, place = poses.quaternion, poses.position * UNITS.get(self.unit, 1.0)
+        if self.quaternion.startswith('wxyz'):
+            turn = turn[:, [1, 2, 3, 0]]
+        if self.quaternion.endswith('conjugate'):
+            turn = turn * np.array([-1.0, -1.0, -1.0, 1.0])
+        if self.handedness == 'left':  # the z axis points the other way
+            place = place * np.array([1.0, 1.0, -1.0])
+            turn = turn * np.array([-1.0, -1.0, 1.0, 1.0])
+        return replace(poses, position=place, quaternion=turn)
+
+
+def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None]:
+    """The session as it is meant, and the convention by which it is, if that is another.
+
+    Raises
+    ------
+    PlausibilityError
+        When hand-eye fits in no reading.
+    DiagnosisError
+        When there are too few poses.
+    """
+    if session.reference is None:
+        return session, None
+    unit = _unit(session)
+    plain = PoseReading(unit=unit)
+    cost = _cost(plain.applied(session))
+    if cost < POOR_M:
+        return plain.applied(session), None if plain.is_plain else plain.record(np.inf, cost)
+    trials = [(_cost(reading.applied(session)), reading) for reading in _readings(unit)]
+    best, reading = min(trials, key=lambda pair: pair[0])
+    if best < BETTER * cost:
+        return reading.applied(session), reading.record(cost, best)
+    if cost > HOPELESS_M:
+        raise PlausibilityError(
+            f'{session.path}: tracked and optical poses do not belong together: hand-eye is off '
+            f'by {1e3 * cost:.0f} mm in the median, and by {1e3 * best:.0f} mm when quaternions '
+            f'are read in another order or sense'
+        )
+    return plain.applied(session), None if plain.is_plain else plain.record(np.inf, cost)
+
+
+def _readings(unit: str) -> Iterator[PoseReading]:
+    for stream in ('tracked', 'optical'):
+        for quaternion in ('xyzw', 'wxyz', 'conjugate', 'wxyz_conjugate'):
+            for handedness in ('right', 'left'):
+                found = PoseReading(stream, quaternion, handedness, unit)
+                is_as_written = (quaternion, handedness) == ('xyzw', 'right')
+                if not is_as_written and (stream == 'tracked' or unit == 'm'):
+                    yield found
+
+
+def _cost(session: PoseSession) -> float:
+    problem = pose_problem(session)
+    step = max(1, max(poses.size for poses in problem.sensors) // FEW_POSES)
+    problem = problem.rows([np.arange(0, poses.size, step) for poses in problem.sensors])
+    return first_cost(first_fit(problem, coarse_offset(problem), False))
+
+
+def _unit(session: PoseSession) -> str:
+    """The unit of the tracked positions by their extent against the optical ones."""
+    problem = pose_problem(session)
+    ratios = []
+    for poses in problem.sensors:
+        place, _, _, known = problem.path.at(poses.time)
+        ratios.append(_extent(poses.position[known]) / max(_extent(place[known]), 1e-9))
+    ratio = float(np.median(ratios))
+    if SAME_SCALE[0] < ratio < SAME_SCALE[1]:
+        return 'm'
+    for unit, size in UNITS.items():
+        if abs(np.log(ratio * size)) < np.log(1 + NEAR_UNIT):
+            return unit
+    return 'm'
+
+
+def _extent(place: Array) -> float:
+    """Robust extent of places: the median distance of each from the median place."""
+    return float(np.median(np.linalg.norm(place - np.median(place, axis=0), axis=1)))

@@ -1,0 +1,318 @@
+"""Diagnosis of a session of poses: convention, hand-eye, search, and what held-out poses say.
+
+The stages are those of a diagnosis of fluxes: read and set up, search on four fifths of the blocks
+of time, judge on the fifth that took no part; then the parameters are fitted to all poses.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from anser_ros.effects.term import Term
+from anser_ros.field.model import EffectRecord
+from anser_ros.poses.convention import read_rightly
+from anser_ros.poses.effect import PoseSight, Sensing
+from anser_ros.poses.effects.hand_eye import FrameTerm, Mount, Registration, frame_term
+from anser_ros.poses.effects.noise import jitter
+from anser_ros.poses.fit import PoseFit, fit_poses, noise_of, standing_out
+from anser_ros.poses.problem import PosePart, PoseProblem, PoseState
+from anser_ros.poses.registry import pose_effects
+from anser_ros.poses.search import PoseEvidence, search_effects
+from anser_ros.poses.sequence import PoseSession
+from anser_ros.poses.start import (
+    coarse_offset,
+    first_fit,
+    frames_from_places,
+    pose_problem,
+    train_blocks,
+)
+from anser_ros.poses.structure import depends_on
+from anser_ros.poses.swaps import put_back, swapped_spans
+
+Array = NDArray[np.float64]
+
+ABOVE_FLOOR = 1.3
+"""Factor of the held-out error over the jitter from which something stays unexplained: jitter is
+what differs between neighbours, and errors of a tracker are never quite alike there."""
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Held-out errors of all sensors, and by sensor: distance (m) and angle (rad), rms."""
+
+    position_m: float
+    orientation_rad: float
+    by_sensor: dict[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class PoseDiagnosis:
+    """What a session of poses was found to contain.
+
+    Attributes
+    ----------
+    session : PoseSession
+        As it is meant (units, order of quaternions).
+    fit : PoseFit
+        The two frames and all effects, on all poses.
+    records : tuple of EffectRecord
+        The effects that are named.
+    evidence : mapping of str to PoseEvidence
+        By the label of the term.
+    registered, before, after : PoseErrors
+        Held out: with the registration alone, with hand-eye, with the effects.
+    floor_m : float
+        What jitter alone would leave, m.
+    unexplained : float
+        Share of the squared error above the jitter that stays.
+    depends_on : tuple of str
+    refused : tuple of (str, str)
+    states : tuple of PoseState
+        The held-out poses before and after.
+    """
+
+    session: PoseSession
+    fit: PoseFit
+    records: tuple[EffectRecord, ...]
+    registered: PoseErrors
+    before: PoseErrors
+    after: PoseErrors
+    floor_m: float
+    unexplained: float
+    depends_on: tuple[str, ...]
+    refused: tuple[tuple[str, str], ...]
+    states: tuple[PoseState, PoseState]
+
+
+def diagnose_poses(
+    session: PoseSession, progress: Callable[[str], None] | None = None
+) -> PoseDiagnosis:
+    """Find what a tracker of poses lacks on a session.
+
+    Raises
+    ------
+    DiagnosisError
+        When there are too few poses with a reference.
+    PlausibilityError
+        When tracked and optical poses fit in no reading.
+    """
+    say = progress or (lambda text: None)
+    say('conventions')
+    session, convention = read_rightly(session)
+    problem = pose_problem(session)
+    train, test = train_blocks(problem)
+    say('hand-eye')
+    alone = session.reference is None
+    training = problem.in_blocks(train)
+    first = first_fit(training, coarse_offset(training), alone)
+    swaps = swapped_spans(problem, first)
+    session, swapped = put_back(session, swaps)
+    if swaps:
+        problem = pose_problem(session)
+        training = problem.in_blocks(train)
+        first = first_fit(training, coarse_offset(training), alone)
+    search = search_effects(first, say)
+    say('held out')
+    found = search.fit
+    frames = fit_poses(_without_stamps(found.state.problem), _frames_of(found.terms))
+    whole = _whole(problem, found)
+    unseen = _judged(replace(problem, noise=found.state.problem.noise).in_blocks(test), found)
+    before, after = unseen.state(frames.terms), unseen.state(found.terms)
+    registered = unseen.state(_registered(frames))
+    floor = _floor(after)
+    sight = _sight(session, problem, whole)
+    records = _records(whole, search.evidence, alone)
+    for effect in pose_effects().values():
+        records += list(effect.observed(sight))
+    records += swapped
+    if convention is not None:
+        records.append(convention)
+    errors = _errors(after)
+    excess = max(errors.position_m**2 - floor**2, 0.0)
+    possible = max(_errors(before).position_m ** 2 - floor**2, excess, 1e-18)
+    significant = errors.position_m > ABOVE_FLOOR * floor
+    return PoseDiagnosis(
+        session=session,
+        fit=whole,
+        records=tuple(records),
+        registered=_errors(registered),
+        before=_errors(before),
+        after=errors,
+        floor_m=floor,
+        unexplained=excess / possible if significant else 0.0,
+        depends_on=depends_on(after) if significant else (),
+        refused=search.refused,
+        states=(before, after),
+    )
+
+
+def _frames_of(terms: tuple[Term, ...]) -> list[Term]:
+    return [term for term in terms if isinstance(term, FrameTerm)]
+
+
+def _is_mount(term: Term) -> bool:
+    return isinstance(term.effect, Mount)
+
+
+def _registered(frames: PoseFit) -> list[Term]:
+    """The registration of places alone, with sensors at the body's origin."""
+    parts = frames.state.parts
+    said = np.concatenate([p.view.optical[p.used] for p in parts])
+    place = np.concatenate([p.view.measured[p.used] for p in parts])
+    rotation = np.eye(3)
+    if any(isinstance(t.effect, Registration) for t in frames.terms):
+        rotation = frames_from_places(place, said)
+    shift = np.mean(place - said @ rotation.T, axis=0)
+    mounts = [
+        t.with_theta(np.array([0, 0, 0, *t.theta[3:]])) for t in frames.terms if _is_mount(t)
+    ]
+    return [frame_term(Registration(), {}, shift, rotation), *mounts]
+
+
+def _without_stamps(problem: PoseProblem) -> PoseProblem:
+    return replace(problem, noise=tuple(replace(n, stamp_s=0.0) for n in problem.noise))
+
+
+def _judged(problem: PoseProblem, fit: PoseFit) -> PoseProblem:
+    """A problem without the poses that stand out from a fit."""
+    every = replace(problem, weight=tuple(np.ones(s.size) for s in problem.sensors))
+    out = standing_out(replace(fit, state=every.state(fit.terms)))
+    return replace(problem, weight=tuple(np.where(mask, 0.0, 1.0) for mask in out))
+
+
+def _whole(problem: PoseProblem, found: PoseFit) -> PoseFit:
+    """The terms fitted to all poses."""
+    every = _judged(replace(problem, noise=found.state.problem.noise), found)
+    return fit_poses(every, found.terms)
+
+
+def _errors(state: PoseState) -> PoseErrors:
+    every = state.rms()
+    return PoseErrors(*every, {p.view.sensor: state.rms(p.view.sensor) for p in state.parts})
+
+
+def _sensings(state: PoseState, out: tuple[NDArray[np.bool_], ...]) -> list[Sensing]:
+    found = []
+    for part, mask in zip(state.parts, out, strict=True):
+        noise, cost = noise_of(part)
+        gain = noise_of(part, with_stamps=False)[1] - cost
+        found.append(Sensing(part.view, part.residual, part.used, mask, noise.position_m,
+                             noise.orientation_rad, noise.stamp_s, gain))  # fmt: skip
+    return found
+
+
+def _sight(session: PoseSession, problem: PoseProblem, whole: PoseFit) -> PoseSight:
+    every = replace(problem, noise=whole.state.problem.noise).state(whole.terms)
+    out = standing_out(replace(whole, state=every))
+    sensings = tuple(_sensings(whole.state, out))
+    return PoseSight(session, problem.setting, sensings, problem.blocks)
+
+
+def _floor(state: PoseState) -> float:
+    """Distance that jitter alone makes, m: from differences between neighbours."""
+    squares = []
+    for part in state.parts:
+        sensing = Sensing(part.view, part.residual, part.used, ~part.used, 0.0, 0.0, 0.0, 0.0)
+        square, _ = jitter(sensing)
+        noise = part.noise
+        along = noise.stamp_s * np.linalg.norm(part.view.velocity[part.used, :3], axis=1)
+        if square.size and along.size:
+            squares.append(3 * float(np.mean(square)) + float(np.mean(along**2)))
+    return float(np.sqrt(np.mean(squares))) if squares else 0.0
+
+
+def _records(
+    fit: PoseFit, evidence: tuple[PoseEvidence | None, ...], alone: bool
+) -> list[EffectRecord]:
+    """Hand-eye of each sensor, and the effects that were fitted."""
+    covariance = fit.covariance()
+    covariances = [fit.covariance_of(i, covariance) for i in range(len(fit.terms))]
+    base = next((i for i, t in enumerate(fit.terms) if isinstance(t.effect, Registration)), None)
+    records = []
+    for i, term in enumerate(fit.terms):
+        if _is_mount(term) and isinstance(term, FrameTerm):
+            whole = None if base is None else fit.terms[base]
+            frame = whole if isinstance(whole, FrameTerm) else None
+            spread = None if base is None else covariances[base]
+            part = next(p for p in fit.state.parts if p.view.sensor == term.site['sensor'])
+            blurred = lever_blur(part)
+            records.append(hand_eye_record(term, covariances[i], frame, spread, blurred))
+    for term, one, spread in zip(fit.terms, evidence, covariances, strict=True):
+        if one is None:
+            continue
+        record = term.effect.record(term, spread)
+        told = {
+            'summary': term.effect.summary, 'remedy': term.effect.remedy.value,
+            'parameters_spent': int(term.theta.size), 'held_out_gain': one.gain,
+            'held_out_share': one.share,
+            'position_rmse_without_m': one.position_rmse_without_m,
+            'position_rmse_with_m': one.position_rmse_with_m,
+        }  # fmt: skip
+        records.append(replace(record, evidence=told))
+    return records
+
+
+MOST_BLUR = 0.1  # share by which a lever arm that is given may be too small
+LEAST_KNOWN_M, LEAST_KNOWN_RAD = 0.01, 0.1
+"""Standard deviation of a lever arm's component, m, or a turn, rad, beyond which it is not given:
+the motion does not determine it."""
+
+
+def lever_blur(part: PosePart) -> Array:
+    """Share, shape (3,), by which the reference's own jitter of orientation shrinks a lever arm.
+
+    Turns that are known with an error make a lever arm too small by the error's share of their
+    variance, whatever its formal uncertainty.
+    """
+    turns = Rotation.from_matrix(part.view.turn[part.used])
+    vectors = (turns.mean().inv() * turns).as_rotvec()
+    tilt = np.cov(vectors.T)
+    told = np.trace(tilt) * np.eye(3) - tilt
+    error = 2 * part.noise.orientation_rad**2
+    return np.asarray(error * np.diag(np.linalg.inv(told + 1e-3 * error * np.eye(3))))
+
+
+def hand_eye_record(
+    mount: FrameTerm,
+    spread: Array,
+    frame: FrameTerm | None,
+    frame_spread: Array | None,
+    blurred: Array,
+) -> EffectRecord:
+    """Registration, lever arm and mount of a sensor; None where the motion does not tell."""
+
+    def degrees(matrix: Array) -> list[float]:
+        turn = np.rad2deg(Rotation.from_matrix(matrix).as_rotvec())
+        return [float(v) for v in turn]
+
+    sigma = np.sqrt(np.maximum(np.diag(spread), 0.0))
+    lever = [
+        float(v) if s < LEAST_KNOWN_M and b < MOST_BLUR else None
+        for v, s, b in zip(mount.translation, sigma[:3], blurred, strict=True)
+    ]
+    values: dict[str, object] = {
+        'sensor': mount.site['sensor'],
+        'lever_arm_m': lever,
+        'mount_rotation_deg': degrees(mount.rotation),
+        'registration_rotation_deg': None,
+        'registration_translation_m': None,
+    }
+    uncertainty: dict[str, object] = {
+        'lever_arm_m': sigma[:3].tolist(),
+        'mount_rotation_deg': np.rad2deg(sigma[3:]).tolist(),
+    }
+    if frame is not None and frame_spread is not None:
+        frame_sigma = np.sqrt(np.maximum(np.diag(frame_spread), 0.0))
+        values['registration_rotation_deg'] = degrees(frame.rotation)
+        values['registration_translation_m'] = frame.translation.tolist()
+        uncertainty['registration_rotation_deg'] = np.rad2deg(frame_sigma[3:]).tolist()
+        uncertainty['registration_translation_m'] = frame_sigma[:3].tolist()
+    known = all(v is not None for v in lever) and bool(np.all(sigma[3:] < LEAST_KNOWN_RAD))
+    evidence = {
+        'summary': 'the two unknown frames; no effect, always fitted',
+        'observable': known,
+    }
+    return EffectRecord('hand_eye', values, uncertainty, evidence)

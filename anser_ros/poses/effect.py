@@ -1,0 +1,177 @@
+"""What an effect of a tracker of poses looks like: one interface, one file for each effect.
+
+A tracked pose is predicted from the optical one in this order::
+
+    clock -> optical track -> optical pose -> hand-eye -> tracked pose
+
+and what the tracker's own map of space does (a distortion) is undone on the measured side. The
+effects are those of `anser_ros.effects` seen through another observation: position and rotation
+instead of fluxes. `Term`, records, priors and costs of parameters are the same.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.effect import Effect
+from anser_ros.effects.term import Term
+from anser_ros.field.model import EffectRecord
+from anser_ros.poses.path import OpticalPath
+from anser_ros.poses.sequence import PoseSession
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PoseSetting:
+    """What effects may know of a session before they are fitted.
+
+    Attributes
+    ----------
+    sensors : tuple of str
+    duration : float
+        s.
+    centre, size : ndarray (3,), float
+        Middle of the tracked positions and their rms distance from it, m, tracker's frame.
+    """
+
+    sensors: tuple[str, ...]
+    duration: float
+    centre: Array
+    size: float
+
+
+@dataclass(frozen=True)
+class PoseView:
+    """The predicted poses of one sensor, n of them, with what derivatives need.
+
+    Attributes
+    ----------
+    sensor : str
+    time : ndarray, shape (n,)
+        Stamps of the tracked poses, s.
+    measured : ndarray, shape (n, 3)
+        Tracked positions as they were reported, m, tracker's frame.
+    optical, turn : ndarray, shapes (n, 3) and (n, 3, 3)
+        The body in the optical frame at these times: place (m) and rotation.
+    frame : ndarray, shape (3, 3)
+        Rotation from the optical frame to the tracker's.
+    lever : ndarray, shape (3,)
+        The sensor in the body's frame, m.
+    position, rotation : ndarray, shapes (n, 3) and (n, 3, 3)
+        Predicted pose in the tracker's frame.
+    velocity : ndarray, shape (n, 6)
+        Of the predicted pose, m/s and rad/s, along the axes of the tracker's frame.
+    """
+
+    sensor: str
+    time: Array
+    measured: Array
+    measured_rotation: Array
+    optical: Array
+    turn: Array
+    frame: Array
+    lever: Array
+    position: Array
+    rotation: Array
+    velocity: Array
+
+
+class PoseEffect(Effect[Term]):
+    """Base of the effects on poses: it changes nothing."""
+
+    blocks_in_space = False
+    """Whether blocks of space and not of time decide on it."""
+
+    def sites(self, setting: PoseSetting) -> Sequence[Term]:
+        """The effect at every site where it may sit, with parameters of zero."""
+        return ()
+
+    def slopes(self, term: Term, view: PoseView) -> Array | None:
+        """Derivative of predicted less measured pose by the parameters, shape (n, 6, q).
+
+        Rows are m and rad along the axes of the tracker's frame; None where it does nothing.
+        """
+        return None
+
+    def clock(self, term: Term, sensor: str, time: Array) -> Array:
+        """Times on the optical clock, s, at which a sensor's poses apply."""
+        return time
+
+    def filter(self, term: Term, path: OpticalPath) -> OpticalPath:
+        """The body's path as a tracker that filters sees it."""
+        return path
+
+    def seen(self, term: Term, position: Array) -> Array:
+        """Optical positions (n, 3) at the tracker's scale, m."""
+        return position
+
+    def corrected(
+        self, term: Term, sensor: str, position: Array, rotation: Array
+    ) -> tuple[Array, Array]:
+        """Tracked poses, (n, 3) m and (n, 3, 3), without what the effect does to them."""
+        return position, rotation
+
+    def observed(self, sight: 'PoseSight') -> Sequence[EffectRecord]:
+        """What is seen of the effect without a fit; nothing where it has parameters to fit."""
+        return ()
+
+    def acts_on(self, term: Term, sensor: str) -> bool:
+        """Whether a term is about a sensor: its own, or all where the site names none."""
+        return str(term.site.get('sensor', sensor)) == sensor
+
+
+@dataclass(frozen=True)
+class Sensing:
+    """What one sensor shows once the frames and effects are fitted.
+
+    Attributes
+    ----------
+    view : PoseView
+    residual : ndarray, shape (n, 6)
+        Measured less predicted, m and rad, tracker's frame.
+    used : ndarray of bool, shape (n,)
+        Poses that have a reference and do not stand out.
+    out : ndarray of bool, shape (n,)
+        Poses that have a reference and stand out.
+    position_m, orientation_rad, stamp_s : float
+        The noise that is left, a coordinate, and of the stamps.
+    stamp_gain : float
+        Minus twice the log likelihood that an error of the stamps takes off.
+    """
+
+    view: PoseView
+    residual: Array
+    used: NDArray[np.bool_]
+    out: NDArray[np.bool_]
+    position_m: float
+    orientation_rad: float
+    stamp_s: float
+    stamp_gain: float
+
+
+@dataclass(frozen=True)
+class PoseSight:
+    """A session and what its fit leaves: what is seen without a parameter to fit is seen here.
+
+    Attributes
+    ----------
+    session : PoseSession
+    setting : PoseSetting
+    sensors : tuple of Sensing
+    blocks : tuple of ndarray of int, one a sensor
+        Block of time of each pose.
+    """
+
+    session: PoseSession
+    setting: PoseSetting
+    sensors: tuple[Sensing, ...]
+    blocks: tuple[NDArray[np.int64], ...]
+
+
+def is_of(term: Term, kind: type[Any]) -> bool:
+    """Whether a term is of a kind of effect."""
+    return isinstance(term.effect, kind)

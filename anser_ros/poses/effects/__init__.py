@@ -1,0 +1,1 @@
+"""The effects of trackers of poses, one file each."""

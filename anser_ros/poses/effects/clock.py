@@ -1,0 +1,92 @@
+"""The clocks of the tracker and of the optical reference: an offset, and a rate."""
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.effect import Remedy, needed, sigmas
+from anser_ros.effects.term import Term
+from anser_ros.field.model import EffectRecord
+from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView
+
+Array = NDArray[np.float64]
+
+
+class PoseTimeOffset(PoseEffect):
+    """At stamp t of a tracked pose the optical pose stamped t - theta applies, s."""
+
+    name = 'time_offset'
+    summary = 'the tracked stamps are late (positive) or early by the optical clock'
+    units: ClassVar[Mapping[str, str]] = {'offset_s': 's'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'offset_s': (-5.0, 5.0)}
+    remedy = Remedy.OPTICAL
+
+    def sites(self, setting: PoseSetting) -> Sequence[Term]:
+        """One offset for all sensors, and one a sensor."""
+        own = [Term(self, {'sensor': s}, np.zeros(1)) for s in setting.sensors]
+        return [Term(self, {}, np.zeros(1)), *(own if len(own) > 1 else [])]
+
+    def prior(self, term: Term) -> Array:
+        """Tenths of a second."""
+        return np.full(1, 0.3)
+
+    def slopes(self, term: Term, view: PoseView) -> Array | None:
+        """Minus the velocity of the predicted pose."""
+        return -view.velocity[:, :, None] if self.acts_on(term, view.sensor) else None
+
+    def clock(self, term: Term, sensor: str, time: Array) -> Array:
+        """Stamps less the offset."""
+        return time - term.theta[0] if self.acts_on(term, sensor) else time
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """The record has the offset, and the sensor where it is one sensor's."""
+        values = {**term.site, 'offset_s': float(term.theta[0])}
+        return EffectRecord(self.name, values, {'offset_s': float(sigmas(covariance)[0])})
+
+    def term(self, record: EffectRecord) -> Term:
+        """From the offset."""
+        site = {k: v for k, v in record.parameters.items() if k == 'sensor'}
+        return Term(self, site, np.array([float(needed(record, 'offset_s'))]))
+
+
+class PoseClockRate(PoseEffect):
+    """Theta is the rate, 1e-3, by which the tracked clock gains on the optical one."""
+
+    name = 'clock_rate'
+    summary = 'the clocks of tracker and reference run apart'
+    units: ClassVar[Mapping[str, str]] = {'rate_ppm': '1e-6'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'rate_ppm': (-3e3, 3e3)}
+    remedy = Remedy.OPTICAL
+
+    def sites(self, setting: PoseSetting) -> Sequence[Term]:
+        """One rate for all sensors."""
+        return [Term(self, {'middle_s': 0.5 * setting.duration}, np.zeros(1))]
+
+    def prior(self, term: Term) -> Array:
+        """Parts in a thousand."""
+        return np.full(1, 2.0)
+
+    def slopes(self, term: Term, view: PoseView) -> Array | None:
+        """Minus the velocity, the more the farther from the session's middle."""
+        apart = 1e-3 * (view.time - float(term.site['middle_s']))
+        return -(view.velocity * apart[:, None])[:, :, None]
+
+    def clock(self, term: Term, sensor: str, time: Array) -> Array:
+        """Stamps that gain no more."""
+        return np.asarray(time - 1e-3 * term.theta[0] * (time - float(term.site['middle_s'])))
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """The record has the rate, and the time at which the offset is the offset."""
+        sigma = 1e3 * float(sigmas(covariance)[0])
+        values = {'rate_ppm': 1e3 * float(term.theta[0]), 'middle_s': term.site['middle_s']}
+        return EffectRecord(self.name, values, {'rate_ppm': sigma})
+
+    def term(self, record: EffectRecord) -> Term:
+        """From the rate."""
+        rate = 1e-3 * float(needed(record, 'rate_ppm'))
+        return Term(self, {'middle_s': float(needed(record, 'middle_s'))}, np.array([rate]))
+
+
+EFFECTS = (PoseTimeOffset(), PoseClockRate())

@@ -1,0 +1,140 @@
+"""What comes and goes, or shifts, during a session: metal that moves, a mount that is loose."""
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from anser_ros.field.model import EffectRecord
+from anser_ros.poses.effect import PoseEffect, PoseSight, Sensing
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+WINDOWS = 40
+"""Windows of time that a session is cut into: an episode of a twentieth is seen in two."""
+FEWEST_POSES = 4  # poses that a window needs to be judged
+TIMES = 9.0
+"""Squared error over the median window's from which a window belongs to an episode: three times
+the error, which the range of places in a session hardly makes."""
+LONGEST = 0.4
+"""Share of the windows that episodes may be: what is there for longer is no episode."""
+NEAR_M = 0.03
+"""Distance within which a place outside the episode is the same place; metal changes over its own
+size, centimetres."""
+SEEN_AGAIN = 0.5  # share of the episode's places that must have been visited outside it
+LOOSE, FAST = 0.5, 0.25
+"""Share of a sensor's squared error that shifts in the body's frame explain if its mount is loose,
+and up to which the others' must be lower."""
+
+
+def windows_of(sensing: Sensing, sight: PoseSight) -> NDArray[np.int64]:
+    """Window of each pose of a sensor that counts; -1 for the others."""
+    start = min(float(s.view.time[0]) for s in sight.sensors)
+    share = (sensing.view.time - start) / max(sight.setting.duration, 1e-9)
+    window = np.clip((WINDOWS * share).astype(np.int64), 0, WINDOWS - 1)
+    return np.where(sensing.used | sensing.out, window, -1)
+
+
+def episode_windows(sensing: Sensing, sight: PoseSight) -> list[int]:
+    """Windows in which a sensor is off though it was right at the same places at other times."""
+    window = windows_of(sensing, sight)
+    square = np.sum(sensing.residual[:, :3] ** 2, axis=1)
+    judged = [w for w in range(WINDOWS) if np.count_nonzero(window == w) >= FEWEST_POSES]
+    if len(judged) < WINDOWS // 3:
+        return []
+    size = {w: float(np.median(square[window == w])) for w in judged}
+    usual = float(np.median(list(size.values())))
+    high = [w for w in judged if size[w] > TIMES * usual]
+    runs = [w for w in high if w - 1 in high or w + 1 in high]
+    if not runs or len(runs) > LONGEST * len(judged):
+        return []
+    inside = np.isin(window, runs)
+    outside = (window >= 0) & ~inside & (square < TIMES * usual)
+    if not outside.any():
+        return []
+    place = sensing.view.measured
+    distance, _ = cKDTree(place[outside]).query(place[inside])
+    return runs if np.mean(distance < NEAR_M) > SEEN_AGAIN else []
+
+
+class PoseMovingMetal(PoseEffect):
+    """Metal comes near and goes again: sensors are off for a while where all was well before."""
+
+    name = 'moving_metal'
+    summary = 'metal comes near for a while'
+    units: ClassVar[Mapping[str, str]] = {'t_start_s': 's', 't_end_s': 's'}
+
+    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+        """One record for all sensors that are off at the time."""
+        found = {s.view.sensor: episode_windows(s, sight) for s in sight.sensors}
+        found = {name: windows for name, windows in found.items() if windows}
+        if not found:
+            return []
+        start = min(float(s.view.time[0]) for s in sight.sensors)
+        length = sight.setting.duration / WINDOWS
+        first = min(min(w) for w in found.values())
+        last = max(max(w) for w in found.values()) + 1
+        values = {'t_start_s': start + first * length, 't_end_s': start + last * length,
+                  'sensors': list(found)}  # fmt: skip
+        return [EffectRecord(self.name, values, {'t_start_s': length, 't_end_s': length})]
+
+
+class LooseMount(PoseEffect):
+    """A sensor shifts on its body: it is off by the same in the body's frame for a while."""
+
+    name = 'loose_mount'
+    summary = 'a sensor moves against the body and the other sensors'
+    units: ClassVar[Mapping[str, str]] = {'rms_m': 'm', 'rms_deg': 'deg'}
+
+    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+        """The sensor whose shifts are its own; with one sensor it could be anything else."""
+        if len(sight.sensors) < 2:
+            return []
+        shifts = {s.view.sensor: _shifts(s, sight) for s in sight.sensors}
+        found = []
+        for sensing in sight.sensors:
+            name = sensing.view.sensor
+            share, place, turn = shifts[name]
+            others = [shifts[other][0] * shifts[other][1] for other in shifts if other != name]
+            if (
+                share < LOOSE
+                or max(others) > FAST * share * place
+                or episode_windows(sensing, sight)
+            ):
+                continue
+            values = {'sensor': name, 'rms_m': place, 'rms_deg': float(np.rad2deg(turn))}
+            found.append(EffectRecord(self.name, values, {'rms_m': 0.15 * place}))
+        return found
+
+
+def _shifts(sensing: Sensing, sight: PoseSight) -> tuple[float, float, float]:
+    """Share of squared error that windows' means in the body's frame explain; rms, m, rad."""
+    window = windows_of(sensing, sight)
+    back = (sensing.view.frame @ sensing.view.turn).transpose(0, 2, 1)
+    body = np.concatenate(
+        [np.einsum('nij,nj->ni', back, sensing.residual[:, k : k + 3]) for k in (0, 3)], axis=1
+    )
+    explained, total, count, means = 0.0, 0.0, 0, []
+    for number in np.unique(window[window >= 0]):
+        rows = body[(window == number) & sensing.used]
+        if len(rows) < FEWEST_POSES:
+            continue
+        mean = rows.mean(axis=0)
+        means.append(mean)
+        explained += len(rows) * float(np.sum(mean[:3] ** 2))
+        total += float(np.sum(rows[:, :3] ** 2))
+        count += len(rows)
+    if count < WINDOWS:
+        return 0.0, 0.0, 0.0
+    values = np.array(means)
+    share = explained / max(total, 1e-18) - len(means) / count
+    place, turn = (
+        float(np.sqrt(np.mean(np.sum(values[:, k : k + 3] ** 2, axis=1)))) for k in (0, 3)
+    )
+    return share, place, turn
+
+
+EFFECTS = (PoseMovingMetal(), LooseMount())

@@ -1,0 +1,115 @@
+"""The tracker's map of space is bent: a smooth function of the tracked place, for a sensor."""
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations_with_replacement
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.effect import Remedy, needed, sigmas
+from anser_ros.effects.term import Term
+from anser_ros.field.model import EffectRecord
+from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView
+
+Array = NDArray[np.float64]
+
+KINDS = {1: 'linear', 2: 'quadratic', 3: 'cubic'}
+"""Degrees of the polynomials of position that are tried."""
+UNIT_M = 1e-3
+"""Unit of theta, m: a coefficient is what it moves a pose at the rms distance from the middle."""
+
+
+def monomials(position: Array, centre: Array, size: float, degree: int, lowest: int = 1) -> Array:
+    """Products of coordinates of positions (n, 3) about a centre, degrees ``lowest`` and up."""
+    scaled = (position - centre) / size
+    columns = [
+        np.prod(scaled[:, list(chosen)], axis=1)
+        for order in range(lowest, degree + 1)
+        for chosen in combinations_with_replacement(range(3), order)
+    ]
+    return np.stack(columns, axis=1)
+
+
+class FieldDistortion(PoseEffect):
+    """Theta is a vector (mm) a monomial: what is added to the tracked position."""
+
+    name = 'field_distortion'
+    summary = "the tracker's map of space is bent: metal at rest, or its field model"
+    units: ClassVar[Mapping[str, str]] = {'rms_m': 'm'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'strain': (0.0, 0.1)}
+    remedy = Remedy.SENSORS
+    blocks_in_space = True
+
+    def sites(self, setting: PoseSetting) -> Sequence[Term]:
+        """Each degree, for all sensors together and for each alone."""
+        alone = setting.sensors if len(setting.sensors) > 1 else ()
+        return [self.at(setting, degree, s) for degree in KINDS for s in (None, *alone)]
+
+    def at(self, setting: PoseSetting, degree: int, sensor: str | None) -> Term:
+        """The effect of a degree on one sensor, or on all."""
+        site = {} if sensor is None else {'sensor': sensor}
+        place = {'degree': degree, 'centre_m': setting.centre.tolist(), 'size_m': setting.size}
+        count = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, degree).shape[1]
+        return Term(self, {**site, **place}, np.zeros(3 * count))
+
+    def bent(self, term: Term) -> Term:
+        """The map without its linear part, which something else has."""
+        site = {**term.site, 'lowest': 2}
+        count = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, int(site['degree']), 2).shape[1]
+        return Term(self, site, np.zeros(3 * count))
+
+    def prior(self, term: Term) -> Array:
+        """Some millimetres."""
+        return np.full(term.theta.size, 5.0)
+
+    def _basis(self, term: Term, position: Array) -> Array:
+        centre, size = np.asarray(term.site['centre_m']), float(term.site['size_m'])
+        degree, lowest = int(term.site['degree']), int(term.site.get('lowest', 1))
+        return monomials(position, centre, size, degree, lowest)
+
+    def slopes(self, term: Term, view: PoseView) -> Array | None:
+        """Minus what it adds to the tracked positions."""
+        if not self.acts_on(term, view.sensor):
+            return None
+        basis = self._basis(term, view.measured)
+        out = np.zeros((view.time.size, 6, term.theta.size))
+        for axis in range(3):
+            out[:, axis, axis::3] = -UNIT_M * basis
+        return out
+
+    def shift(self, term: Term, position: Array) -> Array:
+        """What is added to tracked positions (n, 3), m."""
+        return UNIT_M * self._basis(term, position) @ term.theta.reshape(-1, 3)
+
+    def corrected(
+        self, term: Term, sensor: str, position: Array, rotation: Array
+    ) -> tuple[Array, Array]:
+        """Positions with the map's shift."""
+        if not self.acts_on(term, sensor):
+            return position, rotation
+        return position + self.shift(term, position), rotation
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """The record has the map, and how far it moves poses at their rms distance."""
+        degree = int(term.site['degree'])
+        rms = UNIT_M * float(np.linalg.norm(term.theta)) / np.sqrt(3)
+        spread = UNIT_M * float(np.sqrt(np.mean(sigmas(covariance) ** 2)))
+        return EffectRecord(
+            self.name,
+            {
+                **term.site, 'kind': KINDS[degree], 'rms_m': rms,
+                'strain': rms / float(term.site['size_m']),
+                'coefficients_mm': term.theta.tolist(),
+            },
+            {'rms_m': spread, 'coefficients_mm': sigmas(covariance).tolist()},
+        )  # fmt: skip
+
+    def term(self, record: EffectRecord) -> Term:
+        """From the map."""
+        keys = ('sensor', 'degree', 'lowest', 'centre_m', 'size_m')
+        site = {k: record.parameters[k] for k in keys if k in record.parameters}
+        return Term(self, site, np.asarray(needed(record, 'coefficients_mm'), dtype=np.float64))
+
+
+EFFECTS = (FieldDistortion(),)

@@ -1,0 +1,130 @@
+"""Noise of a sensor that is larger than the others', or grows with the distance."""
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from anser_ros.field.model import EffectRecord
+from anser_ros.poses.effect import PoseEffect, PoseSight, Sensing
+
+Array = NDArray[np.float64]
+
+NOISIER = 2.0
+"""Factor over the other sensors' median noise from which a sensor's is named; sensors of one kind
+at one place differ by a half."""
+NEAR_S, NEAR_STEPS = 0.3, 3.0
+"""Poses that are nearer in time, s or usual intervals, differ by noise and not by place."""
+WIDEST = 1.3
+"""Ratio of far to near distances (95 to 5 %) without which no power law of it can be told."""
+CLEAR = 5.0  # standard deviations by which the noise must differ from a constant
+EXPONENTS = (2.8, 8.0)
+"""Exponents of the noise that a field makes: the signal falls with the third power, the gradient
+with the fourth; what is outside is something else."""
+FEWEST = 60  # differences of neighbours that a power law is fitted to
+
+
+def jitter(sensing: Sensing) -> tuple[Array, Array]:
+    """Squared noise (m^2, a coordinate) and distance (m) of poses beside near neighbours.
+
+    Second differences of the residual across the velocity, so that neither a slow course nor an
+    error of the stamps is in it.
+    """
+    rows = np.flatnonzero(sensing.used)
+    time, velocity = sensing.view.time[rows], sensing.view.velocity[rows, :3]
+    residual = sensing.residual[rows, :3]
+    if rows.size < 3:
+        return np.zeros(0), np.zeros(0)
+    second = residual[1:-1] - 0.5 * (residual[:-2] + residual[2:])
+    speed = np.linalg.norm(velocity[1:-1], axis=1, keepdims=True)
+    along = velocity[1:-1] / np.maximum(speed, 1e-9)
+    second = second - np.sum(second * along, axis=1, keepdims=True) * along
+    usual = float(np.median(np.diff(time)))
+    near = time[2:] - time[:-2] < max(NEAR_S, NEAR_STEPS * usual)
+    square = np.sum(second**2, axis=1) / (1.5 * 2)
+    distance = np.linalg.norm(sensing.view.measured[rows][1:-1], axis=1)
+    return square[near], distance[near]
+
+
+def power_law(square: Array, distance: Array) -> tuple[float, float, float]:
+    """Exponent of the noise by distance above a floor, its sigma, and the likelihood's gain.
+
+    A squared deviation across the velocity has two degrees of freedom, so it is distributed
+    exponentially about the variance.
+    """
+    place = np.log(distance / np.median(distance))
+    cut = np.minimum(square, 12 * np.median(square) * np.exp(8 * np.maximum(place, 0)))
+
+    def cost(values: Array) -> float:
+        variance = np.exp(values[0] + 2 * values[1] * place) + np.exp(values[2])
+        return float(np.sum(np.log(variance) + cut / variance))
+
+    level = float(np.log(np.mean(cut)))
+    best = min(
+        (
+            minimize(cost, np.array([level, n, level - 2]), method='Nelder-Mead')
+            for n in (3.0, 5.0)
+        ),
+        key=lambda result: float(result.fun),
+    )
+    exponent = float(best.x[1])
+    plain = cut.size * (level + 1)
+    # Neighbours share values in second differences: about a third of them is new.
+    step, share = 0.2, 1 / 3
+    sides = [cost(best.x + [0, way * step, 0]) for way in (-1, 1)]
+    curvature = max((sum(sides) - 2 * float(best.fun)) / step**2, 1e-9) * share
+    return exponent, float(1 / np.sqrt(curvature)), 2 * share * float(plain - best.fun)
+
+
+class PoseExcessNoise(PoseEffect):
+    """One sensor's noise is a multiple of the others'."""
+
+    name = 'excess_noise'
+    summary = "a sensor's noise is larger than the others'"
+    units: ClassVar[Mapping[str, str]] = {'factor': '1'}
+
+    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+        """Each sensor that is noisier than the median of the others."""
+        noise = {}
+        law = RangeNoise().observed(sight)
+        exponent = float(law[0].parameters['exponent']) if law else 0.0
+        for sensing in sight.sensors:
+            square, distance = jitter(sensing)
+            square = square / distance ** (2 * exponent)
+            if square.size >= FEWEST:
+                noise[sensing.view.sensor] = float(np.sqrt(np.median(square)))
+        found = []
+        for name, size in noise.items():
+            others = [n for other, n in noise.items() if other != name]
+            if others and size > NOISIER * float(np.median(others)):
+                factor = size / float(np.median(others))
+                values = {'sensor': name, 'factor': factor}
+                found.append(EffectRecord(self.name, values, {'factor': 0.1 * factor}))
+        return found
+
+
+class RangeNoise(PoseEffect):
+    """Jitter grows as a power of the distance from the field generator."""
+
+    name = 'range_noise'
+    summary = 'jitter grows with the distance from the field generator'
+    units: ClassVar[Mapping[str, str]] = {'exponent': '1', 'reference_m': 'm'}
+
+    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+        """A power law of all sensors together, each with a level of its own."""
+        pairs = [jitter(sensing) for sensing in sight.sensors]
+        square, distance = (np.concatenate([pair[k] for pair in pairs]) for k in (0, 1))
+        low, high = np.percentile(distance, [5, 95]) if square.size >= FEWEST else (1.0, 1.0)
+        if high < WIDEST * low:
+            return []
+        exponent, spread, gain = power_law(square, distance)
+        if not EXPONENTS[0] <= exponent <= EXPONENTS[1] or gain < CLEAR**2:
+            return []
+        middle = float(np.median(distance))
+        values = {'exponent': exponent, 'reference_m': middle}
+        return [EffectRecord(self.name, values, {'exponent': spread})]
+
+
+EFFECTS = (PoseExcessNoise(), RangeNoise())

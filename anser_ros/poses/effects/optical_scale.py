@@ -1,0 +1,56 @@
+"""The optical tracker's millimetre is not the tracker's, for all sensors alike."""
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.effect import Remedy, needed, sigmas
+from anser_ros.effects.term import Term
+from anser_ros.field.model import EffectRecord
+from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView
+
+Array = NDArray[np.float64]
+
+
+class PoseOpticalScale(PoseEffect):
+    """Theta is the scale of the optical positions less one, in 1e-3."""
+
+    name = 'optical_scale'
+    summary = "the optical tracker's millimetre is too long or too short for the tracker's"
+    units: ClassVar[Mapping[str, str]] = {'scale': '1'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'scale': (0.9, 1.1)}
+    remedy = Remedy.OPTICAL
+    blocks_in_space = True
+
+    def sites(self, setting: PoseSetting) -> Sequence[Term]:
+        """One reference for all sensors; its scale about the middle of what it saw."""
+        return [Term(self, {}, np.zeros(1))]
+
+    def prior(self, term: Term) -> Array:
+        """Percents."""
+        return np.full(1, 30.0)
+
+    def slopes(self, term: Term, view: PoseView) -> Array | None:
+        """Positions shrink towards the optical origin; the registration takes the rest."""
+        out = np.zeros((view.time.size, 6, 1))
+        out[:, :3, 0] = -1e-3 * view.optical @ view.frame.T / (1 + 1e-3 * term.theta[0])
+        return out
+
+    def seen(self, term: Term, position: Array) -> Array:
+        """Positions at the tracker's scale."""
+        return position / (1 + 1e-3 * float(term.theta[0]))
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """The record has the scale."""
+        sigma = 1e-3 * float(sigmas(covariance)[0])
+        scale = 1 + 1e-3 * float(term.theta[0])
+        return EffectRecord(self.name, {'scale': scale}, {'scale': sigma})
+
+    def term(self, record: EffectRecord) -> Term:
+        """From the scale."""
+        return Term(self, {}, np.array([1e3 * (float(needed(record, 'scale')) - 1)]))
+
+
+EFFECTS = (PoseOpticalScale(),)

@@ -1,0 +1,97 @@
+"""Stamps that are those of a receipt or of a poll, and not of the measurement."""
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.field.model import EffectRecord
+from anser_ros.poses.effect import PoseEffect, PoseSight
+
+Array = NDArray[np.float64]
+
+LEAST_S = 2e-3
+"""Error of the stamps, s, from which it is named: less moves a hand by a tenth of a millimetre."""
+BELIEVED = 25.0
+"""Minus twice the log likelihood that it must take off in the median sensor; chance takes one."""
+FINEST_S = 2e-3  # finest step of stamps, s, that a poll would have
+STEP_SHARE = (0.15, 0.7)
+"""Error over the step that rounding to a step makes: 0.29 if even, more if a poll is late."""
+ON_STEP = 0.95  # share of the stamps that lie on a grid for it to be one
+
+
+def stamp_step(time: Array) -> float:
+    """The step, s, that all intervals between stamps are multiples of, or zero."""
+    steps = np.diff(time)
+    steps = steps[steps > FINEST_S / 2]
+    if steps.size < 20:
+        return 0.0
+    kinds = np.unique(np.round(steps, 5))
+    if kinds.size < 2:
+        return 0.0  # one interval alone is a rate and not a grid
+    base = float(np.percentile(steps, 2))
+    for divisor in range(1, 9):
+        step = base / divisor
+        if step < FINEST_S:
+            return 0.0
+        counts = np.round(steps / step)
+        step = float(np.sum(steps * counts) / np.sum(counts**2))
+        off = np.abs(steps - np.round(steps / step) * step)
+        if np.mean(off < 0.02 * step + 2e-6) > ON_STEP:
+            return step
+    return 0.0
+
+
+def _is_wide(sight: PoseSight) -> tuple[float, float]:
+    """The median error of the stamps over the sensors, and what believing it gains."""
+    rms = float(np.median([s.stamp_s for s in sight.sensors]))
+    return rms, float(np.median([s.stamp_gain for s in sight.sensors]))
+
+
+def _step(sight: PoseSight, rms: float) -> float:
+    """The step of the stamps that makes an error of that size, or zero."""
+    for sensing in sight.sensors:
+        step = stamp_step(sight.session.sensors[sensing.view.sensor].time)
+        if step and STEP_SHARE[0] * step < rms < STEP_SHARE[1] * step:
+            return step
+    return 0.0
+
+
+class StampJitter(PoseEffect):
+    """Stamps are off at random: poses are off along their own velocity."""
+
+    name = 'stamp_jitter'
+    summary = 'stamps are those of receipt, and jitter'
+    units: ClassVar[Mapping[str, str]] = {'rms_s': 's'}
+
+    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+        """Where the residual lies along the velocity and grows with it."""
+        rms, gain = _is_wide(sight)
+        if rms < LEAST_S or gain < BELIEVED or _step(sight, rms):
+            return []
+        spread = max(float(np.std([s.stamp_s for s in sight.sensors])), rms / np.sqrt(2 * gain))
+        values = {'rms_s': rms, 'by_sensor': {s.view.sensor: s.stamp_s for s in sight.sensors}}
+        return [EffectRecord(self.name, values, {'rms_s': spread}, {'likelihood_gain': gain})]
+
+
+class QuantisedStamps(PoseEffect):
+    """Stamps lie on the grid of a poll, and poses are off along their velocity by as much."""
+
+    name = 'quantised_stamps'
+    summary = 'stamps are those of a poll'
+    units: ClassVar[Mapping[str, str]] = {'step_s': 's'}
+
+    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+        """Where an error of the stamps is that of their grid."""
+        rms, gain = _is_wide(sight)
+        step = _step(sight, rms) if rms >= LEAST_S and gain >= BELIEVED else 0.0
+        if not step:
+            return []
+        values = {'step_s': step, 'rms_s': rms}
+        return [
+            EffectRecord(self.name, values, {'step_s': 0.01 * step}, {'likelihood_gain': gain})
+        ]
+
+
+EFFECTS = (StampJitter(), QuantisedStamps())

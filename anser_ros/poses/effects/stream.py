@@ -1,0 +1,165 @@
+"""What is wrong with a stream itself: poses that come again, are missing, or belong nowhere."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.diagnosis.decisions import FEWEST_OUTLIERS
+from anser_ros.field.model import EffectRecord
+from anser_ros.physics.pose_track import LONGEST_GAP_S
+from anser_ros.poses.effect import PoseEffect, PoseSight
+from anser_ros.poses.sequence import PoseSequence, leaps
+
+Array = NDArray[np.float64]
+
+FEWEST_STALE = 0.02
+"""Share of poses of a moving body from which repeats are named; a hand stops now and then."""
+MOVING_M = 5e-4
+"""Way between two poses, m, from which a body moves: trackers tell a tenth of it."""
+NEAR = 3  # poses before and after by which motion is judged
+FEWEST_MISSING = 0.005  # share of poses, or of the time, from which missing ones are named
+LONG_GAPS = 6.0
+"""Gap in median intervals that counts as missing poses: a poll is late by one or two."""
+PAUSE_S, MANY_PAUSES = 2.0, 4
+"""Pauses of this length, s, where there are so many, lie between recordings and are no gaps."""
+FEWEST_POSES = 3  # outliers that must be there at least
+FAR = 14.0
+"""Distance of the median outlier in spreads of a coordinate from which it is one: errors of real
+trackers have tails of half that."""
+
+
+class StalePoses(PoseEffect):
+    """The same pose, number for number, under a new stamp while the body moves."""
+
+    name = 'stale_poses'
+    summary = 'the same pose again under a new stamp'
+    units: ClassVar[Mapping[str, str]] = {'fraction': '1', 'runs': '1'}
+
+    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+        """Each stream in which poses come again."""
+        found = []
+        for poses in _streams(sight):
+            moving = _moving(poses)
+            count = int(np.count_nonzero(moving))
+            if count < 20:
+                continue
+            again = poses.repeated & moving
+            share = float(np.count_nonzero(again)) / count
+            if share < FEWEST_STALE:
+                continue
+            runs = int(np.count_nonzero(np.diff(again.astype(int), prepend=0) == 1))
+            values = {'stream': poses.name, 'fraction': share, 'runs': runs}
+            found.append(_record(self.name, values,
+                                 {'fraction': float(np.sqrt(share / count))}))  # fmt: skip
+        return found
+
+
+class MissingPoses(PoseEffect):
+    """A device's marker for no pose, or no pose for much longer than usual."""
+
+    name = 'missing_poses'
+    summary = 'poses are missing, or marked as such by the device'
+    units: ClassVar[Mapping[str, str]] = {'fraction': '1', 'spans': 's'}
+
+    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+        """Each stream that lacks poses."""
+        found = []
+        for poses in _streams(sight):
+            spans = _gaps(poses)
+            lost = poses.missing.size / max(poses.missing.size + poses.size, 1)
+            length = max(float(np.ptp(poses.time)), 1e-9)
+            silent = sum(b - a for a, b in spans) / length
+            share = max(lost, silent)
+            if share < FEWEST_MISSING or (poses.missing.size < 2 and not spans):
+                continue
+            found.append(_record(self.name, {
+                'stream': poses.name, 'fraction': share, 'marked': int(poses.missing.size),
+                'spans': [[round(a, 3), round(b, 3)] for a, b in spans[:20]],
+            }, {}))  # fmt: skip
+        return found
+
+
+class PoseOutliers(PoseEffect):
+    """Poses that no explanation reaches, such as a marker seen in its other solution."""
+
+    name = 'outliers'
+    summary = 'poses that belong to no model, such as those of a marker in its other solution'
+    units: ClassVar[Mapping[str, str]] = {'fraction': '1'}
+
+    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+        """One record for all sensors."""
+        found = list(self._leaping(sight))
+        out = np.concatenate([s.out for s in sight.sensors])
+        used = np.concatenate([s.used for s in sight.sensors])
+        count = int(np.count_nonzero(out))
+        share = count / max(count + int(np.count_nonzero(used)), 1)
+        if found or share < FEWEST_OUTLIERS or count < FEWEST_POSES:
+            return found
+        residual = np.concatenate([s.residual for s in sight.sensors])[out]
+        noise = np.concatenate(
+            [
+                np.tile([s.position_m, s.orientation_rad], (int(s.out.sum()), 1))
+                for s in sight.sensors
+            ]
+        )
+        far = np.linalg.norm(residual[:, :3], axis=1) / noise[:, 0]
+        turned = np.linalg.norm(residual[:, 3:], axis=1) / noise[:, 1]
+        if float(np.median(np.maximum(far, turned))) < FAR:
+            return []  # the tail of a distribution, and no poses of their own
+        values = {
+            'fraction': share,
+            'position_m': float(np.median(np.linalg.norm(residual[:, :3], axis=1))),
+            'orientation_rad': float(np.median(np.linalg.norm(residual[:, 3:], axis=1))),
+            'by_sensor': {s.view.sensor: int(s.out.sum()) for s in sight.sensors},
+        }
+        return [_record(self.name, values, {'fraction': float(np.sqrt(share / out.size))})]
+
+    def _leaping(self, sight: PoseSight) -> Iterator[EffectRecord]:
+        """The reference's poses that leap."""
+        reference = sight.session.reference
+        if reference is None:
+            return
+        away = leaps(reference)
+        share = float(away.mean()) if away.size else 0.0
+        if share > FEWEST_OUTLIERS and np.count_nonzero(away) >= FEWEST_POSES:
+            values = {'fraction': share, 'stream': reference.name}
+            yield _record(self.name, values, {'fraction': float(np.sqrt(share / away.size))})
+
+
+def _record(
+    name: str, parameters: Mapping[str, object], uncertainty: Mapping[str, object]
+) -> EffectRecord:
+    return EffectRecord(name, parameters, uncertainty)
+
+
+def _streams(sight: PoseSight) -> list[PoseSequence]:
+    reference = sight.session.reference
+    return [*sight.session.sensors.values(), *([reference] if reference else [])]
+
+
+def _moving(poses: PoseSequence) -> NDArray[np.bool_]:
+    """Where a body moves between poses, judged by those some before and after."""
+    n = poses.size
+    before = np.maximum(np.arange(n) - NEAR, 0)
+    after = np.minimum(np.arange(n) + NEAR, n - 1)
+    way = np.linalg.norm(poses.position[after] - poses.position[before], axis=1)
+    apart = poses.time[after] - poses.time[before]
+    near = apart < 2 * NEAR * LONGEST_GAP_S
+    return np.asarray(near & (way > 2 * NEAR * MOVING_M))
+
+
+def _gaps(poses: PoseSequence) -> list[tuple[float, float]]:
+    steps = np.diff(poses.time)
+    if steps.size < 10:
+        return []
+    long = max(LONGEST_GAP_S, LONG_GAPS * float(np.median(steps)))
+    gaps = np.flatnonzero(steps > long)
+    pauses = gaps[steps[gaps] > PAUSE_S]
+    if pauses.size >= MANY_PAUSES:
+        gaps = np.setdiff1d(gaps, pauses)
+    return [(float(poses.time[g]), float(poses.time[g + 1])) for g in gaps]
+
+
+EFFECTS = (StalePoses(), MissingPoses(), PoseOutliers())

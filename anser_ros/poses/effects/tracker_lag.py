@@ -1,0 +1,64 @@
+"""The tracker filters its poses by a low pass, which is more than a delay."""
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.effect import Remedy, needed, sigmas
+from anser_ros.effects.term import Term
+from anser_ros.field.model import EffectRecord
+from anser_ros.poses.effect import PoseEffect, PoseSetting
+from anser_ros.poses.path import OpticalPath
+
+Array = NDArray[np.float64]
+
+TAUS_S = (0.015, 0.03, 0.06, 0.12, 0.24)
+"""Time constants that are tried, s: below a hundredth no hand's motion tells a filter from a
+delay, beyond a quarter nobody would work with the tracker."""
+
+
+TWO_SIDED = 'two_sided'
+
+
+class TrackerLag(PoseEffect):
+    """Theta is the time constant, s, of a first-order low pass on position and rotation.
+
+    A filter's first order is a delay, so only what it rounds off tells it from one: it has no
+    slopes of its own, and is tried at some time constants beside a free time offset.
+    """
+
+    name = 'tracker_lag'
+    summary = 'the tracker filters its poses, which rounds off quick motions'
+    units: ClassVar[Mapping[str, str]] = {'tau_s': 's'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'tau_s': (0.0, 1.0)}
+    remedy = Remedy.NONE
+
+    def sites(self, setting: PoseSetting) -> Sequence[Term]:
+        """All sensors of a tracker are filtered alike."""
+        return [Term(self, {}, np.array([tau])) for tau in TAUS_S]
+
+    def prior(self, term: Term) -> Array:
+        """Tenths of a second."""
+        return np.full(1, 0.1)
+
+    def filter(self, term: Term, path: OpticalPath) -> OpticalPath:
+        """The path behind the filter."""
+        return path.filtered(float(term.theta[0]), TWO_SIDED in term.site)
+
+    def rival(self, term: Term) -> Term:
+        """The same smoothing without a sense of time: what a noisy reference would ask for."""
+        return Term(self, {TWO_SIDED: True}, term.theta)
+
+    def record(self, term: Term, covariance: Array) -> EffectRecord:
+        """The record has the time constant."""
+        sigma = float(sigmas(covariance)[0])
+        return EffectRecord(self.name, {'tau_s': float(term.theta[0])}, {'tau_s': sigma})
+
+    def term(self, record: EffectRecord) -> Term:
+        """From the time constant."""
+        return Term(self, {}, np.array([float(needed(record, 'tau_s'))]))
+
+
+EFFECTS = (TrackerLag(),)

@@ -1,0 +1,198 @@
+"""Gauss-Newton on the two frames and all effects in force, and the noise that fits the rest."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from anser_ros.diagnosis.fit import ATTEMPTS, SETTLED, stepped
+from anser_ros.diagnosis.scoring import BlockSums
+from anser_ros.effects.term import Term
+from anser_ros.poses.effects.hand_eye import FrameTerm
+from anser_ros.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState
+
+Array = NDArray[np.float64]
+
+HEAVY = 4.0
+"""Degrees of freedom of Student's distribution by which poses are weighted in a robust fit: the
+usual compromise between the mean (infinite) and a distribution without one (1)."""
+STANDS_OUT, FAR_OUT = 7.0, 25.0
+"""Distances of a pose from its prediction, in robust spreads of a coordinate, from which it stands
+out: where few do, and where many do. Three normal coordinates reach the first once in 1e10; what
+many poses share is something to explain, and only what no distortion makes is left out of it."""
+FEW = 0.03
+"""Share of a sensor's poses up to which those that stand out are few."""
+FOLDS = 5
+"""Parts of the cross-validation over blocks."""
+SMALLEST_NOISE = (1e-6, 1e-6)  # m and rad; what is exact would have an infinite weight
+LARGEST_STAMP_S = 0.1
+"""Spread of stamps, s, beyond which a time makes no pose of a hand's motion."""
+
+
+@dataclass(frozen=True)
+class PoseFit:
+    """Terms at their joint optimum.
+
+    Attributes
+    ----------
+    state : PoseState
+    sums : BlockSums
+    prior : ndarray, shape (q,)
+    """
+
+    state: PoseState
+    sums: BlockSums
+    prior: Array
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """The terms with their parameters."""
+        return self.state.terms
+
+    @property
+    def misfit(self) -> float:
+        """Mean square of the whitened residuals; one where only noise is left."""
+        return self.state.sum_of_squares / max(self.state.count, 1)
+
+    def held_out(self, in_space: bool = False) -> float:
+        """Cross-validated sum of squares over blocks of time, or of space."""
+        sums = self.state.sums(in_space=True) if in_space else self.sums
+        return sums.held_out(self.prior, FOLDS)
+
+    def covariance(self) -> Array:
+        """Of all parameters, honest about errors that are alike within a block of time.
+
+        The formal one is scaled by the misfit; where blocks scatter more than it says (White's
+        sandwich with blocks as clusters), a parameter's variance is raised to that.
+        """
+        formal = self.sums.solve(self.prior)[1]
+        blocks = max(self.sums.squares.size, 2)
+        scores = self.sums.right @ formal
+        robust = np.sum(scores**2, axis=0) * blocks / (blocks - 1)
+        variance = np.diag(formal) * max(self.misfit, 1.0)
+        raised = np.maximum(variance, robust)
+        scale = np.sqrt(raised / np.maximum(np.diag(formal), 1e-300))
+        return np.asarray(formal * scale[:, None] * scale[None, :])
+
+    def covariance_of(self, index: int, whole: Array | None = None) -> Array:
+        """Of one term's parameters."""
+        sizes = np.cumsum([0] + [t.theta.size for t in self.terms])
+        rows = slice(sizes[index], sizes[index + 1])
+        return (self.covariance() if whole is None else whole)[rows, rows]
+
+
+def fit_poses(problem: PoseProblem, terms: Sequence[Term], iterations: int = 10) -> PoseFit:
+    """Fit all parameters of all terms together.
+
+    Parameters
+    ----------
+    problem : PoseProblem
+    terms : sequence of Term
+        Start values, the two frames among them.
+    iterations : int
+        At most.
+    """
+    state = problem.state(_rebased(terms))
+    prior = np.concatenate([t.effect.prior(t) for t in terms] or [np.zeros(0)])
+    sums, damping = state.sums(), 0.0
+    for _ in range(iterations):
+        better = None
+        for attempt in range(ATTEMPTS):
+            step = sums.step(prior, damping)
+            trial = problem.state(_rebased(stepped(state.terms, step)))
+            if trial.sum_of_squares < state.sum_of_squares:
+                better, damping = trial, damping / 30 if damping > 1e-6 else 0.0
+                break
+            damping = max(1e-5, 10 ** (attempt % 2 + 1) * damping)
+        if better is None:
+            break
+        gain = state.sum_of_squares - better.sum_of_squares
+        settled = gain < SETTLED * state.sum_of_squares
+        state = better
+        sums = state.sums()
+        if settled:
+            break
+    return PoseFit(state, sums, prior)
+
+
+def _rebased(terms: Sequence[Term]) -> list[Term]:
+    return [t.rebased() if isinstance(t, FrameTerm) else t for t in terms]
+
+
+def robust_fit(problem: PoseProblem, terms: Sequence[Term], rounds: int = 5) -> PoseFit:
+    """Fit with poses weighted by how far they are off, and with the spread that they show."""
+    problem = replace(problem, noise=tuple(_spread(p) for p in problem.state(terms).parts))
+    fit = fit_poses(problem, terms, 4)
+    for _ in range(rounds):
+        parts = fit.state.parts
+        noise = tuple(_spread(part) for part in parts)
+        weight = tuple(
+            np.where(w > 0, _student(part, n), 0.0)
+            for part, n, w in zip(parts, noise, problem.weight, strict=True)
+        )
+        fit = fit_poses(replace(problem, noise=noise, weight=weight), fit.terms, 4)
+    return fit
+
+
+def _student(part: PosePart, noise: PoseNoise) -> Array:
+    white = noise.whitened(part.residual, part.view.velocity)
+    far = np.sum(white**2, axis=1)
+    return np.asarray(np.sqrt((HEAVY + 6) / (HEAVY + far)))
+
+
+def _spread(part: PosePart) -> PoseNoise:
+    """Robust spread of a coordinate: the median of |normal| is 0.6745 of its deviation."""
+    used = part.used
+    if not used.any():
+        return part.noise
+    sizes = np.median(np.abs(part.residual[used]), axis=0) / 0.6745
+    place, turn = np.sqrt(np.mean(sizes[:3] ** 2)), np.sqrt(np.mean(sizes[3:] ** 2))
+    return PoseNoise(
+        max(float(place), SMALLEST_NOISE[0]), max(float(turn), SMALLEST_NOISE[1]), 0.0
+    )
+
+
+def standing_out(fit: PoseFit) -> tuple[NDArray[np.bool_], ...]:
+    """Poses that no explanation reaches: far beyond the spread of their sensor's others."""
+    found = []
+    for part in fit.state.parts:
+        noise = replace(_spread(part), stamp_s=part.noise.stamp_s)
+        white = noise.whitened(part.residual, part.view.velocity)
+        place = np.linalg.norm(white[:, :3], axis=1)
+        turn = np.linalg.norm(white[:, 3:], axis=1)
+        far = np.maximum(place, turn)
+        few = np.count_nonzero(part.used & (far > STANDS_OUT)) <= FEW * np.count_nonzero(part.used)
+        found.append(part.used & (far > (STANDS_OUT if few else FAR_OUT)))
+    return tuple(found)
+
+
+def noise_of(part: PosePart, with_stamps: bool = True) -> tuple[PoseNoise, float]:
+    """The likeliest noise of a sensor's residuals, and minus twice its log likelihood."""
+    used = part.used
+    residual, velocity = part.residual[used], part.view.velocity[used]
+    if not len(residual):
+        return part.noise, 0.0
+    squares = np.mean(residual**2, axis=0)
+    start = [np.sqrt(squares[:3].mean()), np.sqrt(squares[3:].mean())]
+    start = [max(s, low) for s, low in zip(start, SMALLEST_NOISE, strict=True)]
+
+    def cost(log: Array) -> float:
+        place, turn = np.exp(log[0]), np.exp(log[1])
+        stamp = float(np.exp(log[2])) if with_stamps else 0.0
+        noise = PoseNoise(float(place), float(turn), stamp)
+        white = noise.whitened(residual, velocity)
+        scale = np.repeat([stamp / place, stamp / turn], 3)
+        along = np.sum((velocity * scale) ** 2, axis=1)
+        spread = 6 * log[0] + 6 * log[1] + np.mean(np.log1p(along))
+        return float(np.sum(white**2) / len(residual) + spread)
+
+    tries = [np.log([start[0], start[1], stamp]) for stamp in (0.002, 0.02)]
+    if not with_stamps:
+        tries = [np.log(start)]
+    best = min((minimize(cost, at, method='Nelder-Mead', options={'xatol': 1e-3, 'fatol': 1e-6,
+               'maxiter': 300}) for at in tries), key=lambda r: float(r.fun))  # fmt: skip
+    values = np.exp(best.x)
+    stamp = min(float(values[2]), LARGEST_STAMP_S) if with_stamps else 0.0
+    return PoseNoise(float(values[0]), float(values[1]), stamp), float(best.fun) * len(residual)

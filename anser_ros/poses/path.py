@@ -1,0 +1,136 @@
+"""The optical body's path between its poses: smooth, with velocity, or behind a low pass."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
+
+from anser_ros.errors import DiagnosisError
+from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+FEWEST_POSES = 4
+"""Poses without which there is no path: a cubic piece needs the poses about it."""
+MEDIAN_GAPS = 2.5
+"""Gap in median intervals over which a slow reference is interpolated: one pose may be lost."""
+STEPS_A_TAU = 8
+"""Steps of a filter's grid in its time constant; the error of a step is a hundredth of the lag."""
+SMALLEST_STEP_S = 0.002  # grid of a filter, s: a hand moves by 0.2 mm in it
+
+
+@dataclass(frozen=True)
+class OpticalPath:
+    """A body's path as cubic pieces through its poses, with the slopes of a parabola at each.
+
+    Attributes
+    ----------
+    knots : ndarray, shape (m,)
+        Times of the poses, s.
+    longest_gap : float
+        Gap over which nothing is interpolated, s.
+    is_at_rest : bool
+        Whether all is at rest whenever there is a pose: what differs is noise and no velocity.
+    """
+
+    knots: Array
+    longest_gap: float
+    is_at_rest: bool
+    _spline: CubicHermiteSpline
+
+    @classmethod
+    def through(cls, track: PoseTrack, is_at_rest: bool = False) -> 'OpticalPath':
+        """The path through a track's poses.
+
+        Raises
+        ------
+        DiagnosisError
+            When there are too few poses.
+        """
+        time = track.time
+        if time.size < FEWEST_POSES:
+            raise DiagnosisError(
+                f'the reference has {time.size} different poses, a path needs {FEWEST_POSES}'
+            )
+        turn = track.quaternion.copy()
+        flips = np.sign(np.einsum('ij,ij->i', turn[1:], turn[:-1]))
+        turn[1:] *= np.cumprod(np.where(flips < 0, -1.0, 1.0))[:, None]
+        values = np.concatenate([track.position, turn], axis=1)
+        gap = max(LONGEST_GAP_S, MEDIAN_GAPS * float(np.median(np.diff(time))))
+        # Nothing is known of the motion in a gap: each side of it is a path of its own.
+        slopes = np.zeros_like(values)
+        edges = np.concatenate([[0], np.flatnonzero(np.diff(time) > gap) + 1, [time.size]])
+        for a, b in pairwise(edges.tolist()):
+            if b - a > 1:
+                slopes[a:b] = np.gradient(values[a:b], time[a:b], axis=0)
+        return cls(time, gap, is_at_rest, CubicHermiteSpline(time, values, slopes))
+
+    def at(self, time: Array) -> tuple[Array, Array, Array, Mask]:
+        """Positions (n, 3), rotations (n, 3, 3), velocities (n, 6) in the optical frame, validity.
+
+        What is not valid is at the nearest pose, at rest.
+        """
+        inside = np.clip(time, self.knots[0], self.knots[-1])
+        right = np.clip(np.searchsorted(self.knots, inside, side='left'), 1, self.knots.size - 1)
+        valid = (inside == time) & (self.knots[right] - self.knots[right - 1] <= self.longest_gap)
+        values, slopes = self._spline(inside), self._spline(inside, 1)
+        norm = np.maximum(np.linalg.norm(values[:, 3:], axis=1, keepdims=True), 1e-6)
+        turn, rate = values[:, 3:] / norm, slopes[:, 3:] / norm
+        velocity = np.zeros((time.size, 6))
+        velocity[:, :3] = slopes[:, :3]
+        vector, scalar, d_vector, d_scalar = turn[:, :3], turn[:, 3:], rate[:, :3], rate[:, 3:]
+        velocity[:, 3:] = 2 * (d_vector * scalar - d_scalar * vector - np.cross(d_vector, vector))
+        velocity[~valid | self.is_at_rest] = 0.0
+        matrices = np.asarray(Rotation.from_quat(turn).as_matrix()).reshape(-1, 3, 3)
+        return values[:, :3], matrices, velocity, valid
+
+    def filtered(self, tau: float, two_sided: bool = False) -> 'OpticalPath':
+        """The path behind a first-order low pass with a time constant, s.
+
+        Two-sided, it looks as far ahead as back, with the same width and no delay.
+        """
+        tau = tau / np.sqrt(2) if two_sided else tau
+        step = max(SMALLEST_STEP_S, tau / STEPS_A_TAU)
+        grid = np.arange(self.knots[0], self.knots[-1] + step, step)
+        values = self._spline(np.minimum(grid, self.knots[-1]))
+        keep = float(np.exp(-step / tau))
+        # A straight line between samples goes through the filter exactly.
+        late = (1 - keep) * tau / step
+        passed = values
+        for way in (1, -1) if two_sided else (1,):
+            turned = passed[::way]
+            driven = lfilter([1 - late, late - keep], [1.0, -keep], turned - turned[0], axis=0)
+            passed = (driven + turned[0])[::way]
+        spline = CubicHermiteSpline(grid, passed, np.gradient(passed, grid, axis=0))
+        gaps = _Gaps(self.knots, self.longest_gap)
+        return _FilteredPath(grid, self.longest_gap, self.is_at_rest, spline, gaps)
+
+
+@dataclass(frozen=True)
+class _Gaps:
+    """Where a path is interpolated: between poses that are near each other."""
+
+    knots: Array
+    longest_gap: float
+
+    def valid(self, time: Array) -> Mask:
+        right = np.clip(np.searchsorted(self.knots, time, side='left'), 1, self.knots.size - 1)
+        inside = (time >= self.knots[0]) & (time <= self.knots[-1])
+        near = self.knots[right] - self.knots[right - 1] <= self.longest_gap
+        return np.asarray(inside & near)
+
+
+@dataclass(frozen=True)
+class _FilteredPath(OpticalPath):
+    """A filtered path is on a grid of its own, and known where the unfiltered one is."""
+
+    gaps: _Gaps
+
+    def at(self, time: Array) -> tuple[Array, Array, Array, Mask]:
+        position, rotation, velocity, valid = super().at(time)
+        return position, rotation, velocity, valid & self.gaps.valid(time)

@@ -1,0 +1,337 @@
+"""Which effects a session of poses shows: each must pay for itself on blocks that it has not seen.
+
+The currencies and prices are those of `anser_ros.diagnosis.decisions`: gains in the whitened sum
+of squares, cross-validated over blocks of time, and for what depends on place over blocks of
+space as well, since neighbours in time flatter a map.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN, PER_PARAMETER
+from anser_ros.effects.term import Term
+from anser_ros.poses.effect import PoseEffect, is_of
+from anser_ros.poses.effects.clock import PoseTimeOffset
+from anser_ros.poses.effects.field_distortion import FieldDistortion
+from anser_ros.poses.effects.hand_eye import FrameTerm
+from anser_ros.poses.effects.optical_scale import PoseOpticalScale
+from anser_ros.poses.effects.tracker_lag import TrackerLag
+from anser_ros.poses.fit import FOLDS, LARGEST_STAMP_S, PoseFit, fit_poses, noise_of, standing_out
+from anser_ros.poses.problem import PoseNoise, PosePart
+from anser_ros.poses.registry import pose_effects
+
+Array = NDArray[np.float64]
+
+LEAST_SHARE = 0.015
+"""Share of the sum of squares that an effect must explain on blocks that it has not seen. Errors
+of trackers are alike over seconds and centimetres, and any smooth course takes a trace of them."""
+POSES_A_PARAMETER = 12  # poses that a parameter needs: neighbours in time are hardly new
+MAP_SHARE = 0.35
+"""The same of a map, and what it must explain beyond a few numbers: a fifth of the error. A map
+follows whatever is smooth in the places that were visited."""
+MOST_EFFECTS = 6  # effects in force after which the search ends: more would be stand-ins
+FULL_FITS = 3  # candidates that are fitted in full in each round
+NOISE_ROUNDS = 3  # times that noise and what stands out are told apart
+STAMP_GAIN = 25.0
+"""Minus twice the log likelihood that an error of the stamps must take off, a sensor, to be
+believed; chance takes off one."""
+SAME_SCALE = 3.0
+"""Standard deviations by which the scales of two sensors may differ that see one reference."""
+SCALE_DIFFERS = 0.003  # difference of scales that matters: 1 mm in a tracked volume
+
+
+@dataclass(frozen=True)
+class PoseEvidence:
+    """What speaks for a term that is in force.
+
+    Attributes
+    ----------
+    gain : float
+        What it takes off the cross-validated sum of squares, in units of the misfit.
+    share : float
+        The same over the sum of squares without it.
+    position_rmse_without_m, position_rmse_with_m : float
+        Of the poses that were fitted.
+    """
+
+    gain: float
+    share: float
+    position_rmse_without_m: float
+    position_rmse_with_m: float
+
+
+@dataclass(frozen=True)
+class PoseSearch:
+    """What a search came to.
+
+    Attributes
+    ----------
+    fit : PoseFit
+        The two frames and all effects in force.
+    evidence : tuple of PoseEvidence or None, one a term
+        None for the frames.
+    refused : tuple of (str, str)
+        Candidates that promised something, and why they are not named.
+    """
+
+    fit: PoseFit
+    evidence: tuple[PoseEvidence | None, ...]
+    refused: tuple[tuple[str, str], ...]
+
+
+def with_noise(fit: PoseFit) -> PoseFit:
+    """The fit with the noise that it shows, and without the poses that stand out from that."""
+    problem = fit.state.problem
+    for _ in range(NOISE_ROUNDS):
+        out = standing_out(fit)
+        weight = tuple(np.where(mask, 0.0, 1.0) for mask in out)
+        cut = replace(problem, weight=weight)
+        noise = tuple(likely_noise(part)[0] for part in cut.state(fit.terms).parts)
+        every = tuple(np.ones(mask.size) for mask in out)
+        judged = replace(problem, weight=every, noise=noise)
+        state = judged.state(fit.terms)
+        fit = replace(fit, state=state)
+    out = standing_out(fit)
+    weight = tuple(np.where(mask, 0.0, 1.0) for mask in out)
+    return fit_poses(replace(fit.state.problem, weight=weight), fit.terms)
+
+
+def likely_noise(part: PosePart) -> tuple[PoseNoise, float]:
+    """A sensor's noise, with an error of its stamps where it is believed, and what that gains."""
+    plain, without = noise_of(part, with_stamps=False)
+    full, cost = noise_of(part, with_stamps=True)
+    gain = without - cost
+    believed = gain > STAMP_GAIN and full.stamp_s < LARGEST_STAMP_S
+    return (full, gain) if believed else (plain, 0.0)
+
+
+def search_effects(start: PoseFit, say: Callable[[str], None] | None = None) -> PoseSearch:
+    """Add effects one by one, the best first, while each pays for itself; drop what does not."""
+    tell = say or (lambda text: None)
+    fit = with_noise(start)
+    refused: list[tuple[str, str]] = []
+    for _ in range(MOST_EFFECTS):
+        tell(f'search beside {len(effects_of(fit))} effects')
+        better = _best_addition(fit, refused)
+        if better is None:
+            break
+        fit = with_noise(better)
+    fit, evidence, dropped = _settled(fit)
+    return PoseSearch(fit, evidence, (*refused, *dropped))
+
+
+def effects_of(fit: PoseFit) -> list[Term]:
+    """The terms that are effects, without the two frames."""
+    return [term for term in fit.terms if not isinstance(term, FrameTerm)]
+
+
+def price(term: Term, total: float, fit: PoseFit) -> float:
+    """Gain, in units of the misfit, that a term must have beside a sum of squares ``total``."""
+    misfit, parts = fit.misfit, fit.state.parts
+    if 'sensor' in term.site:  # of one sensor only its own errors can be explained
+        squares = {p.view.sensor: float(np.sum(p.white**2)) for p in parts}
+        total *= squares[str(term.site['sensor'])] / max(sum(squares.values()), 1e-300)
+    parameters = max(term.complexity, 1)
+    share = MAP_SHARE if is_of(term, FieldDistortion) else LEAST_SHARE
+    return max(LEAST_GAIN + PER_PARAMETER * parameters, share * total / misfit)
+
+
+def _best_addition(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | None:
+    """The fit with the candidate that is worth most, or None; a lag is looked for at the end."""
+    setting = fit.state.problem.setting
+    force = {term.seat for term in fit.terms}
+    promising: list[tuple[float, Term]] = []
+    for effect in pose_effects().values():
+        for term in _beside_scale(effect.sites(setting), fit.terms):
+            if term.seat in force or _is_part(term, fit.terms) or is_of(term, TrackerLag):
+                continue
+            if 6 * POSES_A_PARAMETER * term.theta.size > fit.state.count:
+                continue
+            gain = _probe(fit, term)
+            if gain > LEAST_GAIN:
+                promising.append((gain - AS_GOOD_PER_PARAMETER * term.complexity, term))
+    promising.sort(key=lambda pair: -pair[0])
+    # Of each effect the best is tried, so that many shapes of one do not crowd out the others.
+    chosen = list({t.effect.name: t for _, t in reversed(promising)}.values())
+    accepted: list[tuple[float, PoseFit]] = []
+    for term in [*chosen, *(t for _, t in promising[:FULL_FITS] if t not in chosen)]:
+        found = _accepted(fit, term, refused)
+        if found is not None:
+            accepted.append(found)
+    if not accepted:
+        return _with_lag(fit, refused)
+    return _simplest(accepted)
+
+
+def _beside_scale(sites: Sequence[Term], force: Sequence[Term]) -> list[Term]:
+    """Maps beside a scale in force begin with the second degree: the first is the scale's."""
+    if not any(is_of(term, PoseOpticalScale) for term in force):
+        return list(sites)
+    maps = [t for t in sites if isinstance(t.effect, FieldDistortion) and 'sensor' not in t.site]
+    bent = [FieldDistortion().bent(t) for t in maps if int(t.site['degree']) > 1]
+    return [t for t in sites if t not in maps] + bent
+
+
+def _simplest(accepted: list[tuple[float, PoseFit]]) -> PoseFit:
+    """The one that gains most; a map only when no effect with few numbers is left."""
+    plain = [pair for pair in accepted if not is_of(pair[1].terms[-1], FieldDistortion)]
+    return max(plain or accepted, key=lambda pair: pair[0])[1]
+
+
+def _accepted(
+    fit: PoseFit, term: Term, refused: list[tuple[str, str]]
+) -> tuple[float, PoseFit] | None:
+    """What a candidate gains when fitted in full, and that fit, if it pays for itself."""
+    rest = [t for t in fit.terms if not _is_part(t, [term])]
+    trial = fit_poses(fit.state.problem, [*rest, term])
+    gain = _gain(fit, trial, term)
+    need = price(term, fit.held_out(), fit)
+    if gain < need:
+        refused.append((term.label, f'gain {gain:.0f} of {need:.0f}'))
+        return None
+    last = len(trial.terms) - 1
+    if not term.effect.possible(term.effect.record(trial.terms[last], trial.covariance_of(last))):
+        refused.append((term.label, 'parameters that no instrument has'))
+        return None
+    if is_of(term, PoseOpticalScale) and not _one_scale(trial):
+        refused.append((term.label, 'sensors of one reference see different scales'))
+        return None
+    return gain - AS_GOOD_PER_PARAMETER * term.complexity, trial
+
+
+def _is_part(term: Term, others: Sequence[Term]) -> bool:
+    """Whether one of some maps contains what a scale, or a map of a lower degree, is."""
+    if not is_of(term, PoseOpticalScale) and not is_of(term, FieldDistortion):
+        return False
+    for other in others:
+        if other is term or not is_of(other, FieldDistortion):
+            continue
+        if other.site.get('sensor') not in (None, term.site.get('sensor')):
+            continue
+        lowest = int(other.site.get('lowest', 1))
+        own = int(term.site.get('lowest', 1)), int(term.site.get('degree', 1))
+        if lowest <= own[0] and int(other.site['degree']) >= own[1]:
+            return True
+    return False
+
+
+def _with_lag(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | None:
+    """The fit with a low pass, where neither a delay nor a smooth reference does as well."""
+    lag = TrackerLag()
+    if any(is_of(term, TrackerLag) for term in fit.terms):
+        return None
+    trials = [
+        fit_poses(fit.state.problem, [*fit.terms, term], 3)
+        for term in lag.sites(fit.state.problem.setting)
+    ]
+    trial = _finest_lag(min(trials, key=lambda t: t.state.sum_of_squares))
+    term = trial.terms[-1]
+    widths = [term.with_theta(factor * term.theta) for factor in (0.5, 1.0, 2.0)]
+    rivals = [fit_poses(fit.state.problem, [*fit.terms, lag.rival(t)], 3) for t in widths]
+    best = min([fit, *rivals], key=lambda f: f.held_out())
+    gain = _gain(best, trial, term)
+    need = price(term, fit.held_out(), fit)
+    if gain < need:
+        if _gain(fit, trial, term) > need:
+            refused.append((term.label, 'a smoother reference explains as much'))
+        return None
+    return trial
+
+
+def _probe(fit: PoseFit, term: Term) -> float:
+    """Gain that a term promises, linear about the fit."""
+    effect = term.effect
+    assert isinstance(effect, PoseEffect)
+    prior = np.concatenate([fit.prior, effect.prior(term)])
+    state = fit.state.problem.state([*fit.terms, term])
+    gains = []
+    for in_space in (False, True) if effect.blocks_in_space else (False,):
+        left = state.sums(in_space=in_space).held_out(prior, FOLDS)
+        gains.append((fit.held_out(in_space) - left) / fit.misfit)
+    return min(gains)
+
+
+def _gain(before: PoseFit, after: PoseFit, term: Term) -> float:
+    effect = term.effect
+    assert isinstance(effect, PoseEffect)
+    ways = (False, True) if effect.blocks_in_space else (False,)
+    return min((before.held_out(w) - after.held_out(w)) / after.misfit for w in ways)
+
+
+def _finest_lag(fit: PoseFit) -> PoseFit:
+    """The fit at the time constant that leaves least, by a parabola through three."""
+    best = fit
+    for factor in (1.5, 1.2, 1.06):
+        for direction in (factor, 1 / factor):
+            terms = [
+                t.with_theta(t.theta * direction) if is_of(t, TrackerLag) else t
+                for t in best.terms
+            ]
+            trial = fit_poses(best.state.problem, terms, 3)
+            if trial.state.sum_of_squares < best.state.sum_of_squares:
+                best = trial
+                break
+    return best
+
+
+def _one_scale(fit: PoseFit) -> bool:
+    """Whether each sensor alone sees the same scale as the others do."""
+    problem, found = fit.state.problem, []
+    if len(problem.sensors) < 2:
+        return True
+    for i, poses in enumerate(problem.sensors):
+        alone = replace(
+            problem,
+            **{key: getattr(problem, key)[i : i + 1]
+               for key in ('sensors', 'blocks', 'places', 'weight', 'noise')},
+        )  # fmt: skip
+        terms = [t for t in fit.terms if str(t.site.get('sensor', poses.name)) == poses.name]
+        one = fit_poses(alone, terms)
+        index = next(k for k, t in enumerate(one.terms) if is_of(t, PoseOpticalScale))
+        scale = 1e-3 * float(one.terms[index].theta[0])
+        found.append((scale, 1e-3 * float(np.sqrt(one.covariance_of(index)[0, 0]))))
+    for scale, sigma in found:
+        for other, apart in found:
+            limit = max(SAME_SCALE * float(np.hypot(sigma, apart)), SCALE_DIFFERS)
+            if abs(scale - other) > limit:
+                return False
+    return True
+
+
+def _settled(
+    fit: PoseFit,
+) -> tuple[PoseFit, tuple[PoseEvidence | None, ...], list[tuple[str, str]]]:
+    """Drop effects that no longer pay beside the others; evidence for those that stay."""
+    dropped: list[tuple[str, str]] = []
+    while True:
+        evidence: list[PoseEvidence | None] = []
+        weakest: tuple[float, Term, PoseFit] | None = None
+        for term in fit.terms:
+            if isinstance(term, FrameTerm):
+                evidence.append(None)
+                continue
+            rest = [t for t in fit.terms if t is not term]
+            without = fit_poses(fit.state.problem, rest)
+            gain = _gain(without, fit, term)
+            left = without.held_out()
+            need = price(term, left, without)
+            if gain < need and (weakest is None or gain / need < weakest[0]):
+                weakest = gain / need, term, without
+            evidence.append(
+                PoseEvidence(
+                    gain, gain * fit.misfit / left, without.state.rms()[0], fit.state.rms()[0]
+                )
+            )
+        if weakest is None:
+            return fit, tuple(evidence), dropped
+        share, term, without = weakest
+        dropped.append((term.label, f'{share:.2f} of the gain that it must have'))
+        fit = with_noise(without)
+
+
+def without_offset(terms: Sequence[Term]) -> list[Term]:
+    """The two frames alone, as a fit before any effect starts from them."""
+    return [t for t in terms if not is_of(t, PoseTimeOffset)]

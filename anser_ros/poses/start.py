@@ -1,0 +1,296 @@
+"""From a session to a first fit: blocks, a coarse time offset, two frames in closed form."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from anser_ros.calibration.blocks import fold_of_frames
+from anser_ros.effects.term import Term
+from anser_ros.errors import DiagnosisError, FitError
+from anser_ros.poses.effect import PoseSetting
+from anser_ros.poses.effects.clock import PoseTimeOffset
+from anser_ros.poses.effects.hand_eye import Mount, Registration, frame_term
+from anser_ros.poses.fit import PoseFit, robust_fit
+from anser_ros.poses.path import OpticalPath
+from anser_ros.poses.problem import PoseNoise, PoseProblem
+from anser_ros.poses.sequence import PoseSequence, PoseSession, leaps
+
+Array = NDArray[np.float64]
+
+BLOCKS = 25
+"""Blocks of time of one recording: five folds of five, each long against a hand's motion."""
+PAUSE_S = 2.0
+"""Pause, s, that parts static recordings; where there are several, each is a block."""
+AT_REST_M, POSES_AT_REST = 2e-3, 4
+"""Extent of a recording at rest, m, and the poses of it that are kept."""
+AT_REST_SHARE = 0.3  # share of poses kept below which all is recordings at rest
+FEWEST_PARTS = 5  # recordings that make blocks of their own; fewer leave too few to hold out
+FEWEST_POSES = 8
+"""Poses with a reference that hand-eye needs: it has twelve unknowns, a pose tells six, and as
+many again have to judge it."""
+MOST_POSES = 900
+"""Poses of a sensor that are fitted at most, evenly over the session. More tell no more of errors
+that are alike for seconds, and a session of four sensors has to be done within seconds."""
+COARSE_S, COARSE_STEP_S = 1.5, 0.05
+"""Range and step of the first look for a time offset, s."""
+COARSE_POSES = 300  # poses of that first look
+CLEARLY = 0.8
+"""Share of the misfit at no offset below which a coarse offset is taken."""
+START_NOISE = PoseNoise(2e-3, 0.02)  # m, rad: of the first fit, which then finds its own
+HELD_OUT = 5
+"""Every fifth block takes no part in choosing or fitting."""
+
+
+def pose_problem(session: PoseSession) -> PoseProblem:
+    """Set a session up; without a reference the sensor with most poses takes its place.
+
+    Raises
+    ------
+    DiagnosisError
+        When there are too few poses.
+    """
+    sensors = dict(session.sensors)
+    reference = session.reference
+    if reference is None:
+        name = max(sensors, key=lambda s: sensors[s].size)
+        reference = sensors.pop(name)
+        if not sensors:
+            raise DiagnosisError(
+                f'{session.path}: one sensor and no reference; there is nothing to compare'
+            )
+    reference = reference.rows(~leaps(reference))
+    path = OpticalPath.through(reference.track())
+    kept = {name: _thinned(poses) for name, poses in sensors.items()}
+    if _pauses(list(kept.values())).size + 1 >= FEWEST_PARTS:
+        few = {name: _still_ones(poses) for name, poses in kept.items()}
+        rests = sum(p.size for p in few.values()) < AT_REST_SHARE * sum(
+            p.size for p in kept.values()
+        )
+        kept = few
+        if rests:
+            path = OpticalPath.through(reference.track(), is_at_rest=True)
+    kept = {name: poses for name, poses in kept.items() if _seen(poses, path) >= FEWEST_POSES}
+    if not kept:
+        raise DiagnosisError(
+            f'{session.path}: no sensor has {FEWEST_POSES} poses at times with a reference'
+        )
+    everywhere = np.concatenate([poses.position for poses in kept.values()])
+    centre = np.median(everywhere, axis=0)
+    size = float(np.sqrt(np.mean(np.sum((everywhere - centre) ** 2, axis=1))))
+    start = min(float(poses.time[0]) for poses in kept.values())
+    end = max(float(poses.time[-1]) for poses in kept.values())
+    setting = PoseSetting(tuple(kept), max(end - start, 1e-3), centre, max(size, 1e-3))
+    values = tuple(kept.values())
+    return PoseProblem(
+        values,
+        path,
+        setting,
+        _time_blocks(values),
+        _space_blocks(values),
+        tuple(np.ones(poses.size) for poses in values),
+        tuple(START_NOISE for _ in values),
+    )
+
+
+def _seen(poses: PoseSequence, path: OpticalPath) -> int:
+    return int(np.count_nonzero(path.at(poses.time)[3]))
+
+
+def _thinned(poses: PoseSequence) -> PoseSequence:
+    """The poses that are no repeats, not more than `MOST_POSES`."""
+    fresh = poses.rows(~poses.repeated)
+    step = max(1, -(-fresh.size // MOST_POSES))
+    return fresh.rows(np.arange(0, fresh.size, step))
+
+
+def _pauses(sensors: Sequence[PoseSequence]) -> Array:
+    """Times, s, at which recordings begin that a pause parts from the one before."""
+    every = np.sort(np.concatenate([poses.time for poses in sensors]))
+    return np.asarray(every[1:][np.diff(every) > PAUSE_S])
+
+
+def _still_ones(poses: PoseSequence) -> PoseSequence:
+    """A few poses of each recording at rest: its errors are alike, however many there are."""
+    number = np.searchsorted(_pauses([poses]), poses.time, side='right')
+    keep = []
+    for one in np.unique(number):
+        rows = np.flatnonzero(number == one)
+        extent = np.ptp(np.percentile(poses.position[rows], [10, 90], axis=0), axis=0)
+        if float(np.linalg.norm(extent)) < AT_REST_M and rows.size > POSES_AT_REST:
+            rows = rows[np.linspace(0, rows.size - 1, POSES_AT_REST).astype(int)]
+        keep.append(rows)
+    return poses.rows(np.concatenate(keep))
+
+
+def _time_blocks(sensors: Sequence[PoseSequence]) -> tuple[NDArray[np.int64], ...]:
+    """Equal stretches of time, or the recordings where there are several."""
+    starts = _pauses(sensors)
+    if starts.size + 1 >= FEWEST_PARTS:
+        return tuple(np.searchsorted(starts, p.time, side='right') for p in sensors)
+    first = min(float(poses.time[0]) for poses in sensors)
+    length = max(max(float(poses.time[-1]) for poses in sensors) - first, 1e-9)
+    return tuple(
+        np.minimum((BLOCKS * (p.time - first) / length).astype(np.int64), BLOCKS - 1)
+        for p in sensors
+    )
+
+
+def _space_blocks(sensors: Sequence[PoseSequence]) -> tuple[NDArray[np.int64], ...]:
+    """Cells of space dealt to folds; blocks of time where all is at one place."""
+    places = [poses.position for poses in sensors]
+    every = np.concatenate(places)
+    low, high = np.percentile(every, [1, 99], axis=0)
+    try:
+        return tuple(fold_of_frames([np.clip(p, low, high) for p in places]))
+    except FitError:
+        return _time_blocks(sensors)
+
+
+def train_blocks(problem: PoseProblem) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Blocks of time to choose and fit on, and those that are held out."""
+    every = np.unique(np.concatenate(problem.blocks))
+    held = np.arange(every.size) % HELD_OUT == HELD_OUT - 2
+    return every[~held], every[held]
+
+
+def coarse_offset(problem: PoseProblem) -> float:
+    """The offset, s, at which tracked places are most nearly linear in the optical pose."""
+    chosen = []
+    for poses in problem.sensors:
+        step = max(1, poses.size // COARSE_POSES)
+        chosen.append(poses.rows(np.arange(0, poses.size, step)))
+    if problem.path.is_at_rest:
+        return 0.0
+    trials = np.arange(-COARSE_S, COARSE_S + COARSE_STEP_S / 2, COARSE_STEP_S)
+    misfits = np.array([_misfit(problem.path, chosen, float(trial)) for trial in trials])
+    still = float(misfits[np.argmin(np.abs(trials))])
+    best = int(np.argmin(misfits))
+    return float(trials[best]) if misfits[best] < CLEARLY * still else 0.0
+
+
+def _misfit(path: OpticalPath, sensors: Sequence[PoseSequence], offset: float) -> float:
+    total = 0.0
+    for poses in sensors:
+        place, turn, _, known = path.at(poses.time - offset)
+        if np.count_nonzero(known) < FEWEST_POSES + 13:
+            continue
+        columns = np.concatenate(
+            [np.ones((known.sum(), 1)), place[known], turn[known].reshape(-1, 9)], axis=1
+        )
+        columns -= columns.mean(axis=0) * (np.arange(13) > 0)
+        scale = np.linalg.norm(columns, axis=0) + 1e-12
+        rest = poses.position[known]
+        weight = np.ones(len(rest))
+        for _ in range(3):  # towards the median: a few poses may be far off
+            normal = (columns / scale * weight[:, None]).T @ (columns / scale)
+            right = (columns / scale * weight[:, None]).T @ poses.position[known]
+            solution = np.linalg.solve(normal + 1e-6 * np.trace(normal) / 13 * np.eye(13), right)
+            rest = poses.position[known] - columns / scale @ solution
+            size = np.linalg.norm(rest, axis=1)
+            weight = 1 / np.maximum(size, 0.3 * np.median(size) + 1e-9)
+            weight /= weight.mean()
+        total += float(np.mean(np.linalg.norm(rest, axis=1)))
+    return total if total > 0 else np.inf
+
+
+def frames_from_places(tracked: Array, optical: Array) -> Array:
+    """The rotation (3, 3) that takes optical places (n, 3) to tracked ones, by Kabsch."""
+    left, right = tracked - np.median(tracked, axis=0), optical - np.median(optical, axis=0)
+    u, _, vt = np.linalg.svd(left.T @ right)
+    return np.asarray(u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt)
+
+
+def frames_from_turns(tracked: Array, optical: Array) -> Array:
+    """The rotation (3, 3) from the optical frame to the tracker's, from quaternions alone.
+
+    ``q_tracked = q_frame q_optical q_mount`` is a rotation of four dimensions, which is found as
+    any rotation is from pairs; it splits into the two factors.
+    """
+    solution = np.eye(4)
+    sign = np.ones(len(tracked))
+    jumps = np.sign(np.einsum('ij,ij->i', tracked[1:], tracked[:-1]))
+    jumps *= np.sign(np.einsum('ij,ij->i', optical[1:], optical[:-1]))
+    sign[1:] = np.cumprod(np.where(jumps < 0, -1.0, 1.0))
+    for _ in range(10):
+        u, _, vt = np.linalg.svd((tracked * sign[:, None]).T @ optical)
+        solution = u @ np.diag([1, 1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+        agreement = np.sign(np.einsum('ij,ij->i', tracked, optical @ solution.T))
+        if np.array_equal(agreement, sign):
+            break
+        sign = np.where(agreement == 0, 1.0, agreement)
+    # Of all products of units from the left and the right, how much of each is in it: a dyad.
+    units, matrix = np.eye(4), np.zeros((4, 4))
+    for a, b in np.ndindex(4, 4):
+        both = np.stack([_product(_product(units[a], u), units[b]) for u in units], axis=1)
+        matrix[a, b] = np.sum(both * solution)
+    u, _, _ = np.linalg.svd(matrix)
+    return np.asarray(Rotation.from_quat(u[:, 0]).as_matrix())
+
+
+def _product(left: Array, right: Array) -> Array:
+    """Product of quaternions x y z w."""
+    vector = left[3] * right[:3] + right[3] * left[:3] + np.cross(left[:3], right[:3])
+    return np.array([*vector, left[3] * right[3] - left[:3] @ right[:3]])
+
+
+def started(problem: PoseProblem, offset: float, frame: Array | None = None) -> list[Term]:
+    """Registration, mounts and an offset to start a fit from; a known frame is the identity."""
+    pairs = []
+    for poses in problem.sensors:
+        place, turn, _, known = problem.path.at(poses.time - offset)
+        pairs.append((poses.position[known], poses.rotation[known], place[known], turn[known]))
+    rotation = np.eye(3) if frame is None else frame
+    shift = np.zeros(3)
+    if frame is not None:
+        shift = np.median(
+            np.concatenate([p - o @ rotation.T for p, _, o, _ in pairs if len(p)]), axis=0
+        )
+    terms: list[Term] = []
+    if frame is not None:
+        terms.append(frame_term(Registration(), {}, shift, rotation))
+    for poses, (_, turned, _, turn) in zip(problem.sensors, pairs, strict=True):
+        mounts = Rotation.from_matrix(turn.transpose(0, 2, 1) @ (rotation.T @ turned))
+        site = {'sensor': poses.name}
+        terms.append(frame_term(Mount(), site, np.zeros(3), _middle(mounts)))
+    return [*terms, Term(PoseTimeOffset(), {}, np.array([offset]))]
+
+
+def _middle(turns: Rotation) -> Array:
+    """A rotation that most of some agree with: the mean, of those near it, some times over."""
+    mean = turns.mean()
+    for _ in range(5):
+        angle = (mean.inv() * turns).magnitude()
+        weight = 1 / np.maximum(angle, np.median(angle) + 1e-6) ** 2
+        mean = turns.mean(weights=weight)
+    return np.asarray(mean.as_matrix())
+
+
+def first_fit(problem: PoseProblem, offset: float, is_one_frame: bool) -> PoseFit:
+    """The best robust fit of the two frames from several starts."""
+    starts = [started(problem, offset, frame) for frame in _frames(problem, offset, is_one_frame)]
+    fits = [robust_fit(problem, terms) for terms in starts]
+    return min(fits, key=first_cost)
+
+
+def _frames(problem: PoseProblem, offset: float, is_one_frame: bool) -> list[Array | None]:
+    if is_one_frame:
+        return [None]
+    poses = max(problem.sensors, key=lambda p: p.size)
+    place, turn, _, known = problem.path.at(poses.time - offset)
+    turned = Rotation.from_matrix(turn[known]).as_quat()
+    return [
+        frames_from_places(poses.position[known], place[known]),
+        frames_from_turns(poses.quaternion[known], turned),
+    ]
+
+
+def first_cost(fit: PoseFit) -> float:
+    """Median distance (m), and angle as if at a hand's breadth, of a sensor in the mean."""
+    total = 0.0
+    for part in fit.state.parts:
+        far = np.linalg.norm(part.residual[:, :3], axis=1)
+        far = far + 0.1 * np.linalg.norm(part.residual[:, 3:], axis=1)
+        total += float(np.median(far[part.used])) if part.used.any() else 0.0
+    return total / max(len(fit.state.parts), 1)

@@ -1,0 +1,60 @@
+"""What the residual of held-out poses still depends on."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from anser_ros.poses.problem import PosePart, PoseState
+
+Array = NDArray[np.float64]
+
+GROUPS = 6  # groups of neighbours by which a dependence is looked for
+LEAST_SHARE = 0.1
+"""Share of the squared residual that groups' means must explain beyond chance to be told."""
+
+
+def depends_on(state: PoseState) -> tuple[str, ...]:
+    """Names of what the residual depends on, the strongest first."""
+    shares = {}
+    for name in ('time', 'position', 'orientation', 'speed'):
+        found = [_share(part, name) for part in state.parts if np.count_nonzero(part.used) > 30]
+        if found:
+            shares[name] = float(np.median(found))
+    ordered = sorted(shares, key=lambda name: -shares[name])
+    return tuple(name for name in ordered if shares[name] > LEAST_SHARE)
+
+
+def _share(part: PosePart, name: str) -> float:
+    """Share of the squared residual that means of groups explain, less what chance gives."""
+    used = part.used
+    residual = part.residual[used, :3]
+    if name == 'speed':
+        speed = np.linalg.norm(part.view.velocity[used, :3], axis=1)
+        size = np.sum(residual**2, axis=1)
+        quick = speed > np.median(speed)
+        low, high = float(size[~quick].mean()), float(size[quick].mean())
+        return max((high - low) / max(high + low, 1e-18), 0.0)
+    groups = _groups(part, used, name)
+    explained, count = 0.0, 0
+    for group in np.unique(groups):
+        rows = residual[groups == group]
+        explained += len(rows) * float(np.sum(rows.mean(axis=0) ** 2))
+        count += 1
+    total = float(np.sum(residual**2))
+    return explained / max(total, 1e-18) - count / max(len(residual), 1)
+
+
+def _groups(part: PosePart, used: NDArray[np.bool_], name: str) -> NDArray[np.int64]:
+    if name == 'time':
+        time = part.view.time[used]
+        return np.asarray(np.argsort(np.argsort(time)) * GROUPS**2 // time.size, dtype=np.int64)
+    if name == 'position':
+        values = part.view.measured[used]
+    else:
+        turns = Rotation.from_matrix(part.view.measured_rotation[used])
+        values = (turns.mean().inv() * turns).as_rotvec()
+    code = np.zeros(len(values), dtype=np.int64)
+    for axis in range(3):
+        rank = np.argsort(np.argsort(values[:, axis]))
+        code = 4 * code + rank * 4 // len(values)
+    return code

@@ -1,0 +1,108 @@
+"""Two sensors exchanged for a while: found by whose prediction each pose fits, and put back."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.field.model import EffectRecord
+from anser_ros.poses.fit import PoseFit
+from anser_ros.poses.problem import PoseProblem
+from anser_ros.poses.sequence import PoseSequence, PoseSession
+
+Array = NDArray[np.float64]
+
+FAR, FITS = 8.0, 0.25
+"""Distance of a pose from its own prediction, in spreads, from which it may be another sensor's,
+and the share of it that is left from the other's prediction."""
+NEAR_S = 1.0  # s; spans that are nearer to each other are one
+FEWEST, LEAST_SHARE = 5, 0.01  # poses in a span, and share of a sensor's poses, that are a swap
+
+
+def swapped_spans(
+    problem: PoseProblem, fit: PoseFit
+) -> list[tuple[str, str, list[tuple[float, float]]]]:
+    """Pairs of sensors, and the spans (s) in which each gives the other's poses."""
+    found = []
+    for a, b in combinations(range(len(problem.sensors)), 2):
+        masks = [_looks_like(problem, fit, i, j) for i, j in ((a, b), (b, a))]
+        if min(float(mask.mean()) for mask in masks) < LEAST_SHARE:
+            continue
+        spans = _runs(problem.sensors[a].time, masks[0], _looks_like(problem, fit, a, b, True))
+        if spans:
+            found.append((problem.sensors[a].name, problem.sensors[b].name, spans))
+    return found
+
+
+def _looks_like(
+    problem: PoseProblem, fit: PoseFit, i: int, j: int, rather: bool = False
+) -> NDArray[np.bool_]:
+    """Mask of the poses of sensor i that fit where sensor j should be, or rather fit there."""
+    own = replace(problem, noise=fit.state.problem.noise).state(fit.terms).parts[i]
+    sensors = list(problem.sensors)
+    sensors[i] = replace(sensors[i], name=problem.sensors[j].name)
+    other = replace(problem, sensors=tuple(sensors), noise=fit.state.problem.noise)
+    as_other = other.state(fit.terms).parts[i]
+    noise = replace(own.noise, stamp_s=0.0)
+    here = np.linalg.norm(noise.whitened(own.residual, own.view.velocity), axis=1)
+    there = np.linalg.norm(noise.whitened(as_other.residual, own.view.velocity), axis=1)
+    if rather:
+        return np.asarray(there < here)
+    return np.asarray((here > FAR) & (there < FITS * here) & (own.weight > 0))
+
+
+def _runs(
+    time: Array, mask: NDArray[np.bool_], rather: NDArray[np.bool_]
+) -> list[tuple[float, float]]:
+    """Spans in which a mask holds, as far as poses rather fit the other sensor."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    runs = zip(edges[::2], edges[1::2], strict=True)
+    spans: list[tuple[float, float]] = []
+    for first, last in runs:
+        a, b = int(first), int(last)
+        while a > 0 and rather[a - 1]:
+            a -= 1
+        while b < time.size and rather[b]:
+            b += 1
+        start, end = float(time[a]), float(time[b - 1])
+        if spans and start - spans[-1][1] < NEAR_S:  # a pose between that could be either's
+            start = spans.pop()[0]
+        spans.append((start, end))
+    least = (FEWEST - 1) * float(np.median(np.diff(time)))
+    return [(start, end) for start, end in spans if end - start >= least]
+
+
+def put_back(
+    session: PoseSession, swaps: Sequence[tuple[str, str, list[tuple[float, float]]]]
+) -> tuple[PoseSession, list[EffectRecord]]:
+    """The session with exchanged poses under their own names, and the records of it."""
+    sensors, records = dict(session.sensors), []
+    for one, other, spans in swaps:
+        left, right = sensors[one], sensors[other]
+        gap = 0.5 * float(np.median(np.diff(left.time)))
+        masks = [
+            np.any([(p.time > a - gap) & (p.time < b + gap) for a, b in spans], axis=0)
+            for p in (left, right)
+        ]
+        sensors[one] = _merged(left, ~masks[0], right, masks[1])
+        sensors[other] = _merged(right, ~masks[1], left, masks[0])
+        share = float(np.mean(masks[0]))
+        values = {'sensors': [one, other], 'fraction': share, 'spans': [list(s) for s in spans]}
+        evidence = {'summary': 'two sensors are exchanged', 'remedy': 'the names are put back'}
+        records.append(EffectRecord('swapped_sensors', values, {}, evidence))
+    return replace(session, sensors=sensors), records
+
+
+def _merged(
+    own: PoseSequence, keep: NDArray[np.bool_], other: PoseSequence, take: NDArray[np.bool_]
+) -> PoseSequence:
+    time = np.concatenate([own.time[keep], other.time[take]])
+    order = np.argsort(time, kind='stable')
+    return replace(
+        own,
+        time=time[order],
+        position=np.concatenate([own.position[keep], other.position[take]])[order],
+        quaternion=np.concatenate([own.quaternion[keep], other.quaternion[take]])[order],
+    )

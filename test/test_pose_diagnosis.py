@@ -1,0 +1,231 @@
+"""Sessions of poses with one thing wrong: it is named, with its size, and nothing else is."""
+
+import json
+
+import numpy as np
+import pytest
+from pose_world import FRAME, SHIFT, World
+from scipy.spatial.transform import Rotation
+
+from anser_ros.cli.main import run_verb
+from anser_ros.errors import DiagnosisError, PlausibilityError
+from anser_ros.poses.diagnosis import diagnose_poses
+from anser_ros.poses.recording import write_pose_session
+
+
+def named(found):
+    return {record.name: record for record in found.records if record.name != 'hand_eye'}
+
+
+def hand_eyes(found):
+    return [record for record in found.records if record.name == 'hand_eye']
+
+
+def test_a_clean_session_has_hand_eye_alone_and_knows_how_well():
+    world = World(1)
+    found = diagnose_poses(world.session())
+    assert named(found) == {}
+    assert found.unexplained == 0.0
+    for record, lever in zip(hand_eyes(found), world.levers, strict=True):
+        off = np.array(record.parameters['lever_arm_m']) - lever
+        assert np.all(np.abs(off) < 5 * np.array(record.uncertainty['lever_arm_m']))
+        assert np.linalg.norm(off) < 3e-4
+        turn = np.deg2rad(record.parameters['registration_rotation_deg'])
+        assert (Rotation.from_rotvec(turn).inv() * FRAME).magnitude() < 1e-3
+        np.testing.assert_allclose(
+            record.parameters['registration_translation_m'], SHIFT, atol=2e-3
+        )
+
+
+def late(world):
+    world.offset = 0.04
+
+
+def fast(world):
+    world.offset, world.rate_ppm = 0.02, 900.0
+
+
+def large(world):
+    world.scale = 1.012
+
+
+def jittery(world):
+    world.jitter = 0.01
+
+
+def filtered(world):
+    world.tau = 0.08
+
+
+def bent(world):
+    def bend(sensor, place):
+        away = (place - [0.05, 0.02, -0.3]) / 0.06
+        return place + 1.5e-3 * away[:, [0]] * away if sensor == 1 else place
+
+    world.bend = bend
+
+
+def far_noise(world):
+    world.spread = lambda s, p: (np.linalg.norm(p, axis=1) / 0.3) ** 4
+
+
+def noisy(world):
+    world.spread = lambda s, p: np.full(len(p), 3.0 if s == 1 else 1.0)
+
+
+def twice(streams):
+    for rows in streams['optical']:
+        rows[3::4] = rows[2:-1:4][: len(rows[3::4])] if rows.ndim == 2 else rows[3::4]
+    return streams
+
+
+def stale(world):
+    world.after = twice
+
+
+def lossy(world):
+    def lose(streams):
+        streams['sensor_0'][1][100:118] = -3.697314e28
+        return streams
+
+    world.after = lose
+
+
+def mirrored(world):
+    def flip(streams):
+        rows = streams['optical']
+        rows[1][::50] += [0.057, 0, 0]
+        flipped = Rotation.from_quat(rows[2][::50]) * Rotation.from_rotvec([1.5, 0, 0])
+        rows[2][::50] = flipped.as_quat()
+        return streams
+
+    world.after = flip
+
+
+def swapped(world):
+    def swap(streams):
+        for one, other in zip(streams['sensor_0'], streams['sensor_1'], strict=True):
+            one[200:260], other[200:260] = other[200:260].copy(), one[200:260].copy()
+        return streams
+
+    world.after = swap
+
+
+CASES = [
+    (late, {'time_offset': ('offset_s', 0.04, 5e-4)}),
+    (fast, {'time_offset': ('offset_s', 0.02, 1e-3), 'clock_rate': ('rate_ppm', 900.0, 100.0)}),
+    (large, {'optical_scale': ('scale', 1.012, 1.5e-3)}),
+    (jittery, {'stamp_jitter': ('rms_s', 0.01, 0.0015)}),
+    (filtered, {'tracker_lag': ('tau_s', 0.08, 0.02)}),
+    (far_noise, {'range_noise': ('exponent', 4.0, 1.2)}),
+    (noisy, {'excess_noise': ('factor', 3.0, 0.8)}),
+    (stale, {'stale_poses': ('fraction', 0.25, 0.05)}),
+    (lossy, {'missing_poses': ('fraction', 0.03, 0.005)}),
+    (bent, {'field_distortion': ('degree', 2, 0.1)}),
+    (mirrored, {'outliers': ('fraction', 0.02, 0.005)}),
+    (swapped, {'swapped_sensors': ('fraction', 0.1, 0.01)}),
+]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(('change', 'expected'), CASES, ids=[c[0].__name__ for c in CASES])
+def test_one_thing_wrong_is_named_with_its_size(change, expected):
+    world = World(2)
+    change(world)
+    found = named(diagnose_poses(world.session()))
+    assert set(found) == set(expected)
+    for name, (key, value, tolerance) in expected.items():
+        assert found[name].parameters[key] == pytest.approx(value, abs=tolerance)
+
+
+def read_as(order, sign=1):
+    def change(streams):
+        for name in streams:
+            if name != 'optical':
+                turn = streams[name][2] * [sign, sign, sign, 1]
+                streams[name][2] = turn[:, order]
+        return streams
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ('change', 'convention'),
+    [
+        (read_as([3, 0, 1, 2]), 'wxyz'),
+        (read_as([0, 1, 2, 3], -1), 'conjugate'),
+        (read_as([3, 0, 1, 2], -1), 'wxyz_conjugate'),
+    ],
+)
+def test_another_order_or_sense_of_quaternions_is_named_and_undone(change, convention):
+    world = World(3, duration=20.0, sensors=1)
+    world.after = change
+    found = diagnose_poses(world.session())
+    assert set(named(found)) == {'frame_convention'}
+    assert named(found)['frame_convention'].parameters['quaternion'] == convention
+    assert found.after.position_m < 1e-3
+
+
+def test_inches_are_named():
+    world = World(3, duration=20.0, sensors=1)
+
+    def inches(streams):
+        streams['sensor_0'][1] = streams['sensor_0'][1] / 25.4
+        return streams
+
+    world.after = inches
+    found = named(diagnose_poses(world.session()))
+    assert found['frame_convention'].parameters['unit'] == 'inch taken for mm'
+
+
+@pytest.mark.long
+def test_files_that_do_not_belong_together_are_refused():
+    one, other = World(4, duration=20.0).session(), World(5, duration=20.0).session()
+    with pytest.raises(PlausibilityError, match='do not belong together'):
+        diagnose_poses(type(one)('x', 10**9, one.sensors, other.reference))
+
+
+def test_two_sensors_without_a_reference_are_compared_by_rigidity():
+    world = World(6, duration=20.0)
+
+    def delay(streams):
+        streams.pop('optical')
+        streams['sensor_1'][0] = streams['sensor_1'][0] + 0.03
+        return streams
+
+    world.after = delay
+    session = world.session()
+    found = diagnose_poses(session)
+    assert set(named(found)) == {'time_offset'}
+    assert abs(named(found)['time_offset'].parameters['offset_s']) == pytest.approx(0.03, abs=2e-3)
+    assert hand_eyes(found)[0].parameters['registration_translation_m'] is None
+    alone = type(session)('x', 10**9, {'a': session.sensors['sensor_0']}, None)
+    with pytest.raises(DiagnosisError, match='nothing to compare'):
+        diagnose_poses(alone)
+
+
+def test_a_lever_arm_that_the_motion_does_not_tell_is_not_given():
+    world = World(7, duration=20.0, sensors=1)
+    turn = world._turn
+    world._turn = lambda time: 0.001 * turn(time)
+    (record,) = hand_eyes(diagnose_poses(world.session()))
+    assert None in record.parameters['lever_arm_m']
+    assert not record.evidence['observable']
+
+
+def test_the_command_writes_the_documents_that_are_promised(tmp_path, capsys):
+    bag, out = tmp_path / 'a.mcap', tmp_path / 'out'
+    write_pose_session(bag, World(8, duration=15.0, sensors=1).session())
+    assert run_verb('diagnose', [str(bag), '--poses', '--out', str(out), '--json']) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document == json.loads((out / 'diagnosis.json').read_text())
+    assert document['held_out']['flux_rms_before_t'] is None
+    assert document['held_out']['position_rmse_after_m'] < 1e-3
+    assert [effect['name'] for effect in document['effects']] == ['hand_eye']
+    assert 'Bland' in (out / 'report.html').read_text()
+    arguments = [str(bag), '--poses', '--out', str(out), '--tracked', 'tip=/tracked/sensor_0/pose']
+    assert run_verb('evaluate', arguments) == 0
+    evaluation = json.loads((out / 'evaluation.json').read_text())
+    assert evaluation['sensors']['tip']['n'] > 300
+    assert run_verb('diagnose', [str(bag), '--out', str(out)]) == 2
+    assert '--model (or --poses)' in capsys.readouterr().err
