@@ -15,7 +15,7 @@ from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.convention import read_rightly
 from anser_ros.poses.effect import PoseSight, Sensing
-from anser_ros.poses.effects.hand_eye import FrameTerm, Mount, Registration, frame_term
+from anser_ros.poses.effects.hand_eye import FrameTerm, Mount, OpticalFrame, frame_term
 from anser_ros.poses.effects.noise import jitter
 from anser_ros.poses.fit import PoseFit, fit_poses, noise_of, standing_out
 from anser_ros.poses.problem import PosePart, PoseProblem, PoseState
@@ -40,7 +40,7 @@ what differs between neighbours, and errors of a tracker are never quite alike t
 
 
 @dataclass(frozen=True)
-class PoseErrors:
+class HeldOutErrors:
     """Held-out errors of all sensors, and by sensor: distance (m) and angle (rad), rms."""
 
     position_m: float
@@ -62,7 +62,7 @@ class PoseDiagnosis:
         The effects that are named.
     evidence : mapping of str to PoseEvidence
         By the label of the term.
-    registered, before, after : PoseErrors
+    registered, before, after : HeldOutErrors
         Held out: with the registration alone, with hand-eye, with the effects.
     floor_m : float
         What jitter alone would leave, m.
@@ -77,9 +77,9 @@ class PoseDiagnosis:
     session: PoseSession
     fit: PoseFit
     records: tuple[EffectRecord, ...]
-    registered: PoseErrors
-    before: PoseErrors
-    after: PoseErrors
+    registered: HeldOutErrors
+    before: HeldOutErrors
+    after: HeldOutErrors
     floor_m: float
     unexplained: float
     depends_on: tuple[str, ...]
@@ -163,13 +163,13 @@ def _registered(frames: PoseFit) -> list[Term]:
     said = np.concatenate([p.view.optical[p.used] for p in parts])
     place = np.concatenate([p.view.measured[p.used] for p in parts])
     rotation = np.eye(3)
-    if any(isinstance(t.effect, Registration) for t in frames.terms):
+    if any(isinstance(t.effect, OpticalFrame) for t in frames.terms):
         rotation = frames_from_places(place, said)
     shift = np.mean(place - said @ rotation.T, axis=0)
     mounts = [
         t.with_theta(np.array([0, 0, 0, *t.theta[3:]])) for t in frames.terms if _is_mount(t)
     ]
-    return [frame_term(Registration(), {}, shift, rotation), *mounts]
+    return [frame_term(OpticalFrame(), {}, shift, rotation), *mounts]
 
 
 def _without_stamps(problem: PoseProblem) -> PoseProblem:
@@ -189,9 +189,9 @@ def _whole(problem: PoseProblem, found: PoseFit) -> PoseFit:
     return fit_poses(every, found.terms)
 
 
-def _errors(state: PoseState) -> PoseErrors:
+def _errors(state: PoseState) -> HeldOutErrors:
     every = state.rms()
-    return PoseErrors(*every, {p.view.sensor: state.rms(p.view.sensor) for p in state.parts})
+    return HeldOutErrors(*every, {p.view.sensor: state.rms(p.view.sensor) for p in state.parts})
 
 
 def _sensings(state: PoseState, out: tuple[NDArray[np.bool_], ...]) -> list[Sensing]:
@@ -230,7 +230,7 @@ def _records(
     """Hand-eye of each sensor, and the effects that were fitted."""
     covariance = fit.covariance()
     covariances = [fit.covariance_of(i, covariance) for i in range(len(fit.terms))]
-    base = next((i for i, t in enumerate(fit.terms) if isinstance(t.effect, Registration)), None)
+    base = next((i for i, t in enumerate(fit.terms) if isinstance(t.effect, OpticalFrame)), None)
     records = []
     for i, term in enumerate(fit.terms):
         if _is_mount(term) and isinstance(term, FrameTerm):
@@ -282,7 +282,7 @@ def hand_eye_record(
     frame_spread: Array | None,
     blurred: Array,
 ) -> EffectRecord:
-    """Registration, lever arm and mount of a sensor; None where the motion does not tell."""
+    """OpticalFrame, lever arm and mount of a sensor; None where the motion does not tell."""
 
     def degrees(matrix: Array) -> list[float]:
         turn = np.rad2deg(Rotation.from_matrix(matrix).as_rotvec())

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.diagnosis.scoring import BlockSums
 from anser_ros.effects.term import Term
 from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView
-from anser_ros.poses.effects.hand_eye import FrameTerm, Mount, Registration
+from anser_ros.poses.effects.hand_eye import FrameTerm, Mount, OpticalFrame
 from anser_ros.poses.path import OpticalPath
 from anser_ros.poses.sequence import PoseSequence
 
@@ -116,7 +116,7 @@ def _predicted(
         path = effect.filter(term, path) if effect.acts_on(term, sensor.name) else path
         time = effect.clock(term, sensor.name, time)
         position, rotation = effect.corrected(term, sensor.name, position, rotation)
-        if isinstance(term, FrameTerm) and isinstance(effect, Registration):
+        if isinstance(term, FrameTerm) and isinstance(effect, OpticalFrame):
             frame, shift = term.rotation, term.translation
         elif (
             isinstance(term, FrameTerm)

@@ -262,9 +262,9 @@ def _gain(before: PoseFit, after: PoseFit, term: Term) -> float:
 
 
 def _finest_lag(fit: PoseFit) -> PoseFit:
-    """The fit at the time constant that leaves least, by a parabola through three."""
+    """The fit at the time constant that leaves least, by smaller and smaller steps."""
     best = fit
-    for factor in (1.5, 1.2, 1.06):
+    for factor in (1.4, 1.4, 1.2, 1.1, 1.05, 1.02):
         for direction in (factor, 1 / factor):
             terms = [
                 t.with_theta(t.theta * direction) if is_of(t, TrackerLag) else t
@@ -315,6 +315,8 @@ def _settled(
                 continue
             rest = [t for t in fit.terms if t is not term]
             without = fit_poses(fit.state.problem, rest)
+            if any(is_of(t, TrackerLag) for t in rest):
+                without = _finest_lag(without)
             gain = _gain(without, fit, term)
             left = without.held_out()
             need = price(term, left, without)

@@ -11,7 +11,7 @@ from anser_ros.effects.term import Term
 from anser_ros.errors import DiagnosisError, FitError
 from anser_ros.poses.effect import PoseSetting
 from anser_ros.poses.effects.clock import PoseTimeOffset
-from anser_ros.poses.effects.hand_eye import Mount, Registration, frame_term
+from anser_ros.poses.effects.hand_eye import Mount, OpticalFrame, frame_term
 from anser_ros.poses.fit import PoseFit, robust_fit
 from anser_ros.poses.path import OpticalPath
 from anser_ros.poses.problem import PoseNoise, PoseProblem
@@ -236,7 +236,7 @@ def _product(left: Array, right: Array) -> Array:
 
 
 def started(problem: PoseProblem, offset: float, frame: Array | None = None) -> list[Term]:
-    """Registration, mounts and an offset to start a fit from; a known frame is the identity."""
+    """OpticalFrame, mounts and an offset to start a fit from; a known frame is the identity."""
     pairs = []
     for poses in problem.sensors:
         place, turn, _, known = problem.path.at(poses.time - offset)
@@ -249,7 +249,7 @@ def started(problem: PoseProblem, offset: float, frame: Array | None = None) -> 
         )
     terms: list[Term] = []
     if frame is not None:
-        terms.append(frame_term(Registration(), {}, shift, rotation))
+        terms.append(frame_term(OpticalFrame(), {}, shift, rotation))
     for poses, (_, turned, _, turn) in zip(problem.sensors, pairs, strict=True):
         mounts = Rotation.from_matrix(turn.transpose(0, 2, 1) @ (rotation.T @ turned))
         site = {'sensor': poses.name}

@@ -46,7 +46,7 @@ class PoseTimeOffset(PoseEffect):
         return EffectRecord(self.name, values, {'offset_s': float(sigmas(covariance)[0])})
 
     def term(self, record: EffectRecord) -> Term:
-        """From the offset."""
+        """The term of a recorded offset."""
         site = {k: v for k, v in record.parameters.items() if k == 'sensor'}
         return Term(self, site, np.array([float(needed(record, 'offset_s'))]))
 
@@ -84,7 +84,7 @@ class PoseClockRate(PoseEffect):
         return EffectRecord(self.name, values, {'rate_ppm': sigma})
 
     def term(self, record: EffectRecord) -> Term:
-        """From the rate."""
+        """The term of a recorded rate."""
         rate = 1e-3 * float(needed(record, 'rate_ppm'))
         return Term(self, {'middle_s': float(needed(record, 'middle_s'))}, np.array([rate]))
 

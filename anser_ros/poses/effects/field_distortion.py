@@ -60,7 +60,7 @@ class FieldDistortion(PoseEffect):
         return Term(self, site, np.zeros(3 * count))
 
     def prior(self, term: Term) -> Array:
-        """Some millimetres."""
+        """Some millimetres at the rms distance."""
         return np.full(term.theta.size, 5.0)
 
     def _basis(self, term: Term, position: Array) -> Array:
@@ -106,7 +106,7 @@ class FieldDistortion(PoseEffect):
         )  # fmt: skip
 
     def term(self, record: EffectRecord) -> Term:
-        """From the map."""
+        """The term of a recorded map."""
         keys = ('sensor', 'degree', 'lowest', 'centre_m', 'size_m')
         site = {k: record.parameters[k] for k in keys if k in record.parameters}
         return Term(self, site, np.asarray(needed(record, 'coefficients_mm'), dtype=np.float64))

@@ -39,7 +39,7 @@ class FrameTerm(Term):
 
     @property
     def translation(self) -> Array:
-        """The translation, m."""
+        """The translation of the frame, m."""
         return self.theta[:3]
 
     def rebased(self) -> Self:
@@ -50,14 +50,14 @@ class FrameTerm(Term):
         )  # fmt: skip
 
 
-class Registration(PoseEffect):
+class OpticalFrame(PoseEffect):
     """Theta is the translation (m) and a turn (rad) from the optical frame to the tracker's."""
 
     name = 'registration'
     summary = "the optical frame is not the tracker's"
 
     def prior(self, term: Term) -> Array:
-        """Nothing is known."""
+        """Nothing is known of it before."""
         return np.full(6, FREE)
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
@@ -77,7 +77,7 @@ class Mount(PoseEffect):
     summary = 'where and how the sensor sits on the body'
 
     def prior(self, term: Term) -> Array:
-        """Nothing is known."""
+        """Nothing is known of it before."""
         return np.full(6, FREE)
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
@@ -105,4 +105,4 @@ def frame_term(effect: Any, site: dict[str, Any], place: Array, turn: Array) -> 
     return FrameTerm(effect, site, np.array([*place, 0, 0, 0]), start=turn)
 
 
-EFFECTS = (Registration(), Mount())
+EFFECTS = (OpticalFrame(), Mount())

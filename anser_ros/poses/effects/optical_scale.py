@@ -29,7 +29,7 @@ class PoseOpticalScale(PoseEffect):
         return [Term(self, {}, np.zeros(1))]
 
     def prior(self, term: Term) -> Array:
-        """Percents."""
+        """A scale is off by some percents."""
         return np.full(1, 30.0)
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
@@ -49,7 +49,7 @@ class PoseOpticalScale(PoseEffect):
         return EffectRecord(self.name, {'scale': scale}, {'scale': sigma})
 
     def term(self, record: EffectRecord) -> Term:
-        """From the scale."""
+        """The term of a recorded scale."""
         return Term(self, {}, np.array([1e3 * (float(needed(record, 'scale')) - 1)]))
 
 

@@ -58,7 +58,7 @@ def _step(sight: PoseSight, rms: float) -> float:
     return 0.0
 
 
-class StampJitter(PoseEffect):
+class ReceiptJitter(PoseEffect):
     """Stamps are off at random: poses are off along their own velocity."""
 
     name = 'stamp_jitter'
@@ -94,4 +94,4 @@ class QuantisedStamps(PoseEffect):
         ]
 
 
-EFFECTS = (StampJitter(), QuantisedStamps())
+EFFECTS = (ReceiptJitter(), QuantisedStamps())

@@ -57,7 +57,7 @@ class TrackerLag(PoseEffect):
         return EffectRecord(self.name, {'tau_s': float(term.theta[0])}, {'tau_s': sigma})
 
     def term(self, record: EffectRecord) -> Term:
-        """From the time constant."""
+        """The term of a recorded time constant."""
         return Term(self, {}, np.array([float(needed(record, 'tau_s'))]))
 
 
