@@ -63,22 +63,25 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 def pytest_itemcollected(item: pytest.Item) -> None:
     """Mark a test that takes a ROS domain, and name the group that one worker takes as a whole.
 
-    Of two workers one takes the tests with nodes, which mostly wait, and the other the files that
-    calculate: so only one set of nodes runs at a time, and a file's fixtures are made once.
+    Of two workers one takes the tests whose nodes are processes, which mostly wait, and the other
+    the files that calculate: so only one chain of nodes runs at a time, and a file's fixtures are
+    made once. Nodes in the test's own process do what the test says, and count as calculation.
     This must be done as soon as a test is known: later, pytest-xdist has read the groups already.
     """
     if _has_nodes(item):
         item.add_marker('processes')
     if 'PYTEST_XDIST_WORKER' in os.environ:
-        group = 'nodes' if _has_nodes(item) else _room(item)
-        item.add_marker(pytest.mark.xdist_group(group))
+        item.add_marker(pytest.mark.xdist_group('nodes' if _has_chain(item) else _room(item)))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the tests with nodes first, and then the files that calculate for long."""
+    """Put the tests with chains of nodes first, then the files that calculate for long.
+
+    Last come the files whose nodes leave the machine to others, for whichever worker is free.
+    """
     if 'PYTEST_XDIST_WORKER' in os.environ:
-        long = {item.path for item in items if item.get_closest_marker('long')}
-        items.sort(key=lambda item: (not _has_nodes(item), item.path not in long))
+        long = {_room(item) for item in items if item.get_closest_marker('long')}
+        items.sort(key=lambda i: (not _has_chain(i), _is_light(i), _room(i) not in long))
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
@@ -111,13 +114,23 @@ _begun: list[pytest.Item] = []
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Let the worker that calculates give way to the nodes that the other one has started."""
-    if 'PYTEST_XDIST_WORKER' in os.environ and not _begun and not _has_nodes(item):
+    if 'PYTEST_XDIST_WORKER' in os.environ and not _begun and not _has_chain(item):
         os.nice(10)
     _begun.append(item)
 
 
 def _has_nodes(item: pytest.Item) -> bool:
     return 'domain' in getattr(item, 'fixturenames', ())
+
+
+def _is_light(item: pytest.Item) -> bool:
+    return item.get_closest_marker('light') is not None
+
+
+def _has_chain(item: pytest.Item) -> bool:
+    """Return whether a test's nodes are other processes that ask much of the machine."""
+    names = getattr(item, 'fixturenames', ())
+    return _has_nodes(item) and not _is_light(item) and ('start' in names or 'ros' not in names)
 
 
 def _room(item: pytest.Item) -> str:

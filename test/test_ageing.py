@@ -79,6 +79,7 @@ def test_states_and_codes():
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures('shared_tables')
 def test_a_session_whose_references_stop_near_metal_has_no_wrong_pose():
     session = load_session(ROOT / 'bags/metal.mcap')
     model, clean = load_model(ROOT / 'config/demo_model.yaml'), ROOT / 'bags/factory.mcap'

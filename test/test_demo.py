@@ -185,7 +185,7 @@ def test_bad_usage_is_one_clear_line(words, capsys, tmp_path):
 
 @pytest.mark.realtime
 def test_demo_runs_and_reports(start, tmp_path):
-    demo = start('demo', '--duration', '5', '--out', tmp_path, '--json')
+    demo = start('demo', '--duration', '3', '--out', tmp_path, '--json')
     assert demo.popen.wait(90) == 0, demo.output
     summary = json.loads(demo.output)
     live = summary['chains']['live']
@@ -194,7 +194,7 @@ def test_demo_runs_and_reports(start, tmp_path):
     frames = set().union(*stamps)
     # 50 Hz on a machine of its own. Beside other tests it skips frames, and says so, but never
     # a coil of a frame; how many it keeps up with, a benchmark tells.
-    assert len(frames) > 0.2 * 5 * 50
+    assert len(frames) > 0.2 * 3 * 50
     assert min(len(of_one) for of_one in stamps) > 0.95 * len(frames)
     assert len(stamps) == 10
     assert live['position_rmse_m'] < 0.3e-3

@@ -14,6 +14,8 @@ from anser_ros.nodes.diagnostics import Throttle, text_of
 from anser_ros.nodes.parameter_files import complaints
 from anser_ros.nodes.parameters import parameter
 
+pytestmark = pytest.mark.light
+
 
 @dataclass(frozen=True)
 class Table:

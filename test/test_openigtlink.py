@@ -18,6 +18,8 @@ from anser_ros.nodes.igtl_server import (
     transform_bytes,
 )
 
+pytestmark = pytest.mark.light
+
 SETUP = """
 schema: anser_setup/1
 frame_id: fg

@@ -13,6 +13,8 @@ from anser_ros.cli import main as cli
 from anser_ros.cli.commands import NODES, OFFLINE
 from anser_ros.errors import BagError
 
+pytestmark = pytest.mark.light
+
 COLCON = shutil.which('colcon', path=f'{Path(sys.executable).parent}:{os.environ["PATH"]}')
 LEFT_OUT = shutil.ignore_patterns('.*', 'build', 'install', 'log', 'out', '*.egg-info', 'test')
 

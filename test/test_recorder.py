@@ -14,6 +14,8 @@ from anser_ros.nodes.recording_log import TopicLog, report
 from anser_ros.wire.bag import Salvage, iter_messages
 from anser_ros.wire.bag_metadata import BagRecord
 
+pytestmark = pytest.mark.light
+
 
 @pytest.fixture
 def source(ros):

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from anser_ros.diagnosis.problem import Part, State
 
@@ -187,11 +187,11 @@ def _grouped(parts: list[Part], name: str, noise: float) -> StructureTest:
         over = square / n / noise - 1.0
         statistic += over**2 * n / 2
         excess += max(square - n * noise, 0.0)
-    probability = float(chi2.sf(statistic, max(len(squares), 1)))
+    probability = float(chdtrc(max(len(squares), 1), statistic))
     return StructureTest(name, excess / max(total, 1e-300), probability)
 
 
 def _verdict(name: str, explained: float, cells: int, total: float, noise: float) -> StructureTest:
     share = max(explained - cells * noise, 0.0) / max(total, 1e-300)
-    probability = float(chi2.sf(explained / noise, max(cells, 1)))
+    probability = float(chdtrc(max(cells, 1), explained / noise))
     return StructureTest(name, share, probability)
