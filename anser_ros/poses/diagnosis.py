@@ -21,7 +21,7 @@ from anser_ros.poses.fit import PoseFit, fit_poses, noise_of, standing_out
 from anser_ros.poses.problem import PosePart, PoseProblem, PoseState
 from anser_ros.poses.registry import pose_effects
 from anser_ros.poses.search import PoseEvidence, search_effects
-from anser_ros.poses.sequence import PoseSession
+from anser_ros.poses.sequence import PoseSequence, PoseSession
 from anser_ros.poses.start import (
     coarse_offset,
     first_fit,
@@ -124,7 +124,7 @@ def diagnose_poses(
     registered = unseen.state(_registered(frames))
     floor = _floor(after)
     sight = _sight(session, problem, whole)
-    records = _records(whole, search.evidence, alone)
+    records = _records(whole, search.evidence, session)
     for effect in pose_effects().values():
         records += list(effect.observed(sight))
     records += swapped
@@ -225,12 +225,14 @@ def _floor(state: PoseState) -> float:
 
 
 def _records(
-    fit: PoseFit, evidence: tuple[PoseEvidence | None, ...], alone: bool
+    fit: PoseFit, evidence: tuple[PoseEvidence | None, ...], session: PoseSession
 ) -> list[EffectRecord]:
     """Hand-eye of each sensor, and the effects that were fitted."""
     covariance = fit.covariance()
     covariances = [fit.covariance_of(i, covariance) for i in range(len(fit.terms))]
     base = next((i for i, t in enumerate(fit.terms) if isinstance(t.effect, OpticalFrame)), None)
+    reference = session.reference or max(session.sensors.values(), key=lambda p: p.size)
+    shaking = turn_jitter(reference)
     records = []
     for i, term in enumerate(fit.terms):
         if _is_mount(term) and isinstance(term, FrameTerm):
@@ -238,7 +240,7 @@ def _records(
             frame = whole if isinstance(whole, FrameTerm) else None
             spread = None if base is None else covariances[base]
             part = next(p for p in fit.state.parts if p.view.sensor == term.site['sensor'])
-            blurred = lever_blur(part)
+            blurred = lever_blur(part, shaking)
             records.append(hand_eye_record(term, covariances[i], frame, spread, blurred))
     for term, one, spread in zip(fit.terms, evidence, covariances, strict=True):
         if one is None:
@@ -252,16 +254,36 @@ def _records(
             'position_rmse_with_m': one.position_rmse_with_m,
         }  # fmt: skip
         records.append(replace(record, evidence=told))
-    return records
+    return _one_clock(records, fit.state.problem.setting.duration)
 
 
+def _one_clock(records: list[EffectRecord], duration: float) -> list[EffectRecord]:
+    """A rate has the offset with it; clocks that agree at some time have no offset besides."""
+    rate = next((r for r in records if r.name == 'clock_rate'), None)
+    offset = next(
+        (r for r in records if r.name == 'time_offset' and 'sensor' not in r.parameters), None
+    )
+    value = 0.0 if offset is None else float(offset.parameters['offset_s'])
+    if rate is None:
+        return records
+    whole = replace(rate, parameters={**rate.parameters, 'offset_s': value})
+    most = 1e-6 * abs(float(rate.parameters['rate_ppm'])) * (0.5 * duration + AGREE_S)
+    kept = [whole if r is rate else r for r in records]
+    return [r for r in kept if r is not offset or abs(value) > most]
+
+
+AGREE_S = 3.0
+"""Time before a session's start, or after its end, s, at which clocks are set to agree."""
+
+
+FEWEST_TURNS = 20  # poses that tell a reference's jitter
 MOST_BLUR = 0.1  # share by which a lever arm that is given may be too small
 LEAST_KNOWN_M, LEAST_KNOWN_RAD = 0.01, 0.1
 """Standard deviation of a lever arm's component, m, or a turn, rad, beyond which it is not given:
 the motion does not determine it."""
 
 
-def lever_blur(part: PosePart) -> Array:
+def lever_blur(part: PosePart, jitter_rad: float) -> Array:
     """Share, shape (3,), by which the reference's own jitter of orientation shrinks a lever arm.
 
     Turns that are known with an error make a lever arm too small by the error's share of their
@@ -271,8 +293,22 @@ def lever_blur(part: PosePart) -> Array:
     vectors = (turns.mean().inv() * turns).as_rotvec()
     tilt = np.cov(vectors.T)
     told = np.trace(tilt) * np.eye(3) - tilt
-    error = 2 * part.noise.orientation_rad**2
+    error = 2 * jitter_rad**2
     return np.asarray(error * np.diag(np.linalg.inv(told + 1e-3 * error * np.eye(3))))
+
+
+def turn_jitter(reference: PoseSequence) -> float:
+    """Jitter of a reference's orientation, rad a coordinate, from its quietest stretches.
+
+    The squared second difference of noise has six times its variance a coordinate; the lowest
+    quarter of that with three coordinates is at 1.21.
+    """
+    if reference.size < FEWEST_TURNS:
+        return 0.0
+    turns = Rotation.from_quat(reference.rows(~reference.repeated).quaternion)
+    steps = (turns[:-1].inv() * turns[1:]).as_rotvec()
+    second = np.sum(np.diff(steps, axis=0) ** 2, axis=1)
+    return float(np.sqrt(np.percentile(second, 25) / (6 * 1.21)))
 
 
 def hand_eye_record(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN, PER_PARAMETER
 from anser_ros.effects.term import Term
 from anser_ros.poses.effect import PoseEffect, is_of
-from anser_ros.poses.effects.clock import PoseTimeOffset
+from anser_ros.poses.effects.clock import PoseClockRate, PoseTimeOffset
 from anser_ros.poses.effects.field_distortion import FieldDistortion
 from anser_ros.poses.effects.hand_eye import FrameTerm
 from anser_ros.poses.effects.optical_scale import PoseOpticalScale
@@ -161,9 +161,14 @@ def _best_addition(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | No
         found = _accepted(fit, term, refused)
         if found is not None:
             accepted.append(found)
-    if not accepted:
-        return _with_lag(fit, refused)
-    return _simplest(accepted)
+    best = _simplest(accepted) if accepted else None
+    if best is not None and isinstance(best.terms[-1].effect, PoseTimeOffset | PoseClockRate):
+        return best
+    # A filter rounds off turning points, which looks like a scale or a map.
+    lagging = _with_lag(fit, refused)
+    if best is None or lagging is None:
+        return best or lagging
+    return min(best, lagging, key=lambda one: one.held_out())
 
 
 def _beside_scale(sites: Sequence[Term], force: Sequence[Term]) -> list[Term]:

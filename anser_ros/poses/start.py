@@ -63,7 +63,8 @@ def pose_problem(session: PoseSession) -> PoseProblem:
     reference = reference.rows(~leaps(reference))
     path = OpticalPath.through(reference.track())
     kept = {name: _thinned(poses) for name, poses in sensors.items()}
-    if _pauses(list(kept.values())).size + 1 >= FEWEST_PARTS:
+    starts = _pauses(list(kept.values()))
+    if starts.size + 1 >= FEWEST_PARTS:
         few = {name: _still_ones(poses) for name, poses in kept.items()}
         rests = sum(p.size for p in few.values()) < AT_REST_SHARE * sum(
             p.size for p in kept.values()
@@ -87,8 +88,8 @@ def pose_problem(session: PoseSession) -> PoseProblem:
         values,
         path,
         setting,
-        _time_blocks(values),
-        _space_blocks(values),
+        _time_blocks(values, starts),
+        _space_blocks(values, starts),
         tuple(np.ones(poses.size) for poses in values),
         tuple(START_NOISE for _ in values),
     )
@@ -124,9 +125,8 @@ def _still_ones(poses: PoseSequence) -> PoseSequence:
     return poses.rows(np.concatenate(keep))
 
 
-def _time_blocks(sensors: Sequence[PoseSequence]) -> tuple[NDArray[np.int64], ...]:
+def _time_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[NDArray[np.int64], ...]:
     """Equal stretches of time, or the recordings where there are several."""
-    starts = _pauses(sensors)
     if starts.size + 1 >= FEWEST_PARTS:
         return tuple(np.searchsorted(starts, p.time, side='right') for p in sensors)
     first = min(float(poses.time[0]) for poses in sensors)
@@ -137,7 +137,7 @@ def _time_blocks(sensors: Sequence[PoseSequence]) -> tuple[NDArray[np.int64], ..
     )
 
 
-def _space_blocks(sensors: Sequence[PoseSequence]) -> tuple[NDArray[np.int64], ...]:
+def _space_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[NDArray[np.int64], ...]:
     """Cells of space dealt to folds; blocks of time where all is at one place."""
     places = [poses.position for poses in sensors]
     every = np.concatenate(places)
@@ -145,7 +145,7 @@ def _space_blocks(sensors: Sequence[PoseSequence]) -> tuple[NDArray[np.int64], .
     try:
         return tuple(fold_of_frames([np.clip(p, low, high) for p in places]))
     except FitError:
-        return _time_blocks(sensors)
+        return _time_blocks(sensors, starts)
 
 
 def train_blocks(problem: PoseProblem) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -20,7 +20,7 @@ NEAR_S, NEAR_STEPS = 0.3, 3.0
 WIDEST = 1.3
 """Ratio of far to near distances (95 to 5 %) without which no power law of it can be told."""
 CLEAR = 5.0  # standard deviations by which the noise must differ from a constant
-EXPONENTS = (2.8, 8.0)
+EXPONENTS = (2.8, 6.5)
 """Exponents of the noise that a field makes: the signal falls with the third power, the gradient
 with the fourth; what is outside is something else."""
 FEWEST = 60  # differences of neighbours that a power law is fitted to
