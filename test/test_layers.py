@@ -49,7 +49,7 @@ ROOMS = {
     'serial': ('wire/port.py',),
     'mcap': ('wire/bag.py', 'wire/bag_writer.py'),
     'mcap_ros2': ('wire/bag.py', 'wire/bag_writer.py'),
-    'pyigtl': ('nodes/igtl_server.py',),
+    'pyigtl': (),
     'rich': ('nodes/', 'cli/'),
     'matplotlib': ('diagnosis/', 'experiments/', 'cli/'),
     'magpylib': (),

@@ -3,6 +3,7 @@
 import contextlib
 import re
 import socket
+import struct
 import time
 
 import numpy as np
@@ -10,13 +11,10 @@ import pyigtl
 import pytest
 from conftest import spin_until
 
-from anser_ros.errors import PortError
-from anser_ros.nodes.igtl_server import (
-    MOST_CLIENTS,
-    IgtlServer,
-    device_name,
-    transform_bytes,
-)
+from anser_ros.errors import ParameterError, PortError
+from anser_ros.nodes.igtl_server import MOST_CLIENTS, IgtlServer
+from anser_ros.wire import igtl
+from anser_ros.wire.setup import parse_setup
 
 pytestmark = pytest.mark.light
 
@@ -39,6 +37,10 @@ sensors:
   - {channel: 1, name: tool_a/0/x, body: tool_a, position_m: [0.0, 0.0, 0.0],
      axis: [1.0, 0.0, 0.0], length_m: 0.008}
 """
+
+
+def answer(header):
+    return header.kind.encode()
 
 
 @pytest.fixture
@@ -95,7 +97,7 @@ def read_port(process):
 
 
 def test_poses_and_states_reach_clients(start, tracker, connect):
-    process = start('openigtlink', '--ros-args', '-p', 'port:=0')
+    process = start('openigtlink', '--ros-args', '-p', 'port:=0', '-p', 'version:=2')
     port = read_port(process)
     first, second = connect(port), connect(port)
     assert spin_until(tracker, lambda: tracker.listeners() == 1, 20)
@@ -106,6 +108,7 @@ def test_poses_and_states_reach_clients(start, tracker, connect):
     for client in (first, second):
         pose = client.wait_for_message('tool_a/0/x', timeout=10)
         assert pose.message_type == 'TRANSFORM'
+        assert pose.header_version == 2 and pose.metadata == {'TransformStatus': 'OK'}
         assert pose.timestamp == pytest.approx(1_750_000_000.25, abs=1e-6)
         expected = [[0, -1, 0, 100], [1, 0, 0, 0], [0, 0, 1, 200], [0, 0, 0, 1]]
         np.testing.assert_allclose(pose.matrix, expected, atol=1e-4)
@@ -115,6 +118,7 @@ def test_poses_and_states_reach_clients(start, tracker, connect):
         tracker.say('residual')
         message = first.wait_for_message('tool_a/0/x/state', timeout=0.2)
         states += [message.string] if message else []
+    assert message.timestamp == pytest.approx(1_750_000_000.25, abs=30), "the pose's clock"
     assert states[-1] == 'residual' and set(states) <= {'ok', 'stale', 'residual'}
     tracker.send()
     assert first.wait_for_message('tool_a/0/x', timeout=10).matrix[0, 3] == pytest.approx(100)
@@ -146,15 +150,40 @@ class TestServer:
             assert f'can not listen on 127.0.0.1:{port}: Address already' in process.output
             assert 'Traceback' not in process.output
             with pytest.raises(PortError, match='Address already in use'):
-                IgtlServer('127.0.0.1', port)
+                IgtlServer('127.0.0.1', port, answer)
+
+    def test_what_a_client_asks_is_answered(self):
+        """Requests may come in pieces, and between messages that are none of ours."""
+        other = igtl.message('IMAGE', 'x', 1.0, bytes(5000))
+        asked = [igtl.message(kind, '', 1.0, b'') for kind in ('GET_CAPABIL', 'STP_TDATA')]
+        begin = igtl.message('STT_TDATA', '', 1.0, struct.pack('>i32s', 20, b''), {})
+        server = IgtlServer('127.0.0.1', 0, answer)
+        try:
+            with socket.create_connection(('127.0.0.1', server.port)) as client:
+                client.settimeout(5.0)
+                for byte in asked[0][:30], asked[0][30:] + other, begin:
+                    client.sendall(byte)
+                    time.sleep(0.02)
+                assert read(client, 20) == b'GET_CAPABILSTT_TDATA'
+                assert server.is_tracking_due(10.0)
+                server.send(b'old', b'new')
+                assert read(client, 3) == b'new', 'it has asked in version 2'
+                for now_s in (10.0, 10.01, 10.021, 10.022):
+                    server.send_tracking(b'tracked', now_s)
+                assert read(client, 14) == 2 * b'tracked'
+                client.sendall(asked[1])
+                assert read(client, 9) == b'STP_TDATA'
+                assert not server.is_tracking_due(20.0)
+        finally:
+            server.close()
 
     def test_clients_come_and_go(self):
-        server = IgtlServer('127.0.0.1', 0)
+        server = IgtlServer('127.0.0.1', 0, answer)
         try:
             client = socket.create_connection(('127.0.0.1', server.port))
             wait_until(lambda: server.n_clients == 1)
             client.sendall(b'whatever a client may say')
-            server.send(b'hello')
+            server.send(b'hello', b'newer')
             assert client.recv(5) == b'hello'
             client.close()
             wait_until(lambda: server.n_clients == 0)
@@ -163,7 +192,7 @@ class TestServer:
             server.close()
 
     def test_a_client_that_reads_nothing_holds_nobody_up(self):
-        server = IgtlServer('127.0.0.1', 0)
+        server = IgtlServer('127.0.0.1', 0, answer)
         try:
             with socket.create_connection(('127.0.0.1', server.port)):
                 wait_until(lambda: server.n_clients == 1)
@@ -177,7 +206,7 @@ class TestServer:
             server.close()
 
     def test_more_clients_than_there_may_be_are_refused(self):
-        server = IgtlServer('127.0.0.1', 0)
+        server = IgtlServer('127.0.0.1', 0, answer)
         clients = []
         try:
             for _ in range(MOST_CLIENTS + 3):
@@ -195,7 +224,7 @@ class TestServer:
             server.close()
 
     def test_a_client_that_never_stops_talking_still_gets_its_poses(self):
-        server = IgtlServer('127.0.0.1', 0)
+        server = IgtlServer('127.0.0.1', 0, answer)
         try:
             with socket.create_connection(('127.0.0.1', server.port)) as client:
                 wait_until(lambda: server.n_clients == 1)
@@ -212,14 +241,109 @@ class TestServer:
             server.close()
 
 
-def test_device_names_keep_their_end():
-    assert device_name('tool_a/0/x', '/state') == 'tool_a/0/x/state'
-    assert device_name('a_long_instrument/sensor_0/x') == 'nstrument/sensor_0/x'
-    assert len(transform_bytes('x' * 30, 1.0, (0, 0, 0), (0, 0, 0, 1))) == 58 + 48
-
-
 def wait_until(condition, timeout_s=8.0):
     end = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)
+
+
+def read(client, count):
+    data = b''
+    while len(data) < count:
+        piece = client.recv(count - len(data))
+        assert piece, data
+        data += piece
+    return data
+
+
+def test_replies_of_the_node(ros, tracker):
+    """What it can, how it is, and the poses of all that are tracked."""
+    from rclpy.parameter import Parameter
+
+    from anser_ros.nodes.openigtlink import OpenIGTLink
+
+    values = {'port': 0, 'coil_name': '{sensor}Of{body}'}
+    node = OpenIGTLink(parameter_overrides=[Parameter(k, value=v) for k, v in values.items()])
+    try:
+        with socket.create_connection(('127.0.0.1', node.port)) as client:
+            client.settimeout(5.0)
+            for kind in ('GET_CAPABIL', 'GET_STATUS', 'STT_TDATA'):
+                client.sendall(igtl.message(kind, '', 1.0, b''))
+            found = [take(client) for _ in range(3)]
+            assert [kind for kind, _, _ in found] == ['CAPABILITY', 'STATUS', 'RTS_TDATA']
+            words = [w.rstrip(b'\0').decode() for (w,) in struct.iter_unpack('12s', found[0][2])]
+            assert words == list(igtl.CAPABILITIES)
+            code, _, name = struct.unpack('>Hq20s', found[1][2][:30])
+            assert code == igtl.NOT_READY and name.startswith(b'WARN')
+            assert found[1][2][30:] == b'no setup yet\0'
+            assert spin_until(node, lambda: tracker.listeners() == 1)
+            assert spin_until(node, lambda: node._n_clients == 1)
+            tracker.send()
+            assert spin_until(node, lambda: node.counters['transforms'] == 1)
+            kinds = {}
+            while 'TDATA' not in kinds:
+                kind, device, body = take(client)
+                kinds.setdefault(kind, []).append((device, body))
+            assert kinds['TRANSFORM'][0][0] == '0/xOftool_a'
+            states = [(d, struct.unpack('>H', b[:2])[0]) for d, b in kinds['STATUS']]
+            assert states[-1] == ('0/xOftool_a', igtl.OK) and ('tool_a', igtl.NOT_READY) in states
+            ((_, data),) = kinds['TDATA']
+            assert len(kinds['TRANSFORM'][0][1]) == 48, 'no metadata: it has asked in version 1'
+            assert len(data) == 70, 'one instrument: the body has no pose'
+            place = np.frombuffer(data[22:], '>f4').reshape(4, 3)[3]
+            np.testing.assert_allclose(place, [100.0, 0.0, 200.0], rtol=1e-6)
+    finally:
+        node.close()
+        node.destroy_node()
+
+
+def take(client):
+    header = igtl.read_header(first := read(client, igtl.HEADER_BYTES))
+    body = read(client, header.body_bytes)
+    assert struct.unpack('>Q', first[50:])[0] == igtl.crc64(body)
+    return header.kind, header.device, body
+
+
+class TestNames:
+    def named(self, text=SETUP, **values):
+        from anser_ros.nodes.openigtlink import OpenIGTLinkParameters, devices_of
+
+        return devices_of(parse_setup(text), OpenIGTLinkParameters(**values))
+
+    def test_templates(self):
+        assert self.named() == {'tool_a/0/x': 'tool_a/0/x', 'tool_a': 'tool_a'}
+        assert self.named(body_name='{body}ToTracker', coils=False) == {
+            'tool_a': 'tool_aToTracker'
+        }
+        from anser_ros.nodes.openigtlink import OpenIGTLinkParameters, check_templates
+
+        with pytest.raises(ParameterError, match=r'body_name may have \{body\}'):
+            check_templates(OpenIGTLinkParameters(body_name='{tool}'))
+
+    def test_two_devices_of_one_name_are_refused(self):
+        with pytest.raises(ParameterError, match="both the device 'pen'"):
+            self.named(body_name='pen', coil_name='pen')
+        assert igtl.device_names({'a': 'a_long_instrument/sensor_0/x'}) == {
+            'a': 'nstrument/sensor_0/x'
+        }
+        long = ['left_distal/coil/x', 'right_distal/coil/x']
+        with pytest.raises(ParameterError, match='ight_distal/coil/x'):
+            igtl.device_names({n: f'instrument/inner_{n}' for n in ['right_' + m for m in long]})
+        with pytest.raises(ParameterError, match='is no name for a device'):
+            igtl.device_names({'a': 'Größe'})
+        with pytest.raises(ParameterError, match="'pen/state'"):
+            igtl.device_names({'a': 'pen', 'b': 'pen/state'})
+
+
+def test_the_bytes_are_those_of_the_protocol():
+    """As pyigtl packs them: headers of both versions, texts, and the check sum."""
+    matrix = np.eye(4)
+    matrix[:3, 3] = [1.0, 2.0, 3.0]
+    for version, metadata in ((1, {}), (2, {'TransformStatus': 'OK'})):
+        other = pyigtl.TransformMessage(matrix, timestamp=2.5, device_name='pen')
+        other.header_version, other.metadata = version, metadata
+        ours = igtl.transform('pen', 2.5, (1e-3, 2e-3, 3e-3), (0, 0, 0, 1), version)
+        assert ours == other.pack()
+    text = pyigtl.StringMessage('stale', timestamp=1.0, device_name='pen/state')
+    assert igtl.string('pen/state', 1.0, 'stale') == text.pack()

@@ -8,13 +8,11 @@ PYPI = {
     'mcap': 'mcap',
     'mcap_ros2': 'mcap-ros2-support',
     'zstandard': 'zstandard',
-    'pyigtl': 'pyigtl',
 }
 """Modules without a key of rosdep, and what they are called on PyPI."""
 NEEDED = {
     'recorder': ('mcap',),
     'replay': ('mcap', 'mcap_ros2', 'zstandard'),
-    'openigtlink': ('pyigtl',),
 }
 """Nodes that do nothing without one of these; all others start where they are missing."""
 

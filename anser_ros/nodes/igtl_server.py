@@ -1,21 +1,14 @@
-"""A TCP server that sends every client the same OpenIGTLink messages.
-
-Messages are packed by pyigtl. Its own server is not used: it takes the process's signals, serves
-one client, and does not notice one that has left.
-"""
+"""A TCP server that sends every client the same OpenIGTLink messages, and answers what it asks."""
 
 import contextlib
 import select
 import socket
 import threading
 from collections import deque
-from collections.abc import Sequence
-
-import numpy as np
-import pyigtl
-from scipy.spatial.transform import Rotation
+from collections.abc import Callable
 
 from anser_ros.errors import PortError
+from anser_ros.wire import igtl
 
 # A client that takes nothing for so long is dropped.
 SEND_TIMEOUT_S = 2.0
@@ -28,50 +21,65 @@ MOST_CLIENTS = 16
 """Clients that are served at once; each has a thread and a queue. A room has a few screens; more
 connections than this are a mistake or an attack, and are closed as they come."""
 HEARD_BYTES = 1 << 14
-"""Bytes that are read of a client at a time, and thrown away, since nothing is asked of clients. A
-client that sends without end is slowed down by the system, and takes no time from the others."""
+"""Bytes that are read of a client at a time. A client that sends without end is slowed down by the
+system, and takes no time from the others."""
 IDLE_S, PROBE_S, PROBES = 10, 5, 3
 """Time, s, after which a silent connection is probed, time between probes, and how many go
 unanswered before it counts as gone: a machine that is switched off is forgotten in half a
 minute."""
-DEVICE_NAME_LENGTH = 20
-"""Bytes that the header of an OpenIGTLink message has for the device's name."""
-MM_PER_M = 1e3
-"""OpenIGTLink has millimetres."""
+LONGEST_ASKED = 1024
+"""Bytes of the longest request that is read whole; what clients may ask has 60. Longer ones are
+skipped."""
+
+Answer = Callable[[igtl.Header], bytes]
+"""Gives the reply to a request of a client."""
+ASKED = ('GET_CAPABIL', 'GET_STATUS', 'STT_TDATA', 'STP_TDATA')
+"""Requests that are answered; all else is thrown away."""
 
 
-def device_name(name: str, ending: str = '') -> str:
-    """Return a name that fits the protocol's 20 characters; a longer one loses its beginning."""
-    return (name + ending)[-DEVICE_NAME_LENGTH:]
+class _Requests:
+    """Finds requests in what a client says; after bytes that are no message it hears no more."""
 
+    def __init__(self) -> None:
+        self._bytes = b''
+        self._skip = 0
+        self._deaf = False
 
-def transform_bytes(
-    name: str, stamp_s: float, position_m: Sequence[float], quaternion_xyzw: Sequence[float]
-) -> bytes:
-    """Pack a TRANSFORM message; OpenIGTLink and 3D Slicer work in millimetres."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(quaternion_xyzw).as_matrix()
-    matrix[:3, 3] = MM_PER_M * np.asarray(position_m)
-    message = pyigtl.TransformMessage(matrix, timestamp=stamp_s, device_name=device_name(name))
-    packed: bytes = message.pack()
-    return packed
-
-
-def state_bytes(name: str, stamp_s: float, state: str) -> bytes:
-    """Pack a STRING message with the state of a sensor that has no pose."""
-    text = state.encode('ascii', 'replace').decode()
-    message = pyigtl.StringMessage(
-        text, timestamp=stamp_s, device_name=device_name(name, '/state')
-    )
-    packed: bytes = message.pack()
-    return packed
+    def feed(self, data: bytes) -> list[tuple[igtl.Header, bytes]]:
+        found: list[tuple[igtl.Header, bytes]] = []
+        if self._deaf:
+            return found
+        self._bytes += data
+        while True:
+            skipped = min(self._skip, len(self._bytes))
+            self._bytes, self._skip = self._bytes[skipped:], self._skip - skipped
+            if self._skip or len(self._bytes) < igtl.HEADER_BYTES:
+                return found
+            header = igtl.read_header(self._bytes)
+            if header is None:
+                self._deaf, self._bytes = True, b''
+                return found
+            end = igtl.HEADER_BYTES + header.body_bytes
+            if header.kind not in ASKED or header.body_bytes > LONGEST_ASKED:
+                self._skip = end
+                continue
+            if len(self._bytes) < end:
+                return found
+            found.append((header, self._bytes[igtl.HEADER_BYTES : end]))
+            self._bytes = self._bytes[end:]
 
 
 class _Client:
     """One connection with its queue and its thread."""
 
-    def __init__(self, connection: socket.socket) -> None:
+    def __init__(self, connection: socket.socket, answer: Answer) -> None:
         self._connection = connection
+        self._answer = answer
+        self._requests = _Requests()
+        # Time between two TDATA, s, where they are wanted, and when the next is due.
+        self._tracking_s: float | None = None
+        self.version = 1
+        self._due_s = 0.0
         self._queue: deque[bytes] = deque(maxlen=QUEUE_LENGTH)
         self._filled = threading.Condition()
         self._ending = False
@@ -88,6 +96,15 @@ class _Client:
             self.dropped += len(self._queue) == QUEUE_LENGTH  # the oldest makes room
             self._queue.append(data)
             self._filled.notify()
+
+    def is_due(self, now_s: float) -> bool:
+        """Whether a TDATA is wanted by now."""
+        return self._tracking_s is not None and now_s >= self._due_s
+
+    def put_tracking(self, data: bytes, now_s: float) -> None:
+        if self._tracking_s is not None and now_s >= self._due_s:
+            self._due_s = now_s + self._tracking_s
+            self.put(data)
 
     def end(self) -> None:
         with self._filled:
@@ -109,10 +126,18 @@ class _Client:
                 self._connection.sendall(waiting)
 
     def _has_left(self) -> bool:
-        """Read some of what the client says, all of which is ignored."""
-        if select.select([self._connection], [], [], 0.0)[0]:
-            return not self._connection.recv(HEARD_BYTES)
-        return False
+        """Read some of what the client says, and answer what it asks."""
+        if not select.select([self._connection], [], [], 0.0)[0]:
+            return False
+        data = self._connection.recv(HEARD_BYTES)
+        for header, body in self._requests.feed(data):
+            self.version = max(self.version, header.version)
+            if header.kind == 'STT_TDATA':
+                self._tracking_s = igtl.resolution_s(header, body)
+            elif header.kind == 'STP_TDATA':
+                self._tracking_s = None
+            self.put(self._answer(header))
+        return not data
 
 
 def _set_options(connection: socket.socket) -> None:
@@ -135,6 +160,8 @@ class IgtlServer:
         Address to listen on.
     port : int
         TCP port; 0 for a free one.
+    answer : callable
+        Gives the reply to a request by its header; called by the threads of clients.
 
     Attributes
     ----------
@@ -147,7 +174,8 @@ class IgtlServer:
         The address can't be listened on.
     """
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, answer: Answer) -> None:
+        self._answer = answer
         try:
             self._listener = socket.create_server((host, port))
         except OSError as error:
@@ -174,11 +202,25 @@ class IgtlServer:
         with self._lock:
             return self._dropped_before + sum(client.dropped for client in self._clients)
 
-    def send(self, data: bytes) -> None:
-        """Queue a packed message for every client; never blocks."""
+    def send(self, data: bytes, newer: bytes = b'') -> None:
+        """Queue a packed message for every client; never blocks.
+
+        ``newer`` goes instead to clients that have asked in a header of version 2.
+        """
         with self._lock:
             for client in self._clients:
-                client.put(data)
+                client.put(newer if newer and client.version > 1 else data)
+
+    def is_tracking_due(self, now_s: float) -> bool:
+        """Whether a client wants TDATA by now, a monotonic time."""
+        with self._lock:
+            return any(client.is_due(now_s) for client in self._clients)
+
+    def send_tracking(self, data: bytes, now_s: float) -> None:
+        """Queue a TDATA for the clients that want one by now."""
+        with self._lock:
+            for client in self._clients:
+                client.put_tracking(data, now_s)
 
     def close(self) -> None:
         """End the connections of all clients."""
@@ -205,7 +247,7 @@ class IgtlServer:
                 continue
             _set_options(connection)
             with self._lock:
-                self._clients.append(_Client(connection))
+                self._clients.append(_Client(connection, self._answer))
 
     def _forget_the_gone(self) -> None:
         with self._lock:

@@ -10,11 +10,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import String
 
+from anser_ros.errors import AnserError, ParameterError
 from anser_ros.nodes import qos
-from anser_ros.nodes.igtl_server import IgtlServer, state_bytes, transform_bytes
+from anser_ros.nodes.igtl_server import IgtlServer
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
-from anser_ros.wire.setup import parse_setup, topic_of
+from anser_ros.wire import igtl
+from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
 WATCH_PERIOD_S = 0.05
 """How often sensors are looked at that have fallen silent, s."""
@@ -31,13 +33,23 @@ class OpenIGTLinkParameters:
     stale_after_s: float = parameter(
         0.3, 'a sensor without a pose for so long is reported, s', minimum=0.02, live=True
     )
+    version: int = parameter(
+        1,
+        'version of the headers to who has asked nothing; 2 has TransformStatus, and is read by '
+        'OpenIGTLink 3 only; who asks in version 2 gets that',
+        minimum=1,
+        maximum=2,
+    )
+    body_name: str = parameter('{body}', "a body's device, 20 characters; e.g. {body}ToTracker")
+    coil_name: str = parameter('{name}', "a coil's device: of {name} and its {body} and {sensor}")
+    coils: bool = parameter(True, 'whether single coils are sent too, whose roll is arbitrary')
 
 
 class OpenIGTLink(AnserNode):
-    """Sends each pose as TRANSFORM (mm, frame of the board), each change of state as STRING.
+    """Sends each pose as TRANSFORM (mm, frame of the board), each change of state as STATUS.
 
-    The device is the sensor's or the body's name of the setup document, the state's device is
-    that with ``/state``.
+    The device is made of the sensor's or the body's name of the setup document by a template; for
+    clients that know no STATUS, the state is also a STRING of that device with ``/state``.
     """
 
     NAME = 'openigtlink'
@@ -45,12 +57,18 @@ class OpenIGTLink(AnserNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self._server = IgtlServer(self.parameters.host, self.parameters.port)
-        self.get_logger().info(f'listening on {self.parameters.host}:{self._server.port}')
+        self._devices: dict[str, str] = {}
+        self._tracked: dict[str, igtl.Tracked] = {}
+        self._refused = ''
+        # Stamps are those of the poses, so what is said between them is on their clock.
+        self._ahead_s: float | None = None
+        check_templates(self.parameters)
         self._pose_subscriptions: dict[str, Any] = {}
         self._states: dict[str, str] = {}
         self._last_pose_s: dict[str, float] = {}
         self._n_clients = 0
+        self._server = IgtlServer(self.parameters.host, self.parameters.port, self._answer)
+        self.get_logger().info(f'listening on {self.parameters.host}:{self._server.port}')
         self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, qos.EVENTS)
         self.create_timer(WATCH_PERIOD_S, self._watch, clock=self.steady_clock)
@@ -70,7 +88,8 @@ class OpenIGTLink(AnserNode):
             'sensors_ok': sum(state == OK for state in self._states.values()),
         }
         if not self._states:
-            return Status('', Level.WARN, 'no setup yet', values)
+            level = Level.ERROR if self._refused else Level.WARN
+            return Status('', level, self._refused or 'no setup yet', values)
         return Status('', Level.OK, 'serving', values)
 
     def close(self) -> None:
@@ -78,12 +97,18 @@ class OpenIGTLink(AnserNode):
         self._server.close()
 
     def _on_setup(self, message: String) -> None:
-        setup = parse_setup(message.data)
-        names = [sensor.name for sensor in setup.tool_sensors] + list(setup.bodies)
+        try:
+            self._devices = devices_of(parse_setup(message.data), self.parameters)
+            self._refused = ''
+        except AnserError as error:
+            self._devices, self._refused = {}, str(error)
+            self.warn('setups_refused', str(error))
+        names = list(self._devices)
         for name in set(self._pose_subscriptions) - set(names):
             self.destroy_subscription(self._pose_subscriptions.pop(name))
             self._states.pop(name, None)
             self._last_pose_s.pop(name, None)
+            self._tracked.pop(name, None)
         for name in names:
             if name not in self._pose_subscriptions:
                 self._set_state(name, 'no pose yet')
@@ -104,12 +129,41 @@ class OpenIGTLink(AnserNode):
         if not all(map(math.isfinite, position + quaternion)) or not any(quaternion):
             self.warn('poses_refused', f'{name}: a pose that is not one')
             return
-        self._last_pose_s[name] = time.monotonic()
+        now_s = self._last_pose_s[name] = time.monotonic()
+        stamp_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        self._ahead_s = stamp_s - now_s
         self._set_state(name, OK)
         if self._n_clients:
-            stamp_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-            self._server.send(transform_bytes(name, stamp_s, position, quaternion))
+            device = self._devices[name]
+            pose = (device, stamp_s, position, quaternion)
+            newer = igtl.transform(*pose, version=2)
+            older = newer if self.parameters.version > 1 else igtl.transform(*pose, version=1)
+            self._server.send(older, newer)
             self.count('transforms')
+            self._tracked[name] = igtl.Tracked(device, position, quaternion)
+            self._send_tracking(now_s, stamp_s)
+
+    def _send_tracking(self, now_s: float, stamp_s: float) -> None:
+        """Send what is tracked just now to the clients that have asked for it."""
+        if self._server.is_tracking_due(now_s):
+            good = [one for name, one in self._tracked.items() if self._states[name] == OK]
+            self._server.send_tracking(igtl.tracking(stamp_s, good), now_s)
+
+    def _now_s(self) -> float:
+        """The time on the clock of the poses, those of a bag included."""
+        if self._ahead_s is None:
+            return 1e-9 * self.get_clock().now().nanoseconds
+        return time.monotonic() + self._ahead_s
+
+    def _answer(self, header: igtl.Header) -> bytes:
+        """The reply to what a client asks; runs on the client's thread."""
+        if header.kind == 'GET_CAPABIL':
+            return igtl.capability(self._now_s())
+        if header.kind == 'GET_STATUS':
+            status = self.status()
+            code = igtl.OK if status.level == Level.OK else igtl.NOT_READY
+            return igtl.status('', self._now_s(), code, status.level.name, status.message)
+        return igtl.tracking_reply(self._now_s())
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         """Take the tracker's reasons for sensors that have no pose just now."""
@@ -138,8 +192,41 @@ class OpenIGTLink(AnserNode):
 
     def _send_state(self, name: str, state: str) -> None:
         if self._n_clients:
-            self._server.send(state_bytes(name, time.time(), state))
+            device, now_s = self._devices[name], self._now_s()
+            code = igtl.OK if state == OK else igtl.NOT_READY
+            self._server.send(igtl.status(device, now_s, code, state.split(':')[0], state))
+            self._server.send(igtl.string(igtl.state_device(device), now_s, state))
             self.count('states')
+
+
+def check_templates(table: OpenIGTLinkParameters) -> None:
+    """Raise `ParameterError` where a template asks for what is not there."""
+    for name, known in (('body_name', ('body',)), ('coil_name', ('name', 'body', 'sensor'))):
+        try:
+            getattr(table, name).format(**dict.fromkeys(known, ''))
+        except (KeyError, IndexError, ValueError) as error:
+            words = ', '.join(f'{{{word}}}' for word in known)
+            raise ParameterError(
+                f'{name} may have {words}, got {getattr(table, name)!r}'
+            ) from error
+
+
+def devices_of(setup: Setup, table: OpenIGTLinkParameters) -> dict[str, str]:
+    """Device of each body and, where they are wanted, of each coil.
+
+    Raises
+    ------
+    ParameterError
+        As `anser_ros.wire.igtl.device_names`.
+    """
+    named = {
+        sensor.name: table.coil_name.format(
+            name=sensor.name, body=sensor.body, sensor=sensor.name.removeprefix(f'{sensor.body}/')
+        )
+        for sensor in (setup.tool_sensors if table.coils else ())
+    }
+    named |= {body: table.body_name.format(body=body) for body in setup.bodies}
+    return igtl.device_names(named)
 
 
 if __name__ == '__main__':
