@@ -88,7 +88,7 @@ def resolution_s(header: Header, body: bytes) -> float:
     content = body[12:] if header.version > 1 else body  # behind the extended header
     if len(content) < 4:
         return 0.0
-    return max(struct.unpack('>i', content[:4])[0], 0) / 1e3
+    return max(int.from_bytes(content[:4], signed=True), 0) / 1e3
 
 
 def device_names(named: Mapping[str, str]) -> dict[str, str]:
