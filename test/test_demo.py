@@ -120,6 +120,7 @@ class TestTraces:
 
 
 def test_monitor_measures_error_rate_and_latency(ros, start, tmp_path):
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
     from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
     from std_msgs.msg import String
 
@@ -157,11 +158,22 @@ def test_monitor_measures_error_rate_and_latency(ros, start, tmp_path):
             tracked.pose.covariance[0] = 4e-8
             poses[chain].publish(tracked)
 
+    diagnostics = node.create_publisher(DiagnosticArray, '/diagnostics', qos.EVENTS)
+
+    def complain():
+        one = DiagnosticStatus(
+            level=b'\x02', name='anser/field_model', message='references_lost: no fluxes'
+        )
+        diagnostics.publish(DiagnosticArray(status=[one]))
+
+    node.create_timer(0.2, complain)
     node.create_timer(0.02, publish)
     assert spin_until(node, lambda: monitor.popen.poll() is not None, 25.0), monitor.output
     assert monitor.popen.returncode == 0, monitor.output
     assert '1/10 tracked, error 1.00 mm, sigma 0.20 mm' in monitor.output
     assert 'frozen: 1/10 tracked, error 20.00 mm' in monitor.output
+    assert 'why: field_model: references_lost: no fluxes' in monitor.output
+    assert '\x1b' not in monitor.output, 'plain lines where there is no terminal'
     summary = summarise(load(output))['chains']
     assert summary['live']['position_rmse_m'] == pytest.approx(0.001)
     assert summary['frozen']['position_rmse_m'] == pytest.approx(0.02)

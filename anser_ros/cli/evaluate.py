@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from anser_ros.cli.evaluation_figures import write_figures
 from anser_ros.cli.output import make_folder, say_written, warn_of_snapshot
 from anser_ros.cli.pose_session import add_pose_options, need_model, run_diagnosis
 from anser_ros.cli.stated_values import add_stated_values, stated_values
@@ -84,6 +85,8 @@ def run(args: argparse.Namespace) -> int:
     (args.out / 'evaluation.json').write_text(text + '\n', encoding='utf-8')
     write_poses(args.out / 'poses.csv', evaluation)
     write_body_poses(args.out / 'bodies.csv', evaluation)
+    written = [args.out / name for name in ('evaluation.json', 'poses.csv', 'bodies.csv')]
+    written += write_figures(evaluation, document, args.out, args.session, args.model)[-1:]
     if session.lost:
         console.print(f'{args.session}: {session.lost}', style='yellow', highlight=False)
     if args.json:
@@ -92,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
         Console().print(_table(document))
         if 'refit' in document:
             Console().print(_refit_line(document['refit']), highlight=False)
-        say_written(*(args.out / name for name in ('evaluation.json', 'poses.csv', 'bodies.csv')))
+        say_written(*written)
     return 0
 
 

@@ -29,6 +29,9 @@ half the distance of neighbouring points."""
 DOTS_PER_INCH = 110
 """Resolution of the figures, a compromise between legible text and the size of the files."""
 
+WIDEST = 4.0
+"""Width of the first curve of a figure, points; the last one has less than a third of it."""
+
 
 def draw_all(study: Study, folder: Path) -> dict[str, str]:
     """Draw every figure into a folder and return the file names by figure."""
@@ -68,7 +71,8 @@ def draw_all(study: Study, folder: Path) -> dict[str, str]:
 
 def _save(figure: Any, path: Path, title: str) -> Path:
     figure.suptitle(f'{title} ({SIMULATED})', fontsize=10)
-    figure.tight_layout()
+    if figure.get_layout_engine() is None:
+        figure.tight_layout()
     # No date and no version in the file: the same results give the same bytes.
     figure.savefig(path, dpi=DOTS_PER_INCH, metadata={'Software': None})
     plt.close(figure)
@@ -77,34 +81,44 @@ def _save(figure: Any, path: Path, title: str) -> Path:
 
 def _cdfs(path: Path, curves: Mapping[str, Mapping[str, SensorErrors]], title: str) -> Path:
     """Draw the empirical distribution of the position error with a panel for each sensor."""
-    figure, panels = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True)
+    figure, panels = plt.subplots(1, 2, figsize=(9, 3.8), sharey=True, layout='constrained')
     for panel, (sensor, words) in zip(panels, SENSOR_WORDS.items(), strict=True):
         largest, smallest = 0.0, np.inf
-        for name, errors in curves.items():
+        for rank, (name, errors) in enumerate(curves.items()):
             distance = np.sort(1e3 * errors[sensor].distance)
             distance = distance[np.isfinite(distance)]
             if distance.size == 0:
                 continue
             share = np.arange(1, distance.size + 1) / distance.size
-            panel.step(distance, share, where='post', label=name)
+            # Later curves are thinner: one that lies on another leaves it to be seen.
+            width = WIDEST * (1.0 - 0.7 * rank / max(len(curves) - 1, 1))
+            panel.step(distance, share, where='post', label=name, lw=width)
             largest, smallest = max(largest, distance[-1]), min(smallest, np.median(distance))
         if largest > 20.0 * smallest:
             panel.set_xscale('log')
         panel.set(xlabel='position error, mm', title=words)
         panel.grid(alpha=0.3)
-        panel.legend(fontsize=7)
     panels[0].set_ylabel('share of the points')
+    _legend_below(figure, panels[0])
     return _save(figure, path, title)
+
+
+def _legend_below(figure: Any, panel: Any) -> None:
+    """Put one legend for all panels below them, where it covers nothing."""
+    handles, labels = panel.get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc='outside lower center', ncols=min(len(labels), 4), fontsize=8
+    )
 
 
 def _training_points(study: Study, folder: Path) -> Path:
     training, test = checkerboard(study.recordings.shield(MATERIALS[0]))
-    figure, panel = plt.subplots(figsize=(4.6, 4.4))
+    figure, panel = plt.subplots(figsize=(4.6, 4.8), layout='constrained')
     for session, mark, name in ((training, 's', 'training'), (test, '.', 'test')):
         where = 1e3 * session.tools[0].position
         panel.plot(where[:, 0], where[:, 1], mark, ms=4, label=f'{name} ({len(where)})')
     panel.set(xlabel='x, mm', ylabel='y, mm', aspect='equal')
-    panel.legend(loc='upper right', fontsize=8)
+    _legend_below(figure, panel)
     return _save(figure, folder / 'fig_2.png', 'Training and test points over a plate')
 
 

@@ -5,7 +5,7 @@ free dipoles for every emitter (`refit.free`), and the shared polarisability. No
 pose here, so that wrong poses count as such.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -151,14 +151,17 @@ def _rmse(session: Session, models: Sequence[FieldModel], every: int) -> float:
     return float(np.sqrt(np.mean(np.square(errors))))
 
 
-def plot(rows: Sequence[AblationRow], path: Path) -> None:
-    """Draw the error over the number of references with a panel for each session."""
+def plot(rows: Sequence[AblationRow], path: Path, titles: Mapping[str, str] | None = None) -> None:
+    """Draw the error over the number of references with a panel for each session.
+
+    ``titles`` tell readers what a session is, where its name does not.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter, ScalarFormatter
 
     sessions = list(dict.fromkeys(row.session for row in rows))
-    figure = Figure(figsize=(4.2 * len(sessions), 3.6), layout='constrained')
+    figure = Figure(figsize=(4.2 * len(sessions), 3.9), layout='constrained')
     FigureCanvasAgg(figure)
     for panel, session in enumerate(sessions):
         axes = figure.add_subplot(1, len(sessions), panel + 1)
@@ -174,9 +177,10 @@ def plot(rows: Sequence[AblationRow], path: Path) -> None:
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter(ScalarFormatter())
             axis.set_minor_formatter(NullFormatter())
-        axes.set_title(session)
+        axes.set_title((titles or {}).get(session, session))
         axes.set_xlabel('reference coils')
         axes.set_ylabel('position RMSE / mm')
         axes.grid(True, which='both', alpha=0.3)
-        axes.legend()
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc='outside lower center', ncols=len(labels))
     figure.savefig(path, dpi=120)

@@ -19,6 +19,7 @@ from anser_ros.errors import ParameterError
 from anser_ros.nodes import qos
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
+from anser_ros.nodes.shared_names import optical_parameter, optical_topic
 from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.control_unit import ControlUnit, Piece
 from anser_ros.simulation.effect_draw import NONE as NO_EFFECT
@@ -39,7 +40,7 @@ from anser_ros.simulation.sampling import FrontEnd
 from anser_ros.simulation.world import World
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.config_folder import read_config
-from anser_ros.wire.setup import Setup, parse_setup, topic_of
+from anser_ros.wire.setup import Setup, parse_setup
 
 STRETCH_S = 0.005
 """Stretch of samples that is made at a time, s: it bounds how unevenly they are sent."""
@@ -102,6 +103,7 @@ class CuSimulatorParameters:
         NO_EFFECT, 'effect in the raw signals: none, random, or one of its catalogue'
     )
     effect_seed: int = parameter(0, 'of the effect; 0 for another one every time', minimum=0)
+    optical: str = optical_parameter()
     effect_file: str = parameter('', 'file (.json) that gets the effect drawn; empty for none')
 
 
@@ -151,7 +153,9 @@ class CuSimulator(AnserNode):
         self._injector = FaultInjector(table.fault, table.fault_period_s, table.seed)
         self._port = PseudoPort(Path(table.link))
         self._publishers_of = {
-            body: self.create_publisher(PoseStamped, f'/optical/{topic_of(body)}/pose', qos.STREAM)
+            body: self.create_publisher(
+                PoseStamped, optical_topic(table.optical, body), qos.STREAM
+            )
             for body in setup.bodies
         }
         self._frame_id = setup.frame_id

@@ -12,12 +12,15 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rich.console import Console
 from rich.live import Live
+from rich.markup import escape
 from rich.table import Table
 from std_msgs.msg import String
 
 from anser_ros.nodes import qos
+from anser_ros.nodes.causes import Told, causes
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
+from anser_ros.nodes.shared_names import optical_parameter, optical_topic
 from anser_ros.nodes.traces import OpticalTrace, Row, Traces, targets_of
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
@@ -43,6 +46,7 @@ class MonitorParameters:
     )
     compare: str = parameter('', 'namespace of a second tracker to show beside; empty for none')
     compare_note: str = parameter('', 'what is special about the second tracker, in words')
+    optical: str = optical_parameter()
     output: str = parameter('', 'file (.npz) that gets all poses and errors at the end')
     period_s: float = parameter(
         0.25,
@@ -68,7 +72,7 @@ class Monitor(AnserNode):
         self._setup: Setup | None = None
         self._chains: dict[str, Traces] = {}
         self._optical: dict[str, OpticalTrace] = {}
-        self._states: dict[str, tuple[int, str]] = {}
+        self._told: dict[str, Told] = {}
         self._note = ''
         self._metal: list[tuple[float, float]] = []
         self._pose_subscriptions: list[Any] = []
@@ -103,7 +107,7 @@ class Monitor(AnserNode):
                     partial(self._on_pose, trace),
                 )
         for body, trace in self._optical.items():
-            topic = f'/optical/{topic_of(body)}/pose'
+            topic = optical_topic(self.parameters.optical, body)
             self._subscribe(PoseStamped, topic, partial(self._on_optical, trace))
 
     def _subscribe(self, kind: type, topic: str, callback: Any) -> None:
@@ -135,11 +139,10 @@ class Monitor(AnserNode):
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            self._states[status.name] = (status.level[0], status.message)
-            if status.name.endswith('cu_simulator'):
-                values = {pair.key: pair.value for pair in status.values}
-                if 'metal_distance_m' in values:
-                    self._metal.append((time.time(), float(values['metal_distance_m'])))
+            values = {pair.key: pair.value for pair in status.values}
+            self._told[status.name] = Told(status.level[0], status.message, values)
+            if status.name.endswith('cu_simulator') and 'metal_distance_m' in values:
+                self._metal.append((time.time(), float(values['metal_distance_m'])))
 
     def _show(self) -> None:
         now_s = time.monotonic()
@@ -167,13 +170,16 @@ class Monitor(AnserNode):
 
     def _problems(self) -> str:
         """What the other nodes complain of."""
-        found = [f'{name}: {text}' for name, (level, text) in self._states.items() if level]
-        return '; '.join(found[:4]) or 'no node complains'
+        return '; '.join(self._causes()) or 'no node complains'
+
+    def _causes(self) -> list[str]:
+        rate_hz = 0.0 if self._setup is None else self._setup.flux_rate_hz
+        return causes(self._told, self.get_namespace().strip('/'), rate_hz)
 
     def _state(self, chain: str, name: str) -> tuple[int, str]:
         namespace = self.get_namespace().strip('/')
         prefix = f'{namespace}/{chain}' if chain else namespace
-        return self._states.get(f'{prefix}/tracker: {name}', (1, 'waiting'))
+        return self._told.get(f'{prefix}/tracker: {name}', Told(1, 'waiting', {}))[:2]
 
     def _table(self, rows: dict[str, list[Row]]) -> Table:
         """The table; one column for a position, and states only where they are not ok."""
@@ -207,7 +213,7 @@ class Monitor(AnserNode):
 
     def _state_cell(self, chain: str, name: str, narrow: bool) -> str:
         level, state = self._state(chain, name)
-        if narrow:  # the reason stands in /diagnostics
+        if narrow:  # the reason stands below the table
             state = state.split(':')[0][:STATE_WIDTH]
         return f'[{LEVELS.get(level, "red")}]{state}'
 
@@ -223,6 +229,8 @@ class Monitor(AnserNode):
         if self._metal:
             words.insert(0, f'metal {100 * self._metal[-1][1]:.0f} cm from the board')
         caption = '; '.join(words)
+        if self._first_s is not None:  # until then they are in the title
+            caption += ''.join(f'\n{escape(text)}' for text in self._causes())
         if self.parameters.compare and self.parameters.compare_note:
             caption += f'\n{self.parameters.compare}: {self.parameters.compare_note}'
         return caption
@@ -230,7 +238,7 @@ class Monitor(AnserNode):
     def _line(self, rows: dict[str, list[Row]]) -> str:
         """One line with the medians over all sensors."""
         if self._first_s is None:
-            return f'{self._title()}; {self._problems()}'
+            return self._title()
         parts = [self._title()]
         for chain, found in rows.items():
             good = sum(row.rate_hz > 0 for row in found)
@@ -245,6 +253,9 @@ class Monitor(AnserNode):
         parts.append(f'{_number(1e3 * _middle([row.latency_s for row in live]), 1)} ms')
         if self._metal:
             parts.append(f'metal {100 * self._metal[-1][1]:.0f} cm')
+        why = self._causes()
+        if why:
+            parts.append(f'why: {"; ".join(why)}')
         return '  '.join(parts)
 
     def status(self) -> Status:

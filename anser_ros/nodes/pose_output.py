@@ -38,7 +38,7 @@ class Tally:
 class PoseTopic:
     """The two pose topics of one sensor or body; its messages are built once and filled anew."""
 
-    def __init__(self, node: Any, name: str, frame_id: str) -> None:
+    def __init__(self, node: Any, name: str, frame_id: str, prefix: str = '') -> None:
         self.name = name
         stem = topic_of(name)
         self._pose = node.create_publisher(PoseStamped, f'{stem}/pose', qos.STREAM)
@@ -48,7 +48,8 @@ class PoseTopic:
         self._plain, self._full = PoseStamped(), PoseWithCovarianceStamped()
         self._plain.header.frame_id = self._full.header.frame_id = frame_id
         self.transform = TransformStamped()
-        self.transform.header.frame_id, self.transform.child_frame_id = frame_id, stem
+        self.transform.header.frame_id = frame_id
+        self.transform.child_frame_id = f'{prefix}{stem}'
         self.estimate: PoseEstimate | None = None
         self.states: Counter[str] = Counter()
         self.tally = Tally()

@@ -17,6 +17,7 @@ from anser_ros.nodes.definitions import definition, message_class, type_hash
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.recording_log import TopicLog, report
+from anser_ros.nodes.shared_names import optical_parameter
 from anser_ros.wire.bag_metadata import qos_profile, write_metadata
 from anser_ros.wire.bag_writer import BagWriter
 
@@ -27,7 +28,6 @@ METADATA_PERIOD_S = 2.0
 # Deep enough for a pause of seconds on a slow disk.
 DEPTH = 2000
 COMMON_TOPICS = ('/diagnostics', '/tf', '/tf_static')
-COMMON_PREFIXES = ('/optical/',)
 STAMPED = (
     'sensor_msgs/msg/PointCloud2',
     'geometry_msgs/msg/PoseStamped',
@@ -47,6 +47,7 @@ class RecorderParameters:
     flush_period_s: float = parameter(
         0.25, 'most that a crash may cost, s', minimum=0.05, maximum=1.0
     )
+    optical: str = optical_parameter()
     topics: tuple[str, ...] = parameter((), 'topics to record besides those of docs/interfaces.md')
     without: tuple[str, ...] = parameter(
         ('field_model_error',),
@@ -192,7 +193,8 @@ class Recorder(AnserNode):
             return True
         if topic.rsplit('/', 1)[-1] in self.parameters.without:
             return False
-        return topic.startswith((own, *COMMON_PREFIXES)) or topic in COMMON_TOPICS
+        optical = self.parameters.optical.rstrip('/') + '/'
+        return topic.startswith((own, optical)) or topic in COMMON_TOPICS
 
     def _add(self, topic: str, type_name: str) -> bool:
         """Subscribe to one topic; return whether it is recorded from now on."""

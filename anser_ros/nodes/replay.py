@@ -7,6 +7,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import yaml
@@ -19,7 +20,9 @@ from anser_ros.nodes import qos
 from anser_ros.nodes.consumers import Consumers
 from anser_ros.nodes.definitions import message_class
 from anser_ros.nodes.node import AnserNode, Level, Status, main
+from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.readiness import Readiness
+from anser_ros.nodes.shared_names import OPTICAL, optical_parameter
 from anser_ros.wire.bag import RawMessage, Salvage, iter_messages
 from anser_ros.wire.yaml_text import read_yaml
 
@@ -44,6 +47,14 @@ LAST_ACK_S = 5.0
 # How often a silent listener of poses is asked again: fewer times than one of fluxes, for it is
 # asked after every frame.
 ATTEMPTS_OF_LISTENERS = 2
+
+
+@dataclass(frozen=True)
+class ReplayParameters:
+    """Parameters of the replay: what two of them on one graph must not share."""
+
+    optical: str = optical_parameter()
+    clock: str = parameter('/clock', 'topic of the time in the bag')
 
 
 class Replay(AnserNode):
@@ -72,6 +83,7 @@ class Replay(AnserNode):
     """
 
     NAME = 'replay'
+    PARAMETERS = ReplayParameters
 
     @classmethod
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
@@ -116,7 +128,7 @@ class Replay(AnserNode):
         self._poses: list[str] = []
         self._ending = threading.Event()
         self._scan()
-        self._ticks = self.create_publisher(Clock, '/clock', qos.STREAM)
+        self._ticks = self.create_publisher(Clock, self.parameters.clock, qos.STREAM)
         self._consumers = Consumers(self)
         self._thread = threading.Thread(target=self._play_guarded, name='replay', daemon=True)
         self._thread.start()
@@ -167,6 +179,8 @@ class Replay(AnserNode):
         name = message.topic
         if name.startswith(BAG_NAMESPACE):
             name = name.removeprefix(BAG_NAMESPACE)  # into the namespace of this node
+        elif name.startswith(f'{OPTICAL}/'):
+            name = self.parameters.optical.rstrip('/') + name.removeprefix(OPTICAL)
         profile = qos.LATCHED if _is_latched(message) else qos.STREAM
         self._types[message.topic] = kind
         self._outlets[message.topic] = self.create_publisher(kind, name, profile)

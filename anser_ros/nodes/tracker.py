@@ -65,6 +65,9 @@ class TrackerParameters:
         'model whose effects apply, and its field until field_model speaks; empty or nominal for '
         'none',
     )
+    frame_prefix: str = parameter(
+        '', "put before frames of coils and bodies in /tf; the board's is the setup's frame_id"
+    )
     flux_noise_t: float = stated('flux_noise_t')
     stamp_sigma_s: float = stated('stamp_sigma_s')
     references_age_s: float = stated('references_age_s')
@@ -220,7 +223,7 @@ class TrackerNode(AnserNode):
         for topic in self._topics.values():
             topic.destroy(self)
         self._topics = {
-            name: PoseTopic(self, name, setup.frame_id)
+            name: PoseTopic(self, name, setup.frame_id, self.parameters.frame_prefix)
             for name in (*sensors.name, *tracker.bodies)
         }
         self._trouble.forget()

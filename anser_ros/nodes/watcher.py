@@ -21,6 +21,7 @@ from anser_ros.nodes.model_clouds import SECOND_NS
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.one_source import OneSource, said_of
 from anser_ros.nodes.parameters import parameter
+from anser_ros.nodes.shared_names import optical_parameter, optical_topic
 from anser_ros.nodes.sighting_words import figures_of, plain_text, title_of, words_of
 from anser_ros.nodes.stated_parameters import stated, stated_by
 from anser_ros.sessions.prepared import prepare
@@ -28,7 +29,7 @@ from anser_ros.sessions.session import Session, empty_session, load_session
 from anser_ros.sessions.sliding_window import LIVE, SlidingWindow
 from anser_ros.sessions.starting_model import NOMINAL, model_for
 from anser_ros.sessions.watch import Sighting, Watch
-from anser_ros.wire.setup import parse_setup, topic_of
+from anser_ros.wire.setup import parse_setup
 
 POLL_S = 0.2
 """How often it is asked whether a look is due, s: far less than the time between looks."""
@@ -45,6 +46,7 @@ class WatcherParameters:
     model_file: str = parameter(
         NOMINAL, "the tracker's model: a file, or nominal for that of the setup's own geometry"
     )
+    optical: str = optical_parameter()
     baseline_file: str = parameter(
         '', 'distortion-free recording of the same board; without one the references have no say'
     )
@@ -134,7 +136,10 @@ class Watcher(AnserNode):
         for body in setup.bodies:
             if body not in self._pose_subscriptions:
                 self._pose_subscriptions[body] = self.create_subscription(
-                    PoseStamped, f'/optical/{topic_of(body)}/pose', self._taker(body), qos.STREAM
+                    PoseStamped,
+                    optical_topic(self.parameters.optical, body),
+                    self._taker(body),
+                    qos.STREAM,
                 )
 
     def _taker(self, body: str) -> Callable[[PoseStamped], None]:

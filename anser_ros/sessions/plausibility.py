@@ -114,7 +114,7 @@ def _check_refused(path: str, tool: Measurements, refused: Mapping[str, int]) ->
     words = []
     for what, count in refused.items():
         topic, _, reason = what.partition(': ')
-        if topic != f'/optical/{tool.body}/pose':
+        if not topic.endswith(f'/optical/{tool.body}/pose'):
             continue
         if tool.track is None:
             raise PlausibilityError(

@@ -35,6 +35,8 @@ _RECORD_LIMIT = 256 * 2**20
 means a damaged or a hostile file, and memory for it is never asked for."""
 
 FLUX_TYPE = 'sensor_msgs/msg/PointCloud2'
+OPTICAL = '/optical/'
+"""Part of the topics of optical poses, before the body's name."""
 POSE_TYPE = 'geometry_msgs/msg/PoseStamped'
 
 
@@ -242,7 +244,7 @@ class _Collector:
                 self.setups.append(str(self.decoder.decode(raw).data))
             elif raw.topic.endswith(('/tool/flux', '/reference/flux')):
                 self._add_flux(raw)
-            elif raw.topic.startswith('/optical/') and raw.type_name == POSE_TYPE:
+            elif OPTICAL in raw.topic and raw.type_name == POSE_TYPE:
                 self._add_pose(raw)
         except (BagError, LayoutError, AttributeError, TypeError, ValueError) as error:
             self.refused[f'{raw.topic}: {error}'] += 1
@@ -268,7 +270,8 @@ class _Collector:
         norm = float(np.linalg.norm(values[3:]))
         if not np.isfinite(values).all() or abs(norm - 1.0) > 1e-2:
             raise LayoutError('a pose with values not finite or a quaternion not of unit length')
-        body = raw.topic[len('/optical/') : -len('/pose')]
+        # A board that shares its graph with others has a namespace of its own before it.
+        body = raw.topic.partition(OPTICAL)[2].removesuffix('/pose')
         self.poses.setdefault(body, []).append((stamp_ns(message), values))
 
     def flux_stream(self, which: str) -> RecordedFluxes | None:

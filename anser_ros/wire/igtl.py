@@ -31,6 +31,7 @@ TRANSFORM_STATUS = 'TransformStatus'
 _HEADER = struct.Struct('>H12s20sIIQQ')
 HEADER_BYTES = _HEADER.size
 _VERSIONS = (1, 2, 3)
+"""Versions of headers that there are."""
 _POLYNOMIAL, _MASK = 0x42F0E1EBA9EA3693, 2**64 - 1  # CRC-64, ECMA-182
 
 

@@ -36,6 +36,12 @@ JITTER_M = 0.12e-3
 LAYOUT = Layout('coils', 3, 1.0, 0.0, prior='nominal', moved=True)
 """What the choice by held-out error ends with on the shared scan, without its minutes."""
 TARGETS = {'online/approach': 0.27, 'online/sweep': 0.15, 'effects/s05': 0.18}
+TITLES = {
+    'online/approach': 'metal comes near and stays',
+    'online/sweep': 'metal sweeps past',
+    'bags/metal (own)': 'metal comes from below',
+}
+"""What the sessions of the plot are, for readers who do not know their names."""
 PLOT = REPO / 'docs' / 'refit_ablation.png'
 
 
@@ -193,7 +199,7 @@ def against_references(
     for name in ('online/approach', 'online/sweep', 'bags/metal (own)'):
         if name in sessions:
             found += ablation.ablate(sessions[name], name, model, baseline)
-    ablation.plot(found, PLOT)
+    ablation.plot(found, PLOT, TITLES)
     rows = []
     for shared in (row for row in found if row.method == ablation.SHARED):
         free = next(

@@ -1,0 +1,214 @@
+"""What an evaluation found, drawn: errors over time, over the volume, by coil, and against sigma.
+
+Each figure is a PNG of its own, and all stand in one page that needs nothing else.
+"""
+
+import base64
+import html
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use('Agg')
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from anser_ros.sessions.evaluation import Evaluation
+from anser_ros.sessions.pose_errors import PoseSeries
+
+Array = NDArray[np.float64]
+
+MOST_POINTS = 4000
+"""Most points that a figure shows of one coil: more are not told apart, and make files large."""
+COVERAGE_SIGMAS = np.linspace(0.0, 4.0, 81)
+"""Multiples of sigma for which the share of errors within is drawn, to where all should be."""
+STYLE = """
+body { font: 15px/1.5 sans-serif; max-width: 62em; margin: 2em auto; padding: 0 1em; color: #222 }
+table { border-collapse: collapse; margin: 1em 0 } td, th { padding: .25em .8em; text-align: right;
+border-bottom: 1px solid #ddd } td:first-child, th:first-child { text-align: left }
+th { background: #f4f4f4 } img { max-width: 100% } .note { color: #666 }
+"""
+
+
+def _series(evaluation: Evaluation) -> dict[str, PoseSeries]:
+    return {**evaluation.sensors, **evaluation.bodies}
+
+
+def _seconds(series: PoseSeries, start_ns: int) -> Array:
+    stamps = np.array([estimate.stamp_ns for estimate in series.estimates], dtype=np.int64)
+    return np.asarray(1e-9 * (stamps - start_ns), dtype=np.float64)
+
+
+def _thinned(count: int) -> slice:
+    return slice(0, None, max(1, -(-count // MOST_POINTS)))
+
+
+def _below(figure: Figure, axes: Any) -> None:
+    """One legend below all panels, where it covers nothing."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc='outside lower center', ncols=min(len(labels), 5), fontsize=8
+    )
+
+
+def over_time(evaluation: Evaluation) -> Figure:
+    """Draw the position error of every coil and body over time, and which of them had a pose."""
+    found = _series(evaluation)
+    start = min(s.estimates[0].stamp_ns for s in found.values() if s.estimates)
+    figure, (upper, lower) = plt.subplots(
+        2, 1, figsize=(9, 5.6), sharex=True, layout='constrained', height_ratios=(3, 1)
+    )
+    for rank, (name, series) in enumerate(found.items()):
+        time, keep = _seconds(series, start), _thinned(len(series.estimates))
+        colour = f'C{rank % 10}'
+        upper.plot(
+            time[keep], 1e3 * series.position_error[keep], '.', ms=3, color=colour, label=name
+        )
+        lost = time[~series.ok]
+        lower.plot(lost, np.full(lost.size, rank), '|', color=colour)
+    upper.set(ylabel='position error, mm', yscale='log')
+    lower.set(xlabel='time, s', ylabel='no pose', ylim=(-0.8, len(found) - 0.2))
+    lower.set_yticks([])
+    upper.grid(alpha=0.3)
+    _below(figure, upper)
+    return figure
+
+
+def over_space(evaluation: Evaluation) -> Figure:
+    """Draw where the poses were, from above and from the side, coloured by their error."""
+    place, error = [], []
+    for series in evaluation.sensors.values():
+        good = np.isfinite(series.position_error)
+        place += [e.position for e, g in zip(series.estimates, good, strict=True) if g]
+        error.append(series.position_error[good])
+    where = 1e3 * np.array(place).reshape(-1, 3)
+    size = 1e3 * np.concatenate(error) if error else np.zeros(0)
+    keep = _thinned(len(where))
+    figure, panels = plt.subplots(1, 2, figsize=(9, 4.2), layout='constrained')
+    top = float(np.percentile(size, 98)) if size.size else 1.0
+    for panel, (across, up) in zip(panels, (('x', 'y'), ('x', 'z')), strict=True):
+        columns = ['xyz'.index(name) for name in (across, up)]
+        shown = panel.scatter(
+            where[keep, columns[0]], where[keep, columns[1]], c=size[keep], s=8, vmin=0.0, vmax=top
+        )
+        panel.set(xlabel=f'{across}, mm', ylabel=f'{up}, mm', aspect='equal')
+        panel.grid(alpha=0.3)
+    figure.colorbar(shown, ax=panels, label='position error, mm', extend='max')
+    return figure
+
+
+def by_coil(evaluation: Evaluation) -> Figure:
+    """Draw the distribution of each coil's and body's errors of position and orientation."""
+    found = _series(evaluation)
+    figure, panels = plt.subplots(
+        1, 2, figsize=(9, 1.4 + 0.3 * len(found)), layout='constrained', sharey=True
+    )
+    for panel, scale, unit, errors in (
+        (panels[0], 1e3, 'position error, mm', [s.position_error for s in found.values()]),
+        (panels[1], 57.29578, 'orientation error, deg',
+         [s.orientation_error for s in found.values()]),
+    ):  # fmt: skip
+        for row, error in enumerate(errors, start=1):
+            finite = scale * error[np.isfinite(error)]
+            if not finite.size:
+                continue
+            least, lower, middle, upper, most = np.percentile(finite, (5, 25, 50, 75, 95))
+            panel.hlines(row, least, most, color='0.5')
+            panel.barh(row, upper - lower, 0.6, left=lower, color='C0', alpha=0.6)
+            panel.vlines(middle, row - 0.3, row + 0.3, color='C1', lw=2)
+        panel.set(xlabel=unit)
+        panel.set_xlim(left=0.0)
+        panel.grid(alpha=0.3, axis='x')
+    panels[0].set_yticks(np.arange(1, len(found) + 1), list(found))
+    panels[0].invert_yaxis()
+    return figure
+
+
+def against_sigma(evaluation: Evaluation) -> Figure:
+    """Draw the errors against the sigma told, and how many lie within a multiple of it."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4.2), layout='constrained')
+    low, high = np.inf, 0.0
+    for rank, (name, series) in enumerate(_series(evaluation).items()):
+        sigma = np.array([estimate.sigma_position_m for estimate in series.estimates])
+        good = np.isfinite(series.position_error) & (sigma > 0)
+        error, sigma = 1e3 * series.position_error[good], 1e3 * sigma[good]
+        if not error.size:
+            continue
+        keep, colour = _thinned(error.size), f'C{rank % 10}'
+        left.plot(sigma[keep], error[keep], '.', ms=3, color=colour, label=name)
+        low, high = min(low, float(sigma.min())), max(high, float(sigma.max()))
+        within = [(error <= k * sigma).mean() for k in COVERAGE_SIGMAS]
+        right.plot(COVERAGE_SIGMAS, within, color=colour)
+    if high > 0:
+        line = np.array([low, high])
+        left.plot(line, line, '-', color='0.3', label='error = sigma')
+        left.plot(line, 3 * line, '--', color='0.3', label='error = 3 sigma')
+        left.set(xscale='log', yscale='log')
+    left.set(xlabel='sigma of the position, mm', ylabel='position error, mm')
+    right.set(xlabel='multiple of sigma', ylabel='share of the errors within', ylim=(0, 1.02))
+    for panel in (left, right):
+        panel.grid(alpha=0.3)
+    _below(figure, left)
+    return figure
+
+
+FIGURES: dict[str, tuple[str, Callable[[Evaluation], Figure]]] = {
+    'error_over_time': ('Error over time; marks below: frames without a pose', over_time),
+    'error_over_space': ('Error over the volume', over_space),
+    'error_by_coil': ('Errors by coil and body: median, quartiles, 5 and 95 %', by_coil),
+    'sigma_and_error': ("Errors against the poses' own sigma", against_sigma),
+}
+"""Figures by the names of their files, with what they show."""
+
+
+def write_figures(
+    evaluation: Evaluation, document: Mapping[str, Any], folder: Path, session: str, model: str
+) -> list[Path]:
+    """Write every figure and the page that holds them; return the files.
+
+    Without an optical pose there is no error, and nothing is drawn or written.
+    """
+    found = _series(evaluation)
+    if not any(np.isfinite(series.position_error).any() for series in found.values()):
+        return []
+    parts, files = [], []
+    for name, (title, draw) in FIGURES.items():
+        path = folder / f'{name}.png'
+        figure = draw(evaluation)
+        figure.savefig(path, dpi=110, metadata={'Software': None})
+        plt.close(figure)
+        data = base64.b64encode(path.read_bytes()).decode('ascii')
+        parts.append(
+            f'<h2>{html.escape(title)}</h2>'
+            f'<img alt="{html.escape(title)}" src="data:image/png;base64,{data}">'
+        )
+        files.append(path)
+    page = folder / 'evaluation.html'
+    page.write_text(
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Evaluation</title>'
+        f'<style>{STYLE}</style></head><body><h1>Evaluation</h1>'
+        f'<p class="note">session <code>{html.escape(session)}</code>, '
+        f'model <code>{html.escape(model)}</code></p>'
+        f'{_table(document)}{"".join(parts)}</body></html>\n',
+        encoding='utf-8',
+    )
+    return [*files, page]
+
+
+def _table(document: Mapping[str, Any]) -> str:
+    head = ('', 'poses', 'tracked', 'RMSE, mm', '95 %, mm', 'RMSE, deg', '95 %, deg')
+    rows = ''.join(f'<th>{cell}</th>' for cell in head)
+    for group in ('sensors', 'bodies'):
+        for name, row in document[group].items():
+            cells = [html.escape(name), str(row['n']), f'{row["tracked_fraction"]:.1%}']
+            for key, scale in (
+                ('position_rmse_m', 1e3), ('position_prc95_m', 1e3),
+                ('orientation_rmse_rad', 57.29578), ('orientation_prc95_rad', 57.29578),
+            ):  # fmt: skip
+                cells.append('-' if row[key] is None else f'{scale * row[key]:.3f}')
+            rows += '</tr><tr>' + ''.join(f'<td>{cell}</td>' for cell in cells)
+    return f'<table><tr>{rows}</tr></table>'

@@ -1,0 +1,72 @@
+"""Why things are as they are, in the words of the nodes' own diagnostics, the gravest first.
+
+A service answers with the same words, as both come from the node that knows.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+MOST_CAUSES = 4
+"""Causes that are told at once: what is behind all else is among the gravest."""
+MOST_NAMES = 3
+"""Sensors that are named for one cause; of the others their number is told."""
+MOST_TEXT = 160
+"""Characters of a cause: two lines of a terminal."""
+LEAST_LOSS = 0.05
+"""Share of frames missing that is told: a rate counted over a second is off by a few percent."""
+
+
+class Told(NamedTuple):
+    """What was said last of a node or of a part of it: level, words, figures by name."""
+
+    level: int
+    message: str
+    values: Mapping[str, str]
+
+
+def causes(told: Mapping[str, Told], namespace: str, flux_rate_hz: float = 0.0) -> list[str]:
+    """Name what is wrong: nodes that complain, then sensors without pose, by their reasons.
+
+    Parameters
+    ----------
+    told : mapping
+        What was said last, by ``node`` or ``node: part``.
+    namespace : str
+        Of the nodes that are asked, without slashes around it.
+    flux_rate_hz : float
+        Frames a second that there should be; 0 where that is not known.
+    """
+    found: list[tuple[int, str]] = []
+    silent: dict[tuple[int, str], list[str]] = {}
+    for name, one in told.items():
+        node, _, part = name.partition(': ')
+        home, _, short = node.rpartition('/')
+        if home != namespace or not one.level:
+            continue
+        if not part:
+            found.append((-one.level, f'{short}: {one.message}{_loss(one, flux_rate_hz)}'))
+        elif short == 'tracker':
+            silent.setdefault((-one.level, one.message), []).append(part)
+    found.sort(key=lambda item: item[0])
+    reasons = [f'{words} ({_names(names)})' for (_, words), names in sorted(silent.items())]
+    texts = [words for _, words in found] + reasons
+    return [_short(text) for text in texts[:MOST_CAUSES]]
+
+
+def _loss(one: Told, flux_rate_hz: float) -> str:
+    """The share of frames that are missing, where a node tells its rate."""
+    try:
+        rate_hz = float(one.values['rate_hz'])
+    except (KeyError, ValueError):
+        return ''
+    share = 1.0 - rate_hz / flux_rate_hz if flux_rate_hz > 0 else 0.0
+    return f'; {share:.0%} of the frames are missing' if share > LEAST_LOSS else ''
+
+
+def _names(names: list[str]) -> str:
+    more = f' and {len(names) - MOST_NAMES} more' if len(names) > MOST_NAMES else ''
+    return ', '.join(names[:MOST_NAMES]) + more
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= MOST_TEXT else text[: MOST_TEXT - 3] + '...'

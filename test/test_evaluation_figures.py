@@ -1,0 +1,84 @@
+"""What `evaluate` draws is what was found, and a session without optics draws nothing."""
+
+from types import SimpleNamespace
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from anser_ros.cli import evaluation_figures as figures
+from anser_ros.sessions.evaluation import Evaluation
+from anser_ros.sessions.evaluation_document import to_document
+from anser_ros.sessions.pose_errors import PoseSeries
+from anser_ros.tracking.estimate import OK
+
+FRAMES = 200
+
+
+def series(name, scale, rng, lost=()):
+    """Errors that are half-normal of the sigma told, times a scale."""
+    sigma = np.linspace(0.1e-3, 1e-3, FRAMES)
+    error = scale * sigma * np.abs(rng.normal(size=FRAMES))
+    error[list(lost)] = np.nan
+    estimates = tuple(
+        SimpleNamespace(
+            stamp_ns=1_750_000_000_000_000_000 + 20_000_000 * i,
+            position=np.array([1e-3 * i, 0.0, 0.15]),
+            sigma_position_m=float(sigma[i]),
+            state='residual' if i in lost else OK,
+        )
+        for i in range(FRAMES)
+    )
+    return PoseSeries(name, estimates, error, error)
+
+
+@pytest.fixture
+def evaluation():
+    rng = np.random.default_rng(2)
+    sensors = {n: series(n, 1.0, rng, lost) for n, lost in (('a/x', ()), ('a/y', (3, 4)))}
+    return Evaluation(sensors, {'a': series('a', 3.0, rng)}, 1e-3)
+
+
+def test_errors_and_lost_frames_over_time(evaluation):
+    upper, lower = figures.over_time(evaluation).axes
+    x = upper.lines[0].get_xydata()
+    np.testing.assert_allclose(x[:, 0], 0.02 * np.arange(FRAMES), atol=1e-6)
+    np.testing.assert_allclose(x[:, 1], 1e3 * evaluation.sensors['a/x'].position_error)
+    assert [len(line.get_xdata()) for line in lower.lines] == [0, 2, 0]
+    plt.close('all')
+
+
+def test_the_place_of_every_pose_has_its_error(evaluation):
+    above = figures.over_space(evaluation).axes[0].collections[0]
+    places, colours = above.get_offsets(), above.get_array()
+    assert len(places) == 2 * FRAMES - 2
+    np.testing.assert_allclose(places[5], [5.0, 0.0], atol=1e-9)
+    assert colours[5] == pytest.approx(1e3 * evaluation.sensors['a/x'].position_error[5])
+    plt.close('all')
+
+
+def test_sigma_that_is_too_small_shows(evaluation):
+    """Of half-normal errors 68 % lie within a sigma; of ones three times as large, 26 %."""
+    _, right = figures.against_sigma(evaluation).axes
+    at_one = int(np.argmin(np.abs(figures.COVERAGE_SIGMAS - 1.0)))
+    shares = [line.get_ydata()[at_one] for line in right.lines]
+    assert shares[0] == pytest.approx(0.68, abs=0.1) and shares[2] == pytest.approx(0.26, abs=0.1)
+    plt.close('all')
+
+
+def test_the_page_holds_all_figures(evaluation, tmp_path):
+    document = to_document(evaluation)
+    files = figures.write_figures(evaluation, document, tmp_path, 'run <1>.mcap', 'nominal')
+    assert {path.name for path in files} == {
+        'evaluation.html', *(f'{name}.png' for name in figures.FIGURES)
+    }  # fmt: skip
+    text = (tmp_path / 'evaluation.html').read_text()
+    assert text.count('data:image/png;base64,') == len(figures.FIGURES)
+    assert 'run &lt;1&gt;.mcap' in text and 'http' not in text
+    nothing = np.full(FRAMES, np.nan)
+    blind = PoseSeries('a', evaluation.bodies['a'].estimates, nothing, nothing)
+    (folder := tmp_path / 'blind').mkdir()
+    assert not figures.write_figures(
+        Evaluation({'a': blind}, {}, 1e-3), document, folder, 'x', 'nominal'
+    )
+    assert not list(folder.iterdir())
