@@ -9,12 +9,13 @@ import contextlib
 import fcntl
 import importlib.util
 import os
+import random
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -74,11 +75,24 @@ def pytest_itemcollected(item: pytest.Item) -> None:
         item.add_marker(pytest.mark.xdist_group('nodes' if _has_chain(item) else _room(item)))
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the tests with chains of nodes first, then the files that calculate for long.
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Let the order be another one, to find tests that depend on what ran before them."""
+    words = 'run the files in a random order, and the tests of each in one'
+    parser.addoption('--shuffle', type=int, metavar='SEED', help=words)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Shuffle if asked to; of two workers' tests put chains of nodes and long files first.
 
     Last come the files whose nodes leave the machine to others, for whichever worker is free.
     """
+    seed = config.getoption('shuffle')
+    if seed is not None:
+        rng = random.Random(seed)
+        files = list(dict.fromkeys(item.path for item in items))
+        rng.shuffle(files)
+        rng.shuffle(items)
+        items.sort(key=lambda item: files.index(item.path))  # its fixtures are made once
     if 'PYTEST_XDIST_WORKER' in os.environ:
         long = {_room(item) for item in items if item.get_closest_marker('long')}
         items.sort(key=lambda i: (not _has_chain(i), _is_light(i), _room(i) not in long))
@@ -151,6 +165,15 @@ def _starts_are_marked(request: pytest.FixtureRequest) -> Iterator[None]:
     assert _has_processes(request.node) or not seen, (
         f'starts a process without @pytest.mark.processes: {seen}'
     )
+
+
+def by_room(files: Iterable[Path]) -> Any:
+    """Give a test the files of one folder of the package after the other; a test each is dear."""
+    rooms: dict[str, list[Path]] = {}
+    for path in files:
+        folder = path.parent.relative_to(REPO).as_posix()
+        rooms.setdefault(folder, []).append(path)
+    return pytest.mark.parametrize('paths', rooms.values(), ids=rooms)
 
 
 @pytest.fixture(scope='session')

@@ -12,6 +12,7 @@ import re
 from pathlib import Path
 
 import pytest
+from conftest import by_room
 
 import anser_ros.effects as package
 from anser_ros.effects.effect import Effect
@@ -23,6 +24,7 @@ ALLOWED = {
     'effects/': 'their own room',
     'simulation/': 'faults of a simulated nature, labelled with what a diagnosis should call them',
     'measured/': 'models of other laboratories, with effects of their own that share some names',
+    'poses/effects/': 'of trackers that give poses alone, under the names of the page of interfaces',
     'calibration/sensor_parameters.py': 'writes records as `docs/interfaces.md` names them, from '
     'below the effects: the scan finds gains, axes and lever arms with its own fit',
 }
@@ -73,10 +75,12 @@ def _named(node):
     return node.id if isinstance(node, ast.Name) else ''
 
 
-@pytest.mark.parametrize('path', FILES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
-def test_no_effect_is_a_special_case_outside_its_room(path):
-    found = list(special_cases(path.read_text(encoding='utf-8')))
-    assert not found, f'{path}: let the effect declare it (anser_ros/effects/effect.py): {found}'
+@by_room(FILES)
+def test_no_effect_is_a_special_case_outside_its_room(paths):
+    found = [
+        f'{path}: {case}' for path in paths for case in special_cases(path.read_text('utf-8'))
+    ]
+    assert not found, f'let the effect declare it (anser_ros/effects/effect.py): {found}'
 
 
 def test_no_site_hides_state_behind_an_underscore():

@@ -6,7 +6,7 @@ Every file's syntax tree is walked, imports inside functions included.
 import ast
 from pathlib import Path
 
-import pytest
+from conftest import by_room
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 FILES = sorted(PACKAGE.rglob('*.py'))
@@ -77,28 +77,34 @@ def is_ros(name):
     return name.endswith('_msgs') or name in ('rclpy', 'std_srvs')
 
 
-@pytest.mark.parametrize('path', FILES, ids=place)
-def test_imports_of_ours_point_inwards(path):
-    layer = path.relative_to(PACKAGE).parts[0]
-    if layer.endswith('.py'):  # errors.py knows nothing; __init__.py names what is public
-        allowed, layer = ALLOWED['__init__.py'] if layer == '__init__.py' else set(), ''
-    else:
-        assert layer in ALLOWED, f'{layer} is no layer'
-        allowed = ALLOWED[layer]
-    modules = {path.stem for path in PACKAGE.glob('*.py')}
-    for name in imports(path):
-        parts = name.split('.')
-        if parts[0] == 'anser_ros' and len(parts) > 1 and parts[1] not in modules:
-            assert parts[1] == layer or parts[1] in allowed, f'{place(path)} imports {name}'
+@by_room(FILES)
+def test_imports_of_ours_point_inwards(paths):
+    modules, faults = {path.stem for path in PACKAGE.glob('*.py')}, []
+    for path in paths:
+        layer = path.relative_to(PACKAGE).parts[0]
+        if layer.endswith('.py'):  # errors.py knows nothing; __init__.py names what is public
+            allowed, layer = ALLOWED['__init__.py'] if layer == '__init__.py' else set(), ''
+        else:
+            assert layer in ALLOWED, f'{layer} is no layer'
+            allowed = ALLOWED[layer]
+        for name in imports(path):
+            parts = name.split('.')
+            is_ours = parts[0] == 'anser_ros' and len(parts) > 1 and parts[1] not in modules
+            if is_ours and parts[1] != layer and parts[1] not in allowed:
+                faults.append(f'{place(path)} imports {name}')
+    assert not faults, '\n'.join(faults)
 
 
-@pytest.mark.parametrize('path', FILES, ids=place)
-def test_libraries_stay_in_their_rooms(path):
-    for name in imports(path):
-        library = name.split('.')[0]
-        rooms = ('nodes/',) if is_ros(library) else ROOMS.get(library)
-        if rooms is not None:
-            assert place(path).startswith(rooms), f'{place(path)} imports {name}'
+@by_room(FILES)
+def test_libraries_stay_in_their_rooms(paths):
+    faults = []
+    for path in paths:
+        for name in imports(path):
+            library = name.split('.')[0]
+            rooms = ('nodes/',) if is_ros(library) else ROOMS.get(library)
+            if rooms is not None and not place(path).startswith(rooms):
+                faults.append(f'{place(path)} imports {name}')
+    assert not faults, '\n'.join(faults)
 
 
 def test_the_walk_sees_imports_everywhere(tmp_path):

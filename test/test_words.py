@@ -10,7 +10,7 @@ import tokenize
 from itertools import zip_longest
 from pathlib import Path
 
-import pytest
+from conftest import by_room
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 FEWEST_WORDS = 4
@@ -114,16 +114,25 @@ def constant_faults(source):
             yield f'{node.lineno}: nothing explains {ast.unparse(node)[:60]}'
 
 
-@pytest.mark.parametrize('path', FILES, ids=place)
-def test_public_things_are_described_in_whole_sentences(path):
-    faults = list(docstring_faults(path.read_text(encoding='utf-8')))
-    assert not faults, '\n'.join(f'{place(path)}:{fault}' for fault in faults)
+def all_faults(paths, faults_of):
+    """Lines of what is wrong in some files, with its place."""
+    return '\n'.join(
+        f'{place(path)}:{fault}'
+        for path in paths
+        for fault in faults_of(path.read_text(encoding='utf-8'))
+    )
 
 
-@pytest.mark.parametrize('path', FILES, ids=place)
-def test_named_numbers_are_explained(path):
-    faults = list(constant_faults(path.read_text(encoding='utf-8')))
-    assert not faults, '\n'.join(f'{place(path)}:{fault}' for fault in faults)
+@by_room(FILES)
+def test_public_things_are_described_in_whole_sentences(paths):
+    faults = all_faults(paths, docstring_faults)
+    assert not faults, faults
+
+
+@by_room(FILES)
+def test_named_numbers_are_explained(paths):
+    faults = all_faults(paths, constant_faults)
+    assert not faults, faults
 
 
 def test_the_walk_sees_what_it_should():
