@@ -24,7 +24,7 @@ ALLOWED = {
     'effects/': 'their own room',
     'simulation/': 'faults of a simulated nature, labelled with what a diagnosis should call them',
     'measured/': 'models of other laboratories, with effects of their own that share some names',
-    'poses/effects/': 'of trackers that give poses alone, under the names of the page of interfaces',
+    'poses/effects/': 'of trackers that give poses alone, under the names of docs/interfaces.md',
     'calibration/sensor_parameters.py': 'writes records as `docs/interfaces.md` names them, from '
     'below the effects: the scan finds gains, axes and lever arms with its own fit',
 }
