@@ -25,8 +25,9 @@ ALLOWED = {
     'simulation/': 'faults of a simulated nature, labelled with what a diagnosis should call them',
     'measured/': 'models of other laboratories, with effects of their own that share some names',
     'poses/effects/': 'of trackers that give poses alone, under the names of docs/interfaces.md',
-    'calibration/sensor_parameters.py': 'writes records as `docs/interfaces.md` names them, from '
-    'below the effects: the scan finds gains, axes and lever arms with its own fit',
+    'calibration/sensor_parameters.py': 'parameters of a fit below the effects, as they are named',
+    'calibration/survey_records.py': 'writes records as `docs/interfaces.md` names them, from '
+    'below the effects: a scan finds what is wrong with itself by its own fit',
 }
 FILES = sorted(
     path

@@ -233,9 +233,11 @@ def test_estimated_sensors_travel_with_the_model(world):
     told = replace(world.measurements, flux=world.measurements.flux * gain[:, None])
     options = Options(layout=Layout('layer', 10, 1.25, 0.0), estimate=('gains',))
     found = calibrate([told], ['one'], world.generator, EMITTERS, TONES, options)
-    gains = [effect.parameters['gain'] for effect in found.model.effects]
-    assert len(gains) == len(table)
-    assert np.allclose(gains, gain, atol=2e-3)
+    (effect,) = found.model.effects
+    assert effect.name == 'sensor_gain_spread'
+    assert effect.parameters['channels'] == table.channel.tolist()
+    values = np.array(effect.parameters['values'])
+    assert np.allclose(values, np.stack([gain, 0 * gain], axis=1), atol=2e-3)
 
 
 # Error maps.

@@ -8,6 +8,7 @@ from anser_ros.api.model import Model
 from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.document import to_document
 from anser_ros.calibration.layouts import Layout
+from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.errors import FitError
 from anser_ros.sessions.calibration import calibrate_sessions, check_same_board
 from anser_ros.sessions.session import Session
@@ -42,7 +43,7 @@ def calibrate(
     sessions: Session | Sequence[Session],
     *,
     dipoles: int | None = None,
-    estimate: Sequence[str] = (),
+    estimate: Sequence[str] = KINDS,
     force: bool = False,
     progress: Callable[[str, float], None] | None = None,
 ) -> CalibrationResult:
@@ -56,7 +57,8 @@ def calibrate(
         A layer of so many by so many vertical dipoles on the board. When not given, the layout is
         chosen by its error on held-out blocks of space, which takes longer.
     estimate : sequence of str
-        What is found of the sensors together with the field: ``gains``, ``axes``, ``lever_arm``.
+        What is found of sensors and clock together with the field, where the scan speaks for it;
+        all of `KINDS` by default, and nothing when it is empty.
     force : bool
         Whether a model is returned that is worse on held-out readings than the drawn board.
     progress : callable, optional

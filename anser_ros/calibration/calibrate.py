@@ -15,7 +15,7 @@ from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.prior import DrawnBoard
 from anser_ros.calibration.readings import with_pose
 from anser_ros.calibration.requirements import check_agreement, check_measurements
-from anser_ros.calibration.result import Calibration, provenance, residuals
+from anser_ros.calibration.result import Calibration, Scan, provenance, residuals
 from anser_ros.calibration.selection import (
     COUNTS,
     LEAST_GAIN_OF_FIXED,
@@ -24,8 +24,9 @@ from anser_ros.calibration.selection import (
     thin_frames,
 )
 from anser_ros.calibration.sensor_survey import SensorSurveyor
+from anser_ros.calibration.survey_records import corrections, tellings
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import EffectRecord, FieldModel
+from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
@@ -44,7 +45,9 @@ class Options:
     damping : float or None
         Damping of the moments; chosen by held-out error by default.
     estimate : tuple of str
-        What is estimated of the sensors together with the field, of `sensor_parameters.KINDS`.
+        What is estimated of sensors and clock together with the field, of
+        `sensor_parameters.KINDS`. Whatever is, frames whose pose or field is not sound are left
+        out then, and the optical jitter is estimated.
     """
 
     accuracy: Accuracy = field(default_factory=Accuracy)
@@ -62,6 +65,7 @@ def calibrate(
     options: Options | None = None,
     nominal: FieldModel | None = None,
     progress: Progress | None = None,
+    steady: Sequence[NDArray[np.bool_]] | None = None,
 ) -> Calibration:
     """Fit a field model to measurements.
 
@@ -83,6 +87,8 @@ def calibrate(
         The drawn board: a prior of the fit, and compared with its result.
     progress : callable, optional
         Called with the name of the stage and its finished fraction.
+    steady : sequence of ndarray of bool, shape (F,), optional
+        Frames of each of the measurements in which the references saw nothing move.
 
     Raises
     ------
@@ -92,7 +98,8 @@ def calibrate(
     options = options or Options()
     needed = COUNTS[0] ** 2 if options.layout is None else len(place(options.layout, generator))
     readings = check_measurements(measurements, needed)
-    posed, effects = _surveyed([with_pose(m) for m in measurements], generator, options)
+    scan = _surveyed(measurements, generator, options, nominal, progress, steady)
+    posed, options = list(scan.measurements), replace(options, accuracy=scan.accuracy)
     thin = thin_frames(posed)
     folds = fold_of_frames([m.position for m in thin])
     drawn = None if nominal is None else DrawnBoard(nominal, thin)
@@ -117,25 +124,40 @@ def calibrate(
         emitters=emitters,
         frequencies_hz=frequencies_hz,
         flux_error_t=held_out.flux_error_t,
-        effects=effects,
+        effects=scan.corrections,
     )
     calibration = Calibration(
         model, fit, held_out, None if nominal is None else residuals(posed, nominal).rmse_t,
         selection.candidates, chosen, chosen.layout, damping, readings, residuals(posed, model),
+        scan,
     )  # fmt: skip
     return replace(calibration, model=replace(model, provenance=provenance(calibration, names)))
 
 
 def _surveyed(
-    posed: list[Measurements], generator: Generator, options: Options
-) -> tuple[list[Measurements], tuple[EffectRecord, ...]]:
-    """Return the measurements with estimated sensors, and the records of the estimates."""
+    measurements: Sequence[Measurements],
+    generator: Generator,
+    options: Options,
+    nominal: FieldModel | None,
+    progress: Progress | None,
+    steady: Sequence[NDArray[np.bool_]] | None,
+) -> Scan:
+    """Return the measurements as sound sensors would have given them, and what was not."""
     if not options.estimate:
-        return posed, ()
-    surveyor = SensorSurveyor(posed, options.estimate, generator, options.accuracy)
-    surveys = surveyor.fit()
-    records = tuple(record for survey in surveys.values() for record in survey.records)
-    return [surveys[m.body].apply(m) for m in posed], records
+        return Scan(tuple(with_pose(m) for m in measurements), options.accuracy)
+    surveyor = SensorSurveyor(
+        measurements, options.estimate, generator, options.accuracy, nominal, progress, steady
+    )
+    result = surveyor.fit()
+    sound = [m.frames(kept) for m, kept in zip(measurements, result.kept, strict=True)]
+    root = np.sqrt(result.optical.interpolated)
+    accuracy = replace(
+        options.accuracy,
+        optical_position_m=float(root * result.optical.position_m),
+        optical_rotation_rad=float(root * result.optical.rotation_rad),
+    )
+    corrected = tuple(with_pose(result.survey(m.body).apply(m)) for m in sound)
+    return Scan(corrected, accuracy, corrections(result), tellings(result, measurements), result)
 
 
 def _fitter(

@@ -7,7 +7,10 @@ import numpy as np
 from anser_ros.calibration.factors import as_real
 from anser_ros.calibration.held_out import rms
 from anser_ros.calibration.moments import MomentFit
+from anser_ros.calibration.optical_noise import OpticalNoise
 from anser_ros.calibration.result import Calibration
+from anser_ros.field.model import EffectRecord
+from anser_ros.field.plain_data import plain
 
 OUTLIER_WEIGHT = 0.25
 """A reading whose weight fell below this counts as an outlier: its residual is twice as large as
@@ -20,7 +23,7 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
     Errors are root mean squares of the complex residual's magnitude at the measured poses; the
     normalised ones are divided by the range of the measured in-phase fluxes (article, equation 8).
     """
-    held_out = calibration.held_out
+    held_out, scan = calibration.held_out, calibration.scan
     inside, span = calibration.residuals, calibration.residuals.span_t
     each = zip(calibration.model.emitters, inside.each_t, held_out.error.T, strict=True)
     nominal = calibration.nominal_rmse_t
@@ -64,6 +67,29 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
             ],
         },
         'nominal_flux_rmse_t': nominal,
+        'effects': [_effect(record) for record in (*scan.corrections, *scan.tellings)],
+        'optical_noise': None if scan.survey is None else _optical(scan.survey.optical),
+    }
+
+
+def _effect(record: EffectRecord) -> dict[str, Any]:
+    return {
+        'name': record.name,
+        'parameters': plain(dict(record.parameters)),
+        'uncertainty': plain(dict(record.uncertainty)),
+        'evidence': plain(dict(record.evidence)),
+    }
+
+
+def _optical(noise: OpticalNoise) -> dict[str, Any]:
+    relative = noise.relative_uncertainty
+    return {
+        'position_m': noise.position_m,
+        'rotation_rad': noise.rotation_rad,
+        'uncertainty': {
+            'position_m': relative * noise.position_m,
+            'rotation_rad': relative * noise.rotation_rad,
+        },
     }
 
 

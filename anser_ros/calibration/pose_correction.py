@@ -69,14 +69,35 @@ def pose_terms(
         points.reshape(-1, 3), axes.reshape(-1, 3), lengths,
         dipoles.positions, dipoles.directions, moments,
     )  # fmt: skip
-    shape = (frames, sensors, 2 * moments.shape[1])
-    place = as_real(by_place).reshape(frames, sensors, 3, -1).transpose(0, 1, 3, 2)
-    axis = as_real(by_axis).reshape(frames, sensors, 3, -1).transpose(0, 1, 3, 2)
-    arms = (points - measurements.position[:, None, :])[:, :, None, :]
+    shape = (frames, sensors, 3, moments.shape[1])
+    slope = pose_slopes(
+        points, axes, measurements.position, by_place.reshape(shape), by_axis.reshape(shape)
+    )
+    modelled = as_real(flux).reshape(frames, sensors, -1)
+    residual = (as_real(measurements.flux) - modelled).astype(np.float64)
+    return PoseTerms(residual, slope)
+
+
+def pose_slopes(
+    points: Array, axes: Array, position: Array, by_place: ComplexArray, by_axis: ComplexArray
+) -> Array:
+    """Return the derivatives of fluxes by the body's pose, shape (F, S, 2K, 6).
+
+    Parameters
+    ----------
+    points, axes : ndarray, shape (F, S, 3)
+        Sensor centres (m) and unit axes, frame fg.
+    position : ndarray, shape (F, 3)
+        Origin of the body, m, frame fg.
+    by_place, by_axis : ndarray, shape (F, S, 3, K), complex
+        Derivatives by the sensors' centres (T/m) and axes (T).
+    """
+    place = as_real(by_place).transpose(0, 1, 3, 2)
+    axis = as_real(by_axis).transpose(0, 1, 3, 2)
+    arms = (points - position[:, None, :])[:, :, None, :]
     turn = np.cross(np.broadcast_to(arms, place.shape), place)
     turn += np.cross(np.broadcast_to(axes[:, :, None, :], axis.shape), axis)
-    residual = (as_real(measurements.flux) - as_real(flux).reshape(shape)).astype(np.float64)
-    return PoseTerms(residual, np.concatenate([place, turn], axis=3))
+    return np.concatenate([place, turn], axis=3)
 
 
 def most_probable_step(

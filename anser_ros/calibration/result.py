@@ -13,8 +13,10 @@ from anser_ros.calibration.layout_score import LayoutCandidate
 from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.moments import MomentFit
 from anser_ros.calibration.readings import usable_readings
+from anser_ros.calibration.sensor_survey import SurveyResult
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import FieldModel
+from anser_ros.field.model import EffectRecord, FieldModel
+from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 
@@ -52,6 +54,31 @@ def residuals(measurements: Sequence[Measurements], model: FieldModel) -> Residu
 
 
 @dataclass(frozen=True)
+class Scan:
+    """A scan as sound sensors and a sound clock would have given it.
+
+    Attributes
+    ----------
+    measurements : tuple of Measurements
+        The frames that are used, one a body and session.
+    accuracy : Accuracy
+        Noise and jitter, estimated where they were.
+    corrections : tuple of EffectRecord
+        What was wrong with sensors and clock; the model corrects it.
+    tellings : tuple of EffectRecord
+        What the scan contained besides.
+    survey : SurveyResult or None
+        How that was found; None where nothing was estimated.
+    """
+
+    measurements: tuple[Measurements, ...]
+    accuracy: Accuracy
+    corrections: tuple[EffectRecord, ...] = ()
+    tellings: tuple[EffectRecord, ...] = ()
+    survey: SurveyResult | None = None
+
+
+@dataclass(frozen=True)
 class Calibration:
     """A field model with the figures of its fit and of its choice.
 
@@ -78,6 +105,8 @@ class Calibration:
         Number of readings of each emitter.
     residuals : Residuals
         Residuals of the model on all readings that it was fitted to.
+    scan : Scan
+        The scan with what was wrong with it.
     """
 
     model: FieldModel
@@ -90,6 +119,7 @@ class Calibration:
     damping: float
     n_measurements: int
     residuals: Residuals
+    scan: Scan
 
     @property
     def better_than_nominal(self) -> bool:

@@ -1,8 +1,9 @@
-"""Parameters of the sensors of all bodies in one vector: gains, axes and lever arms.
+"""What a scan's sensors, optics and clocks may be off by: parameters, and what they do to fluxes.
 
-A body with S sensors has, in this order and as far as they are estimated, two numbers a sensor for
-its gain (real part minus one, imaginary part), two a sensor for the tilt of its axis (rad, along
-two directions across the surveyed axis), and three for its lever arm (m, in the body's frame).
+A body's S sensors have a complex gain each (real part minus one, imaginary part), a tilt of the
+axis (rad, along two directions across the surveyed axis) and a place (m, in the body's frame);
+the body has a lever arm (m). The optical clock, which all bodies share, has an offset (s) in the
+middle of the scan and a rate (s a second).
 """
 
 from collections.abc import Sequence
@@ -12,21 +13,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.measurements import Measurements
-from anser_ros.field.model import EffectRecord
+from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.tangent import tangents, tilted
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-KINDS = ('gains', 'axes', 'lever_arm')
-PRIOR = {'gains': 0.05, 'axes': 0.05, 'lever_arm': 5e-3}
-"""Standard deviation of each parameter before any data: relative, rad, m. The values are wide for
-sensors that were surveyed at all; they only hold what the data do not determine."""
+KINDS = ('gains', 'axes', 'places', 'lever_arm', 'time_offset', 'clock_rate')
+POPULATIONS = ('gains', 'axes', 'places')
+"""Kinds that every sensor has a value of: one population with one spread."""
+CLOCKS = ('time_offset', 'clock_rate')
+"""Kinds that all bodies share."""
+EACH = {'gains': 2, 'axes': 2, 'places': 3}
+"""Parameters a sensor."""
+PRIOR = {
+    'gains': 0.05, 'axes': 0.05, 'places': 5e-3, 'lever_arm': 5e-3,
+    'time_offset': 0.1, 'clock_rate': 3e-3,
+}  # fmt: skip
+"""Standard deviation of each parameter before any data: relative, rad, m, m, s, s a second. They
+are wide for a tool that was built and surveyed at all, and only hold what the data leave open."""
+BY_RULE = 1e-9
+"""Standard deviation, relative or m, of what a rule sets: far below any spread, and above what
+rounding makes of it."""
+VELOCITY_STEP_S = 0.02
+"""Half the time, s, over which a body's velocity is taken: much shorter multiplies the optical
+jitter, much longer smooths away how a hand accelerates."""
 
 
 @dataclass(frozen=True)
-class BodySurvey:
-    """Estimated gains, axes and lever arm of the sensors of one body.
+class Survey:
+    """Estimated errors of the sensors of one body and of the optical clock.
 
     Attributes
     ----------
@@ -34,33 +51,73 @@ class BodySurvey:
         Factor of each sensor's fluxes.
     axis : ndarray, shape (S, 3)
         Unit axes in the body's frame.
-    offset : ndarray, shape (3,)
+    place : ndarray, shape (S, 3)
+        Shift of each sensor in the body's frame, m, without the lever arm.
+    lever_arm : ndarray, shape (3,)
         Shift of all sensors in the body's frame, m.
-    records : tuple of EffectRecord
-        The same estimates as corrections that a field model carries.
+    offset_s, rate : float
+        An optical stamp t counts as ``t (1 + rate) + offset_s``.
     """
 
     gain: ComplexArray
     axis: Array
-    offset: Array
-    records: tuple[EffectRecord, ...]
+    place: Array
+    lever_arm: Array
+    offset_s: float
+    rate: float
+
+    def track(self, track: PoseTrack) -> PoseTrack:
+        """Return an optical track on the clock of the fluxes."""
+        return replace(track, time=track.time * (1.0 + self.rate) + self.offset_s)
 
     def apply(self, measurements: Measurements) -> Measurements:
-        """Return the measurements with their gains, axes and positions corrected."""
+        """Return the measurements as sound sensors and a sound clock would have given them."""
         sensors = measurements.sensors
-        return replace(
+        out = replace(
             measurements,
             flux=measurements.flux / self.gain[:, None],
-            sensors=sensors.with_geometry(sensors.position + self.offset, self.axis),
+            sensors=sensors.with_geometry(
+                sensors.position + self.place + self.lever_arm, self.axis
+            ),
         )
+        if measurements.track is None or (self.offset_s == 0.0 and self.rate == 0.0):
+            return out
+        track = self.track(measurements.track)
+        position, rotation, seen = track.at(measurements.time)
+        # Frames without a pose of their own, such as left out ones, stay without.
+        seen &= measurements.has_pose
+        return replace(out, track=track, position=position, rotation=rotation, has_pose=seen)
 
 
-def tangents(axes: Array) -> Array:
-    """Return two unit vectors across each unit axis, shape (S, 2, 3), for axes of shape (S, 3)."""
-    least = np.eye(3)[np.argmin(np.abs(axes), axis=1)]
-    first = np.cross(axes, least)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(axes, first)], axis=1)
+def is_followed(measurements: Measurements) -> bool:
+    """Whether the optical tracker followed the body's movement, so that clocks can be told.
+
+    A recording of a pose at each point where the tool rested says nothing of its clock.
+    """
+    track = measurements.track
+    if track is None or track.time.size < 2:
+        return False
+    return float(np.median(np.diff(track.time))) <= LONGEST_GAP_S
+
+
+def velocity_of(measurements: Measurements) -> Array:
+    """Return a body's velocity (m/s) and angular velocity (rad/s), frame fg, shape (F, 6).
+
+    It is zero without a track, from which it is taken.
+    """
+    out, track = np.zeros((len(measurements.time), 6)), measurements.track
+    if track is None or track.time.size < 2:
+        return out
+    low = np.clip(measurements.time - VELOCITY_STEP_S, track.time[0], track.time[-1])
+    high = np.clip(measurements.time + VELOCITY_STEP_S, track.time[0], track.time[-1])
+    before, turned, _ = track.at(low, np.inf)
+    after, turned_on, _ = track.at(high, np.inf)
+    turn = turned_on @ turned.transpose(0, 2, 1)
+    span = np.maximum(high - low, 1e-9)[:, None]
+    out[:, :3] = (after - before) / span
+    parts = [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0]]
+    out[:, 3:] = 0.5 * np.stack([*parts, turn[:, 1, 0] - turn[:, 0, 1]], axis=1) / span
+    return out
 
 
 class SensorParameters:
@@ -75,94 +132,85 @@ class SensorParameters:
     """
 
     def __init__(self, measurements: Sequence[Measurements], kinds: Sequence[str]) -> None:
-        self.kinds = tuple(kinds)
+        told = set(kinds) if all(is_followed(m) for m in measurements) else {*kinds} - {*CLOCKS}
+        self.kinds = tuple(kind for kind in KINDS if kind in told)
         self.bodies = list(dict.fromkeys(m.body for m in measurements))
         tables = {m.body: m.sensors for m in measurements}
         self.tables: list[SensorTable] = [tables[body] for body in self.bodies]
-        self.starts = np.cumsum([0] + [self._size(len(table)) for table in self.tables])
+        times = [m.time for m in measurements if len(m.time)]
+        self.middle_s = float(np.mean(np.concatenate(times))) if times else 0.0
+        self.slices: dict[tuple[str, str], slice] = {}
+        self._size = 0
+        for body, table in zip(self.bodies, self.tables, strict=True):
+            for kind in self.kinds:
+                if kind not in CLOCKS:
+                    self._add(kind, body, EACH[kind] * len(table) if kind in EACH else 3)
+        for kind in self.kinds:
+            if kind in CLOCKS:
+                self._add(kind, '', 1)
+
+    def _add(self, kind: str, body: str, size: int) -> None:
+        self.slices[kind, body] = slice(self._size, self._size + size)
+        self._size += size
 
     def __len__(self) -> int:
-        return int(self.starts[-1])
+        return self._size
 
-    def _size(self, sensors: int) -> int:
-        gains, axes, arm = (kind in self.kinds for kind in KINDS)
-        return sensors * 2 * (gains + axes) + 3 * arm
+    def rows(self, kind: str) -> NDArray[np.int64]:
+        """Indices of all parameters of a kind."""
+        found = [np.arange(s.start, s.stop) for (own, _), s in self.slices.items() if own == kind]
+        return np.concatenate(found) if found else np.zeros(0, dtype=np.int64)
 
-    @property
-    def prior_sigma(self) -> Array:
-        """Standard deviation of every parameter before any data, shape (Q,)."""
-        sigma = []
-        for table in self.tables:
-            for kind in KINDS:
-                if kind in self.kinds:
-                    sigma += [PRIOR[kind]] * (3 if kind == 'lever_arm' else 2 * len(table))
-        return np.array(sigma)
+    def groups(self) -> list[tuple[str, NDArray[np.int64]]]:
+        """Parameters that share a prior's width: a kind's, with gain and phase apart."""
+        out = []
+        for kind in self.kinds:
+            rows = self.rows(kind)
+            out += [(kind, rows[0::2]), (kind, rows[1::2])] if kind == 'gains' else [(kind, rows)]
+        return out
 
-    @property
-    def gain_rows(self) -> NDArray[np.int64]:
-        """Indices of all gains' real and imaginary parts by turns; they must be estimated."""
-        return np.concatenate(
-            [
-                start + np.arange(2 * len(table))
-                for start, table in zip(self.starts[:-1], self.tables, strict=True)
-            ]
-        )
+    def rule(self) -> Array:
+        """Return the information (Q, Q) of the rule for what no data tell.
 
-    def survey(self, body: str, values: Array, covariance: Array) -> BodySurvey:
-        """Return the survey of a body's sensors.
-
-        Parameters
-        ----------
-        body : str
-            Name of the body.
-        values : ndarray, shape (Q,)
-            All parameters.
-        covariance : ndarray, shape (Q, Q)
-            Their covariance, for the uncertainties in the records.
+        The mean of all gains is one, and the mean of a body's places is zero.
         """
-        index = self.bodies.index(body)
-        table, part = self.tables[index], values[self.starts[index] : self.starts[index + 1]]
-        count = len(table)
-        gain, axis, offset = np.ones(count, complex), table.axis, np.zeros(3)
-        if 'gains' in self.kinds:
-            pairs, part = part[: 2 * count].reshape(count, 2), part[2 * count :]
-            gain = 1.0 + pairs[:, 0] + 1j * pairs[:, 1]
-        if 'axes' in self.kinds:
-            pairs, part = part[: 2 * count].reshape(count, 2), part[2 * count :]
-            axis = axis + np.einsum('st,stj->sj', pairs, tangents(axis))
-            axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
-        if 'lever_arm' in self.kinds:
-            offset = part
-        sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))[self.starts[index] :]
-        return BodySurvey(gain, axis, offset, self._records(index, gain, axis, offset, sigma))
+        out = np.zeros((len(self), len(self)))
+        groups = [rows for kind, rows in self.groups() if kind == 'gains']
+        for (kind, _), own in self.slices.items():
+            if kind == 'places':
+                groups += [np.arange(own.start + j, own.stop, 3) for j in range(3)]
+        for rows in groups:
+            out[np.ix_(rows, rows)] += 1.0 / (rows.size * BY_RULE**2)
+        return out
 
-    def _records(
-        self, index: int, gain: ComplexArray, axis: Array, offset: Array, sigma: Array
-    ) -> tuple[EffectRecord, ...]:
-        table, records = self.tables[index], []
-        count, start = len(table), 0
-        if 'gains' in self.kinds:
-            for row, channel in enumerate(table.channel.tolist()):
-                records.append(_gain_record(channel, gain[row], sigma[2 * row : 2 * row + 2]))
-            start += 2 * count
-        if 'axes' in self.kinds:
-            for row, channel in enumerate(table.channel.tolist()):
-                tilt_sigma = sigma[start + 2 * row : start + 2 * row + 2]
-                records.append(_axis_record(channel, table.axis[row], axis[row], tilt_sigma))
-            start += 2 * count
-        if 'lever_arm' in self.kinds:
-            records.append(
-                EffectRecord(
-                    'lever_arm',
-                    {'offset_m': offset.tolist(), 'body': self.bodies[index]},
-                    {'offset_m': sigma[start : start + 3].tolist()},
-                )
-            )
-        return tuple(records)
+    def of(self, kind: str, body: str, values: Array) -> Array | None:
+        """A kind's parameters of a body, a row a sensor for a population; None where fixed."""
+        if (kind, body) not in self.slices:
+            return None
+        part = values[self.slices[kind, body]]
+        return part.reshape(-1, EACH[kind]) if kind in EACH else part
+
+    def survey(self, body: str, values: Array) -> Survey:
+        """Return the survey of a body's sensors for all parameters, shape (Q,)."""
+        table = self.tables[self.bodies.index(body)]
+        gain, axis = np.ones(len(table), complex), table.axis
+        place, lever, clock = np.zeros((len(table), 3)), np.zeros(3), [0.0, 0.0]
+        if (pairs := self.of('gains', body, values)) is not None:
+            gain = 1.0 + pairs[:, 0] + 1j * pairs[:, 1]
+        if (pairs := self.of('axes', body, values)) is not None:
+            axis = tilted(axis, pairs)
+        if (part := self.of('places', body, values)) is not None:
+            place = part
+        if (part := self.of('lever_arm', body, values)) is not None:
+            lever = part
+        for index, kind in enumerate(CLOCKS):
+            if (part := self.of(kind, '', values)) is not None:
+                clock[index] = float(part[0])
+        return Survey(gain, axis, place, lever, clock[0] - clock[1] * self.middle_s, clock[1])
 
     def derivatives(
         self, part: Measurements, modelled: ComplexArray, by_place: ComplexArray,
-        by_axis: ComplexArray,
+        by_axis: ComplexArray, velocity: Array,
     ) -> ComplexArray:  # fmt: skip
         """Return the derivatives of fluxes by all parameters.
 
@@ -174,6 +222,8 @@ class SensorParameters:
             Modelled fluxes, T.
         by_place, by_axis : ndarray, shape (F, S, 3, K), complex
             Their derivatives by the sensors' positions (T/m) and axes (T), frame fg.
+        velocity : ndarray, shape (F, 6)
+            Of the body, m/s and rad/s, frame fg.
 
         Returns
         -------
@@ -182,69 +232,32 @@ class SensorParameters:
         """
         frames, sensors, emitters = modelled.shape
         out = np.zeros((frames, sensors, len(self), emitters), complex)
-        index = self.bodies.index(part.body)
-        start = int(self.starts[index])
-        if 'gains' in self.kinds:
-            for s in range(sensors):
-                out[:, s, start + 2 * s] = modelled[:, s]
-                out[:, s, start + 2 * s + 1] = 1j * modelled[:, s]
-            start += 2 * sensors
-        if 'axes' in self.kinds:
-            across = np.einsum('fij,stj->fsti', part.rotation, tangents(self.tables[index].axis))
+        each = np.arange(sensors)
+        if (own := self.slices.get(('gains', part.body))) is not None:
+            out[:, each, own.start + 2 * each] = modelled
+            out[:, each, own.start + 2 * each + 1] = 1j * modelled
+        if (own := self.slices.get(('axes', part.body))) is not None:
+            surveyed = self.tables[self.bodies.index(part.body)].axis
+            across = np.einsum('fij,stj->fsti', part.rotation, tangents(surveyed))
             tilt = np.einsum('fsik,fsti->fstk', by_axis, across, optimize=True)
-            for s in range(sensors):
-                out[:, s, start + 2 * s : start + 2 * s + 2] = tilt[:, s]
-            start += 2 * sensors
-        if 'lever_arm' in self.kinds:
-            out[:, :, start : start + 3] = np.einsum('fsik,fij->fsjk', by_place, part.rotation)
+            for t in range(2):
+                out[:, each, own.start + 2 * each + t] = tilt[:, :, t]
+        along = np.einsum('fsik,fij->fsjk', by_place, part.rotation, optimize=True)
+        if (own := self.slices.get(('places', part.body))) is not None:
+            for j in range(3):
+                out[:, each, own.start + 3 * each + j] = along[:, :, j]
+        if (own := self.slices.get(('lever_arm', part.body))) is not None:
+            out[:, :, own] = along
+        if not any(kind in self.kinds for kind in CLOCKS):
+            return out
+        points, axes = part.placed()
+        arms = points - part.position[:, None, :]
+        moving = velocity[:, None, :3] + np.cross(velocity[:, None, 3:], arms)
+        rate = np.einsum('fsik,fsi->fsk', by_place, moving)
+        rate += np.einsum('fsik,fsi->fsk', by_axis, np.cross(velocity[:, None, 3:], axes))
+        if (own := self.slices.get(('time_offset', ''))) is not None:
+            out[:, :, own.start] = -rate
+        if (own := self.slices.get(('clock_rate', ''))) is not None:
+            since = part.time - self.middle_s
+            out[:, :, own.start] = -rate * since[:, None, None]
         return out
-
-    def separable_from_poses(self) -> Array:
-        """Return an orthonormal basis (Q, Q') of what no movement of a body's pose resembles.
-
-        A lever arm shifts all sensors of a body alike, and some tilts of all axes together are a
-        rotation of the body; the basis spans everything else.
-        """
-        like_a_pose = []
-        for table, end in zip(self.tables, self.starts[1:], strict=True):
-            arm = 3 if 'lever_arm' in self.kinds else 0
-            if arm:
-                like_a_pose += list(np.eye(len(self))[end - 3 : end])
-            if 'axes' in self.kinds:
-                for rotation in np.eye(3):
-                    row = np.zeros(len(self))
-                    change = np.cross(rotation, table.axis)
-                    first = end - arm - 2 * len(table)
-                    tilt = np.einsum('stj,sj->st', tangents(table.axis), change)
-                    row[first : end - arm] = tilt.ravel()
-                    like_a_pose.append(row)
-        if not like_a_pose:
-            return np.eye(len(self))
-        u, s, _ = np.linalg.svd(np.stack(like_a_pose, axis=1), full_matrices=True)
-        return np.asarray(u[:, int((s > 1e-9 * s[0]).sum()) :])
-
-
-def _gain_record(channel: int, gain: complex, sigma: Array) -> EffectRecord:
-    return EffectRecord(
-        'sensor_gain',
-        {
-            'channel': channel,
-            'gain': float(abs(gain)),
-            'phase_deg': float(np.degrees(np.angle(gain))),
-        },
-        {'gain': float(sigma[0]), 'phase_deg': float(np.degrees(sigma[1] / abs(gain)))},
-    )
-
-
-def _axis_record(channel: int, surveyed: Array, axis: Array, sigma: Array) -> EffectRecord:
-    tilt = np.arctan2(np.linalg.norm(np.cross(surveyed, axis)), float(surveyed @ axis))
-    return EffectRecord(
-        'sensor_axis',
-        {
-            'channel': channel,
-            'tilt_deg': float(np.degrees(tilt)),
-            'axis': axis.tolist(),
-            'surveyed_axis': surveyed.tolist(),
-        },
-        {'tilt_deg': float(np.degrees(np.linalg.norm(sigma)))},
-    )

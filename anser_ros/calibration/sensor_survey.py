@@ -1,60 +1,157 @@
-"""Gains, axes and lever arms of sensors, estimated together with the field.
+"""What is wrong with a scan's own sensors, clock and optics, found together with the field.
 
-The first rounds use the measured poses and eliminate the dipoles' moments: the change of the
-fluxes by a sensor parameter is compared with the residual only outside the span of the dipoles'
-basis (variable projection, as for the dipoles' positions). A sensor thus gets no correction that a
-change of the field explains as well, and what the data cannot separate from the field, such as a
-gain common to all sensors, stays as surveyed. Further rounds estimate gains and axes with the
-poses marginalised: the sensors of one body share the jitter of its pose, which separates it from
-their parameters. A shift or rotation common to all sensors of a body resembles a pose; it is left
-as the first rounds found it.
+Every step solves for the field and all parameters at once, with the poses marginalised
+(`joint_system`), and then weighs the parameters with the widths of their populations
+(`population`). The noise of the fluxes and the jitter of the poses are estimated from what is
+left, and frames that no step explains are left out (`disturbances`).
+
+What the data cannot determine follows a rule. A gain that all sensors share is the emitters': the
+mean of the gains is one. A shift that all sensors of a body share is its lever arm: the median of
+their places is zero. The frame is the optical tracker's, and so is that of the body: a turn that
+all axes share stands in their tilts. Where a scan does not turn the tool, a shift of all sensors
+is one of the field, which the drawing holds.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.calibration.dipole_sites import DipoleSites
+from anser_ros.calibration.dipole_sites import basis_rows
+from anser_ros.calibration.disturbances import glitches, outside, spans_of, unsteady_tool
 from anser_ros.calibration.factors import ComplexArray, as_real
+from anser_ros.calibration.joint_system import FieldModes, JointSystem, Linear, linearise
 from anser_ros.calibration.layout_fit import RICH_DAMPING, rich_layout
 from anser_ros.calibration.layouts import Generator, place
-from anser_ros.calibration.moments import MomentFitter
-from anser_ros.calibration.pose_correction import pose_precision, pose_terms
-from anser_ros.calibration.pose_whitening import PoseWhitener
-from anser_ros.calibration.readings import frame_blocks, with_pose
-from anser_ros.calibration.sensor_parameters import BodySurvey, SensorParameters
+from anser_ros.calibration.moments import MomentFitter, Progress
+from anser_ros.calibration.optical_noise import OpticalNoise, estimate_noise, interpolation_share
+from anser_ros.calibration.population import Likelihood, Population, Posterior
+from anser_ros.calibration.pose_correction import (
+    SMALLEST_NOISE_T,
+    PoseTerms,
+    most_probable_step,
+    outlier_weights,
+)
+from anser_ros.calibration.prior import DrawnBoard
+from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
+from anser_ros.calibration.sensor_parameters import SensorParameters, Survey
 from anser_ros.field.measurements import Measurements
-from anser_ros.physics.dipole import flux_basis, flux_jacobian
+from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 
-PLAIN_ROUNDS = 3
-"""Gauss-Newton steps at the measured poses. The problem is nearly linear, so that the steps after
-the first only follow the change of the weights and of the field."""
-MARGINAL_ROUNDS = 4
-"""Largest number of further steps with marginalised poses. They end earlier once a step is smaller
-than `SMALL_STEP` standard deviations of every parameter."""
+COARSE_ROWS = 5000
+"""Readings of the first steps, which only bring field and parameters near where they belong."""
+MOST_ROWS = 22_000
+"""Readings of the last steps; more are thinned. Their time grows in proportion."""
+COARSE_STEPS = 6
+"""First steps at most."""
+FINE_STEPS = 3
+"""Last steps at most."""
 SMALL_STEP = 0.1
 """Step, in standard deviations, below which another one is not worth its time."""
-SURVEY_ROWS = 2048
-"""Readings in memory at a time: fewer than elsewhere, since each has a row for every parameter."""
+LOOSE = OpticalNoise(1e-3, 1e-2)
+"""Jitter of the first step, m and rad: poses are off by that much while the clock's offset and the
+lever arm are unknown."""
+FREE_POSE = np.repeat([1.0 / 0.02**2, 1.0 / 0.1**2], 3)
+"""Precision of a pose that is to follow the fluxes, 1/m^2 and 1/rad^2: a prior of 2 cm and 0.1 rad
+holds only what they do not tell."""
+FIELD_WIDTH = 0.3
+"""Prior width of the field's deviation from the drawing, relative to the flux, to begin with."""
+LEAST_FIELD_WIDTH = 1e-3
+"""Least such width: no board is made more exactly than that."""
+FIT_NOISE = 10.0
+"""Noise of the first step as a multiple of the fluxes' own."""
+
+
+@dataclass
+class _Tool:
+    """One body's frames with a pose, with their present weights.
+
+    Attributes
+    ----------
+    measured : Measurements
+        As recorded.
+    known : ndarray of bool, shape (F,)
+        Frames that nothing speaks against beforehand.
+    steady : ndarray of bool, shape (F,)
+        Those of them in which the tool saw nothing move either.
+    weights : ndarray, shape (F, S)
+        Of the readings, in [0, 1].
+    """
+
+    measured: Measurements
+    known: NDArray[np.bool_]
+    steady: NDArray[np.bool_]
+    weights: Array
+
+    @property
+    def kept(self) -> NDArray[np.bool_]:
+        return np.asarray((self.weights > 0.0).any(axis=1))
+
+
+@dataclass(frozen=True)
+class SurveyResult:
+    """What a scan says of its own sensors, clock and optics.
+
+    Attributes
+    ----------
+    parameters : SensorParameters
+        What was asked for.
+    posterior : Posterior
+        Values, prior widths and covariance of all parameters.
+    left_out : tuple of str
+        Kinds that the data do not speak for.
+    evidence : dict of str to float
+        Gain of the log probability by each other kind.
+    noise_t : float
+        Noise of a phasor component, with what the field's model misses, T.
+    optical : OpticalNoise
+        Jitter of the optical poses.
+    alone : dict of str to ndarray of int
+        Parameters of channels that stand outside their population.
+    kept, steady : tuple of ndarray of bool
+        Frames of each of the measurements whose pose and field are sound, and those in which
+        nothing moved.
+    reflected : float
+        Share of the frames whose pose is not where the fluxes put it.
+    """
+
+    parameters: SensorParameters
+    posterior: Posterior
+    left_out: tuple[str, ...]
+    evidence: dict[str, float]
+    noise_t: float
+    optical: OpticalNoise
+    alone: dict[str, NDArray[np.int64]]
+    kept: tuple[NDArray[np.bool_], ...]
+    steady: tuple[NDArray[np.bool_], ...]
+    reflected: float
+
+    def survey(self, body: str) -> Survey:
+        """The survey of a body's sensors."""
+        return self.parameters.survey(body, self.posterior.values)
 
 
 class SensorSurveyor:
-    """Estimates the sensors' parameters; sessions with the same body share them.
+    """Estimates the parameters; sessions with the same body share them.
 
     Parameters
     ----------
     measurements : sequence of Measurements
-        Tool measurements with poses, one a body and session.
+        Tool measurements, one a body and session; frames without a pose are left as they are.
     kinds : sequence of str
         What is estimated, of `sensor_parameters.KINDS`.
     generator : Generator
         Places of the coils, for the layer of dipoles that represents the field.
     accuracy : Accuracy
-        Flux noise and pose jitter.
+        Flux noise and pose jitter to begin with.
+    nominal : FieldModel, optional
+        The drawn board.
+    progress : callable, optional
+        Called with the name of the stage and its finished fraction.
     """
 
     def __init__(
@@ -63,134 +160,216 @@ class SensorSurveyor:
         kinds: Sequence[str],
         generator: Generator,
         accuracy: Accuracy,
+        nominal: FieldModel | None = None,
+        progress: Progress | None = None,
+        steady: Sequence[NDArray[np.bool_]] | None = None,
     ) -> None:
         self.measured = list(measurements)
-        self.accuracy = accuracy
-        self.dipoles: DipoleSites = place(rich_layout(measurements, generator), generator)
+        every = [np.ones(len(m.time), dtype=bool) for m in measurements]
+        self.steady = every if steady is None else list(steady)
+        self.generator, self.accuracy, self.nominal = generator, accuracy, nominal
+        self.progress = progress
         self.parameters = SensorParameters(measurements, kinds)
-        size = len(self.parameters)
-        self.values, self.covariance = np.zeros(size), np.zeros((size, size))
+        self.population = Population(self.parameters)
+        self.values = np.zeros(len(self.parameters))
+        self.noise_t = FIT_NOISE * accuracy.flux_noise_t
+        self.optical = LOOSE
+        self.field_width = FIELD_WIDTH
 
-    def survey(self, body: str) -> BodySurvey:
-        """Return the survey of a body's sensors by the present estimate."""
-        return self.parameters.survey(body, self.values, self.covariance)
+    def survey(self, body: str) -> Survey:
+        """The survey of a body's sensors by the present estimate."""
+        return self.parameters.survey(body, self.values)
 
-    def fit(self) -> dict[str, BodySurvey]:
-        """Alternate between field and sensors, and return the survey of every body."""
-        for _ in range(PLAIN_ROUNDS):
-            corrected, fitter = self._fitter()
-            # The pose correction only tells which readings are outliers. Corrected poses would
-            # already have absorbed the errors of the sensors.
-            moments, spectrum = fitter.solve(exact=False)
-            noise = fitter.correct(moments, spectrum.freedom(RICH_DAMPING))
-            weights = [state.weights for state in fitter.states]
-            self._step(corrected, moments, weights, noise, marginal=False)
-        free = self.parameters.separable_from_poses()
-        rest = np.eye(self.values.size) - free @ free.T
-        plain = rest @ self.covariance @ rest
-        for _ in range(MARGINAL_ROUNDS if free.size else 0):
-            corrected, fitter = self._fitter()
-            found = fitter.fit(3, exact=False)
-            step = self._step(corrected, found.moments, found.weights, found.noise_t, True)
-            if np.all(np.abs(step) <= SMALL_STEP * np.sqrt(np.diag(self.covariance))):
+    def fit(self) -> SurveyResult:
+        """Find field and parameters, first with few frames and then with all."""
+        total = COARSE_STEPS + 3 * FINE_STEPS
+        tools = self._tools(COARSE_ROWS)
+        self._start(tools)
+        for step in range(COARSE_STEPS):
+            self._tell(step / total)
+            moved = self._step(tools, inspect=step > 0)
+            if step > 2 and moved < 10.0 * SMALL_STEP:
                 break
-        self.covariance = free @ free.T @ self.covariance @ free @ free.T + plain
-        return {body: self.survey(body) for body in self.parameters.bodies}
-
-    def _fitter(self) -> tuple[list[Measurements], MomentFitter]:
-        surveys = [self.survey(m.body) for m in self.measured]
-        corrected = [with_pose(s.apply(m)) for s, m in zip(surveys, self.measured, strict=True)]
-        return corrected, MomentFitter(corrected, self.dipoles, RICH_DAMPING, self.accuracy)
-
-    def _step(
-        self,
-        corrected: Sequence[Measurements],
-        moments: ComplexArray,
-        weights: Sequence[Array],
-        noise_t: float,
-        marginal: bool,
-    ) -> Array:
-        """Take one Gauss-Newton step of the sensor parameters with the moments eliminated.
-
-        With marginalised poses, slopes and residuals are the parts that no pose explains, and
-        what resembles a pose stays. Otherwise the residual is mostly the jitter, which all
-        readings of a frame share: readings count as independent only up to the six parameters of
-        a pose, and the variance is larger by the same factor.
-        """
-        size, unknowns, parts = len(self.dipoles), self.values.size, 2 * moments.shape[1]
-        gram, mixed = np.zeros((size, size)), np.zeros((size, (unknowns + 1) * parts))
-        inner, power, count, frames = np.zeros((unknowns + 1, unknowns + 1)), 0.0, 0.0, 0
-        for m, weight in zip(corrected, weights, strict=True):
-            frames += len(m.time)
-            for block in frame_blocks(len(m.time), len(m.sensors), SURVEY_ROWS):
-                part = m.frames(block)
-                basis, slopes = self._rows(part, moments, weight[block], noise_t, marginal)
-                gram += basis.T @ basis
-                mixed += basis.T @ slopes.reshape(len(basis), -1)
-                columns = slopes.transpose(1, 0, 2).reshape(unknowns + 1, -1)
-                inner += columns @ columns.T
-                power, count = power + float((columns[-1] ** 2).sum()), count + columns.shape[1]
-        floor = RICH_DAMPING**2 * float(np.linalg.eigvalsh(gram)[-1])
-        inside = np.linalg.solve(gram + floor * np.eye(size), mixed)
-        span, inside = (t.reshape(size, unknowns + 1, parts) for t in (mixed, inside))
-        normal = inner - np.einsum('nup,nvp->uv', span, inside, optimize=True)
-        gradient = normal[:-1, -1]
-        variance = noise_t**2 if marginal else power / count * max(1.0, count / frames / 6.0)
-        return self._move(normal[:-1, :-1] / variance, gradient / variance, marginal)
-
-    def _move(self, normal: Array, gradient: Array, marginal: bool) -> Array:
-        precision = np.diag(1.0 / self.parameters.prior_sigma**2)
-        free = self.parameters.separable_from_poses() if marginal else np.eye(self.values.size)
-        inner = free.T @ (normal + precision) @ free
-        covariance = free @ np.linalg.inv(inner) @ free.T
-        step = covariance @ (gradient - precision @ self.values)
-        self.values, self.covariance = self.values + step, covariance
-        self._fix_common_gain()
-        return np.asarray(step)
-
-    def _fix_common_gain(self) -> None:
-        """Set the median gain to one: the emitters may have the gain common to all sensors."""
-        if 'gains' not in self.parameters.kinds:
-            return
-        rows = self.parameters.gain_rows
-        pairs = self.values[rows].reshape(-1, 2)
-        gain = 1.0 + pairs[:, 0] + 1j * pairs[:, 1]
-        gain = gain / (np.median(np.abs(gain)) * np.exp(1j * np.median(np.angle(gain))))
-        self.values[rows] = np.stack([gain.real - 1.0, gain.imag], axis=1).ravel()
-        common = np.zeros((self.values.size, 2))
-        common[rows[0::2], 0] = common[rows[1::2], 1] = 1.0 / np.sqrt(len(gain))
-        keep = np.eye(self.values.size) - common @ common.T
-        self.covariance = keep @ self.covariance @ keep
-
-    def _rows(
-        self,
-        part: Measurements,
-        moments: ComplexArray,
-        weights: Array,
-        noise_t: float,
-        marginal: bool,
-    ) -> tuple[Array, Array]:
-        """Return the basis (P, N), and slopes with the residual as the last one (P, Q + 1, 2K)."""
-        points, axes = part.placed()
-        frames, sensors = points.shape[:2]
-        lengths = np.tile(part.sensors.length, frames)
-        placed = (points.reshape(-1, 3), axes.reshape(-1, 3), lengths)
-        sites = (self.dipoles.positions, self.dipoles.directions)
-        flux, by_place, by_axis = flux_jacobian(*placed, *sites, moments)
-        shape = (frames, sensors, 3, moments.shape[1])
-        columns = self.parameters.derivatives(
-            part,
-            flux.reshape(frames, sensors, -1),
-            by_place.reshape(shape),
-            by_axis.reshape(shape),
+        tools = self._tools(MOST_ROWS)
+        for step in range(FINE_STEPS):
+            self._tell((COARSE_STEPS + 3 * step) / total)
+            # Metal is looked for once field and sensors fit: where neither is known yet, both look
+            # as if something moved, and what is left out is not learnt.
+            moved = self._step(tools, inspect=True, watch=step > 0)
+            if self.population.stand_alone(self.posterior):
+                continue
+            if moved < SMALL_STEP:
+                break
+        posterior, left_out, evidence = self.population.chosen(self.likelihood)
+        self.values = posterior.values
+        steady = tuple(
+            known & outside(m.time, spans_of(tool.measured.time, ~tool.steady))
+            for m, known, tool in zip(self.measured, self.steady, tools, strict=True)
         )
-        terms = pose_terms(part, self.dipoles, moments)
-        real = np.concatenate([as_real(columns), terms.residual[:, :, None, :]], axis=2)
-        root = np.sqrt(weights)
-        if marginal:
-            white = PoseWhitener(terms.slope, weights, noise_t, pose_precision(self.accuracy))
-            real = np.stack([white.left_over(real[:, :, q]) for q in range(real.shape[2])], axis=2)
-        else:
-            real = real * root[:, :, None, None]
-        basis = flux_basis(*placed, *sites) * root.reshape(-1, 1)
-        return basis, real.reshape(len(basis), real.shape[2], -1)
+        kept, reflected = self._all_frames(steady)
+        return SurveyResult(
+            self.parameters, posterior, left_out, evidence, self.noise_t, self.optical,
+            self.population.alone, kept, steady, reflected,
+        )  # fmt: skip
+
+    def _tell(self, share: float) -> None:
+        if self.progress is not None:
+            self.progress('sensors and clock', share)
+
+    def _tools(self, most_rows: int) -> list[_Tool]:
+        """The frames of a stage, thinned evenly; those without a pose or a reading are left."""
+        total = sum(m.flux.shape[0] * m.flux.shape[1] for m in self.measured)
+        step, out = max(1, -(-total // most_rows)), []
+        for whole, known in zip(self.measured, self.steady, strict=True):
+            rows = np.arange(0, len(whole.time), step)
+            rows = rows[np.asarray(whole.usable.any(axis=1))[rows]]
+            thin = with_pose(whole.frames(rows))
+            mask = np.asarray(known[rows], dtype=bool)
+            out.append(_Tool(thin, mask, mask, usable_weights(thin)))
+        return out
+
+    def _start(self, tools: Sequence[_Tool]) -> None:
+        """Set up the field's modes, and its first amplitudes as a plain fit has them."""
+        measured = [tool.measured for tool in tools]
+        sites = place(rich_layout(measured, self.generator), self.generator)
+        self.modes = FieldModes.of(measured, sites)
+        self.count = sum(int(m.usable.sum()) for m in measured)
+        moments, _ = MomentFitter(measured, sites, RICH_DAMPING, self.accuracy).solve(exact=False)
+        self.middle = np.zeros((self.modes.size.size, 2 * moments.shape[1]))
+        drawn = None
+        if self.nominal is not None:
+            drawn = DrawnBoard(self.nominal, measured).moments(sites)
+            self.middle = self._amplitudes(measured, drawn)
+        self.field = self._amplitudes(measured, moments if drawn is None else drawn)
+
+    def _amplitudes(self, measured: Sequence[Measurements], moments: ComplexArray) -> Array:
+        """Amplitudes (M, 2K) of the modes that make the flux of moments best."""
+        out, count = np.zeros((self.modes.size.size, 2 * moments.shape[1])), 0
+        for m in measured:
+            for block in frame_blocks(len(m.time), len(m.sensors)):
+                rows = basis_rows(m.frames(block), self.modes.sites)[m.usable[block].ravel()]
+                out += (rows @ self.modes.vectors).T @ (rows @ as_real(moments))
+                count += len(rows)
+        return out / max(count, 1)
+
+    def _corrected(self, tool: _Tool) -> Measurements:
+        """A tool's frames by the present estimate; those without a pose lose their weight."""
+        out = self.survey(tool.measured.body).apply(tool.measured)
+        lost: NDArray[np.bool_] = np.asarray(~np.isfinite(out.position).all(axis=1))
+        if lost.any():
+            tool.weights[lost] = 0.0
+            out = replace(
+                out,
+                position=np.where(lost[:, None], tool.measured.position, out.position),
+                rotation=np.where(lost[:, None, None], tool.measured.rotation, out.rotation),
+            )
+        return out
+
+    def _step(self, tools: Sequence[_Tool], inspect: bool, watch: bool = False) -> float:
+        """Take one step of field and parameters; return its size in standard deviations."""
+        linear = [linearise(self._corrected(tool), self.modes, self.field) for tool in tools]
+        if inspect:
+            self._inspect(tools, linear, watch)
+        system = JointSystem(self.parameters, self.modes, self.field.shape[1])
+        for tool, at in zip(tools, linear, strict=True):
+            share = interpolation_share(at.part)
+            system.add(at, tool.weights, self.noise_t, self.optical.jitter, share)
+        precision = 1.0 / (self.field_width * self.flux_rms * self.modes.size) ** 2
+        rest = system.eliminate(precision, self.middle - self.field)
+        # Errors of the field's model are alike in neighbouring frames: the scatter of whole
+        # stretches tells how much less the data say than independent readings would.
+        scatter = rest.scores.T @ rest.scores
+        size = np.sqrt(np.maximum(np.diag(rest.information), 1e-300))
+        told = np.trace(scatter / np.outer(size, size)) / max(len(size), 1)
+        self.inflation = max(1.0, float(told)) if inspect else 1.0
+        self.likelihood = Likelihood(
+            rest.information / self.inflation + self.parameters.rule(),
+            (rest.gradient + rest.information @ self.values) / self.inflation,
+            sum(float(tool.weights.sum()) for tool in tools)
+            * self.field.shape[1]
+            / self.inflation,
+        )
+        self.posterior = self.population.fit(self.likelihood)
+        step = self.posterior.values - self.values
+        change = rest.field_step(step, self.modes.size.size)
+        self.values, self.field = self.posterior.values, self.field + change
+        self._learn_field_width(rest.field_variance)
+        sigma = np.sqrt(np.maximum(np.diag(self.posterior.covariance), 1e-300))
+        return float(np.abs(step / sigma).max(initial=0.0))
+
+    def _learn_field_width(self, variance: Array) -> None:
+        """Set the field's prior width to what makes its amplitudes most probable."""
+        scale = (self.flux_rms * self.modes.size)[:, None]
+        power = float((((self.field - self.middle) / scale) ** 2).sum())
+        told = self.field.size - float((variance / (self.field_width * scale) ** 2).sum())
+        self.field_width = max(float(np.sqrt(power / max(told, 1.0))), LEAST_FIELD_WIDTH)
+
+    @property
+    def flux_rms(self) -> float:
+        """Typical flux of a phasor component, T."""
+        power = [np.mean(np.abs(m.flux[m.usable]) ** 2) / 2.0 for m in self.measured]
+        return float(np.sqrt(np.mean(power)))
+
+    def _inspect(self, tools: Sequence[_Tool], linear: Sequence[Linear], watch: bool) -> None:
+        """Weigh readings and frames, and estimate noise and jitter from what is left."""
+        steps, variances, shares, kept, power, count = [], [], [], [], 0.0, 0.0
+        for tool, at in zip(tools, linear, strict=True):
+            usable, terms = usable_weights(tool.measured), PoseTerms(at.residual, at.slope)
+            zero = np.zeros((len(usable), 6))
+            step, left = most_probable_step(terms, usable, self.noise_t, FREE_POSE, zero)
+            size = (left**2).mean(axis=2)
+            share = interpolation_share(at.part)
+            seen = usable.any(axis=1)
+            bad = glitches(step / np.sqrt(share)[:, None], seen & tool.known)
+            frame_power = (size * usable).sum(axis=1) / np.maximum(usable.sum(axis=1), 1.0)
+            good = seen & tool.known & ~bad
+            moving = unsteady_tool(at.part.time, at.part.position, frame_power, good)
+            tool.steady = tool.known & ~moving if watch else tool.known
+            sound = tool.steady & ~bad
+            tool.weights = outlier_weights(left, usable * sound[:, None])
+            power += float((tool.weights * size).sum()) * left.shape[2]
+            told = min(6.0 / (usable.sum(axis=1).mean() * left.shape[2]), 0.9)
+            count += float(tool.weights.sum()) * left.shape[2] * (1.0 - told)
+            prior = 1.0 / (self.optical.jitter**2 * share[:, None])
+            step, variance = self._pose_steps(terms, tool.weights, prior)
+            steps.append(step)
+            variances.append(variance)
+            shares.append(share)
+            kept.append(sound & seen)
+        free = self.modes.size.size * self.field.shape[1]
+        self.noise_t = max(np.sqrt(power / max(count - free, 0.2 * count)), SMALLEST_NOISE_T)
+        self.optical = estimate_noise(steps, variances, shares, kept)
+
+    def _pose_steps(self, terms: PoseTerms, weights: Array, prior: Array) -> tuple[Array, Array]:
+        """Most probable steps (F, 6) of the poses and their variances."""
+        count = len(terms.slope)
+        root = np.sqrt(weights) / self.noise_t
+        slope = (terms.slope * root[:, :, None, None]).reshape(count, -1, 6)
+        residual = (terms.residual * root[:, :, None]).reshape(count, -1)
+        precision = slope.transpose(0, 2, 1) @ slope + prior[:, :, None] * np.eye(6)
+        inverse = np.linalg.inv(precision)
+        step = (inverse @ np.einsum('fri,fr->fi', slope, residual)[:, :, None])[:, :, 0]
+        return step, np.diagonal(inverse, axis1=1, axis2=2)
+
+    def _all_frames(
+        self, steady: Sequence[NDArray[np.bool_]]
+    ) -> tuple[tuple[NDArray[np.bool_], ...], float]:
+        """Which of all frames are sound, and the share of those whose pose is not."""
+        out, bad, seen = [], 0, 0
+        for whole, mask in zip(self.measured, steady, strict=True):
+            kept = mask.copy()
+            rows = np.flatnonzero(kept & whole.usable.any(axis=1))
+            for block in frame_blocks(rows.size, len(whole.sensors), MOST_ROWS):
+                posed = with_pose(whole.frames(rows[block]))
+                every = np.ones(len(posed.time), dtype=bool)
+                part = _Tool(posed, every, every, usable_weights(posed))
+                at = linearise(self._corrected(part), self.modes, self.field)
+                zero = np.zeros((len(part.weights), 6))
+                terms = PoseTerms(at.residual, at.slope)
+                step, _ = most_probable_step(terms, part.weights, self.noise_t, FREE_POSE, zero)
+                share = np.sqrt(interpolation_share(at.part))[:, None]
+                wrong = glitches(step / share, np.ones(len(step), dtype=bool))
+                kept[rows[block][wrong]] = False
+                bad, seen = bad + int(wrong.sum()), seen + len(step)
+            out.append(kept)
+        return tuple(out), bad / max(seen, 1)

@@ -51,8 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='use a layer of N x N z-dipoles on the board; chosen by held-out error by default',
     )  # fmt: skip
     parser.add_argument(
-        '--estimate', type=_kinds, default=(), metavar='LIST',
-        help=f'estimate these of the sensors together with the field: {",".join(KINDS)}',
+        '--estimate', type=_kinds, default=KINDS, metavar='LIST',
+        help='find these of sensors and clock together with the field, where the scan speaks for '
+        f'them; "none" takes all as the setup says; by default {",".join(KINDS)}',
     )  # fmt: skip
     parser.add_argument(
         '--damping', type=float, help='damping of the moments; chosen by held-out error by default'
@@ -68,6 +69,8 @@ def _layer(text: str) -> Layout:
 
 
 def _kinds(text: str) -> tuple[str, ...]:
+    if text == 'none':
+        return ()
     kinds = tuple(part for part in text.split(',') if part)
     unknown = [kind for kind in kinds if kind not in KINDS]
     if unknown or not kinds:

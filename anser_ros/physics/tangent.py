@@ -1,6 +1,8 @@
 """The plane across a direction: two unit vectors in it."""
 
 import numba
+import numpy as np
+from numpy.typing import NDArray
 
 
 @numba.njit(cache=True, error_model='numpy')
@@ -14,3 +16,17 @@ def fill_tangent(n, t):  # type: ignore[no-untyped-def]
     b = n[0] * n[1] * a
     t[0, 0], t[0, 1], t[0, 2] = 1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0]
     t[1, 0], t[1, 1], t[1, 2] = b, sign + n[1] * n[1] * a, -n[1]
+
+
+def tangents(axes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return two unit vectors across each unit axis, shape (S, 2, 3), for axes of shape (S, 3)."""
+    least = np.eye(3)[np.argmin(np.abs(axes), axis=1)]
+    first = np.cross(axes, least)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(axes, first)], axis=1)
+
+
+def tilted(axes: NDArray[np.float64], tilt: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return unit axes (S, 3) stepped by ``tilt`` (S, 2), rad, along their `tangents`."""
+    out = axes + np.einsum('st,stj->sj', tilt, tangents(axes))
+    return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))

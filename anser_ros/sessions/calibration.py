@@ -5,11 +5,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from anser_ros.calibration.calibrate import Options, calibrate
+from anser_ros.calibration.disturbances import outside, spans_of, unsteady_references
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.result import Calibration
 from anser_ros.errors import FitError
+from anser_ros.field.measurements import Measurements
 from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import made_for
@@ -64,8 +67,17 @@ def calibrate_sessions(
     calibration = calibrate(
         measurements, names, generator_of(setup), setup.emitter_names, setup.frequencies_hz,
         replace(options, accuracy=setup.accuracy), Drawing.of(setup).model, progress,
+        [_steady(session, tool) for session in sessions for tool in session.tools],
     )  # fmt: skip
     model = calibration.model
     for session in sessions:
         model = made_for(model, session.setup)
     return replace(calibration, model=model)
+
+
+def _steady(session: Session, tool: Measurements) -> NDArray[np.bool_]:
+    """Which frames of a tool lie outside the times in which the session's references changed."""
+    if session.reference is None:
+        return np.ones(tool.time.size, dtype=bool)
+    changed = unsteady_references(session.reference)
+    return outside(tool.time, spans_of(session.reference.time, changed))

@@ -1,0 +1,182 @@
+"""Frames of a scan that belong to no steady field and pose: moving metal, reflected poses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from anser_ros.field.measurements import Measurements
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+BIN_S = 0.5
+"""Length of the stretches, s, in which changes are looked for: metal on a hand's way comes and
+goes in seconds, and the mean of a stretch has a few times less noise than a frame."""
+BIN_FRAMES = 4
+"""Frames of a stretch at least."""
+GLITCH = 6.0
+"""Deviation of a pose from where the fluxes put it, in robust standard deviations, from which on
+it is left out. A Gaussian jitter is that far off once in a billion."""
+LEFT_OVER = 25.0
+"""Power that no pose explains, in a stretch against the median stretch and against where the tool
+was near the same place, from which on something moved. What a field's model misses at the edge of
+a scan is a few times the noise, in power; what moves there leaves it also a millimetre away."""
+SHORTEST_S = 2.0
+"""Time, s, for which a tool must see that something moves: a glimpse is no path."""
+SEEN = 8.0
+"""Power of the references' deviation in a stretch, in standard deviations beyond the noise's, from
+which on something moved."""
+EDGE = 3.0
+"""The same, beside a stretch that something moved in: it comes and goes gradually."""
+ROUNDS = 6
+"""Rounds in which the quiet stretches are told from the others."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """A part of a session in which the field was not steady.
+
+    Attributes
+    ----------
+    start_s, end_s : float
+        s since the session's start.
+    """
+
+    start_s: float
+    end_s: float
+
+    def holds(self, time: Array) -> Mask:
+        """Which times lie in it."""
+        return np.asarray((time >= self.start_s) & (time <= self.end_s))
+
+
+def glitches(steps: Array, usable: Mask) -> Mask:
+    """Return which frames' poses are far from where their fluxes put them, shape (F,).
+
+    Parameters
+    ----------
+    steps : ndarray, shape (F, 6)
+        From each optical pose to the one that the fluxes tell, m and rad.
+    usable : ndarray of bool, shape (F,)
+        Frames to judge by.
+    """
+    if usable.sum() < BIN_FRAMES:
+        return np.zeros(len(steps), dtype=bool)
+    middle = np.median(steps[usable], axis=0)
+    spread = 1.4826 * np.median(np.abs(steps[usable] - middle), axis=0)
+    return np.asarray((np.abs(steps - middle) > GLITCH * np.maximum(spread, 1e-12)).any(axis=1))
+
+
+def _bins(time: Array) -> NDArray[np.int64]:
+    """Number of the stretch of each frame."""
+    if time.size < 2:
+        return np.zeros(time.size, dtype=np.int64)
+    length = max(BIN_S, BIN_FRAMES * float(np.median(np.diff(time))))
+    return np.asarray(np.floor((time - time[0]) / length), dtype=np.int64)
+
+
+def unsteady_references(reference: Measurements) -> Mask:
+    """Return which frames' references differ from their steady readings, shape (F,).
+
+    The noise is that of differences between frames; steady is what most stretches agree on.
+    """
+    good = reference.valid.all(axis=0)
+    bins = _bins(reference.time)
+    count = int(bins.max()) + 1 if bins.size else 0
+    out = np.zeros(reference.time.size, dtype=bool)
+    if not good.any() or count < 3:
+        return out
+    flux = reference.flux[:, good].reshape(reference.time.size, -1)
+    values = np.concatenate([flux.real, flux.imag], axis=1)
+    noise = np.median(np.abs(np.diff(values, axis=0)), axis=0) / 0.6745 / np.sqrt(2.0)
+    values = values / np.maximum(noise, 1e-15)
+    size = np.bincount(bins, minlength=count)
+    sums = np.stack([np.bincount(bins, v, count) for v in values.T], axis=1)
+    means = np.asarray(sums / np.maximum(size, 1)[:, None], dtype=np.float64)
+    steady = np.median(means[size > 0], axis=0)
+    excess = np.zeros(count)
+    for _ in range(ROUNDS):
+        power = np.asarray(((means - steady) ** 2).mean(axis=1) * size, dtype=np.float64)
+        quiet_power = np.median(power[size > 0])
+        scatter = max(1.4826 * float(np.median(np.abs(power - quiet_power))), 1e-6)
+        # The least scatter is that of so many squares of Gaussian numbers.
+        scatter = max(scatter, np.sqrt(2.0 / values.shape[1]))
+        excess = (power - quiet_power) / scatter
+        quiet = (excess < EDGE) & (size > 0)
+        if quiet.sum() < 2:
+            break
+        steady = np.average(means[quiet], axis=0, weights=size[quiet])
+    return np.asarray(_grown(excess > SEEN, excess > EDGE)[bins])
+
+
+def unsteady_tool(time: Array, place: Array, power: Array, usable: Mask) -> Mask:
+    """Return which frames lie in stretches that no pose explains, shape (F,).
+
+    Parameters
+    ----------
+    time : ndarray, shape (F,)
+        s, ascending.
+    place : ndarray, shape (F, 3)
+        Of the body, m.
+    power : ndarray, shape (F,)
+        Mean square of what no pose explains in each frame.
+    usable : ndarray of bool, shape (F,)
+        Frames to judge by.
+    """
+    bins = _bins(time)
+    count = int(bins.max()) + 1 if bins.size else 0
+    size = np.bincount(bins[usable], minlength=count)
+    if (size > 0).sum() < 3:
+        return np.zeros(time.size, dtype=bool)
+    total = np.bincount(bins[usable], power[usable], count)
+    mean = np.asarray(total / np.maximum(size, 1), dtype=np.float64)
+    ratio = mean / max(float(np.median(mean[size > 0])), 1e-300)
+    found = np.asarray(_grown(ratio > LEFT_OVER, ratio > np.sqrt(LEFT_OVER))[bins])
+    quiet = usable & ~found
+    for span in spans_of(time, found):
+        rows = np.flatnonzero(span.holds(time) & usable)
+        if not rows.size or not quiet.any() or span.end_s - span.start_s < SHORTEST_S:
+            found[span.holds(time)] = False
+            continue
+        # A field that is missed in a place is missed there at other times as well.
+        _, nearest = cKDTree(place[quiet]).query(place[rows])
+        beside = float(power[quiet][nearest].mean())
+        if float(power[rows].mean()) < np.sqrt(LEFT_OVER) * beside:
+            found[span.holds(time)] = False
+    return found
+
+
+def _grown(core: Mask, edge: Mask) -> Mask:
+    """The core with all edges that adjoin it."""
+    out = core.copy()
+    for index in np.flatnonzero(core):
+        for way in (-1, 1):
+            at = index + way
+            while 0 <= at < edge.size and edge[at] and not out[at]:
+                out[at] = True
+                at += way
+    return out
+
+
+def spans_of(time: Array, unsteady: Mask) -> list[Span]:
+    """Return the spans that a mask covers; gaps shorter than two stretches are closed."""
+    spans: list[Span] = []
+    step = float(np.median(np.diff(time))) if time.size > 1 else 0.0
+    for index in np.flatnonzero(unsteady):
+        start, end = float(time[index]) - step / 2.0, float(time[index]) + step / 2.0
+        if spans and start - spans[-1].end_s <= 2.0 * BIN_S:
+            spans[-1] = Span(spans[-1].start_s, end)
+        else:
+            spans.append(Span(start, end))
+    return spans
+
+
+def outside(time: Array, spans: Sequence[Span]) -> Mask:
+    """Which times lie in none of the spans."""
+    out = np.ones(time.size, dtype=bool)
+    for span in spans:
+        out &= ~span.holds(time)
+    return out

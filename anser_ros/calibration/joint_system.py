@@ -1,0 +1,264 @@
+"""The normal equations of a field and of the sensors' parameters, with every pose marginalised.
+
+All of a frame's readings share the error of its optical pose, along six known directions J. With
+flux noise sigma and the covariance S of the pose the readings have the covariance
+``sigma^2 I + J S J^T``, whose inverse takes a 6 x 6 matrix a frame (Golub and Van Loan, Matrix
+Computations, section 2.1.4). Field and parameters are weighed with it together, so that what a
+pose, the field and a parameter explain alike is shared out as it should be, in one solution. To
+keep the system small the field is written in the modes of a rich layer of dipoles that the
+readings can tell at all.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows
+from anser_ros.calibration.factors import as_complex, as_real
+from anser_ros.calibration.pose_correction import pose_slopes
+from anser_ros.calibration.readings import frame_blocks
+from anser_ros.calibration.sensor_parameters import SensorParameters, velocity_of
+from anser_ros.field.measurements import Measurements
+from anser_ros.physics.dipole import flux_jacobian
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+MOST_MODES = 160
+"""Modes of the field at most: the size of the system grows in proportion, its time with the third
+power. The flux of the last of them is a millionth of the first one's for a scan of a board's
+volume, below the noise."""
+LEAST_MODE = 1e-6
+"""Singular value of a mode at least, relative to the largest."""
+SYSTEM_ROWS = 1200
+"""Readings in memory at a time: each has a row for every parameter."""
+
+
+@dataclass(frozen=True)
+class FieldModes:
+    """Combinations of dipoles whose fluxes are orthogonal over a scan's readings.
+
+    Attributes
+    ----------
+    sites : DipoleSites
+        N dipoles.
+    vectors : ndarray, shape (N, M)
+        Moments of each mode, A m^2, for a flux of 1 T rms over the readings.
+    size : ndarray, shape (M,)
+        Singular values relative to the largest: how strongly a moment makes each mode.
+    """
+
+    sites: DipoleSites
+    vectors: Array
+    size: Array
+
+    @staticmethod
+    def of(measurements: Sequence[Measurements], sites: DipoleSites) -> 'FieldModes':
+        """The modes of dipoles over the usable readings of measurements at their poses."""
+        gram, count = np.zeros((len(sites), len(sites))), 0.0
+        for m in measurements:
+            for block in frame_blocks(len(m.time), len(m.sensors)):
+                part = m.frames(block)
+                rows = basis_rows(part, sites)[part.usable.ravel()]
+                gram, count = gram + rows.T @ rows, count + len(rows)
+        scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        values, vectors = np.linalg.eigh(gram / np.outer(scale, scale))
+        values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+        size = np.sqrt(values / values[0])
+        keep = (size > LEAST_MODE) & (np.arange(size.size) < MOST_MODES)
+        moments = vectors[:, keep] / scale[:, None] / np.sqrt(values[keep] / count)
+        return FieldModes(sites, moments, size[keep])
+
+
+@dataclass(frozen=True)
+class Linear:
+    """The readings of one body about the present estimate.
+
+    Attributes
+    ----------
+    part : Measurements
+        F frames, corrected by the present parameters.
+    residual : ndarray, shape (F, S, 2K)
+        Measured minus modelled flux, T; real and imaginary parts by turns.
+    slope : ndarray, shape (F, S, 2K, 6)
+        Derivative of the flux by the pose, T/m and T/rad.
+    rows : ndarray, shape (F, S, M)
+        Flux of each mode.
+    flux : ndarray, shape (F, S, K), complex
+        Modelled, T.
+    by_place, by_axis : ndarray, shape (F, S, 3, K), complex
+        Its derivatives by the sensors' places (T/m) and axes (T).
+    """
+
+    part: Measurements
+    residual: Array
+    slope: Array
+    rows: Array
+    flux: ComplexArray
+    by_place: ComplexArray
+    by_axis: ComplexArray
+
+
+def linearise(part: Measurements, modes: FieldModes, field: Array) -> Linear:
+    """Evaluate a field, given by its modes (M, 2K), and all derivatives at a body's poses."""
+    points, axes = part.placed()
+    frames, sensors = points.shape[:2]
+    lengths = np.tile(part.sensors.length, frames)
+    flat = (points.reshape(-1, 3), axes.reshape(-1, 3), lengths)
+    moments = as_complex(modes.vectors @ field)
+    sites = (modes.sites.positions, modes.sites.directions)
+    flux, by_place, by_axis = flux_jacobian(*flat, *sites, moments)
+    shape = (frames, sensors, 3, moments.shape[1])
+    by_place, by_axis = by_place.reshape(shape), by_axis.reshape(shape)
+    flux = flux.reshape(frames, sensors, -1)
+    return Linear(
+        part,
+        as_real(part.flux) - as_real(flux),
+        pose_slopes(points, axes, part.position, by_place, by_axis),
+        (basis_rows(part, modes.sites) @ modes.vectors).reshape(frames, sensors, -1),
+        flux,
+        by_place,
+        by_axis,
+    )
+
+
+class JointSystem:
+    """Sums of the weighted readings: what they say of field and parameters together.
+
+    Parameters
+    ----------
+    parameters : SensorParameters
+        Q of them.
+    modes : FieldModes
+        M of them.
+    parts : int
+        Real and imaginary parts of all emitters, 2K.
+    """
+
+    def __init__(self, parameters: SensorParameters, modes: FieldModes, parts: int) -> None:
+        self.parameters, self.modes, self.parts = parameters, modes, parts
+        self.fields = parts * modes.size.size
+        width = self.fields + len(parameters) + 1
+        self.normal = np.zeros((width, width))
+        self.scores: list[Array] = []
+
+    def add(
+        self, linear: Linear, weights: Array, noise_t: float, jitter: Array, share: Array
+    ) -> None:
+        """Take in the frames of a body.
+
+        Parameters
+        ----------
+        linear : Linear
+            F frames.
+        weights : ndarray, shape (F, S)
+            Weights of the readings in [0, 1].
+        noise_t : float
+            Flux noise of a phasor component, T.
+        jitter : ndarray, shape (6,)
+            Standard deviations of an optical pose, m and rad.
+        share : ndarray, shape (F,)
+            Share of its variance that is left after interpolation.
+        """
+        velocity = velocity_of(linear.part)
+        modes = self.modes.size.size
+        for block in frame_blocks(len(weights), weights.shape[1], SYSTEM_ROWS):
+            part, root = linear.part.frames(block), np.sqrt(weights[block]) / noise_t
+            columns = self.parameters.derivatives(
+                part, linear.flux[block], linear.by_place[block], linear.by_axis[block],
+                velocity[block],
+            )  # fmt: skip
+            right = np.concatenate(
+                [as_real(columns), linear.residual[block][:, :, None, :]], axis=2
+            )
+            right = right * root[:, :, None, None]
+            rows = linear.rows[block] * root[:, :, None]
+            slope = linear.slope[block] * root[:, :, None, None]
+            count, sensors = root.shape
+            flat = slope.reshape(count, -1, 6)
+            prior = 1.0 / (np.maximum(jitter, 1e-9) ** 2 * share[block, None])
+            precision = flat.transpose(0, 2, 1) @ flat + prior[:, :, None] * np.eye(6)
+            # The inverse of the transposed factor is a root of the pose's covariance.
+            lower = np.linalg.cholesky(precision)
+            along = np.linalg.solve(lower, flat.transpose(0, 2, 1))
+            along = along.reshape(count, 6, sensors, self.parts)
+            by_field = along.transpose(0, 1, 3, 2).reshape(count, -1, sensors) @ rows
+            by_rest = along.reshape(count, 6, -1) @ right.transpose(0, 1, 3, 2).reshape(
+                count, sensors * self.parts, -1
+            )
+            taken = np.concatenate([by_field.reshape(count, 6, -1), by_rest], axis=2)
+            taken = taken.reshape(6 * count, -1)
+            score = -(taken[:, :-1].T @ taken[:, -1])
+            self.normal -= taken.T @ taken
+            flat_rows = rows.reshape(-1, modes)
+            gram = flat_rows.T @ flat_rows
+            mixed = np.tensordot(rows, right, axes=([0, 1], [0, 1]))
+            for c in range(self.parts):
+                own = slice(c * modes, (c + 1) * modes)
+                self.normal[own, own] += gram
+                self.normal[own, self.fields :] += mixed[:, :, c]
+                self.normal[self.fields :, own] += mixed[:, :, c].T
+                score[own] += mixed[:, -1, c]
+            columns_flat = right.transpose(2, 0, 1, 3).reshape(right.shape[2], -1)
+            inner = columns_flat @ columns_flat.T
+            self.normal[self.fields :, self.fields :] += inner
+            score[self.fields :] += inner[:-1, -1]
+            self.scores.append(score)
+
+    def eliminate(self, field_precision: Array, pull: Array) -> 'Eliminated':
+        """Return what is left for the parameters when the field is eliminated.
+
+        Parameters
+        ----------
+        field_precision : ndarray, shape (M,)
+            Prior precision of each mode's amplitude.
+        pull : ndarray, shape (M, 2K)
+            Prior mean minus present amplitude, T.
+        """
+        n = self.fields
+        precision = np.tile(field_precision, self.parts)
+        factor = scipy.linalg.cho_factor(self.normal[:n, :n] + np.diag(precision), lower=True)
+        right = self.normal[:n, n:].copy()
+        right[:, -1] += precision * pull.T.ravel()
+        inside = scipy.linalg.cho_solve(factor, right)
+        rest = self.normal[n:, n:] - self.normal[n:, :n] @ inside
+        gradient = self.normal[n:-1, -1] - inside[:, :-1].T @ right[:, -1]
+        scores = np.array([s[n:] - inside[:, :-1].T @ s[:n] for s in self.scores])
+        inverse, _ = scipy.linalg.lapack.dpotri(factor[0], lower=1)
+        return Eliminated(
+            rest[:-1, :-1], gradient, inside, scores,
+            np.diag(inverse).reshape(self.parts, -1).T.copy(),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Eliminated:
+    """What remains for the parameters once the field is eliminated.
+
+    Attributes
+    ----------
+    information : ndarray, shape (Q, Q)
+        Of the parameters.
+    gradient : ndarray, shape (Q,)
+        Of the log-likelihood at the present parameters.
+    inside : ndarray, shape (2KM, Q + 1)
+        The field's answer to each parameter, and its own step.
+    scores : ndarray, shape (B, Q)
+        The gradient's parts from the blocks of frames.
+    field_variance : ndarray, shape (M, 2K)
+        Of the modes' amplitudes at fixed parameters, T^2.
+    """
+
+    information: Array
+    gradient: Array
+    inside: Array
+    scores: Array
+    field_variance: Array
+
+    def field_step(self, step: Array, modes: int) -> Array:
+        """The field's step (M, 2K) that goes with a step of the parameters (Q,)."""
+        flat = self.inside[:, -1] - self.inside[:, :-1] @ step
+        return np.asarray(flat.reshape(-1, modes).T)

@@ -1,0 +1,197 @@
+"""Widths of populations from the data, and which kinds of errors the data speak for at all.
+
+The likelihood of the parameters is Gaussian about the present estimate. A population's values are
+random with one width, which is the one that makes the data most probable (empirical Bayes; MacKay,
+Bayesian interpolation, Neural Computation 1992). A kind of error is kept when that probability is
+larger with it than without. A channel far outside its population is taken out and stands alone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.calibration.sensor_parameters import (
+    EACH,
+    POPULATIONS,
+    PRIOR,
+    SensorParameters,
+)
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+ROUNDS = 40
+"""Fixed-point steps of the widths; they settle within some ten."""
+NARROWEST = {'gains': 1e-6, 'axes': 1e-6, 'places': 1e-7}
+"""Least width of a population, in its own unit (relative, rad, m): no spread at all."""
+LEAST_EVIDENCE = 5.0
+"""Gain of the log probability for which a kind of error is kept: odds of 150 to 1."""
+LEAST_SHARE = 0.01
+"""Power of what a population does to the fluxes, relative to their noise, from which on it is one:
+smaller errors change no pose, and a field's model is not exact to so little."""
+FAR = 6.0
+"""Size of a channel's value, in widths of the others' population, from which on it stands alone. A
+value of a Gaussian population of ten is that far out once in ten million."""
+FEWEST = 4
+"""Channels that a population needs for one of them to be judged by the others."""
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """What the data say of Q parameters: a Gaussian about ``values``.
+
+    Attributes
+    ----------
+    information : ndarray, shape (Q, Q)
+        Inverse covariance.
+    natural : ndarray, shape (Q,)
+        Information times the most probable values.
+    readings : float
+        Phasor components of independent noise that the information is from.
+    """
+
+    information: Array
+    natural: Array
+    readings: float = 0.0
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Parameters with their widths.
+
+    Attributes
+    ----------
+    values, width : ndarray, shape (Q,)
+        Most probable values, and their prior widths.
+    covariance : ndarray, shape (Q, Q)
+    evidence : float
+        Log probability of the data, up to a constant.
+    """
+
+    values: Array
+    width: Array
+    covariance: Array
+    evidence: float
+
+
+def solve(likelihood: Likelihood, width: Array) -> Posterior:
+    """The parameters for given prior widths."""
+    scaled = width[:, None] * likelihood.information * width[None, :]
+    inner = np.eye(width.size) + scaled
+    # In units of the widths, a parameter that is held fixed does no harm.
+    covariance = width[:, None] * np.linalg.solve(inner, np.diag(width))
+    covariance = (covariance + covariance.T) / 2.0
+    values = covariance @ likelihood.natural
+    log_size = float(np.linalg.slogdet(inner)[1])
+    evidence = 0.5 * float(likelihood.natural @ values) - 0.5 * log_size
+    return Posterior(values, width, covariance, evidence)
+
+
+class Population:
+    """Finds the widths of all kinds of parameters.
+
+    Parameters
+    ----------
+    parameters : SensorParameters
+        What is estimated.
+    """
+
+    def __init__(self, parameters: SensorParameters) -> None:
+        self.parameters = parameters
+        self.groups = parameters.groups()
+        self.alone: dict[str, Index] = {kind: np.zeros(0, dtype=np.int64) for kind in POPULATIONS}
+
+    def _start(self, fixed: Sequence[str]) -> Array:
+        width = np.zeros(len(self.parameters))
+        for kind, rows in self.groups:
+            width[rows] = 1e-12 if kind in fixed else PRIOR[kind]
+        return width
+
+    def fit(self, likelihood: Likelihood, fixed: Sequence[str] = ()) -> Posterior:
+        """Return the parameters with the widths that make the data most probable.
+
+        Parameters
+        ----------
+        likelihood : Likelihood
+            Of all parameters.
+        fixed : sequence of str
+            Kinds that are held at zero.
+        """
+        width = self._start(fixed)
+        shared = [
+            (kind, np.setdiff1d(rows, self.alone[kind]))
+            for kind, rows in self.groups
+            if kind in POPULATIONS and kind not in fixed
+        ]
+        found = solve(likelihood, width)
+        for _ in range(ROUNDS if shared else 0):
+            for kind, rows in shared:
+                if not rows.size:
+                    continue
+                variance = np.diag(found.covariance)[rows]
+                told = rows.size - float((variance / width[rows] ** 2).sum())
+                power = float((found.values[rows] ** 2).sum())
+                new = np.sqrt(power / max(told, 1e-3))
+                width[rows] = np.clip(new, NARROWEST[kind], PRIOR[kind])
+            found = solve(likelihood, width)
+        return found
+
+    def stand_alone(self, found: Posterior) -> bool:
+        """Take channels far outside their population out of it; return whether there are any."""
+        changed = False
+        for kind in POPULATIONS:
+            rows = self.parameters.rows(kind)
+            if kind not in self.parameters.kinds or rows.size < FEWEST * EACH[kind]:
+                continue
+            rows = rows.reshape(-1, EACH[kind])
+            inside = ~np.isin(rows[:, 0], self.alone[kind])
+            size = np.sqrt((found.values[rows] ** 2).mean(axis=1))
+            if inside.sum() < FEWEST:
+                continue
+            worst = int(np.argmax(np.where(inside, size, -1.0)))
+            others = inside.copy()
+            others[worst] = False
+            typical = float(np.sqrt(np.mean(size[others] ** 2)))
+            spread = np.sqrt(np.diag(found.covariance)[rows[worst]].mean())
+            if size[worst] > FAR * max(typical, float(spread)):
+                self.alone[kind] = np.concatenate([self.alone[kind], rows[worst]])
+                changed = True
+        return changed
+
+    def _power(self, likelihood: Likelihood, found: Posterior, kind: str) -> float:
+        """What a kind of error does to the fluxes, in the power of their noise."""
+        rows = self.parameters.rows(kind)
+        values = found.values[rows]
+        power = values @ likelihood.information[np.ix_(rows, rows)] @ values
+        return float(power / max(likelihood.readings, 1.0))
+
+    def chosen(
+        self, likelihood: Likelihood
+    ) -> tuple[Posterior, tuple[str, ...], dict[str, float]]:
+        """Leave out every kind that the data are more probable without.
+
+        Returns
+        -------
+        found : Posterior
+            With the kinds that are kept.
+        left_out : tuple of str
+            The others, which stay at zero.
+        evidence : dict of str to float
+            Gain of the log probability by each kind that is kept.
+        """
+        left_out: tuple[str, ...] = ()
+        while True:
+            found = self.fit(likelihood, left_out)
+            gains = {
+                kind: found.evidence - self.fit(likelihood, (*left_out, kind)).evidence
+                for kind in self.parameters.kinds
+                if kind not in left_out
+            }
+            for kind in POPULATIONS:
+                if kind in gains and self._power(likelihood, found, kind) < LEAST_SHARE:
+                    gains[kind] = 0.0
+            if not gains or min(gains.values()) >= LEAST_EVIDENCE:
+                return found, left_out, gains
+            left_out = (*left_out, min(gains, key=lambda kind: gains[kind]))

@@ -1,0 +1,189 @@
+"""What a survey found, as records: those that a model carries, and those that only tell."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.calibration.disturbances import spans_of
+from anser_ros.calibration.population import FAR
+from anser_ros.calibration.sensor_parameters import EACH, SensorParameters
+from anser_ros.calibration.sensor_survey import SurveyResult
+from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import EffectRecord
+from anser_ros.physics.tangent import tilted
+
+Array = NDArray[np.float64]
+
+SPREADS = {
+    'gains': 'sensor_gain_spread',
+    'axes': 'sensor_axis_spread',
+    'places': 'sensor_place_spread',
+}
+"""Names of the populations' effects."""
+FEWEST_REFLECTED = 1e-3
+"""Share of frames with a wrong optical pose from which on they are told."""
+
+
+def corrections(result: SurveyResult) -> tuple[EffectRecord, ...]:
+    """Return what the model corrects: sensors, lever arms and the optical clock."""
+    records: list[EffectRecord] = []
+    for kind in SPREADS:
+        if kind in result.evidence:
+            records += _population(result, kind)
+    parameters, found = result.parameters, result.posterior
+    sigma = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))
+    for body in parameters.bodies:
+        offset = parameters.of('lever_arm', body, found.values)
+        if offset is not None and 'lever_arm' in result.evidence:
+            width = parameters.of('lever_arm', body, sigma)
+            records.append(
+                EffectRecord(
+                    'lever_arm',
+                    {'offset_m': offset.tolist(), 'body': body},
+                    {'offset_m': [] if width is None else width.tolist()},
+                    _evidence(result, 'lever_arm'),
+                )
+            )
+    return (*records, *_clock(result, sigma))
+
+
+def _evidence(result: SurveyResult, kind: str) -> dict[str, float]:
+    return {'log_probability': result.evidence[kind]}
+
+
+def _clock(result: SurveyResult, sigma: Array) -> list[EffectRecord]:
+    parameters = result.parameters
+    offset = parameters.of('time_offset', '', result.posterior.values)
+    rate = parameters.of('clock_rate', '', result.posterior.values)
+    if rate is not None and 'clock_rate' in result.evidence:
+        survey = result.survey(parameters.bodies[0])
+        of_rate = float(sigma[parameters.rows('clock_rate')][0])
+        of_offset = float(sigma[parameters.rows('time_offset')].sum())
+        return [
+            EffectRecord(
+                'clock_rate',
+                {'offset_s': survey.offset_s, 'rate_ppm': 1e6 * survey.rate},
+                {
+                    'offset_s': float(np.hypot(of_offset, of_rate * parameters.middle_s)),
+                    'rate_ppm': 1e6 * of_rate,
+                },
+                _evidence(result, 'clock_rate'),
+            )
+        ]
+    if offset is None or 'time_offset' not in result.evidence:
+        return []
+    return [
+        EffectRecord(
+            'time_offset',
+            {'offset_s': float(offset[0])},
+            {'offset_s': float(sigma[parameters.rows('time_offset')][0])},
+            _evidence(result, 'time_offset'),
+        )
+    ]
+
+
+def _population(result: SurveyResult, kind: str) -> list[EffectRecord]:
+    """The population's record, and one for each channel that stands outside it."""
+    parameters, found = result.parameters, result.posterior
+    rows = parameters.rows(kind).reshape(-1, EACH[kind])
+    sigma = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))[rows]
+    values = found.values[rows].copy()
+    channels = np.concatenate([table.channel for table in parameters.tables])
+    alone = np.isin(rows[:, 0], result.alone[kind])
+    records = [
+        _single(parameters, kind, int(i), values[i], sigma[i]) for i in np.flatnonzero(alone)
+    ]
+    members = rows[~alone]
+    width = found.width[members[0]] if members.size else np.zeros(EACH[kind])
+    # A width is known as well as that many squares of Gaussian numbers tell.
+    relative = 1.0 / np.sqrt(2.0 * max(members.size / (2 if kind == 'gains' else 1), 1.0))
+    keep, listed = ~alone, values
+    stated = {'spread': float(width[0])}
+    if kind == 'gains':
+        listed = values + [1.0, 0.0]
+        stated['phase_spread_rad'] = float(width[1])
+    more = {}
+    if kind == 'axes':
+        axes = np.concatenate([table.axis for table in parameters.tables])
+        more = {'axes': tilted(axes, values)[keep].tolist()}
+    record = EffectRecord(
+        SPREADS[kind],
+        {
+            **stated,
+            'channels': channels[keep].tolist(),
+            'values': listed[keep].tolist(),
+            'uncertainty': sigma[keep].tolist(),
+            **more,
+        },
+        {'spread': float(width[0] * relative), 'values': sigma[keep].tolist()},
+        _evidence(result, kind),
+    )
+    return [record, *records]
+
+
+def _single(
+    parameters: SensorParameters, kind: str, row: int, value: Array, sigma: Array
+) -> EffectRecord:
+    channels = np.concatenate([table.channel for table in parameters.tables])
+    channel, evidence = int(channels[row]), {'widths_of_its_population': FAR}
+    if kind == 'gains':
+        gain = complex(1.0 + value[0], value[1])
+        return EffectRecord(
+            'sensor_gain',
+            {
+                'channel': channel,
+                'gain': abs(gain),
+                'phase_deg': float(np.degrees(np.angle(gain))),
+            },
+            {'gain': float(sigma[0]), 'phase_deg': float(np.degrees(sigma[1] / abs(gain)))},
+            evidence,
+        )
+    if kind == 'places':
+        return EffectRecord(
+            'sensor_position',
+            {'channels': [channel], 'offset_m': value.tolist()},
+            {'offset_m': sigma.tolist()},
+            evidence,
+        )
+    surveyed = np.concatenate([table.axis for table in parameters.tables])[row]
+    return EffectRecord(
+        'sensor_axis',
+        {
+            'channel': channel,
+            'tilt_deg': float(np.degrees(np.arctan(np.linalg.norm(value)))),
+            'axis': tilted(surveyed[None], value[None])[0].tolist(),
+            'surveyed_axis': surveyed.tolist(),
+        },
+        {'tilt_deg': float(np.degrees(np.linalg.norm(sigma)))},
+        evidence,
+    )
+
+
+def tellings(
+    result: SurveyResult, measurements: Sequence[Measurements]
+) -> tuple[EffectRecord, ...]:
+    """Return what the scan contained besides: metal that moved, poses that were reflected.
+
+    Parameters
+    ----------
+    result : SurveyResult
+        The survey.
+    measurements : sequence of Measurements
+        What was surveyed, one a body and session.
+    """
+    spans = [
+        span
+        for whole, steady in zip(measurements, result.steady, strict=True)
+        for span in spans_of(whole.time, ~steady)
+    ]
+    records = [
+        EffectRecord('moving_metal', {'t_start_s': span.start_s, 't_end_s': span.end_s})
+        for span in dict.fromkeys(spans)
+    ]
+    if result.reflected > FEWEST_REFLECTED:
+        sigma = float(np.sqrt(result.reflected / max(result.optical.poses, 1.0)))
+        records.append(
+            EffectRecord('outliers', {'fraction': result.reflected}, {'fraction': sigma})
+        )
+    return tuple(records)

@@ -1,0 +1,138 @@
+"""Errors that all sensors have, each its own: populations of gains, axes and places."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Family,
+    Remedy,
+    needed,
+    sigmas,
+    unit_matrix,
+)
+from anser_ros.effects.term import Term
+from anser_ros.errors import ModelFileError
+from anser_ros.field.model import EffectRecord
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.tangent import tilted
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpreadTerm(Term):
+    """A population: theta holds the values of its channels, one channel after the other.
+
+    Attributes
+    ----------
+    members : tuple of int
+        Their channels.
+    spread : float
+        Standard deviation of the population, in the values' unit.
+    """
+
+    members: tuple[int, ...]
+    spread: float
+
+    @property
+    def values(self) -> Array:
+        """The values, a row a channel."""
+        return self.theta.reshape(len(self.members), -1)
+
+    def of(self, channels: NDArray[np.generic]) -> Array:
+        """The values of listed channels, a row each; zero for one that is no member."""
+        out = np.zeros((len(channels), self.values.shape[1]))
+        place = {channel: row for row, channel in enumerate(self.members)}
+        for row, channel in enumerate(np.asarray(channels, dtype=np.int64).tolist()):
+            if channel in place:
+                out[row] = self.values[place[channel]]
+        return out
+
+
+class SensorSpread(Effect[SpreadTerm]):
+    """Found by a calibration, which has every channel in many poses; a model carries it."""
+
+    family = Family.SEEN
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'spread': (0.0, 0.3)}
+    width: ClassVar[int] = 0
+    offset_of_values: ClassVar[tuple[float, ...]] = ()
+
+    def record(self, term: SpreadTerm, covariance: Array) -> EffectRecord:
+        """Spread, channels, and each channel's values with their uncertainty."""
+        sigma = sigmas(covariance).reshape(term.values.shape).tolist()
+        values = (term.values + np.array(self.offset_of_values)).tolist()
+        return EffectRecord(
+            self.name,
+            {
+                'spread': term.spread, 'channels': list(term.members), 'values': values,
+                'uncertainty': sigma,
+            },
+            {'values': sigma},
+        )  # fmt: skip
+
+    def term(self, record: EffectRecord) -> SpreadTerm:
+        """From the channels and their values."""
+        channels = tuple(int(channel) for channel in needed(record, 'channels'))
+        values = np.asarray(needed(record, 'values'), dtype=np.float64)
+        if values.shape != (len(channels), self.width) or len(set(channels)) != len(channels):
+            raise ModelFileError(
+                f'model: {record.name} needs {self.width} values for each of its '
+                f'{len(channels)} channels, got {values.shape}'
+            )
+        theta = (values - np.array(self.offset_of_values)).ravel()
+        spread = float(record.parameters.get('spread', 0.0))
+        return SpreadTerm(self, {}, theta, members=channels, spread=spread)
+
+
+class SensorGainSpread(SensorSpread):
+    """Values are real part less one and imaginary part of each channel's gain."""
+
+    name = 'sensor_gain_spread'
+    summary = 'every channel has a gain of its own'
+    units: ClassVar[Mapping[str, str]] = {'spread': '1', 'channels': '1', 'values': '1'}
+    remedy = Remedy.FLUX
+    width = 2
+    offset_of_values = (1.0, 0.0)
+
+    def channel_matrix(self, term: SpreadTerm, channels: NDArray[np.int64]) -> ComplexArray | None:
+        """The gains on the diagonal."""
+        parts = term.of(channels)
+        return np.asarray(unit_matrix(channels.size) + np.diag(parts[:, 0] + 1j * parts[:, 1]))
+
+
+class SensorAxisSpread(SensorSpread):
+    """Values are the tilts (rad) of each axis along its two tangents (`physics.tangent`)."""
+
+    name = 'sensor_axis_spread'
+    summary = "every sensor's axis is a little off"
+    units: ClassVar[Mapping[str, str]] = {'spread': 'rad', 'channels': '1', 'values': 'rad'}
+    remedy = Remedy.SENSORS
+    width = 2
+    offset_of_values = (0.0, 0.0)
+
+    def table(self, term: SpreadTerm, sensors: SensorTable) -> SensorTable:
+        """Sensors with their true axes."""
+        return sensors.with_geometry(axis=tilted(sensors.axis, term.of(sensors.channel)))
+
+
+class SensorPlaceSpread(SensorSpread):
+    """Values are the shifts (m) of each sensor in its body's frame."""
+
+    name = 'sensor_place_spread'
+    summary = 'every sensor sits a little off its surveyed place'
+    units: ClassVar[Mapping[str, str]] = {'spread': 'm', 'channels': '1', 'values': 'm'}
+    remedy = Remedy.SENSORS
+    width = 3
+    offset_of_values = (0.0, 0.0, 0.0)
+
+    def table(self, term: SpreadTerm, sensors: SensorTable) -> SensorTable:
+        """Sensors where they truly are."""
+        return sensors.with_geometry(position=sensors.position + term.of(sensors.channel))
+
+
+EFFECTS = (SensorGainSpread(), SensorAxisSpread(), SensorPlaceSpread())

@@ -1,0 +1,180 @@
+"""What a scan is found to be wrong with: sensors, clock, optics, and frames that are left out."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calibration_world import JITTER_M, JITTER_RAD, NOISE_T, scene
+from scipy.spatial.transform import Rotation
+
+from anser_ros.calibration.disturbances import outside, spans_of, unsteady_references
+from anser_ros.calibration.population import Likelihood, Population, solve
+from anser_ros.calibration.sensor_parameters import KINDS, SensorParameters
+from anser_ros.calibration.sensor_survey import SensorSurveyor
+from anser_ros.calibration.survey_records import corrections, tellings
+from anser_ros.effects.correction import Correction
+from anser_ros.errors import ModelFileError
+from anser_ros.field.model import EffectRecord
+from anser_ros.physics.pose_track import PoseTrack
+from anser_ros.physics.tangent import tangents, tilted
+from anser_ros.settings import Accuracy
+
+FRAMES, RATE_HZ, OPTICAL_HZ = 500, 25.0, 60.0
+OFFSET_S, LEVER_M = 0.018, np.array([0.3e-3, -0.4e-3, 0.2e-3])
+GLITCHES = (100, 400, 777)
+
+
+def hand(time):
+    """A hand's path through the volume, with turns by half a right angle."""
+    waves = [np.sin(w * time + p) for w, p in ((0.9, 0.0), (1.3, 1.0), (1.7, 2.0))]
+    position = np.stack(waves, axis=1) * [0.09, 0.09, 0.03] + [0.0, 0.0, 0.14]
+    turns = [np.sin(w * time + p) for w, p in ((0.7, 2.0), (1.1, 0.5), (0.8, 1.0))]
+    return position, Rotation.from_rotvec(0.6 * np.stack(turns, axis=1))
+
+
+@pytest.fixture(scope='module')
+def dirty():
+    """A moved scan in which everything is a little wrong, and what."""
+    rng = np.random.default_rng(5)
+    world = scene(rng, side=4)
+    table = world.measurements.sensors
+    gain = 1 + 0.004 * rng.normal(size=6) + 0.005j * rng.normal(size=6)
+    gain *= 1 / gain.mean()
+    axis = tilted(table.axis, 0.008 * rng.normal(size=(6, 2)))
+    place = 0.12e-3 * rng.normal(size=(6, 3))
+    place -= place.mean(axis=0)
+    time = np.arange(FRAMES) / RATE_HZ
+    position, turn = hand(time)
+    true = table.with_geometry(table.position + place + LEVER_M, axis)
+    points, axes = true.placed(position, turn.as_matrix())
+    flux = world.flux(points.reshape(-1, 3), axes.reshape(-1, 3)).reshape(FRAMES, 6, -1)
+    flux = flux * gain[:, None]
+    flux = flux + NOISE_T * (rng.normal(size=flux.shape) + 1j * rng.normal(size=flux.shape))
+    seen = np.arange(-0.3, time[-1] + 0.3, 1 / OPTICAL_HZ)
+    there, turned = hand(seen)
+    there += JITTER_M * rng.normal(size=there.shape)
+    turned = Rotation.from_rotvec(JITTER_RAD * rng.normal(size=there.shape)) * turned
+    there[list(GLITCHES)] += [0.02, -0.01, 0.015]
+    track = PoseTrack(seen - OFFSET_S, there, turned.as_quat())
+    at, rotation, has_pose = track.at(time)
+    told = replace(
+        world.measurements, sensors=table, time=time, flux=flux, position=at, rotation=rotation,
+        has_pose=has_pose, track=track, valid=np.ones((FRAMES, 6), dtype=bool),
+        flags=np.zeros((FRAMES, 6), dtype=np.int64),
+    )  # fmt: skip
+    found = SensorSurveyor([told], KINDS, world.generator, Accuracy()).fit()
+    return told, found, {'gain': gain, 'axis': axis, 'place': place}
+
+
+def test_all_that_is_wrong_is_found(dirty):
+    _, found, truth = dirty
+    survey = found.survey('tool')
+    assert np.abs(survey.gain - truth['gain']).max() < 3e-4
+    assert np.linalg.norm(survey.axis - truth['axis'], axis=1).max() < 5e-4
+    assert np.abs(survey.place - truth['place']).max() < 2e-5
+    assert np.abs(survey.lever_arm - LEVER_M).max() < 5e-5
+    assert abs(survey.offset_s - OFFSET_S) < 1e-4
+    assert found.left_out == ('clock_rate',)
+
+
+def test_uncertainties_hold(dirty):
+    _, found, truth = dirty
+    sigma = np.sqrt(np.diag(found.posterior.covariance))
+    rows = found.parameters.rows('gains')
+    survey = found.survey('tool')
+    error = np.stack([survey.gain.real, survey.gain.imag], axis=1)
+    error -= np.stack([truth['gain'].real, truth['gain'].imag], axis=1)
+    assert np.sqrt(np.mean((error.ravel() / sigma[rows]) ** 2)) < 2.0
+    assert sigma[rows].max() < 1e-3
+
+
+def test_jitter_and_reflected_poses_are_told(dirty):
+    told, found, _ = dirty
+    assert found.optical.position_m == pytest.approx(JITTER_M, rel=0.08)
+    assert found.optical.rotation_rad == pytest.approx(JITTER_RAD, rel=0.08)
+    wrong = [np.argmin(abs(told.time - told.track.time[i] - OFFSET_S)) for i in GLITCHES]
+    assert not found.kept[0][wrong].any()
+    assert found.kept[0].mean() > 0.97
+    (outliers,) = tellings(found, [told])
+    assert outliers.parameters['fraction'] == pytest.approx(6 / FRAMES, rel=0.5)
+
+
+def test_records_undo_what_was_found(dirty):
+    told, found, _ = dirty
+    records = corrections(found)
+    assert [record.name for record in records] == [
+        'sensor_gain_spread', 'sensor_axis_spread', 'sensor_place_spread', 'lever_arm',
+        'time_offset',
+    ]  # fmt: skip
+    correction = Correction.of(records, told.sensors, (1.0, 2.0, 3.0))
+    survey = found.survey('tool')
+    repaired = survey.apply(told)
+    assert np.allclose(correction.sensors().position, repaired.sensors.position, atol=1e-12)
+    assert np.allclose(correction.sensors().axis, repaired.sensors.axis, atol=1e-12)
+    assert np.allclose(correction.optical(told.track).time, repaired.track.time)
+    flux = correction.flux(0.0, told.sensors.channel, told.flux[7])
+    assert np.allclose(flux, repaired.flux[7], rtol=1e-12)
+
+
+def test_a_spread_without_its_values_is_refused():
+    record = EffectRecord('sensor_gain_spread', {'channels': [0, 1], 'values': [[1.0, 0.0]]})
+    sensors = scene(np.random.default_rng(0), side=2).measurements.sensors
+    with pytest.raises(ModelFileError, match='needs 2 values for each of its 2 channels'):
+        Correction.of([record], sensors, (1.0,))
+
+
+def test_a_channel_far_outside_its_population_stands_alone(dirty):
+    told, _, _ = dirty
+    parameters = SensorParameters([told], ('gains',))
+    population = Population(parameters)
+    values = 0.004 * np.random.default_rng(1).normal(size=12)
+    values[6] = 0.08
+    information = np.eye(12) / 1e-4**2
+    likelihood = Likelihood(information, information @ values)
+    assert population.stand_alone(population.fit(likelihood))
+    assert population.alone['gains'].tolist() == [6, 7]
+    found = population.fit(likelihood)
+    assert found.width[0] < 0.01
+    assert found.values[6] == pytest.approx(0.08, rel=1e-3)
+    assert not population.stand_alone(found)
+
+
+def test_what_the_data_do_not_tell_stays_at_zero(dirty):
+    told, _, _ = dirty
+    population = Population(SensorParameters([told], ('axes', 'lever_arm')))
+    noise = np.random.default_rng(2).normal(size=15)
+    information = np.eye(15) / 1e-4**2
+    found, left_out, _ = population.chosen(Likelihood(information, information @ (1e-4 * noise)))
+    assert set(left_out) == {'axes', 'lever_arm'}
+    assert np.abs(found.values).max() < 1e-9
+    free = solve(Likelihood(information, information @ (1e-4 * noise)), np.full(15, 1.0))
+    assert np.allclose(free.values, 1e-4 * noise, rtol=1e-6)
+
+
+def test_references_say_when_metal_moved():
+    rng = np.random.default_rng(3)
+    steady = scene(rng, side=20)
+    time = np.arange(400) / 25.0
+    change = 5e-10 * np.exp(-(((time - 8.0) / 1.0) ** 2))
+    flux = (
+        1e-6
+        + change[:, None, None]
+        + NOISE_T * (rng.normal(size=(400, 6, 3)) + 1j * rng.normal(size=(400, 6, 3)))
+    )
+    reference = replace(
+        steady.measurements, time=time, flux=flux, valid=np.ones((400, 6), dtype=bool)
+    )
+    (span,) = spans_of(time, unsteady_references(reference))
+    assert span.start_s == pytest.approx(6.2, abs=0.8)
+    assert span.end_s == pytest.approx(9.8, abs=0.8)
+    assert outside(time, [span]).sum() == 400 - span.holds(time).sum()
+    quiet = replace(reference, flux=flux - change[:, None, None])
+    assert not unsteady_references(quiet).any()
+
+
+def test_tangents_are_across():
+    axes = np.random.default_rng(8).normal(size=(5, 3))
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    pair = tangents(axes)
+    assert np.allclose(np.einsum('stj,sj->st', pair, axes), 0)
+    assert np.allclose(np.einsum('stj,suj->stu', pair, pair), np.eye(2))
