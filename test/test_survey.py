@@ -11,7 +11,7 @@ from anser_ros.calibration.disturbances import outside, spans_of, unsteady_refer
 from anser_ros.calibration.population import Likelihood, Population, solve
 from anser_ros.calibration.sensor_parameters import KINDS, SensorParameters
 from anser_ros.calibration.sensor_survey import SensorSurveyor
-from anser_ros.calibration.survey_records import corrections, tellings
+from anser_ros.calibration.survey_records import corrections, tellings, untold_words
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
@@ -95,7 +95,8 @@ def test_jitter_and_reflected_poses_are_told(dirty):
     wrong = [np.argmin(abs(told.time - told.track.time[i] - OFFSET_S)) for i in GLITCHES]
     assert not found.kept[0][wrong].any()
     assert found.kept[0].mean() > 0.97
-    (outliers,) = tellings(found, [told])
+    assert tellings(found, [told]) == ()
+    outliers = corrections(found)[-1]
     assert outliers.parameters['fraction'] == pytest.approx(6 / FRAMES, rel=0.5)
 
 
@@ -104,7 +105,7 @@ def test_records_undo_what_was_found(dirty):
     records = corrections(found)
     assert [record.name for record in records] == [
         'sensor_gain_spread', 'sensor_axis_spread', 'sensor_place_spread', 'lever_arm',
-        'time_offset',
+        'time_offset', 'outliers',
     ]  # fmt: skip
     correction = Correction.of(records, told.sensors, (1.0, 2.0, 3.0))
     survey = found.survey('tool')
@@ -149,6 +150,16 @@ def test_what_the_data_do_not_tell_stays_at_zero(dirty):
     assert np.abs(found.values).max() < 1e-9
     free = solve(Likelihood(information, information @ (1e-4 * noise)), np.full(15, 1.0))
     assert np.allclose(free.values, 1e-4 * noise, rtol=1e-6)
+
+
+def test_what_a_scan_cannot_tell_is_said(dirty):
+    _, found, _ = dirty
+    assert not found.untold
+    population = Population(found.parameters)
+    nothing = Likelihood(np.zeros((47, 47)), np.zeros(47))
+    assert set(population.untold(nothing)) == set(KINDS)
+    lines = untold_words(replace(found, untold={'lever_arm': 0.004}))
+    assert lines == ('lever_arm: the scan tells it to 4 mm only; it is weighed with its prior',)
 
 
 def test_references_say_when_metal_moved():

@@ -16,6 +16,7 @@ from anser_ros.calibration.sensor_parameters import (
     EACH,
     POPULATIONS,
     PRIOR,
+    USEFUL,
     SensorParameters,
 )
 
@@ -159,6 +160,16 @@ class Population:
                 self.alone[kind] = np.concatenate([self.alone[kind], rows[worst]])
                 changed = True
         return changed
+
+    def untold(self, likelihood: Likelihood) -> dict[str, float]:
+        """Return the kinds that the data do not tell to a useful degree, and how far they do."""
+        width = self._start(())
+        sigma = np.sqrt(np.maximum(np.diag(solve(likelihood, width).covariance), 0.0))
+        typical = {
+            kind: float(np.sqrt(np.mean(sigma[self.parameters.rows(kind)] ** 2)))
+            for kind in self.parameters.kinds
+        }
+        return {kind: size for kind, size in typical.items() if size > USEFUL[kind]}
 
     def _power(self, likelihood: Likelihood, found: Posterior, kind: str) -> float:
         """What a kind of error does to the fluxes, in the power of their noise."""

@@ -33,6 +33,12 @@ PRIOR = {
 }  # fmt: skip
 """Standard deviation of each parameter before any data: relative, rad, m, m, s, s a second. They
 are wide for a tool that was built and surveyed at all, and only hold what the data leave open."""
+USEFUL = {
+    'gains': 2e-3, 'axes': 5e-3, 'places': 2e-4, 'lever_arm': 2e-4, 'time_offset': 1e-3,
+    'clock_rate': 1e-4,
+}  # fmt: skip
+"""Standard deviation, in the parameters' own units, beyond which a scan does not tell them: that
+much makes errors of some tenths of a millimetre, as a tool that was not calibrated has."""
 BY_RULE = 1e-9
 """Standard deviation, relative or m, of what a rule sets: far below any spread, and above what
 rounding makes of it."""

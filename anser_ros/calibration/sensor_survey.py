@@ -117,6 +117,9 @@ class SurveyResult:
         nothing moved.
     reflected : float
         Share of the frames whose pose is not where the fluxes put it.
+    untold : dict of str to float
+        Kinds that the scan does not tell, with the standard deviation that it leaves; these are
+        as the setup says, or as their prior makes them.
     """
 
     parameters: SensorParameters
@@ -129,6 +132,7 @@ class SurveyResult:
     kept: tuple[NDArray[np.bool_], ...]
     steady: tuple[NDArray[np.bool_], ...]
     reflected: float
+    untold: dict[str, float]
 
     def survey(self, body: str) -> Survey:
         """The survey of a body's sensors."""
@@ -210,6 +214,7 @@ class SensorSurveyor:
         return SurveyResult(
             self.parameters, posterior, left_out, evidence, self.noise_t, self.optical,
             self.population.alone, kept, steady, reflected,
+            self.population.untold(self.likelihood),
         )  # fmt: skip
 
     def _tell(self, share: float) -> None:

@@ -25,8 +25,25 @@ FEWEST_REFLECTED = 1e-3
 """Share of frames with a wrong optical pose from which on they are told."""
 
 
+UNITS = {
+    'gains': (100.0, '%'), 'axes': (1e3, 'mrad'), 'places': (1e3, 'mm'),
+    'lever_arm': (1e3, 'mm'), 'time_offset': (1e3, 'ms'), 'clock_rate': (1e6, 'ppm'),
+}  # fmt: skip
+"""Factor and unit in which each kind of parameter is told to people."""
+
+
+def untold_words(result: SurveyResult) -> tuple[str, ...]:
+    """Return a line for every kind of parameter that the scan cannot give."""
+    words = []
+    for kind, size in result.untold.items():
+        factor, unit = UNITS[kind]
+        kept = 'it is weighed with its prior' if kind in result.evidence else "the setup's is kept"
+        words.append(f'{kind}: the scan tells it to {factor * size:.2g} {unit} only; {kept}')
+    return tuple(words)
+
+
 def corrections(result: SurveyResult) -> tuple[EffectRecord, ...]:
-    """Return what the model corrects: sensors, lever arms and the optical clock."""
+    """Return what the model knows of: sensors, lever arms and the optical tracker."""
     records: list[EffectRecord] = []
     for kind in SPREADS:
         if kind in result.evidence:
@@ -45,11 +62,19 @@ def corrections(result: SurveyResult) -> tuple[EffectRecord, ...]:
                     _evidence(result, 'lever_arm'),
                 )
             )
-    return (*records, *_clock(result, sigma))
+    return (*records, *_clock(result, sigma), *_reflected(result))
 
 
 def _evidence(result: SurveyResult, kind: str) -> dict[str, float]:
     return {'log_probability': result.evidence[kind]}
+
+
+def _reflected(result: SurveyResult) -> list[EffectRecord]:
+    """Wrong poses of the optical tracker, which it will have in other sessions as well."""
+    if result.reflected <= FEWEST_REFLECTED:
+        return []
+    sigma = float(np.sqrt(result.reflected / max(result.optical.poses, 1.0)))
+    return [EffectRecord('outliers', {'fraction': result.reflected}, {'fraction': sigma})]
 
 
 def _clock(result: SurveyResult, sigma: Array) -> list[EffectRecord]:
@@ -163,7 +188,7 @@ def _single(
 def tellings(
     result: SurveyResult, measurements: Sequence[Measurements]
 ) -> tuple[EffectRecord, ...]:
-    """Return what the scan contained besides: metal that moved, poses that were reflected.
+    """Return what the scan alone contained: metal that moved.
 
     Parameters
     ----------
@@ -181,9 +206,4 @@ def tellings(
         EffectRecord('moving_metal', {'t_start_s': span.start_s, 't_end_s': span.end_s})
         for span in dict.fromkeys(spans)
     ]
-    if result.reflected > FEWEST_REFLECTED:
-        sigma = float(np.sqrt(result.reflected / max(result.optical.poses, 1.0)))
-        records.append(
-            EffectRecord('outliers', {'fraction': result.reflected}, {'fraction': sigma})
-        )
     return tuple(records)

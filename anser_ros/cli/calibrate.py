@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from anser_ros.calibration.calibrate import Options
@@ -18,13 +18,16 @@ from anser_ros.calibration.document import to_document
 from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.sensor_parameters import KINDS
-from anser_ros.cli.calibration_figure import draw_choice
+from anser_ros.cli.calibration_figure import draw_choice, draw_populations
 from anser_ros.cli.output import make_folder, say_written
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.sessions.calibration import calibrate_sessions, check_same_board
 from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.session import load_session
+
+LONG = ('values', 'uncertainty', 'axes')
+"""Parameters of a population that are tables: the report's picture and document have them."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -96,12 +99,15 @@ def run(args: argparse.Namespace) -> int:
     if args.report is not None:
         (args.report / 'calibration.json').write_text(text + '\n', encoding='utf-8')
         draw_choice(calibration, args.report / 'choice.png')
+        draw_populations(calibration, args.report / 'populations.png')
     if not calibration.better_than_nominal and not args.force:
         raise FitError(
             f'no model written: its held-out error {document["heldout_flux_rmse_t"]:.3g} T is '
             f"worse than the nominal model's {calibration.nominal_rmse_t:.3g} T; "
             '--force writes it'
         )
+    for line in document['unobservable']:
+        print(f'anser calibrate: {line}', file=sys.stderr)
     save_model(args.out, calibration.model)
     if args.json:
         print(text)
@@ -120,7 +126,12 @@ def _options(args: argparse.Namespace) -> Options:
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, float], None]]:
     """Yield a function that updates a bar on stderr, which is shown only on a terminal."""
-    columns = (TextColumn('{task.description}'), BarColumn(), TimeElapsedColumn())
+    columns = (
+        TextColumn('{task.description}'),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
     console = Console(stderr=True)
     with Progress(*columns, console=console, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task('calibrating', total=1.0)
@@ -143,7 +154,7 @@ def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
     for name, value in rows:
         table.add_row(name, value)
     for effect in calibration.model.effects:
-        found = {**effect.parameters}
+        found = {k: v for k, v in effect.parameters.items() if k not in LONG}
         table.add_row(effect.name, ', '.join(f'{k} {_short(v)}' for k, v in found.items()))
     return table
 

@@ -1,8 +1,9 @@
-"""The figure of a calibration: the held-out errors of all layouts and dampings that were tried."""
+"""The figures of a calibration: what was tried for the field, and how the sensors differ."""
 
 from pathlib import Path
 
 import matplotlib
+import numpy as np
 
 matplotlib.use('Agg')
 from matplotlib import pyplot as plt
@@ -34,5 +35,31 @@ def draw_choice(calibration: Calibration, path: Path) -> None:
         # Below the axes, where it covers no curve.
         panel.legend(fontsize=7, loc='upper center', bbox_to_anchor=(0.5, -0.16), ncols=2)
     figure.suptitle('Choice by held-out error, pose marginalised', fontsize=10)
+    figure.savefig(path, dpi=110, metadata={'Software': None})
+    plt.close(figure)
+
+
+def draw_populations(calibration: Calibration, path: Path) -> None:
+    """Draw each channel's values with their uncertainty, and the population's width behind them.
+
+    Nothing is drawn where the scan contains no population.
+    """
+    found = [e for e in calibration.scan.corrections if 'values' in e.parameters]
+    if not found:
+        return
+    figure, panels = plt.subplots(1, len(found), figsize=(4 * len(found), 3.5), squeeze=False)
+    for panel, effect in zip(panels[0], found, strict=True):
+        values = np.array(effect.parameters['values'], dtype=np.float64)
+        values = values - np.median(values, axis=0).round()
+        sigma = np.array(effect.parameters['uncertainty'], dtype=np.float64)
+        places, spread = np.arange(len(values)), float(effect.parameters['spread'])
+        panel.axhspan(-spread, spread, color='0.9')
+        for part in range(values.shape[1]):
+            at = places + 0.15 * (part - (values.shape[1] - 1) / 2.0)
+            panel.errorbar(at, values[:, part], sigma[:, part], fmt='.', capsize=2)
+        panel.set_xticks(places, [str(c) for c in effect.parameters['channels']])
+        panel.set(title=f'{effect.name}: {spread:.3g}', xlabel='channel')
+        panel.grid(alpha=0.3)
+    figure.tight_layout()
     figure.savefig(path, dpi=110, metadata={'Software': None})
     plt.close(figure)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from anser_ros.diagnosis.decisions import BESIDE_OUTLIERS, FEWEST_OUTLIERS, NOISIER
+from anser_ros.diagnosis.decisions import BESIDE_OUTLIERS, FEWEST_OUTLIERS, KNOWN_SIGMAS, NOISIER
 from anser_ros.diagnosis.finding import Finding, plain_finding
 from anser_ros.diagnosis.outlying import outlying_share
 from anser_ros.diagnosis.problem import Problem, State
@@ -14,7 +14,7 @@ from anser_ros.effects.outliers import outliers_of
 
 
 def outlier_findings(
-    whole: Problem, cleaned: Problem, after: State, excess: float
+    whole: Problem, cleaned: Problem, after: State, excess: float, known: float = 0.0
 ) -> list[Finding]:
     """Outliers or a loose contact, where frames stand out and nothing else makes them.
 
@@ -26,14 +26,18 @@ def outlier_findings(
         The held-out part with all effects.
     excess : float
         Power that is not explained, over the floor's.
+    known : float
+        Share of frames that stand out as the model's own scan had them: what the optical tracker
+        always does is no effect of a session.
     """
     share, channels = outlying_share(whole, cleaned)
     # A fluctuation is taken for normal: frames far out along it are its own tails.
     own_tails = any(term.effect.family is Family.FLUCTUATION for term in after.terms)
     alone = excess < BESIDE_OUTLIERS and not own_tails
-    if share <= FEWEST_OUTLIERS or not (channels or alone):
-        return []
     frames = sum(tool.time.size for tool in whole.tools)
+    usual = known + KNOWN_SIGMAS * float(np.sqrt(known / max(frames, 1)))
+    if share <= FEWEST_OUTLIERS + usual or not (channels or alone):
+        return []
     sigma = float(np.sqrt(share / max(frames, 1)))
     return [plain_finding(outliers_of(share, sigma, channels), rms(after))]
 

@@ -56,6 +56,15 @@ OUTLIERS, LOOSE_CONTACT = Outliers(), LooseContact()
 EFFECTS = (OUTLIERS, LOOSE_CONTACT)
 
 
+def known_share(records: Sequence[EffectRecord]) -> float:
+    """Share of the frames that a model's records know to stand out in every session."""
+    return sum(
+        float(record.parameters.get('fraction', 0.0))
+        for record in records
+        if record.name == OUTLIERS.name
+    )
+
+
 def outliers_of(fraction: float, sigma: float, channels: Sequence[int]) -> OutliersTerm:
     """Outliers in whole frames, or of some channels, which is what a loose contact does."""
     if not channels:
