@@ -14,6 +14,7 @@ NODES = {
     'replay': 'publishes a bag again: replay BAG [--rate R] [--loop]',
     'openigtlink': 'serves the poses to 3D Slicer as OpenIGTLink',
     'cu_simulator': 'a control unit behind a pseudo-terminal',
+    'corrector': 'corrects the poses of a tracker of poses by a model of diagnose --poses',
     'monitor': 'a live table of sensors, rates and latencies',
     'watcher': 'names live, in /diagnostics, what the model lacks',
 }

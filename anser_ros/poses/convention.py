@@ -62,10 +62,13 @@ class PoseReading:
         """The session with its numbers read so."""
         if self.stream == 'optical':
             assert session.reference is not None
-            return replace(session, reference=self._read(session.reference))
-        return replace(session, sensors={n: self._read(s) for n, s in session.sensors.items()})
+            return replace(session, reference=self.of_sequence(session.reference))
+        return replace(
+            session, sensors={n: self.of_sequence(s) for n, s in session.sensors.items()}
+        )
 
-    def _read(self, poses: PoseSequence) -> PoseSequence:
+    def of_sequence(self, poses: PoseSequence) -> PoseSequence:
+        """The poses of one stream, read so."""
         turn, place = poses.quaternion, poses.position * UNITS.get(self.unit, 1.0)
         if self.quaternion.startswith('wxyz'):
             turn = turn[:, [1, 2, 3, 0]]

@@ -32,6 +32,8 @@ POSES_A_PARAMETER = 12  # poses that a parameter needs: neighbours in time are h
 MAP_SHARE = 0.35
 """The same of a map, and what it must explain beyond a few numbers: a fifth of the error. A map
 follows whatever is smooth in the places that were visited."""
+SMOOTH_STEPS = 2.0
+"""Intervals of the reference up to which a filter may only smooth its noise."""
 MOST_EFFECTS = 6  # effects in force after which the search ends: more would be stand-ins
 FULL_FITS = 3  # candidates that are fitted in full in each round
 NOISE_ROUNDS = 3  # times that noise and what stands out are told apart
@@ -119,7 +121,7 @@ def search_effects(start: PoseFit, say: Callable[[str], None] | None = None) -> 
         if better is None:
             break
         fit = with_noise(better)
-    fit, evidence, dropped = _settled(fit)
+    fit, evidence, dropped = _settled(_one_map(fit))
     return PoseSearch(fit, evidence, (*refused, *dropped))
 
 
@@ -165,10 +167,11 @@ def _best_addition(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | No
     if best is not None and isinstance(best.terms[-1].effect, PoseTimeOffset | PoseClockRate):
         return best
     # A filter rounds off turning points, which looks like a scale or a map.
-    lagging = _with_lag(fit, refused)
-    if best is None or lagging is None:
-        return best or lagging
-    return min(best, lagging, key=lambda one: one.held_out())
+    lagging, filtered = _with_lag(fit, refused)
+    if best is not None and filtered < best.held_out():
+        refused.append((best.terms[-1].label, 'a filter explains as much'))
+        return lagging
+    return best or lagging
 
 
 def _beside_scale(sites: Sequence[Term], force: Sequence[Term]) -> list[Term]:
@@ -223,27 +226,34 @@ def _is_part(term: Term, others: Sequence[Term]) -> bool:
     return False
 
 
-def _with_lag(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | None:
-    """The fit with a low pass, where neither a delay nor a smooth reference does as well."""
+def _with_lag(fit: PoseFit, refused: list[tuple[str, str]]) -> tuple[PoseFit | None, float]:
+    """The fit with a low pass, where neither a delay nor a smooth reference does as well.
+
+    Also the cross-validated sum of squares that a low pass or a smooth reference leaves.
+    """
     lag = TrackerLag()
     if any(is_of(term, TrackerLag) for term in fit.terms):
-        return None
+        return None, np.inf
     trials = [
         fit_poses(fit.state.problem, [*fit.terms, term], 3)
         for term in lag.sites(fit.state.problem.setting)
     ]
     trial = _finest_lag(min(trials, key=lambda t: t.state.sum_of_squares))
     term = trial.terms[-1]
-    widths = [term.with_theta(factor * term.theta) for factor in (0.5, 1.0, 2.0)]
+    # A filter over several poses of the reference takes off more than their noise.
+    interval = float(np.median(np.diff(fit.state.problem.path.knots)))
+    noisy = float(term.theta[0]) < SMOOTH_STEPS * interval
+    widths = [term.with_theta(factor * term.theta) for factor in (0.5, 1.0, 2.0) if noisy]
     rivals = [fit_poses(fit.state.problem, [*fit.terms, lag.rival(t)], 3) for t in widths]
     best = min([fit, *rivals], key=lambda f: f.held_out())
     gain = _gain(best, trial, term)
     need = price(term, fit.held_out(), fit)
+    left = min(best.held_out(), trial.held_out())
     if gain < need:
         if _gain(fit, trial, term) > need:
             refused.append((term.label, 'a smoother reference explains as much'))
-        return None
-    return trial
+        return None, left
+    return trial, left
 
 
 def _probe(fit: PoseFit, term: Term) -> float:
@@ -304,6 +314,18 @@ def _one_scale(fit: PoseFit) -> bool:
             if abs(scale - other) > limit:
                 return False
     return True
+
+
+def _one_map(fit: PoseFit) -> PoseFit:
+    """A whole map instead of a scale and what is bent besides, where it explains as much."""
+    bent = [t for t in fit.terms if is_of(t, FieldDistortion) and 'lowest' in t.site]
+    rest = [t for t in fit.terms if t not in bent and not is_of(t, PoseOpticalScale)]
+    if not bent or len(rest) + len(bent) == len(fit.terms):
+        return fit
+    problem = fit.state.problem
+    whole = FieldDistortion().at(problem.setting, int(bent[0].site['degree']), None)
+    trial = fit_poses(problem, [*rest, whole])
+    return trial if trial.held_out(True) < (1 + LEAST_SHARE) * fit.held_out(True) else fit
 
 
 def _settled(

@@ -37,7 +37,7 @@ class FieldDistortion(PoseEffect):
     name = 'field_distortion'
     summary = "the tracker's map of space is bent: metal at rest, or its field model"
     units: ClassVar[Mapping[str, str]] = {'rms_m': 'm'}
-    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'strain': (0.0, 0.1)}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'strain': (0.0, 0.2)}
     remedy = Remedy.SENSORS
     blocks_in_space = True
 

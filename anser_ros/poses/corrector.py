@@ -1,0 +1,143 @@
+"""A pose model applied to poses one by one: the same offline and in the live node."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import ModelFileError
+from anser_ros.field.model import EffectRecord
+from anser_ros.poses.convention import PoseReading
+from anser_ros.poses.document import MODEL_SCHEMA
+from anser_ros.poses.effects.field_distortion import UNIT_M, FieldDistortion, monomials
+from anser_ros.poses.sequence import FARTHEST, NO_TURN, PoseSequence
+
+Array = NDArray[np.float64]
+
+OK, OUTSIDE, NO_POSE, UNKNOWN = 'ok', 'outside_support', 'no_pose', 'unknown_sensor'
+"""States of a corrected pose: what is published is in one of the first two."""
+GROWTH = 0.1
+"""How fast a pose's error may grow outside the places where the model was learnt, m a metre: the
+strain that a distortion may have."""
+
+
+@dataclass(frozen=True)
+class CorrectedPose:
+    """A pose without what the model knows of its errors.
+
+    Attributes
+    ----------
+    state : str
+        `OK`, or why not: outside the places where the model was learnt, no pose, no such sensor.
+    stamp_ns : int
+        On the reference's clock.
+    position : ndarray, shape (3,)
+        m, tracker's frame.
+    quaternion : ndarray, shape (4,)
+        x y z w.
+    covariance : ndarray, shape (6, 6)
+        Of position (m) and turn (rad) along the tracker's axes.
+    """
+
+    state: str
+    stamp_ns: int
+    position: Array
+    quaternion: Array
+    covariance: Array
+
+
+class PoseCorrector:
+    """Applies a pose model's offsets, conventions and maps.
+
+    Parameters
+    ----------
+    document : mapping
+        As `anser_ros.poses.document.to_model` makes it.
+
+    Raises
+    ------
+    ModelFileError
+        When it is no pose model, or a record lacks a parameter.
+    """
+
+    def __init__(self, document: Mapping[str, Any]) -> None:
+        if not isinstance(document, Mapping) or document.get('schema') != MODEL_SCHEMA:
+            raise ModelFileError(f'no model of poses: the schema must be {MODEL_SCHEMA}')
+        try:
+            support = document['support']
+            self._low = np.asarray(support['low_m'], dtype=np.float64)
+            self._high = np.asarray(support['high_m'], dtype=np.float64)
+            self._sigma = float(document['held_out_position_rmse_m']) / np.sqrt(3)
+            self._turn = float(document['held_out_orientation_rmse_rad']) / np.sqrt(3)
+            records = [
+                EffectRecord(e['name'], e['parameters'], e.get('uncertainty') or {})
+                for e in document['effects']
+            ]
+        except (KeyError, TypeError, ValueError) as error:
+            raise ModelFileError(f'model of poses: {error!r} is missing or no number') from None
+        self.sensors = {str(r.parameters['sensor']) for r in records if r.name == 'hand_eye'}
+        self._offsets = [r for r in records if r.name == 'time_offset']
+        bend = FieldDistortion()
+        self._maps = [(bend.term(r), r) for r in records if r.name == bend.name]
+        self._bend = bend
+        self._reading = PoseReading()
+        for record in records:
+            if record.name == 'frame_convention' and record.parameters['stream'] == 'tracked':
+                self._reading = PoseReading(**dict(record.parameters))
+
+    def correct(
+        self, sensor: str, stamp_ns: int, position: Array, quaternion: Array
+    ) -> CorrectedPose:
+        """The pose of a sensor as it is, with its covariance and state.
+
+        Parameters
+        ----------
+        sensor : str
+        stamp_ns : int
+            On the tracker's clock.
+        position : ndarray, shape (3,)
+            As the tracker tells it; markers for no pose give the state `NO_POSE`.
+        quaternion : ndarray, shape (4,)
+        """
+        empty = CorrectedPose(NO_POSE, stamp_ns, position, quaternion, np.full((6, 6), np.nan))
+        if sensor not in self.sensors:
+            return CorrectedPose(UNKNOWN, stamp_ns, position, quaternion, empty.covariance)
+        norm = float(np.sqrt(quaternion @ quaternion))
+        whole = np.isfinite(position).all() and np.abs(position).max() < FARTHEST
+        if not whole or not NO_TURN < norm < FARTHEST:
+            return empty
+        place, turn = position, quaternion / norm
+        if not self._reading.is_plain:
+            one = PoseSequence('', np.zeros(1), place[None], turn[None], np.zeros(0))
+            read = self._reading.of_sequence(one)
+            place, turn = read.position[0], read.quaternion[0]
+        late = sum(float(r.parameters['offset_s']) for r in self._offsets
+                   if r.parameters.get('sensor', sensor) == sensor)  # fmt: skip
+        outside = np.maximum(np.maximum(self._low - place, place - self._high), 0.0)
+        away = float(np.sqrt(outside @ outside))
+        inside = np.clip(place, self._low, self._high)
+        variance = self._sigma**2 + (GROWTH * away) ** 2
+        for term, record in self._maps:
+            if self._bend.acts_on(term, sensor):
+                # Outside it is held at the border: a polynomial knows nothing beyond it.
+                variance += self._map_variance(record, inside)
+                place = place + self._bend.shift(term, inside[None])[0]
+        covariance = np.diag(np.repeat([variance, self._turn**2], 3))
+        state = OK if away == 0.0 else OUTSIDE
+        return CorrectedPose(state, stamp_ns - round(1e9 * late), place, turn, covariance)
+
+    @staticmethod
+    def _map_variance(record: EffectRecord, place: Array) -> float:
+        """Variance that the map's coefficients give a coordinate of a place, m^2."""
+        told = record.uncertainty.get('coefficients_mm')
+        if told is None:
+            return 0.0
+        p = record.parameters
+        basis = monomials(
+            place[None], np.asarray(p['centre_m']), float(p['size_m']), int(p['degree']),
+            int(p.get('lowest', 1)),
+        )[0]  # fmt: skip
+        spread = np.asarray(told, dtype=np.float64).reshape(-1, 3)
+        return float(UNIT_M**2 * np.mean((basis**2) @ spread**2))

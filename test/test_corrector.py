@@ -1,0 +1,126 @@
+"""A pose model applied: errors fall on poses that it has not seen, and it says where it can't."""
+
+import time
+
+import numpy as np
+import pytest
+import yaml
+from conftest import spin_until
+from pose_world import World
+from scipy.spatial.transform import Rotation
+
+from anser_ros.errors import ModelFileError
+from anser_ros.poses.corrector import NO_POSE, OK, OUTSIDE, UNKNOWN, PoseCorrector
+from anser_ros.poses.diagnosis import diagnose_poses
+from anser_ros.poses.document import to_model
+
+
+@pytest.fixture(scope='module')
+def bent():
+    """A world with a distortion, its model, and a session of other poses without noise."""
+    world = World(11, duration=25.0, sensors=1)
+    world.offset = 0.03
+
+    def bend(sensor, place):
+        away = (place - [0.05, 0.02, -0.3]) / 0.06
+        return place + 1.5e-3 * away[:, [0]] * away
+
+    world.bend = bend
+    model = to_model(diagnose_poses(world.session()))
+    return world, yaml.safe_load(yaml.safe_dump(model))
+
+
+def misfit(one, other):
+    """Distance, rms, that is left when one set of places is moved onto the other."""
+    one, other = one - one.mean(axis=0), other - other.mean(axis=0)
+    turn, _ = Rotation.align_vectors(other, one)
+    return np.sqrt(np.mean(np.sum((turn.apply(one) - other) ** 2, axis=1)))
+
+
+def test_errors_fall_and_stamps_move_to_the_references_clock(bent):
+    world, model = bent
+    corrector = PoseCorrector(model)
+    instant = np.arange(0.3, 24.0, 0.31)
+    true, turn = world.sensor(0, instant)
+    poses = [
+        corrector.correct('sensor_0', 10**9, place, q)
+        for place, q in zip(world.bend(0, true), turn.as_quat(), strict=True)
+    ]
+    inside = np.array([pose.state == OK for pose in poses])
+    assert inside.mean() > 0.8
+    corrected = np.array([pose.position for pose in poses])[inside]
+    # A map leaves what a registration takes up, a shift and a turn of the whole.
+    before, after = (misfit(p, true[inside]) for p in (world.bend(0, true)[inside], corrected))
+    assert after < 0.5 * before
+    assert poses[0].stamp_ns == pytest.approx(10**9 - 3e7, abs=1.5e6)
+
+
+def test_outside_the_covariance_grows_and_the_state_says_so(bent):
+    corrector = PoseCorrector(bent[1])
+    q = np.array([0, 0, 0, 1.0])
+    near = corrector.correct('sensor_0', 10**9, np.array([0.05, 0.02, -0.3]), q)
+    far = corrector.correct('sensor_0', 10**9, np.array([0.6, 0.02, -0.3]), q)
+    assert (near.state, far.state) == (OK, OUTSIDE)
+    assert np.sqrt(far.covariance[0, 0]) > 0.02 > 10 * np.sqrt(near.covariance[0, 0])
+
+
+def test_no_pose_stays_none_and_a_pose_costs_little(bent):
+    corrector = PoseCorrector(bent[1])
+    q, place = np.array([0, 0, 0, 1.0]), np.array([0.05, 0.02, -0.3])
+    assert corrector.correct('sensor_0', 1, place * np.nan, q).state == NO_POSE
+    assert corrector.correct('sensor_0', 1, np.full(3, -3.7e28), q).state == NO_POSE
+    assert corrector.correct('sensor_0', 1, place, 0 * q).state == NO_POSE
+    assert corrector.correct('other', 1, place, q).state == UNKNOWN
+    start = time.thread_time()
+    for _ in range(200):
+        corrector.correct('sensor_0', 1, place, q)
+    assert (time.thread_time() - start) / 200 < 3e-4
+
+
+def test_what_is_no_model_of_poses_is_refused(bent):
+    with pytest.raises(ModelFileError, match='anser_pose_model/1'):
+        PoseCorrector({'schema': 'anser_model/1'})
+    with pytest.raises(ModelFileError, match='support'):
+        PoseCorrector({k: v for k, v in bent[1].items() if k != 'support'})
+
+
+@pytest.mark.light
+def test_the_node_corrects_what_comes_and_tells_what_does_not(ros, bent, tmp_path):
+    from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+    from rclpy.parameter import Parameter
+
+    from anser_ros.nodes.corrector import Corrector
+
+    path = tmp_path / 'model.yaml'
+    path.write_text(yaml.safe_dump(bent[1]), encoding='utf-8')
+    node = Corrector(parameter_overrides=[Parameter('model', value=str(path))])
+    other = ros.create_node('listener')
+    got = []
+    other.create_subscription(
+        PoseWithCovarianceStamped, '/anser/corrected/sensor_0/pose_with_covariance', got.append, 10
+    )
+    sender = other.create_publisher(PoseStamped, '/tracked/sensor_0/pose', 10)
+    message = PoseStamped()
+    message.header.stamp.sec = 5
+    message.pose.position.x, message.pose.position.z = 0.05, -0.3
+    message.pose.orientation.w = 1.0
+
+    def heard():
+        ros.spin_once(other, timeout_sec=0.0)
+        return got
+
+    try:
+        assert spin_until(node, lambda: sender.get_subscription_count() > 0)
+        gone = PoseStamped()
+        gone.pose.position.x = float('nan')
+        sender.publish(gone)
+        sender.publish(message)
+        assert spin_until(node, heard)
+        assert got[0].header.stamp.sec == 4
+        assert 0 < got[0].pose.covariance[0] < 1e-4
+        (status,) = node.part_statuses()
+        assert status.message == OK
+        assert status.values['poses_no_pose'] == 1
+    finally:
+        node.destroy_node()
+        other.destroy_node()
