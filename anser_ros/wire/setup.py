@@ -5,19 +5,26 @@ are given in the frame of the sensor's body; the body ``fg`` is the field genera
 """
 
 import difflib
-import math
-import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 import yaml
 
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.fingerprint import Identity, fingerprint_of
 from anser_ros.settings import SECTIONS, Accuracy, RefitSettings, settings_from
+from anser_ros.wire.setup_values import (
+    Vector,
+    read_axis,
+    read_mapping,
+    read_name,
+    read_number,
+    read_vector,
+    refuse_repeats,
+    take,
+)
 from anser_ros.wire.yaml_text import read_yaml
 
 SCHEMA = 'anser_setup/1'
@@ -29,16 +36,9 @@ LIKENESS = 0.8
 """Ratio of equal letters (`difflib`) from which an unknown key is taken for a misspelt one: one
 letter off in a short key, two in a long one. Smaller, and somebody's own keys are refused."""
 FIELD_GENERATOR = 'fg'
-AXIS_TOLERANCE = 1e-3
-"""Largest deviation of an axis' length from one; axes with three written digits pass."""
-LARGEST_NUMBER = 1e300
-"""Size from which on a number counts as infinite, in any unit."""
 LOWEST_VOLUME_M = 1e-3
 """A tracked volume ends at least so far over the board's copper (z = 0), m: nearer than the copper
 is thick, no model of its field holds, and heights are sampled in a geometric series."""
-
-_NAME = re.compile(r'^[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*$')
-Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -182,111 +182,56 @@ def topic_of(name: str) -> str:
     return '/'.join(tokens)
 
 
-def _number(value: Any, where: str, low: float = -math.inf, high: float = math.inf) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise SetupError(f'setup: {where} must be a number, got {value!r}')
-    # A whole number may be too large for a float; its digits then are too many to be told.
-    number = float(value) if abs(value) < LARGEST_NUMBER else math.inf
-    if not math.isfinite(number) or not low <= number <= high:
-        told = repr(value) if math.isfinite(number) else 'what is not'
-        raise SetupError(f'setup: {where} must be finite and in [{low:g}, {high:g}], got {told}')
-    return number
-
-
-def _vector(value: Any, where: str) -> Vector:
-    if not isinstance(value, list) or len(value) != 3:
-        raise SetupError(f'setup: {where} must be a list of three numbers, got {value!r}')
-    x, y, z = (_number(v, f'{where}[{i}]', -100.0, 100.0) for i, v in enumerate(value))
-    return x, y, z
-
-
-def _axis(value: Any, where: str) -> Vector:
-    vector = np.asarray(_vector(value, where))
-    norm = math.hypot(*vector)  # the same to the last bit on every machine
-    if abs(norm - 1.0) > AXIS_TOLERANCE:
-        raise SetupError(f'setup: {where} must be a unit vector, its length is {norm:.6g}')
-    if abs(norm - 1.0) > 1e-12:
-        vector = vector / norm
-    x, y, z = (float(v) for v in vector)
-    return x, y, z
-
-
-def _mapping(value: Any, where: str) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise SetupError(f'setup: {where} must be a mapping, got {type(value).__name__}')
-    return value
-
-
-def _take(document: dict[str, Any], key: str, where: str) -> Any:
-    if key not in document:
-        raise SetupError(f'setup: {where} lacks the key {key!r}')
-    return document[key]
-
-
-def _name(value: Any, where: str) -> str:
-    if not isinstance(value, str) or not _NAME.match(value):
-        raise SetupError(f'setup: {where} must be words joined by /, got {value!r}')
-    return value
-
-
-def _unique(values: list[Any], what: str) -> None:
-    seen: set[Any] = set()
-    for value in values:
-        if value in seen:
-            raise SetupError(f'setup: {what} {value!r} appears twice')
-        seen.add(value)
-
-
 def _parse_coil(item: Any, where: str) -> Coil:
-    coil = _mapping(item, where)
+    coil = read_mapping(item, where)
     return Coil(
-        name=_name(_take(coil, 'name', where), f'{where}.name'),
-        centre_m=_vector(_take(coil, 'centre_m', where), f'{where}.centre_m'),
-        rotation_deg=_number(coil.get('rotation_deg', 0.0), f'{where}.rotation_deg'),
-        frequency_hz=_number(
-            _take(coil, 'frequency_hz', where), f'{where}.frequency_hz', 1e-3, 1e9
+        name=read_name(take(coil, 'name', where), f'{where}.name'),
+        centre_m=read_vector(take(coil, 'centre_m', where), f'{where}.centre_m'),
+        rotation_deg=read_number(coil.get('rotation_deg', 0.0), f'{where}.rotation_deg'),
+        frequency_hz=read_number(
+            take(coil, 'frequency_hz', where), f'{where}.frequency_hz', 1e-3, 1e9
         ),
     )
 
 
 def _parse_emitter(item: Any) -> Emitter:
-    emitter = _mapping(item, 'emitter')
-    coils = _take(emitter, 'coils', 'emitter')
+    emitter = read_mapping(item, 'emitter')
+    coils = take(emitter, 'coils', 'emitter')
     if not isinstance(coils, list) or not coils:
         raise SetupError('setup: emitter.coils must be a list of at least one coil')
     parsed = tuple(_parse_coil(coil, f'emitter.coils[{i}]') for i, coil in enumerate(coils))
-    _unique([coil.name for coil in parsed], 'coil')
+    refuse_repeats([coil.name for coil in parsed], 'coil')
     # What tells emitters apart is their tone.
-    _unique([coil.frequency_hz for coil in parsed], "emitter's frequency_hz")
+    refuse_repeats([coil.frequency_hz for coil in parsed], "emitter's frequency_hz")
     geometry = {k: v for k, v in emitter.items() if k not in ('kind', 'coils')}
-    kind = _take(emitter, 'kind', 'emitter')
-    return Emitter(_name(kind, 'emitter.kind'), geometry, parsed)
+    kind = take(emitter, 'kind', 'emitter')
+    return Emitter(read_name(kind, 'emitter.kind'), geometry, parsed)
 
 
 def _parse_sensor(item: Any, where: str) -> SensorSpec:
-    sensor = _mapping(item, where)
-    channel = _take(sensor, 'channel', where)
+    sensor = read_mapping(item, where)
+    channel = take(sensor, 'channel', where)
     if isinstance(channel, bool) or not isinstance(channel, int) or not 0 <= channel <= 0xFFFF:
         raise SetupError(
             f'setup: {where}.channel must be an integer in [0, 65535], got {channel!r}'
         )
     return SensorSpec(
         channel=channel,
-        name=_name(_take(sensor, 'name', where), f'{where}.name'),
-        body=_name(_take(sensor, 'body', where), f'{where}.body'),
-        position_m=_vector(_take(sensor, 'position_m', where), f'{where}.position_m'),
-        axis=_axis(_take(sensor, 'axis', where), f'{where}.axis'),
-        length_m=_number(sensor.get('length_m', 0.0), f'{where}.length_m', 0.0, 1.0),
+        name=read_name(take(sensor, 'name', where), f'{where}.name'),
+        body=read_name(take(sensor, 'body', where), f'{where}.body'),
+        position_m=read_vector(take(sensor, 'position_m', where), f'{where}.position_m'),
+        axis=read_axis(take(sensor, 'axis', where), f'{where}.axis'),
+        length_m=read_number(sensor.get('length_m', 0.0), f'{where}.length_m', 0.0, 1.0),
     )
 
 
 def _parse_volume(item: Any) -> tuple[Vector, Vector]:
-    volume = _mapping(item, 'volume')
+    volume = read_mapping(item, 'volume')
     unknown = sorted(set(volume) - {'low_m', 'high_m'})
     if unknown:
         raise SetupError(f'setup: volume has low_m and high_m, not {unknown[0]}')
     low, high = (
-        _vector(_take(volume, key, 'volume'), f'volume.{key}') for key in ('low_m', 'high_m')
+        read_vector(take(volume, key, 'volume'), f'volume.{key}') for key in ('low_m', 'high_m')
     )
     if not all(a < b for a, b in zip(low, high, strict=True)):
         raise SetupError(f'setup: volume.low_m must be below volume.high_m, got {low} and {high}')
@@ -302,7 +247,7 @@ def _parse_stated(root: dict[str, Any]) -> dict[str, float]:
     """The values of the sections `SECTIONS`, checked."""
     stated: dict[str, float] = {}
     for section, names in SECTIONS.items():
-        given = _mapping(root.get(section, {}), section)
+        given = read_mapping(root.get(section, {}), section)
         unknown = sorted(set(map(str, given)) - set(names))
         if unknown:
             raise SetupError(
@@ -360,36 +305,36 @@ def parse_setup(text: str) -> Setup:
         document = read_yaml(text)
     except (yaml.YAMLError, UnicodeError, ValueError) as error:
         raise SetupError(f'setup: not YAML: {" ".join(str(error).split())}') from error
-    root = _mapping(document, 'the document')
+    root = read_mapping(document, 'the document')
     if root.get('schema') != SCHEMA:
         raise SetupError(f'setup: schema must be {SCHEMA!r}, got {root.get("schema")!r}')
     if root.get('flux_unit', 'T') != 'T':
         raise SetupError(f'setup: flux_unit must be T, got {root.get("flux_unit")!r}')
-    frame_id = _name(root.get('frame_id', FIELD_GENERATOR), 'frame_id')
+    frame_id = read_name(root.get('frame_id', FIELD_GENERATOR), 'frame_id')
     if frame_id != FIELD_GENERATOR:
         raise SetupError(
             f'setup: frame_id must be {FIELD_GENERATOR!r}, the board that all positions are '
             f'given in, got {frame_id!r}'
         )
-    sensors = _take(root, 'sensors', 'the document')
+    sensors = take(root, 'sensors', 'the document')
     if not isinstance(sensors, list) or not sensors:
         raise SetupError('setup: sensors must be a list of at least one sensor')
     parsed = tuple(_parse_sensor(sensor, f'sensors[{i}]') for i, sensor in enumerate(sensors))
-    _unique([sensor.channel for sensor in parsed], 'channel')
-    _unique([sensor.name for sensor in parsed], 'sensor')
+    refuse_repeats([sensor.channel for sensor in parsed], 'channel')
+    refuse_repeats([sensor.name for sensor in parsed], 'sensor')
     tools = [sensor for sensor in parsed if sensor.body != FIELD_GENERATOR]
     bodies = list(dict.fromkeys(sensor.body for sensor in tools))
-    _unique(
+    refuse_repeats(
         [topic_of(name) for name in [s.name for s in tools] + bodies], 'topic of sensor or body'
     )
     extra = {key: value for key, value in root.items() if key not in KEYS}
     _no_misspelt(extra)
     return Setup(
         frame_id=frame_id,
-        flux_rate_hz=_number(
-            _take(root, 'flux_rate_hz', 'the document'), 'flux_rate_hz', 1e-3, 1e6
+        flux_rate_hz=read_number(
+            take(root, 'flux_rate_hz', 'the document'), 'flux_rate_hz', 1e-3, 1e6
         ),
-        emitter=_parse_emitter(_take(root, 'emitter', 'the document')),
+        emitter=_parse_emitter(take(root, 'emitter', 'the document')),
         sensors=parsed,
         volume=_parse_volume(root['volume']) if 'volume' in root else None,
         stated=_parse_stated(root),

@@ -1,0 +1,81 @@
+"""Values of a setup document, each taken whole or refused with its place in the document.
+
+All functions raise `SetupError` with one line that says where the value stands and what it is.
+"""
+
+import math
+import re
+from typing import Any
+
+import numpy as np
+
+from anser_ros.errors import SetupError
+
+AXIS_TOLERANCE = 1e-3
+"""Largest deviation of an axis' length from one; axes with three written digits pass."""
+LARGEST_NUMBER = 1e300
+"""Size from which on a number counts as infinite, in any unit."""
+NAME = re.compile(r'^[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*$')
+Vector = tuple[float, float, float]
+
+
+def read_number(value: Any, where: str, low: float = -math.inf, high: float = math.inf) -> float:
+    """Return a finite number within bounds."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise SetupError(f'setup: {where} must be a number, got {value!r}')
+    # A whole number may be too large for a float; its digits then are too many to be told.
+    number = float(value) if abs(value) < LARGEST_NUMBER else math.inf
+    if not math.isfinite(number) or not low <= number <= high:
+        told = repr(value) if math.isfinite(number) else 'what is not'
+        raise SetupError(f'setup: {where} must be finite and in [{low:g}, {high:g}], got {told}')
+    return number
+
+
+def read_vector(value: Any, where: str) -> Vector:
+    """Return three numbers, in m or parts of an axis, of at most 100 each."""
+    if not isinstance(value, list) or len(value) != 3:
+        raise SetupError(f'setup: {where} must be a list of three numbers, got {value!r}')
+    x, y, z = (read_number(v, f'{where}[{i}]', -100.0, 100.0) for i, v in enumerate(value))
+    return x, y, z
+
+
+def read_axis(value: Any, where: str) -> Vector:
+    """Return a unit vector, its length exactly one."""
+    vector = np.asarray(read_vector(value, where))
+    norm = math.hypot(*vector)  # the same to the last bit on every machine
+    if abs(norm - 1.0) > AXIS_TOLERANCE:
+        raise SetupError(f'setup: {where} must be a unit vector, its length is {norm:.6g}')
+    if abs(norm - 1.0) > 1e-12:
+        vector = vector / norm
+    x, y, z = (float(v) for v in vector)
+    return x, y, z
+
+
+def read_mapping(value: Any, where: str) -> dict[str, Any]:
+    """Return what has to be a mapping."""
+    if not isinstance(value, dict):
+        raise SetupError(f'setup: {where} must be a mapping, got {type(value).__name__}')
+    return value
+
+
+def take(document: dict[str, Any], key: str, where: str) -> Any:
+    """Return the value of a key that has to be there."""
+    if key not in document:
+        raise SetupError(f'setup: {where} lacks the key {key!r}')
+    return document[key]
+
+
+def read_name(value: Any, where: str) -> str:
+    """Return words joined by /, as names of coils, sensors and bodies are."""
+    if not isinstance(value, str) or not NAME.match(value):
+        raise SetupError(f'setup: {where} must be words joined by /, got {value!r}')
+    return value
+
+
+def refuse_repeats(values: list[Any], what: str) -> None:
+    """Refuse values that appear twice."""
+    seen: set[Any] = set()
+    for value in values:
+        if value in seen:
+            raise SetupError(f'setup: {what} {value!r} appears twice')
+        seen.add(value)
