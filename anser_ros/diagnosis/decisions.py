@@ -136,7 +136,8 @@ FEWEST_OUTLIERS = 0.004
 """Share of frames from which outliers are named. Normal noise makes none in a session: a reading
 of 16 values passes its limit once in 5e12, one of 8 values once in 1e7."""
 KNOWN_SIGMAS = 3.0
-"""Standard deviations by which a share of frames may exceed the one that the model knows of."""
+"""Standard deviations by which a share of frames may exceed the one that the model knows of, which
+chance alone does in one session of 700."""
 BESIDE_OUTLIERS = 0.3
 """Unexplained power over the floor's up to which frames that stand out are outliers: a model that
 is wrong by more makes some itself."""

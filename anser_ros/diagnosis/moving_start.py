@@ -65,7 +65,8 @@ def _starts(
     if not places:
         return []
     one_place = scorer.held_out - min(held_out for _, _, held_out in places)
-    gains = np.array([[_gain(sums, i) for i in range(blocks.size)] for _, sums, _ in places])
+    # What a place explains in each block, shape (places, blocks).
+    gains = np.array([s.explained_alone(np.full(s.size, NO_PRIOR)) for _, s, _ in places])
     alone = float(gains.max(axis=0).sum())
     excess = scorer.state.sum_of_squares - scorer.state.count
     if alone < max(FREER * one_place + LEAST_MORE, LEAST_OF_EXCESS * excess):
@@ -98,9 +99,3 @@ def _smoothest(points: Array, gains: Array) -> NDArray[np.int64]:
 
 def _estimate(sums: BlockSums) -> Array:
     return sums.solve(np.full(sums.size, NO_PRIOR))[0]
-
-
-def _gain(sums: BlockSums, block: int) -> float:
-    """What a place explains in one block, by its number."""
-    part = sums.part(np.array([block]))
-    return float(part.right.sum(axis=0) @ _estimate(part))

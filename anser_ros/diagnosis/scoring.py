@@ -58,6 +58,11 @@ class BlockSums:
         raised = normal + damping * np.diag(np.diag(normal))
         return _estimate(raised, self.right.sum(axis=0), prior)
 
+    def explained_alone(self, prior: Array) -> Array:
+        """What the columns explain in each block (B,), fitted to that block alone."""
+        covariance = _covariance(self.normal, prior)
+        return np.asarray(np.einsum('bi,bij,bj->b', self.right, covariance, self.right))
+
     def held_out(self, prior: Array, folds: int) -> float:
         """Sum of squared residuals of each fold, predicted from the others."""
         if self.size == 0:
@@ -76,17 +81,21 @@ class BlockSums:
 
 
 def _scaled(normal: Array, prior: Array) -> tuple[Array, Array]:
-    """Normal matrix with the prior, scaled to a unit diagonal, and the scale."""
+    """Normal matrices (..., q, q) with the prior, scaled to a unit diagonal, and the scale."""
     full = normal + np.diag(1 / prior**2)
-    scale = 1 / np.sqrt(np.diag(full))
-    return full * scale[:, None] * scale[None, :], scale
+    scale = 1 / np.sqrt(np.diagonal(full, axis1=-2, axis2=-1))
+    return full * scale[..., :, None] * scale[..., None, :], scale
+
+
+def _covariance(normal: Array, prior: Array) -> Array:
+    full, scale = _scaled(normal, prior)
+    inverse = np.linalg.pinv(full, rcond=1e-13, hermitian=True)
+    return np.asarray(inverse * scale[..., :, None] * scale[..., None, :])
 
 
 def _solve(normal: Array, right: Array, prior: Array) -> tuple[Array, Array]:
     """Estimate and covariance."""
-    full, scale = _scaled(normal, prior)
-    inverse = np.linalg.pinv(full, rcond=1e-13, hermitian=True)
-    covariance = inverse * scale[:, None] * scale[None, :]
+    covariance = _covariance(normal, prior)
     return covariance @ right, covariance
 
 

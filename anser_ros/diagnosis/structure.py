@@ -18,7 +18,8 @@ whose noise is only estimated."""
 MATTERS = 0.005
 """Share of the residual power that a dependence must explain to be reported."""
 FEWEST = 4
-"""Values that a cell needs for its mean to be compared."""
+"""Values that a cell needs for its mean to be compared: the mean of four is uncertain by half of
+what one value is, and cells of fewer would add more noise than they tell."""
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,17 @@ ComplexArray = NDArray[np.complex128]
 Mask = NDArray[np.bool_]
 
 ITS_OWN = 0.9
-"""Correlation with its own prediction from which a reading is its own, whatever its sign."""
+"""Correlation with its own prediction from which a reading is its own, whatever its sign: the
+prediction then leaves less than a fifth of its power."""
 TURNED_ROUND = 0.3
-"""A gain within this of -1 is a polarity."""
+"""A gain within this of -1 is a polarity: as far as a gain is expected from one (the prior of
+`sensor_gain`)."""
 ALIKE, BETTER = 0.95, 0.1
 """Correlation with another's prediction, and share of the power that its own leaves which the
 other's may leave, from which a plug is in its socket."""
 DEAD = 0.02
-"""Share of the expected reading below which a channel hears nothing."""
+"""Share of the expected reading below which a channel hears nothing: a fifth of the leak that
+`channel_crosstalk` expects, so that one that still hears its neighbours is not called dead."""
 
 
 def wiring_faults(problem: Problem) -> list[Term]:
