@@ -229,3 +229,16 @@ def test_the_command_writes_the_documents_that_are_promised(tmp_path, capsys):
     assert evaluation['sensors']['tip']['n'] > 250
     assert run_verb('diagnose', [str(bag), '--out', str(out)]) == 2
     assert '--model (or --poses)' in capsys.readouterr().err
+
+
+def test_stamps_of_a_poll_are_told_from_those_that_jitter():
+    world = World(12, duration=25.0, sensors=1)
+
+    def poll(streams):
+        streams['sensor_0'][0] = np.round(streams['sensor_0'][0] / 0.0312) * 0.0312
+        return streams
+
+    world.after = poll
+    found = named(diagnose_poses(world.session()))
+    assert set(found) == {'quantised_stamps'}
+    assert found['quantised_stamps'].parameters['step_s'] == pytest.approx(0.0312, rel=0.01)

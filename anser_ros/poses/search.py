@@ -168,7 +168,11 @@ def _best_addition(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | No
         return best
     # A filter rounds off turning points, which looks like a scale or a map.
     lagging, filtered = _with_lag(fit, refused)
-    if best is not None and filtered < best.held_out():
+    if best is not None and filtered is not None and filtered.held_out() < best.held_out():
+        term = best.terms[-1]
+        both = fit_poses(fit.state.problem, [*filtered.terms, term])
+        if _gain(filtered, both, term) > price(term, filtered.held_out(), filtered):
+            return best
         refused.append((best.terms[-1].label, 'a filter explains as much'))
         return lagging
     return best or lagging
@@ -226,14 +230,16 @@ def _is_part(term: Term, others: Sequence[Term]) -> bool:
     return False
 
 
-def _with_lag(fit: PoseFit, refused: list[tuple[str, str]]) -> tuple[PoseFit | None, float]:
+def _with_lag(
+    fit: PoseFit, refused: list[tuple[str, str]]
+) -> tuple[PoseFit | None, PoseFit | None]:
     """The fit with a low pass, where neither a delay nor a smooth reference does as well.
 
-    Also the cross-validated sum of squares that a low pass or a smooth reference leaves.
+    Also the best fit with a low pass or a smooth reference, whether it pays or not.
     """
     lag = TrackerLag()
     if any(is_of(term, TrackerLag) for term in fit.terms):
-        return None, np.inf
+        return None, None
     trials = [
         fit_poses(fit.state.problem, [*fit.terms, term], 3)
         for term in lag.sites(fit.state.problem.setting)
@@ -248,7 +254,7 @@ def _with_lag(fit: PoseFit, refused: list[tuple[str, str]]) -> tuple[PoseFit | N
     best = min([fit, *rivals], key=lambda f: f.held_out())
     gain = _gain(best, trial, term)
     need = price(term, fit.held_out(), fit)
-    left = min(best.held_out(), trial.held_out())
+    left = min(trial, best, key=lambda one: one.held_out())
     if gain < need:
         if _gain(fit, trial, term) > need:
             refused.append((term.label, 'a smoother reference explains as much'))

@@ -21,6 +21,7 @@ TIMES = 9.0
 the error, which the range of places in a session hardly makes."""
 LONGEST = 0.4
 """Share of the windows that episodes may be: what is there for longer is no episode."""
+ALIKE = 0.4  # share of a window's squared error that its mean must be; noise has a small one
 NEAR_M = 0.03
 """Distance within which a place outside the episode is the same place; metal changes over its own
 size, centimetres."""
@@ -47,7 +48,7 @@ def episode_windows(sensing: Sensing, sight: PoseSight) -> list[int]:
         return []
     size = {w: float(np.median(square[window == w])) for w in judged}
     usual = float(np.median(list(size.values())))
-    high = [w for w in judged if size[w] > TIMES * usual]
+    high = [w for w in judged if size[w] > TIMES * usual and _is_shift(sensing, window == w)]
     runs = [w for w in high if w - 1 in high or w + 1 in high]
     if not runs or len(runs) > LONGEST * len(judged):
         return []
@@ -58,6 +59,13 @@ def episode_windows(sensing: Sensing, sight: PoseSight) -> list[int]:
     place = sensing.view.measured
     distance, _ = cKDTree(place[outside]).query(place[inside])
     return runs if np.mean(distance < NEAR_M) > SEEN_AGAIN else []
+
+
+def _is_shift(sensing: Sensing, inside: Mask) -> bool:
+    """Whether poses are off the same way, as metal makes them, and not at random."""
+    residual = sensing.residual[inside, :3]
+    mean = residual.mean(axis=0)
+    return bool(mean @ mean > ALIKE * np.mean(np.sum(residual**2, axis=1)))
 
 
 class PoseMovingMetal(PoseEffect):

@@ -114,15 +114,20 @@ class RangeNoise(PoseEffect):
 
     def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
         """A power law of all sensors together, each with a level of its own."""
-        pairs = [jitter(sensing) for sensing in sight.sensors]
-        square, distance = (np.concatenate([pair[k] for pair in pairs]) for k in (0, 1))
+        # Each sensor has a level of its own, so only what changes within one tells a power.
+        pairs = [pair for pair in map(jitter, sight.sensors) if pair[0].size >= FEWEST]
+        if not pairs:
+            return []
+        places = np.concatenate([distance for _, distance in pairs])
+        square = np.concatenate([one / np.median(one) for one, _ in pairs])
+        distance = np.concatenate([one / np.median(one) for _, one in pairs])
         low, high = np.percentile(distance, [5, 95]) if square.size >= FEWEST else (1.0, 1.0)
         if high < WIDEST * low:
             return []
         exponent, spread, gain = power_law(square, distance)
         if not EXPONENTS[0] <= exponent <= EXPONENTS[1] or gain < CLEAR**2:
             return []
-        middle = float(np.median(distance))
+        middle = float(np.median(places))
         values = {'exponent': exponent, 'reference_m': middle}
         return [EffectRecord(self.name, values, {'exponent': spread})]
 

@@ -30,11 +30,15 @@ def stamp_step(time: Array) -> float:
     kinds = np.unique(np.round(steps, 5))
     if kinds.size < 2:
         return 0.0  # one interval alone is a rate and not a grid
+    # Intervals differ by whole steps, and are some steps themselves.
+    apart = np.diff(kinds)
+    apart = apart[apart > FINEST_S]
     base = float(np.percentile(steps, 2))
-    for divisor in range(1, 9):
-        step = base / divisor
+    trials = [*apart[:1].tolist(), *(base / divisor for divisor in range(1, 9))]
+    for trial in trials:
+        step = float(trial)
         if step < FINEST_S:
-            return 0.0
+            continue
         counts = np.round(steps / step)
         step = float(np.sum(steps * counts) / np.sum(counts**2))
         off = np.abs(steps - np.round(steps / step) * step)

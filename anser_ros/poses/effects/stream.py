@@ -20,6 +20,8 @@ MOVING_M = 5e-4
 """Way between two poses, m, from which a body moves: trackers tell a tenth of it."""
 NEAR = 3  # poses before and after by which motion is judged
 FEWEST_MISSING = 0.005  # share of poses, or of the time, from which missing ones are named
+FEWEST_MARKED, FEWEST_MARKED_SHARE = 5, 1e-3
+"""Markers for no pose, and their share, from which they are named: a device wrote them itself."""
 LONG_GAPS = 6.0
 """Gap in median intervals that counts as missing poses: a poll is late by one or two."""
 PAUSE_S, MANY_PAUSES = 2.0, 4
@@ -72,7 +74,8 @@ class MissingPoses(PoseEffect):
             length = max(float(np.ptp(poses.time)), 1e-9)
             silent = sum(b - a for a, b in spans) / length
             share = max(lost, silent)
-            if share < FEWEST_MISSING or (poses.missing.size < 2 and not spans):
+            marked = poses.missing.size >= FEWEST_MARKED and lost > FEWEST_MARKED_SHARE
+            if not marked and (share < FEWEST_MISSING or not (spans or poses.missing.size > 1)):
                 continue
             found.append(_record(self.name, {
                 'stream': poses.name, 'fraction': share, 'marked': int(poses.missing.size),
