@@ -67,6 +67,7 @@ def done(factory_calibration):
     return factory_calibration
 
 
+@pytest.mark.long
 def test_calibration_json_is_the_contracts(done):
     document = json.loads((done / 'calibration.json').read_text())
     assert document['schema'] == 'anser_calibration/1'
@@ -84,6 +85,7 @@ def test_calibration_json_is_the_contracts(done):
     assert (done / 'choice.png').read_bytes()[:4] == b'\x89PNG'
 
 
+@pytest.mark.long
 def test_the_model_file_says_where_it_comes_from(done):
     text = yaml.safe_load((done / 'model.yaml').read_text())
     assert text['provenance']['sessions'] == ['factory.mcap']
@@ -92,6 +94,7 @@ def test_the_model_file_says_where_it_comes_from(done):
     assert 0 <= text['flux_error_t'] < 100e-12
 
 
+@pytest.mark.long
 def test_the_model_tracks_to_the_optical_jitter(done):
     evaluation = track_session(load_session(BAGS / 'moving.mcap'), load_model(done / 'model.yaml'))
     for series in evaluation.sensors.values():

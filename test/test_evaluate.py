@@ -34,8 +34,8 @@ FIGURES = {
 
 
 @pytest.fixture(scope='module')
-def model(factory_calibration) -> Path:
-    return factory_calibration / 'model.yaml'
+def model() -> Path:
+    return BAGS.parent / 'config' / 'demo_model.yaml'
 
 
 @pytest.fixture(scope='module')

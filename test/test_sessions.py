@@ -254,10 +254,12 @@ class TestDiagnose:
     def test_search(self, search):
         assert [term.effect.name for term in search.fit.terms] == ['sensor_gain']
 
+    @pytest.mark.long
     def test_confirm(self, confirmed):
         assert [term.effect.name for term in confirmed.fit.terms] == ['sensor_gain']
         assert confirmed.refused == ()
 
+    @pytest.mark.long
     def test_conclude(self, found):
         (finding,) = found.findings
         assert finding.record.parameters['channel'] == CHANNEL
@@ -271,6 +273,7 @@ class TestDiagnose:
         assert part.tools[0].time.tolist() == [0.0, *times.tolist()]
         assert set(part.reference.time.tolist()) <= set(part.tools[0].time.tolist())
 
+    @pytest.mark.long
     def test_track_held_out_and_document(self, prepared, problem, found, tmp_path):
         unseen = prepared.with_session(held_out_part(prepared.session, problem))
         before, after = track_held_out(unseen, found)
