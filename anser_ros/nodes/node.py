@@ -35,7 +35,6 @@ from rclpy.parameter import Parameter
 from anser_ros.errors import AnserError
 from anser_ros.nodes import incoming, parameters, qos
 from anser_ros.nodes.diagnostics import Level, Status, Throttle, diagnostic_array
-from anser_ros.nodes.kernel_start import wait_for_kernels
 from anser_ros.nodes.process import main
 
 NAMESPACE = 'anser'
@@ -87,6 +86,9 @@ class AnserNode(Node):
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(DIAGNOSTICS_PERIOD_S, self.publish_diagnostics, clock=self.steady_clock)
         if self.HAS_KERNELS:
+            # Numba is half of the start of a node that has none.
+            from anser_ros.nodes.kernel_start import wait_for_kernels
+
             trouble = wait_for_kernels(self._say_starting)
             if trouble:
                 self.warn('kernels_not_compiled', trouble)

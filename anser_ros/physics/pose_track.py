@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 Array = NDArray[np.float64]
 
@@ -63,6 +62,9 @@ class PoseTrack:
         bracketed = (self.time[left] <= time) & (time <= self.time[right])
         valid = exact | (bracketed & (self.time[right] - self.time[left] <= longest_gap))
         if valid.any():
+            # Loaded here, as each start of a node would pay for it that interpolates no poses.
+            from scipy.spatial.transform import Rotation, Slerp
+
             inside = time[valid]
             for axis in range(3):
                 position[valid, axis] = np.interp(inside, self.time, self.position[:, axis])

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.measurements import Measurements
@@ -125,6 +124,9 @@ def _fit(
 ) -> tuple[float, float]:
     """Share of readings (P,) that fit when poses are read so, and the fluxes' common factor."""
     frames, where = np.unique(rows, return_inverse=True)
+    # Loaded here, as each start of a node would pay for it that has no poses to read.
+    from scipy.spatial.transform import Rotation
+
     turn = Rotation.from_quat(
         Rotation.from_matrix(tool.rotation[frames]).as_quat()[:, list(reading.order)]
     )
