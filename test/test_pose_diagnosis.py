@@ -242,3 +242,18 @@ def test_stamps_of_a_poll_are_told_from_those_that_jitter():
     found = named(diagnose_poses(world.session()))
     assert set(found) == {'quantised_stamps'}
     assert found['quantised_stamps'].parameters['step_s'] == pytest.approx(0.0312, rel=0.01)
+
+
+def test_a_body_at_rest_tells_no_lever_arm_and_breaks_nothing():
+    world = World(3, duration=10.0, sensors=1)
+
+    def rest(streams):
+        shaken = np.random.default_rng(0)
+        for rows in streams.values():
+            rows[1] = rows[1][0] + 1e-5 * shaken.normal(size=rows[1].shape)
+            rows[2] = np.tile(rows[2][0], (len(rows[2]), 1))
+        return streams
+
+    world.after = rest
+    found = diagnose_poses(world.session())
+    assert hand_eyes(found)[0].parameters['lever_arm_m'] == [None] * 3

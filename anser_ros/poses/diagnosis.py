@@ -276,6 +276,7 @@ AGREE_S = 3.0
 """Time before a session's start, or after its end, s, at which clocks are set to agree."""
 
 
+LEAST_JITTER_RAD = 1e-5  # no reference tells turns better; none at all has no inverse
 FEWEST_TURNS = 20  # poses that tell a reference's jitter
 MOST_BLUR = 0.1  # share by which a lever arm that is given may be too small
 LEAST_KNOWN_M, LEAST_KNOWN_RAD = 0.01, 0.1
@@ -293,7 +294,7 @@ def lever_blur(part: PosePart, jitter_rad: float) -> Array:
     vectors = (turns.mean().inv() * turns).as_rotvec()
     tilt = np.cov(vectors.T)
     told = np.trace(tilt) * np.eye(3) - tilt
-    error = 2 * jitter_rad**2
+    error = 2 * max(jitter_rad, LEAST_JITTER_RAD) ** 2
     return np.asarray(error * np.diag(np.linalg.inv(told + 1e-3 * error * np.eye(3))))
 
 
