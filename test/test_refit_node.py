@@ -281,6 +281,27 @@ def test_a_baseline_of_too_few_is_refused_and_the_old_one_holds(make):
     assert rig.node._refit is refit
 
 
+def test_metal_at_rest_is_in_no_baseline(make):
+    from std_msgs.msg import String
+    from std_srvs.srv import Trigger
+
+    rig = make(baseline_at_start=True)
+    metal = rig.world.metal(metal_block((0.03, 0.0, -0.06), (0.15, 0.15, 0.004)))
+    rig.node._on_setup(String(data=setup_text(rig.world)))
+    for _ in range(12):
+        rig.say(metal)
+    assert rig.node.counters['baselines_refused'] == 1
+    state = rig.node.status()
+    assert state.level == Level.WARN and 'constant, no baseline: ' in state.message
+    for _ in range(4):
+        rig.say(metal)
+    with pytest.raises(FitError, match='drawn board'):
+        rig.node._on_set_baseline(Trigger.Request(), Trigger.Response())
+    for _ in range(24):
+        rig.say(0.0)
+    assert rig.node._refit is not None and 'no baseline' not in rig.node.status().message
+
+
 def test_every_frame_is_answered_under_its_own_stamp(make):
     from sensor_msgs.msg import PointCloud2
 

@@ -193,7 +193,7 @@ class TestFollow:
         assert prepare(blind, model, factory).baseline is None
         with pytest.raises(BagError, match='needs reference fluxes'):
             ModelFollower(prepare(blind, model, factory))
-        few = baseline_of(factory, metal.reference.sensors)
+        few = baseline_of(factory, metal.reference.sensors, model)
         few.flux[3:] = np.nan
         with pytest.raises(BagError, match=f'{factory.path}.*a baseline of 3'):
             ModelFollower(replace(prepare(metal, model), baseline=few))

@@ -37,7 +37,7 @@ from anser_ros.refit.baseline import ReadingWindow, check_enough
 from anser_ros.refit.change import MOST_RATE_HZ, Pace
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.result import RefitResult
-from anser_ros.sessions.baseline import baseline_flux
+from anser_ros.sessions.baseline import check_clean, clean_flux
 from anser_ros.sessions.model_file import SNAPSHOT, as_saved, is_snapshot, load_model, save_model
 from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session, sensor_table
@@ -102,7 +102,7 @@ class FieldModelNode(AnserNode):
         self._stated = stated_by(table)
         self._file_model = None if table.model_file == NOMINAL else load_model(table.model_file)
         self._baseline_bag = load_session(table.baseline_file) if table.baseline_file else None
-        self._setup_text = ''
+        self._setup_text = self._no_baseline = ''
         self._setup: Setup | None = None
         self._references: SensorTable | None = None
         self._window: ReadingWindow | None = None
@@ -175,7 +175,10 @@ class FieldModelNode(AnserNode):
             self._serve(base, self.get_clock().now().nanoseconds)
         self._base = base
         if self._baseline_bag is not None and len(self._references):
-            self._follow(baseline_flux(self._baseline_bag, self._references))
+            try:
+                self._follow(clean_flux(self._baseline_bag, self._references, base))
+            except AnserError as error:
+                self._refuse_baseline(error)
         elif (
             len(self._references)
             and self.parameters.refit
@@ -219,7 +222,7 @@ class FieldModelNode(AnserNode):
                 self.count(f'readings_{kind}', many)
             window.add(frame)
             if self._refit is None and self.parameters.baseline_at_start and window.full:
-                self._follow(window.still_mean())
+                self._begin(window, setup)
             if self._refit is not None and self._follows:
                 self._update(self._refit, frame)
         except AnserError as error:
@@ -289,6 +292,32 @@ class FieldModelNode(AnserNode):
             self.count('models')
         self._model = model
 
+    def _begin(self, window: ReadingWindow, setup: Setup) -> None:
+        """Take the first readings for the distortion-free ones, or wait for others."""
+        try:
+            self._follow(self._clean_mean(window, setup))
+        except FitError as error:
+            self._refuse_baseline(error)
+            window.clear()
+
+    def _clean_mean(self, window: ReadingWindow, setup: Setup) -> NDArray[np.complex128]:
+        """Return the mean readings (S, K), T, of a window in which there seems to be no metal.
+
+        Raises
+        ------
+        FitError
+            When they change, or are not what the references read without metal.
+        """
+        mean = window.still_mean()
+        if self._base is not None and self._references is not None:
+            sigma = setup.accuracy.flux_noise_t / math.sqrt(len(window))
+            check_clean(self._base, self._references, mean, sigma, setup)
+        return mean
+
+    def _refuse_baseline(self, error: AnserError) -> None:
+        self._no_baseline = str(error)
+        self._refuse('baselines_refused', error)
+
     def _tell_following(self) -> None:
         """Let receivers know, when it has changed, whether frames are answered from now on."""
         if self._model is not None and not self._writer.has_told(self._follows):
@@ -301,7 +330,7 @@ class FieldModelNode(AnserNode):
         self._refit, self._patches = start_refit(
             self._setup, self._base, self._references, baseline, tuple(self._patch_topics)
         )
-        self._result, self._heard_s = None, time.monotonic()
+        self._result, self._heard_s, self._no_baseline = None, time.monotonic(), ''
         self._tell_following()
         self.count('baselines')
 
@@ -336,7 +365,7 @@ class FieldModelNode(AnserNode):
     def _on_set_baseline(self, _request: Any, response: Any) -> Any:
         if self._window is None or self._setup is None:
             raise FitError('no setup yet')
-        baseline = self._window.still_mean()
+        baseline = self._clean_mean(self._window, self._setup)
         good = check_enough(baseline, self._setup.refit.min_references)
         self._follow(baseline)
         response.success = True
@@ -384,7 +413,9 @@ class FieldModelNode(AnserNode):
         if self._follows and silent_s > self._longest_s:
             said = f'{REFERENCES_LOST}: no reference fluxes for {silent_s:.1f} s'
             return Status('', Level.ERROR, said, values)
-        level = Level.WARN if values.get('refit_state') in refit_status.TROUBLED else Level.OK
+        is_troubled = values.get('refit_state') in refit_status.TROUBLED
+        is_troubled |= bool(self._no_baseline and self._refit is None and self.parameters.refit)
+        level = Level.WARN if is_troubled else Level.OK
         return Status('', level, activity, values)
 
     @property
@@ -396,7 +427,12 @@ class FieldModelNode(AnserNode):
         if self._frozen:
             return 'held as it is: freeze was called'
         if self._refit is None or not self.parameters.refit:
-            return 'constant' if not self.parameters.refit else 'constant, no baseline yet'
+            missing = f', no baseline: {self._no_baseline}' if self._no_baseline else ''
+            return (
+                f'constant{missing or ", no baseline yet"}'
+                if self.parameters.refit
+                else 'constant'
+            )
         values |= refit_status.refit_values(self._result)
         return refit_status.refit_words(self._result)
 

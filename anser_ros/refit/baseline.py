@@ -58,6 +58,10 @@ class ReadingWindow:
             return False
         return self._frames[-1][0] - self._frames[0][0] >= 0.9 * self._span_ns
 
+    def clear(self) -> None:
+        """Forget all readings."""
+        self._frames.clear()
+
     def add(self, frame: Frame) -> None:
         """Take in a judged frame of the sensors; a jump back in time starts anew.
 

@@ -5,9 +5,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.errors import BagError
+from anser_ros.effects.correction import is_undone
+from anser_ros.errors import BagError, FitError
+from anser_ros.field.model import FieldModel
+from anser_ros.field.reference_readings import ReferenceReadings
+from anser_ros.integrity.clean_references import (
+    check_as_calibrated,
+    check_as_drawn,
+    check_steady,
+)
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.baseline import FELT
+from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.session import Session
+from anser_ros.wire.setup import Setup
 
 ComplexArray = NDArray[np.complex128]
 
@@ -35,9 +46,109 @@ class Baseline:
     flux: ComplexArray
 
 
-def baseline_of(recording: Session, sensors: SensorTable) -> Baseline:
-    """Clean readings of reference sensors; raises as `baseline_flux`."""
-    return Baseline(recording.path, baseline_flux(recording, sensors))
+PARTS = 3
+"""Parts of a recording whose means must agree: metal may come and go, and be away at both ends."""
+FEWEST_FRAMES = 12
+"""Frames of a recording in which a change is looked for: four a part."""
+
+
+def baseline_of(recording: Session, sensors: SensorTable, model: FieldModel) -> Baseline:
+    """Clean readings of reference sensors; raises as `clean_flux`."""
+    return Baseline(recording.path, clean_flux(recording, sensors, model))
+
+
+def clean_flux(recording: Session, sensors: SensorTable, model: FieldModel) -> ComplexArray:
+    """Mean readings of a recording that there is no metal in, as far as anything tells.
+
+    Arguments, result and further errors are those of `baseline_flux`.
+
+    Raises
+    ------
+    BagError
+        When readings change during the recording, or are not those that the model knows of.
+    """
+    flux = baseline_flux(recording, sensors)
+    try:
+        sigma = steady_sigma(recording)
+        check_clean(model, sensors, flux, sigma, recording.setup)
+    except FitError as error:
+        raise BagError(f'{recording.path} is no baseline: {error}') from error
+    return flux
+
+
+def check_clean(
+    model: FieldModel, sensors: SensorTable, flux: ComplexArray, sigma_t: float, setup: Setup
+) -> None:
+    """Raise `FitError` when references do not read what they do without metal.
+
+    What they should read is what they did when the model was calibrated, else what the drawing
+    says. A model that has metal in it by a diagnosis, and no readings from then, says nothing.
+
+    Parameters
+    ----------
+    model : FieldModel
+    sensors : SensorTable
+        The R references.
+    flux : ndarray, shape (R, K), complex
+        Their readings, T.
+    sigma_t : float
+        Noise of a component of these, T.
+    setup : Setup
+        Of the board.
+    """
+    known = model.references
+    if known is not None and check_as_calibrated(known, sensors, flux, sigma_t, setup.accuracy):
+        return
+    board = Drawing.of(setup).board
+    if board is not None and all(is_undone(record) for record in model.effects):
+        check_as_drawn(board.field, board.centres, sensors, flux, setup.accuracy)
+
+
+def steady_sigma(recording: Session) -> float:
+    """Return the noise of a component of a recording's mean readings, T, from its scatter.
+
+    Raises
+    ------
+    FitError
+        When the readings change during the recording by more than an emitter's strength.
+    """
+    reference = recording.reference
+    if reference is None or len(reference.flux) < FEWEST_FRAMES:
+        return recording.setup.accuracy.flux_noise_t
+    flux = np.where(reference.valid[:, :, None], reference.flux, np.nan)
+    good = np.isfinite(flux).all(axis=2)
+    whole = good.sum(axis=0) > len(flux) // 2
+    flux = flux[:, whole]
+    # The variance of a second difference of complex noise is 12 times that of a component.
+    scatter = np.abs(np.diff(flux, 2, axis=0)) ** 2
+    noise = float(np.sqrt(np.nanmedian(np.nanmean(scatter, axis=2)) / 12.0)) if flux.size else 0.0
+    parts = [_mean_of(part) for part in np.array_split(flux, PARTS)]
+    check_steady(parts, noise / np.sqrt(len(flux) / PARTS), FELT)
+    return noise / float(np.sqrt(len(flux)))
+
+
+def _mean_of(flux: ComplexArray) -> ComplexArray:
+    """Mean (R, K) of frames (F, R, K) with NaN where a reading is bad; NaN where all are."""
+    good = np.isfinite(flux)
+    total = np.where(good, flux, 0.0).sum(axis=0)
+    return np.asarray(np.where(good.any(axis=0), total / np.maximum(good.sum(axis=0), 1), np.nan))
+
+
+def readings_of(recording: Session) -> ReferenceReadings | None:
+    """What a calibration keeps of its references; None without them, or near metal that moves."""
+    reference = recording.reference
+    if reference is None:
+        return None
+    sensors = reference.sensors
+    try:
+        sigma, flux = steady_sigma(recording), baseline_flux(recording, sensors)
+    except FitError:
+        return None
+    known = np.flatnonzero(np.isfinite(flux).all(axis=1))
+    if not len(known):
+        return None
+    kept, names = sensors.select(known), np.array(sensors.name)[known].tolist()
+    return ReferenceReadings(tuple(names), kept.position, kept.axis, flux[known], sigma)
 
 
 def baseline_flux(baseline: Session, sensors: SensorTable) -> ComplexArray:

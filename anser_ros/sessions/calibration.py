@@ -13,6 +13,7 @@ from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.result import Calibration
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
+from anser_ros.sessions.baseline import readings_of
 from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import made_for
@@ -59,7 +60,8 @@ def calibrate_sessions(
     """Calibrate on all tool sensors of the sessions.
 
     Reference sensors are left out: their survey is less accurate than the field model becomes.
-    How accurate fluxes and poses are is what the first session's setup states.
+    How accurate fluxes and poses are is what the first session's setup states. What the references
+    of the first session that has them read is kept with the model, for baselines to be compared.
     """
     setup = sessions[0].setup
     measurements = [tool for session in sessions for tool in session.tools]
@@ -72,7 +74,8 @@ def calibrate_sessions(
     model = calibration.model
     for session in sessions:
         model = made_for(model, session.setup)
-    return replace(calibration, model=model)
+    kept = next((r for r in map(readings_of, sessions) if r is not None), None)
+    return replace(calibration, model=replace(model, references=kept))
 
 
 def _steady(session: Session, tool: Measurements) -> NDArray[np.bool_]:

@@ -103,14 +103,14 @@ def prepare(
         When the model's emitters are not the session's or the baseline's, or an effect of it is
         unknown.
     BagError
-        When the baseline's references are not the session's.
+        When the baseline's references are not the session's, or there is metal in it.
     """
     check_fits(model, session)
     clean = None
     if baseline is not None:
         check_fits(model, baseline)
         if session.reference is not None:
-            clean = baseline_of(baseline, session.reference.sensors)
+            clean = baseline_of(baseline, session.reference.sensors, model)
     return PreparedSession(
         session,
         model,

@@ -1,0 +1,243 @@
+"""Whether reference readings are those of a field without metal.
+
+A baseline is what all later readings are compared with: metal that lay there when it was taken is
+part of the field for ever, and no refit sees it. So a baseline has to agree with what is known of
+the references from elsewhere: the readings when the model was calibrated, or else the drawing of
+the board. The strength of an emitter may have changed, and single sensors may be bad.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import FitError
+from anser_ros.field.nominal import Tolerances
+from anser_ros.field.reference_readings import ReferenceReadings
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.tangent import fill_tangent
+from anser_ros.settings import Accuracy
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+FieldAt = Callable[[Array], Array]
+"""Drawn field at points (P, 3) in m, frame fg: (P, K, 3) in T."""
+
+STABLE_SHARE = 0.25
+"""Share of `Accuracy.reference_gain` that a sensor's reading may change by from one day to
+another: what it is known by at all is worse than how it keeps. Smaller, and a warm amplifier is
+taken for metal; larger, and metal that moves poses by a tenth of a millimetre is not noticed."""
+CERTAIN = 4.0
+"""Changes below so many times their noise are none."""
+FEWEST_SENSORS = 4
+"""Sensors that have to be known: with fewer, the emitters' strengths explain what metal does."""
+SAME_PLACE_M = 1e-4
+"""Farthest that a sensor may be from where it was at the calibration, m. A new survey tells of
+another place, where the old reading is worth nothing."""
+STEPS = 25
+"""Steps in which sensors that changed most lose their say in the emitters' strengths."""
+FREE_GAIN = 0.1
+"""Deviation of an emitter's strength from its drawing, which is not judged here: a meter of the
+current that is 10 % off is another fault."""
+DRAWN_GATE = 3.0
+"""Root mean square of all readings' differences from the drawn board, in units of what survey and
+manufacture allow, from which on there is metal. It is 1 where these are stated as they are.
+Smaller, and a board that was made less well is refused; larger, and more metal passes."""
+LEAST_SHARE = 1e-4
+"""Error of a drawn field relative to itself: turns and leads are not drawn to less."""
+STEP_M, STEP_RAD = 1e-5, 1e-4
+"""Steps of the differences by which the field changes with place (m) and direction (rad)."""
+
+
+def change_beside_gains(now: ComplexArray, before: ComplexArray) -> Array:
+    """Return by how much each sensor's readings changed, beside a gain of each emitter.
+
+    The gains are those of most sensors: the fit gives less weight to those that changed more.
+
+    Parameters
+    ----------
+    now, before : ndarray, shape (R, K), complex
+        T; rows with NaN have no say.
+
+    Returns
+    -------
+    ndarray, shape (R,)
+        Norm of the change over that of the reading; NaN where one is not known.
+    """
+    change = np.full(len(now), np.nan)
+    known = np.isfinite(now).all(axis=1) & np.isfinite(before).all(axis=1)
+    new, old = now[known], before[known]
+    size = np.maximum(np.linalg.norm(old, axis=1), 1e-300)
+    weight = np.ones(len(new))
+    relative = np.zeros(len(new))
+    for _ in range(STEPS if len(new) else 0):
+        across = weight[:, None] / size[:, None] ** 2
+        gain = (across * old.conj() * new).sum(axis=0) / (across * np.abs(old) ** 2).sum(axis=0)
+        relative = np.linalg.norm(new - gain * old, axis=1) / size
+        weight = 1.0 / np.maximum(relative, np.median(relative) / 3.0 + 1e-12)
+    change[known] = relative
+    return change
+
+
+def check_steady(parts: list[ComplexArray], sigma_t: float, allowed: float) -> None:
+    """Refuse readings that change from one part of a recording to another, as near moving metal.
+
+    Parameters
+    ----------
+    parts : list of ndarray, shape (R, K), complex
+        Mean readings of each part, T.
+    sigma_t : float
+        Noise of a component of these means, T.
+    allowed : float
+        Change relative to a reading that no pose would feel.
+
+    Raises
+    ------
+    FitError
+    """
+    for i, before in enumerate(parts):
+        for now in parts[i + 1 :]:
+            share = _typical_change(now, before, np.sqrt(2.0) * sigma_t, allowed)
+            if share > 0.0:
+                raise FitError(
+                    f'most reference readings change by {share:.2%} while it is recorded; '
+                    'is there metal that moves?'
+                )
+
+
+def check_as_calibrated(
+    known: ReferenceReadings, sensors: SensorTable, flux: ComplexArray, sigma_t: float,
+    accuracy: Accuracy,
+) -> bool:  # fmt: skip
+    """Refuse readings that are not those of the calibration; return whether they were compared.
+
+    Parameters
+    ----------
+    known : ReferenceReadings
+        Of the calibration.
+    sensors : SensorTable
+        The R sensors now.
+    flux : ndarray, shape (R, K), complex
+        Their readings, T.
+    sigma_t : float
+        Noise of a component, T.
+    accuracy : Accuracy
+        How well a sensor's gain is known.
+
+    Raises
+    ------
+    FitError
+        When most sensors read something else, which is metal at rest, or another board.
+    """
+    before = np.full(flux.shape, np.nan, dtype=np.complex128)
+    rows = {name: i for i, name in enumerate(known.name)}
+    for row, name in enumerate(sensors.name):
+        i = rows.get(name)
+        if i is None or known.flux.shape[1] != flux.shape[1]:
+            continue
+        moved = np.linalg.norm(known.position[i] - sensors.position[row])
+        turned = np.linalg.norm(known.axis[i] - sensors.axis[row])
+        if moved < SAME_PLACE_M and turned < SAME_PLACE_M:
+            before[row] = known.flux[i]
+    both = np.isfinite(before).all(axis=1) & np.isfinite(flux).all(axis=1)
+    if both.sum() < FEWEST_SENSORS:
+        return False
+    noise = float(np.hypot(sigma_t, known.sigma_t))
+    share = _typical_change(flux, before, noise, STABLE_SHARE * accuracy.reference_gain)
+    if share > 0.0:
+        raise FitError(
+            f'most reference readings differ by {share:.2%} from those of the calibration; '
+            'is there metal, or is it another board?'
+        )
+    return True
+
+
+def _typical_change(
+    now: ComplexArray, before: ComplexArray, sigma_t: float, allowed: float
+) -> float:
+    """Return the median relative change where it is more than allowed and than noise, else 0."""
+    change = change_beside_gains(now, before)
+    known = np.isfinite(change)
+    if known.sum() < FEWEST_SENSORS:
+        return 0.0
+    size = np.linalg.norm(before[known], axis=1)
+    noise = np.sqrt(2.0 * now.shape[1]) * sigma_t / np.maximum(size, 1e-300)
+    typical, certain = np.median(change[known]), np.median(change[known] / (noise + 1e-300))
+    return float(typical) if typical > allowed and certain > CERTAIN else 0.0
+
+
+def check_as_drawn(
+    field: FieldAt, centres: Array, sensors: SensorTable, flux: ComplexArray, accuracy: Accuracy
+) -> None:
+    """Refuse readings that the drawn board, its tolerances and the survey do not explain.
+
+    It sees much metal only: a plate near the board, not a hand's breadth of it at the side.
+
+    Parameters
+    ----------
+    field : callable
+        The drawn field.
+    centres : ndarray, shape (K, 3)
+        Centres of the coils, m.
+    sensors : SensorTable
+        The R sensors.
+    flux : ndarray, shape (R, K), complex
+        Their readings, T; NaN rows are passed over.
+    accuracy : Accuracy
+        Of the survey and the readings.
+
+    Raises
+    ------
+    FitError
+        When all readings together differ by more than `DRAWN_GATE` of what is allowed.
+    """
+    good = np.isfinite(flux).all(axis=1)
+    if good.sum() < FEWEST_SENSORS:
+        return
+    points, axes = sensors.position[good], sensors.axis[good]
+    ends = sensors.length[good, None] / np.sqrt(12.0) * axes
+
+    def flux_at(places: Array, along: Array) -> Array:
+        """Mean flux (S, K) of coils of these lengths, by Gauss' two points."""
+        both = field(places + ends) + field(places - ends)
+        return np.asarray(np.einsum('ski,si->sk', 0.5 * both, along))
+
+    drawn = flux_at(points, axes)
+    difference = flux[good].real - drawn
+    count, emitters = drawn.shape
+    made = Tolerances()
+    place = np.array([(flux_at(points + STEP_M * e, axes) - drawn) / STEP_M for e in np.eye(3)])
+    planes = np.empty((count, 2, 3))
+    for axis, plane in zip(axes, planes, strict=True):
+        fill_tangent(axis, plane)
+    turned = np.array([flux_at(points, planes[:, i]) for i in range(2)])
+    # A row a deviation: of each coil by manufacture, then of each sensor by its survey.
+    rows = np.zeros((6 * emitters + 6 * count, count, emitters))
+    for k in range(emitters):
+        own = rows[6 * k : 6 * (k + 1), :, k]
+        own[0] = FREE_GAIN * drawn[:, k]
+        own[1:4] = made.shift_m * place[:, :, k]
+        for i, axis in enumerate(np.eye(3)[:2]):
+            turn = np.eye(3) - STEP_RAD * np.cross(np.eye(3), axis)
+            moved = (points - centres[k]) @ turn.T + centres[k]
+            tilted = flux_at(moved, axes @ turn.T)[:, k]
+            own[4 + i] = made.tilt_rad * (tilted - drawn[:, k]) / STEP_RAD
+    survey = rows[6 * emitters :]
+    for s in range(count):
+        own = survey[6 * s : 6 * (s + 1), s]
+        own[0:3] = accuracy.reference_position_m * place[:, s]
+        own[3:5] = accuracy.reference_axis_rad * turned[:, s]
+        own[5] = accuracy.reference_gain * drawn[s]
+    matrix = rows.reshape(len(rows), -1)
+    noise = accuracy.flux_noise_t**2 + (LEAST_SHARE * drawn.ravel()) ** 2
+    covariance = matrix.T @ matrix + np.diag(noise)
+    scale = np.sqrt(np.diag(covariance))
+    whitened = difference.ravel() / scale
+    squares = whitened @ np.linalg.solve(covariance / np.outer(scale, scale), whitened)
+    beyond = float(np.sqrt(squares / difference.size))
+    if beyond > DRAWN_GATE:
+        raise FitError(
+            f'the reference readings differ from the drawn board by {beyond:.1f} times what its '
+            'tolerances and the survey allow; is there metal? A model calibrated with it, '
+            'from a scan with the references, would know of it'
+        )

@@ -1,0 +1,102 @@
+"""Reference readings that are no baseline: metal at rest or moving is seen, the rest not."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from refit_world import anser_world, metal_block, three_coil_world
+
+from anser_ros.errors import BagError, FitError
+from anser_ros.field.reference_readings import ReferenceReadings
+from anser_ros.integrity.clean_references import (
+    change_beside_gains,
+    check_as_calibrated,
+    check_as_drawn,
+    check_steady,
+)
+from anser_ros.sessions.baseline import baseline_flux, check_clean, clean_flux, readings_of
+from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.session import load_session
+from anser_ros.settings import Accuracy
+
+ROOT = Path(__file__).resolve().parents[1]
+ACCURACY = Accuracy()
+SIGMA_T = 2e-12
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)
+
+
+def known_of(world):
+    table = world.references
+    return ReferenceReadings(table.name, table.position, table.axis, world.baseline, SIGMA_T)
+
+
+def drifted(world, rng):
+    """Other strengths of the emitters, one sensor turned, one without a reading, and noise."""
+    gains = 1 + 0.05 * rng.normal(size=world.baseline.shape[1])
+    flux = world.baseline * gains + world.noise(rng, SIGMA_T)
+    flux[3] *= 1.1
+    flux[7] = np.nan
+    return flux
+
+
+@pytest.mark.parametrize('world', [anser_world(), three_coil_world()])
+def test_metal_at_rest_differs_from_the_calibration_and_drift_does_not(world, rng):
+    flux = drifted(world, rng)
+    assert check_as_calibrated(known_of(world), world.references, flux, SIGMA_T, ACCURACY)
+    change = change_beside_gains(flux, world.baseline)
+    assert np.isnan(change[7]) and change[3] > 0.05
+    assert np.nanmedian(change) < 1e-4
+    metal = world.metal(metal_block((0.05, 0.0, -0.08), (0.06, 0.06, 0.02)))
+    with pytest.raises(FitError, match='those of the calibration; is there metal'):
+        check_as_calibrated(known_of(world), world.references, flux + metal, SIGMA_T, ACCURACY)
+    moved = replace(world.references, position=world.references.position + 0.001)
+    assert not check_as_calibrated(known_of(world), moved, flux + metal, SIGMA_T, ACCURACY)
+
+
+def test_metal_that_moves_is_seen_whenever_it_is_there(rng):
+    world = anser_world()
+    clean = [drifted(world, rng) for _ in range(3)]
+    check_steady(clean, SIGMA_T, 2e-4)
+    for when in range(3):
+        parts = list(clean)
+        parts[when] = clean[when] + 0.05 * world.metal(
+            metal_block((0, 0, -0.08), (0.1, 0.1, 0.02))
+        )
+        with pytest.raises(FitError, match='metal that moves'):
+            check_steady(parts, SIGMA_T, 2e-4)
+        check_steady(parts, 1e-7, 2e-4)  # lost in noise
+
+
+@pytest.mark.parametrize('world', [anser_world(), three_coil_world()])
+def test_the_drawing_knows_the_survey_and_the_tolerances_but_no_plate(world, rng):
+    table, board = world.references, world.board
+    off = table.position + ACCURACY.reference_position_m * rng.normal(size=table.position.shape)
+    surveyed = replace(table, position=off)
+    gain = 1 + 0.02 * rng.normal(size=world.baseline.shape[1])
+    own = 1 + ACCURACY.reference_gain * rng.normal(size=(len(table), 1))
+    flux = gain * own * world.baseline
+    check_as_drawn(board.field, board.centres, surveyed, flux, ACCURACY)
+    plate = world.metal(metal_block((0, 0, -0.06), (0.2, 0.2, 0.001)), polarisability=-2000.0)
+    with pytest.raises(FitError, match='drawn board by'):
+        check_as_drawn(board.field, board.centres, surveyed, flux + plate, ACCURACY)
+
+
+def test_a_recording_with_metal_is_no_baseline():
+    clean, metal = (load_session(ROOT / 'bags' / f'{n}.mcap') for n in ('factory', 'metal'))
+    model, sensors = load_model(ROOT / 'config/demo_model.yaml'), clean.reference.sensors
+    assert np.isfinite(clean_flux(clean, sensors, model)).all()
+    with pytest.raises(BagError, match=r'metal.mcap is no baseline: most reference readings chan'):
+        clean_flux(metal, sensors, model)
+    assert readings_of(metal) is None and readings_of(replace(clean, reference=None)) is None
+    kept = replace(model, references=readings_of(clean))
+    assert kept.references.sigma_t < 5e-12
+    flux = baseline_flux(clean, sensors)
+    check_clean(kept, sensors, flux, SIGMA_T, clean.setup)
+    near = np.where(np.arange(8) < 4, 1.0, 1.0 + 0.02 * sensors.axis[:, :1]) * flux
+    with pytest.raises(FitError, match='those of the calibration'):
+        check_clean(kept, sensors, near, SIGMA_T, clean.setup)
