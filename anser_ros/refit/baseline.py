@@ -59,7 +59,7 @@ class ReadingWindow:
         return self._frames[-1][0] - self._frames[0][0] >= 0.9 * self._span_ns
 
     def clear(self) -> None:
-        """Forget all readings."""
+        """Forget all readings that were taken in so far."""
         self._frames.clear()
 
     def add(self, frame: Frame) -> None:
