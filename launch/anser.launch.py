@@ -26,6 +26,7 @@ ARGUMENTS = {
     'setup': ('demo_setup.yaml', 'setup document: a path, or a file of the package'),
     'channels': ('demo_channels.yaml', 'channel calibration: a path, or a file of the package'),
     'model': ('nominal', 'model file of calibrate, or nominal'),
+    'allow_uncalibrated': ('', 'whether the nominal model gives poses; true where simulated'),
     'baseline': ('', 'distortion-free recording of the board; empty: call set_baseline'),
     'board_seed': ('0', "the simulated unit's board: 0 as drawn, 1 that of demo_model.yaml"),
     'simulate': ('false', 'whether a simulated control unit replaces the real one'),
@@ -48,9 +49,10 @@ def find_files(context):
     """
     given = context.launch_configurations
     given['params'] = checked(given['params'], list(NODES))
+    # As IfCondition reads it.
+    is_simulated = given['simulate'].lower() in ('true', '1')
+    given['allow_uncalibrated'] = given['allow_uncalibrated'] or str(is_simulated).lower()
     if not given['device']:
-        # As IfCondition reads it.
-        is_simulated = given['simulate'].lower() in ('true', '1')
         simulated = SIMULATED.format(namespace=given['namespace'].strip('/').replace('/', '_'))
         given['device'] = simulated if is_simulated else DEVICE
 
@@ -97,6 +99,9 @@ def generate_launch_description():
                     node(
                         'field_model',
                         model_file=value('model'),
+                        allow_uncalibrated=ParameterValue(
+                            value('allow_uncalibrated'), value_type=bool
+                        ),
                         baseline_file=ParameterValue(value('baseline'), value_type=str),
                     ),
                     node(

@@ -4,16 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tracking_world import certain_model, setup_of, triaxial_tool
+from tracking_world import anser_board, certain_model, setup_of, triaxial_tool
 
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord, from_document, to_document
+from anser_ros.field.nominal import nominal_model
 from anser_ros.field.reference_readings import ReferenceReadings
 from anser_ros.fingerprint import fingerprint_of
+from anser_ros.integrity.withheld import code_of
 from anser_ros.nodes.model_in_force import ModelInForce
 from anser_ros.nodes.model_intake import GivenModel
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.sessions.starting_model import check_emitters, made_for
+from anser_ros.sessions.starting_model import check_emitters, is_nominal, made_for
 from anser_ros.wire.model_error import ModelError, decode_model_error, encode_model_error
 from anser_ros.wire.points import DipolePoints
 from anser_ros.wire.setup import dump_setup, parse_setup
@@ -120,3 +122,20 @@ def test_an_uncertainty_that_names_no_model_is_read_as_before():
     old = decode_model_error(fields[:-2], step - 8, len(data) // step, short, 2, 3)
     assert (old.fingerprint, old.effects, old.withheld) == ('', 0, 2)
     np.testing.assert_array_equal(old.modes, modes)
+
+
+@pytest.mark.parametrize(('allowed', 'state'), [(False, 'uncalibrated'), (True, '')])
+def test_the_drawing_gives_poses_only_where_it_may(allowed, state):
+    model = certain_model()
+    in_force = ModelInForce(
+        SETUP, TrackedVolume((-0.2, -0.2, 0.05), (0.2, 0.2, 0.3)), None, allowed
+    )
+    error = ModelError(0.0, np.zeros((0, 1, 8), complex), withheld=code_of('uncalibrated'))
+    points = DipolePoints(model.positions, model.directions, model.moments)
+    given = GivenModel(5, b'', points, error)
+    in_force.put(given, in_force.field_of(given))
+    withheld = in_force.at(10).withheld
+    assert (withheld.state if withheld else '') == state
+    drawn = nominal_model(anser_board())
+    assert is_nominal(drawn) and is_nominal(from_document(to_document(drawn)))
+    assert not is_nominal(model)

@@ -299,7 +299,7 @@ def test_all_started_in_the_same_moment_lose_no_frame(start, domain, tmp_path, f
     topics = ('tool_a_0/x', 'tool_a_2/z', 'tool_a')
 
     def nodes():
-        start('field_model')
+        start('field_model', '--ros-args', '-p', 'allow_uncalibrated:=true')
         start('tracker', '--ros-args', '-p', 'gate:=1e5', '-p', 'max_sigma_m:=1.0')
         return start('recorder', '--ros-args', '-p', f'directory:={tmp_path}', '-p', 'name:=bag')
 

@@ -655,13 +655,16 @@ def test_a_model_file_is_served_at_once_and_must_fit_the_setup(ros, tmp_path):
 
 def test_both_nodes_track_a_recorded_session(ros, shared):
     """The chain of field_model and tracker on a recording that this package did not make."""
+    from rclpy.parameter import Parameter
+
     from anser_ros.nodes.field_model import FieldModelNode
     from anser_ros.nodes.tracker import TrackerNode
     from anser_ros.sessions.session import load_session
 
     session = load_session(shared / 'sessions' / 'effects' / 's01.mcap')
     tool = session.tools[0]
-    server, node = FieldModelNode(), TrackerNode()
+    allowed = [Parameter('allow_uncalibrated', value=True)]
+    server, node = FieldModelNode(parameter_overrides=allowed), TrackerNode()
     bench = Bench(ros, node)
     bench.executor.add_node(server)
     try:

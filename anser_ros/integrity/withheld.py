@@ -8,9 +8,11 @@ REFERENCES_DOUBTFUL = 'references_doubtful'
 """The references contradict each other, and which of them are right cannot be told."""
 OTHER_MODEL = 'other_model'
 """The model in force was made for another board, or is not the one whose effects are undone."""
+UNCALIBRATED = 'uncalibrated'
+"""The model is the drawing of the board, and nobody has said that this will do."""
 TWO_SOURCES = 'two_sources'
 """More than one publisher of what poses are made from; said by the tracker itself."""
-STATES = (REFERENCES_LOST, REFERENCES_DOUBTFUL, OTHER_MODEL)
+STATES = (REFERENCES_LOST, REFERENCES_DOUBTFUL, OTHER_MODEL, UNCALIBRATED)
 """States in which the model's server lets no pose be given; their places are their codes,
 from 1."""
 

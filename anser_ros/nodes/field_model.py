@@ -21,7 +21,13 @@ from std_srvs.srv import SetBool, Trigger
 from anser_ros.errors import AnserError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
-from anser_ros.integrity.withheld import OTHER_MODEL, REFERENCES_LOST, TWO_SOURCES, code_of
+from anser_ros.integrity.withheld import (
+    OTHER_MODEL,
+    REFERENCES_LOST,
+    TWO_SOURCES,
+    UNCALIBRATED,
+    code_of,
+)
 from anser_ros.nodes import qos, refit_status
 from anser_ros.nodes.diagnostics import Trouble
 from anser_ros.nodes.flux_reader import read_frame
@@ -41,7 +47,7 @@ from anser_ros.sessions.baseline import check_clean, clean_flux
 from anser_ros.sessions.model_file import SNAPSHOT, as_saved, is_snapshot, load_model, save_model
 from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session, sensor_table
-from anser_ros.sessions.starting_model import NOMINAL, starting_model
+from anser_ros.sessions.starting_model import NOMINAL, is_nominal, starting_model
 from anser_ros.wire.setup import Setup, parse_setup
 
 
@@ -51,6 +57,9 @@ class FieldModelParameters:
 
     model_file: str = parameter(
         NOMINAL, "model to start from: a file, or nominal for that of the setup's own geometry"
+    )
+    allow_uncalibrated: bool = parameter(
+        False, 'whether trackers may give poses by the nominal model', live=True
     )
     refit: bool = parameter(
         True, 'whether the model follows the reference sensors once a baseline is set', live=True
@@ -170,10 +179,9 @@ class FieldModelNode(AnserNode):
             self._references, len(base.emitters), self.parameters.baseline_s
         )
         self._writer.name_origin(base)
-        told, self._unfit = not self._unfit, False
+        told, self._unfit, self._base = not self._unfit, False, base
         if base is not self._model or not told:
             self._serve(base, self.get_clock().now().nanoseconds)
-        self._base = base
         if self._baseline_bag is not None and len(self._references):
             try:
                 self._follow(clean_flux(self._baseline_bag, self._references, base))
@@ -278,7 +286,10 @@ class FieldModelNode(AnserNode):
         The model of a frame of readings has their stamp, which may be of another day. ``withheld``
         is the state for which trackers are to give no pose, or not for long.
         """
-        withheld = OTHER_MODEL if self._unfit else withheld
+        if self._unfit:
+            withheld = OTHER_MODEL
+        elif not withheld and self._is_uncalibrated:
+            withheld = UNCALIBRATED
         self._stamp_ns = stamp_ns if stamp_ns != self._stamp_ns else stamp_ns + 1
         frame_id = self._frame_id
         # The uncertainty goes first, so that a receiver has both when the model comes.
@@ -291,6 +302,12 @@ class FieldModelNode(AnserNode):
         if model is not self._model:
             self.count('models')
         self._model = model
+
+    @property
+    def _is_uncalibrated(self) -> bool:
+        """Whether the base is the drawing of the board, and nobody has said that this will do."""
+        base, allowed = self._base, self.parameters.allow_uncalibrated
+        return base is not None and is_nominal(base) and not allowed
 
     def _begin(self, window: ReadingWindow, setup: Setup) -> None:
         """Take the first readings for the distortion-free ones, or wait for others."""
@@ -382,6 +399,8 @@ class FieldModelNode(AnserNode):
         """Go on at the new rate, or no longer."""
         self._pace.rate_hz = new.refit_rate_hz
         self._tell_following()
+        if self._model is not None and old.allow_uncalibrated != new.allow_uncalibrated:
+            self._serve(self._model, self.get_clock().now().nanoseconds)
 
     def status(self) -> Status:
         """Return which model is in force, where it comes from, and what the refit does."""
@@ -402,6 +421,8 @@ class FieldModelNode(AnserNode):
             'refit_time_s': self._refit_s,
         }
         activity = self._activity(values)
+        if self._is_uncalibrated:
+            activity = f'{UNCALIBRATED}: calibrate, or set allow_uncalibrated; {activity}'
         dead = '' if self._frames is None else ', '.join(self._frames.dead)
         values['dead_emitters'] = dead
         if dead:
@@ -415,7 +436,7 @@ class FieldModelNode(AnserNode):
             return Status('', Level.ERROR, said, values)
         is_troubled = values.get('refit_state') in refit_status.TROUBLED
         is_troubled |= bool(self._no_baseline and self._refit is None and self.parameters.refit)
-        level = Level.WARN if is_troubled else Level.OK
+        level = Level.WARN if is_troubled or self._is_uncalibrated else Level.OK
         return Status('', level, activity, values)
 
     @property

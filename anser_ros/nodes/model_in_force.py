@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from anser_ros.field.model import FieldModel
 from anser_ros.integrity.ageing import ModelAge, Standing
-from anser_ros.integrity.withheld import OTHER_MODEL, REFERENCES_LOST, Withheld
+from anser_ros.integrity.withheld import OTHER_MODEL, REFERENCES_LOST, UNCALIBRATED, Withheld
 from anser_ros.nodes.model_intake import GivenModel
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.wire.setup import Setup
@@ -26,6 +26,8 @@ class ModelInForce:
         Where tools are tracked.
     file_model : FieldModel or None
         The tracker's own, whose effects apply, and its field while none is published.
+    uncalibrated : bool
+        Whether the nominal model will do.
 
     Attributes
     ----------
@@ -35,8 +37,15 @@ class ModelInForce:
         It, or the file's while none is published.
     """
 
-    def __init__(self, setup: Setup, volume: TrackedVolume, file_model: FieldModel | None) -> None:
+    def __init__(
+        self,
+        setup: Setup,
+        volume: TrackedVolume,
+        file_model: FieldModel | None,
+        uncalibrated: bool = False,
+    ) -> None:
         self._setup, self._file_model = setup, file_model
+        self._uncalibrated = uncalibrated
         self.field = file_model
         self._age = ModelAge(setup.refit.references_age_s, volume)
         self._frame_ns = 0
@@ -61,7 +70,7 @@ class ModelInForce:
         self._differs = self._difference(given)
         if not given.follows:
             self._age.forget()
-        elif not given.withheld:
+        elif given.withheld in ('', UNCALIBRATED):
             stamp_ns = given.stamp_ns
             if self._frame_ns and abs(stamp_ns - self._frame_ns) > OTHER_CLOCK_NS:
                 stamp_ns = self._frame_ns
@@ -90,6 +99,8 @@ class ModelInForce:
         if self._differs:
             return Standing(self.field, Withheld(OTHER_MODEL, self._differs))
         state = '' if self.given is None else self.given.withheld
+        if state == UNCALIBRATED and self._uncalibrated:
+            state = ''
         standing = self._age.at(stamp_ns, REASONS.get(state, ''))
         if standing.model is None:
             standing = replace(standing, model=self.field)

@@ -68,6 +68,9 @@ class TrackerParameters:
     frame_prefix: str = parameter(
         '', "put before frames of coils and bodies in /tf; the board's is the setup's frame_id"
     )
+    allow_uncalibrated: bool = parameter(
+        False, 'whether poses are given by the nominal model though field_model withholds them'
+    )
     flux_noise_t: float = stated('flux_noise_t')
     stamp_sigma_s: float = stated('stamp_sigma_s')
     references_age_s: float = stated('references_age_s')
@@ -219,7 +222,9 @@ class TrackerNode(AnserNode):
             self._refuse('setups_refused', error)
             return
         self._setup_text, self._setup, self._tracker = message.data, setup, tracker
-        self._in_force = ModelInForce(setup, settings.box, self._file_model)
+        self._in_force = ModelInForce(
+            setup, settings.box, self._file_model, self.parameters.allow_uncalibrated
+        )
         for topic in self._topics.values():
             topic.destroy(self)
         self._topics = {

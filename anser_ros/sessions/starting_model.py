@@ -79,6 +79,11 @@ def model_for(name: str, session: 'Session', snapshot: bool = False) -> FieldMod
     return model
 
 
+def is_nominal(model: FieldModel) -> bool:
+    """Whether a model is the drawing of a board, or was made from it without a calibration."""
+    return model.provenance.get('source') == NOMINAL
+
+
 def made_for(model: FieldModel, setup: Setup) -> FieldModel:
     """Return the model as one for a setup: its board, and its bodies beside those from before."""
     before = {} if model.made_for is None else model.made_for.bodies
