@@ -37,6 +37,7 @@ setup(
         'setuptools',
         'numpy>=1.26',
         'scipy>=1.11',
+        'h5py>=3.10',
         'numba>=0.59',
         'PyYAML>=6',
         'pyserial>=3.5',

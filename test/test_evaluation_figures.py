@@ -61,6 +61,8 @@ def test_sigma_that_is_too_small_shows(evaluation):
     """Of half-normal errors 68 % lie within a sigma; of ones three times as large, 26 %."""
     _, right = figures.against_sigma(evaluation).axes
     at_one = int(np.argmin(np.abs(figures.COVERAGE_SIGMAS - 1.0)))
+    _, wider = figures.against_sigma(evaluation, jitter_m=1.0).axes
+    assert wider.lines[2].get_ydata()[at_one] == 1.0, 'a jitter of 1 m explains all'
     shares = [line.get_ydata()[at_one] for line in right.lines]
     assert shares[0] == pytest.approx(0.68, abs=0.1) and shares[2] == pytest.approx(0.26, abs=0.1)
     plt.close('all')
@@ -68,7 +70,9 @@ def test_sigma_that_is_too_small_shows(evaluation):
 
 def test_the_page_holds_all_figures(evaluation, tmp_path):
     document = to_document(evaluation)
-    files = figures.write_figures(evaluation, document, tmp_path, 'run <1>.mcap', 'nominal')
+    files = figures.write_figures(
+        evaluation, document, tmp_path, session='run <1>.mcap', model='nominal'
+    )
     assert {path.name for path in files} == {
         'evaluation.html', *(f'{name}.png' for name in figures.FIGURES)
     }  # fmt: skip
@@ -79,6 +83,6 @@ def test_the_page_holds_all_figures(evaluation, tmp_path):
     blind = PoseSeries('a', evaluation.bodies['a'].estimates, nothing, nothing)
     (folder := tmp_path / 'blind').mkdir()
     assert not figures.write_figures(
-        Evaluation({'a': blind}, {}, 1e-3), document, folder, 'x', 'nominal'
+        Evaluation({'a': blind}, {}, 1e-3), document, folder, session='x', model='nominal'
     )
     assert not list(folder.iterdir())

@@ -24,6 +24,7 @@ ROSDEP = {
     'pyyaml': 'python3-yaml',
     'pyserial': 'python3-serial',
     'matplotlib': 'python3-matplotlib',
+    'h5py': 'python3-h5py',
     'numba': 'python3-numba',
     'rich': 'python3-rich',
 }

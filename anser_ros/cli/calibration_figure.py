@@ -13,7 +13,7 @@ from anser_ros.calibration.result import Calibration
 
 def draw_choice(calibration: Calibration, path: Path) -> None:
     """Draw held-out errors by the number of dipoles, and by damping for the six best layouts."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.6), layout='constrained')
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 5.4), layout='constrained')
     for mark, name, chosen in (
         ('o', 'placed', lambda layout: not layout.moved),
         ('^', 'positions optimised', lambda layout: layout.moved),
@@ -33,7 +33,7 @@ def draw_choice(calibration: Calibration, path: Path) -> None:
     for panel in (left, right):
         panel.grid(alpha=0.3)
         # Below the axes, where it covers no curve.
-        panel.legend(fontsize=7, loc='upper center', bbox_to_anchor=(0.5, -0.16), ncols=2)
+        panel.legend(fontsize=7, loc='upper center', bbox_to_anchor=(0.5, -0.14))
     figure.suptitle('Choice by held-out error, pose marginalised', fontsize=10)
     figure.savefig(path, dpi=110, metadata={'Software': None})
     plt.close(figure)

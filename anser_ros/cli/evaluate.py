@@ -86,7 +86,10 @@ def run(args: argparse.Namespace) -> int:
     write_poses(args.out / 'poses.csv', evaluation)
     write_body_poses(args.out / 'bodies.csv', evaluation)
     written = [args.out / name for name in ('evaluation.json', 'poses.csv', 'bodies.csv')]
-    written += write_figures(evaluation, document, args.out, args.session, args.model)[-1:]
+    written += write_figures(
+        evaluation, document, args.out, session=args.session, model=args.model,
+        jitter_m=session.setup.accuracy.optical_position_m,
+    )[-1:]  # fmt: skip
     if session.lost:
         console.print(f'{args.session}: {session.lost}', style='yellow', highlight=False)
     if args.json:

@@ -5,7 +5,8 @@ Each figure is a PNG of its own, and all stand in one page that needs nothing el
 
 import base64
 import html
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -128,14 +129,18 @@ def by_coil(evaluation: Evaluation) -> Figure:
     return figure
 
 
-def against_sigma(evaluation: Evaluation) -> Figure:
-    """Draw the errors against the sigma told, and how many lie within a multiple of it."""
+def against_sigma(evaluation: Evaluation, jitter_m: float = 0.0) -> Figure:
+    """Draw the errors against the sigma told, and how many lie within a multiple of it.
+
+    ``jitter_m``, the optical tracker's own error a component, m, is a part of what is expected.
+    """
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4.2), layout='constrained')
     low, high = np.inf, 0.0
     for rank, (name, series) in enumerate(_series(evaluation).items()):
         sigma = np.array([estimate.sigma_position_m for estimate in series.estimates])
         good = np.isfinite(series.position_error) & (sigma > 0)
-        error, sigma = 1e3 * series.position_error[good], 1e3 * sigma[good]
+        error = 1e3 * series.position_error[good]
+        sigma = 1e3 * np.hypot(sigma[good], math.sqrt(3.0) * jitter_m)
         if not error.size:
             continue
         keep, colour = _thinned(error.size), f'C{rank % 10}'
@@ -148,7 +153,7 @@ def against_sigma(evaluation: Evaluation) -> Figure:
         left.plot(line, line, '-', color='0.3', label='error = sigma')
         left.plot(line, 3 * line, '--', color='0.3', label='error = 3 sigma')
         left.set(xscale='log', yscale='log')
-    left.set(xlabel='sigma of the position, mm', ylabel='position error, mm')
+    left.set(xlabel='sigma, with the optical jitter, mm', ylabel='position error, mm')
     right.set(xlabel='multiple of sigma', ylabel='share of the errors within', ylim=(0, 1.02))
     for panel in (left, right):
         panel.grid(alpha=0.3)
@@ -156,17 +161,23 @@ def against_sigma(evaluation: Evaluation) -> Figure:
     return figure
 
 
-FIGURES: dict[str, tuple[str, Callable[[Evaluation], Figure]]] = {
-    'error_over_time': ('Error over time; marks below: frames without a pose', over_time),
-    'error_over_space': ('Error over the volume', over_space),
-    'error_by_coil': ('Errors by coil and body: median, quartiles, 5 and 95 %', by_coil),
-    'sigma_and_error': ("Errors against the poses' own sigma", against_sigma),
+FIGURES = {
+    'error_over_time': 'Error over time; marks below: frames without a pose',
+    'error_over_space': 'Error over the volume',
+    'error_by_coil': 'Errors by coil and body: median, quartiles, 5 and 95 %',
+    'sigma_and_error': "Errors against the poses' own sigma and the optical jitter",
 }
 """Figures by the names of their files, with what they show."""
 
 
 def write_figures(
-    evaluation: Evaluation, document: Mapping[str, Any], folder: Path, session: str, model: str
+    evaluation: Evaluation,
+    document: Mapping[str, Any],
+    folder: Path,
+    *,
+    session: str,
+    model: str,
+    jitter_m: float = 0.0,
 ) -> list[Path]:
     """Write every figure and the page that holds them; return the files.
 
@@ -176,9 +187,12 @@ def write_figures(
     if not any(np.isfinite(series.position_error).any() for series in found.values()):
         return []
     parts, files = [], []
-    for name, (title, draw) in FIGURES.items():
+    drawn = (
+        over_time(evaluation), over_space(evaluation), by_coil(evaluation),
+        against_sigma(evaluation, jitter_m),
+    )  # fmt: skip
+    for (name, title), figure in zip(FIGURES.items(), drawn, strict=True):
         path = folder / f'{name}.png'
-        figure = draw(evaluation)
         figure.savefig(path, dpi=110, metadata={'Software': None})
         plt.close(figure)
         data = base64.b64encode(path.read_bytes()).decode('ascii')

@@ -29,8 +29,8 @@ half the distance of neighbouring points."""
 DOTS_PER_INCH = 110
 """Resolution of the figures, a compromise between legible text and the size of the files."""
 
-WIDEST = 4.0
-"""Width of the first curve of a figure, points; the last one has less than a third of it."""
+SAME = 0.05
+"""Relative difference of medians below which a curve may hide an earlier one, and is dashed."""
 
 
 def draw_all(study: Study, folder: Path) -> dict[str, str]:
@@ -83,18 +83,21 @@ def _cdfs(path: Path, curves: Mapping[str, Mapping[str, SensorErrors]], title: s
     """Draw the empirical distribution of the position error with a panel for each sensor."""
     figure, panels = plt.subplots(1, 2, figsize=(9, 3.8), sharey=True, layout='constrained')
     for panel, (sensor, words) in zip(panels, SENSOR_WORDS.items(), strict=True):
-        largest, smallest = 0.0, np.inf
-        for rank, (name, errors) in enumerate(curves.items()):
+        medians: list[float] = []
+        largest = 0.0
+        for name, errors in curves.items():
             distance = np.sort(1e3 * errors[sensor].distance)
             distance = distance[np.isfinite(distance)]
             if distance.size == 0:
                 continue
             share = np.arange(1, distance.size + 1) / distance.size
-            # Later curves are thinner: one that lies on another leaves it to be seen.
-            width = WIDEST * (1.0 - 0.7 * rank / max(len(curves) - 1, 1))
-            panel.step(distance, share, where='post', label=name, lw=width)
-            largest, smallest = max(largest, distance[-1]), min(smallest, np.median(distance))
-        if largest > 20.0 * smallest:
+            middle = float(np.median(distance))
+            hides = any(abs(middle - other) < SAME * other for other in medians)
+            style = {'ls': (0, (4, 4)), 'lw': 2.5} if hides else {}
+            panel.step(distance, share, where='post', label=name, **style)
+            medians.append(middle)
+            largest = max(largest, distance[-1])
+        if medians and largest > 20.0 * min(medians):
             panel.set_xscale('log')
         panel.set(xlabel='position error, mm', title=words)
         panel.grid(alpha=0.3)

@@ -334,3 +334,13 @@ def read_bag(path: str | os.PathLike[str]) -> Bag:
         os.fspath(path), setup, text, tool, reference, collector.pose_streams(),
         dict(collector.refused), salvage.lost,
     )  # fmt: skip
+
+
+def read_fluxes(path: str | os.PathLike[str]) -> dict[str, RecordedFluxes]:
+    """The fluxes of a bag that need not have a setup, by ``tool`` and ``reference``."""
+    collector = _Collector()
+    for raw in iter_messages(path, Salvage()):
+        if raw.topic.endswith(('/tool/flux', '/reference/flux')):
+            collector.add(raw)
+    found = {which: collector.flux_stream(which) for which in ('tool', 'reference')}
+    return {which: fluxes for which, fluxes in found.items() if fluxes is not None}

@@ -1,0 +1,72 @@
+"""Make a session bag of tables (CSV, NumPy, MATLAB) or of another program's bag."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from rich.console import Console
+
+from anser_ros.cli.output import make_folder, say_written
+from anser_ros.errors import ParameterError
+from anser_ros.sessions.bag_import import import_bag, parse_remaps
+from anser_ros.sessions.table_import import import_tables
+
+SCHEMA = 'anser_import_result/1'
+DOCUMENTS = ('.yaml', '.yml')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.epilog = (
+        'examples: anser import my_tables.yaml --out session.mcap; '
+        'anser import rosbag2_folder/ --remap /em/flux:=/anser/tool/flux --setup board.yaml '
+        '--out session.mcap'
+    )
+    parser.add_argument(
+        'source',
+        type=Path,
+        help='document (.yaml) that describes tables, or a bag: .db3, .mcap, or its folder',
+    )
+    parser.add_argument(
+        '--out', required=True, type=Path, help='the .mcap file to write; it must not exist yet'
+    )
+    parser.add_argument(
+        '--remap',
+        action='append',
+        default=[],
+        metavar='/FROM:=/TO',
+        help='new name of a topic of the bag; may be repeated',
+    )
+    parser.add_argument('--setup', type=Path, help='setup document, in place of any in the bag')
+    parser.add_argument('--json', action='store_true', help='print what was written as JSON')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; the exit code."""
+    make_folder(args.out.parent)
+    is_document = args.source.suffix in DOCUMENTS
+    if is_document and (args.remap or args.setup is not None):
+        raise ParameterError('--remap and --setup are for bags; the document tells its setup')
+    lost, left_out = '', {}
+    with Console(stderr=True).status(f'reading {args.source}'):
+        if is_document:
+            tables = import_tables(args.source, args.out)
+            counts = {f'/anser/{topic}/flux': n for topic, n in tables.fluxes.items()}
+            counts |= {f'/optical/{body}/pose': n for body, n in tables.poses.items()}
+        else:
+            setup = '' if args.setup is None else args.setup.read_text(encoding='utf-8')
+            bag = import_bag(args.source, args.out, parse_remaps(args.remap), setup)
+            counts, lost, left_out = bag.messages, bag.lost, bag.left_out
+    if lost:
+        print(f'anser import: {args.source}: {lost}', file=sys.stderr)
+    for topic, count in left_out.items():
+        print(f'anser import: {count} messages of {topic} left out', file=sys.stderr)
+    if args.json:
+        document = {'schema': SCHEMA, 'messages': counts, 'left_out': left_out, 'lost': lost}
+        print(json.dumps(document, indent=1))
+    else:
+        for topic, count in sorted(counts.items()):
+            print(f'{topic}: {count} messages')
+        say_written(args.out)
+    return 0

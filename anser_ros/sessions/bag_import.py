@@ -1,0 +1,119 @@
+"""A bag of somebody else's made into a session: topics renamed, a setup document added."""
+
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from anser_ros.errors import BagError, ParameterError
+from anser_ros.wire import cdr
+from anser_ros.wire.bag import Salvage
+from anser_ros.wire.bag_metadata import qos_profile
+from anser_ros.wire.bag_writer import BagWriter
+from anser_ros.wire.foreign_bag import read_foreign
+from anser_ros.wire.setup import parse_setup
+
+SETUP_TOPIC = '/anser/setup'
+SETUP_TYPE = 'std_msgs/msg/String'
+
+
+@dataclass(frozen=True)
+class ImportedBag:
+    """What came of an import.
+
+    Attributes
+    ----------
+    messages : dict of str to int
+        Written messages by their topic's new name.
+    left_out : dict of str to int
+        Messages whose type has no known definition, by topic and type.
+    lost : str
+        What could not be read, in words.
+    """
+
+    messages: dict[str, int]
+    left_out: dict[str, int]
+    lost: str
+
+
+def parse_remaps(entries: Sequence[str]) -> dict[str, str]:
+    """New names by old ones from entries ``FROM:=TO``.
+
+    Raises
+    ------
+    ParameterError
+        When an entry is not of that form, a name is not absolute, or one is renamed twice.
+    """
+    names: dict[str, str] = {}
+    for entry in entries:
+        old, _, new = entry.partition(':=')
+        if not old.startswith('/') or not new.startswith('/') or old in names:
+            raise ParameterError(f'{entry!r} is no new /FROM:=/TO')
+        names[old] = new
+    return names
+
+
+def import_bag(
+    path: str | os.PathLike[str],
+    out: Path,
+    remaps: Mapping[str, str] | None = None,
+    setup_text: str = '',
+) -> ImportedBag:
+    """Write the messages of any ROS 2 bag as one MCAP file that every command reads.
+
+    Parameters
+    ----------
+    path : path
+        As `anser_ros.wire.foreign_bag.read_foreign`.
+    out : Path
+        The file to write; it must not exist yet.
+    remaps : mapping, optional
+        New names of topics.
+    setup_text : str
+        Setup document that is written at the start, in place of any in the bag.
+
+    Raises
+    ------
+    BagError
+        When the bag cannot be read, has no message, or lacks a topic that is to be renamed.
+    SetupError
+        When the setup document is none.
+    """
+    if setup_text:
+        parse_setup(setup_text)
+    names, salvage = dict(remaps or {}), Salvage()
+    written: Counter[str] = Counter()
+    left_out: Counter[str] = Counter()
+    channels: dict[str, int] = {}
+    seen: set[str] = set()
+    with BagWriter(out) as writer:
+        for message in read_foreign(path, salvage):
+            seen.add(message.topic)
+            topic = names.get(message.topic, message.topic)
+            if setup_text and SETUP_TOPIC not in channels:
+                channels[SETUP_TOPIC] = _channel(writer, SETUP_TOPIC, SETUP_TYPE, '')
+                data = cdr.string_bytes(setup_text)
+                writer.write(channels[SETUP_TOPIC], message.log_time_ns, data)
+            if setup_text and topic.endswith('/setup') and message.type_name == SETUP_TYPE:
+                continue
+            if topic not in channels:
+                text = cdr.DEFINITIONS.get(message.type_name, message.definition)
+                if not text:
+                    left_out[f'{message.topic} ({message.type_name})'] += 1
+                    continue
+                channels[topic] = _channel(writer, topic, message.type_name, text)
+            writer.write(channels[topic], message.log_time_ns, message.data)
+            written[topic] += 1
+    missing = sorted(set(names) - seen)
+    if missing or not written:
+        out.unlink()
+        what = f'no topic {", ".join(missing)}; there are: {", ".join(sorted(seen))}'
+        raise BagError(f'{os.fspath(path)}: {what if missing else "not one message can be read"}')
+    return ImportedBag(dict(written), dict(left_out), salvage.lost)
+
+
+def _channel(writer: BagWriter, topic: str, type_name: str, text: str) -> int:
+    latched = topic.endswith('/setup')
+    qos = [qos_profile(latched=latched, depth=1 if latched else 100)]
+    return writer.add_topic(topic, type_name, text or cdr.DEFINITIONS[type_name], qos)

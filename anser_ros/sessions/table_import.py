@@ -1,0 +1,269 @@
+"""Tables of fluxes and optical poses made into a session, as a small document says.
+
+The document names the files, their columns, units, the order of quaternions and the time base;
+`docs/howto/import.md` has every key with examples.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from anser_ros.errors import ParameterError
+from anser_ros.sessions.tables import NumberTable, read_table
+from anser_ros.wire.bag_writer import SessionWriter
+from anser_ros.wire.points import STALE, FluxPoints, encode_flux
+from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup, parse_setup
+from anser_ros.wire.yaml_text import read_yaml
+
+SCHEMA = 'anser_import/1'
+TIME_NS = {'s': 1e9, 'ms': 1e6, 'us': 1e3, 'ns': 1.0}
+"""Nanoseconds in a unit of time."""
+FLUX_T = {'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'pT': 1e-12}
+"""Tesla in a unit of flux density."""
+LENGTH_M = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}
+"""Metres in a unit of length."""
+ORDERS = {'xyzw': (0, 1, 2, 3), 'wxyz': (1, 2, 3, 0)}
+"""Where x, y, z, w stand in a quaternion of that order."""
+UNIT_NORM = 0.01
+"""Most that a quaternion's length may differ from 1, as where bags are read."""
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class ImportedTables:
+    """Number of flux frames by topic, and of poses by body, that were written."""
+
+    fluxes: dict[str, int]
+    poses: dict[str, int]
+
+
+def import_tables(document: Path, out: Path) -> ImportedTables:
+    """Write the session that a document describes; files are looked for beside it.
+
+    Raises
+    ------
+    ParameterError
+        When the document or a table breaks a rule, with the file's name.
+    SetupError
+        When the setup document is none.
+    BagError
+        When the file to write is there already.
+    """
+    try:
+        spec = read_yaml(document.read_text(encoding='utf-8'))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ParameterError(f'{document}: {" ".join(str(error).split())}') from error
+    try:
+        return _Import(_mapping(spec, 'the document'), document.parent).write(out)
+    except ParameterError as error:
+        text = str(error)
+        said = text if str(document.parent) in text else f'{document}: {text}'
+        raise ParameterError(said) from error
+
+
+class _Import:
+    """One document's import."""
+
+    def __init__(self, spec: Mapping[str, Any], folder: Path) -> None:
+        if spec.get('schema') != SCHEMA:
+            raise ParameterError(f'schema must be {SCHEMA}, got {spec.get("schema")!r}')
+        _known(spec, ('schema', 'setup', 'time', 'fluxes', 'poses'), 'the document')
+        self._folder = folder
+        path = folder / str(_needed(spec, 'setup', 'the document'))
+        try:
+            self._setup_text = path.read_text(encoding='utf-8')
+        except (OSError, UnicodeDecodeError) as error:
+            raise ParameterError(f'setup {path}: {error}') from error
+        self._setup: Setup = parse_setup(self._setup_text)
+        time = _mapping(spec.get('time', {}), 'time')
+        _known(time, ('unit', 'start_ns'), 'time')
+        self._time_ns = _choice(time, 'unit', TIME_NS, 's', 'time')
+        self._start_ns = time.get('start_ns', 0)
+        if not isinstance(self._start_ns, int) or isinstance(self._start_ns, bool):
+            raise ParameterError(f'time: start_ns must be a whole number, got {self._start_ns!r}')
+        self._entries: list[tuple[int, Callable[[SessionWriter], None]]] = []
+        self._tables: dict[Path, NumberTable] = {}
+        self._done: dict[str, dict[str, int]] = {'fluxes': {}, 'poses': {}}
+        fluxes, poses = spec.get('fluxes') or [], spec.get('poses') or []
+        if not isinstance(fluxes, list) or not fluxes:
+            raise ParameterError('fluxes must be a list of tables')
+        for number, entry in enumerate(fluxes):
+            self._add_fluxes(_mapping(entry, f'fluxes[{number}]'), f'fluxes[{number}]')
+        for number, entry in enumerate(poses):
+            self._add_poses(_mapping(entry, f'poses[{number}]'), f'poses[{number}]')
+
+    def write(self, out: Path) -> ImportedTables:
+        """Write all by its stamps."""
+        self._entries.sort(key=lambda entry: entry[0])
+        with SessionWriter(out, self._setup.frame_id) as writer:
+            writer.write_setup(self._setup_text, self._entries[0][0])
+            for _, put in self._entries:
+                put(writer)
+        return ImportedTables(self._done['fluxes'], self._done['poses'])
+
+    def _table(self, entry: Mapping[str, Any], what: str) -> NumberTable:
+        path = self._folder / str(_needed(entry, 'file', what))
+        if path not in self._tables:
+            self._tables[path] = read_table(path)
+        return self._tables[path]
+
+    def _stamps(self, table: NumberTable, entry: Mapping[str, Any], what: str) -> list[int]:
+        column = table.column(_needed(entry, 'stamp', what))
+        if column.dtype.kind in 'iu':  # exact, as nanoseconds since 1970 have 19 digits
+            stamps = [self._start_ns + int(v) * int(self._time_ns) for v in column.tolist()]
+        else:
+            values = _real(column, table, str(entry['stamp']))
+            if not np.isfinite(values).all():
+                raise ParameterError(f'{table.path}: {entry["stamp"]} has values not finite')
+            stamps = [self._start_ns + round(v * self._time_ns) for v in values.tolist()]
+        if not stamps:
+            raise ParameterError(f'{table.path}: no rows')
+        if min(stamps) <= 0:
+            raise ParameterError(f'{table.path}: a stamp is not after 1970; is start_ns missing?')
+        if len(set(stamps)) < len(stamps):
+            raise ParameterError(f'{table.path}: the same stamp twice; is the unit of time right?')
+        return stamps
+
+    def _add_fluxes(self, entry: Mapping[str, Any], what: str) -> None:
+        _known(entry, ('file', 'stamp', 'unit', 'sensors', 'array'), what)
+        table = self._table(entry, what)
+        scale = _choice(entry, 'unit', FLUX_T, 'T', what)
+        stamps = self._stamps(table, entry, what)
+        by_name = {sensor.name: sensor for sensor in self._setup.sensors}
+        given = _needed(entry, 'sensors', what)
+        names = list(given)
+        unknown = [name for name in names if name not in by_name]
+        if unknown or not names:
+            raise ParameterError(
+                f'{what}: the setup has no sensor {", ".join(map(str, unknown)) or "named here"}'
+            )
+        emitters = len(self._setup.emitter.coils)
+        if 'array' in entry:
+            flux = table.array(str(entry['array']))
+            wanted = (len(stamps), len(names), emitters)
+            if flux.shape != wanted:
+                raise ParameterError(
+                    f'{table.path}: {entry["array"]} has shape {flux.shape}, not frames x sensors '
+                    f'x emitters, which is {wanted}'
+                )
+        else:
+            columns = _mapping(given, f'{what}: sensors')
+            flux = np.stack([_phasors(table, columns[n], emitters, n) for n in names], axis=1)
+        flux = scale * np.asarray(flux, dtype=np.complex128)
+        sensors = [by_name[name] for name in names]
+        for topic, fixed in (('tool', False), ('reference', True)):
+            rows = [i for i, s in enumerate(sensors) if (s.body == FIELD_GENERATOR) == fixed]
+            if rows:
+                self._put_fluxes(topic, [sensors[i] for i in rows], flux[:, rows], stamps, fixed)
+
+    def _put_fluxes(
+        self, topic: str, sensors: list[SensorSpec], flux: Array, stamps: list[int], fixed: bool
+    ) -> None:
+        channel = np.array([s.channel for s in sensors], dtype=np.int64)
+        nothing = np.full((len(sensors), 3), np.nan)
+        place = np.array([s.position_m for s in sensors]) if fixed else nothing
+        axis = np.array([s.axis for s in sensors]) if fixed else nothing
+        for stamp, values in zip(stamps, flux, strict=True):
+            lacking = ~np.isfinite(values).all(axis=1)
+            flags = np.where(lacking, STALE, 0)
+            points = FluxPoints(channel, flags, values, place, axis)
+            self._entries.append((stamp, _flux_putter(f'/anser/{topic}/flux', stamp, points)))
+        done = self._done['fluxes']
+        done[topic] = done.get(topic, 0) + len(stamps)
+
+    def _add_poses(self, entry: Mapping[str, Any], what: str) -> None:
+        _known(entry, ('file', 'stamp', 'body', 'position', 'unit', 'quaternion', 'order'), what)
+        table, body = self._table(entry, what), str(_needed(entry, 'body', what))
+        if body not in self._setup.bodies:
+            raise ParameterError(f'{what}: the setup has no body {body}')
+        scale = _choice(entry, 'unit', LENGTH_M, 'm', what)
+        order = entry.get('order')
+        if order not in ORDERS:
+            raise ParameterError(f'{what}: order must be {" or ".join(ORDERS)}, got {order!r}')
+        stamps = self._stamps(table, entry, what)
+        position = scale * _real(
+            table.columns(entry.get('position'), 3, f'{what}: position'), table, 'position'
+        )
+        quaternion = _real(
+            table.columns(entry.get('quaternion'), 4, f'{what}: quaternion'), table, 'quaternion'
+        )[:, ORDERS[order]]
+        good = np.isfinite(position).all(axis=1) & np.isfinite(quaternion).all(axis=1)
+        length = np.linalg.norm(quaternion, axis=1)
+        if (np.abs(length[good] - 1.0) > UNIT_NORM).any():
+            raise ParameterError(f'{table.path}: quaternions are not of unit length')
+        for row in np.flatnonzero(good).tolist():
+            put = _pose_putter(body, stamps[row], position[row], quaternion[row] / length[row])
+            self._entries.append((stamps[row], put))
+        self._done['poses'][body] = self._done['poses'].get(body, 0) + int(good.sum())
+
+
+def _flux_putter(topic: str, stamp: int, points: FluxPoints) -> Callable[[SessionWriter], None]:
+    def put(writer: SessionWriter) -> None:
+        fields, step, data = encode_flux(points)
+        writer.write_flux(topic, stamp, fields, step, len(points.channel), data)
+
+    return put
+
+
+def _pose_putter(
+    body: str, stamp: int, position: Array, quaternion: Array
+) -> Callable[[SessionWriter], None]:
+    def put(writer: SessionWriter) -> None:
+        topic = f'/optical/{body}/pose'
+        writer.write_pose(topic, stamp, position.tolist(), quaternion.tolist())
+
+    return put
+
+
+def _phasors(table: NumberTable, given: Any, emitters: int, name: str) -> Array:
+    """Fluxes of one sensor, shape (F, K): complex columns, or those of ``re`` and ``im``."""
+    if isinstance(given, dict):
+        _known(given, ('re', 'im'), name)
+        parts = [
+            _real(table.columns(given.get(part), emitters, f'{name}: {part}'), table, name)
+            for part in ('re', 'im')
+        ]
+        return np.asarray(parts[0] + 1j * parts[1])
+    found = table.columns(given, emitters, name)
+    if found.dtype.kind not in 'fiuc':
+        raise ParameterError(f'{table.path}: {name} has cells that are no numbers')
+    return found
+
+
+def _real(values: Array, table: NumberTable, name: str) -> Array:
+    if values.dtype.kind not in 'fiu':
+        raise ParameterError(f'{table.path}: {name} has cells that are no real numbers')
+    return np.asarray(values, dtype=np.float64)
+
+
+def _mapping(value: Any, what: str) -> Mapping[str, Any]:
+    if not isinstance(value, dict):
+        raise ParameterError(f'{what} must be a mapping')
+    return value
+
+
+def _needed(spec: Mapping[str, Any], key: str, what: str) -> Any:
+    if spec.get(key) is None:
+        raise ParameterError(f'{what} lacks {key}')
+    return spec[key]
+
+
+def _known(spec: Mapping[str, Any], keys: tuple[str, ...], what: str) -> None:
+    unknown = sorted(str(key) for key in spec if key not in keys)
+    if unknown:
+        raise ParameterError(f'{what}: no key {", ".join(unknown)}; there are: {", ".join(keys)}')
+
+
+def _choice(
+    spec: Mapping[str, Any], key: str, known: Mapping[str, float], usual: str, what: str
+) -> float:
+    given = spec.get(key, usual)
+    if given not in known:
+        raise ParameterError(f'{what}: {key} must be among {", ".join(known)}, got {given!r}')
+    return known[given]
