@@ -7,13 +7,13 @@ ros2 launch anser_ros anser.launch.py simulate:=true baseline:=clean.mcap openig
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, GroupAction, OpaqueFunction
 from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node, PushRosNamespace
 from launch_ros.parameter_descriptions import ParameterValue
-from launch_ros.substitutions import FindPackageShare
 
 from anser_ros.cli.commands import NODES
 from anser_ros.nodes.parameter_files import checked
+from anser_ros.wire.config_folder import config_path
 
 PACKAGE = 'anser_ros'
 DEVICE = '/dev/ttyACM0'
@@ -31,13 +31,14 @@ ARGUMENTS = {
     'board_seed': ('0', "the simulated unit's board: 0 as drawn, 1 that of demo_model.yaml"),
     'simulate': ('false', 'whether a simulated control unit replaces the real one'),
     'optical': ('/optical', 'namespace of the optical poses'),
-    'frame_prefix': ('', 'put before the frames of coils and bodies in /tf'),
+    'frame_prefix': ('', 'put before the frames of poses and of /tf'),
     'record': ('true', 'whether a bag is recorded'),
     'directory': ('recordings', 'folder of the bags'),
     'watch': ('false', 'whether effects that the model lacks are reported in /diagnostics'),
     'openigtlink': ('false', 'whether poses are served to 3D Slicer'),
     'igtl_host': ('127.0.0.1', 'address that OpenIGTLink is served on; 0.0.0.0 for all'),
     'igtl_port': ('18944', 'TCP port of OpenIGTLink'),
+    'rviz_config': ('anser.rviz', 'view of anser views: a path, or a file of the package'),
     'rviz': ('false', 'whether RViz is started'),
 }
 
@@ -48,6 +49,7 @@ def find_files(context):
     A parameter file that is none, or names a node that there is not, ends the launch with a line.
     """
     given = context.launch_configurations
+    given['rviz_config'] = str(config_path(given['rviz_config']))
     given['params'] = checked(given['params'], list(NODES))
     # As IfCondition reads it.
     is_simulated = given['simulate'].lower() in ('true', '1')
@@ -76,7 +78,6 @@ def generate_launch_description():
     """Return the nodes of the chain with the launch arguments."""
     value = LaunchConfiguration
     board = {'setup_file': value('setup'), 'channels_file': value('channels')}
-    rviz_config = PathJoinSubstitution([FindPackageShare(PACKAGE), 'config', 'anser.rviz'])
     return LaunchDescription(
         [
             *(
@@ -127,7 +128,7 @@ def generate_launch_description():
             Node(
                 package='rviz2',
                 executable='rviz2',
-                arguments=['-d', rviz_config],
+                arguments=['-d', value('rviz_config')],
                 condition=IfCondition(value('rviz')),
             ),
         ]

@@ -110,6 +110,8 @@ def test_views_show_topics_that_exist():
     plotted = {path['value'] for panel in panels for path in panel.get('paths', [])}
     shown |= {value.split('.', 1)[0] for value in plotted}
     known = poses | {'/anser/field_model', '/anser/reference/flux', '/diagnostics', '/tf'}
+    assert '/anser/metal' in shown
+    known.add('/anser/metal')
     assert shown and shown <= known
 
 

@@ -44,6 +44,7 @@ def test_a_simulated_unit_has_a_port_that_anybody_may_make(launched):
 
 def test_a_parameter_file_is_taken_from_here_or_from_the_package(launched, tmp_path):
     assert launched()['params'] == str(REPO / 'config' / 'anser.yaml')
+    assert launched()['rviz_config'] == str(REPO / 'config' / 'anser.rviz')
     (tmp_path / 'mine.yaml').write_text('/**/tracker:\n  ros__parameters: {gate: 3.0}\n')
     assert launched(params='mine.yaml')['params'] == 'mine.yaml'
     (tmp_path / 'bad.yaml').write_text('/**/trakcer:\n  ros__parameters: {gate: 3.0}\n')

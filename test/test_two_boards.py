@@ -76,7 +76,7 @@ def test_frames_have_their_boards_prefix(ros):
     node = ros.create_node('peer')
     try:
         first, second = (
-            PoseTopic(node, 'tool_a/0/x', f'{board}_fg', f'{board}_').transform
+            PoseTopic(node, 'tool_a/0/x', 'fg', f'{board}_').transform
             for board in ('left', 'right')
         )
         assert (first.header.frame_id, first.child_frame_id) == ('left_fg', 'left_tool_a_0/x')

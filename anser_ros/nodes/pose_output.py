@@ -46,9 +46,10 @@ class PoseTopic:
             PoseWithCovarianceStamped, f'{stem}/pose_with_covariance', qos.STREAM
         )
         self._plain, self._full = PoseStamped(), PoseWithCovarianceStamped()
-        self._plain.header.frame_id = self._full.header.frame_id = frame_id
+        board = f'{prefix}{frame_id}'
+        self._plain.header.frame_id = self._full.header.frame_id = board
         self.transform = TransformStamped()
-        self.transform.header.frame_id = frame_id
+        self.transform.header.frame_id = board
         self.transform.child_frame_id = f'{prefix}{stem}'
         self.estimate: PoseEstimate | None = None
         self.states: Counter[str] = Counter()

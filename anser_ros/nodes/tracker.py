@@ -66,7 +66,7 @@ class TrackerParameters:
         'none',
     )
     frame_prefix: str = parameter(
-        '', "put before frames of coils and bodies in /tf; the board's is the setup's frame_id"
+        '', "put before the frames of poses and of /tf, the board's too, where boards are several"
     )
     allow_uncalibrated: bool = parameter(
         False, 'whether poses are given by the nominal model though field_model withholds them'
