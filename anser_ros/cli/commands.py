@@ -24,6 +24,7 @@ OFFLINE = {
     'calibrate': 'fit a field model to recorded sessions',
     'demo': 'watch a simulated tool being tracked: a live table, a bag, a picture',
     'diagnose': 'find what a model leaves unexplained on a session, name the effect, correct it',
+    'doctor': 'look at installation, ports, clock and graph, with a remedy for each problem',
     'error_map': 'learn an error map from tracked and true positions, and apply it to others',
     'evaluate': 'track a recorded session and compare its poses with the optical ones',
     'export': 'write poses and fluxes of a bag as CSV, TUM or MATLAB files',

@@ -1,0 +1,212 @@
+"""Look at the installation and the machine, and name a remedy for each problem."""
+
+import argparse
+import glob
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from anser_ros.cli.commands import NODES
+from anser_ros.cli.missing import PYPI
+
+SCHEMA = 'anser_doctor/1'
+GOOD, NOTE, BAD = 'ok', 'note', 'problem'
+COLOURS = {GOOD: 'green', NOTE: 'yellow', BAD: 'red'}
+TESTED = ((3, 11), (3, 12))
+"""Versions of Python that the tests run with."""
+MODULES = ('numpy', 'scipy', 'numba', 'yaml', 'serial', 'rich', 'matplotlib', 'h5py')
+"""Modules that come by rosdep or pip; those of `PYPI` by pip only."""
+DISTRIBUTIONS = {'yaml': 'PyYAML', 'serial': 'pyserial', **PYPI}
+"""What the distribution of a module is called where that is another name."""
+LOOK_S = 2.0
+"""How long the graph is looked at, s: nodes speak in /diagnostics once a second."""
+PATIENCE_S = 20.0
+"""Time that the look may take beyond that, s: ROS loads slowly from a cold disk."""
+LEAST_FREE_BYTES = 2 * 2**30
+"""Free disk space below which a recording is at risk, bytes: an hour of the usual fluxes."""
+PORTS = ('/dev/ttyACM*', '/dev/ttyUSB*')
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at: how it is, and what to do where it is not well."""
+
+    name: str
+    state: str
+    found: str
+    remedy: str = ''
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.epilog = 'example: anser doctor --device /dev/ttyACM0'
+    parser.add_argument('--device', help="the control unit's port; all usual ones by default")
+    parser.add_argument(
+        '--seconds', type=float, default=LOOK_S, help='how long to look at the graph, s'
+    )
+    parser.add_argument('--json', action='store_true', help='print the findings as JSON')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command: 0 where nothing is wrong, 2 where something is."""
+    with Console(stderr=True).status('looking') as status:
+        findings: list[Finding] = []
+        for name, look in looks(args.device, args.seconds):
+            status.update(f'looking at {name}')
+            findings += look()
+    problems = [finding for finding in findings if finding.state == BAD]
+    if args.json:
+        listed = [asdict(finding) for finding in findings]
+        print(json.dumps({'schema': SCHEMA, 'problems': len(problems), 'findings': listed}))
+    else:
+        Console().print(_table(findings))
+        print(f'{len(problems)} problems' if problems else 'nothing is wrong')
+    return 2 if problems else 0
+
+
+def looks(device: str | None, seconds: float) -> Iterator[tuple[str, Callable[[], list[Finding]]]]:
+    """Everything that is looked at, by what it is called."""
+    yield 'Python', python
+    yield 'packages', packages
+    yield 'kernels', kernels
+    yield 'ports', lambda: ports(device)
+    yield 'clock', clock
+    yield 'disk', lambda: disk(Path.cwd())
+    yield 'the graph', lambda: graph(seconds)
+
+
+def _table(findings: list[Finding]) -> Table:
+    table = Table('', 'found', 'remedy')
+    for one in findings:
+        name = f'[{COLOURS[one.state]}]{escape(one.name)}'
+        table.add_row(name, escape(one.found), escape(one.remedy))
+    return table
+
+
+def python() -> list[Finding]:
+    """The interpreter: whether it is one that is tested."""
+    own, words = sys.version_info[:2], sys.version.split()[0]
+    tested = ' and '.join('.'.join(map(str, one)) for one in TESTED)
+    if own in TESTED:
+        return [Finding('Python', GOOD, words)]
+    return [Finding('Python', NOTE, words, f'tested are {tested}')]
+
+
+def packages(has: Callable[[str], Any] = find_spec) -> list[Finding]:
+    """Every package that is imported somewhere: its version, or how to get it."""
+    found = []
+    for module in (*MODULES, *PYPI):
+        name = DISTRIBUTIONS.get(module, module)
+        if not has(module):
+            found.append(Finding(name, BAD, 'not installed', f'pip install {name}'))
+            continue
+        try:
+            text = version(name)
+        except PackageNotFoundError:
+            text = 'installed, version unknown'
+        found.append(Finding(name, GOOD, text))
+    return found
+
+
+def kernels() -> list[Finding]:
+    """The compiled kernels: whether the first start has to wait for them."""
+    # Late, as numba may be what is missing.
+    if not find_spec('numba'):
+        return []
+    from anser_ros.frames.intake import fill_frame
+    from anser_ros.kernel_cache import KernelCache, folder_of
+
+    cache = KernelCache(folder_of(fill_frame))
+    if cache.is_full:
+        return [Finding('kernels', GOOD, f'all {cache.total} are compiled')]
+    words = f'{cache.done} of {cache.total} are compiled: the first start waits for them'
+    return [Finding('kernels', NOTE, words, 'anser warm_up')]
+
+
+def ports(device: str | None, patterns: tuple[str, ...] = PORTS) -> list[Finding]:
+    """The serial ports: whether there is one, and may be opened."""
+    names = [device] if device else sorted(n for p in patterns for n in glob.glob(p))
+    if not names:
+        words = f'none of {", ".join(patterns)}'
+        return [Finding('port', NOTE, words, 'plug the control unit in, or simulate:=true')]
+    found = []
+    for name in names:
+        if not os.path.exists(name):
+            found.append(Finding(name, BAD, 'not there', 'plug it in; see dmesg for its name'))
+        elif not os.access(name, os.R_OK | os.W_OK):
+            remedy = 'sudo usermod -aG dialout $USER, and log in anew'
+            found.append(Finding(name, BAD, 'may not be read and written', remedy))
+        else:
+            found.append(Finding(name, GOOD, 'may be opened'))
+    return found
+
+
+def clock(tool: str = 'timedatectl') -> list[Finding]:
+    """The system's clock: whether somebody keeps it right, as poses of two machines need it."""
+    if shutil.which(tool) is None:
+        return [Finding('clock', NOTE, f'unknown, as there is no {tool}')]
+    command = [tool, 'show', '-p', 'NTPSynchronized', '--value']
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.stdout.strip() == 'yes':
+        return [Finding('clock', GOOD, 'synchronised')]
+    if done.stdout.strip() == 'no':
+        remedy = 'install chrony, or timedatectl set-ntp true'
+        return [Finding('clock', NOTE, 'not synchronised with other machines', remedy)]
+    return [Finding('clock', NOTE, f'unknown, as {tool} does not tell')]
+
+
+def disk(folder: Path, least: int = LEAST_FREE_BYTES) -> list[Finding]:
+    """The disk under a folder: whether a recording has room."""
+    free = shutil.disk_usage(folder).free
+    words = f'{free / 2**30:.1f} GB free in {folder}'
+    if free < least:
+        return [Finding('disk', BAD, words, 'make room, or record elsewhere (directory:=...)')]
+    return [Finding('disk', GOOD, words)]
+
+
+def graph(seconds: float) -> list[Finding]:
+    """The ROS graph: the middleware, which nodes are there, and what they complain of."""
+    code = f'from anser_ros.nodes.graph_look import main; main({seconds!r})'
+    try:
+        done = subprocess.run(
+            [sys.executable, '-c', code], capture_output=True, text=True, check=False,
+            timeout=seconds + PATIENCE_S,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        remedy = 'look at RMW_IMPLEMENTATION and the network'
+        return [Finding('ROS', BAD, 'the middleware does not answer', remedy)]
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or ['no reason'])[-1]
+        remedy = 'source /opt/ros/jazzy/setup.bash, or use the environment that `make` makes'
+        return [Finding('ROS', BAD, last, remedy)]
+    told = json.loads(done.stdout.strip().splitlines()[-1])
+    return graph_findings(told)
+
+
+def graph_findings(told: dict[str, Any]) -> list[Finding]:
+    """What a look at the graph means."""
+    domain = os.environ.get('ROS_DOMAIN_ID', '0')
+    reach = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')
+    words = f'{told["middleware"]}, domain {domain}, discovery {reach}'
+    found = [Finding('ROS', GOOD, words)]
+    for name in told['twice']:
+        remedy = 'end one of them, or give it a namespace of its own'
+        found.append(Finding(name, BAD, 'runs more than once', remedy))
+    ours = [name for name in told['nodes'] if name.rsplit('/', 1)[-1] in NODES]
+    words = f'{len(told["nodes"])} nodes, {len(ours)} of them ours, {told["topics"]} topics'
+    found.append(Finding('graph', GOOD, words))
+    for name, text in told['complaints'].items():
+        found.append(Finding(name, NOTE, text, 'docs/faults.md has what states mean'))
+    return found
