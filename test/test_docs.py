@@ -87,7 +87,7 @@ sensors:
             (REPO / 'anser_ros' / place).read_text(encoding='utf-8')
             for place in ('wire/setup.py', 'physics/board.py')
         )
-        keys = set(re.findall(r"(?:_take|_number|_whole)\(\w+, '(\w+)'", code))
+        keys = set(re.findall(r"\b_?(?:take|number|whole)\(\w+, '(\w+)'", code))
         keys |= set(re.findall(r"\.get\('(\w+)'", code))
         assert {'channel', 'pitch_m', 'rotation_deg', 'sides'} <= keys
         for key in keys | set(KINDS):

@@ -22,6 +22,7 @@ NODES = {
 OFFLINE = {
     'bags': 'record the small simulated sessions of the folder bags/',
     'calibrate': 'fit a field model to recorded sessions',
+    'compare': 'compare two evaluations of a session, paired, with bootstrap intervals',
     'demo': 'watch a simulated tool being tracked: a live table, a bag, a picture',
     'diagnose': 'find what a model leaves unexplained on a session, name the effect, correct it',
     'doctor': 'look at installation, ports, clock and graph, with a remedy for each problem',

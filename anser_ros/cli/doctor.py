@@ -40,7 +40,7 @@ PORTS = ('/dev/ttyACM*', '/dev/ttyUSB*')
 
 
 @dataclass(frozen=True)
-class Finding:
+class Observation:
     """One thing that was looked at: how it is, and what to do where it is not well."""
 
     name: str
@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command: 0 where nothing is wrong, 2 where something is."""
     with Console(stderr=True).status('looking') as status:
-        findings: list[Finding] = []
+        findings: list[Observation] = []
         for name, look in looks(args.device, args.seconds):
             status.update(f'looking at {name}')
             findings += look()
@@ -76,7 +76,9 @@ def run(args: argparse.Namespace) -> int:
     return 2 if problems else 0
 
 
-def looks(device: str | None, seconds: float) -> Iterator[tuple[str, Callable[[], list[Finding]]]]:
+def looks(
+    device: str | None, seconds: float
+) -> Iterator[tuple[str, Callable[[], list[Observation]]]]:
     """Everything that is looked at, by what it is called."""
     yield 'Python', python
     yield 'packages', packages
@@ -87,7 +89,7 @@ def looks(device: str | None, seconds: float) -> Iterator[tuple[str, Callable[[]
     yield 'the graph', lambda: graph(seconds)
 
 
-def _table(findings: list[Finding]) -> Table:
+def _table(findings: list[Observation]) -> Table:
     table = Table('', 'found', 'remedy')
     for one in findings:
         name = f'[{COLOURS[one.state]}]{escape(one.name)}'
@@ -95,32 +97,32 @@ def _table(findings: list[Finding]) -> Table:
     return table
 
 
-def python() -> list[Finding]:
+def python() -> list[Observation]:
     """The interpreter: whether it is one that is tested."""
     own, words = sys.version_info[:2], sys.version.split()[0]
     tested = ' and '.join('.'.join(map(str, one)) for one in TESTED)
     if own in TESTED:
-        return [Finding('Python', GOOD, words)]
-    return [Finding('Python', NOTE, words, f'tested are {tested}')]
+        return [Observation('Python', GOOD, words)]
+    return [Observation('Python', NOTE, words, f'tested are {tested}')]
 
 
-def packages(has: Callable[[str], Any] = find_spec) -> list[Finding]:
+def packages(has: Callable[[str], Any] = find_spec) -> list[Observation]:
     """Every package that is imported somewhere: its version, or how to get it."""
     found = []
     for module in (*MODULES, *PYPI):
         name = DISTRIBUTIONS.get(module, module)
         if not has(module):
-            found.append(Finding(name, BAD, 'not installed', f'pip install {name}'))
+            found.append(Observation(name, BAD, 'not installed', f'pip install {name}'))
             continue
         try:
             text = version(name)
         except PackageNotFoundError:
             text = 'installed, version unknown'
-        found.append(Finding(name, GOOD, text))
+        found.append(Observation(name, GOOD, text))
     return found
 
 
-def kernels() -> list[Finding]:
+def kernels() -> list[Observation]:
     """The compiled kernels: whether the first start has to wait for them."""
     # Late, as numba may be what is missing.
     if not find_spec('numba'):
@@ -130,53 +132,53 @@ def kernels() -> list[Finding]:
 
     cache = KernelCache(folder_of(fill_frame))
     if cache.is_full:
-        return [Finding('kernels', GOOD, f'all {cache.total} are compiled')]
+        return [Observation('kernels', GOOD, f'all {cache.total} are compiled')]
     words = f'{cache.done} of {cache.total} are compiled: the first start waits for them'
-    return [Finding('kernels', NOTE, words, 'anser warm_up')]
+    return [Observation('kernels', NOTE, words, 'anser warm_up')]
 
 
-def ports(device: str | None, patterns: tuple[str, ...] = PORTS) -> list[Finding]:
+def ports(device: str | None, patterns: tuple[str, ...] = PORTS) -> list[Observation]:
     """The serial ports: whether there is one, and may be opened."""
     names = [device] if device else sorted(n for p in patterns for n in glob.glob(p))
     if not names:
         words = f'none of {", ".join(patterns)}'
-        return [Finding('port', NOTE, words, 'plug the control unit in, or simulate:=true')]
+        return [Observation('port', NOTE, words, 'plug the control unit in, or simulate:=true')]
     found = []
     for name in names:
         if not os.path.exists(name):
-            found.append(Finding(name, BAD, 'not there', 'plug it in; see dmesg for its name'))
+            found.append(Observation(name, BAD, 'not there', 'plug it in; see dmesg for its name'))
         elif not os.access(name, os.R_OK | os.W_OK):
             remedy = 'sudo usermod -aG dialout $USER, and log in anew'
-            found.append(Finding(name, BAD, 'may not be read and written', remedy))
+            found.append(Observation(name, BAD, 'may not be read and written', remedy))
         else:
-            found.append(Finding(name, GOOD, 'may be opened'))
+            found.append(Observation(name, GOOD, 'may be opened'))
     return found
 
 
-def clock(tool: str = 'timedatectl') -> list[Finding]:
+def clock(tool: str = 'timedatectl') -> list[Observation]:
     """The system's clock: whether somebody keeps it right, as poses of two machines need it."""
     if shutil.which(tool) is None:
-        return [Finding('clock', NOTE, f'unknown, as there is no {tool}')]
+        return [Observation('clock', NOTE, f'unknown, as there is no {tool}')]
     command = [tool, 'show', '-p', 'NTPSynchronized', '--value']
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.stdout.strip() == 'yes':
-        return [Finding('clock', GOOD, 'synchronised')]
+        return [Observation('clock', GOOD, 'synchronised')]
     if done.stdout.strip() == 'no':
         remedy = 'install chrony, or timedatectl set-ntp true'
-        return [Finding('clock', NOTE, 'not synchronised with other machines', remedy)]
-    return [Finding('clock', NOTE, f'unknown, as {tool} does not tell')]
+        return [Observation('clock', NOTE, 'not synchronised with other machines', remedy)]
+    return [Observation('clock', NOTE, f'unknown, as {tool} does not tell')]
 
 
-def disk(folder: Path, least: int = LEAST_FREE_BYTES) -> list[Finding]:
+def disk(folder: Path, least: int = LEAST_FREE_BYTES) -> list[Observation]:
     """The disk under a folder: whether a recording has room."""
     free = shutil.disk_usage(folder).free
     words = f'{free / 2**30:.1f} GB free in {folder}'
     if free < least:
-        return [Finding('disk', BAD, words, 'make room, or record elsewhere (directory:=...)')]
-    return [Finding('disk', GOOD, words)]
+        return [Observation('disk', BAD, words, 'make room, or record elsewhere (directory:=...)')]
+    return [Observation('disk', GOOD, words)]
 
 
-def graph(seconds: float) -> list[Finding]:
+def graph(seconds: float) -> list[Observation]:
     """The ROS graph: the middleware, which nodes are there, and what they complain of."""
     code = f'from anser_ros.nodes.graph_look import main; main({seconds!r})'
     try:
@@ -186,27 +188,27 @@ def graph(seconds: float) -> list[Finding]:
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         remedy = 'look at RMW_IMPLEMENTATION and the network'
-        return [Finding('ROS', BAD, 'the middleware does not answer', remedy)]
+        return [Observation('ROS', BAD, 'the middleware does not answer', remedy)]
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ['no reason'])[-1]
         remedy = 'source /opt/ros/jazzy/setup.bash, or use the environment that `make` makes'
-        return [Finding('ROS', BAD, last, remedy)]
+        return [Observation('ROS', BAD, last, remedy)]
     told = json.loads(done.stdout.strip().splitlines()[-1])
     return graph_findings(told)
 
 
-def graph_findings(told: dict[str, Any]) -> list[Finding]:
+def graph_findings(told: dict[str, Any]) -> list[Observation]:
     """What a look at the graph means."""
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
     reach = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')
     words = f'{told["middleware"]}, domain {domain}, discovery {reach}'
-    found = [Finding('ROS', GOOD, words)]
+    found = [Observation('ROS', GOOD, words)]
     for name in told['twice']:
         remedy = 'end one of them, or give it a namespace of its own'
-        found.append(Finding(name, BAD, 'runs more than once', remedy))
+        found.append(Observation(name, BAD, 'runs more than once', remedy))
     ours = [name for name in told['nodes'] if name.rsplit('/', 1)[-1] in NODES]
     words = f'{len(told["nodes"])} nodes, {len(ours)} of them ours, {told["topics"]} topics'
-    found.append(Finding('graph', GOOD, words))
+    found.append(Observation('graph', GOOD, words))
     for name, text in told['complaints'].items():
-        found.append(Finding(name, NOTE, text, 'docs/faults.md has what states mean'))
+        found.append(Observation(name, NOTE, text, 'docs/faults.md has what states mean'))
     return found

@@ -17,10 +17,17 @@ from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.evaluation_document import to_document
 from anser_ros.sessions.patches import parse_patches
-from anser_ros.sessions.pose_table import write_body_poses, write_poses
+from anser_ros.sessions.pose_table import (
+    ERRORS_FILE,
+    write_body_poses,
+    write_errors,
+    write_poses,
+)
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.tracking.estimate import TrackerSettings
+
+FILES = ('evaluation.json', 'poses.csv', 'bodies.csv', ERRORS_FILE)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -85,7 +92,8 @@ def run(args: argparse.Namespace) -> int:
     (args.out / 'evaluation.json').write_text(text + '\n', encoding='utf-8')
     write_poses(args.out / 'poses.csv', evaluation)
     write_body_poses(args.out / 'bodies.csv', evaluation)
-    written = [args.out / name for name in ('evaluation.json', 'poses.csv', 'bodies.csv')]
+    write_errors(args.out / ERRORS_FILE, evaluation)
+    written = [args.out / name for name in FILES]
     written += write_figures(
         evaluation, document, args.out, session=args.session, model=args.model,
         jitter_m=session.setup.accuracy.optical_position_m,

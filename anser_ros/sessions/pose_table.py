@@ -1,6 +1,7 @@
 """The tables of poses that an evaluation leaves, as `docs/interfaces.md` promises them."""
 
 import csv
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,9 @@ BODY_COLUMNS = (
     'residual_t', 'status',
 )  # fmt: skip
 """Columns of the bodies' table; the orientation is a quaternion."""
+ERRORS_FILE = 'errors.csv'
+ERROR_COLUMNS = ('stamp_ns', 'name', 'position_error_m', 'orientation_error_rad')
+"""Columns of the table of errors, of coils and bodies."""
 
 
 def write_poses(path: Path, evaluation: Evaluation) -> None:
@@ -33,6 +37,20 @@ def write_body_poses(path: Path, evaluation: Evaluation) -> None:
     """Write every rigid tool's 6-DoF pose, or why there is none, one tool after the other."""
     rows = [row for series in evaluation.bodies.values() for row in _body_rows(series)]
     _write(path, BODY_COLUMNS, rows)
+
+
+def write_errors(path: Path, evaluation: Evaluation) -> None:
+    """Write the error of every pose that has an optical one, of coils and then of bodies."""
+    rows = [
+        [estimate.stamp_ns, series.name, f'{place:.9g}', f'{turn:.9g}']
+        for series in (*evaluation.sensors.values(), *evaluation.bodies.values())
+        for estimate, place, turn in zip(
+            series.estimates, series.position_error.tolist(), series.orientation_error.tolist(),
+            strict=True,
+        )
+        if isfinite(place)
+    ]  # fmt: skip
+    _write(path, ERROR_COLUMNS, rows)
 
 
 def _write(path: Path, columns: tuple[str, ...], rows: list[list[Any]]) -> None:

@@ -1,0 +1,89 @@
+"""Two evaluations are compared by the frames that both have, and noise alone decides nothing."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from anser_ros.cli.main import main
+from anser_ros.errors import ParameterError
+from anser_ros.sessions.comparison import FEWEST_BLOCKS, compare_errors, read_errors
+from anser_ros.sessions.evaluation import Evaluation
+from anser_ros.sessions.pose_errors import PoseSeries
+from anser_ros.sessions.pose_table import ERRORS_FILE, write_errors
+from anser_ros.tracking.estimate import OK
+
+STEP_NS = 40_000_000
+FRAMES = 750
+
+
+def errors(scale, seed=3, frames=FRAMES):
+    rng = np.random.default_rng(seed)
+    sizes = scale * np.abs(rng.normal(size=frames)) * 1e-3
+    return {(1_000_000_000 + STEP_NS * i, 'a'): float(e) for i, e in enumerate(sizes)}
+
+
+def test_a_clear_difference_has_an_interval_that_holds_it():
+    rng = np.random.default_rng(1)
+    found = compare_errors(errors(2.0), errors(1.0, seed=4), rng)['a']
+    assert found.verdict == 'b' and found.n == FRAMES
+    assert found.low < -1e-3 < found.high, 'the true difference is -1 mm'
+    back = compare_errors(errors(1.0, seed=4), errors(2.0), rng)['a']
+    assert back.verdict == 'a'
+
+
+def test_noise_alone_is_seldom_called_a_difference():
+    rng = np.random.default_rng(2)
+    pairs = [(errors(1.0, seed=s), errors(1.0, seed=100 + s)) for s in range(40)]
+    called = sum(compare_errors(*pair, rng)['a'].verdict != 'neither' for pair in pairs)
+    assert called <= 6, 'of 40, two are expected'
+
+
+def test_frames_that_only_one_has_are_counted_and_not_compared():
+    first, second = errors(1.0), errors(1.0)
+    for key in list(first)[:10]:
+        del first[key]
+    for key in list(second)[-3:]:
+        second.pop(key)
+    worst = next(iter(second))
+    second[worst] = 1.0  # not in the other: a metre that counts for nothing
+    found = compare_errors(first, second, np.random.default_rng(1))['a']
+    assert (found.n, found.only_a, found.only_b) == (FRAMES - 13, 3, 10)
+    assert found.rmse_a == found.rmse_b and found.verdict == 'neither'
+
+
+def test_few_stretches_give_no_interval_and_no_common_frame_is_refused():
+    short = errors(1.0, frames=25 * (FEWEST_BLOCKS - 1))
+    found = compare_errors(short, short, np.random.default_rng(1))['a']
+    assert np.isnan(found.low) and found.verdict == 'neither'
+    with pytest.raises(ParameterError, match='no frame in common'):
+        compare_errors(short, {(1, 'a'): 1.0}, np.random.default_rng(1))
+
+
+def evaluation_of(found):
+    estimates = tuple(SimpleNamespace(stamp_ns=stamp, state=OK) for stamp, _ in found)
+    sizes = np.array(list(found.values()))
+    sizes[5] = np.nan
+    return Evaluation({'a': PoseSeries('a', estimates, sizes, 2 * sizes)}, {}, 1e-3)
+
+
+def test_the_command(tmp_path, capsys):
+    for name, scale in (('one', 2.0), ('two', 1.0)):
+        (tmp_path / name).mkdir()
+        write_errors(tmp_path / name / ERRORS_FILE, evaluation_of(errors(scale)))
+    read = read_errors(tmp_path / 'one')
+    assert len(read['position']) == FRAMES - 1
+    key = next(iter(read['position']))
+    assert read['position'][key] == pytest.approx(errors(2.0)[key], rel=1e-8)
+    folders = [str(tmp_path / 'one'), str(tmp_path / 'two')]
+    assert main(['compare', *folders, '--out', str(tmp_path / 'out'), '--json']) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document == json.loads((tmp_path / 'out' / 'comparison.json').read_text())
+    assert document['position']['a']['better'] == 'b'
+    assert (tmp_path / 'out' / 'comparison.png').read_bytes()[:4] == b'\x89PNG'
+    assert main(['compare', folders[0], str(tmp_path)]) == 2
+    assert 'is it a folder of anser evaluate?' in capsys.readouterr().err
+    (tmp_path / 'two' / ERRORS_FILE).write_text('a,b\n1,2\n')
+    assert main(['compare', *folders]) == 2
+    assert 'columns must be' in capsys.readouterr().err
