@@ -108,6 +108,7 @@ def test_records_undo_what_was_found(dirty):
         'time_offset', 'outliers',
     ]  # fmt: skip
     correction = Correction.of(records, told.sensors, (1.0, 2.0, 3.0))
+    assert correction.corrected[0] == 'sensor_gain_spread'
     survey = found.survey('tool')
     repaired = survey.apply(told)
     assert np.allclose(correction.sensors().position, repaired.sensors.position, atol=1e-12)

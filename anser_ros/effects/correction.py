@@ -111,6 +111,11 @@ class Correction:
         """Effects that only references, or a recorded course, can correct."""
         return tuple(term.label for term in self.terms if term.effect.drifts)
 
+    @property
+    def corrected(self) -> tuple[str, ...]:
+        """What is undone, by name and site."""
+        return tuple(term.label for term in self.terms if not term.effect.drifts)
+
     def sensors(self, table: SensorTable | None = None) -> SensorTable:
         """The sensors (by default those given at the start) as they truly are."""
         out = self.surveyed if table is None else table

@@ -415,6 +415,7 @@ class TrackerNode(AnserNode):
         values['dead_emitters'] = dead
         # A drift takes no recorded course here: field_model follows it where references tell.
         values['left_to_references'] = ', '.join(tracker.drifting_effects)
+        values['corrected'] = ', '.join(tracker.corrected_effects)
         if self._withheld is not None and self._withheld.state != TWO_SOURCES:
             return Status('', Level.ERROR, ': '.join(self._withheld), values)
         if dead:

@@ -138,6 +138,11 @@ class Tracker:
         return self._correction.drifting
 
     @property
+    def corrected_effects(self) -> tuple[str, ...]:
+        """Effects of the model that are undone on what is measured."""
+        return () if self._correction is None else self._correction.corrected
+
+    @property
     def bodies(self) -> tuple[str, ...]:
         """Bodies that get a 6-DoF pose."""
         return tuple(self._bodies)
