@@ -66,8 +66,12 @@ def estimate_noise(
     variances: Sequence[Array],
     shares: Sequence[Array],
     kept: Sequence[NDArray[np.bool_]],
+    present: OpticalNoise,
 ) -> OpticalNoise:
-    """Estimate the jitter from the poses' most probable steps, as the step of an EM algorithm.
+    """Estimate the jitter from the poses' most probable steps.
+
+    The squares of the steps are divided by how many of them the fluxes determined at all (MacKay,
+    Bayesian interpolation, Neural Computation 1992): a single coil does not see every direction.
 
     Parameters
     ----------
@@ -77,16 +81,20 @@ def estimate_noise(
         Of `interpolation_share`.
     kept : sequence of ndarray of bool, shape (F,)
         Frames to use.
+    present : OpticalNoise
+        The jitter that the steps were found with.
     """
-    power, count, share_sum = np.zeros(2), 0, 0.0
+    power, told, count, share_sum = np.zeros(2), np.zeros(2), 0, 0.0
     for step, variance, share, keep in zip(steps, variances, shares, kept, strict=True):
-        each = ((step**2 + variance) / share[:, None])[keep]
+        each = (step**2 / share[:, None])[keep]
+        seen = (1.0 - variance / (present.jitter**2 * share[:, None]))[keep]
         power += [each[:, :3].sum(), each[:, 3:].sum()]
+        told += [seen[:, :3].sum(), seen[:, 3:].sum()]
         count, share_sum = count + int(keep.sum()), share_sum + float(share[keep].sum())
-    sigma = np.sqrt(power / max(3 * count, 1))
+    sigma = np.sqrt(power / np.maximum(told, 1.0))
     return OpticalNoise(
         max(float(sigma[0]), SMALLEST_M),
         max(float(sigma[1]), SMALLEST_RAD),
-        float(count),
+        float(told.min()) / 3.0,
         share_sum / max(count, 1),
     )

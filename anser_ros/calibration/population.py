@@ -171,6 +171,14 @@ class Population:
         }
         return {kind: size for kind, size in typical.items() if size > USEFUL[kind]}
 
+    def fixed(self, likelihood: Likelihood) -> tuple[str, ...]:
+        """Return the kinds without a population that the data do not tell: they stay at zero.
+
+        What field and, say, a lever arm explain alike would else be shared out by the field's
+        prior, which knows nothing of tools.
+        """
+        return tuple(kind for kind in self.untold(likelihood) if kind not in POPULATIONS)
+
     def _power(self, likelihood: Likelihood, found: Posterior, kind: str) -> float:
         """What a kind of error does to the fluxes, in the power of their noise."""
         rows = self.parameters.rows(kind)
@@ -192,7 +200,7 @@ class Population:
         evidence : dict of str to float
             Gain of the log probability by each kind that is kept.
         """
-        left_out: tuple[str, ...] = ()
+        left_out = self.fixed(likelihood)
         while True:
             found = self.fit(likelihood, left_out)
             gains = {

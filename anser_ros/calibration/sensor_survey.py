@@ -35,7 +35,7 @@ from anser_ros.calibration.pose_correction import (
 )
 from anser_ros.calibration.prior import DrawnBoard
 from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
-from anser_ros.calibration.sensor_parameters import SensorParameters, Survey
+from anser_ros.calibration.sensor_parameters import PRIOR, SensorParameters, Survey
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy
@@ -214,8 +214,14 @@ class SensorSurveyor:
         return SurveyResult(
             self.parameters, posterior, left_out, evidence, self.noise_t, self.optical,
             self.population.alone, kept, steady, reflected,
-            self.population.untold(self.likelihood),
+            self._untold(),
         )  # fmt: skip
+
+    def _untold(self) -> dict[str, float]:
+        """Kinds that the scan does not tell, those among them that were not even tried."""
+        not_tried = set(self.parameters.asked) - set(self.parameters.kinds)
+        wide = {kind: PRIOR[kind] for kind in self.parameters.asked if kind in not_tried}
+        return {**self.population.untold(self.likelihood), **wide}
 
     def _tell(self, share: float) -> None:
         if self.progress is not None:
@@ -294,6 +300,7 @@ class SensorSurveyor:
             * self.field.shape[1]
             / self.inflation,
         )
+        # Nothing is held here: while a clock is off, poses look too bad to tell it.
         self.posterior = self.population.fit(self.likelihood)
         step = self.posterior.values - self.values
         change = rest.field_step(step, self.modes.size.size)
@@ -343,7 +350,7 @@ class SensorSurveyor:
             kept.append(sound & seen)
         free = self.modes.size.size * self.field.shape[1]
         self.noise_t = max(np.sqrt(power / max(count - free, 0.2 * count)), SMALLEST_NOISE_T)
-        self.optical = estimate_noise(steps, variances, shares, kept)
+        self.optical = estimate_noise(steps, variances, shares, kept, self.optical)
 
     def _pose_steps(self, terms: PoseTerms, weights: Array, prior: Array) -> tuple[Array, Array]:
         """Most probable steps (F, 6) of the poses and their variances."""
