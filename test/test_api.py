@@ -84,7 +84,7 @@ def test_the_library_needs_no_ros(workshop):
     code = (
         f'{NO_ROS}\nimport anser_ros as a\n[getattr(a, n) for n in a.__all__]\n'
         "m = a.Model.load('config/demo_model.yaml')\n"
-        "a.calibrate(a.load_session('bags/factory.mcap'), dipoles=3, force=True)\n"
+        "a.calibrate(a.load_session('bags/factory.mcap'), dipoles=3, estimate=(), force=True)\n"
         "print(a.track(a.load_session('bags/moving.mcap'), m).bodies['tool_a'].ok.all())\n"
     )
     done = subprocess.run(
