@@ -170,7 +170,7 @@ def heard(client, server):
 def test_whatever_a_client_says_to_openigtlink():
     from anser_ros.nodes.igtl_server import IgtlServer
 
-    server = IgtlServer('127.0.0.1', 0)
+    server = IgtlServer('127.0.0.1', 0, lambda header: b'answer')
     try:
         for path in files('igtl'):
             with socket.create_connection(('127.0.0.1', server.port), timeout=5.0) as client:
