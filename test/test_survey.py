@@ -40,6 +40,7 @@ def dirty():
     table = world.measurements.sensors
     gain = 1 + 0.004 * rng.normal(size=6) + 0.005j * rng.normal(size=6)
     gain *= 1 / gain.mean()
+    gain /= np.abs(gain).mean()
     axis = tilted(table.axis, 0.008 * rng.normal(size=(6, 2)))
     place = 0.12e-3 * rng.normal(size=(6, 3))
     place -= place.mean(axis=0)
@@ -70,6 +71,7 @@ def test_all_that_is_wrong_is_found(dirty):
     _, found, truth = dirty
     survey = found.survey('tool')
     assert np.abs(survey.gain - truth['gain']).max() < 3e-4
+    assert np.abs(survey.gain).mean() == pytest.approx(1.0, abs=1e-12)
     assert np.linalg.norm(survey.axis - truth['axis'], axis=1).max() < 5e-4
     assert np.abs(survey.place - truth['place']).max() < 2e-5
     assert np.abs(survey.lever_arm - LEVER_M).max() < 5e-5

@@ -210,6 +210,21 @@ class SensorParameters:
             out[np.ix_(rows, rows)] += 1.0 / (rows.size * BY_RULE**2)
         return out
 
+    def by_rule(self, values: Array) -> tuple[Array, float]:
+        """Return the parameters (Q,) with gains of mean modulus one, and the factor of the field.
+
+        The mean of complex gains, which `rule` sets, is smaller by half the phases' variance.
+        """
+        rows = self.rows('gains').reshape(-1, 2)
+        if not rows.size:
+            return values, 1.0
+        gain = 1.0 + values[rows[:, 0]] + 1j * values[rows[:, 1]]
+        common = float(np.abs(gain).mean())
+        gain = gain / common
+        out = values.copy()
+        out[rows[:, 0]], out[rows[:, 1]] = gain.real - 1.0, gain.imag
+        return out, common
+
     def of(self, kind: str, body: str, values: Array) -> Array | None:
         """A kind's parameters of a body, a row a sensor for a population; None where fixed."""
         if (kind, body) not in self.slices:

@@ -175,7 +175,9 @@ class SensorSurveyor:
         self.progress = progress
         self.parameters = SensorParameters(measurements, kinds)
         self.population = Population(self.parameters)
-        self.values = np.zeros(len(self.parameters))
+        self.values, self.field = np.zeros(len(self.parameters)), np.zeros((0, 0))
+        self.likelihood: Likelihood
+        self.posterior: Posterior
         self.noise_t = FIT_NOISE * accuracy.flux_noise_t
         self.optical = LOOSE
         self.field_width = FIELD_WIDTH
@@ -205,6 +207,9 @@ class SensorSurveyor:
             if moved < SMALL_STEP:
                 break
         posterior, left_out, evidence = self.population.chosen(self.likelihood)
+        if 'gains' in evidence:
+            values, common = self.parameters.by_rule(posterior.values)
+            posterior, self.field = replace(posterior, values=values), self.field * common
         self.values = posterior.values
         steady = tuple(
             known & outside(m.time, spans_of(tool.measured.time, ~tool.steady))
