@@ -108,6 +108,7 @@ def test_json_is_all_of_stdout(tmp_path, capsys):
     assert json.loads(out)['n_dipoles'] == 81
 
 
+@pytest.mark.long
 def test_the_same_twice_gives_the_same_file(tmp_path):
     for name in ('a', 'b'):
         assert calibrate(FACTORY, '--out', tmp_path / name, '--dipoles', '10') == 0
@@ -186,6 +187,7 @@ def test_two_drawings(factory, tmp_path, capsys):
     )
 
 
+@pytest.mark.long
 def test_a_model_worse_than_the_nominal_one_is_only_written_when_forced(factory, tmp_path, capsys):
     tool = factory.tools[0]
     rng = np.random.default_rng(0)

@@ -16,9 +16,10 @@ SAID = {
 }
 
 
-# A whole diagnosis: some ten seconds on a quiet machine, a minute on a busy one.
+# A whole diagnosis or calibration: some ten seconds on a quiet machine, a minute on a busy one.
 SLOW = (pytest.mark.long, pytest.mark.timeout(300))
-NAMES = [pytest.param(n, marks=SLOW) if n == 'find_an_effect' else n for n in SAID]
+LONG = ('find_an_effect', 'own_board', 'own_data')
+NAMES = [pytest.param(n, marks=SLOW) if n in LONG else n for n in SAID]
 
 
 @pytest.mark.parametrize('name', NAMES)

@@ -149,6 +149,7 @@ def read_as(order, sign=1):
     return change
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ('change', 'convention'),
     [
