@@ -19,6 +19,7 @@ from anser_ros.calibration.pose_correction import PoseTerms, pose_precision, pos
 from anser_ros.calibration.pose_whitening import PoseWhitener
 from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
 from anser_ros.field.measurements import Measurements
+from anser_ros.parallel import in_order
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
@@ -92,20 +93,21 @@ def predict_held_out(
         Flux noise alone, T a component, that is subtracted; estimated from the imaginary parts by
         default.
     """
-    fits = []
-    for fold in np.unique(np.concatenate(list(folds))):
-        train = [m.frames(f != fold) for m, f in zip(measurements, folds, strict=True)]
-        fits.append((int(fold), fit(train)))
+
+    def fitted(fold: int) -> tuple[int, LayoutFit]:
+        return fold, fit([m.frames(f != fold) for m, f in zip(measurements, folds, strict=True)])
+
+    fits = in_order(fitted, np.unique(np.concatenate(list(folds))).tolist())
     noise = min(part.fit.noise_t for _, part in fits) if noise_t is None else noise_t
     quadrature = min(part.fit.quadrature_noise_t for _, part in fits)
     flux_noise = min(noise, quadrature if flux_noise_t is None else flux_noise_t)
     tally = _Tally(noise, flux_noise, accuracy, len(fits[0][1].dipoles))
-    for fold, fitted in fits:
+    for fold, part_fit in fits:
         for m, f in zip(measurements, folds, strict=True):
             test = with_pose(m.frames(f == fold))
             for block in frame_blocks(len(test.time), len(test.sensors)):
                 part = test.frames(block)
-                terms = pose_terms(part, fitted.dipoles, fitted.fit.moments)
+                terms = pose_terms(part, part_fit.dipoles, part_fit.fit.moments)
                 tally.add(terms, usable_weights(part))
     return tally.result()
 

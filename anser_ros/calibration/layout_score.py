@@ -25,6 +25,7 @@ from anser_ros.calibration.pose_whitening import PoseWhitener
 from anser_ros.calibration.prior import DrawnBoard
 from anser_ros.calibration.readings import with_pose
 from anser_ros.field.measurements import Measurements
+from anser_ros.parallel import in_order
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
@@ -158,9 +159,10 @@ class LayoutScorer:
             The dampings to try.
         """
         prior = prior_of(layout, dipoles, drawn)
-        chi, count = np.zeros(len(dampings)), 0.0
         same = None if layout.moved else self._tables(dipoles)
-        for fold in (int(fold) for fold in self._folds):
+
+        def scored(fold: int) -> tuple[Array, float]:
+            chi, count = np.zeros(len(dampings)), 0.0
             sites, moments_prior = dipoles, prior
             if layout.moved:
                 sites = self._moved_without(fold, dipoles, prior)
@@ -174,14 +176,20 @@ class LayoutScorer:
                     continue
                 part, used = self._chi(body, matrix, fold, moments)
                 chi, count = chi + part, count + used
-        scores = self.noise_t * np.sqrt(chi / count)
+            return chi, count
+
+        parts = in_order(scored, [int(fold) for fold in self._folds])
+        chi = np.sum([part for part, _ in parts], axis=0)
+        scores = self.noise_t * np.sqrt(chi / sum(count for _, count in parts))
         best = int(np.argmin(scores))
         curve = tuple(zip(map(float, dampings), map(float, scores), strict=True))
         return LayoutCandidate(layout, dipoles, float(dampings[best]), float(scores[best]), curve)
 
     def _tables(self, dipoles: DipoleSites) -> tuple[list[Array], dict[int, Array]]:
         matrices = [basis_rows(body.corrected, dipoles) for body in self._bodies]
-        return matrices, {int(fold): self._gram(int(fold), matrices) for fold in self._folds}
+        folds = [int(fold) for fold in self._folds]
+        grams = in_order(lambda fold: self._gram(fold, matrices), folds)
+        return matrices, dict(zip(folds, grams, strict=True))
 
     def _moved_without(
         self, fold: int, dipoles: DipoleSites, prior: ComplexArray | None

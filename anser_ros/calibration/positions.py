@@ -30,7 +30,7 @@ CONVERGED = 1e-3
 """Relative fall of the sum of squares below which another step is not worth its time."""
 
 
-@numba.njit(cache=True, error_model='numpy')
+@numba.njit(cache=True, nogil=True, error_model='numpy')
 def _fill_slopes(points, axes, lengths, positions, directions, out):  # type: ignore[no-untyped-def]
     basis = np.empty((9, positions.shape[0]))
     point = np.empty(3)

@@ -4,13 +4,10 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from anser_ros.calibration.calibrate import Options
@@ -20,6 +17,7 @@ from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.cli.calibration_figure import draw_choice, draw_populations
 from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.progress import progress_of
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.sessions.calibration import calibrate_sessions, check_same_board
@@ -92,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     make_folder(args.out.parent)
     if args.report is not None:
         make_folder(args.report)
-    with progress_bar() as progress:
+    with progress_of('calibrating') as progress:
         calibration = calibrate_sessions(sessions, _options(args), progress)
     document = to_document(calibration)
     text = json.dumps(document, indent=1)
@@ -121,21 +119,6 @@ def _options(args: argparse.Namespace) -> Options:
     if not 0.0 <= (args.damping or 0.0) < math.inf:
         raise ParameterError(f'damping must not be negative, got {args.damping:g}')
     return Options(layout=args.dipoles, damping=args.damping, estimate=args.estimate)
-
-
-@contextmanager
-def progress_bar() -> Iterator[Callable[[str, float], None]]:
-    """Yield a function that updates a bar on stderr, which is shown only on a terminal."""
-    columns = (
-        TextColumn('{task.description}'),
-        BarColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not sys.stderr.isatty()) as bar:
-        task = bar.add_task('calibrating', total=1.0)
-        yield lambda stage, share: bar.update(task, description=stage, completed=share)
 
 
 def _table(calibration: Calibration, document: dict[str, Any]) -> Table:

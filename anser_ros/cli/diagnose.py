@@ -2,8 +2,6 @@
 
 import argparse
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +12,7 @@ from anser_ros.cli.diagnosis_report import render
 from anser_ros.cli.diagnosis_words import verdict
 from anser_ros.cli.output import make_folder, say_written, warn_of_snapshot
 from anser_ros.cli.pose_session import add_pose_options, need_model, run_diagnosis
+from anser_ros.cli.progress import stages_of
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.sessions.diagnosis import diagnose_session
 from anser_ros.sessions.diagnosis_document import to_document
@@ -46,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     baseline = load_session(args.baseline) if args.baseline else None
     make_folder(args.out)
     console = Console(stderr=True)
-    with _progress(console) as say:
+    with stages_of('diagnosing') as say:
         result = diagnose_session(session, model, baseline, say)
         say('writing the report')
         document = to_document(result)
@@ -64,16 +63,6 @@ def run(args: argparse.Namespace) -> int:
         print(verdict(document))
         say_written(*(args.out / name for name in ('report.html', 'model.yaml', 'diagnosis.json')))
     return 0
-
-
-@contextmanager
-def _progress(console: Console) -> Iterator[Callable[[str], None]]:
-    """A status line where there is a terminal, nothing elsewhere."""
-    if not console.is_terminal:
-        yield lambda text: None
-        return
-    with console.status('preparing') as status:
-        yield status.update
 
 
 def _show(document: dict[str, Any]) -> None:

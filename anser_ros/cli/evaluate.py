@@ -2,17 +2,16 @@
 
 import argparse
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from anser_ros.cli.evaluation_figures import write_figures
 from anser_ros.cli.output import make_folder, say_written, warn_of_snapshot
 from anser_ros.cli.pose_session import add_pose_options, need_model, run_diagnosis
+from anser_ros.cli.progress import progress_of
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.evaluation_document import to_document
@@ -74,9 +73,7 @@ def run(args: argparse.Namespace) -> int:
     baseline = load_session(args.baseline) if args.baseline else None
     make_folder(args.out)
     console = Console(stderr=True)
-    columns = (TextColumn('tracking'), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not sys.stderr.isatty()) as bar:
-        task = bar.add_task('', total=1.0)
+    with progress_of('evaluating') as progress:
         evaluation = track_session(
             session,
             model,
@@ -85,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
             refit=args.refit,
             in_phase=args.in_phase,
             patches=parse_patches(args.patch),
-            progress=lambda share: bar.update(task, completed=share),
+            progress=lambda share: progress('tracking', share),
         )
     document = to_document(evaluation)
     text = json.dumps(document, indent=1)

@@ -17,6 +17,7 @@ from anser_ros.cli import missing
 from anser_ros.cli.commands import NODES, OFFLINE
 from anser_ros.errors import AnserError
 from anser_ros.one_line_parser import OneLineParser
+from anser_ros.parallel import cores, shared_among
 
 # Exit codes, as docs/interfaces.md has them.
 EXIT_OK = 0  # done
@@ -101,7 +102,8 @@ def run_verb(name: str, arguments: Sequence[str]) -> int:
         parser = OneLineParser(prog=f'anser {name}', description=OFFLINE[name])
         module.add_arguments(parser)
         args = parser.parse_args(arguments)
-        return int(module.run(args))
+        with shared_among(cores()):
+            return int(module.run(args))
     except AnserError as error:
         print(f'anser {name}: {_one_line(error)}', file=sys.stderr)
         return EXIT_BAD_INPUT

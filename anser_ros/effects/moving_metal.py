@@ -26,6 +26,7 @@ from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
 from anser_ros.metal.body import COMPACT, SPACINGS, ball_modes, centre_sigma
 from anser_ros.metal.scattering import UNIT
+from anser_ros.parallel import in_order
 
 STEP = 1e-3
 """Step (m) of the central differences that give the derivative by the place. Their relative error
@@ -189,11 +190,10 @@ class MovingMetal(Effect[MovingTerm]):
         out[..., term.placed + groups :] = 1j * unit
         if term.held:
             return out
+        steps = STEP * np.eye(3)
+        moved = in_order(lambda shift: term.flux(view, shift), [*steps, *-steps])
         by_place = np.stack(
-            [
-                (term.flux(view, step) - term.flux(view, -step)) / (2 * STEP)
-                for step in STEP * np.eye(3)
-            ],
+            [(there - back) / (2 * STEP) for there, back in zip(moved, moved[3:], strict=False)],
             axis=-1,
         )
         rates = term.path.rates(term.course, view.time)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.physics.dipole import field_basis, flux_basis
+from anser_ros.physics.dipole import dipole_field, flux_basis
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -61,8 +61,7 @@ class Dipoles:
 
     def field(self, points: Array) -> ComplexArray:
         """Return each emitter's field, shape (P, 3, K), T, at points, shape (P, 3), m."""
-        basis = field_basis(points, self.positions, self.directions)
-        return np.asarray(np.einsum('pnc,nk->pck', basis, self.moments, optimize=True))
+        return dipole_field(points, self.positions, self.directions, self.moments)
 
     def flux(self, points: Array, axes: Array, lengths: Array | None) -> ComplexArray:
         """Return each emitter's flux density along sensors' axes.

@@ -194,7 +194,7 @@ def dipole_coupling(points: Array, centres: Array, axes: Array) -> Array:
     return out.reshape(*frames, *out.shape[1:])
 
 
-@numba.njit(cache=True, error_model='numpy')
+@numba.njit(cache=True, nogil=True, error_model='numpy')
 def _fill_coupling(points, centres, axes, out):  # type: ignore[no-untyped-def]
     """n . B of a moment m is m . (3 (n . d) d / d^5 - n / d^3)."""
     for f in range(centres.shape[0]):

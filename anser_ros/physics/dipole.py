@@ -13,6 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.parallel import in_order, slices
 from anser_ros.physics.constants import DIPOLE_CONSTANT
 
 Array = NDArray[np.float64]
@@ -20,34 +21,49 @@ ComplexArray = NDArray[np.complex128]
 
 GAUSS_OFFSET = 0.5 / math.sqrt(3.0)
 """Offset of the two Gauss-Legendre points from a coil's centre, as a fraction of its length."""
+AT_ONCE = 16
+"""Points whose couplings to all dipoles are kept at once: some hundred kilobytes, which stay in
+the processor's cache until they are used."""
+SHARE = 512
+"""Points that one thread works out, a millisecond's work."""
 
 
-@numba.njit(cache=True, error_model='numpy')
+@numba.njit(cache=True, nogil=True, error_model='numpy')
+def _in_rows(positions, directions):  # type: ignore[no-untyped-def]
+    """Return x, y, z, u_x, u_y, u_z of dipoles as rows (6, N), which vector registers can load."""
+    out = np.empty((6, positions.shape[0]))
+    for j in range(positions.shape[0]):
+        for i in range(3):
+            out[i, j], out[3 + i, j] = positions[j, i], directions[j, i]
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model='numpy')
 def fill_flux_basis(points, axes, lengths, positions, directions, out):  # type: ignore[no-untyped-def]
     """Write each unit dipole's flux density along each coil's axis into ``out``, shape (P, N).
 
     The arguments are those of `flux_basis` as contiguous arrays; nothing is checked.
     """
+    dipoles = _in_rows(positions, directions)
+    x, y, z = dipoles[0], dipoles[1], dipoles[2]
+    u, v, w = dipoles[3], dipoles[4], dipoles[5]
     for p in range(points.shape[0]):
         nx, ny, nz = axes[p, 0], axes[p, 1], axes[p, 2]
         half = lengths[p] * GAUSS_OFFSET
         count = 1 if half == 0.0 else 2
-        scale = DIPOLE_CONSTANT / count
-        for j in range(positions.shape[0]):
-            total = 0.0
-            ux, uy, uz = directions[j, 0], directions[j, 1], directions[j, 2]
-            nu = nx * ux + ny * uy + nz * uz
-            for s in range(count):
-                h = half * (1 - 2 * s)
-                dx = points[p, 0] + h * nx - positions[j, 0]
-                dy = points[p, 1] + h * ny - positions[j, 1]
-                dz = points[p, 2] + h * nz - positions[j, 2]
+        scale, row = DIPOLE_CONSTANT / count, out[p]
+        for s in range(count):
+            h = half * (1 - 2 * s)
+            px, py, pz = points[p, 0] + h * nx, points[p, 1] + h * ny, points[p, 2] + h * nz
+            for j in range(x.shape[0]):
+                dx, dy, dz = px - x[j], py - y[j], pz - z[j]
                 inv2 = 1.0 / (dx * dx + dy * dy + dz * dz)
                 inv3 = inv2 * math.sqrt(inv2)
-                du = dx * ux + dy * uy + dz * uz
+                du = dx * u[j] + dy * v[j] + dz * w[j]
                 dn = dx * nx + dy * ny + dz * nz
-                total += inv3 * (3.0 * du * dn * inv2 - nu)
-            out[p, j] = scale * total
+                nu = nx * u[j] + ny * v[j] + nz * w[j]
+                value = scale * (inv3 * (3.0 * du * dn * inv2 - nu))
+                row[j] = value if s == 0 else row[j] + value
 
 
 @numba.njit(cache=True, error_model='numpy')
@@ -77,24 +93,89 @@ def fill_field_and_gradient(point, positions, directions, basis):  # type: ignor
         basis[8, j] = k5 * (2.0 * uz * dz + du - q * dz * dz)
 
 
-@numba.njit(cache=True, error_model='numpy')
-def _fill_flux_jacobian(points, axes, lengths, positions, directions, moments, flux, d_r, d_n):  # type: ignore[no-untyped-def]
+@numba.njit(cache=True, nogil=True, error_model='numpy')
+def _fill_near(px, py, pz, dipoles, offset, inverse, near, along):  # type: ignore[no-untyped-def]
+    """Write offsets d (3, N), ``1/d^2``, ``k/d^3`` and ``d . u`` of dipoles, from `_in_rows`.
+
+    One row at a time: a loop that writes to several is not turned to vector registers.
+    """
+    for i in range(3):
+        row, place, at = offset[i], dipoles[i], px if i == 0 else py if i == 1 else pz
+        for j in range(row.shape[0]):
+            row[j] = at - place[j]
+    dx, dy, dz = offset[0], offset[1], offset[2]
+    u, v, w = dipoles[3], dipoles[4], dipoles[5]
+    for j in range(near.shape[0]):
+        inverse[j] = 1.0 / (dx[j] * dx[j] + dy[j] * dy[j] + dz[j] * dz[j])
+    for j in range(near.shape[0]):
+        near[j] = DIPOLE_CONSTANT * inverse[j] * math.sqrt(inverse[j])
+    for j in range(along.shape[0]):
+        along[j] = dx[j] * u[j] + dy[j] * v[j] + dz[j] * w[j]
+
+
+@numba.njit(cache=True, nogil=True, error_model='numpy')
+def _fill_field_basis(points, dipoles, out):  # type: ignore[no-untyped-def]
+    """Write the fields of unit dipoles, from `_in_rows`, at points into ``out``, (P, 3, N)."""
+    count = dipoles.shape[1]
+    offset, inverse = np.empty((3, count)), np.empty(count)
+    near, along = np.empty(count), np.empty(count)
+    for p in range(points.shape[0]):
+        px, py, pz = points[p, 0], points[p, 1], points[p, 2]
+        _fill_near(px, py, pz, dipoles, offset, inverse, near, along)
+        for i in range(3):
+            row, way, direction = out[p, i], offset[i], dipoles[3 + i]
+            for j in range(count):
+                turned = 3.0 * along[j] * inverse[j] * way[j] - direction[j]
+                row[j] = near[j] * turned
+
+
+@numba.njit(cache=True, nogil=True, error_model='numpy')
+def _fill_slopes(px, py, pz, dipoles, work, basis):  # type: ignore[no-untyped-def]
+    """Do what `fill_field_and_gradient` does, for one of many points and dipoles in rows.
+
+    ``work`` (8, N) is written over.
+    """
+    offset, inverse, near, along = work[:3], work[3], work[4], work[5]
+    k5, k7 = work[6], work[7]
+    _fill_near(px, py, pz, dipoles, offset, inverse, near, along)
+    for j in range(near.shape[0]):
+        k5[j] = 3.0 * near[j] * inverse[j]
+    for j in range(near.shape[0]):
+        k7[j] = 5.0 * along[j] * inverse[j]
+    for i in range(3):
+        row, way, direction = basis[i], offset[i], dipoles[3 + i]
+        for j in range(near.shape[0]):
+            row[j] = k5[j] * along[j] * way[j] - near[j] * direction[j]
+    place = 3
+    for a in range(3):
+        for b in range(a, 3):
+            row, first, second = basis[place], offset[a], offset[b]
+            u, v, same = dipoles[3 + a], dipoles[3 + b], 1.0 if a == b else 0.0
+            for j in range(near.shape[0]):
+                mixed = u[j] * second[j] + v[j] * first[j] - k7[j] * first[j] * second[j]
+                row[j] = k5[j] * (mixed + same * along[j])
+            place += 1
+
+
+@numba.njit(cache=True, nogil=True, error_model='numpy')
+def _fill_flux_jacobian(points, axes, lengths, dipoles, moments, flux, d_r, d_n):  # type: ignore[no-untyped-def]
     """Add fluxes and derivatives to ``flux``, ``d_r`` and ``d_n``, as `flux_jacobian` has them.
 
     These three and ``moments`` are real; their last axis holds the 2K parts (re, im by turns).
+    ``dipoles`` is from `_in_rows`.
     """
-    basis = np.empty((9, positions.shape[0]))
-    point = np.empty(3)
+    basis, work = np.empty((9, dipoles.shape[1])), np.empty((8, dipoles.shape[1]))
     for p in range(points.shape[0]):
+        n0, n1, n2 = axes[p, 0], axes[p, 1], axes[p, 2]
         half = lengths[p] * GAUSS_OFFSET
         count = 1 if half == 0.0 else 2
         for s in range(count):
             h = half * (1 - 2 * s)
-            for i in range(3):
-                point[i] = points[p, i] + h * axes[p, i]
-            fill_field_and_gradient(point, positions, directions, basis)
+            _fill_slopes(
+                points[p, 0] + h * n0, points[p, 1] + h * n1, points[p, 2] + h * n2, dipoles, work,
+                basis,
+            )  # fmt: skip
             f = np.dot(basis, moments)
-            n0, n1, n2 = axes[p, 0], axes[p, 1], axes[p, 2]
             for k in range(moments.shape[1]):
                 gx = n0 * f[3, k] + n1 * f[4, k] + n2 * f[5, k]
                 gy = n0 * f[4, k] + n1 * f[6, k] + n2 * f[7, k]
@@ -184,11 +265,42 @@ def field_basis(
         Field vectors, frame fg, T / (A m^2).
     """
     r = _rows(points, 3, 'points')
-    unit = np.eye(3)
-    columns = [
-        flux_basis(r, np.broadcast_to(axis, r.shape), None, positions, directions) for axis in unit
-    ]
-    return np.stack(columns, axis=2)
+    q, u = _rows(positions, 3, 'positions'), _rows(directions, 3, 'directions')
+    out = np.empty((r.shape[0], 3, q.shape[0]))
+    _fill_field_basis(r, _in_rows(q, u), out)
+    return np.moveaxis(out, 1, 2)
+
+
+def dipole_field(
+    points: NDArray[np.generic],
+    positions: NDArray[np.generic],
+    directions: NDArray[np.generic],
+    moments: NDArray[np.generic],
+) -> ComplexArray:
+    """Return the field of dipoles, shape (P, 3, K), T.
+
+    Parameters
+    ----------
+    points, positions, directions
+        As for `field_basis`.
+    moments : ndarray, shape (N, K), complex
+        Dipole magnitudes for each of the K emitters, A m^2.
+    """
+    r = _rows(points, 3, 'points')
+    q, u = _rows(positions, 3, 'positions'), _rows(directions, 3, 'directions')
+    m = np.ascontiguousarray(moments, dtype=np.complex128).view(np.float64)
+    out, dipoles = np.empty((r.shape[0], 3, m.shape[1])), _in_rows(q, u)
+
+    def work(rows: slice) -> None:
+        basis = np.empty((AT_ONCE, 3, q.shape[0]))
+        for part in slices(rows.stop - rows.start, AT_ONCE):
+            here = slice(rows.start + part.start, rows.start + part.stop)
+            few = basis[: part.stop - part.start]
+            _fill_field_basis(r[here], dipoles, few)
+            np.matmul(few.reshape(-1, len(m)), m, out=out[here].reshape(-1, m.shape[1]))
+
+    in_order(work, slices(len(r), SHARE))
+    return out.view(np.complex128)
 
 
 def flux_jacobian(
@@ -228,6 +340,10 @@ def flux_jacobian(
     m = np.ascontiguousarray(moments, dtype=np.complex128).view(np.float64)
     flux = np.zeros((r.shape[0], m.shape[1]))
     d_r = np.zeros((r.shape[0], 3, m.shape[1]))
-    d_n = np.zeros_like(d_r)
-    _fill_flux_jacobian(r, n, spans, q, u, m, flux, d_r, d_n)
+    d_n, dipoles = np.zeros_like(d_r), _in_rows(q, u)
+
+    def work(at: slice) -> None:
+        _fill_flux_jacobian(r[at], n[at], spans[at], dipoles, m, flux[at], d_r[at], d_n[at])
+
+    in_order(work, slices(len(r), SHARE))
     return flux.view(np.complex128), d_r.view(np.complex128), d_n.view(np.complex128)

@@ -1,0 +1,70 @@
+"""Independent pieces of work, shared among threads.
+
+What is worked out does not depend on who does it: the pieces are the same for any number of
+threads, and their results are taken in the pieces' order. So a result is the same, bit by bit, on
+any machine. It pays where the pieces are compiled code or large arrays, which let other threads
+run meanwhile.
+"""
+
+import os
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import cache
+from typing import TypeVar
+
+Piece = TypeVar('Piece')
+Result = TypeVar('Result')
+
+_THIS = threading.local()
+
+
+def cores() -> int:
+    """Return how many processor cores this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+@contextmanager
+def shared_among(count: int) -> Iterator[None]:
+    """Share work among so many threads for as long as the context lasts.
+
+    Elsewhere one thread does it: the cores of nodes are the other nodes' too.
+    """
+    before, _Workers.count = _Workers.count, max(1, count)
+    try:
+        yield
+    finally:
+        _Workers.count = before
+
+
+class _Workers:
+    """How many threads share the work."""
+
+    count = 1
+
+
+@cache
+def _threads(count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count, thread_name_prefix='piece')
+
+
+def in_order(work: Callable[[Piece], Result], pieces: Iterable[Piece]) -> list[Result]:
+    """Return the results of all pieces, in their order.
+
+    Pieces that share out work themselves do it alone.
+    """
+    whole = list(pieces)
+    if _Workers.count == 1 or len(whole) < 2 or getattr(_THIS, 'is_busy', False):
+        return [work(piece) for piece in whole]
+
+    def do(piece: Piece) -> Result:
+        _THIS.is_busy = True
+        return work(piece)
+
+    return list(_threads(_Workers.count).map(do, whole))
+
+
+def slices(count: int, size: int) -> list[slice]:
+    """Return the slices of so many rows, each but the last of one size."""
+    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
