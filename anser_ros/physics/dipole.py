@@ -297,7 +297,9 @@ def dipole_field(
             here = slice(rows.start + part.start, rows.start + part.stop)
             few = basis[: part.stop - part.start]
             _fill_field_basis(r[here], dipoles, few)
-            np.matmul(few.reshape(-1, len(m)), m, out=out[here].reshape(-1, m.shape[1]))
+            np.matmul(
+                few.reshape(3 * len(few), len(m)), m, out=out[here].reshape(3 * len(few), -1)
+            )
 
     in_order(work, slices(len(r), SHARE))
     return out.view(np.complex128)
