@@ -21,7 +21,7 @@ def shared(*folders):
             yield f'share/{PACKAGE}/{folder}', [str(path.relative_to(HERE)) for path in files]
 
 
-names = [*COMMANDS['NODES'], *COMMANDS['OFFLINE']]
+names = [name for group in ('NODES', 'COMPOSED', 'OFFLINE') for name in COMMANDS[group]]
 scripts = [f'{name} = {PACKAGE}.cli.main:run_executable' for name in names]
 
 setup(

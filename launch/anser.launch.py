@@ -6,7 +6,7 @@ ros2 launch anser_ros anser.launch.py simulate:=true baseline:=clean.mcap openig
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, GroupAction, OpaqueFunction
-from launch.conditions import IfCondition
+from launch.conditions import IfCondition, UnlessCondition
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node, PushRosNamespace
 from launch_ros.parameter_descriptions import ParameterValue
@@ -30,6 +30,7 @@ ARGUMENTS = {
     'baseline': ('', 'distortion-free recording of the board; empty: call set_baseline'),
     'board_seed': ('0', "the simulated unit's board: 0 as drawn, 1 that of demo_model.yaml"),
     'simulate': ('false', 'whether a simulated control unit replaces the real one'),
+    'composed': ('true', 'whether acquisition, field model and tracker are one process, live'),
     'optical': ('/optical', 'namespace of the optical poses'),
     'frame_prefix': ('', 'put before the frames of poses and of /tf'),
     'record': ('true', 'whether a bag is recorded'),
@@ -59,15 +60,17 @@ def find_files(context):
         given['device'] = simulated if is_simulated else DEVICE
 
 
-def node(name, condition=None, **parameters):
-    """Return one node with the common parameter file, and values that override it."""
+def process(name, condition=None, **parameters):
+    """Return a process with the common parameter file, and values that override it.
+
+    It is not given a name: that of `live` would be each of its nodes'.
+    """
     common = LaunchConfiguration('params')
     return Node(
         package=PACKAGE,
         executable=name,
-        name=name,
         parameters=[common, parameters] if parameters else [common],
-        condition=IfCondition(LaunchConfiguration(condition)) if condition else None,
+        condition=condition,
         output='screen',
         emulate_tty=True,
         sigterm_timeout='5',
@@ -77,7 +80,18 @@ def node(name, condition=None, **parameters):
 def generate_launch_description():
     """Return the nodes of the chain with the launch arguments."""
     value = LaunchConfiguration
+
+    def wanted(name):
+        return IfCondition(value(name))
+
+    apart = UnlessCondition(value('composed'))
     board = {'setup_file': value('setup'), 'channels_file': value('channels')}
+    model = {'model_file': value('model')}
+    baseline = {
+        'baseline_file': ParameterValue(value('baseline'), value_type=str),
+        'allow_uncalibrated': ParameterValue(value('allow_uncalibrated'), value_type=bool),
+    }
+    prefix = {'frame_prefix': ParameterValue(value('frame_prefix'), value_type=str)}
     return LaunchDescription(
         [
             *(
@@ -88,38 +102,36 @@ def generate_launch_description():
             GroupAction(
                 [
                     PushRosNamespace(value('namespace')),
-                    node(
+                    process(
                         'cu_simulator',
-                        'simulate',
+                        wanted('simulate'),
                         link=value('device'),
                         board_seed=value('board_seed'),
                         optical=value('optical'),
                         **board,
                     ),
-                    node('acquisition', device=value('device'), **board),
-                    node(
-                        'field_model',
-                        model_file=value('model'),
-                        allow_uncalibrated=ParameterValue(
-                            value('allow_uncalibrated'), value_type=bool
-                        ),
-                        baseline_file=ParameterValue(value('baseline'), value_type=str),
+                    process(
+                        'live',
+                        wanted('composed'),
+                        device=value('device'),
+                        **board,
+                        **model,
+                        **baseline,
+                        **prefix,
                     ),
-                    node(
-                        'tracker',
-                        model_file=value('model'),
-                        frame_prefix=ParameterValue(value('frame_prefix'), value_type=str),
-                    ),
-                    node(
+                    process('acquisition', apart, device=value('device'), **board),
+                    process('field_model', apart, **model, **baseline),
+                    process('tracker', apart, **model, **prefix),
+                    process(
                         'recorder',
-                        'record',
+                        wanted('record'),
                         directory=value('directory'),
                         optical=value('optical'),
                     ),
-                    node('watcher', 'watch', model_file=value('model'), optical=value('optical')),
-                    node(
+                    process('watcher', wanted('watch'), optical=value('optical'), **model),
+                    process(
                         'openigtlink',
-                        'openigtlink',
+                        wanted('openigtlink'),
                         host=value('igtl_host'),
                         port=value('igtl_port'),
                     ),
@@ -129,7 +141,7 @@ def generate_launch_description():
                 package='rviz2',
                 executable='rviz2',
                 arguments=['-d', value('rviz_config')],
-                condition=IfCondition(value('rviz')),
+                condition=wanted('rviz'),
             ),
         ]
     )

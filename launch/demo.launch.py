@@ -41,6 +41,22 @@ def node(name, remappings=(), output='log', **parameters):
     )
 
 
+def live(model):
+    """Return acquisition, field model and tracker in one process, a value for the node it is for.
+
+    It is not given a name, which would be each of its nodes'.
+    """
+    words = [f'acquisition:device:={PORT}', 'field_model:baseline_at_start:=true']
+    words.append(['field_model:model_file:=', model])
+    return Node(
+        package=PACKAGE,
+        executable='live',
+        ros_arguments=[word for text in words for word in ('-p', text)],
+        output='log',
+        sigterm_timeout='5',
+    )
+
+
 def generate_launch_description():
     """Return the nodes, all of which end when the monitor does."""
     value = LaunchConfiguration
@@ -63,9 +79,7 @@ def generate_launch_description():
                 [
                     PushRosNamespace('anser'),
                     node('cu_simulator', link=PORT, metal=value('metal'), board_seed=BOARD_SEED),
-                    node('acquisition', device=PORT),
-                    node('field_model', model_file=model, baseline_at_start=True),
-                    node('tracker'),
+                    live(model),
                     node('recorder', directory=value('directory')),
                     GroupAction(
                         [

@@ -299,6 +299,27 @@ class TestStream:
         assert not any(push(k, 900) for k in range(121, 1000))
         assert stream.waiting.withheld > 20 and stream.clock.wants_answer
 
+    def test_windows_that_are_skipped_are_counted_and_cost_no_later_one(self):
+        """A too slow computer takes the newest; what it passes over is not demodulated."""
+        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        stream.restart(10**12)
+        frames = []
+        for k in range(100):
+            block = SampleBlock(k, 1000 * k, self.codes(k))
+            frames += stream.push(block, 10**12 + 10**6 * (k + 1), skips=20 <= k < 80)
+        assert [frame.host_ns for frame in frames] == pytest.approx(
+            [10**12 + 10 * 10**6, 10**12 + 90 * 10**6], abs=10**5
+        )
+        assert (stream.counters.windows, stream.counters.windows_skipped) == (2, 3)
+
+    def test_a_frame_that_waits_is_looked_after_with_every_block(self):
+        stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
+        self.frames(stream, 100)
+        assert stream.blocks_wanted == 20
+        for k in range(100, 120):
+            stream.push(SampleBlock(k, 1000 * k, self.codes(k)), 10**12 + 10**6 * (k + 51))
+        assert stream.waiting and stream.blocks_wanted == 1
+
     def test_a_restarted_stream_has_new_stamps(self):
         stream = FluxStream(hello(), SETUP, CHANNELS, OPTIONS)
         assert len(self.frames(stream, 110)) == 5

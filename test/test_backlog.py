@@ -3,6 +3,7 @@
 import pytest
 
 from anser_ros.nodes.backlog import Backlog
+from anser_ros.nodes.overload import too_slow
 
 
 def backlog(spacing_s, work_s, stamp_spacing_s=None):
@@ -32,6 +33,25 @@ def test_what_is_hopeless(work_s, age_s, hopeless):
 def test_a_burst_is_no_faster_than_its_stamps():
     assert not backlog(0.0, 0.002, stamp_spacing_s=0.02).is_hopeless(0.3)
     assert backlog(0.0, 0.002, stamp_spacing_s=0.001).is_hopeless(0.3)
+
+
+def test_a_known_spacing_needs_no_arrivals():
+    one = Backlog(0.02)
+    for _ in range(30):
+        one.worked(0.025)
+    assert one.is_hopeless(0.07) and not one.is_hopeless(0.05)
+    for _ in range(30):
+        one.worked(0.002)
+    assert not one.is_hopeless(0.07)
+
+
+def test_what_is_said_has_the_share_and_the_load(monkeypatch):
+    monkeypatch.setattr('os.getloadavg', lambda: (6.06, 1.0, 1.0))
+    monkeypatch.setattr('os.cpu_count', lambda: 2)
+    said = 'computer too slow: 40 % of windows skipped, load 6.1 on 2 cores'
+    assert too_slow(20, 30) == said
+    assert too_slow(1, 300).startswith('computer too slow: less than 1 % of')
+    assert too_slow(0, 50) == ''
 
 
 def test_one_slow_frame_says_nothing():

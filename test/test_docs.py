@@ -9,7 +9,7 @@ import pytest
 from conftest import REPO
 
 from anser_ros.api.setup import load_setup
-from anser_ros.cli.commands import NODES, OFFLINE
+from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE
 from anser_ros.effects.registry import all_effects
 from anser_ros.physics.board import KINDS
 from anser_ros.sessions.diagnosis_document import DEPENDENCIES
@@ -123,7 +123,7 @@ class TestInterfacesPage:
 
     def test_states_nodes_and_commands(self):
         text = page('interfaces')
-        for name in (*STATES, *NODES, *OFFLINE):
+        for name in (*STATES, *NODES, *COMPOSED, *OFFLINE):
             assert re.search(rf'`{name}`|anser {name}', text), name
 
     def test_node_parameters_come_from_the_file_that_the_tables_write(self):

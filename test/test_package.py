@@ -10,7 +10,7 @@ import pytest
 from conftest import REPO, Process, spin_until
 
 from anser_ros.cli import main as cli
-from anser_ros.cli.commands import NODES, OFFLINE
+from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE
 from anser_ros.errors import BagError
 
 pytestmark = pytest.mark.light
@@ -70,7 +70,7 @@ def test_the_ament_index_knows_the_package(installed, monkeypatch):
 @pytest.mark.processes
 def test_every_command_is_an_executable(installed):
     executables = {path.name for path in (installed / 'lib' / 'anser_ros').iterdir()}
-    assert executables == {'anser', *NODES, *OFFLINE}
+    assert executables == {'anser', *NODES, *COMPOSED, *OFFLINE}
     needed = {'acquisition', 'field_model', 'tracker', 'recorder', 'replay', 'cu_simulator'}
     needed |= {'openigtlink', 'calibrate', 'evaluate', 'diagnose', 'demo'}
     assert needed <= executables
@@ -81,7 +81,7 @@ def test_the_table_lists_every_module_that_is_a_command():
         files = (REPO / 'anser_ros' / room).glob('*.py')
         return {path.stem for path in files if mark in path.read_text()}
 
-    assert set(NODES) == modules('nodes', "\nif __name__ == '__main__':")
+    assert {*NODES, *COMPOSED} == modules('nodes', "\nif __name__ == '__main__':")
     assert set(OFFLINE) == modules('cli', '\ndef add_arguments(')
 
 
@@ -191,7 +191,7 @@ class TestConsole:
     def test_usage_lists_every_command_without_importing_any(self, capsys):
         assert cli.main(['--help']) == 0
         usage = capsys.readouterr().out
-        for name in [*NODES, *OFFLINE]:
+        for name in [*NODES, *COMPOSED, *OFFLINE]:
             assert f'  {name}' in usage
         assert cli.main([]) == 2
         assert cli.main(['--version']) == 0

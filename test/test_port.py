@@ -337,3 +337,16 @@ def test_control_that_may_not_set_tones_says_what_differs():
     control.take(Record(HELLO), 0)
     assert control.due(SECOND) is None
     assert '6170' in control.refusal and '7000' in control.refusal
+
+
+def test_blocks_that_are_there_already_are_not_waited_for():
+    """A receiver that worked while the last block of its window came gets it at once."""
+    port = ControlUnitPort('nowhere')
+    port.want(20)
+    port._take([Record(SampleBlock(k, k, np.zeros((1, 2), np.int16))) for k in range(5)], 7)
+    assert port.get(0.0) is None and port.has_more
+    port.want(6)
+    assert port.get(0.0) is None
+    port.want(5)
+    batch = port.get(0.0)
+    assert batch is not None and len(batch.records) == 5 and not port.has_more

@@ -1,9 +1,10 @@
 """Every command of the package with its one line of help: the only list of them.
 
 A command's name is that of its module. A node's lies in ``anser_ros/nodes`` and runs as a process
-of its own; the others lie in ``anser_ros/cli``, have ``add_arguments(parser)`` and
-``run(args) -> int``, and need no ROS. `setup.py` makes an executable of each; as it runs before
-anything is installed, this module imports nothing.
+of its own; a composed one, beside it, is several nodes in one process; the others lie in
+``anser_ros/cli``, have ``add_arguments(parser)`` and ``run(args) -> int``, and need no ROS.
+`setup.py` makes an executable of each; as it runs before anything is installed, this module
+imports nothing.
 """
 
 NODES = {
@@ -17,6 +18,10 @@ NODES = {
     'corrector': 'corrects the poses of a tracker of poses by a model of diagnose --poses',
     'monitor': 'a live table of sensors, rates and latencies',
     'watcher': 'names live, in /diagnostics, what the model lacks',
+}
+
+COMPOSED = {
+    'live': 'acquisition, field_model and tracker in one process, for the least latency',
 }
 
 OFFLINE = {

@@ -1,4 +1,4 @@
-"""The demo: all nodes as processes track a simulated tool, with a table, a bag and a picture.
+"""The demo: all nodes track a simulated tool, with a table, a bag and a picture.
 
 Two chains of field model and tracker run side by side: one refits its model to the reference
 coils, the other keeps the model as calibrated. A steel disc comes from below and leaves again.
@@ -197,12 +197,12 @@ def node_command(name: str, /, *words: str, **parameters: object) -> list[str]:
     *words : str
         Further ROS arguments.
     **parameters : object
-        Values of the node's parameters.
+        Values of the node's parameters; ``NODE__NAME`` is one of several nodes' in one process.
     """
     command = [sys.executable, '-P', '-m', f'anser_ros.nodes.{name}', '--ros-args', *words]
     for key, value in parameters.items():
         text = str(value).lower() if isinstance(value, bool) else str(value)
-        command += ['-p', f'{key}:={text}']
+        command += ['-p', f'{key.replace("__", ":")}:={text}']
     return command
 
 
@@ -223,9 +223,16 @@ def _commands(folder: Path, port: Path, args: argparse.Namespace) -> list[tuple[
                 sample_rate_hz=SAMPLE_RATE_HZ,
             ),
         ),
-        ('acquisition', node_command('acquisition', device=port, rate_hz=float(args.rate))),
-        ('field_model', node_command('field_model', model_file=model, baseline_at_start=True)),
-        ('tracker', node_command('tracker')),
+        (
+            'live',
+            node_command(
+                'live',
+                acquisition__device=port,
+                acquisition__rate_hz=float(args.rate),
+                field_model__model_file=model,
+                field_model__baseline_at_start=True,
+            ),
+        ),
         ('field_model_frozen', node_command('field_model', *apart, model_file=model)),
         ('tracker_frozen', node_command('tracker', *apart, **NO_GATE)),
         ('recorder', node_command('recorder', directory=folder, name='bag')),

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from anser_ros.cli import missing
-from anser_ros.cli.commands import NODES, OFFLINE
+from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE
 from anser_ros.errors import AnserError
 from anser_ros.one_line_parser import OneLineParser
 from anser_ros.parallel import cores, shared_among
@@ -61,7 +61,7 @@ def _dispatch(arguments: list[str]) -> int:
         print(_version())
         return EXIT_OK
     name, rest = arguments[0].replace('-', '_'), arguments[1:]
-    if name in NODES:
+    if name in {**NODES, **COMPOSED}:
         try:
             missing.check(name)
         except AnserError as error:
@@ -70,7 +70,7 @@ def _dispatch(arguments: list[str]) -> int:
         exec_node(name, rest)
     if name in OFFLINE:
         return run_verb(name, rest)
-    known = ', '.join([*NODES, *OFFLINE])
+    known = ', '.join([*NODES, *COMPOSED, *OFFLINE])
     print(f'anser: no command {arguments[0]!r}; there are: {known}', file=sys.stderr)
     return EXIT_BAD_INPUT
 
@@ -146,6 +146,7 @@ def _version() -> str:
 def _usage() -> str:
     lines = ['usage: anser VERB [arguments]      (anser VERB --help says which)', '', 'nodes:']
     lines += [f'  {name:<14} {line}' for name, line in NODES.items()]
+    lines += [f'  {name:<14} {line}' for name, line in COMPOSED.items()]
     lines += ['', 'offline, no ROS needed:']
     lines += [f'  {name:<14} {line}' for name, line in OFFLINE.items()]
     return '\n'.join(lines)

@@ -17,13 +17,17 @@ from std_msgs.msg import String
 
 from anser_ros.errors import AnserError, PortError
 from anser_ros.nodes import qos
+from anser_ros.nodes.backlog import Backlog
 from anser_ros.nodes.clouds import FluxCloud
 from anser_ros.nodes.fault_memory import FAULTS, RecentFaults, device_words
 from anser_ros.nodes.flux_frame import FluxFrame, Staleness
 from anser_ros.nodes.flux_stream import FluxStream, StreamOptions
+from anser_ros.nodes.handover import HandedFlux
 from anser_ros.nodes.measured_accuracy import MeasuredAccuracy
 from anser_ros.nodes.node import AnserNode, Level, Status, main
+from anser_ros.nodes.overload import too_slow
 from anser_ros.nodes.parameters import parameter
+from anser_ros.nodes.process import TURN_S
 from anser_ros.nodes.stream_status import (
     clock_troubles,
     clock_values,
@@ -35,6 +39,7 @@ from anser_ros.nodes.wall_clock import WallClock
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.frames import TYPE_OF
+from anser_ros.wire.points import FluxPoints, as_sent
 from anser_ros.wire.port import DEFAULT_BAUD, Batch, ControlUnitPort, PortState, find_port
 from anser_ros.wire.protocols import PROTOCOLS
 from anser_ros.wire.records import (
@@ -56,8 +61,11 @@ ASK_NS = 50_000_000
 """Time (50 ms) from one question to the device about its time to the next, while its answer would
 help: windows wait for it. Each costs the device a hello of some hundred bytes."""
 MANY_BLOCKS = 8
-"""Blocks still wanted by a window, above which the node is woken one block early, so that what
-takes most of the time is done when the last block arrives."""
+"""Blocks still wanted by a window, above which the node is woken early, so that what takes most of
+the time is done when the last block arrives."""
+FEW_BLOCKS = 4
+"""Blocks still to come when it is woken first. The second time one is missing: fewer at the first,
+and the work on those before is not over when it comes; more, and that of the second time isn't."""
 WAIT_S = 0.1
 """Longest wait for blocks, s: how late the end of the node or a change is noticed in a silence."""
 GOODBYE_S = 0.1
@@ -118,6 +126,7 @@ class Interval:
     staleness: Staleness | None = None
     repeats: int = 0
     duplicates: int = 0
+    skipped: int = 0
 
     def add(self, frame: FluxFrame, delay_s: float) -> None:
         """Note a published frame."""
@@ -147,6 +156,8 @@ class Acquisition(AnserNode):
         self._reference_publisher = self.create_publisher(
             PointCloud2, 'reference/flux', qos.STREAM
         )
+        self.offer(self._tool_publisher)
+        self.offer(self._reference_publisher)
         self._cloud = FluxCloud(self._setup.frame_id)
         self._control = StreamControl(
             self._setup.frequencies_hz, set_frequencies=table.set_frequencies
@@ -160,7 +171,8 @@ class Acquisition(AnserNode):
         self._interval = Interval(time.monotonic())
         self._sensor_flags: np.ndarray | None = None
         self._past: Counter[str] = Counter()
-        self._duplicates = 0
+        self._duplicates = self._skipped = 0
+        self._backlog = Backlog()
         self._published_setup = ''
         self._accuracy = MeasuredAccuracy()
         self._wall_clock = WallClock()
@@ -233,9 +245,9 @@ class Acquisition(AnserNode):
             self._control.take(record, arrival_ns)
             self._dispatch(record, arrival_ns)
         if self._port is not None:
-            self._port.blocks_wanted = self._wake_after()
+            self._port.want(self._wake_after(self._port))
 
-    def _wake_after(self) -> int:
+    def _wake_after(self, port: ControlUnitPort) -> int:
         """Blocks after which to go on: those of a window, the last of many apart.
 
         While that one is on its way the others are worked off, and the last window is demodulated
@@ -244,10 +256,14 @@ class Acquisition(AnserNode):
         if self._stream is None:
             return 1
         wanted = self._stream.blocks_wanted
+        if wanted > MANY_BLOCKS:
+            self._woken_early = True
+            return wanted - FEW_BLOCKS
         if wanted == 1 and self._woken_early:
-            self._stream.rehearse()
-        self._woken_early = wanted > MANY_BLOCKS
-        return wanted - 1 if self._woken_early else wanted
+            self._woken_early = False
+            if not port.has_more:
+                self._stream.rehearse()
+        return wanted - 1 if self._woken_early and wanted > 1 else wanted
 
     def _dispatch(self, record: Record, arrival_ns: int) -> None:
         payload = record.payload
@@ -259,8 +275,7 @@ class Acquisition(AnserNode):
             if self._stream is None and not self._refusal:
                 self._make_stream()
             if self._stream is not None:
-                for frame in self._stream.push(payload, arrival_ns):
-                    self._publish_frame(frame, arrival_ns)
+                self._take_block(self._stream, payload, arrival_ns)
         elif isinstance(payload, Hello):
             if payload != self._hello:
                 self._drop_stream()
@@ -269,6 +284,16 @@ class Acquisition(AnserNode):
             self._device = payload
         elif isinstance(payload, Reply) and payload.code is ReplyCode.OK:
             self._take_answer(payload.command, record.tag)
+
+    def _take_block(self, stream: FluxStream, block: SampleBlock, arrival_ns: int) -> None:
+        """Publish the frames that a block completes; those late beyond hope give way to newer."""
+        begin_ns = time.monotonic_ns()
+        skips = self._backlog.is_hopeless((begin_ns - arrival_ns) / 1e9)
+        for frame in stream.push(block, arrival_ns, skips=skips):
+            self._publish_frame(frame, arrival_ns)
+            now_ns = time.monotonic_ns()
+            self._backlog.worked((now_ns - begin_ns) / 1e9)
+            begin_ns = now_ns
 
     def _take_answer(self, command: int, tag: int) -> None:
         """Take from an answer that what follows it was sampled after the command had left."""
@@ -308,6 +333,7 @@ class Acquisition(AnserNode):
             self._refusal = str(error)
             raise
         self._accuracy.reset()
+        self._backlog = Backlog(1 / self._stream.rate_hz)
         if self._start_sent_ns is not None:
             self._stream.clock.bound(0, self._start_sent_ns)
 
@@ -325,12 +351,21 @@ class Acquisition(AnserNode):
             self._publish_setup(self._accuracy.stated_in(self._setup, stream.rate_hz))
         # The system's clock may be set while we run; the offset is taken anew for every stamp.
         stamp_ns = frame.host_ns + self._wall_clock.offset_ns()
+        self._hand_over_flux(self._tool_publisher, frame.tool, stamp_ns)
         if len(frame.tool.channel):
             self._tool_publisher.publish(self._cloud.message(frame.tool, stamp_ns))
         if len(frame.reference.channel):
             self._reference_publisher.publish(self._cloud.message(frame.reference, stamp_ns))
+        # The model is refitted when the poses and all messages are on their way.
+        self._hand_over_flux(self._reference_publisher, frame.reference, stamp_ns)
         self._frame = frame
         self._interval.add(frame, (time.monotonic_ns() - arrival_ns) / 1e9)
+        self.pause()
+
+    def _hand_over_flux(self, publisher: Any, points: FluxPoints, stamp_ns: int) -> None:
+        if self.hands_over and len(points.channel):
+            sent = HandedFlux(stamp_ns, self._setup.frame_id, as_sent(points))
+            self.hand_over(publisher, sent)
 
     # Executor thread ----------------------------------------------------------------------
 
@@ -375,6 +410,8 @@ class Acquisition(AnserNode):
             }
         duplicates = self._past['duplicate_blocks'] + live.get('duplicate_blocks', 0)
         interval.duplicates, self._duplicates = duplicates - self._duplicates, duplicates
+        skipped = self._past['windows_skipped'] + live.get('windows_skipped', 0)
+        interval.skipped, self._skipped = skipped - self._skipped, skipped
         counters = {name: int(values.get(name, 0)) for name in FAULTS}  # type: ignore[call-overload]
         self._faults.note(counters, time.monotonic())
         level, message = self._verdict(interval)
@@ -394,6 +431,10 @@ class Acquisition(AnserNode):
         if interval.repeats == frames and max(frames, interval.duplicates) > 0:
             return Level.ERROR, 'the control unit repeats itself'
         troubles = [(self._faults.level, self._faults.words)] if self._faults.words else []
+        slow = too_slow(interval.skipped, frames)
+        if slow:
+            self.warn('seconds_too_slow', slow)
+            troubles.insert(0, (Level.WARN, slow))
         if self._device is not None and self._device.flags:
             troubles.append((Level.WARN, f'control unit: {device_words(self._device)}'))
         if self._stream is not None:
@@ -420,6 +461,5 @@ class Acquisition(AnserNode):
 
 
 if __name__ == '__main__':
-    # Threads take turns every millisecond, not every five.
-    sys.setswitchinterval(1e-3)
+    sys.setswitchinterval(TURN_S)
     sys.exit(main(Acquisition))

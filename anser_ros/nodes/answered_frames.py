@@ -6,6 +6,7 @@ answer: a few milliseconds, and never longer than it may. That makes live poses 
 found offline. Where nobody answers, no frame waits.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable
 from typing import Generic, TypeVar
@@ -17,6 +18,8 @@ OTHER_CLOCK_NS = 1_000_000_000
 """A model that far from a frame has its stamp from another clock (a recording's, the host's)."""
 MOST_LATE = 5
 """Frames in a row that waited in vain, after which none waits until an answer has come again."""
+NOT_AT_ALL = -math.inf
+"""Time until which a frame waits that is not to wait."""
 MOST_WAITING = 200
 """Most frames and models that are kept waiting, each; older models are dropped, and the oldest
 frame is tracked at once. At 50 frames a second that is four seconds, beyond any useful wait."""
@@ -64,8 +67,12 @@ class AnsweredFrames(Generic[Model, Frame]):
         self.work(now_s)
 
     def add_frame(self, stamp_ns: int, frame: Frame, now_s: float, longest_wait_s: float) -> None:
-        """Take a frame, and track it once its model is there, at most so much later."""
-        self._frames.append((stamp_ns, frame, now_s + longest_wait_s))
+        """Take a frame, and track it once its model is there, at most so much later.
+
+        One that is not to wait, with 0, is not late.
+        """
+        until_s = now_s + longest_wait_s if longest_wait_s > 0 else NOT_AT_ALL
+        self._frames.append((stamp_ns, frame, until_s))
         self.work(now_s)
 
     def work(self, now_s: float) -> None:
@@ -75,7 +82,8 @@ class AnsweredFrames(Generic[Model, Frame]):
             self._use_models(stamp_ns)
             if not self._is_answered(stamp_ns):
                 overdue = now_s >= until_s or len(self._frames) > MOST_WAITING
-                if self.follows and self._in_vain < MOST_LATE:
+                waits = until_s != NOT_AT_ALL
+                if self.follows and waits and self._in_vain < MOST_LATE:
                     if not overdue:
                         return
                     self.late += 1

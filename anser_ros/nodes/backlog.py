@@ -25,10 +25,17 @@ FEWEST = 10
 
 
 class Backlog:
-    """Typical spacing of messages, and the time that each takes."""
+    """Typical spacing of messages, and the time that each takes.
 
-    def __init__(self) -> None:
-        self._spacing_s: deque[float] = deque(maxlen=MEMORY)
+    Parameters
+    ----------
+    spacing_s : float, optional
+        The spacing, s, where it is known.
+    """
+
+    def __init__(self, spacing_s: float | None = None) -> None:
+        known = () if spacing_s is None else (spacing_s,)
+        self._spacing_s: deque[float] = deque(known, maxlen=MEMORY)
         self._work_s: deque[float] = deque(maxlen=MEMORY)
         self._last = (0, 0)
 

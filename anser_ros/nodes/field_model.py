@@ -104,6 +104,7 @@ class FieldModelNode(AnserNode):
     NAME = 'field_model'
     PARAMETERS = FieldModelParameters
     HAS_KERNELS = True
+    WORKS_ASIDE = True  # its first answer takes seconds
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -129,6 +130,8 @@ class FieldModelNode(AnserNode):
         self._writer = ModelWriter()
         self._models = self.create_publisher(PointCloud2, 'field_model', qos.MODELS)
         self._errors = self.create_publisher(PointCloud2, 'field_model_error', qos.MODEL_ERRORS)
+        self.offer(self._errors, lasts=True)
+        self.offer(self._models, lasts=True)
         self._metal = MetalView(self)
         self._sources = [
             OneSource(
@@ -296,9 +299,13 @@ class FieldModelNode(AnserNode):
         error = self._writer.new_error(
             model, frame_id, self._stamp_ns, self._follows, code_of(withheld)
         )
+        dipoles = self._writer.dipoles(model, frame_id, self._stamp_ns)
+        if error is not None:
+            self.hand_over(self._errors, error)
+        self.hand_over(self._models, dipoles)
         if error is not None:
             self._errors.publish(error)
-        self._models.publish(self._writer.dipoles(model, frame_id, self._stamp_ns))
+        self._models.publish(dipoles)
         if model is not self._model:
             self.count('models')
         self._model = model

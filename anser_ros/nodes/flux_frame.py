@@ -91,6 +91,10 @@ class WaitingFrames:
         self._queue: deque[_Waiting] = deque()
         self.withheld = 0
 
+    def __len__(self) -> int:
+        """Return how many frames wait."""
+        return len(self._queue)
+
     def add(
         self, frame: FluxFrame, middle_sample: float, end_sample: float, arrival_ns: int
     ) -> None:

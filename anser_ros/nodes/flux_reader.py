@@ -7,6 +7,7 @@ from sensor_msgs.msg import PointCloud2
 
 from anser_ros.errors import LayoutError
 from anser_ros.frames.intake import Count
+from anser_ros.nodes.handover import HandedFlux
 from anser_ros.nodes.model_clouds import SECOND_NS, layout_of, stamp_of, width_of
 from anser_ros.wire.points import FluxPoints, decode_flux
 
@@ -32,12 +33,14 @@ def read_flux(message: PointCloud2) -> tuple[int, FluxPoints]:
     )
 
 
-def read_frame(message: PointCloud2, frame_id: str, count: Count) -> tuple[int, FluxPoints]:
+def read_frame(
+    message: PointCloud2 | HandedFlux, frame_id: str, count: Count
+) -> tuple[int, FluxPoints]:
     """Read a flux message that must be in a frame; its peculiarities are counted.
 
     Parameters
     ----------
-    message : PointCloud2
+    message : PointCloud2, or HandedFlux where it has been handed over within the process
     frame_id : str
         The setup's frame.
     count : callable
@@ -49,13 +52,15 @@ def read_frame(message: PointCloud2, frame_id: str, count: Count) -> tuple[int, 
     LayoutError
         When it is in another frame, has no stamp, or is no flux cloud.
     """
+    handed = isinstance(message, HandedFlux)
+    given_id = message.frame_id if handed else message.header.frame_id
+    if given_id != frame_id:
+        count('fluxes_other_frame_id', 1)
+        raise LayoutError(f'fluxes in the frame {given_id!r}, the setup is in {frame_id!r}')
+    if isinstance(message, HandedFlux):
+        return message.stamp_ns, message.points
     if message.is_bigendian:
         count('fluxes_big_endian', 1)
-    if message.header.frame_id != frame_id:
-        count('fluxes_other_frame_id', 1)
-        raise LayoutError(
-            f'fluxes in the frame {message.header.frame_id!r}, the setup is in {frame_id!r}'
-        )
     if stamp_of(message) <= 0 or message.header.stamp.nanosec >= SECOND_NS:
         count('fluxes_without_stamp', 1)
     return read_flux(message)

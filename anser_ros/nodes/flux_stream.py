@@ -105,7 +105,9 @@ class FluxStream:
 
     @property
     def blocks_wanted(self) -> int:
-        """Blocks until the next window is complete."""
+        """Blocks until a frame may be ready: one while frames wait for a block to confirm them."""
+        if self.waiting:
+            return 1
         return -(-self._cutter.samples_wanted // self._block_samples)
 
     def restart(self, sent_ns: int | None) -> None:
@@ -120,10 +122,11 @@ class FluxStream:
         """Take in that the device has just answered a command that was sent at a host time."""
         self.clock.bound(self._cutter.end_sample + self._block_samples, sent_ns)
 
-    def push(self, block: SampleBlock, arrival_ns: int) -> list[FluxFrame]:
+    def push(self, block: SampleBlock, arrival_ns: int, *, skips: bool = False) -> list[FluxFrame]:
         """Take a block and return the frames that are complete and whose stamps are good.
 
-        A frame may wait for its stamp, and be withheld; see `WaitingFrames`.
+        A frame may wait for its stamp, and be withheld; see `WaitingFrames`. Where it ``skips``,
+        a window that is complete gives way to newer ones: it is counted and no more.
         """
         if block.codes.shape[1] != self._cutter.columns:
             return []
@@ -136,6 +139,10 @@ class FluxStream:
         if self._cutter.end_sample != before and not self._watch.repeats:
             self.clock.observe(self._cutter.end_sample, arrival_ns)
         for window in windows:
+            if skips:
+                self.counters.windows -= 1
+                self.counters.windows_skipped += 1
+                continue
             try:
                 frame = self._frame(window)
             except FitError:

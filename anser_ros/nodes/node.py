@@ -18,7 +18,9 @@ an error is logged, counted and shown in ``/diagnostics``, and the node lives on
 """
 
 import argparse
+import contextlib
 import functools
+import threading
 import time
 import traceback
 from collections import Counter
@@ -35,6 +37,7 @@ from rclpy.parameter import Parameter
 from anser_ros.errors import AnserError
 from anser_ros.nodes import incoming, parameters, qos
 from anser_ros.nodes.diagnostics import Level, Status, Throttle, diagnostic_array
+from anser_ros.nodes.handover import Aside, Handover, Taking
 from anser_ros.nodes.process import main
 
 NAMESPACE = 'anser'
@@ -42,6 +45,12 @@ DIAGNOSTICS_PERIOD_S = 1.0
 """Time between two messages in /diagnostics, s, as other ROS nodes have it."""
 WARNING_PERIOD_S = 10.0
 """Least time between two warnings of one kind in the log, s."""
+LONGEST_TURN_S = 0.05
+"""Time, s, that a timer waits while another thread works in its node, before it is left out until
+the next time: other nodes of the process wait meanwhile."""
+LONGEST_END_S = 0.2
+"""Time, s, that the end of a process waits for what its nodes work on aside: longer than a frame
+takes. The start of a refit takes seconds, which nobody waits for."""
 # Parameters that rclpy itself declares or reads.
 FOREIGN_PARAMETERS = ('use_sim_time', 'start_type_description_service')
 FOREIGN_PREFIXES = ('qos_overrides.',)
@@ -63,6 +72,13 @@ class AnserNode(Node):
         Events by name; all of them are shown in ``/diagnostics``.
     exit_code : int or None
         What the process ends with once :meth:`stop` was called.
+
+    Parameters
+    ----------
+    handover : Handover, optional
+        What nodes of the same process give each other directly.
+    beside : sequence of type, optional
+        The other nodes of the process: values that are given to all of them may be meant for one.
     """
 
     NAME: ClassVar[str]
@@ -70,8 +86,21 @@ class AnserNode(Node):
     HAS_KERNELS: ClassVar[bool] = False
     """Whether the node calculates with compiled kernels, and waits until all are there."""
 
-    def __init__(self, **options: Any) -> None:
+    WORKS_ASIDE: ClassVar[bool] = False
+    """Whether what is handed over is worked on in a thread of its own, the newest first."""
+
+    def __init__(
+        self,
+        handover: Handover | None = None,
+        beside: Sequence[type['AnserNode']] = (),
+        **options: Any,
+    ) -> None:
         # The base class already creates services, so what guards them must be there first.
+        self._handover = handover
+        self._beside = tuple(beside)
+        # Where frames are handed over, they come in another thread than the executor's.
+        self._aside: Aside | None = None
+        self._turn: Any = contextlib.nullcontext() if handover is None else threading.RLock()
         self.counters: Counter[str] = Counter()
         self.exit_code: int | None = None
         self._throttle = Throttle(WARNING_PERIOD_S)
@@ -84,7 +113,9 @@ class AnserNode(Node):
         self.add_on_set_parameters_callback(self._on_set_parameters)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.EVENTS)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(DIAGNOSTICS_PERIOD_S, self.publish_diagnostics, clock=self.steady_clock)
+        self._speak = self._guard(self._in_turn(self.publish_diagnostics, LONGEST_TURN_S))
+        timer = self._guard(self._diagnostics_due)
+        super().create_timer(DIAGNOSTICS_PERIOD_S, timer, clock=self.steady_clock)
         if self.HAS_KERNELS:
             # Numba is half of the start of a node that has none.
             from anser_ros.nodes.kernel_start import wait_for_kernels
@@ -115,6 +146,26 @@ class AnserNode(Node):
 
     # What a node uses ---------------------------------------------------------------------
 
+    def offer(self, publisher: Any, *, lasts: bool = False) -> None:
+        """Hand over what is published, too, to the nodes of this process that want it."""
+        if self._handover is not None:
+            self._handover.offer(publisher.topic_name, lasts=lasts)
+
+    def hand_over(self, publisher: Any, what: Any) -> None:
+        """Give something that is published to the nodes of this process."""
+        if self._handover is not None:
+            self._handover.give(publisher.topic_name, what)
+
+    def pause(self) -> None:
+        """Let the nodes of this process do what they put off: there is time until the next."""
+        if self._handover is not None:
+            self._handover.pause()
+
+    @property
+    def hands_over(self) -> bool:
+        """Whether other nodes of this process get what this one publishes directly."""
+        return self._handover is not None
+
     def count(self, name: str, by: int = 1) -> None:
         """Count an event for ``/diagnostics``."""
         self.counters[name] += by
@@ -133,6 +184,20 @@ class AnserNode(Node):
     def publish_diagnostics(self) -> None:
         """Publish all statuses now."""
         self._send_statuses(self._status_with_counters(), *self.part_statuses())
+
+    def _diagnostics_due(self) -> None:
+        """Publish them in the next pause between two frames, where there are such."""
+        if self._handover is None or not self._handover.put_off(self._speak_if_free):
+            self._speak()
+
+    def _speak_if_free(self) -> bool:
+        is_free = bool(self._turn.acquire(blocking=False))
+        if is_free:
+            try:
+                self._speak()
+            finally:
+                self._turn.release()
+        return is_free
 
     def publish_end(self) -> None:
         """Publish that the node has ended, so that its last state is not taken for a live one."""
@@ -162,15 +227,24 @@ class AnserNode(Node):
 
     # Guarded callbacks --------------------------------------------------------------------
 
-    def create_subscription(self, msg_type, topic, callback, qos_profile, **options):
-        """Subscribe as rclpy does, with the callback guarded, and what is too large refused."""
+    def create_subscription(
+        self, msg_type, topic, callback, qos_profile, *, handed=None, **options
+    ):
+        """Subscribe as rclpy does, with the callback guarded, and what is too large refused.
+
+        What a node of this process hands over goes to ``handed``, by default the callback too.
+        """
         bounded = incoming.is_bounded(msg_type) and not options.get('raw', False)
 
         @functools.wraps(callback)
         def opened(message, *info):
             return callback(incoming.opened(message, msg_type) if bounded else message, *info)
 
-        guarded = self._guard(opened)
+        name = self.resolve_topic_name(topic)
+        if self._handover is not None and self._handover.offers(name):
+            taker = self._guard(self._in_turn(handed or callback))
+            return self._handover.take(name, self._put_aside(name, taker))
+        guarded = self._guard(self._in_turn(opened))
 
         @functools.wraps(callback)
         def unpacked(*args):
@@ -185,12 +259,48 @@ class AnserNode(Node):
 
     def create_timer(self, timer_period_sec, callback, *args, **options):
         """Make a timer as rclpy does, with the callback guarded."""
-        return super().create_timer(timer_period_sec, self._guard(callback), *args, **options)
+        guarded = self._guard(self._in_turn(callback, LONGEST_TURN_S))
+        return super().create_timer(timer_period_sec, guarded, *args, **options)
 
     def create_service(self, srv_type, srv_name, callback, **options):
         """Serve as rclpy does; an error becomes ``success = False`` with its message."""
-        guarded = self._guard(callback, is_service=True)
+        guarded = self._guard(self._in_turn(callback), is_service=True)
         return super().create_service(srv_type, srv_name, guarded, **options)
+
+    def destroy_subscription(self, subscription: Any) -> bool:
+        """Destroy a subscription as rclpy does, or take no longer what is handed over."""
+        if isinstance(subscription, Taking) and self._handover is not None:
+            self._handover.drop(subscription)
+            return True
+        return super().destroy_subscription(subscription)
+
+    def _put_aside(self, topic: str, taker: Callable) -> Callable:
+        if not self.WORKS_ASIDE:
+            return taker
+        aside = self._aside = self._aside or Aside(lambda: self.count('frames_skipped'))
+        return lambda what: aside.put(topic, taker, what)
+
+    def stop_working(self) -> None:
+        """End what is worked on aside; the process is about to end."""
+        if self._aside is not None:
+            self._aside.end(LONGEST_END_S)
+
+    def _in_turn(self, callback: Callable, longest_s: float = -1.0) -> Callable:
+        """A callback that waits for another one of this node in another thread.
+
+        One that comes again does not hold up other nodes for long, and is left out.
+        """
+
+        @functools.wraps(callback)
+        def in_turn(*args):
+            if not self._turn.acquire(timeout=longest_s):
+                return None
+            try:
+                return callback(*args)
+            finally:
+                self._turn.release()
+
+        return in_turn if self._handover is not None else callback
 
     def _guard(self, callback: Callable, is_service: bool = False) -> Callable:
         @functools.wraps(callback)
@@ -225,7 +335,9 @@ class AnserNode(Node):
         table = self.PARAMETERS
         kinds, values = parameters.types(table), {}
         # rclpy drops overrides that nobody declares; a misspelt name must not pass silently.
-        unknown = [name for name in self._parameter_overrides if not _is_known(name, kinds)]
+        others = {name for node in self._beside for name in parameters.types(node.PARAMETERS)}
+        given = [name for name in self._parameter_overrides if name not in others]
+        unknown = [name for name in given if not _is_known(name, kinds)]
         if unknown:
             parameters.build(table, dict.fromkeys(sorted(unknown)))
         for name, rule in parameters.rules(table).items():
@@ -247,8 +359,9 @@ class AnserNode(Node):
         old = self.parameters
         try:
             new = parameters.build(self.PARAMETERS, {**vars(old), **own})
-            self.parameters = new
-            self.on_parameters(old, new)
+            with self._turn:
+                self.parameters = new
+                self.on_parameters(old, new)
         except AnserError as error:
             self.parameters = old
             return SetParametersResult(successful=False, reason=str(error))

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Hashable, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
 LOOK_S = 0.1
 """How often the graph is asked at most, s, while messages go on as before: it takes 15 us.
 Smaller costs more; larger, and who only begins to publish is noticed later."""
+NO_INFORMATION: Mapping[str, Any] = MappingProxyType({})
+"""What is known of a message that was handed over within the process: its sender is ours, and a
+second one is known to the graph alone."""
 NUMBER = 'publication_sequence_number'
 """Key of a message's information: which of its publisher's messages it is."""
 
@@ -52,6 +56,7 @@ class OneSource:
         informed: bool = False,
     ) -> None:
         self._node, self._topic = node, topic
+        self._name = node.resolve_topic_name(topic)
         self._callback, self._doubted, self._lasting = callback, doubted, lasting
         self._informed = informed
         self._arguments = message_type, profile
@@ -77,7 +82,7 @@ class OneSource:
     def hears(self, info: Mapping[str, Any], lasting: Hashable = None) -> bool:
         """Take a message's information; return whether the message may be believed."""
         now_s, number = time.monotonic(), info.get(NUMBER)
-        if not self._sources.continues(number):
+        if number is not None and not self._sources.continues(number):
             self._looked_s = 0.0  # the graph as it is at this moment is needed
         is_good = self._sources.take(number, self._count(now_s), now_s, lasting)
         if not is_good:
@@ -87,7 +92,12 @@ class OneSource:
 
     def _subscribed(self) -> Any:
         message_type, profile = self._arguments
-        return self._node.create_subscription(message_type, self._topic, self._take, profile)
+        return self._node.create_subscription(
+            message_type, self._topic, self._take, profile, handed=self._take_handed
+        )
+
+    def _take_handed(self, what: Any) -> None:
+        self._take(what, NO_INFORMATION)
 
     def _take(self, message: Any, info: Mapping[str, Any]) -> None:
         lasting = None if self._lasting is None else self._lasting(message)
@@ -98,8 +108,7 @@ class OneSource:
     def _count(self, now_s: float) -> int:
         """How many publishers the graph knows."""
         if now_s - self._looked_s > LOOK_S:
-            name = self.subscription.topic_name
-            self._publishers, self._looked_s = self._node.count_publishers(name), now_s
+            self._publishers, self._looked_s = self._node.count_publishers(self._name), now_s
         return self._publishers
 
 

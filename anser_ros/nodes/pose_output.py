@@ -51,6 +51,7 @@ class PoseTopic:
         self.transform = TransformStamped()
         self.transform.header.frame_id = board
         self.transform.child_frame_id = f'{prefix}{stem}'
+        self._values: tuple[Any, ...] = ()
         self.estimate: PoseEstimate | None = None
         self.states: Counter[str] = Counter()
         self.tally = Tally()
@@ -96,25 +97,30 @@ class PoseTopic:
             x, y, z, w = quaternion_of_rotation(estimate.rotation)
         px, py, pz = estimate.position.tolist()
         sec, nanosec = divmod(estimate.stamp_ns, SECOND_NS)
-        for message, pose in ((self._plain, self._plain.pose), (self._full, self._full.pose.pose)):
-            message.header.stamp.sec, message.header.stamp.nanosec = sec, nanosec
-            pose.position.x, pose.position.y, pose.position.z = px, py, pz
-            turn = pose.orientation
-            turn.x, turn.y, turn.z, turn.w = x, y, z, w
+        self._values = sec, nanosec, px, py, pz, x, y, z, w
+        self._fill(self._plain.header.stamp, self._plain.pose)
         self._pose.publish(self._plain)
-        header, move = self.transform.header, self.transform.transform
-        header.stamp.sec, header.stamp.nanosec = sec, nanosec
-        move.translation.x, move.translation.y, move.translation.z = px, py, pz
-        move.rotation.x, move.rotation.y, move.rotation.z, move.rotation.w = x, y, z, w
+
+    def _fill(self, stamp: Any, pose: Any) -> None:
+        """Write the pose just taken into a message."""
+        place, turn = pose.position, pose.orientation
+        stamp.sec, stamp.nanosec, place.x, place.y, place.z, *_ = self._values
+        turn.x, turn.y, turn.z, turn.w = self._values[5:]
 
     def publish_covariance(self) -> None:
         """Publish the good pose just taken once more, with its covariance.
 
-        A step of its own, so that no sensor's plain pose waits for another's covariance.
+        A step of its own, so that no sensor's plain pose waits for what else is made of another's.
         """
-        if self.estimate is not None and self.estimate.state == OK:
-            self._full.pose.covariance = self.estimate.covariance.ravel()
-            self._uncertain.publish(self._full)
+        if self.estimate is None or self.estimate.state != OK:
+            return
+        self._fill(self._full.header.stamp, self._full.pose.pose)
+        self._full.pose.covariance = self.estimate.covariance.ravel()
+        self._uncertain.publish(self._full)
+        header, move = self.transform.header, self.transform.transform
+        place, turn = move.translation, move.rotation
+        header.stamp.sec, header.stamp.nanosec, place.x, place.y, place.z, *_ = self._values
+        turn.x, turn.y, turn.z, turn.w = self._values[5:]
 
     def state(self, stale_after_s: float) -> tuple[str, str]:
         """Return the state as it is now, silence included, and its reason."""

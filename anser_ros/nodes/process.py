@@ -20,6 +20,7 @@ from rclpy.utilities import remove_ros_args
 
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.nodes import parameter_files, parameters
+from anser_ros.nodes.handover import Handover
 from anser_ros.one_line_parser import OneLineParser
 from anser_ros.wire.config_folder import config_path
 
@@ -36,10 +37,28 @@ READ_PROFILES = 'RMW_FASTRTPS_USE_QOS_FROM_XML'
 ENDING = (signal.SIGINT, signal.SIGTERM)
 # How long a busy one may take to notice it.
 NOTICE_S = 1.5
+TURN_S = 1e-3
+"""Time, s, after which a thread lets another one have its turn where samples are received.
+Python's usual 5 ms would be as much error in the time at which bytes arrive."""
+RENAMING = ('__node:=', '__name:=')
+"""Rules that rename all nodes of a process, which several can't be."""
 
 
-def main(node_class: 'type[AnserNode]', argv: Sequence[str] | None = None) -> int:
-    """Run one node until it ends, or until SIGINT or SIGTERM.
+def main(
+    node_class: 'type[AnserNode] | Sequence[type[AnserNode]]',
+    argv: Sequence[str] | None = None,
+    name: str = '',
+) -> int:
+    """Run nodes until one of them ends, or until SIGINT or SIGTERM.
+
+    Parameters
+    ----------
+    node_class : type, or sequence of types
+        The node; or several that hand their frames over to each other, in the order of the chain.
+    argv : sequence of str, optional
+        The command line; that of the process by default.
+    name : str, optional
+        How the process is called, where it is not called like its node.
 
     Returns
     -------
@@ -47,14 +66,19 @@ def main(node_class: 'type[AnserNode]', argv: Sequence[str] | None = None) -> in
         0 ended as asked; 2 a wrong argument or parameter, said in one line; 1 a defect.
     """
     arguments = list(sys.argv if argv is None else argv)
+    classes = tuple(node_class) if isinstance(node_class, Sequence) else (node_class,)
+    name = name or classes[0].NAME
     try:
-        own = _parse(node_class, _without_ros(arguments))
+        own = _parse(name, classes, _without_ros(arguments))
+        if len(classes) > 1 and any(text.startswith(RENAMING) for text in arguments):
+            raise ParameterError(f'one node is renamed by -r {classes[-1].NAME}:__node:=NAME')
         signals = _Signals()
         _choose_profile()
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        return _run(node_class, own, arguments, signals)
+        common, meant = _meant_for(classes, arguments)
+        rclpy.init(args=common, signal_handler_options=SignalHandlerOptions.NO)
+        return _run(classes, own, arguments, meant, signals)
     except AnserError as error:
-        print(f'{node_class.NAME}: {" ".join(str(error).split())}', file=sys.stderr)
+        print(f'{name}: {" ".join(str(error).split())}', file=sys.stderr)
         return 2
     except (_Interrupted, rclpy.exceptions.ROSInterruptException):
         return 0
@@ -84,17 +108,45 @@ def _without_ros(arguments: Sequence[str]) -> list[str]:
         raise ParameterError(f'ROS arguments: {error}') from error
 
 
-def _parse(node_class: 'type[AnserNode]', arguments: Sequence[str]) -> dict[str, Any]:
-    summary = (sys.modules[node_class.__module__].__doc__ or '').strip().split('\n')[0]
-    table = parameters.describe(node_class.PARAMETERS)
+def _parse(
+    name: str, classes: 'Sequence[type[AnserNode]]', arguments: Sequence[str]
+) -> dict[str, Any]:
+    module = classes[0].__module__ if len(classes) == 1 else '__main__'
+    summary = (sys.modules[module].__doc__ or '').strip().split('\n')[0]
+    tables = [(node.NAME, parameters.describe(node.PARAMETERS)) for node in classes]
+    prefix = '' if len(classes) == 1 else 'NODE:'
+    if prefix:
+        table = '\n'.join(f'{node}:\n{table}' for node, table in tables)
+    else:
+        table = tables[0][1]
     parser = OneLineParser(
-        prog=f'anser {node_class.NAME}',
+        prog=f'anser {name}',
         description=summary,
-        epilog=f'parameters (--ros-args -p NAME:=VALUE, or --params-file):\n{table}',
+        epilog=f'parameters (--ros-args -p {prefix}NAME:=VALUE, or --params-file):\n{table}',
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    node_class.add_arguments(parser)
+    for node in classes:
+        node.add_arguments(parser)
     return vars(parser.parse_args(arguments))
+
+
+def _meant_for(
+    classes: 'Sequence[type[AnserNode]]', arguments: Sequence[str]
+) -> tuple[list[str], dict[str, list[str]]]:
+    """Split off the parameters of one node among several, ``-p NODE:NAME:=VALUE``.
+
+    ROS has this too, but finds no node so that is in a namespace, and drops the value.
+    """
+    common, meant = [], {node.NAME: ['--ros-args'] for node in classes}
+    left = iter(arguments)
+    for text in left:
+        value = next(left, '') if text in ('-p', '--param') else None
+        node, _, rule = (value or '').partition(':')
+        if len(classes) > 1 and node in meant and ':=' in rule:
+            meant[node] += [text, rule]
+        else:
+            common += [text] if value is None else [text, value]
+    return common, meant
 
 
 class _Interrupted(BaseException):
@@ -164,30 +216,50 @@ def make_executor() -> Executor:
 
 
 def _run(
-    node_class: 'type[AnserNode]',
+    classes: 'Sequence[type[AnserNode]]',
     own: dict[str, Any],
     arguments: Sequence[str],
+    meant: dict[str, list[str]],
     signals: _Signals,
 ) -> int:
-    node, code = None, 0
+    nodes: list[AnserNode] = []
+    code = 0
     executor = make_executor()
+    handover = Handover()
     try:
-        node = node_class(**own)
-        for text in parameter_files.complaints(arguments, node.get_name()):
-            node.get_logger().warning(text)
-        executor.add_node(node)
+        for node_class in classes:
+            options: dict[str, Any] = {}
+            if len(classes) > 1:
+                arguments_of = meant[node_class.NAME]
+                options = {'handover': handover, 'beside': classes, 'cli_args': arguments_of}
+            nodes.append(node_class(**own, **options))
+        _complain(nodes, arguments)
+        for node in nodes:
+            executor.add_node(node)
         # What is there now stays: looking through all of it for garbage takes up to 0.1 s.
         gc.collect()
         gc.freeze()
         signals.is_node_made = True
-        while not signals.caught and node.exit_code is None:
+        while not signals.caught and all(node.exit_code is None for node in nodes):
             executor.spin_once(timeout_sec=SPIN_SLICE_S)
-        code = node.exit_code or 0
+        code = max(node.exit_code or 0 for node in nodes)
     finally:
         signals.ignore()
-        if node is not None:
+        for node in nodes:
             node.close()
+        for node in nodes:
+            node.stop_working()
             node.publish_end()
+        if nodes:
             executor.shutdown(timeout_sec=1.0)
+        for node in nodes:
             node.destroy_node()
     return code
+
+
+def _complain(nodes: 'Sequence[AnserNode]', arguments: Sequence[str]) -> None:
+    """Warn of parameter files that say nothing to any of the nodes."""
+    said = [parameter_files.complaints(arguments, node.get_name()) for node in nodes]
+    if all(said):
+        for text in said[-1]:
+            nodes[-1].get_logger().warning(text)

@@ -21,12 +21,14 @@ from anser_ros.nodes.answered_frames import AnsweredFrames
 from anser_ros.nodes.backlog import Backlog, take_waiting
 from anser_ros.nodes.diagnostics import Trouble
 from anser_ros.nodes.flux_reader import read_frame
+from anser_ros.nodes.handover import HandedFlux
 from anser_ros.nodes.incoming import opened
 from anser_ros.nodes.model_clouds import SECOND_NS, stamp_of
 from anser_ros.nodes.model_in_force import ModelInForce
 from anser_ros.nodes.model_intake import GivenModel, ModelIntake
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.one_source import OneSource, said_of
+from anser_ros.nodes.overload import too_slow
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.pose_output import PoseTopic, transform_message, transform_publisher
 from anser_ros.nodes.readiness import digest_of
@@ -186,6 +188,8 @@ class TrackerNode(AnserNode):
         self._solve_s = 0.0
         self._backlog = Backlog()
         self._told_s = 0.0
+        self._told_frames = (0, 0)
+        self._model_age_ns = 0
         self._transforms = transform_publisher(self) if table.publish_tf else None
         warm_up()
         setups = OneSource(
@@ -283,8 +287,14 @@ class TrackerNode(AnserNode):
         else:
             self._tracker = self._tracker.with_model(field, name)
 
-    def _on_flux(self, message: PointCloud2, info: dict[str, int]) -> None:
-        """Take a frame; one that is late beyond hope gives way to the newest."""
+    def _on_flux(self, message: PointCloud2 | HandedFlux, info: dict[str, int]) -> None:
+        """Take a frame; one that is late beyond hope gives way to the newest.
+
+        One that was handed over doesn't wait: its model is made once its poses have gone out.
+        """
+        if isinstance(message, HandedFlux):
+            self._take_frame(self._read(message), 0.0)
+            return
         received_ns = info.get('received_timestamp') or info.get('source_timestamp') or 0
         now_ns, stamp_ns = time.time_ns(), stamp_of(message)
         self._backlog.arrived(received_ns, stamp_ns)
@@ -297,18 +307,17 @@ class TrackerNode(AnserNode):
                 return
             if waiting:
                 self.count('frames_skipped', len(waiting))
-                self._trouble.say(
-                    'frames skipped: they come faster than they can be tracked', time.monotonic()
-                )
                 message = opened(waiting[-1][0], PointCloud2)
-        frame = self._read(message)
+        self._take_frame(self._read(message), self.parameters.model_wait_s)
+
+    def _take_frame(self, frame: tuple[int, FluxPoints] | None, wait_s: float) -> None:
+        """Track a frame when its model is there, or after so long."""
         if frame is not None:
-            wait_s = self.parameters.model_wait_s
             self._frames.add_frame(frame[0], frame, time.monotonic(), wait_s)
             if self._frames.waiting:
                 self._wait.reset()
 
-    def _on_doubted(self, message: PointCloud2, _info: dict[str, int]) -> None:
+    def _on_doubted(self, message: PointCloud2 | HandedFlux, _info: dict[str, int]) -> None:
         """Say of a frame that may be another sender's why it has no poses."""
         frame = self._read(message)
         if frame is not None:
@@ -324,7 +333,7 @@ class TrackerNode(AnserNode):
         if not self._frames.waiting:
             self._wait.cancel()
 
-    def _read(self, message: PointCloud2) -> tuple[int, FluxPoints] | None:
+    def _read(self, message: PointCloud2 | HandedFlux) -> tuple[int, FluxPoints] | None:
         """Stamp and points of a frame that can be tracked, or None for one that is refused."""
         setup = self._setup
         if setup is None:
@@ -349,6 +358,8 @@ class TrackerNode(AnserNode):
         else:
             standing = self._in_force.at(stamp_ns)
         self._withheld = standing.withheld
+        if self._given is not None and self._given.follows:
+            self._model_age_ns = max(self._model_age_ns, stamp_ns - self._given.stamp_ns)
         try:
             if standing.model is not None and standing.model is not self._tracker.model:
                 self._track_with(standing.model, self._given)
@@ -388,8 +399,11 @@ class TrackerNode(AnserNode):
     def status(self) -> Status:
         """Return what the tracker lacks, if anything, and its counters."""
         self._told_s = time.monotonic()
+        slow = self._slow_words()
         tracker, newest = self._tracker, self._intake.newest
         values: dict[str, object] = {'frame_time_s': self._solve_s}
+        values['model_age_s_max'] = self._model_age_ns / SECOND_NS
+        self._model_age_ns = 0
         values['last_refusal'] = self._trouble.last
         values['ready_for'] = self._ready_for()
         values['pose_listeners'] = sum(topic.listeners for topic in self._topics.values())
@@ -421,6 +435,8 @@ class TrackerNode(AnserNode):
         if dead:
             return Status('', Level.WARN, f'no flux of {dead}', values)
         tracked = f'{good} of {len(self._topics)} tracked'
+        if slow:
+            return Status('', Level.WARN, f'{slow}; {tracked}', values)
         trouble = self._trouble.recent(time.monotonic())
         if trouble:
             return Status('', Level.WARN, f'{tracked}; lately: {trouble}', values)
@@ -430,6 +446,16 @@ class TrackerNode(AnserNode):
                 '', Level.WARN, f'{tracked}; a gate of {gate:g} lets wrong poses out', values
             )
         return Status('', Level.OK, tracked, values)
+
+    def _slow_words(self) -> str:
+        """What part of the frames since the last look was skipped, in words."""
+        now = self.counters['frames_skipped'], self.counters['frames']
+        skipped, worked = now[0] - self._told_frames[0], now[1] - self._told_frames[1]
+        self._told_frames = now
+        slow = too_slow(skipped, worked)
+        if slow:
+            self.warn('seconds_too_slow', slow)
+        return slow
 
     def _ready_for(self) -> str:
         """Digest of the setup that no pose will be lost of: all listeners and the model are there.

@@ -18,6 +18,7 @@ BUSY = {
     'dropped_blocks': 'blocks that the simulated unit could not send',
     'overrun_blocks': 'blocks that the host was too slow to take',
     'gap_blocks': 'blocks missing in the stream',
+    'windows_skipped': 'windows that the host was too slow for',
     'windows_lost': 'windows without enough samples',
     'windows_dropped_samples': 'windows with holes',
     'frames_skipped': 'frames that the tracker was too slow for',

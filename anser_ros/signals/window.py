@@ -63,6 +63,7 @@ class CutterCounters:
 
     windows: int = 0
     windows_lost: int = 0
+    windows_skipped: int = 0
     windows_dropped_samples: int = 0
     missing_samples: int = 0
     duplicate_blocks: int = 0

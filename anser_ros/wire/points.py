@@ -192,6 +192,12 @@ def encode_flux(points: FluxPoints) -> tuple[list[PointFieldTuple], int, bytes]:
     return fields, step, out.tobytes()
 
 
+def as_sent(points: FluxPoints) -> FluxPoints:
+    """Return fluxes as a reader of their message has them: in single precision."""
+    single = points.flux.astype(np.complex64).astype(np.complex128)
+    return FluxPoints(points.channel, points.flags, single, points.position, points.axis)
+
+
 def decode_field_model(
     fields: Sequence[PointFieldTuple],
     point_step: int,

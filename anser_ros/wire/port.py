@@ -106,8 +106,9 @@ class ControlUnitPort:
 
     Attributes
     ----------
-    blocks_wanted : blocks to collect before the receiver is woken; it may change this at any time.
-        A receiver that needs twenty blocks for a window is spared nineteen changes of threads.
+    blocks_wanted : blocks to collect before the receiver is woken; it may change this at any time
+        by `want`. A receiver that needs twenty blocks for a window is spared nineteen changes of
+        threads.
     """
 
     def __init__(
@@ -129,6 +130,7 @@ class ControlUnitPort:
         self._silence_s = silence_s
         self.blocks_wanted = 1
         self._queue_blocks = queue_blocks
+        self._holding = threading.RLock()
         self._held: list[Record] = []
         self._arrivals_ns: list[int] = []
         self._held_blocks = 0
@@ -161,6 +163,18 @@ class ControlUnitPort:
         self._stopping.set()
         if self._thread is not None:
             self._thread.join(timeout_s)
+
+    def want(self, blocks: int) -> None:
+        """Set how many blocks to collect; those that are there already are not waited for."""
+        with self._holding:
+            self.blocks_wanted = blocks
+            if self._held_blocks >= blocks:
+                self._hand_over()
+
+    @property
+    def has_more(self) -> bool:
+        """Whether records have come that the receiver has not got yet."""
+        return bool(self._held) or not self._queue.empty()
 
     def get(self, timeout_s: float) -> Batch | None:
         """Wait for the next batch and return it, or None when none arrived in time."""
@@ -266,27 +280,29 @@ class ControlUnitPort:
     def _take(self, records: list[Record], arrival_ns: int) -> None:
         """Hold blocks until there are as many as wanted; anything else goes on at once."""
         urgent = False
-        for record in records:
-            payload = record.payload
-            if isinstance(payload, SampleBlock):
-                self._count_gap(payload.sequence)
-                if self._queue.qsize() * self.blocks_wanted >= self._queue_blocks:
-                    self.counters.overrun_blocks += 1
-                    continue
-                self._held_blocks += 1
-            else:
-                urgent = True
-            self._held.append(record)
-            self._arrivals_ns.append(arrival_ns)
-        if urgent or self._held_blocks >= self.blocks_wanted:
-            self._hand_over()
+        with self._holding:
+            for record in records:
+                payload = record.payload
+                if isinstance(payload, SampleBlock):
+                    self._count_gap(payload.sequence)
+                    if self._queue.qsize() * self.blocks_wanted >= self._queue_blocks:
+                        self.counters.overrun_blocks += 1
+                        continue
+                    self._held_blocks += 1
+                else:
+                    urgent = True
+                self._held.append(record)
+                self._arrivals_ns.append(arrival_ns)
+            if urgent or self._held_blocks >= self.blocks_wanted:
+                self._hand_over()
 
     def _hand_over(self) -> None:
         """Queue what is held; a receiver that never reads gets no more than records fit."""
-        if self._held and self._queue.qsize() < 2 * self._queue_blocks:
-            arrivals_ns = tuple(self._arrivals_ns)
-            self._queue.put(Batch(arrivals_ns[-1], tuple(self._held), arrivals_ns=arrivals_ns))
-        self._held, self._arrivals_ns, self._held_blocks = [], [], 0
+        with self._holding:
+            if self._held and self._queue.qsize() < 2 * self._queue_blocks:
+                arrivals_ns = tuple(self._arrivals_ns)
+                self._queue.put(Batch(arrivals_ns[-1], tuple(self._held), arrivals_ns=arrivals_ns))
+            self._held, self._arrivals_ns, self._held_blocks = [], [], 0
 
     def _count_gap(self, sequence: int) -> None:
         if self._next_sequence is not None and sequence:

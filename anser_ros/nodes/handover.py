@@ -1,0 +1,150 @@
+"""Frames and models from node to node within one process: as objects, without the middleware.
+
+What is handed over is published all the same, for the recorder and everybody else. A node that
+gets a topic so has no subscription to it: it would do everything twice.
+"""
+
+import math
+import threading
+import time
+from collections import defaultdict, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from anser_ros.wire.points import FluxPoints
+
+Taker = Callable[[Any], object]
+LONGEST_PAUSE_S = 0.2
+"""Time without a pause, s, after which no frames flow, and nothing is put off: more than any stall
+of a host, less than the time between two words of a node on itself."""
+
+
+@dataclass(frozen=True)
+class HandedFlux:
+    """The fluxes of a window, as a reader of their message has them.
+
+    Attributes
+    ----------
+    stamp_ns : middle of the window, ns of the ROS clock
+    frame_id : the setup's frame
+    points : a row a sensor, in single precision as messages are
+    """
+
+    stamp_ns: int
+    frame_id: str
+    points: FluxPoints
+
+
+@dataclass(frozen=True, eq=False)
+class Taking:
+    """What a node has instead of a subscription."""
+
+    topic_name: str
+    taker: Taker
+
+
+class Aside:
+    """A thread that works on the newest of what is handed over, so that who gives it goes on.
+
+    Parameters
+    ----------
+    skipped : callable
+        Called for each thing that gave way to a newer one of its topic.
+    """
+
+    def __init__(self, skipped: Callable[[], object]) -> None:
+        self._skipped = skipped
+        self._waiting: dict[str, tuple[Taker, Any]] = {}
+        self._news = threading.Condition()
+        self._is_ending = False
+        self._thread = threading.Thread(target=self._run, name='aside', daemon=True)
+        self._thread.start()
+
+    def put(self, topic: str, taker: Taker, what: Any) -> None:
+        """Have a taker work on something as soon as the thread can."""
+        with self._news:
+            if topic in self._waiting:
+                self._skipped()
+            self._waiting[topic] = taker, what
+            self._news.notify()
+
+    def end(self, timeout_s: float) -> None:
+        """End the thread, after what it works on now if that is soon over."""
+        with self._news:
+            self._is_ending = True
+            self._news.notify()
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        while True:
+            with self._news:
+                self._news.wait_for(lambda: self._waiting or self._is_ending)
+                if self._is_ending:
+                    return
+                taker, what = self._waiting.pop(next(iter(self._waiting)))
+            taker(what)
+
+
+class Handover:
+    """Topics that nodes of this process offer each other, by their full names.
+
+    Who gives frames says when there is a pause before the next: what the nodes say of themselves
+    is put off until then, so that no pose waits for it.
+    """
+
+    def __init__(self) -> None:
+        self._put_off: deque[Callable[[], bool]] = deque()
+        self._paused_s = -math.inf
+        self._takings: defaultdict[str, list[Taking]] = defaultdict(list)
+        self._offered: dict[str, bool] = {}
+        self._last: dict[str, Any] = {}
+
+    def offer(self, topic: str, *, lasts: bool = False) -> None:
+        """Promise to give what is published on a topic.
+
+        Who takes it later gets the last one at once where it ``lasts``.
+        """
+        self._offered[topic] = lasts
+
+    def offers(self, topic: str) -> bool:
+        """Whether a topic is given to those who take it."""
+        return topic in self._offered
+
+    def take(self, topic: str, taker: Taker) -> Taking:
+        """Have all that is given on a topic go to a callable, in the thread of who gives it."""
+        taking = Taking(topic, taker)
+        self._takings[topic].append(taking)
+        if topic in self._last:
+            taker(self._last[topic])
+        return taking
+
+    def drop(self, taking: Taking) -> None:
+        """End what `take` began."""
+        self._takings[taking.topic_name].remove(taking)
+
+    def put_off(self, work: Callable[[], bool]) -> bool:
+        """Have some work done in the next pause; False where nobody makes pauses at present.
+
+        Work that returns False could not be done, and is tried again in the pause after.
+        """
+        if time.monotonic() - self._paused_s > LONGEST_PAUSE_S:
+            return False
+        if work not in self._put_off:
+            self._put_off.append(work)
+        return True
+
+    def pause(self) -> None:
+        """Do one thing that was put off: there is time until the next frame."""
+        self._paused_s = time.monotonic()
+        if self._put_off:
+            work = self._put_off.popleft()
+            if not work():
+                self._put_off.append(work)
+
+    def give(self, topic: str, what: Any) -> None:
+        """Give something to all who take a topic."""
+        if self._offered[topic]:
+            self._last[topic] = what
+        for taking in tuple(self._takings[topic]):
+            taking.taker(what)
