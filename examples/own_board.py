@@ -34,7 +34,7 @@ poses = {'pen': (np.arange(float(count)), position, turn.as_quat())}
 write_session(out / 'board.mcap', setup, poses['pen'][0], flux, poses, overwrite=True)
 
 session = load_session(out / 'board.mcap')
-for label, model in ('as drawn', drawn), ('calibrated', calibrate(session, dipoles=8).model):
+for label, model in ('as drawn', drawn), ('calibrated', calibrate(session, dipoles=10).model):
     pen = track(session, model)['pen']
     sigma, error = (np.nanmedian(v[pen.ok]) for v in (pen.sigma_position_m, pen.position_error_m))
     print(f'{label}: {pen.ok.mean():.0%} tracked, {1e3 * error:.2f} of {1e3 * sigma:.2f} mm off')

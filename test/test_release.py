@@ -12,7 +12,7 @@ import pytest
 import yaml
 from conftest import REPO
 
-from anser_ros.cli.commands import NODES, OFFLINE
+from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE
 from anser_ros.cli.missing import PYPI
 
 PACKAGE = ElementTree.parse(REPO / 'package.xml')
@@ -52,7 +52,7 @@ def test_a_wheel_of_the_sdist_runs(tmp_path):
         assert {f'{share}/{folder}/{file}' for file in files} <= set(listed)
     (entry,) = (path for path in listed if path.endswith('entry_points.txt'))
     scripts = re.findall(r'^(\w+) = ', (target / entry).read_text(), re.MULTILINE)
-    assert set(scripts) == {'anser', *NODES, *OFFLINE}
+    assert set(scripts) == {'anser', *NODES, *COMPOSED, *OFFLINE}
     code = 'import sys; sys.path.insert(0, sys.argv[1]); from anser_ros.cli.main import main; '
     code += 'import anser_ros; assert anser_ros.__file__.startswith(sys.argv[1]); '
     code += 'sys.exit(main(["--version"]))'

@@ -53,7 +53,7 @@ class Span:
         return np.asarray((time >= self.start_s) & (time <= self.end_s))
 
 
-def glitches(steps: Array, usable: Mask) -> Mask:
+def glitches(steps: Array, usable: Mask, stated: Array) -> Mask:
     """Return which frames' poses are far from where their fluxes put them, shape (F,).
 
     Parameters
@@ -62,12 +62,16 @@ def glitches(steps: Array, usable: Mask) -> Mask:
         From each optical pose to the one that the fluxes tell, m and rad.
     usable : ndarray of bool, shape (F,)
         Frames to judge by.
+    stated : ndarray, shape (6,)
+        Jitter that the optical tracker is said to have, m and rad. A deviation that is usual for
+        it is not taken for a wrong pose where its jitter shows to be less: then what the field's
+        model misses near the board stands out first.
     """
     if usable.sum() < BIN_FRAMES:
         return np.zeros(len(steps), dtype=bool)
     middle = np.median(steps[usable], axis=0)
     spread = 1.4826 * np.median(np.abs(steps[usable] - middle), axis=0)
-    return np.asarray((np.abs(steps - middle) > GLITCH * np.maximum(spread, 1e-12)).any(axis=1))
+    return np.asarray((np.abs(steps - middle) > GLITCH * np.maximum(spread, stated)).any(axis=1))
 
 
 def _bins(time: Array) -> NDArray[np.int64]:

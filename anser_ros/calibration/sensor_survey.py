@@ -337,7 +337,8 @@ class SensorSurveyor:
             size = (left**2).mean(axis=2)
             share = interpolation_share(at.part)
             seen = usable.any(axis=1)
-            bad = glitches(step / np.sqrt(share)[:, None], seen & tool.known)
+            scaled = step / np.sqrt(share)[:, None]
+            bad = glitches(scaled, seen & tool.known, self.accuracy.pose_jitter)
             frame_power = (size * usable).sum(axis=1) / np.maximum(usable.sum(axis=1), 1.0)
             good = seen & tool.known & ~bad
             moving = unsteady_tool(at.part.time, at.part.position, frame_power, good)
@@ -385,7 +386,7 @@ class SensorSurveyor:
                 terms = PoseTerms(at.residual, at.slope)
                 step, _ = most_probable_step(terms, part.weights, self.noise_t, FREE_POSE, zero)
                 share = np.sqrt(interpolation_share(at.part))[:, None]
-                wrong = glitches(step / share, np.ones(len(step), dtype=bool))
+                wrong = glitches(step / share, every, self.accuracy.pose_jitter)
                 kept[rows[block][wrong]] = False
                 bad, seen = bad + int(wrong.sum()), seen + len(step)
             out.append(kept)

@@ -29,7 +29,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = 'example: anser compare frozen/ refit/ --out compared/'
     parser.add_argument('first', type=Path, help='folder that anser evaluate has written')
     parser.add_argument('second', type=Path, help='another one, of the same session')
-    parser.add_argument('--out', type=Path, help='folder for comparison.json and comparison.png')
+    parser.add_argument(
+        '--out',
+        type=Path,
+        help='folder for comparison.json and comparison.png, made if missing',
+    )
     parser.add_argument('--json', action='store_true', help='print comparison.json on stdout')
 
 

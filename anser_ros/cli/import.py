@@ -29,7 +29,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='document (.yaml) that describes tables, or a bag: .db3, .mcap, or its folder',
     )
     parser.add_argument(
-        '--out', required=True, type=Path, help='the .mcap file to write; it must not exist yet'
+        '--out',
+        required=True,
+        type=Path,
+        help='the .mcap file to write, which must not exist yet; its folder is made if missing',
     )
     parser.add_argument(
         '--remap',

@@ -11,6 +11,7 @@ from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.convention import PoseReading
 from anser_ros.poses.document import MODEL_SCHEMA
+from anser_ros.poses.effects.clock import PoseTimeOffset
 from anser_ros.poses.effects.field_distortion import UNIT_M, FieldDistortion, monomials
 from anser_ros.poses.sequence import FARTHEST, NO_TURN, PoseSequence
 
@@ -78,7 +79,7 @@ class PoseCorrector:
         except (KeyError, TypeError, ValueError) as error:
             raise ModelFileError(f'model of poses: {error!r} is missing or no number') from None
         self.sensors = {str(r.parameters['sensor']) for r in records if r.name == 'hand_eye'}
-        self._offsets = [r for r in records if r.name == 'time_offset']
+        self._offsets = [r for r in records if r.name == PoseTimeOffset.name]
         bend = FieldDistortion()
         self._maps = [(bend.term(r), r) for r in records if r.name == bend.name]
         self._bend = bend

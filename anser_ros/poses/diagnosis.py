@@ -15,6 +15,7 @@ from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.convention import read_rightly
 from anser_ros.poses.effect import PoseSight, Sensing
+from anser_ros.poses.effects.clock import one_clock
 from anser_ros.poses.effects.hand_eye import FrameTerm, Mount, OpticalFrame, frame_term
 from anser_ros.poses.effects.noise import jitter
 from anser_ros.poses.fit import PoseFit, fit_poses, noise_of, standing_out
@@ -254,26 +255,7 @@ def _records(
             'position_rmse_with_m': one.position_rmse_with_m,
         }  # fmt: skip
         records.append(replace(record, evidence=told))
-    return _one_clock(records, fit.state.problem.setting.duration)
-
-
-def _one_clock(records: list[EffectRecord], duration: float) -> list[EffectRecord]:
-    """A rate has the offset with it; clocks that agree at some time have no offset besides."""
-    rate = next((r for r in records if r.name == 'clock_rate'), None)
-    offset = next(
-        (r for r in records if r.name == 'time_offset' and 'sensor' not in r.parameters), None
-    )
-    value = 0.0 if offset is None else float(offset.parameters['offset_s'])
-    if rate is None:
-        return records
-    whole = replace(rate, parameters={**rate.parameters, 'offset_s': value})
-    most = 1e-6 * abs(float(rate.parameters['rate_ppm'])) * (0.5 * duration + AGREE_S)
-    kept = [whole if r is rate else r for r in records]
-    return [r for r in kept if r is not offset or abs(value) > most]
-
-
-AGREE_S = 3.0
-"""Time before a session's start, or after its end, s, at which clocks are set to agree."""
+    return one_clock(records, fit.state.problem.setting.duration)
 
 
 LEAST_JITTER_RAD = 1e-5  # no reference tells turns better; none at all has no inverse

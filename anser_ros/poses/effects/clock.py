@@ -1,6 +1,7 @@
 """The clocks of the tracker and of the optical reference: an offset, and a rate."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -12,6 +13,9 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView
 
 Array = NDArray[np.float64]
+
+AGREE_S = 3.0
+"""Time before a session's start, or after its end, s, at which clocks are set to agree."""
 
 
 class PoseTimeOffset(PoseEffect):
@@ -87,6 +91,25 @@ class PoseClockRate(PoseEffect):
         """The term of a recorded rate."""
         rate = 1e-3 * float(needed(record, 'rate_ppm'))
         return Term(self, {'middle_s': float(needed(record, 'middle_s'))}, np.array([rate]))
+
+
+def one_clock(records: Sequence[EffectRecord], duration: float) -> list[EffectRecord]:
+    """Return the records with one for the clock: a rate takes the offset of all sensors with it.
+
+    Clocks that agree some time near a session of ``duration`` s have a rate and no offset besides.
+    """
+    offset = next(
+        (r for r in records if r.name == PoseTimeOffset.name and 'sensor' not in r.parameters),
+        None,
+    )
+    rate = next((r for r in records if r.name == PoseClockRate.name), None)
+    if rate is None:
+        return list(records)
+    value = 0.0 if offset is None else float(offset.parameters['offset_s'])
+    most = 1e-6 * abs(float(rate.parameters['rate_ppm'])) * (0.5 * duration + AGREE_S)
+    whole = replace(rate, parameters={**rate.parameters, 'offset_s': value})
+    kept = [whole if r is rate else r for r in records]
+    return [r for r in kept if r is not offset or abs(value) > most]
 
 
 EFFECTS = (PoseTimeOffset(), PoseClockRate())
