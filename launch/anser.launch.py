@@ -30,7 +30,7 @@ ARGUMENTS = {
     'baseline': ('', 'distortion-free recording of the board; empty: call set_baseline'),
     'board_seed': ('0', "the simulated unit's board: 0 as drawn, 1 that of demo_model.yaml"),
     'simulate': ('false', 'whether a simulated control unit replaces the real one'),
-    'composed': ('true', 'whether acquisition, field model and tracker are one process, live'),
+    'composed': ('false', 'whether acquisition, field model and tracker are one process, live'),
     'optical': ('/optical', 'namespace of the optical poses'),
     'frame_prefix': ('', 'put before the frames of poses and of /tf'),
     'record': ('true', 'whether a bag is recorded'),
