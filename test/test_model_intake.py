@@ -10,7 +10,9 @@ from dataclasses import replace
 from tracking_world import certain_model, setup_of, triaxial_tool
 
 from anser_ros.nodes.model_clouds import ModelWriter
+from anser_ros.nodes.model_in_force import ModelInForce
 from anser_ros.nodes.model_intake import ModelIntake
+from anser_ros.physics.volume import TrackedVolume
 
 MODEL = certain_model()
 FIRST_NS = 1_750_000_000_000_000_000
@@ -65,9 +67,6 @@ def test_what_is_not_said_yet_is_unknown():
 
 
 def test_the_model_in_force_ages_by_the_clock_of_the_frames():
-    from anser_ros.nodes.model_in_force import ModelInForce
-    from anser_ros.physics.volume import TrackedVolume
-
     model, maker, intake = certain_model(), ModelWriter(), ModelIntake()
     setup = setup_of(triaxial_tool())
     force = ModelInForce(setup, TrackedVolume(), None)
@@ -94,3 +93,17 @@ def test_the_model_in_force_ages_by_the_clock_of_the_frames():
     publish(10**18)
     assert force.at(first + 2 * second + second // 4).withheld is None
     assert force.at(first + 3 * second).withheld.state == 'references_lost'
+
+
+@pytest.mark.parametrize('late_s', [1, 6, 60])
+def test_an_answer_to_an_old_frame_is_late_however_old_the_frame(late_s):
+    """Beyond some age it was once taken for one by another clock, and trusted anew."""
+    model, maker, intake = certain_model(), ModelWriter(), ModelIntake()
+    force = ModelInForce(setup_of(triaxial_tool()), TrackedVolume(), None)
+    now = 10**12
+    force.at(now)
+    stamp = now - late_s * 10**9
+    intake.take_error(maker.error(model, 'fg', stamp, True, 0))
+    given = intake.take(maker.dipoles(model, 'fg', stamp))
+    force.put(given, force.field_of(given))
+    assert force.at(now + 1).withheld.state == 'references_lost'

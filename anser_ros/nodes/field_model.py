@@ -366,7 +366,9 @@ class FieldModelNode(AnserNode):
         if self._refit is not None:
             self._refit.reset()
         self._result = None
-        self._serve(self._base, self.get_clock().now().nanoseconds)
+        # It is no answer of the references: trackers wait for the next one.
+        state = REFERENCES_LOST if self._follows else ''
+        self._serve(self._base, self.get_clock().now().nanoseconds, state)
         response.success, response.message = True, 'the model is the one from the start'
         return response
 
@@ -407,7 +409,7 @@ class FieldModelNode(AnserNode):
         self._pace.rate_hz = new.refit_rate_hz
         self._tell_following()
         if self._model is not None and old.allow_uncalibrated != new.allow_uncalibrated:
-            self._serve(self._model, self.get_clock().now().nanoseconds)
+            self._serve(self._model, self._stamp_ns, self._withheld)
 
     def status(self) -> Status:
         """Return which model is in force, where it comes from, and what the refit does."""

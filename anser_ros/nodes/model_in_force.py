@@ -12,8 +12,8 @@ from anser_ros.wire.setup import Setup
 REASONS = {REFERENCES_LOST: 'too few references'}
 """What is said of a state that the server names, where it needs words."""
 OTHER_CLOCK_NS = 5_000_000_000
-"""A model whose stamp is that far from the frames' has it from another clock: the host's, where a
-recording is played. Its age counts from when it came."""
+"""A model whose stamp is that far ahead of the frames' has it from another clock: the host's,
+where a recording is played. Its age counts from when it came."""
 
 
 class ModelInForce:
@@ -72,7 +72,8 @@ class ModelInForce:
             self._age.forget()
         elif given.withheld in ('', UNCALIBRATED):
             stamp_ns = given.stamp_ns
-            if self._frame_ns and abs(stamp_ns - self._frame_ns) > OTHER_CLOCK_NS:
+            # One that is far behind is late, however far; only one ahead is of another clock.
+            if self._frame_ns and stamp_ns - self._frame_ns > OTHER_CLOCK_NS:
                 stamp_ns = self._frame_ns
             self._age.answered(stamp_ns, field)
 
