@@ -75,3 +75,9 @@ def test_the_whole_on_this_machine(capsys, domain):
     assert {'Python', 'kernels', 'disk', 'ROS', 'graph', 'mcap'} <= set(found)
     assert found['ROS']['state'] == doctor.GOOD, found['ROS']
     assert code == (2 if document['problems'] else 0)
+
+
+@pytest.mark.parametrize('seconds', ['nan', '-1', '0', '1e9'])
+def test_a_look_that_is_no_time_is_refused(capsys, seconds):
+    assert main(['doctor', '--seconds', seconds]) == 2
+    assert '--seconds must lie in 0 .. 60' in capsys.readouterr().err

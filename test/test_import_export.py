@@ -137,6 +137,7 @@ def test_columns_of_csv_become_a_session_with_poses(folder, moving, capsys):
         ({'sensors': ['nobody']}, 'the setup has no sensor nobody'),
         ({'array': 't'}, 'not frames x sensors x emitters'),
         ({'file': 'absent.npz'}, 'no such file'),
+        ({'file': 'torn.npz'}, 'cannot be read'),
         ({'colour': 'red'}, 'no key colour'),
         ({'stamp': 'B'}, 'so B is no column'),
         ({'stamp': 'z'}, 'the same stamp twice'),
@@ -146,6 +147,7 @@ def test_what_is_wrong_with_a_document_is_one_line(folder, moving, capsys, chang
     start, seconds, flux = arrays_of(moving)
     arrays = {'t': seconds, 'B': flux, 'z': 0 * seconds}
     np.savez(folder / 'data.npz', **arrays)
+    (folder / 'torn.npz').write_bytes(b'PK\3\4junk')
     table = {'file': 'data.npz', 'stamp': 't', 'unit': 'nT', 'array': 'B',
              'sensors': names_of(moving, moving.tool)}  # fmt: skip
     command = write_document(folder, [{**table, **change}], [], {'start_ns': start})
@@ -226,6 +228,10 @@ def test_a_setup_document_can_be_added_and_a_wrong_name_is_said(tmp_path, moving
     other = ['import', str(MOVING), '--out', str(tmp_path / 'o.mcap'), '--remap', '/a:=/b']
     assert main(other) == 2
     assert 'no topic /a; there are: /anser/' in capsys.readouterr().err
+    assert not (tmp_path / 'o.mcap').exists()
+    other[-1] = '/optical/tool_a/pose:=/anser/tool/flux'
+    assert main(other) == 2
+    assert '/anser/tool/flux would have' in capsys.readouterr().err
     assert not (tmp_path / 'o.mcap').exists()
     assert main(command) == 2
     assert 'is there already' in capsys.readouterr().err

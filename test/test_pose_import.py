@@ -126,6 +126,25 @@ def test_a_file_of_no_known_form_is_refused_in_a_line(tmp_path, text, capsys):
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    ('rows', 'said'),
+    [
+        (('1,2,3',), 'not one whole pose'),
+        (('inf,1,2,3,0,0,0,1',), 'no pose has a time'),
+        (('-5,1,2,3,0,0,0,1',), 'no stamps of a bag'),
+        (('99999999999999999999999,1,2,3,0,0,0,1',), 'no stamps of a bag'),
+    ],
+)
+def test_a_table_without_one_pose_or_time_is_refused_and_leaves_no_bag(
+    tmp_path, rows, said, capsys
+):
+    path = write(tmp_path / 'a.csv', 'stamp_ns,x_mm,y_mm,z_mm,qx,qy,qz,qw', *rows)
+    out = tmp_path / 'a.mcap'
+    assert run_verb('import_poses', [str(path), '--out', str(out)]) == 2
+    (words,) = capsys.readouterr().err.strip().splitlines()
+    assert said in words and not out.exists()
+
+
 def test_quaternions_of_another_length_and_odd_files_are_refused(tmp_path):
     path = write(tmp_path / 'a.txt', line(0, 1, (2, 0, 0, 3), 10**9))
     with pytest.raises(PlausibilityError, match=r'norm of 3\.6'):

@@ -38,8 +38,13 @@ def untold_words(result: SurveyResult) -> tuple[str, ...]:
     for kind, size in result.untold.items():
         factor, unit = UNITS[kind]
         kept = 'it is weighed with its prior' if kind in result.evidence else "the setup's is kept"
-        words.append(f'{kind}: the scan tells it to {factor * size:.2g} {unit} only; {kept}')
+        words.append(f'{kind}: the scan tells it to {_short(factor * size)} {unit} only; {kept}')
     return tuple(words)
+
+
+def _short(value: float) -> str:
+    """Two digits, and no power of ten."""
+    return f'{value:.0f}' if value >= 10.0 else f'{value:.2g}'
 
 
 def corrections(result: SurveyResult) -> tuple[EffectRecord, ...]:

@@ -30,6 +30,7 @@ LONG = ('values', 'uncertainty', 'axes')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.epilog = 'example: anser calibrate bags/scan.mcap --out model.yaml --report report/'
     parser.add_argument('sessions', nargs='+', metavar='SESSION', help='bags to learn from')
     parser.add_argument(
         '--out',

@@ -23,6 +23,7 @@ from anser_ros.sessions.starting_model import model_for
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.epilog = 'example: anser diagnose bags/moving.mcap --model model.yaml --out result/'
     parser.add_argument('session', help='bag to diagnose (.mcap file or bag folder)')
     parser.add_argument('--model', help="model file, or 'nominal' for the setup's own geometry")
     parser.add_argument(

@@ -20,6 +20,7 @@ from rich.table import Table
 
 from anser_ros.cli.commands import NODES
 from anser_ros.cli.missing import PYPI
+from anser_ros.errors import ParameterError
 
 SCHEMA = 'anser_doctor/1'
 GOOD, NOTE, BAD = 'ok', 'note', 'problem'
@@ -30,6 +31,7 @@ MODULES = ('numpy', 'scipy', 'numba', 'yaml', 'serial', 'rich', 'matplotlib', 'h
 """Modules that come by rosdep or pip; those of `PYPI` by pip only."""
 DISTRIBUTIONS = {'yaml': 'PyYAML', 'serial': 'pyserial', **PYPI}
 """What the distribution of a module is called where that is another name."""
+LONGEST_LOOK_S = 60.0  # nodes say what they have to say once a second
 LOOK_S = 2.0
 """How long the graph is looked at, s: nodes speak in /diagnostics once a second."""
 PATIENCE_S = 20.0
@@ -61,6 +63,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command: 0 where nothing is wrong, 2 where something is."""
+    if not 0.0 < args.seconds <= LONGEST_LOOK_S:
+        raise ParameterError(f'--seconds must lie in 0 .. {LONGEST_LOOK_S:g}, got {args.seconds}')
     with Console(stderr=True).status('looking') as status:
         findings: list[Observation] = []
         for name, look in looks(args.device, args.seconds):
@@ -133,7 +137,7 @@ def kernels() -> list[Observation]:
     cache = KernelCache(folder_of(fill_frame))
     if cache.is_full:
         return [Observation('kernels', GOOD, f'all {cache.total} are compiled')]
-    words = f'{cache.done} of {cache.total} are compiled: the first start waits for them'
+    words = 'not said to be compiled as a whole: the first start sees to it, up to a minute'
     return [Observation('kernels', NOTE, words, 'anser warm_up')]
 
 

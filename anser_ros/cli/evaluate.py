@@ -31,6 +31,10 @@ FILES = ('evaluation.json', 'poses.csv', 'bodies.csv', ERRORS_FILE)
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.epilog = (
+        'example: anser evaluate bags/metal.mcap --model model.yaml'
+        ' --refit --baseline bags/scan.mcap --out result/'
+    )
     parser.add_argument('session', help='bag to track (.mcap file or bag folder)')
     parser.add_argument('--model', help="model file, or 'nominal' for the setup's own geometry")
     parser.add_argument(

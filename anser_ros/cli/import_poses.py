@@ -11,6 +11,7 @@ from anser_ros.poses.recording import write_pose_session
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.epilog = 'example: anser import_poses EM.tsv --reference OT.tsv --out session.mcap'
     parser.add_argument(
         'tracked',
         nargs='+',

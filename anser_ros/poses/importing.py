@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 BETWEEN_FILES_S = 10.0
 """Pause, s, between recordings without a host's time that are put one after the other. A pose is
 not interpolated over a tenth of it."""
+LATEST_S = 9e9
+"""Latest time, s: stamps in ns have no room for more in 63 bits."""
 STAMPS = ('host', 'device')
 """Which of a file's times become stamps; the other is taken where a file lacks the one."""
 
@@ -66,6 +68,9 @@ def import_poses(
         if reference:
             groups |= _named(read_form(reference[number]), 'optical', None, None)
         times = {label: _times(rows, stamps) for label, (rows, _, _) in groups.items()}
+        for label, (time, _) in times.items():
+            if not np.isfinite(time).any():
+                raise ParameterError(f'{path}: {label}: no pose has a time')
         own = [time for time, is_host in times.values() if not is_host]
         for label, (_, position, turn) in groups.items():
             time, is_host = times[label]
@@ -118,6 +123,9 @@ def _continued(counter: Array) -> Array:
 
 def _session(path: str, pieces: Sequence[tuple[str, Array, Array, Array]]) -> PoseSession:
     start = min(float(np.nanmin(time)) for _, time, _, _ in pieces)
+    end = max(float(np.nanmax(time)) for _, time, _, _ in pieces)
+    if start < 0.0 or end > LATEST_S:
+        raise ParameterError(f'{path}: times from {start:g} to {end:g} s: no stamps of a bag')
     sequences: dict[str, PoseSequence] = {}
     for label in dict.fromkeys(piece[0] for piece in pieces):
         chosen = [piece for piece in pieces if piece[0] == label]
@@ -125,6 +133,8 @@ def _session(path: str, pieces: Sequence[tuple[str, Array, Array, Array]]) -> Po
         known = np.isfinite(time)
         sequences[label] = sequence_of(label, time[known] - start, position[known], turn[known])
     reference = sequences.pop('optical', None)
+    if not any(poses.size for poses in sequences.values()):
+        raise ParameterError(f'{path}: not one whole pose with a time')
     # A bag's stamp of zero means none.
     start_ns = max(round(start * 1e9), 1_000_000_000)
     return PoseSession(path, start_ns, sequences, reference)

@@ -86,7 +86,9 @@ def import_bag(
     written: Counter[str] = Counter()
     left_out: Counter[str] = Counter()
     channels: dict[str, int] = {}
+    types: dict[str, str] = {}
     seen: set[str] = set()
+    clash = ''
     with BagWriter(out) as writer:
         for message in read_foreign(path, salvage):
             seen.add(message.topic)
@@ -97,6 +99,9 @@ def import_bag(
                 writer.write(channels[SETUP_TOPIC], message.log_time_ns, data)
             if setup_text and topic.endswith('/setup') and message.type_name == SETUP_TYPE:
                 continue
+            if types.setdefault(topic, message.type_name) != message.type_name:
+                clash = f'{topic} would have {types[topic]} and {message.type_name}'
+                break
             if topic not in channels:
                 text = cdr.DEFINITIONS.get(message.type_name, message.definition)
                 if not text:
@@ -105,6 +110,9 @@ def import_bag(
                 channels[topic] = _channel(writer, topic, message.type_name, text)
             writer.write(channels[topic], message.log_time_ns, message.data)
             written[topic] += 1
+    if clash:
+        out.unlink()
+        raise BagError(f'{os.fspath(path)}: {clash}')
     missing = sorted(set(names) - seen)
     if missing or not written:
         out.unlink()

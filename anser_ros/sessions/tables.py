@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,11 +86,11 @@ def read_table(path: Path) -> NumberTable:
         if path.suffix == '.npy':
             return NumberTable(path, {'data': np.load(path, allow_pickle=False)})
         if path.suffix == '.npz':
-            with np.load(path, allow_pickle=False) as loaded:
+            with path.open('rb') as stream, np.load(stream, allow_pickle=False) as loaded:
                 return NumberTable(path, dict(loaded))
         if path.suffix == '.mat':
             return NumberTable(path, _mat(path))
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, OverflowError, BadZipFile) as error:
         raise ParameterError(f'{path}: cannot be read: {" ".join(str(error).split())}') from error
     raise ParameterError(f'{path}: ends with none of {", ".join(ENDINGS)}')
 
