@@ -35,8 +35,9 @@ PROFILES = 'fastdds.xml'
 # Without it, rmw_fastrtps sets how the memory of messages is kept itself; the ROS QoS hold anyway.
 READ_PROFILES = 'RMW_FASTRTPS_USE_QOS_FROM_XML'
 ENDING = (signal.SIGINT, signal.SIGTERM)
-# How long a busy one may take to notice it.
-NOTICE_S = 1.5
+NOTICE_S = 1.0
+"""How long, s, a busy process may take to notice that it is to end: the start of a refit takes
+seconds, and who presses Ctrl-C has the prompt back within 1.5 s."""
 TURN_S = 1e-3
 """Time, s, after which a thread lets another one have its turn where samples are received.
 Python's usual 5 ms would be as much error in the time at which bytes arrive."""
