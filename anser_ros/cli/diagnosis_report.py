@@ -6,20 +6,12 @@ from typing import Any
 
 from anser_ros.cli.diagnosis_figures import bars, course, image, maps, strongest, time_line
 from anser_ros.cli.diagnosis_words import paths, short_ones, value_text, verdict
+from anser_ros.cli.html_page import page, table
 from anser_ros.diagnosis.search import Candidate
 from anser_ros.sessions.diagnosis import SessionDiagnosis
 
 MOST_CANDIDATES = 40
 """Most candidates of a round that the page lists, the best first; it says how many there were."""
-STYLE = """
-body { font: 15px/1.5 sans-serif; max-width: 60em; margin: 2em auto; padding: 0 1em; color: #222 }
-table { border-collapse: collapse; margin: 1em 0 } td, th { padding: .25em .8em; text-align: left;
-border-bottom: 1px solid #ddd; vertical-align: top } th { background: #f4f4f4 }
-img { max-width: 100% }
-.verdict { background: #eef3fa; padding: 1em; border-left: 4px solid #4c72b0 }
-td.n { text-align: right; font-variant-numeric: tabular-nums } code { background: #f4f4f4 }
-.note { color: #666 }
-"""
 
 
 def render(result: SessionDiagnosis, document: dict[str, Any], *, session: str, model: str) -> str:
@@ -57,18 +49,7 @@ def render(result: SessionDiagnosis, document: dict[str, Any], *, session: str, 
         _candidates(found.search.rounds),
         _left_out(result),
     ]
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Diagnosis</title>'
-        f'<style>{STYLE}</style></head><body>{"".join(sections)}</body></html>\n'
-    )
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    cells = ''.join(f'<th>{html.escape(cell)}</th>' for cell in head)
-    body = ''.join(
-        '<tr>' + ''.join(f'<td>{html.escape(cell)}</td>' for cell in row) + '</tr>' for row in rows
-    )
-    return f'<table><tr>{cells}</tr>{body}</table>'
+    return page('Diagnosis', sections)
 
 
 def _held_out(document: dict[str, Any]) -> str:
@@ -82,7 +63,7 @@ def _held_out(document: dict[str, Any]) -> str:
         pair = [held[f'{key}_{when}_{unit}'] for when in ('before', 'after')]
         rows.append([label, *('-' if v is None else f'{scale * v:.4g}' for v in pair)])
     rows.append(['noise floor of the flux, pT rms', '', f'{1e12 * held["flux_rms_floor_t"]:.4g}'])
-    return _table(['', 'before', 'after'], rows)
+    return table(['', 'before', 'after'], rows)
 
 
 def _effects(document: dict[str, Any]) -> str:
@@ -113,7 +94,7 @@ def _effects(document: dict[str, Any]) -> str:
         )
     head = ['effect', 'what it is', 'parameters', '1 sigma', 'residual without it, pT',
             'explains nearly as much', 'online']  # fmt: skip
-    return _table(head, rows).replace('\n', '<br>')
+    return table(head, rows).replace('\n', '<br>')
 
 
 def _paths(document: dict[str, Any], result: SessionDiagnosis) -> Iterator[str]:
@@ -131,7 +112,7 @@ def _paths(document: dict[str, Any], result: SessionDiagnosis) -> Iterator[str]:
             ]
             yield (
                 f'<details><summary>{len(rows)} points</summary>'
-                f'{_table(list(columns), rows)}</details>'
+                f'{table(list(columns), rows)}</details>'
             )
 
 
@@ -154,7 +135,7 @@ def _structure(result: SessionDiagnosis) -> str:
     text += 'plain to see, but too small to matter.</p>'
     if found.unexplained > 0:
         text += f'<p>{html.escape(strongest(found.after))}</p>'
-    return text + _table(head, rows)
+    return text + table(head, rows)
 
 
 def _candidates(rounds: Sequence[Sequence[Candidate]]) -> str:
@@ -174,7 +155,7 @@ def _candidates(rounds: Sequence[Sequence[Candidate]]) -> str:
         parts.append(
             f'<details{" open" if number == 1 else ""}><summary>Round {number}: '
             f'{len(candidates)} candidates, the best {len(ordered)}</summary>'
-            f'{_table(head, rows)}</details>'
+            f'{table(head, rows)}</details>'
         )
     return (
         '<p>What each takes off the squared residual of blocks that its fit has not seen, in '
@@ -192,7 +173,7 @@ def _left_out(result: SessionDiagnosis) -> str:
     if rows:
         text += '<h2>Refused</h2><p>These explained something, but may not be named.</p>'
         head = ['candidate', 'why', 'varies by', 'leaves where it acts']
-        text += _table(head, rows)
+        text += table(head, rows)
     if found.search.removed:
         names = ', '.join(term.label for term in found.search.removed)
         text += f'<p>Explained away by others: {html.escape(names)}.</p>'

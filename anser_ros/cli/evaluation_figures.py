@@ -18,6 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from anser_ros.cli.html_page import page
 from anser_ros.sessions.evaluation import Evaluation
 from anser_ros.sessions.pose_errors import PoseSeries
 
@@ -201,16 +202,14 @@ def write_figures(
             f'<img alt="{html.escape(title)}" src="data:image/png;base64,{data}">'
         )
         files.append(path)
-    page = folder / 'evaluation.html'
-    page.write_text(
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Evaluation</title>'
-        f'<style>{STYLE}</style></head><body><h1>Evaluation</h1>'
-        f'<p class="note">session <code>{html.escape(session)}</code>, '
+    heading = (
+        f'<h1>Evaluation</h1><p class="note">session <code>{html.escape(session)}</code>, '
         f'model <code>{html.escape(model)}</code></p>'
-        f'{_table(document)}{"".join(parts)}</body></html>\n',
-        encoding='utf-8',
     )
-    return [*files, page]
+    path = folder / 'evaluation.html'
+    text = page('Evaluation', [heading, _table(document), *parts], STYLE)
+    path.write_text(text, encoding='utf-8')
+    return [*files, path]
 
 
 def _table(document: Mapping[str, Any]) -> str:

@@ -1,7 +1,6 @@
 """The diagnosis of a tracker of poses as one self-contained page for a clinic's engineer."""
 
 import html
-from collections.abc import Sequence
 from typing import Any
 
 import matplotlib
@@ -14,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.cli.diagnosis_figures import AFTER, BEFORE, image
-from anser_ros.cli.diagnosis_report import STYLE
 from anser_ros.cli.diagnosis_words import short_ones, value_text
+from anser_ros.cli.html_page import page, table
 from anser_ros.poses.diagnosis import PoseDiagnosis
 from anser_ros.poses.problem import PosePart, PoseState
 
@@ -63,21 +62,10 @@ def render_poses(found: PoseDiagnosis, document: dict[str, Any], session: str) -
         'which 95% of differences lie.</p>',
         image(_bland_altman(after)),
         '<h2>What was tried and not named</h2>',
-        _table(['candidate', 'why not'],
+        table(['candidate', 'why not'],
                [[row['candidate'], row['why']] for row in document['refused']]),
     ]  # fmt: skip
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Diagnosis</title>'
-        f'<style>{STYLE}</style></head><body>{"".join(sections)}</body></html>\n'
-    )
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    cells = ''.join(f'<th>{html.escape(cell)}</th>' for cell in head)
-    body = ''.join(
-        '<tr>' + ''.join(f'<td>{html.escape(cell)}</td>' for cell in row) + '</tr>' for row in rows
-    )
-    return f'<table><tr>{cells}</tr>{body}</table>'.replace('\n', '<br>')
+    return page('Diagnosis', sections)
 
 
 def _mm(value: float | None) -> str:
@@ -97,7 +85,7 @@ def _by_sensor(document: dict[str, Any]) -> str:
         ]
         for name, row in document['sensors'].items()
     ]  # fmt: skip
-    return _table(
+    return table(
         ['sensor', 'registration only, mm', 'with lever arm and mount, mm', 'with effects, mm',
          'with mount, deg', 'with effects, deg'], rows,
     )  # fmt: skip
@@ -115,7 +103,7 @@ def _effects(document: dict[str, Any]) -> str:
             _mm(evidence.get('position_rmse_without_m')),
         ])  # fmt: skip
     head = ['effect', 'what it is', 'parameters', '1 sigma', 'error without it, mm']
-    return _table(head, rows)
+    return table(head, rows).replace('\n', '<br>')
 
 
 def _groups(before: PoseState, after: PoseState) -> str:
@@ -138,7 +126,7 @@ def _groups(before: PoseState, after: PoseState) -> str:
             one, other = (1e3 * float(np.sqrt(np.mean(e[inside]))) for e in errors)
             where = f'{label} {edges[k]:.0f} to {edges[k + 1]:.0f} {unit}'
             rows.append([where, str(int(inside.sum())), f'{one:.2f}', f'{other:.2f}'])
-    return _table(['poses', 'number', 'before, mm', 'after, mm'], rows)
+    return table(['poses', 'number', 'before, mm', 'after, mm'], rows)
 
 
 def _distance(part: PosePart) -> Array:

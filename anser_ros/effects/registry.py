@@ -6,6 +6,7 @@ Adding an effect means adding its file; nothing else needs to know.
 import importlib
 import pkgutil
 from functools import cache
+from types import ModuleType
 from typing import Any
 
 import anser_ros.effects as package
@@ -16,9 +17,14 @@ from anser_ros.errors import ModelFileError
 @cache
 def all_effects() -> dict[str, Effect[Any]]:
     """Every effect by its name, in alphabetical order."""
-    found: dict[str, Effect[Any]] = {}
-    for info in pkgutil.iter_modules(package.__path__):
-        module = importlib.import_module(f'{package.__name__}.{info.name}')
+    return effects_in(package)
+
+
+def effects_in(room: ModuleType) -> dict[str, Any]:
+    """The effects that the modules of a package define, by their names in alphabetical order."""
+    found: dict[str, Any] = {}
+    for info in pkgutil.iter_modules(room.__path__):
+        module = importlib.import_module(f'{room.__name__}.{info.name}')
         for effect in getattr(module, 'EFFECTS', ()):
             if effect.name in found:
                 raise ValueError(f'two effects are called {effect.name!r}')

@@ -365,8 +365,3 @@ def _settled(
         share, term, without = weakest
         dropped.append((term.label, f'{share:.2f} of the gain that it must have'))
         fit = with_noise(without)
-
-
-def without_offset(terms: Sequence[Term]) -> list[Term]:
-    """The two frames alone, as a fit before any effect starts from them."""
-    return [t for t in terms if not is_of(t, PoseTimeOffset)]

@@ -10,10 +10,11 @@ from anser_ros.frames.intake import Intake
 from anser_ros.refit.patches import PatchCoils
 from anser_ros.refit.result import RefitResult
 from anser_ros.sessions.prepared import PreparedSession
-from anser_ros.sessions.recorded_poses import PublishedPoses, published_poses
+from anser_ros.sessions.recorded_poses import published_poses
 from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.volume import stated_volume
 from anser_ros.tracking.rotations import rotation_of_quaternion
+from anser_ros.wire.recorded import PoseStream
 
 ComplexArray = NDArray[np.complex128]
 
@@ -65,7 +66,7 @@ class PatchFollower:
         for topic, poses in found.items():
             if poses.stamp_ns.size == 0:
                 raise BagError(f'{session.path}: no pose on the topic {topic}')
-        self._poses: dict[str, PublishedPoses] = {b: found[t] for b, t in topics.items()}
+        self._poses: dict[str, PoseStream] = {b: found[t] for b, t in topics.items()}
         self._patches = PatchCoils(sensor_table(moving), baseline.flux, session.setup.refit)
         self._intake = Intake(session.reference.sensors.channel, error=FitError)
         self._refit = self._patches.started(

@@ -12,18 +12,10 @@ from anser_ros.errors import BagError
 from anser_ros.field.measurements import Measurements
 from anser_ros.sessions.prepared import PreparedSession, with_truth
 from anser_ros.sessions.session import NANO, Session
+from anser_ros.wire.recorded import PoseStream
 from anser_ros.wire.setup import topic_of
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class PublishedPoses:
-    """Poses of one topic: stamps (n,), ns, positions (n, 3), m, quaternions (n, 4), x y z w."""
-
-    stamp_ns: NDArray[np.int64]
-    position: Array
-    quaternion: Array
 
 
 @dataclass(frozen=True)
@@ -45,9 +37,7 @@ class LiveErrors:
     frames: int
 
 
-def published_poses(
-    path: str | os.PathLike[str], topics: Sequence[str]
-) -> dict[str, PublishedPoses]:
+def published_poses(path: str | os.PathLike[str], topics: Sequence[str]) -> dict[str, PoseStream]:
     """What each PoseStamped topic of a bag carries."""
     # Nodes that read no bag run where the packages that read bags are not installed.
     from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages, stamp_ns
@@ -65,7 +55,7 @@ def published_poses(
     for topic, values in rows.items():
         table = np.array(values, dtype=np.float64).reshape(-1, 7)
         stamp = np.array(stamps[topic], dtype=np.int64)
-        found[topic] = PublishedPoses(stamp, table[:, :3], table[:, 3:])
+        found[topic] = PoseStream(stamp, table[:, :3], table[:, 3:])
     return found
 
 
@@ -101,7 +91,7 @@ def live_errors(prepared: PreparedSession, namespace: str) -> dict[str, LiveErro
 def _compared(
     session: Session,
     tool: Measurements,
-    poses: PublishedPoses,
+    poses: PoseStream,
     column: int | None,
 ) -> LiveErrors:
     """Errors of one sensor (by its column), or of the body."""
