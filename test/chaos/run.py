@@ -109,13 +109,11 @@ def tried(chain: Chain, faults: Sequence[Fault], seed: int, lasts_s: float | Non
     seen = witness.errors(begin, time.monotonic() - 0.1)
     judged = [one for one in seen if not rig.line.late(one[0].arrival_s, UNIT_LATE_S)]
     bad = [(pose, error) for pose, error in judged if is_wrong(pose, error)]
-    said = next(
-        (
-            s for s in witness.states
-            if s.arrival_s > begin and s.level > 0 and before.get(s.name) != s.words
-        ),
-        None,
-    )  # fmt: skip
+    told = [
+        s for s in witness.states
+        if s.arrival_s > begin and s.level > 0 and before.get(s.name) != s.words
+    ]  # fmt: skip
+    heard = tuple(dict.fromkeys(f'{s.name.removeprefix("anser/")}: {s.words}' for s in told))
     crashed = tuple(rig.crashed())
     if any(fault.spoils for fault in faults):
         chain.end()
@@ -125,8 +123,8 @@ def tried(chain: Chain, faults: Sequence[Fault], seed: int, lasts_s: float | Non
         group,
         '+'.join(fault.name for fault in faults),
         ' and '.join(fault.what for fault in faults),
-        '' if said is None else f'{said.name.removeprefix("anser/")}: {said.words}',
-        None if said is None else said.arrival_s - begin,
+        heard[0] if heard else '',
+        told[0].arrival_s - begin if told else None,
         len(judged),
         len(bad),
         None if worst is None else worst[1],
@@ -134,6 +132,7 @@ def tried(chain: Chain, faults: Sequence[Fault], seed: int, lasts_s: float | Non
         back,
         crashed,
         len(seen) - len(judged),
+        heard,
     )
 
 

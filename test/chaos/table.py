@@ -34,6 +34,8 @@ class Row:
         What ended by itself, or answered as it should not.
     skipped : int
         Poses that were not judged, since the simulated unit itself was late.
+    heard : tuple of str
+        All new states that told of it, the first one included, whichever node was first.
     """
 
     group: str
@@ -48,6 +50,7 @@ class Row:
     back_s: float | None
     crashed: tuple[str, ...] = ()
     skipped: int = 0
+    heard: tuple[str, ...] = ()
 
     @property
     def is_judged(self) -> bool:
