@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_tracker import CHANNELS, MODEL, STEP_NS, TOOL, path
+from tracked_tool import CHANNELS, MODEL, STEP_NS, TOOL, path
 from tracking_world import NOISE_T, fluxes, random_pose
 
 from anser_ros.errors import TrackingError

@@ -6,117 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refit_rig import HEAD, PATCH_COILS, STEP_NS, Rig, setup_text
 from refit_world import anser_world, metal_block
-from tracking_world import CENTRES_MM, GEOMETRY, TURNED
 
 from anser_ros.errors import FitError, FrameError, ModelFileError, ParameterError
 from anser_ros.nodes.diagnostics import Level
 from anser_ros.nodes.model_clouds import stamp_of
 from anser_ros.refit.result import Metal
-from anser_ros.sessions.model_file import load_model, save_model
-from anser_ros.wire.points import FluxPoints
-from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup, dump_setup
+from anser_ros.sessions.model_file import load_model
 
 pytestmark = pytest.mark.usefixtures('shared_tables')
-
-HEAD = metal_block([0.03, -0.02, -0.11], [0.1, 0.12, 0.06])
-FIRST_NS = 1_750_000_000_000_000_000
-STEP_NS = 20_000_000
-PATCH_COILS = (
-    ((0.01, 0.0, 0.0), (0.0, 0.0, 1.0)),
-    ((-0.01, 0.0, 0.0), (1.0, 0.0, 0.0)),
-)
-
-
-def setup_text(world):
-    """The test's world as a setup document, with a patch of two coils."""
-    names, tones = world.board.names, world.board.frequencies_hz
-    coils = tuple(
-        Coil(name, (x * 1e-3, y * 1e-3, 0.0), turn, tone)
-        for name, (x, y), turn, tone in zip(names, CENTRES_MM, TURNED, tones, strict=True)
-    )
-    table = world.references
-    sensors = [
-        SensorSpec(int(c), n, 'fg', tuple(p), tuple(a), float(length))
-        for c, n, p, a, length in zip(
-            table.channel, table.name, table.position.tolist(), table.axis.tolist(),
-            table.length, strict=True,
-        )
-    ]  # fmt: skip
-    for i, (place, axis) in enumerate(PATCH_COILS):
-        sensors.append(SensorSpec(40 + i, f'patch/{i}', 'patch', place, axis, 0.0))
-    emitter = Emitter('square_spiral_pcb', GEOMETRY, coils)
-    return dump_setup(Setup('fg', 50.0, emitter, tuple(sensors)))
-
-
-class Rig:
-    """A field_model node, what it publishes, and the callbacks that it is fed through."""
-
-    def __init__(self, ros, folder, **parameters):
-        from geometry_msgs.msg import PointStamped
-        from rclpy.executors import SingleThreadedExecutor
-        from rclpy.parameter import Parameter
-        from visualization_msgs.msg import MarkerArray
-
-        from anser_ros.nodes import qos
-        from anser_ros.nodes.clouds import FluxCloud
-        from anser_ros.nodes.field_model import FieldModelNode
-
-        self.world = anser_world()
-        save_model(folder / 'model.yaml', self.world.model)
-        values = {'model_file': str(folder / 'model.yaml'), 'baseline_s': 0.2, **parameters}
-        self.node = FieldModelNode(
-            parameter_overrides=[Parameter(name, value=value) for name, value in values.items()]
-        )
-        self.peer = ros.create_node('peer', namespace='anser')
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
-        self.executor.add_node(self.peer)
-        self.markers, self.centroids = [], []
-        self.peer.create_subscription(MarkerArray, 'metal', self.markers.append, qos.LATCHED)
-        self.peer.create_subscription(
-            PointStamped, 'metal/centroid', self.centroids.append, qos.STREAM
-        )
-        self.until(lambda: self.node._metal._centroid.get_subscription_count() > 0)
-        self.cloud, self.stamp_ns = FluxCloud('fg'), FIRST_NS
-        self.rng = np.random.default_rng(1)
-
-    def until(self, condition, timeout_s=20.0):
-        end = time.monotonic() + timeout_s
-        while not condition():
-            assert time.monotonic() < end, self.node.counters
-            self.executor.spin_once(timeout_sec=0.02)
-
-    def message(self, channels, flux, flags=None):
-        count = len(flux)
-        nothing = np.full((count, 3), np.nan)
-        flags = np.zeros(count, dtype=int) if flags is None else flags
-        points = FluxPoints(np.asarray(channels), flags, flux, nothing, nothing)
-        return self.cloud.message(points, self.stamp_ns)
-
-    def say(self, change, fault=None):
-        """One frame of the references."""
-        self.stamp_ns += STEP_NS
-        flux = self.world.baseline + change + self.world.noise(self.rng)
-        if fault is not None:
-            flux[fault] = 0.0
-        self.node._on_flux(self.message(self.world.references.channel, flux))
-        self.executor.spin_once(timeout_sec=0.0)
-
-    def start(self):
-        from std_msgs.msg import String
-        from std_srvs.srv import Trigger
-
-        self.node._on_setup(String(data=setup_text(self.world)))
-        for _ in range(12):
-            self.say(0.0)
-        reply = self.node._on_set_baseline(Trigger.Request(), Trigger.Response())
-        assert reply.success, reply.message
-
-    def close(self):
-        self.executor.shutdown()
-        self.node.destroy_node()
-        self.peer.destroy_node()
 
 
 @pytest.fixture

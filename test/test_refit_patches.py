@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refit_rig import setup_text
 from refit_world import anser_world, metal_block, metal_flux
-from test_refit_node import setup_text
 
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, ParameterError

@@ -1,57 +1,28 @@
-"""The tracker as a whole: states and their reasons, honest uncertainty, bad input, model swaps."""
+"""The tracker as a whole: states and their reasons, honest uncertainty, bad readings."""
 
-import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from tracking_world import (
-    NOISE_T,
-    anser_board,
-    certain_model,
-    fluxes,
-    random_pose,
-    triaxial_tool,
-)
+from tracked_tool import CHANNELS, MODEL, STEP_NS, TOOL, one_frame, path
+from tracking_world import NOISE_T, anser_board, fluxes, random_pose, triaxial_tool
 
-from anser_ros.errors import TrackingError
-from anser_ros.field.model import EffectRecord
 from anser_ros.field.nominal import nominal_model
 from anser_ros.metal.sphere import sphere_polarisability
 from anser_ros.physics.board import build_board
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking import estimate as states
-from anser_ros.tracking.estimate import NoiseScale, TrackerSettings
-from anser_ros.tracking.rotations import rotation_of_vector
+from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 
-MODEL = certain_model()
-TOOL = triaxial_tool()
-CHANNELS = TOOL.channel
-STEP_NS = 20_000_000
 EXACT = TrackerSettings(stamp_sigma_s=0.0)
 """Settings for stamps without an error, as this file's own have none."""
-HERE = Path(__file__).parent
 
 
 @pytest.fixture
 def rng():
     return np.random.default_rng(51)
-
-
-def path(count, seed=0):
-    """A tool that moves and turns smoothly: stamps, positions, rotations."""
-    rng = np.random.default_rng(seed)
-    _, rotation = random_pose(rng)
-    for i in range(count):
-        t = i / 50.0
-        position = np.array(
-            [0.08 * np.sin(0.9 * t), 0.08 * np.cos(0.7 * t), 0.15 + 0.04 * np.sin(0.5 * t)]
-        )
-        turn = rotation_of_vector(np.array([0.4 * t, 0.3 * np.sin(t), 0.2 * t]))
-        yield (i + 1) * STEP_NS, position, turn @ rotation
 
 
 def run(tracker, count, rng, model=MODEL, noise_t=NOISE_T, seed=0):
@@ -69,13 +40,6 @@ def run(tracker, count, rng, model=MODEL, noise_t=NOISE_T, seed=0):
                     np.linalg.norm(e.position - truth[e.name]) / e.sigma_position_m
                 )
     return ratios, seen
-
-
-def one_frame(tracker, flux, stamp=STEP_NS, **others):
-    return {e.name: e for e in tracker.update(stamp, CHANNELS, flux, **others)}
-
-
-# Honest uncertainty ---------------------------------------------------------------------
 
 
 def test_errors_are_what_their_sigma_says(rng):
@@ -124,9 +88,6 @@ def test_finite_coils_are_not_points(rng):
     found = {e.name: e for e in Tracker(MODEL, tool).update(1, CHANNELS, flux)}
     assert {e.state for e in found.values()} == {'ok'}
     assert np.linalg.norm(found['tool_a'].position - position) < 1e-4
-
-
-# States ---------------------------------------------------------------------------------
 
 
 def test_every_state_has_its_reason(rng):
@@ -344,209 +305,3 @@ def test_two_bodies_are_tracked_side_by_side(rng):
     found = {e.name: e for e in Tracker(MODEL, both).update(1, both.channel, flux)}
     assert np.linalg.norm(found['tool_a'].position - first[0]) < 2e-4
     assert np.linalg.norm(found['tool_b'].position - second[0]) < 2e-4
-
-
-# Time -----------------------------------------------------------------------------------
-
-
-def test_duplicates_jumps_and_gaps(rng):
-    tracker = Tracker(MODEL, TOOL)
-    place = random_pose(rng)
-
-    def flux():
-        return fluxes(MODEL, TOOL, *place, rng)
-
-    assert one_frame(tracker, flux(), 10**12)
-    assert tracker.update(10**12, CHANNELS, flux()) == []
-    assert tracker.counters['duplicates'] == 1
-    assert tracker.counters['cold_starts'] == 9
-    one_frame(tracker, flux(), 10**12 + STEP_NS)
-    assert tracker.counters['cold_starts'] == 9, 'warm'
-    one_frame(tracker, flux(), 10**12 + 5 * 10**9)
-    assert tracker.counters['cold_starts'] == 18, 'the last good pose is too old'
-    one_frame(tracker, flux(), 10**9)
-    assert tracker.counters['time_jumps'] == 1
-    assert tracker.counters['cold_starts'] == 27, 'a jump back forgets'
-    tracker.reset()
-    one_frame(tracker, flux(), 10**9 + STEP_NS)
-    assert tracker.counters['cold_starts'] == 36
-
-
-def test_a_tool_that_leaps_between_frames_is_found_every_time(rng):
-    """A robot's raster leaps from point to point in a second: the last pose is no start."""
-    tracker = Tracker(MODEL, TOOL)
-    for i in range(40):
-        position, rotation = random_pose(rng)
-        found = one_frame(tracker, fluxes(MODEL, TOOL, position, rotation, rng), (i + 1) * 10**9)
-        assert {e.state for e in found.values()} == {'ok'}, i
-        assert np.linalg.norm(found['tool_a'].position - position) < 3e-4
-
-
-def test_only_good_poses_start_the_next_frame(rng):
-    """A tool that jumps while it can't be seen is found again, not followed into a false place."""
-    tracker = Tracker(MODEL, TOOL)
-    here, there = random_pose(rng), random_pose(rng)
-    one_frame(tracker, fluxes(MODEL, TOOL, *here, rng), 1 * STEP_NS)
-    broken = fluxes(MODEL, TOOL, *here, rng)
-    broken[:, 2:6] *= [1.5, 0.6, 1.4, 0.7]
-    found = one_frame(tracker, broken, 2 * STEP_NS)
-    assert not any(e.state == states.OK for e in found.values())
-    for i in range(3, 3 + 50):
-        found = one_frame(tracker, fluxes(MODEL, TOOL, *there, rng), i * STEP_NS)
-        assert i > 3 or not any(e.state == states.OK for e in found.values()), 'one is not enough'
-    assert all(e.state == states.OK for e in found.values())
-    assert np.linalg.norm(found['tool_a'].position - there[0]) < 2e-4
-
-
-# Models ---------------------------------------------------------------------------------
-
-
-def test_swapping_models_keeps_the_warm_starts(rng):
-    tracker = Tracker(MODEL, TOOL)
-    position, rotation = random_pose(rng)
-    one_frame(tracker, fluxes(MODEL, TOOL, position, rotation, rng))
-    other = replace(MODEL, moments=1.001 * MODEL.moments)
-    swapped = tracker.with_model(other, 'second')
-    found = one_frame(swapped, fluxes(other, TOOL, position, rotation, rng), 2 * STEP_NS)
-    assert {e.model_id for e in found.values()} == {'second'}
-    assert {e.state for e in found.values()} == {'ok'}
-    assert swapped.counters['cold_starts'] == 9
-    assert swapped.model is other
-    assert tracker.model is MODEL
-    far = tracker.with_model(replace(MODEL, moments=0.5 * MODEL.moments))
-    assert far._context.grid is not tracker._context.grid, 'another field needs another grid'
-    assert swapped._context.grid is tracker._context.grid
-
-
-def test_settings_may_change_on_the_way(rng):
-    tracker = Tracker(MODEL, TOOL)
-    place = random_pose(rng)
-    one_frame(tracker, fluxes(MODEL, TOOL, *place, rng))
-    strict = tracker.with_settings(TrackerSettings(gate=0.01))
-    found = one_frame(strict, fluxes(MODEL, TOOL, *place, rng), 2 * STEP_NS)
-    assert {e.state for e in found.values()} == {'residual'}
-    assert Tracker(None, TOOL).with_settings(TrackerSettings(gate=2.0)).settings.gate == 2.0
-
-
-def test_effects_of_the_model_are_undone(rng):
-    """A sensor's gain that the model knows about does not move its pose."""
-    record = EffectRecord('sensor_gain', {'channel': 3, 'gain': 0.97, 'phase_deg': 1.0})
-    informed = replace(MODEL, effects=(record,))
-    position, rotation = random_pose(rng)
-    flux = fluxes(MODEL, TOOL, position, rotation, rng)
-    flux[3] *= 0.97 * np.exp(1j * math.radians(1.0))
-    plain = one_frame(Tracker(MODEL, TOOL), flux)[TOOL.name[3]]
-    sound = one_frame(Tracker(informed, TOOL), flux)[TOOL.name[3]]
-    point = TOOL.placed(position, rotation)[0][3]
-    assert plain.state == states.RESIDUAL
-    assert sound.state == states.OK
-    assert np.linalg.norm(sound.position - point) < 1e-3
-
-
-def test_what_a_correction_makes_absurd_is_no_signal(rng):
-    """A model may be wrong too: a gain of next to nothing makes fluxes of thousands of tesla."""
-    record = EffectRecord('sensor_gain', {'channel': 3, 'gain': 1e-12, 'phase_deg': 0.0})
-    flux = fluxes(MODEL, TOOL, *random_pose(rng), rng)
-    tracker = Tracker(replace(MODEL, effects=(record,)), TOOL)
-    found = one_frame(tracker, flux)
-    assert found[TOOL.name[3]].state == states.NO_SIGNAL
-    assert 'absurd' in found[TOOL.name[3]].reason
-    assert tracker.counters['readings_absurd'] == 1
-    assert found['tool_a'].state == states.OK
-
-
-def test_the_gate_is_where_the_settings_say(rng):
-    """Noise three times as large as it is taken to be misses a gate that is a little smaller."""
-    position, rotation = random_pose(rng)
-    flux = fluxes(MODEL, TOOL, position, rotation, rng, 3 * NOISE_T)
-    coils, rest = range(len(TOOL)), TrackerSettings(adaptive=False, gate=100.0)
-    misfit = {name: e.chi2 for name, e in one_frame(Tracker(MODEL, TOOL, rest), flux).items()}
-    assert misfit['tool_a'] == pytest.approx(9.0, rel=0.3)
-    for i in coils:
-        gate = math.sqrt(misfit[TOOL.name[i]])
-        for factor, withheld in ((1.01, False), (0.99, True)):
-            tracker = Tracker(MODEL, TOOL, replace(rest, gate=factor * gate))
-            # Its body may have missed the gate.
-            state = one_frame(tracker, flux)[TOOL.name[i]].state
-            assert (state == states.RESIDUAL) == withheld
-    # A body first does without the coils that disagree most, so it falls a little later.
-    for gate, state in ((1.01, states.OK), (0.6, states.RESIDUAL)):
-        tracker = Tracker(MODEL, TOOL, replace(rest, gate=gate * math.sqrt(misfit['tool_a'])))
-        assert one_frame(tracker, flux)['tool_a'].state == state
-
-
-def test_unexplained_flux_widens_sigma(rng):
-    flux = fluxes(MODEL, TOOL, *random_pose(rng), rng)
-    settings = TrackerSettings(adaptive=False)
-    sure = one_frame(Tracker(MODEL, TOOL, settings), flux)['tool_a']
-    unsure = one_frame(Tracker(replace(MODEL, flux_error_t=120e-12), TOOL, settings), flux)
-    expected = sure.sigma_position_m * math.hypot(120, 60) / 60
-    assert unsure['tool_a'].sigma_position_m == pytest.approx(expected, rel=1e-3)
-
-
-# Refusals -------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ('stamp', 'channels', 'shape', 'flags', 'word'),
-    [
-        (0, CHANNELS, (9, 8), None, 'positive stamp'),
-        (-5, CHANNELS, (9, 8), None, 'positive stamp'),
-        (1, CHANNELS, (9,), None, 'need s channels'),
-        (1, CHANNELS[:4], (9, 8), None, 'need s channels'),
-        (1, CHANNELS, (9, 8), np.zeros(3, int), 'need s channels'),
-        (1, CHANNELS, (9, 7), None, '8 emitters'),
-        (1, np.zeros(9, int), (9, 8), None, 'appears twice'),
-    ],
-)
-def test_frames_that_are_none_are_refused(stamp, channels, shape, flags, word):
-    tracker = Tracker(MODEL, TOOL)
-    with pytest.raises(TrackingError, match=word):
-        tracker.update(stamp, channels, np.ones(shape, complex), flags)
-    assert tracker.counters['frames'] == 0
-
-
-def test_sensors_and_settings_that_are_none_are_refused():
-    with pytest.raises(TrackingError, match='no tool sensor'):
-        Tracker(MODEL, TOOL.select(np.zeros(0, int)))
-    with pytest.raises(TrackingError, match='channel appears twice'):
-        Tracker(MODEL, replace(TOOL, channel=np.zeros(9, int)))
-    with pytest.raises(TrackingError, match='name appears twice'):
-        Tracker(MODEL, replace(TOOL, name=('a',) * 9))
-    for name in ('flux_noise_t', 'grid_spacing_m', 'gate', 'max_sigma_m', 'warm_age_s'):
-        with pytest.raises(TrackingError, match=name):
-            TrackerSettings(**{name: 0.0})
-    with pytest.raises(TrackingError, match='odds'):
-        TrackerSettings(odds=0.5)
-    assert TrackerSettings(gate=math.inf).gate == math.inf, 'no gate at all'
-
-
-def test_hostile_fluxes_never_make_a_pose(rng):
-    """Random garbage of all sizes: refused, and no exception."""
-    tracker = Tracker(MODEL, TOOL)
-    for i in range(60):
-        size = 10.0 ** rng.uniform(-13, 300 if i % 3 == 0 else 0)
-        flux = size * (rng.normal(size=(9, 8)) + 1j * rng.normal(size=(9, 8)))
-        flux[rng.random((9, 8)) < 0.1] = rng.choice([0.0, np.nan, np.inf, 1e-300])
-        found = one_frame(tracker, flux, (i + 1) * STEP_NS)
-        assert all(e.state != 'ok' for e in found.values()), size
-
-
-def test_noise_scale_is_a_running_mean_that_one_frame_can_not_break():
-    scale = NoiseScale()
-    assert scale.value == 1.0
-    for _ in range(500):
-        scale.add(4.0)
-    assert scale.value == pytest.approx(4.0, rel=1e-2)
-    scale.add(1e9)
-    assert scale.value < 4.2
-    assert scale.of_frame(5.0, 2.0, 2.2, 0.0, False) == scale.value
-    assert scale.of_frame(50.0, 2.0, 2.2, 0.0, False) == pytest.approx(168.0, rel=0.02)
-    assert scale.of_frame(5.0, 2.0, 2.2, 0.0, True) == pytest.approx(scale.value + 12.0, rel=0.02)
-    assert scale.of_frame(5.0, 2.0, 2.2, 1.0, False) == pytest.approx(4 * scale.value)
-    quiet = NoiseScale()
-    for _ in range(500):
-        quiet.add(0.5)
-    assert quiet.of_frame(0.9, 2.0, 2.2, 0.0, False) == quiet.value
-    assert quiet.of_frame(1.5, 2.0, 2.2, 0.0, False) > 4.0 * quiet.value, 'unusual for this sensor'
-    assert quiet.of_frame(0.9, 2.0, 2.2, 0.0, True) == 1.0, 'what the model states stays'

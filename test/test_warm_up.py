@@ -21,7 +21,10 @@ def compiled():
 
 warm_up()
 before = compiled()
-from test_tracker import CHANNELS, MODEL, TOOL, Tracker, anser_board, fluxes, nominal_model, path
+from tracked_tool import CHANNELS, MODEL, TOOL, path
+from tracking_world import anser_board, fluxes
+from anser_ros.field.nominal import nominal_model
+from anser_ros.tracking.tracker import Tracker
 for model in (MODEL, nominal_model(anser_board())):
     tracker = Tracker(model, TOOL)
     for stamp, position, rotation in path(5):

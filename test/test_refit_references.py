@@ -1,0 +1,215 @@
+"""References that fail, repeat themselves, jump together or cannot be read, and the refit."""
+
+import numpy as np
+import pytest
+from refit_frames import HEAD, STEP_NS, errors, run
+from refit_world import anser_world
+
+from anser_ros.refit.live_refit import LiveRefit
+
+pytestmark = pytest.mark.usefixtures('shared_tables')
+
+
+@pytest.fixture(scope='module')
+def refit(shared_tables):
+    """One refit for the module: its geometry is worked out once."""
+    return anser_world().refit()
+
+
+@pytest.fixture(autouse=True)
+def fresh(refit):
+    """Every test begins with a refit that has seen nothing."""
+    refit.reset()
+
+
+FAULTS = {
+    'dead': lambda flux: flux.__setitem__(5, 0.0),
+    'turned round': lambda flux: flux.__setitem__(5, -flux[5]),
+    'gain': lambda flux: flux.__setitem__(5, 0.9 * flux[5]),
+}
+
+
+@pytest.mark.parametrize('fault', FAULTS.values(), ids=FAULTS)
+@pytest.mark.parametrize('metal', [False, True])
+def test_a_reference_that_fails_is_named_and_left_out(refit, fault, metal):
+    world = anser_world()
+    change = world.metal(HEAD) if metal else 0.0
+    run(refit, world, change)
+    result = run(refit, world, change, frames=1, start=10, fault=fault)
+    assert result.left_out == ('ref/5',)
+    assert result.references[5].state == ('silent' if fault is FAULTS['dead'] else 'disagrees')
+    if metal:
+        before, after, _, _ = errors(world, result.model, HEAD)
+        assert after < 0.03 * before
+    else:
+        assert result.model is world.model
+
+
+@pytest.mark.parametrize('metal', [False, True])
+def test_a_whole_plug_that_is_out_is_left_out(refit, metal):
+    world = anser_world()
+    change = world.metal(HEAD) if metal else 0.0
+    run(refit, world, change)
+
+    def unplugged(flux):
+        flux[:6] = world.noise(np.random.default_rng(3))[:6]
+
+    result = run(refit, world, change, frames=1, start=10, fault=unplugged)
+    assert result.left_out == tuple(world.references.name[:6])
+    assert {health.state for health in result.references[:6]} == {'silent'}
+    if metal:
+        before, after, _, _ = errors(world, result.model, HEAD)
+        assert after < 0.1 * before
+    else:
+        assert result.model is world.model
+
+
+def test_when_all_are_silent_the_calibrated_model_is_in_force(refit):
+    world = anser_world()
+    change = world.metal(HEAD)
+    run(refit, world, change)
+    result = run(refit, world, change, frames=1, start=10, fault=lambda flux: flux.fill(0.0))
+    assert result.state == 'few_references'
+    assert result.model is world.model
+
+
+def test_an_absurd_reading_is_left_out_with_its_reason(refit):
+    world = anser_world()
+    result = run(refit, world, 0.0, fault=lambda flux: flux.__setitem__(4, 1e30))
+    assert result.left_out == ('ref/4',)
+    assert result.references[4].state == 'absurd'
+
+
+def test_two_that_fail_together_do_not_hide_each_other(refit):
+    world = anser_world()
+
+    def swap(flux):
+        flux[[3, 11]] = flux[[11, 3]]
+
+    result = run(refit, world, world.metal(HEAD), frames=1, fault=swap)
+    assert result.left_out == ('ref/3', 'ref/11')
+    before, after, _, _ = errors(world, result.model, HEAD)
+    assert after < 0.03 * before
+
+
+def test_one_that_works_again_comes_back_after_a_while(refit):
+    world = anser_world()
+    run(refit, world, 0.0, fault=FAULTS['dead'])
+    hold = refit.settings.hold_frames
+    result = run(refit, world, 0.0, frames=hold - 1, start=10)
+    assert result.left_out == ('ref/5',)
+    result = run(refit, world, 0.0, frames=3, start=100)
+    assert result.left_out == ()
+
+
+@pytest.mark.parametrize('reason', ['flagged', 'not finite', 'missing'])
+def test_what_can_not_be_read_is_left_out_with_its_reason(refit, reason):
+    world, rng = anser_world(), np.random.default_rng(2)
+    flux = world.baseline + world.metal(HEAD) + world.noise(rng)
+    flags = np.zeros(len(flux), dtype=int)
+    channels = world.references.channel
+    if reason == 'flagged':
+        flags[2], flux[2] = 1, 3e-6
+    elif reason == 'not finite':
+        flux[2, 3] = np.nan
+    else:
+        keep = np.arange(len(flux)) != 2
+        flux, flags, channels = flux[keep], flags[keep], channels[keep]
+    result = refit.update(STEP_NS, channels, flux, flags)
+    assert result.left_out == ('ref/2',)
+    assert result.references[2].state == reason
+    assert np.isnan(result.references[2].residual_t)
+    before, after, _, _ = errors(world, result.model, HEAD)
+    assert after < 0.03 * before
+
+
+def test_too_few_references_mean_the_calibrated_model_and_say_so(refit):
+    world = anser_world()
+    run(refit, world, world.metal(HEAD))
+    few = world.references.channel[:3]
+    result = refit.update(10 * STEP_NS, few, world.baseline[:3])
+    assert result.state == 'few_references'
+    assert result.changed
+    assert result.model is world.model
+    assert '3 usable' in result.reason
+    assert result.left_out == world.references.name[3:]
+
+
+def test_a_frame_with_lost_samples_leaves_no_trace(refit):
+    world = anser_world()
+    flags = np.full(len(world.baseline), 4)
+    before = run(refit, world, world.metal(HEAD))
+    assert run(refit, world, world.metal(HEAD), 1, 5, 10, flags=flags).state == 'few_references'
+    after = run(refit, world, world.metal(HEAD), 1, 6, 11)
+    assert (after.state, after.left_out) == (before.state, ())
+
+
+def test_coils_that_could_not_be_read_one_after_the_other_return(refit):
+    world = anser_world()
+    count = len(world.baseline)
+    for first in range(0, count, 3):
+        flags = np.zeros(count, dtype=int)
+        flags[first : first + 3] = 1
+        run(refit, world, 0.0, 1, 5, 10 + first, flags=flags)
+    result = run(refit, world, 0.0, 2 * refit.settings.hold_frames, 6, 100)
+    assert (result.state, result.left_out) == ('frozen', ())
+
+
+@pytest.mark.long
+def test_a_reference_without_a_baseline_takes_no_part():
+    world = anser_world()
+    baseline = world.baseline.copy()
+    baseline[7, 2] = np.nan
+    refit = LiveRefit(world.model, world.references, baseline, drawing=world.board.field)
+    result = run(refit, world, world.metal(HEAD))
+    assert result.references[7].state == 'no baseline'
+    before, after, _, _ = errors(world, result.model, HEAD)
+    assert after < 0.03 * before
+
+
+def group_of(world, count, seed=4):
+    return np.random.default_rng(seed).permutation(len(world.references))[:count]
+
+
+@pytest.mark.parametrize('near', [False, True])
+@pytest.mark.parametrize(
+    ('count', 'gain', 'state'),
+    [(5, 1.03, ''), (12, 1.02, 'references_doubtful'), (16, 1.05, 'references_doubtful')],
+)
+def test_references_that_go_wrong_together_are_left_out_or_doubted(
+    refit, near, count, gain, state
+):
+    world = anser_world()
+    change, group = world.metal(HEAD) if near else 0.0, group_of(world, count)
+    run(refit, world, change, frames=5)
+
+    def fault(flux):
+        flux[group] *= gain
+
+    result = run(refit, world, change, seed=2, start=6, frames=4, fault=fault)
+    assert result.withheld == state and result.is_answer == (not state)
+    if not state:
+        assert set(result.left_out) == {world.references.name[i] for i in group}
+    result = run(refit, world, change, seed=3, start=10, frames=2)
+    assert result.left_out, 'what has jumped back is watched for a while'
+    result = run(refit, world, change, seed=3, start=12, frames=60)
+    assert result.withheld == '' and result.left_out == ()
+
+
+def test_frozen_references_are_left_out_however_many_they_are(refit):
+    world, held = anser_world(), {}
+    group = group_of(world, 11)
+
+    def fault(flux):
+        held.setdefault('flux', flux[group].copy())
+        flux[group] = held['flux']
+
+    change = world.metal(HEAD)
+    run(refit, world, change)
+    result = run(refit, world, change, seed=2, start=4, frames=4, fault=fault)
+    assert set(result.left_out) == {world.references.name[i] for i in group}
+    assert {r.state for r in result.references if r.name in result.left_out} == {'stuck'}
+    assert result.is_answer
+    held.clear()
+    group = np.arange(len(world.references))
+    assert run(refit, world, change, seed=5, start=9, fault=fault).withheld == 'references_lost'

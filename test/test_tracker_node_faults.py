@@ -1,0 +1,243 @@
+"""The node tracker over DDS and what it cannot use: other publishers, bad frames, too many."""
+
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from graph_bench import BODY, FIRST_NS, SENSORS, ready, tracker_bench, wait_frame
+from tracking_world import certain_model, fluxes, random_pose
+
+from anser_ros.tracking.tracker import Tracker
+
+tracker = pytest.fixture(tracker_bench)
+
+
+def test_two_publishers_give_no_poses_and_their_models_are_not_obeyed(tracker):
+    from sensor_msgs.msg import PointCloud2
+
+    from anser_ros.nodes import qos
+
+    rng = np.random.default_rng(8)
+    ready(tracker)
+    node, first = tracker.node, tracker.flux
+    places = [random_pose(rng) for _ in range(2)]
+
+    def send(publisher, which):
+        known = node.counters['frames']
+        tracker.flux = publisher
+        tracker.say_flux(fluxes(certain_model(), SENSORS, *places[which], rng))
+        wait_frame(tracker, known + 1)
+
+    for _ in range(3):
+        send(first, 0)
+    tracker.spin_until(
+        lambda: len(tracker.full.get(BODY, [])) == len(tracker.poses.get(BODY, [])) == 3
+    )
+    for poses in (tracker.poses, tracker.full):
+        tracker.spin_until(
+            lambda poses=poses: all(len(poses.get(n, [])) == 3 for n in SENSORS.name)
+        )
+        poses.clear()
+    second = tracker.peer.create_publisher(PointCloud2, 'tool/flux', qos.STREAM)
+    tracker.connect(second)
+    for _ in range(5):
+        send(second, 1)
+        send(first, 0)
+    assert not tracker.poses, 'not even the first frame of the second one has a pose'
+    assert node.status().message == 'two_sources: two publishers of tool/flux'
+    assert int(node.status().level) == 2
+    assert {part.message for part in node.part_statuses()} == {'two_sources'}
+    # One goes; the other is believed within a second, whichever it was.
+    tracker.peer.destroy_publisher(first)
+    gone_s = time.monotonic()
+    while not tracker.poses:
+        assert time.monotonic() - gone_s < 1.3, node.status()
+        send(second, 1)
+    # Another model on the same topic is not obeyed, and whose holds is asked when one has gone.
+    models = node.counters['models']
+    other = tracker.peer.create_publisher(PointCloud2, 'field_model', qos.LATCHED)
+    tracker.connect(other)
+    mine, tracker.model = tracker.model, other
+    wrong = certain_model()
+    tracker.say_model(replace(wrong, moments=1.01 * wrong.moments), stamp_ns=9)
+    tracker.spin_until(
+        lambda: node.status().message.startswith('two_sources: two publishers of f')
+    )
+    tracker.spin_until(lambda: not tracker.executor.spin_once(timeout_sec=0.0))
+    tracker.poses.clear()
+    send(second, 1)
+    assert node.counters['models'] == models
+    assert not tracker.poses
+    tracker.peer.destroy_publisher(other)
+    tracker.model = mine
+    tracker.spin_until(lambda: 'two_sources' not in node.status().message)
+    tracker.spin_until(lambda: node._intake.newest.stamp_ns == 5)
+    while not tracker.poses:
+        send(second, 1)
+
+
+def test_refusals_are_counted_with_their_reason_and_tracking_goes_on(tracker):
+    rng = np.random.default_rng(4)
+    ready(tracker)
+    model = certain_model()
+    flux = fluxes(model, SENSORS, *random_pose(rng), rng)
+    node = tracker.node
+
+    def refused(counter, count, word):
+        tracker.spin_until(lambda: node.counters[counter] == count)
+        node.publish_diagnostics()
+        tracker.spin_until(lambda: word in tracker.value('anser/tracker', 'last_refusal'))
+
+    tracker.say_flux(flux, stamp_ns=0)
+    refused('fluxes_refused', 1, 'no stamp')
+    message = tracker.cloud.message(tracker.points(flux), 7)
+    message.data = message.data[:-8]
+    tracker.flux.publish(message)
+    refused('fluxes_refused', 2, 'bytes')
+    message = tracker.cloud.message(tracker.points(flux), 8)
+    message.fields = [f for f in message.fields if f.name != 'coil3_im']
+    tracker.flux.publish(message)
+    refused('fluxes_refused', 3, 'coil3_im')
+    message = tracker.cloud.message(tracker.points(flux[:, :5]), 9)
+    tracker.flux.publish(message)
+    refused('fluxes_refused', 4, '8 emitters')
+    message = tracker.cloud.message(
+        tracker.points(flux, channels=np.zeros(9, dtype=int)), FIRST_NS + 1
+    )
+    tracker.flux.publish(message)
+    refused('fluxes_refused', 5, 'twice')
+    tracker.say_model(model, stamp_ns=0)
+    refused('models_refused', 1, 'no stamp')
+    bad = model.positions.copy()
+    bad[3, 1] = np.nan
+    tracker.say_model(type(model)(bad, model.directions, model.moments, model.emitters,
+                                  model.frequencies_hz), stamp_ns=8)  # fmt: skip
+    refused('models_refused', 2, 'not finite')
+    tracker.say_model(type(model)(model.positions, model.directions, model.moments[:, :3],
+                                  model.emitters[:3], model.frequencies_hz[:3]),
+                      stamp_ns=9)  # fmt: skip
+    refused('models_refused', 3, '3 emitters')
+    tracker.say_model(model, stamp_ns=10)
+    tracker.say_setup('schema: anser_setup/1\nsensors: 5\n')
+    refused('setups_refused', 1, 'sensors')
+    tracker.say_setup('schema: [')
+    refused('setups_refused', 2, 'YAML')
+    before = node.counters['frames']
+    tracker.say_flux(flux)
+    wait_frame(tracker, before + 1)
+    tracker.spin_until(lambda: BODY in tracker.poses)
+    assert node.counters['callback_faults'] == 0
+
+
+def test_a_jump_back_in_time_and_duplicates(tracker):
+    rng = np.random.default_rng(6)
+    ready(tracker)
+    flux = fluxes(certain_model(), SENSORS, *random_pose(rng), rng)
+    tracker.say_flux(flux)
+    tracker.say_flux(flux, stamp_ns=tracker.stamp_ns)
+    tracker.say_flux(flux, stamp_ns=FIRST_NS - 10**12)
+    wait_frame(tracker, 3)
+    counters = tracker.node._tracker.counters
+    assert counters['duplicates'] == 1
+    assert counters['time_jumps'] == 1
+    tracker.spin_until(lambda: len(tracker.poses.get(BODY, [])) == 2)
+
+
+def test_every_kind_of_bad_flux_has_its_counter(tracker):
+    rng = np.random.default_rng(8)
+    ready(tracker)
+    flux = fluxes(certain_model(), SENSORS, *random_pose(rng), rng)
+    node = tracker.node
+
+    def send(values, **header):
+        tracker.stamp_ns += 20_000_000
+        message = tracker.cloud.message(tracker.points(values), tracker.stamp_ns)
+        for name, value in header.items():
+            setattr(message.header if name == 'frame_id' else message.header.stamp, name, value)
+        tracker.flux.publish(message)
+
+    bad = flux.copy()
+    bad[0, 0], bad[1, 1] = np.inf, 1e20
+    dead = flux.copy()
+    dead[:, 6] = np.nan
+    send(flux, frame_id='world')
+    send(flux, nanosec=1_000_000_000)
+    send(flux[:0])
+    tracker.spin_until(lambda: node.counters['frames'] == 1)
+    send(bad)
+    message = tracker.cloud.message(tracker.points(flux), tracker.stamp_ns + 1)
+    message.is_bigendian = True
+    tracker.flux.publish(message)
+    tracker.spin_until(lambda: node.counters['fluxes_big_endian'] == 1)
+    send(dead)
+    tracker.stamp_ns += 10**10
+    send(dead)
+    tracker.spin_until(lambda: node._tracker.counters['time_jumps_forward'] == 1)
+    node.publish_diagnostics()
+    # The words about the first frame without the emitter may still be on their way; only those
+    # that know of the jump were published after the last frame.
+    tracker.spin_until(lambda: tracker.value('anser/tracker', 'time_jumps_forward') == '1')
+    assert tracker.value('anser/tracker', 'dead_emitters') == 'coil6'
+    assert tracker.state('anser/tracker') == 'no flux of coil6'
+    for counter, count in (
+        ('fluxes_other_frame_id', 1), ('fluxes_without_stamp', 1), ('frames_empty', 1),
+        ('readings_not_finite', 1), ('frames_dead_emitter', 2), ('fluxes_refused', 2),
+        ('fluxes_big_endian', 1), ('time_jumps_forward', 1),
+    ):  # fmt: skip
+        assert tracker.value('anser/tracker', counter) == str(count), counter
+    # The bytes that were called big endian make other channels.
+    assert int(tracker.value('anser/tracker', 'readings_missing')) > 9
+    assert int(tracker.value('anser/tracker', 'readings_absurd')) >= 1
+    assert node.counters['callback_faults'] == 0
+
+
+@pytest.mark.parametrize('live', [True, False])
+def test_only_live_frames_too_fast_to_solve_are_skipped(tracker, monkeypatch, live):
+    """A pause loses none, and neither does a recording that is played faster than it is solved."""
+    from rclpy.parameter import Parameter
+
+    rng = np.random.default_rng(9)
+    if live:
+        tracker.stamp_ns = time.time_ns()
+    ready(tracker)
+    tracker.node.set_parameters([Parameter('stale_after_s', value=30.0)])
+    place = random_pose(rng)
+    node, whole, pause_s = tracker.node, Tracker.estimates, [0.2]
+
+    def slow(self, *arguments):
+        time.sleep(pause_s.pop() if pause_s else work_s)
+        return whole(self, *arguments)
+
+    monkeypatch.setattr(Tracker, 'estimates', slow)
+    work_s = 0.0
+    for _ in range(20):
+        tracker.say_flux(fluxes(certain_model(), SENSORS, *place, rng))
+    wait_frame(tracker, 20)
+    assert node.counters['frames_skipped'] == 0
+    work_s, late_s = 0.05, []
+
+    def send():
+        for _ in range(100):
+            time.sleep(0.02)
+            tracker.say_flux(fluxes(certain_model(), SENSORS, *place, rng))
+            late_s.append(1e-9 * (tracker.stamp_ns - node._tracker.last_stamp_ns))
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    tracker.spin_until(lambda: not sender.is_alive())
+    tracker.spin_until(lambda: node._tracker.last_stamp_ns == tracker.stamp_ns)
+    assert (node.counters['frames_skipped'] > 20) if live else not node.counters['frames_skipped']
+    assert node.counters['frames_skipped'] + node.counters['frames'] == 120
+    node.publish_diagnostics()
+    said = 'computer too slow: '
+    tracker.spin_until(lambda: (said in tracker.state('anser/tracker')) is live)
+    assert tracker.value('anser/tracker', 'tracked') == '10'
+    for topic in node._topics.values():
+        topic.tally.latest_s -= 60.0
+    node.publish_diagnostics()
+    tracker.spin_until(lambda: tracker.value('anser/tracker', 'tracked') == '0')
+    assert max(late_s) < 1.5
+    if live:
+        assert max(late_s[60:]) < 0.3, 'a backlog that is dropped does not grow'
