@@ -13,6 +13,8 @@ from anser_ros.cli.output import make_folder, say_written, warn_of_snapshot
 from anser_ros.cli.pose_session import add_pose_options, need_model, run_diagnosis
 from anser_ros.cli.progress import progress_of
 from anser_ros.cli.stated_values import add_stated_values, stated_values
+from anser_ros.errors import ParameterError
+from anser_ros.sessions.chosen_references import parse_references, with_references
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.evaluation_document import to_document
 from anser_ros.sessions.patches import parse_patches
@@ -45,6 +47,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--refit', action='store_true', help='let the model follow the reference sensors'
     )
     parser.add_argument(
+        '--references',
+        metavar='CHANNEL,...|none',
+        help='reference sensors that the refit may use; the others count as not there',
+    )
+    parser.add_argument(
         '--patch',
         action='append',
         default=[],
@@ -72,6 +79,10 @@ def run(args: argparse.Namespace) -> int:
         return run_diagnosis(args, is_evaluation=True)
     need_model(args)
     session = load_session(args.session).with_stated(stated_values(args))
+    if args.references is not None:
+        if not args.refit:
+            raise ParameterError('--references chooses those of a refit; it needs --refit')
+        session = with_references(session, parse_references(args.references))
     model = model_for(args.model, session, snapshot=True)
     warn_of_snapshot('evaluate', args.model, model)
     baseline = load_session(args.baseline) if args.baseline else None

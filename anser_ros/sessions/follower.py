@@ -10,6 +10,7 @@ from anser_ros.refit.baseline import check_enough
 from anser_ros.refit.change import Pace
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.result import RefitResult
+from anser_ros.sessions.baseline import Baseline
 from anser_ros.sessions.frames import FrameReadings, SessionFrame
 from anser_ros.sessions.patches import PatchFollower
 from anser_ros.sessions.prepared import PreparedSession
@@ -60,18 +61,12 @@ class ModelFollower:
                 'a refit needs --baseline, a distortion-free recording of the same board'
             )
         try:
-            check_enough(baseline.flux, session.setup.refit.min_references)
+            fewest = min(session.setup.refit.min_references, len(session.reference.sensors))
+            check_enough(baseline.flux, fewest)
         except FitError as error:
             raise BagError(f'{baseline.path}: {error}') from error
         self._patches = PatchFollower(prepared, patches) if patches else None
-        self._refit = self._patches or LiveRefit(
-            prepared.model,
-            session.reference.sensors,
-            baseline.flux,
-            session.setup.refit,
-            prepared.drawing.field,
-            volume=stated_volume(session.setup),
-        )
+        self._refit = self._patches or _refit_of(prepared, baseline)
         self._pace = Pace()
         self._age = ModelAge(session.setup.refit.references_age_s, prepared.volume)
         self._result: RefitResult | None = None
@@ -82,6 +77,8 @@ class ModelFollower:
         if self._patches is not None and frame.tools is not None:
             tools = frame.tools
             self._patches.take_flux(frame.stamp_ns, tools.channels, tools.flux, tools.flags)
+        if self._refit is None:
+            return Standing(None, Withheld(REFERENCES_LOST, 'there are no reference sensors'))
         if frame.reference is not None:
             self._follow(frame.stamp_ns, frame.reference)
         result = None if frame.reference is None else self._result
@@ -92,6 +89,7 @@ class ModelFollower:
 
     def _follow(self, stamp_ns: int, reference: FrameReadings) -> None:
         """Take in one frame of the references."""
+        assert self._refit is not None
         if self._pace.is_due(stamp_ns):
             self._result = self._refit.update(
                 stamp_ns, reference.channels, reference.flux, reference.flags
@@ -99,3 +97,19 @@ class ModelFollower:
             self.summary.add(self._result)
         if self._result is not None and self._result.is_answer:
             self._age.answered(stamp_ns, self._result.model)
+
+
+def _refit_of(prepared: PreparedSession, baseline: Baseline) -> LiveRefit | None:
+    """The refit to a session's references; None where there are none."""
+    session = prepared.session
+    assert session.reference is not None
+    if not len(session.reference.sensors):
+        return None
+    return LiveRefit(
+        prepared.model,
+        session.reference.sensors,
+        baseline.flux,
+        session.setup.refit,
+        prepared.drawing.field,
+        volume=stated_volume(session.setup),
+    )
