@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 FILES = sorted(PACKAGE.rglob('*.py'))
 CORE = {
     'physics', 'signals', 'wire', 'frames', 'field', 'metal', 'calibration', 'refit', 'effects',
-    'tracking', 'diagnosis', 'sessions', 'integrity', 'poses',
+    'tracking', 'diagnosis', 'sessions', 'integrity', 'poses', 'assessment',
 }  # fmt: skip
 # What each layer may import of ours, itself and the errors aside.
 ALLOWED = {
@@ -33,6 +33,7 @@ ALLOWED = {
         'field', 'metal', 'physics',
     },
     'poses': {'sessions', 'diagnosis', 'calibration', 'effects', 'field', 'physics', 'wire'},
+    'assessment': {'poses', 'sessions', 'tracking', 'field', 'physics', 'wire'},
     'simulation': {'sessions', 'effects', 'field', 'metal', 'physics', 'signals', 'wire'},
     'measured': CORE,
     'experiments': {*CORE, 'simulation'},

@@ -21,6 +21,7 @@ from anser_ros.physics.volume import TrackedVolume
 from anser_ros.sessions.tracker_settings import settings_for
 from anser_ros.tracking.rotations import rotation_of_quaternion
 from anser_ros.wire.setup import dump_setup
+from anser_ros.wire.setup_tips import TipSpec
 
 tracker = pytest.fixture(tracker_bench)
 
@@ -208,3 +209,35 @@ def test_both_nodes_track_a_recorded_session(ros, shared):
         sigma = np.sqrt(np.trace(message.pose.covariance.reshape(6, 6)[:3, :3]))
         assert away < 4e-3, 'a drawn board is good to a few millimetres'
         assert away < 4.0 * np.hypot(sigma, 0.12e-3), 'and it knows'
+
+
+def test_the_tip_of_a_body_has_its_own_topics(tracker):
+    from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+
+    spec = TipSpec((0.01, 0.02, -0.15), (1e-8, 0.0, 0.0, 1e-8, 0.0, 4e-8))
+    for kind, ending, box in (
+        (PoseStamped, 'pose', tracker.poses),
+        (PoseWithCovarianceStamped, 'pose_with_covariance', tracker.full),
+    ):
+        tracker.peer.create_subscription(
+            kind, f'{BODY}/tip/{ending}', tracker._keep(box, 'tip'), 10
+        )
+    rng = np.random.default_rng(1)
+    setup = setup_of(SENSORS, reference_specs()).with_tips({BODY: spec})
+    tracker.say_setup(dump_setup(setup))
+    tracker.say_model(certain_model())
+    tracker.spin_until(lambda: tracker.node.counters['models'] >= 1)
+    tracker.spin_until(lambda: tracker.node._topics[f'{BODY}/tip'].listeners == 2)
+    tracker.spin_until(lambda: tracker.node._topics[BODY].listeners == 2)
+    position, rotation = random_pose(rng)
+    message = tracker.say_flux(fluxes(certain_model(), SENSORS, position, rotation, rng))
+    tracker.spin_until(
+        lambda: {'tip', BODY} <= tracker.poses.keys() and {'tip', BODY} <= tracker.full.keys()
+    )
+    pose = tracker.poses['tip'][0]
+    assert pose.header.stamp == message.header.stamp and pose.header.frame_id == 'fg'
+    assert np.linalg.norm(place_of(pose.pose) - position - rotation @ spec.position_m) < 1.5e-3
+    assert pose.pose.orientation == tracker.poses[BODY][0].pose.orientation
+    tip, body = (tracker.full[n][0].pose.covariance.reshape(6, 6) for n in ('tip', BODY))
+    assert np.trace(tip[:3, :3]) > np.trace(body[:3, :3]) + np.trace(spec.covariance)
+    np.testing.assert_array_equal(tip[3:, 3:], body[3:, 3:])

@@ -7,8 +7,10 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
@@ -39,10 +41,12 @@ from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.starting_model import NOMINAL, check_emitters
 from anser_ros.sessions.tracker_settings import settings_for
 from anser_ros.tracking.estimate import OK, USUAL_GATE, TrackerSettings
+from anser_ros.tracking.tip import Tip
 from anser_ros.tracking.tracker import Tracker
 from anser_ros.tracking.warm_up import warm_up
 from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.setup import Setup, parse_setup
+from anser_ros.wire.setup_tips import TipSpec, read_tips, tip_name
 
 EARLIEST_DIAGNOSTICS_S = 0.1
 """Least time between two messages in /diagnostics that a changed state asks for, s: a state that
@@ -66,6 +70,9 @@ class TrackerParameters:
         '',
         'model whose effects apply, and its field until field_model speaks; empty or nominal for '
         'none',
+    )
+    tips_file: str = parameter(
+        '', "tips.yaml of pivot, or a setup document, whose tips go before the setup's own"
     )
     frame_prefix: str = parameter(
         '', "put before the frames of poses and of /tf, the board's too, where boards are several"
@@ -159,6 +166,22 @@ def settings_of(table: TrackerParameters) -> TrackerSettings:
     )
 
 
+def tips_of_file(path: str) -> dict[str, TipSpec]:
+    """Tips of a file by body; none where no file is named.
+
+    Raises
+    ------
+    ParameterError
+        When it can't be read.
+    SetupError
+        When it has no tips.
+    """
+    try:
+        return read_tips(Path(path).read_text(encoding='utf-8')) if path else {}
+    except OSError as error:
+        raise ParameterError(f'parameter tips_file: {path}: {error.strerror}') from error
+
+
 class TrackerNode(AnserNode):
     """Subscribes to ``setup``, ``field_model`` and ``tool/flux``; publishes poses."""
 
@@ -173,6 +196,8 @@ class TrackerNode(AnserNode):
         self._stated = stated_by(table)
         has_file = table.model_file not in ('', NOMINAL)
         self._file_model = load_model(table.model_file) if has_file else None
+        self._file_tips = tips_of_file(table.tips_file)
+        self._tips: dict[str, Tip] = {}
         self._setup_text = ''
         self._setup: Setup | None = None
         self._tracker: Tracker | None = None
@@ -217,6 +242,7 @@ class TrackerNode(AnserNode):
             return
         try:
             setup = parse_setup(message.data).with_stated(self._stated)
+            setup = setup.with_tips(self._file_tips)
             sensors = sensor_table(setup.tool_sensors)
             settings = settings_for(setup, self._settings)
             tracker = Tracker(None, sensors, settings)
@@ -231,9 +257,15 @@ class TrackerNode(AnserNode):
         )
         for topic in self._topics.values():
             topic.destroy(self)
+        self._tips = {
+            body: Tip(tip_name(body), np.array(tip.position_m), tip.covariance)
+            for body, tip in setup.tips.items()
+            if body in tracker.bodies
+        }
+        names = (*sensors.name, *tracker.bodies, *(tip.name for tip in self._tips.values()))
         self._topics = {
             name: PoseTopic(self, name, setup.frame_id, self.parameters.frame_prefix)
-            for name in (*sensors.name, *tracker.bodies)
+            for name in names
         }
         self._trouble.forget()
         self._use_model()
@@ -369,6 +401,10 @@ class TrackerNode(AnserNode):
                 now_ns = self.get_clock().now().nanoseconds
                 changed |= self._topics[estimate.name].take(estimate, now_ns)
                 estimates.append(estimate)
+                tip = self._tips.get(estimate.name)
+                if tip is not None:
+                    estimates.append(tip.of_body(estimate))
+                    changed |= self._topics[tip.name].take(estimates[-1], now_ns)
         except AnserError as error:
             self._refuse('fluxes_refused', error)
             return

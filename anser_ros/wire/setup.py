@@ -15,6 +15,7 @@ import yaml
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.fingerprint import Identity, fingerprint_of
 from anser_ros.settings import SECTIONS, Accuracy, RefitSettings, settings_from
+from anser_ros.wire.setup_tips import TipSpec, dump_tips, parse_tips, refuse_homeless
 from anser_ros.wire.setup_values import (
     Vector,
     read_axis,
@@ -30,7 +31,7 @@ from anser_ros.wire.yaml_text import read_yaml
 SCHEMA = 'anser_setup/1'
 KEYS = (
     'schema', 'fingerprint', 'frame_id', 'flux_rate_hz', 'flux_unit', 'emitter', 'sensors',
-    'volume', *SECTIONS,
+    'volume', 'tips', *SECTIONS,
 )  # fmt: skip
 LIKENESS = 0.8
 """Ratio of equal letters (`difflib`) from which an unknown key is taken for a misspelt one: one
@@ -81,7 +82,8 @@ class Setup:
     """A validated setup document.
 
     ``volume`` holds the corners, low and high (m, frame fg), of the box in which tools are
-    tracked; None where the document leaves it to the board's size.
+    tracked; None where the document leaves it to the board's size. ``tips`` holds the tips of
+    tools, by body.
     """
 
     frame_id: str
@@ -91,6 +93,7 @@ class Setup:
     volume: tuple[Vector, Vector] | None = None
     stated: Mapping[str, float] = field(default_factory=dict)
     extra: Mapping[str, Any] = field(default_factory=dict)
+    tips: Mapping[str, TipSpec] = field(default_factory=dict)
 
     @cached_property
     def refit(self) -> RefitSettings:
@@ -113,6 +116,18 @@ class Setup:
         together = {**self.stated, **stated}
         settings_from(together)
         return replace(self, stated=together)
+
+    def with_tips(self, tips: Mapping[str, TipSpec]) -> 'Setup':
+        """The setup with further tips, which go before its own.
+
+        Raises
+        ------
+        SetupError
+            When a tip is of no body, or its topic is that of a sensor.
+        """
+        topics = [topic_of(name) for name in (*(s.name for s in self.tool_sensors), *self.bodies)]
+        refuse_homeless(tips, {body: topic_of(body) for body in self.bodies}, topics)
+        return replace(self, tips={**self.tips, **tips})
 
     @cached_property
     def identity(self) -> Identity:
@@ -339,7 +354,7 @@ def parse_setup(text: str) -> Setup:
         volume=_parse_volume(root['volume']) if 'volume' in root else None,
         stated=_parse_stated(root),
         extra=extra,
-    )
+    ).with_tips(parse_tips(root.get('tips', {})))
 
 
 def dump_setup(setup: Setup) -> str:
@@ -375,6 +390,7 @@ def dump_setup(setup: Setup) -> str:
         'emitter': {'kind': setup.emitter.kind, **setup.emitter.geometry, 'coils': coils},
         'sensors': sensors,
         **({'volume': volume} if volume else {}),
+        **({'tips': dump_tips(setup.tips)} if setup.tips else {}),
         **_stated_sections(setup.stated),
         **setup.extra,
     }

@@ -1,0 +1,51 @@
+"""Poses of a topic of the graph for some seconds, a JSON line each, for who may not load ROS."""
+
+import json
+import sys
+import time
+
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import qos_profile_sensor_data
+
+NAME = 'anser_pose_look'
+SLICE_S = 0.1
+"""Longest time that one message is waited for, s."""
+SECOND_NS = 1_000_000_000
+
+
+def main(topic: str, seconds: float) -> None:
+    """Listen for so long from the first pose on, or as long for one; print the poses."""
+    rclpy.init()
+    node = rclpy.create_node(NAME)
+    end = time.monotonic() + seconds
+    heard = 0
+
+    def take(message: PoseStamped) -> None:
+        nonlocal heard, end
+        if not heard:
+            end = time.monotonic() + seconds
+        heard += 1
+        stamp, p, q = message.header.stamp, message.pose.position, message.pose.orientation
+        values = [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
+        print(json.dumps([stamp.sec * SECOND_NS + stamp.nanosec, *values]), flush=True)
+
+    # Best effort is compatible with every publisher.
+    node.create_subscription(PoseStamped, topic, take, qos_profile_sensor_data)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while time.monotonic() < end:
+        executor.spin_once(timeout_sec=SLICE_S)
+    if not heard:
+        known = [
+            name for name, types in node.get_topic_names_and_types()
+            if 'geometry_msgs/msg/PoseStamped' in types and node.count_publishers(name)
+        ]  # fmt: skip
+        words = ', '.join(sorted(known)) or 'none'
+        print(
+            f'no pose on {topic} within {seconds:g} s; topics of poses: {words}', file=sys.stderr
+        )
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.try_shutdown()
