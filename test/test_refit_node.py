@@ -1,5 +1,6 @@
 """The refit inside its node: marker, centroid, health with names, services, moving patches."""
 
+import re
 import threading
 import time
 from dataclasses import replace
@@ -10,6 +11,7 @@ from refit_rig import HEAD, PATCH_COILS, STEP_NS, Rig, setup_text
 from refit_world import anser_world, metal_block
 
 from anser_ros.errors import FitError, FrameError, ModelFileError, ParameterError
+from anser_ros.integrity.withheld import OTHER_MODEL, code_of
 from anser_ros.nodes.diagnostics import Level
 from anser_ros.nodes.model_clouds import stamp_of
 from anser_ros.refit.result import Metal
@@ -199,6 +201,31 @@ def test_metal_at_rest_is_in_no_baseline(make):
     for _ in range(24):
         rig.say(0.0)
     assert rig.node._refit is not None and 'no baseline' not in rig.node.status().message
+
+
+def test_a_model_beside_its_board_gives_no_poses_until_the_references_agree(make):
+    from std_msgs.msg import String
+
+    rig = make(baseline_at_start=True)
+    codes, write = [], rig.node._writer.new_error
+    rig.node._writer.new_error = lambda *given: codes.append(given[-1]) or write(*given)
+    table = rig.world.references
+    there = table.position - [0.002, 0.0, 0.0]
+    aside = rig.world.model.flux(there, table.axis, table.length)
+    here = rig.world.model.flux(table.position, table.axis, table.length)
+    rig.node._on_setup(String(data=setup_text(rig.world)))
+    rig.say(aside - here)
+    state = rig.node.status()
+    assert state.level == Level.ERROR
+    assert re.match(r'other_model: the model lies (1\.9|2\.0|2\.1) mm', state.message)
+    assert codes[-1] == code_of(OTHER_MODEL)
+    for _ in range(12):
+        rig.say(aside - here)
+    assert codes[-1] == code_of(OTHER_MODEL) and rig.node._refit is None
+    for _ in range(24):
+        rig.say(0.0)
+    assert codes[-1] == 0 and rig.node._refit is not None
+    assert rig.node.status().level == Level.OK
 
 
 def test_every_frame_is_answered_under_its_own_stamp(make):

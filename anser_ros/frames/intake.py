@@ -67,6 +67,11 @@ class Frame:
         return np.asarray(self.codes == GOOD)
 
     @property
+    def readings(self) -> ComplexArray:
+        """Fluxes without a fault, shape (S, K), T; NaN in place of the others."""
+        return np.where(self.usable[:, None], self.flux, np.nan)
+
+    @property
     def kinds(self) -> Counter[str]:
         """How many readings have which kind of fault."""
         found = (FAULTS[code] for code in self.codes.tolist())

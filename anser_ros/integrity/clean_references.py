@@ -6,22 +6,18 @@ the references from elsewhere: the readings when the model was calibrated, or el
 the board. The strength of an emitter may have changed, and single sensors may be bad.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import FitError
-from anser_ros.field.nominal import Tolerances
 from anser_ros.field.reference_readings import ReferenceReadings
+from anser_ros.integrity.drawn_readings import DrawnReadings, FieldAt
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.physics.tangent import fill_tangent
+from anser_ros.physics.tangent import tangents
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
-FieldAt = Callable[[Array], Array]
-"""Drawn field at points (P, 3) in m, frame fg: (P, K, 3) in T."""
 
 STABLE_SHARE = 0.25
 """Share of `Accuracy.reference_gain` that a sensor's reading may change by from one day to
@@ -36,17 +32,12 @@ SAME_PLACE_M = 1e-4
 another place, where the old reading is worth nothing."""
 STEPS = 25
 """Steps in which sensors that changed most lose their say in the emitters' strengths."""
-FREE_GAIN = 0.1
-"""Deviation of an emitter's strength from its drawing, which is not judged here: a meter of the
-current that is 10 % off is another fault."""
 DRAWN_GATE = 3.0
 """Root mean square of all readings' differences from the drawn board, in units of what survey and
 manufacture allow, from which on there is metal. It is 1 where these are stated as they are.
 Smaller, and a board that was made less well is refused; larger, and more metal passes."""
 LEAST_SHARE = 1e-4
 """Error of a drawn field relative to itself: turns and leads are not drawn to less."""
-STEP_M, STEP_RAD = 1e-5, 1e-4
-"""Steps of the differences by which the field changes with place (m) and direction (rad)."""
 
 
 def change_beside_gains(now: ComplexArray, before: ComplexArray) -> Array:
@@ -194,43 +185,19 @@ def check_as_drawn(
     good = np.isfinite(flux).all(axis=1)
     if good.sum() < FEWEST_SENSORS:
         return
-    points, axes = sensors.position[good], sensors.axis[good]
-    ends = sensors.length[good, None] / np.sqrt(12.0) * axes
-
-    def flux_at(places: Array, along: Array) -> Array:
-        """Mean flux (S, K) of coils of these lengths, by Gauss' two points."""
-        both = field(places + ends) + field(places - ends)
-        return np.asarray(np.einsum('ski,si->sk', 0.5 * both, along))
-
-    drawn = flux_at(points, axes)
-    difference = flux[good].real - drawn
-    count, emitters = drawn.shape
-    made = Tolerances()
-    place = np.array([(flux_at(points + STEP_M * e, axes) - drawn) / STEP_M for e in np.eye(3)])
-    planes = np.empty((count, 2, 3))
-    for axis, plane in zip(axes, planes, strict=True):
-        fill_tangent(axis, plane)
-    turned = np.array([flux_at(points, planes[:, i]) for i in range(2)])
-    # A row a deviation: of each coil by manufacture, then of each sensor by its survey.
-    rows = np.zeros((6 * emitters + 6 * count, count, emitters))
-    for k in range(emitters):
-        own = rows[6 * k : 6 * (k + 1), :, k]
-        own[0] = FREE_GAIN * drawn[:, k]
-        own[1:4] = made.shift_m * place[:, :, k]
-        for i, axis in enumerate(np.eye(3)[:2]):
-            turn = np.eye(3) - STEP_RAD * np.cross(np.eye(3), axis)
-            moved = (points - centres[k]) @ turn.T + centres[k]
-            tilted = flux_at(moved, axes @ turn.T)[:, k]
-            own[4 + i] = made.tilt_rad * (tilted - drawn[:, k]) / STEP_RAD
-    survey = rows[6 * emitters :]
-    for s in range(count):
-        own = survey[6 * s : 6 * (s + 1), s]
-        own[0:3] = accuracy.reference_position_m * place[:, s]
-        own[3:5] = accuracy.reference_axis_rad * turned[:, s]
-        own[5] = accuracy.reference_gain * drawn[s]
-    matrix = rows.reshape(len(rows), -1)
-    noise = accuracy.flux_noise_t**2 + (LEAST_SHARE * drawn.ravel()) ** 2
-    covariance = matrix.T @ matrix + np.diag(noise)
+    drawn = DrawnReadings.of(
+        field, sensors.position[good], sensors.axis[good], sensors.length[good]
+    )
+    difference = flux[good].real - drawn.flux
+    matrix = drawn.by_manufacture(centres).reshape(-1, difference.size)
+    own = survey_errors(drawn, accuracy)
+    covariance = matrix.T @ matrix
+    size = difference.shape[1]
+    for s, rows in enumerate(own):
+        at = slice(s * size, (s + 1) * size)
+        covariance[at, at] += rows.T @ rows
+    noise = accuracy.flux_noise_t**2 + (LEAST_SHARE * drawn.flux.ravel()) ** 2
+    covariance += np.diag(noise)
     scale = np.sqrt(np.diag(covariance))
     whitened = difference.ravel() / scale
     squares = whitened @ np.linalg.solve(covariance / np.outer(scale, scale), whitened)
@@ -241,3 +208,17 @@ def check_as_drawn(
             'tolerances and the survey allow; is there metal? A model calibrated with it, '
             'from a scan with the references, would know of it'
         )
+
+
+def survey_errors(drawn: DrawnReadings, accuracy: Accuracy) -> Array:
+    """What each sensor's survey does to its readings, (S, 6, K), T a standard deviation.
+
+    Six a sensor: its place along x, y and z, its axis along two directions across, its gain.
+    """
+    across = np.einsum('sti,isk->tsk', tangents(drawn.axes), drawn.by_axis)
+    rows = [
+        accuracy.reference_position_m * drawn.by_place,
+        accuracy.reference_axis_rad * across,
+        accuracy.reference_gain * drawn.flux[None],
+    ]
+    return np.concatenate(rows).transpose(1, 0, 2)

@@ -75,8 +75,7 @@ class ReadingWindow:
         stamp_ns = frame.stamp_ns
         if self._frames and stamp_ns < self._frames[-1][0]:
             self._frames.clear()
-        readings = np.where(frame.usable[:, None], frame.flux, np.nan)
-        self._frames.append((stamp_ns, readings))
+        self._frames.append((stamp_ns, frame.readings))
         while stamp_ns - self._frames[0][0] > self._span_ns:
             self._frames.popleft()
 

@@ -9,6 +9,7 @@ from anser_ros.effects.correction import is_undone
 from anser_ros.errors import BagError, FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.reference_readings import ReferenceReadings
+from anser_ros.integrity.board_place import BoardPlace
 from anser_ros.integrity.clean_references import (
     check_as_calibrated,
     check_as_drawn,
@@ -18,6 +19,8 @@ from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.baseline import FELT
 from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.session import Session
+from anser_ros.sessions.starting_model import is_nominal
+from anser_ros.sessions.volume import pose_volume
 from anser_ros.wire.setup import Setup
 
 ComplexArray = NDArray[np.complex128]
@@ -82,7 +85,8 @@ def check_clean(
     """Raise `FitError` when references do not read what they do without metal.
 
     What they should read is what they did when the model was calibrated, else what the drawing
-    says. A model that has metal in it by a diagnosis, and no readings from then, says nothing.
+    says; and they and the model must have the board at one place. A model that has metal in it by
+    a diagnosis, and no readings from then, says nothing.
 
     Parameters
     ----------
@@ -97,11 +101,33 @@ def check_clean(
         Of the board.
     """
     known = model.references
-    if known is not None and check_as_calibrated(known, sensors, flux, sigma_t, setup.accuracy):
-        return
+    compared = known is not None and check_as_calibrated(
+        known, sensors, flux, sigma_t, setup.accuracy
+    )
+    place = board_place_of(model, sensors, setup)
+    if place is not None:
+        place.check(flux)
     board = Drawing.of(setup).board
-    if board is not None and all(is_undone(record) for record in model.effects):
+    if not compared and board is not None and _is_without_metal(model):
         check_as_drawn(board.field, board.centres, sensors, flux, setup.accuracy)
+
+
+def board_place_of(model: FieldModel, sensors: SensorTable, setup: Setup) -> BoardPlace | None:
+    """What compares the places that a model and references have the board at.
+
+    None for the drawing itself, for a board that cannot be drawn, and for a model with metal.
+    """
+    board = Drawing.of(setup).board
+    if board is None or is_nominal(model) or not len(sensors) or not _is_without_metal(model):
+        return None
+    return BoardPlace(
+        model, board.field, board.centres, pose_volume(setup), sensors, setup.accuracy
+    )
+
+
+def _is_without_metal(model: FieldModel) -> bool:
+    """Whether all effects of a model are those of sensors, emitters and optics."""
+    return all(is_undone(record) for record in model.effects)
 
 
 def steady_sigma(recording: Session) -> float:

@@ -1,0 +1,219 @@
+"""Whether a field model lies where the reference sensors say that the board is.
+
+A model that lies beside its board as a whole gives poses that are as far off, and no residual of
+a tool shows it: every field of the model is a field of the board, a little elsewhere. References
+have stated places. They and the model both see the drawn board, with the same errors of its coils;
+how far the model's board lies from that of the references is what is left between the two.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import FitError
+from anser_ros.field.model import FieldModel
+from anser_ros.integrity.clean_references import FEWEST_SENSORS, LEAST_SHARE, survey_errors
+from anser_ros.integrity.drawn_readings import DrawnReadings, FieldAt
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.volume import TrackedVolume
+from anser_ros.settings import Accuracy
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+FAR_M = 5e-4
+"""Distance between the model's board and the references' from which on the model is refused: half
+of the error that a pose may have beside three of its sigmas. A survey's 0.2 mm a sensor is a tenth
+of that among 32 of them."""
+FAR_SIGMAS = 5.0
+"""The same in standard deviations of that distance, for few sensors or a poor survey."""
+EXPLAINED = 1.0
+"""Misfit of the typical reference, in what survey and manufacture allow, up to which the distance
+is believed: metal is no board that lies elsewhere, and is left to others to judge."""
+MODEL_SHARE = 2e-3
+"""Error of a calibrated model's field relative to itself, in the middle of the volume."""
+DRAWN_SHARE = 2e-3
+"""Error of a drawn field with its coils moved, relative to itself: tracks are not where they are
+drawn either."""
+INNER = 0.5
+"""Part of the volume, from its middle, in which the model is asked: scans reach that far."""
+SIDE = 4
+"""Points along a side of that part; three readings each."""
+ALIKE = 40.0
+"""So many of these readings count: neighbouring points tell the same."""
+PRIOR_M, PRIOR_RAD = 5e-3, 0.02
+"""Standard deviations of how far a model lies aside before anything is known, m and rad."""
+ROUNDS = 12
+"""Rounds in which sensors that do not fit lose weight."""
+
+
+@dataclass(frozen=True)
+class Misplacement:
+    """How far a model's board lies from where the references have it.
+
+    Attributes
+    ----------
+    shift_m, turn_rad : ndarray, shape (3,)
+        Along and about x, y and z of fg, in the middle of the volume.
+    sigma_m : ndarray, shape (3,)
+        Standard deviations of the shift.
+    misfit : float
+        Of the typical reference with that, in what survey and manufacture allow.
+    """
+
+    shift_m: Array
+    turn_rad: Array
+    sigma_m: Array
+    misfit: float
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the model lies so far aside that its poses cannot be trusted."""
+        far = float(np.linalg.norm(self.shift_m))
+        across = float(self.sigma_m @ np.abs(self.shift_m)) / max(far, 1e-12)
+        return self.misfit < EXPLAINED and far > max(FAR_M, FAR_SIGMAS * across)
+
+
+class BoardPlace:
+    """Compares where a calibrated model and the references have the drawn board.
+
+    Parameters
+    ----------
+    model : FieldModel
+        Calibrated.
+    field : callable
+        The drawn field of its K coils.
+    centres : ndarray, shape (K, 3)
+        Centres of the coils, m.
+    volume : TrackedVolume
+        Where the model is good.
+    sensors : SensorTable
+        The R references at their stated places.
+    accuracy : Accuracy
+        Of the survey and the readings.
+    """
+
+    def __init__(
+        self, model: FieldModel, field: FieldAt, centres: Array, volume: TrackedVolume,
+        sensors: SensorTable, accuracy: Accuracy,
+    ) -> None:  # fmt: skip
+        self._drawn = DrawnReadings.of(field, sensors.position, sensors.axis, sensors.length)
+        self._roots = _survey_roots(self._drawn, accuracy)
+        rows = _rows(self._drawn, centres, np.zeros(3))
+        # Coils are the same for both; where the model lies is the model's alone.
+        rows[..., -6:] = 0.0
+        self._rows = np.asarray(np.linalg.solve(self._roots, rows), dtype=np.float64)
+        self._by_model = _of_model(model, field, centres, volume)
+
+    def misplacement(self, flux: ComplexArray) -> Misplacement | None:
+        """Return how far the model lies from the board that the references see.
+
+        Parameters
+        ----------
+        flux : ndarray, shape (R, K), complex
+            Readings of the references, T, of one frame or of many; NaN rows are passed over.
+
+        Returns
+        -------
+        Misplacement or None
+            None where too few references have readings.
+        """
+        good = np.isfinite(flux).all(axis=1)
+        if good.sum() < FEWEST_SENSORS:
+            return None
+        difference = (flux[good].real - self._drawn.flux[good])[..., None]
+        white = np.asarray(np.linalg.solve(self._roots[good], difference)[..., 0], np.float64)
+        estimate, covariance, misfit = _solved((self._rows[good], white), self._by_model)
+        scale = np.repeat([PRIOR_M, PRIOR_RAD], 3)
+        placed = scale * estimate[-6:]
+        sigma = scale * np.sqrt(np.diag(covariance)[-6:])
+        return Misplacement(placed[:3], placed[3:], sigma[:3], misfit)
+
+    def check(self, flux: ComplexArray) -> bool:
+        """Refuse a model that lies beside the board; return whether the readings tell.
+
+        Raises
+        ------
+        FitError
+            With how far.
+        """
+        found = self.misplacement(flux)
+        if found is not None and found.is_certain:
+            told = ', '.join(f'{1e3 * v:+.1f}' for v in found.shift_m)
+            raise FitError(
+                f'the model lies {1e3 * np.linalg.norm(found.shift_m):.1f} mm ({told} along x, y, '
+                'z) beside where the references have the board; is it of another frame?'
+            )
+        return found is not None
+
+
+def _rows(drawn: DrawnReadings, centres: Array, middle: Array) -> Array:
+    """What coils and a displaced frame do to readings, (S, K, 6 K + 6), T a prior deviation."""
+    own = [
+        drawn.by_manufacture(centres),
+        PRIOR_M * drawn.by_place,
+        PRIOR_RAD * drawn.turned(middle),
+    ]
+    return np.moveaxis(np.concatenate(own), 0, 2)
+
+
+def _survey_roots(drawn: DrawnReadings, accuracy: Accuracy) -> Array:
+    """Root (R, K, K) of the covariance of each sensor's readings by its survey and noise."""
+    survey = survey_errors(drawn, accuracy)
+    count = drawn.flux.shape[1]
+    size = np.linalg.norm(drawn.flux, axis=1) / np.sqrt(count)
+    noise = accuracy.flux_noise_t**2 + (DRAWN_SHARE * size) ** 2
+    covariance = survey.transpose(0, 2, 1) @ survey + noise[:, None, None] * np.eye(count)
+    return np.asarray(np.linalg.cholesky(covariance))
+
+
+def _of_model(
+    model: FieldModel, field: FieldAt, centres: Array, volume: TrackedVolume
+) -> tuple[Array, Array]:
+    """The same of readings that the model makes along x, y and z in the middle of the volume."""
+    low, high = np.array(volume.low), np.array(volume.high)
+    middle, half = (low + high) / 2.0, INNER * (high - low) / 2.0
+    steps = np.linspace(-1.0, 1.0, SIDE)
+    grid = np.stack(np.meshgrid(steps, steps, steps, indexing='ij'), axis=-1).reshape(-1, 3)
+    points = np.repeat(middle + half * grid, 3, axis=0)
+    axes, lengths = np.tile(np.eye(3), (len(grid), 1)), np.zeros(len(points))
+    drawn = DrawnReadings.of(field, points, axes, lengths)
+    # A model that lies aside reads at a place what the board makes beside it.
+    rows = _rows(drawn, centres, middle)
+    difference = model.flux(points, axes, lengths).real - drawn.flux
+    size = np.linalg.norm(drawn.flux, axis=1) / np.sqrt(drawn.flux.shape[1])
+    weight = np.sqrt(ALIKE / len(points)) / np.maximum(
+        MODEL_SHARE * size, LEAST_SHARE * size.max()
+    )
+    return rows * weight[:, None, None], difference * weight[:, None]
+
+
+def _solved(
+    references: tuple[Array, Array], model: tuple[Array, Array]
+) -> tuple[Array, Array, float]:
+    """Estimate (n,), covariance, and misfit of the typical reference, for a prior of one.
+
+    What does not fit has less say.
+    """
+    prior = np.ones(references[0].shape[2])
+    weights = [np.ones(len(references[0])), np.ones(len(model[0]))]
+    estimate, covariance, misfit = np.zeros(prior.size), np.diag(prior), 0.0
+    for _ in range(ROUNDS):
+        normal, right = np.diag(prior), np.zeros(prior.size)
+        for (rows, values), weight in zip((references, model), weights, strict=True):
+            flat = (rows * weight[:, None, None]).reshape(-1, prior.size)
+            normal += flat.T @ flat
+            right += flat.T @ (values * weight[:, None]).ravel()
+        covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+        estimate = covariance @ right
+        left = [
+            np.sqrt(np.mean((values - rows @ estimate) ** 2, axis=1))
+            for rows, values in (references, model)
+        ]
+        misfit = float(np.median(left[0]))
+        weights = [
+            1.0 / np.sqrt(1.0 + (size / max(1.5 * float(np.median(size)), 1.0)) ** 2)
+            for size in left
+        ]
+    return estimate, covariance, misfit

@@ -1,0 +1,80 @@
+"""What sensors read over a drawn board, and how that changes with place, direction and coils."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.field.nominal import Tolerances
+
+Array = NDArray[np.float64]
+FieldAt = Callable[[Array], Array]
+"""Drawn field at points (P, 3) in m, frame fg: (P, K, 3) in T."""
+
+STEP_M = 1e-5
+"""Step (m) of the differences by which the field changes with place."""
+FREE_GAIN = 0.1
+"""Deviation of an emitter's strength from its drawing, which is not judged here: a meter of the
+current that is 10 % off is another fault."""
+
+
+@dataclass(frozen=True)
+class DrawnReadings:
+    """Fluxes of S sensors over a drawn board of K coils, in phase, with their derivatives.
+
+    Attributes
+    ----------
+    points, axes : ndarray, shape (S, 3)
+        Places (m) and unit axes of the sensors, frame fg.
+    flux : ndarray, shape (S, K)
+        T.
+    by_place : ndarray, shape (3, S, K)
+        Derivative by the place, T/m.
+    by_axis : ndarray, shape (3, S, K)
+        Derivative by the axis' vector, T.
+    """
+
+    points: Array
+    axes: Array
+    flux: Array
+    by_place: Array
+    by_axis: Array
+
+    @staticmethod
+    def of(field: FieldAt, points: Array, axes: Array, lengths: Array) -> 'DrawnReadings':
+        """Readings of sensors of some lengths (S,), m, by Gauss' two points."""
+        ends = lengths[:, None] / np.sqrt(12.0) * axes
+
+        def mean(places: Array) -> Array:
+            return np.asarray(0.5 * (field(places + ends) + field(places - ends)))
+
+        here = mean(points)
+        slopes = [(mean(points + STEP_M * e) - here) / STEP_M for e in np.eye(3)]
+        along = [np.einsum('ski,si->sk', values, axes) for values in (here, *slopes)]
+        by_axis = np.moveaxis(here, 2, 0)
+        return DrawnReadings(points, axes, along[0], np.array(along[1:]), by_axis)
+
+    def turned(self, about: Array) -> Array:
+        """Derivative by a turn of all sensors about a point along x, y and z, (3, S, K), T/rad."""
+        eye = np.eye(3)
+        moved = np.cross(eye[:, None, :], self.points - about)
+        twisted = np.cross(eye[:, None, :], self.axes)
+        return np.asarray(
+            np.einsum('rsi,isk->rsk', moved, self.by_place)
+            + np.einsum('rsi,isk->rsk', twisted, self.by_axis)
+        )
+
+    def by_manufacture(self, centres: Array) -> Array:
+        """What each coil's deviation from the drawing does, (6 K, S, K), T a standard deviation.
+
+        Six a coil: its strength, its place along x, y and z, its tilt about x and y.
+        """
+        made, (sensors, count) = Tolerances(), self.flux.shape
+        out = np.zeros((6 * count, sensors, count))
+        for k in range(count):
+            own = out[6 * k : 6 * (k + 1), :, k]
+            own[0] = FREE_GAIN * self.flux[:, k]
+            own[1:4] = made.shift_m * self.by_place[:, :, k]
+            own[4:6] = made.tilt_rad * self.turned(centres[k])[:2, :, k]
+        return out

@@ -1,0 +1,73 @@
+"""A model that lies beside its board: found by the references, and not mistaken for metal."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from anser_ros.errors import BagError, FitError
+from anser_ros.sessions.baseline import board_place_of, clean_flux
+from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.session import load_session
+from anser_ros.sessions.starting_model import model_for
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope='module')
+def recorded():
+    """A simulated recording of a board with manufacturing errors, and a calibrated model of it."""
+    session = load_session(ROOT / 'bags' / 'factory.mcap')
+    return session, load_model(ROOT / 'config/demo_model.yaml')
+
+
+def found(session, model, flux):
+    return board_place_of(model, session.reference.sensors, session.setup).misplacement(flux)
+
+
+def test_a_calibrated_model_lies_where_the_references_have_the_board(recorded):
+    session, model = recorded
+    one_frame = session.reference.flux[0].copy()
+    one_frame[4] = np.nan
+    placed = found(session, model, one_frame)
+    assert np.abs(placed.shift_m).max() < 1e-4 and placed.sigma_m.max() < 1.5e-4
+    assert np.abs(placed.turn_rad).max() < 1e-3
+    assert not placed.is_certain
+    assert found(session, model, np.full_like(one_frame, np.nan)) is None
+
+
+@pytest.mark.parametrize('shift', [(2e-3, 0.0, 0.0), (0.0, -1e-3, 0.0), (0.0, 0.0, 1e-3)])
+def test_a_model_that_lies_aside_is_refused_and_its_shift_is_told(recorded, shift):
+    session, model = recorded
+    aside = replace(model, positions=model.positions + np.array(shift))
+    flux = session.reference.flux[0]
+    placed = found(session, aside, flux)
+    # What is told is where the board is, seen from the model.
+    assert placed.shift_m == pytest.approx(-np.array(shift), abs=1.5e-4)
+    assert placed.is_certain
+    with pytest.raises(BagError, match='beside where the references have the board'):
+        clean_flux(session, session.reference.sensors, aside)
+
+
+def test_metal_is_no_board_that_lies_elsewhere(recorded):
+    session, model = recorded
+    recording = load_session(ROOT / 'bags' / 'metal.mcap').reference
+    size = np.linalg.norm(recording.flux - recording.flux[0], axis=(1, 2))
+    near = recording.flux[np.argmax(size)]
+    placed = found(session, model, near)
+    assert np.linalg.norm(placed.shift_m) > 1e-4
+    assert not placed.is_certain
+
+
+def test_the_drawing_and_a_model_with_metal_are_not_asked(recorded):
+    session, model = recorded
+    sensors, setup = session.reference.sensors, session.setup
+    assert board_place_of(model_for('nominal', session), sensors, setup) is None
+    assert board_place_of(model, sensors.select(np.zeros(0, dtype=np.int64)), setup) is None
+    few = session.reference.flux[0].copy()
+    few[3:] = np.nan
+    assert not board_place_of(model, sensors, setup).check(few)
+    aside = replace(model, positions=model.positions + [0.0, 0.003, 0.0])
+    with pytest.raises(FitError, match=r'lies 3\.\d mm \(.* along x, y, z\)'):
+        board_place_of(aside, sensors, setup).check(session.reference.flux[0])
