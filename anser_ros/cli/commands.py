@@ -34,6 +34,7 @@ OFFLINE = {
     'error_map': 'learn an error map from tracked and true positions, and apply it to others',
     'evaluate': 'track a recorded session and compare its poses with the optical ones',
     'export': 'write poses and fluxes of a bag as CSV, TUM or MATLAB files',
+    'handeye': 'frames, lever arm, mount and clocks of two streams of poses, jointly',
     'import': "make a bag of tables (CSV, NumPy, MATLAB), or of another program's bag",
     'import_poses': 'files of poses as trackers write them, to a bag',
     'loop': 'put an effect into simulated samples, find it blind, correct it, measure again',

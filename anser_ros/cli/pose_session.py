@@ -25,13 +25,18 @@ def add_pose_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--poses', action='store_true', help='a session of a tracker that gives poses only'
     )
+    add_topic_options(parser, 'sensor', 'with --poses: ')
+
+
+def add_topic_options(parser: argparse.ArgumentParser, what: str, when: str = '') -> None:
+    """Declare the options that name topics of poses in a bag."""
     parser.add_argument(
-        '--tracked', action='append', default=[], metavar='NAME=TOPIC',
-        help='with --poses: a sensor and its topic, by default all /tracked/<sensor>/pose',
+        '--tracked', action='append', default=[], metavar='NAME=TOPIC', dest='topics',
+        help=f'{when}a tracked {what} and its topic, by default all /tracked/<sensor>/pose',
     )  # fmt: skip
     parser.add_argument(
         '--optical', metavar='TOPIC',
-        help='with --poses: topic of the reference, by default the only /optical/<body>/pose',
+        help=f'{when}topic of the reference, by default the only /optical/<body>/pose',
     )  # fmt: skip
 
 
@@ -41,20 +46,20 @@ def need_model(args: argparse.Namespace) -> None:
         raise ParameterError('the following arguments are required: --model (or --poses)')
 
 
-def load_poses(args: argparse.Namespace) -> PoseSession:
+def load_poses(path: Path | str, args: argparse.Namespace) -> PoseSession:
     """The session that the options name."""
     topics = {}
-    for text in args.tracked:
+    for text in args.topics:
         name, _, topic = text.partition('=')
         if not name or not topic:
             raise ParameterError(f'--tracked takes NAME=TOPIC, got {text!r}')
         topics[name] = topic
-    return read_pose_session(args.session, topics or None, args.optical)
+    return read_pose_session(path, topics or None, args.optical)
 
 
 def run_diagnosis(args: argparse.Namespace, *, is_evaluation: bool = False) -> int:
     """Diagnose a session of poses, or tell its errors; the exit code."""
-    session = load_poses(args)
+    session = load_poses(args.session, args)
     make_folder(args.out)
     found = diagnose_poses(session)
     document = to_document(found)

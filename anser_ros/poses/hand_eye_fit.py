@@ -1,0 +1,297 @@
+"""Hand-eye calibration: registration, lever arm, mount and clocks of two streams, jointly.
+
+The first stage of a diagnosis of poses, alone: the two frames, the offset and the rate of the
+clocks, robustly, with uncertainties, and in words what the motion does not determine.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from anser_ros.effects.term import Term
+from anser_ros.errors import DiagnosisError
+from anser_ros.field.model import EffectRecord
+from anser_ros.poses.convention import read_rightly
+from anser_ros.poses.diagnosis import (
+    LEAST_KNOWN_M,
+    LEAST_KNOWN_RAD,
+    hand_eye_record,
+    lever_blur,
+    turn_jitter,
+)
+from anser_ros.poses.effects.clock import PoseClockRate, PoseTimeOffset
+from anser_ros.poses.effects.hand_eye import FrameTerm, Mount, OpticalFrame
+from anser_ros.poses.fit import PoseFit, fit_poses
+from anser_ros.poses.problem import PoseProblem
+from anser_ros.poses.search import with_noise
+from anser_ros.poses.sequence import PoseSession
+from anser_ros.poses.start import coarse_offset, first_fit, pose_problem, train_blocks
+
+Array = NDArray[np.float64]
+
+BETWEEN_PAIRS_S = 10.0
+"""Time from one static pair to the next, s: long enough that each is a recording."""
+LEAST_KNOWN_S = 0.02
+"""Standard deviation of an offset, s, beyond which it is not given: a pose of a fast tracker."""
+LEAST_KNOWN_PPM = 500.0
+"""Standard deviation of a rate beyond which it is not given: crystals differ by a tenth of it."""
+TILT_NEEDED_DEG = 20.0  # what is asked for where a lever arm is open
+
+
+@dataclass(frozen=True)
+class SensorFrames:
+    """One sensor on the body, its place and mount with what is known of them.
+
+    Attributes
+    ----------
+    lever_m : ndarray, shape (3,)
+        m, body's frame; NaN where the motion does not tell.
+    lever_sigma_m : ndarray, shape (3,)
+    mount : ndarray, shape (3, 3), or None
+        Rotation from the sensor's frame to the body's; None where it is not determined.
+    mount_sigma_rad : ndarray, shape (3,)
+    n : int
+        Poses that took part.
+    rms : tuple of float
+        Distance (m) and angle (rad) that are left, root mean square, on all poses.
+    held_out : tuple of float
+        The same on the fifth of the recording that took no part in a fit of its own.
+    """
+
+    lever_m: Array
+    lever_sigma_m: Array
+    mount: Array | None
+    mount_sigma_rad: Array
+    n: int
+    rms: tuple[float, float]
+    held_out: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class HandEye:
+    """What two streams of poses have between them.
+
+    Attributes
+    ----------
+    session : PoseSession
+        As it is meant (units, order of quaternions).
+    convention : EffectRecord or None
+        How it had to be read, where that is not as it says.
+    rotation : ndarray, shape (3, 3)
+        From the optical frame to the tracker's.
+    rotation_sigma_rad : ndarray, shape (3,)
+    translation_m, translation_sigma_m : ndarray, shape (3,)
+        Of the optical frame's origin in the tracker's, m; NaN where the motion does not tell.
+    offset_s, rate_ppm : tuple of float (value, standard deviation), or None
+        At stamp t of a tracked pose the optical pose stamped t - offset applies; the tracked clock
+        gains on the optical one by the rate; the offset is that at ``middle_s``. None where the
+        recording does not tell.
+    middle_s : float
+        s since the recording's start.
+    sensors : dict of str to SensorFrames
+    undetermined : tuple of str
+        What the recording does not tell, and what it would take, in words.
+    fit : PoseFit
+    """
+
+    session: PoseSession
+    convention: EffectRecord | None
+    rotation: Array
+    rotation_sigma_rad: Array
+    translation_m: Array
+    translation_sigma_m: Array
+    offset_s: tuple[float, float] | None
+    rate_ppm: tuple[float, float] | None
+    middle_s: float
+    sensors: dict[str, SensorFrames]
+    undetermined: tuple[str, ...]
+    fit: PoseFit
+
+
+def as_pairs(session: PoseSession) -> PoseSession:
+    """The n-th pose of every sensor beside the n-th of the reference, whatever their stamps.
+
+    Raises
+    ------
+    DiagnosisError
+        When numbers differ, or there is no reference.
+    """
+    if session.reference is None:
+        raise DiagnosisError(f'{session.path}: pairs need a reference')
+    count = session.reference.size
+    for name, poses in session.sensors.items():
+        if poses.size != count:
+            raise DiagnosisError(
+                f'{session.path}: {name} has {poses.size} poses and the reference {count}; pairs '
+                'are the n-th with the n-th'
+            )
+    time = np.asarray(BETWEEN_PAIRS_S * np.arange(count), dtype=np.float64)
+    sensors = {name: replace(p, time=time) for name, p in session.sensors.items()}
+    return replace(session, sensors=sensors, reference=replace(session.reference, time=time))
+
+
+def fit_hand_eye(
+    session: PoseSession,
+    *,
+    pairs: bool = False,
+    progress: Callable[[str, float], None] | None = None,
+) -> HandEye:
+    """Fit frames and clocks jointly.
+
+    Parameters
+    ----------
+    session : PoseSession
+        With a reference.
+    pairs : bool
+        Whether the poses are static pairs (`as_pairs`), which tell nothing of clocks.
+
+    Raises
+    ------
+    DiagnosisError
+        When there is no reference, or too few poses.
+    PlausibilityError
+        When the two streams fit in no reading.
+    """
+    say = progress or (lambda text, share: None)
+    if session.reference is None:
+        raise DiagnosisError(
+            f'{session.path}: no second stream of poses; name it with --optical or --reference'
+        )
+    say('conventions', 0.1)
+    session, convention = read_rightly(as_pairs(session) if pairs else session)
+    problem = pose_problem(session)
+    if pairs:
+        problem = replace(problem, path=replace(problem.path, is_at_rest=True))
+    train, test = train_blocks(problem)
+    say('held out', 0.4)
+    learnt = _fitted(problem.in_blocks(train))
+    unseen = replace(problem, noise=learnt.state.problem.noise).in_blocks(test)
+    held_out = unseen.state(learnt.terms)
+    say('all poses', 0.7)
+    fit = _fitted(problem)
+    apart = {part.view.sensor: held_out.rms(part.view.sensor) for part in held_out.parts}
+    return _told(session, convention, fit, apart, pairs)
+
+
+def _fitted(problem: PoseProblem) -> PoseFit:
+    """The frames, and the clocks as far as the motion tells them."""
+    fit = first_fit(problem, coarse_offset(problem), False)
+    if problem.path.is_at_rest:
+        frames = [t for t in fit.terms if isinstance(t, FrameTerm)]
+        return with_noise(fit_poses(fit.state.problem, frames))
+    rate = PoseClockRate().sites(problem.setting)[0]
+    whole = with_noise(fit_poses(fit.state.problem, [*fit.terms, rate]))
+    if _sigma(whole, len(whole.terms) - 1) * 1e3 < LEAST_KNOWN_PPM:
+        return whole
+    return with_noise(fit)
+
+
+def _sigma(fit: PoseFit, index: int) -> float:
+    return float(np.sqrt(fit.covariance_of(index)[0, 0]))
+
+
+def _clock(fit: PoseFit, kind: type, scale: float) -> tuple[float, float] | None:
+    for index, term in enumerate(fit.terms):
+        if isinstance(term.effect, kind):
+            return scale * float(term.theta[0]), scale * _sigma(fit, index)
+    return None
+
+
+def _told(
+    session: PoseSession,
+    convention: EffectRecord | None,
+    fit: PoseFit,
+    held_out: dict[str, tuple[float, float]],
+    pairs: bool,
+) -> HandEye:
+    reference = session.reference
+    assert reference is not None
+    # Pairs are not in the order of a motion, so their differences tell no jitter.
+    shaking = 0.0 if pairs else turn_jitter(reference)
+    covariance = fit.covariance()
+    spreads = [fit.covariance_of(i, covariance) for i in range(len(fit.terms))]
+    (base, frame), = (
+        (i, t) for i, t in enumerate(fit.terms) if isinstance(t.effect, OpticalFrame)
+    )  # fmt: skip
+    assert isinstance(frame, FrameTerm)
+    sensors, words = {}, []
+    for index, term in enumerate(fit.terms):
+        if not (isinstance(term, FrameTerm) and isinstance(term.effect, Mount)):
+            continue
+        name = str(term.site['sensor'])
+        part = next(p for p in fit.state.parts if p.view.sensor == name)
+        record = hand_eye_record(
+            term, spreads[index], frame, spreads[base], lever_blur(part, shaking)
+        )
+        lever = [np.nan if v is None else float(v) for v in record.parameters['lever_arm_m']]
+        sigma = np.sqrt(np.maximum(np.diag(spreads[index]), 0.0))
+        known = bool(np.all(sigma[3:] < LEAST_KNOWN_RAD))
+        sensors[name] = SensorFrames(
+            np.array(lever), sigma[:3], term.rotation if known else None, sigma[3:],
+            int(np.count_nonzero(part.used)), fit.state.rms(name),
+            held_out.get(name, (np.nan, np.nan)),
+        )  # fmt: skip
+        words += _open_lever(name, np.array(lever), part.view.turn[part.used])
+        if not known:
+            words.append(f'{name}: its mount, known to {np.rad2deg(sigma[3:].max()):.0f} deg only')
+    sigma = np.sqrt(np.maximum(np.diag(spreads[base]), 0.0))
+    place = np.where(sigma[:3] < LEAST_KNOWN_M, frame.translation, np.nan)
+    if np.isnan(place).any():
+        words.append(
+            'the origin of the optical frame, known to '
+            f'{1e3 * sigma[:3].max():.0f} mm only; it goes with the lever arm'
+        )
+    offset = _clock(fit, PoseTimeOffset, 1.0)
+    rate = _clock(fit, PoseClockRate, 1e3)
+    if offset is None or offset[1] > LEAST_KNOWN_S:
+        words.append('the offset of the clocks: the body was at rest, or moved too slowly')
+        offset, rate = None, None
+    elif rate is None:
+        words.append(
+            f'the rate of the clocks: in {fit.state.problem.setting.duration:.0f} s it is known '
+            f'to more than {LEAST_KNOWN_PPM:.0f} ppm; record longer'
+        )
+    return HandEye(
+        session, convention, frame.rotation, sigma[3:], place, sigma[:3], offset, rate,
+        _middle(fit.terms), sensors, tuple(words), fit,
+    )  # fmt: skip
+
+
+def _middle(terms: tuple[Term, ...]) -> float:
+    """When the offset is the offset: at stamp zero where no rate is known."""
+    middles = [t.site['middle_s'] for t in terms if isinstance(t.effect, PoseClockRate)]
+    return float(middles[0]) if middles else 0.0
+
+
+def _open_lever(name: str, lever: Array, turn: Array) -> list[str]:
+    """In words, which components of a lever arm are open, and what motion would tell them."""
+    if not np.isnan(lever).any():
+        return []
+    middle = turn.mean(axis=0)
+    values = np.linalg.eigvalsh(np.eye(3) - middle.T @ middle)
+    tilts = np.rad2deg(np.sqrt(np.maximum(values, 0.0)))
+    axes = ', '.join(axis for axis, v in zip('xyz', lever, strict=True) if np.isnan(v))
+    about = 'hardly turned' if tilts[2] < 5 else (
+        'turned about one axis only' if tilts[0] < 0.25 * tilts[1] else 'was tilted too little'
+    )  # fmt: skip
+    return [
+        f'{name}: its lever arm along {axes} of the body, which {about} ({tilts[0]:.1f}, '
+        f'{tilts[1]:.1f}, {tilts[2]:.1f} deg rms); turn it about two axes by '
+        f'{TILT_NEEDED_DEG:g} deg or more'
+    ]
+
+
+def matrix_of(rotation: Array, translation: Array) -> Array:
+    """A rotation and a translation as one matrix, shape (4, 4); NaN where either is unknown."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, translation
+    return matrix
+
+
+def turn_of(rotation: Array) -> tuple[list[float], list[float]]:
+    """A rotation matrix as a rotation vector, degrees, and a quaternion x y z w."""
+    turn = Rotation.from_matrix(rotation)
+    return np.rad2deg(turn.as_rotvec()).tolist(), turn.as_quat().tolist()

@@ -1,0 +1,180 @@
+"""Hand-eye: against exact truth, against Shah's closed form, and what motion can't tell."""
+
+import json
+
+import numpy as np
+import pytest
+from pose_world import FRAME, SHIFT, World
+from scipy.spatial.transform import Rotation
+
+from anser_ros.cli.main import run_verb
+from anser_ros.errors import DiagnosisError
+from anser_ros.poses.hand_eye_fit import fit_hand_eye
+from anser_ros.poses.recording import write_pose_session
+from anser_ros.poses.sequence import PoseSession, sequence_of
+
+SEEDS = range(4000, 4004)  # nothing was chosen on them
+OFFSET, RATE = 0.03, 800.0
+
+
+def static_pairs(seed, turn=(0.5, 0.5, 0.5), count=25):
+    """A session of poses at rest, with the sensor's place and mount on the body."""
+    rng = np.random.default_rng(seed)
+    body = Rotation.from_rotvec(rng.normal(0, 1, (count, 3)) * turn)
+    place = rng.normal(0, 0.08, (count, 3)) + [0.05, 0.02, 0.3]
+    lever, mount = rng.normal(0, 0.04, 3), Rotation.random(random_state=seed)
+
+    def shaken(rad):
+        return Rotation.from_rotvec(rad * rng.normal(size=(count, 3)))
+
+    tracked = place + body.apply(lever) + 3e-4 * rng.normal(size=(count, 3))
+    optical = FRAME.inv().apply(place - SHIFT) + 1e-4 * rng.normal(size=(count, 3))
+    time = np.arange(count) * 1.0
+    poses = sequence_of('s', time, tracked, (shaken(3e-3) * body * mount).as_quat())
+    turns = (shaken(1e-3) * FRAME.inv() * body).as_quat()
+    return PoseSession('pairs', 10**9, {'s': poses}, sequence_of('optical', time, optical, turns)
+                       ), lever, mount  # fmt: skip
+
+
+def shah(session):
+    """Frames of ``A X = Z B`` by Shah's Kronecker product (J. Mechanisms Robotics 5, 2013)."""
+    one, two = session.sensors['s'], session.reference
+    products = sum(np.kron(b, a) for a, b in zip(one.rotation, two.rotation, strict=True))
+    u, _, vt = np.linalg.svd(products)
+    # tracked = frame optical mount, so vec(tracked mount^T) = (optical x 1) vec(frame)
+    mount, frame = vt[0].reshape(3, 3).T, u[:, 0].reshape(3, 3).T
+    found = []
+    for matrix in (mount, frame):
+        matrix = matrix * np.sign(np.linalg.det(matrix))
+        left, _, right = np.linalg.svd(matrix)
+        found.append(left @ right)
+    frame = found[1]
+    count = one.size
+    rows = np.zeros((3 * count, 6))
+    rows[:, :3] = (frame @ two.rotation).reshape(-1, 3)
+    rows[:, 3:] = np.tile(np.eye(3), (count, 1))
+    rest = (one.position - two.position @ frame.T).ravel()
+    solution = np.linalg.lstsq(rows, rest, rcond=None)[0]
+    return frame, solution[:3], solution[3:]
+
+
+def test_frames_and_clocks_are_found_and_their_sigmas_are_honest():
+    scores = {'lever': [], 'mount': [], 'place': [], 'turn': [], 'offset': [], 'rate': []}
+    for seed in SEEDS:
+        world = World(seed, sensors=1, duration=30.0)
+        world.offset, world.rate_ppm = OFFSET, RATE
+        found = fit_hand_eye(world.session())
+        one = found.sensors['sensor_0']
+        scores['lever'].append((one.lever_m - world.levers[0]) / one.lever_sigma_m)
+        off = Rotation.from_matrix(one.mount) * world.mounts[0].inv()
+        scores['mount'].append(off.as_rotvec() / one.mount_sigma_rad)
+        scores['place'].append((found.translation_m - SHIFT) / found.translation_sigma_m)
+        off = Rotation.from_matrix(found.rotation) * FRAME.inv()
+        scores['turn'].append(off.as_rotvec() / found.rotation_sigma_rad)
+        # The world counts from a second and half its length on, in the session's time.
+        late = OFFSET + 1e-6 * RATE * (found.middle_s - 1.0 - world.duration / 2)
+        scores['offset'].append((found.offset_s[0] - late) / found.offset_s[1])
+        scores['rate'].append((found.rate_ppm[0] - RATE) / found.rate_ppm[1])
+        assert found.undetermined == ()
+        assert one.held_out[0] < 1e-3
+    every = np.concatenate([np.ravel(values) for values in scores.values()])
+    assert 0.8 < np.sqrt(np.mean(every**2)) < 1.3
+    assert max(np.abs(np.mean(np.array(v), axis=0)).max() for v in scores.values()) < 1.5
+
+
+def test_static_pairs_agree_with_a_closed_form():
+    """Both see the same data, and are as near to the truth."""
+    ours, theirs = [], []
+    for seed in SEEDS:
+        session, lever, mount = static_pairs(seed)
+        found = fit_hand_eye(session, pairs=True)
+        frame, arm, place = shah(session)
+        one = found.sensors['s']
+        turned = Rotation.from_matrix(frame).inv() * Rotation.from_matrix(found.rotation)
+        assert turned.magnitude() < 5e-3
+        assert np.linalg.norm(one.lever_m - arm) < 3e-4
+        assert np.linalg.norm(found.translation_m - place) < 3e-3
+        assert (Rotation.from_matrix(one.mount) * mount.inv()).magnitude() < 5e-3
+        ours.append(np.linalg.norm(one.lever_m - lever))
+        theirs.append(np.linalg.norm(arm - lever))
+        assert found.offset_s is None and 'the offset of the clocks' in found.undetermined[-1]
+    assert np.mean(ours) < 5e-4 and np.mean(ours) < 1.3 * np.mean(theirs)
+
+
+def test_static_pairs_agree_with_opencv():
+    cv2 = pytest.importorskip('cv2')
+    if not hasattr(cv2, 'calibrateRobotWorldHandEye'):
+        pytest.skip('this OpenCV has no robot-world hand-eye calibration')
+    session, _, _ = static_pairs(SEEDS[0])
+    one, two = session.sensors['s'], session.reference
+    inverse = [
+        (
+            [r.T for r in p.rotation],
+            [-r.T @ t for r, t in zip(p.rotation, p.position, strict=True)],
+        )
+        for p in (one, two)
+    ]
+    _, place, turn, back = cv2.calibrateRobotWorldHandEye(*inverse[0], *inverse[1])
+    found = fit_hand_eye(session, pairs=True)
+    assert np.linalg.norm(found.translation_m - place.ravel()) < 5e-3
+    assert np.linalg.norm(found.sensors['s'].lever_m + (turn.T @ back).ravel()) < 3e-3
+
+
+@pytest.mark.parametrize(
+    ('turn', 'open_axes', 'words'),
+    [((0.0, 0.0, 0.5), 'z', 'about one axis only'), ((0.0, 0.0, 0.0), 'x, y, z', 'hardly turned')],
+)
+def test_what_the_motion_leaves_open_is_said_and_not_given(turn, open_axes, words):
+    session, lever, _ = static_pairs(3, turn)
+    found = fit_hand_eye(session, pairs=True)
+    (said,) = (w for w in found.undetermined if w.startswith('s: its lever arm'))
+    assert f'along {open_axes} of the body' in said and words in said
+    for axis, value, true in zip('xyz', found.sensors['s'].lever_m, lever, strict=True):
+        if axis in open_axes:
+            assert np.isnan(value)
+        else:
+            assert abs(value - true) < 2e-3
+    assert np.isnan(found.translation_m).any()
+
+
+def test_a_body_that_moves_too_shortly_has_no_rate():
+    world = World(4100, sensors=1, duration=4.0)
+    world.noise_m, world.noise_rad = 2e-3, 2e-2
+    found = fit_hand_eye(world.session())
+    assert found.rate_ppm is None and found.offset_s is not None
+    assert any(words.startswith('the rate of the clocks') for words in found.undetermined)
+
+
+def test_the_command_takes_a_bag_or_files(tmp_path, capsys):
+    world = World(4200, sensors=2, duration=12.0)
+    session = world.session()
+    bag = tmp_path / 'session.mcap'
+    write_pose_session(bag, session)
+    assert run_verb('handeye', [str(bag), '--out', str(tmp_path / 'o'), '--json']) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert json.loads((tmp_path / 'o' / 'handeye.json').read_text()) == document
+    assert set(document['sensors']) == {'sensor_0', 'sensor_1'}
+    matrix = np.array(document['registration_matrix'])
+    np.testing.assert_allclose(matrix[:3, :3], FRAME.as_matrix(), atol=5e-3)
+    np.testing.assert_allclose(matrix[:3, 3], SHIFT, atol=2e-3)
+    assert abs(document['clock']['offset_s']) < 1e-3
+    assert '<img' in (tmp_path / 'o' / 'report.html').read_text(encoding='utf-8')
+    for name, poses in (('em', session.sensors['sensor_1']), ('optical', session.reference)):
+        rows = np.c_[poses.time + 5.0, poses.position, poses.quaternion]
+        np.savetxt(tmp_path / f'{name}.tum', rows, fmt='%.9f')
+    files = [str(tmp_path / 'em.tum'), '--reference', str(tmp_path / 'optical.tum')]
+    assert run_verb('handeye', [*files, '--json']) == 0
+    (one,) = json.loads(capsys.readouterr().out)['sensors'].values()
+    np.testing.assert_allclose(one['lever_arm_m'], world.levers[1], atol=1e-3)
+    assert run_verb('handeye', [files[0]]) == 2
+    assert 'no second stream' in capsys.readouterr().err
+    assert run_verb('handeye', [str(bag), *files[1:]]) == 2
+    assert run_verb('handeye', [*files, '--optical', '/optical/x/pose']) == 2
+    assert 'topics of a bag' in capsys.readouterr().err
+
+
+def test_pairs_must_be_pairs():
+    session, _, _ = static_pairs(1)
+    short = session.sensors['s'].rows(np.arange(20))
+    with pytest.raises(DiagnosisError, match='the n-th with the n-th'):
+        fit_hand_eye(PoseSession('p', 0, {'s': short}, session.reference), pairs=True)
