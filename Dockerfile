@@ -34,7 +34,7 @@ RUN apt-get update && apt-get install -y --no-install-recommends \
 
 # What has no package in Ubuntu; the lock keeps the rest of the system's Python as it is.
 RUN python3 -m pip install --no-cache-dir --break-system-packages --no-deps \
-    mcap mcap-ros2-support zstandard lz4
+    mcap mcap-ros2-support zstandard lz4 distributed dask click cloudpickle fsspec jinja2 locket markupsafe msgpack partd psutil sortedcontainers tblib toolz tornado urllib3 zict
 
 WORKDIR /workspace
 COPY . src/anser_ros

@@ -46,6 +46,7 @@ setup(
         'zstandard>=0.22',
         'rich>=13',
         'matplotlib>=3.8',
+        'distributed>=2024.8',
     ],
     extras_require={'docs': ['sphinx>=9', 'myst-parser>=5', 'furo>=2025.9']},
     python_requires='>=3.11',

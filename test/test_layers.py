@@ -53,6 +53,7 @@ ROOMS = {
     'pyigtl': (),
     'rich': ('nodes/', 'cli/'),
     'matplotlib': ('diagnosis/', 'experiments/', 'cli/'),
+    'distributed': ('cli/batch.py',),
     'magpylib': (),
 }
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from anser_ros.cli.output import warn_of_snapshot
+from anser_ros.cli.output import snapshot_notes
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord, FieldModel, from_document, to_document
 from anser_ros.sessions.model_file import as_saved, is_snapshot, load_model, save_model
@@ -99,10 +99,9 @@ def test_a_snapshot_with_metal_in_it_is_no_calibration(tmp_path, capsys):
         assert is_snapshot(read)
         assert read.provenance['started_from'] == base.provenance
         np.testing.assert_array_equal(read.moments, changed.moments)
-    warn_of_snapshot('evaluate', 'a file', base)
-    assert capsys.readouterr().err == ''
-    warn_of_snapshot('evaluate', 'a file', read)
-    assert capsys.readouterr().err.startswith('anser evaluate: a file is a snapshot of a refit')
+    assert snapshot_notes('a file', base) == ()
+    (note,) = snapshot_notes('a file', read)
+    assert note.startswith('a file is a snapshot of a refit')
 
 
 def test_shapes_must_fit():

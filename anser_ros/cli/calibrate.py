@@ -3,11 +3,10 @@
 import argparse
 import json
 import math
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from anser_ros.calibration.calibrate import Options
@@ -16,7 +15,7 @@ from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.cli.calibration_figure import draw_choice, draw_populations
-from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.output import Result, check_file, loss_notes, make_folder, say
 from anser_ros.cli.progress import progress_of
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.errors import FitError, ParameterError
@@ -43,7 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help='folder for calibration.json and choice.png, made if missing',
     )
+    add_options(parser)
     parser.add_argument('--json', action='store_true', help='print calibration.json on stdout')
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options that hold for every calibration."""
     parser.add_argument(
         '--force', action='store_true',
         help="write the model even when its held-out error is worse than the nominal model's",
@@ -82,17 +86,36 @@ def _kinds(text: str) -> tuple[str, ...]:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command and return the exit code."""
+    with progress_of('calibrating') as tell:
+        result = work(args, tell)
+    say('calibrate', result, as_json=args.json)
+    return 0
+
+
+def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result:
+    """Calibrate with the sessions of the arguments, into their files.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        Of `add_arguments`.
+    tell : callable
+        Is told the stage and the finished share of it.
+
+    Raises
+    ------
+    FitError
+        When the drawing of the board is the better model, and that is not forced.
+    """
     stated = stated_values(args)
+    options = _options(args)
     sessions = [load_session(path).with_stated(stated) for path in args.sessions]
     check_same_board(sessions)
-    for path, session in zip(args.sessions, sessions, strict=True):
-        if session.lost:
-            print(f'anser calibrate: {path}: {session.lost}', file=sys.stderr)
-    make_folder(args.out.parent)
+    lost = [loss_notes(path, one.lost) for path, one in zip(args.sessions, sessions, strict=True)]
+    check_file(args.out)
     if args.report is not None:
         make_folder(args.report)
-    with progress_of('calibrating') as progress:
-        calibration = calibrate_sessions(sessions, _options(args), progress)
+    calibration = calibrate_sessions(sessions, options, tell)
     document = to_document(calibration)
     text = json.dumps(document, indent=1)
     if args.report is not None:
@@ -105,15 +128,13 @@ def run(args: argparse.Namespace) -> int:
             f"worse than the nominal model's {calibration.nominal_rmse_t:.3g} T; "
             '--force writes it'
         )
-    for line in document['unobservable']:
-        print(f'anser calibrate: {line}', file=sys.stderr)
     save_model(args.out, calibration.model)
-    if args.json:
-        print(text)
-    else:
-        Console().print(_table(calibration, document))
-        say_written(args.out, *(() if args.report is None else (args.report,)))
-    return 0
+    return Result(
+        document,
+        (*(note for notes in lost for note in notes), *document['unobservable']),
+        (_table(calibration, document),),
+        (args.out, *(() if args.report is None else (args.report,))),
+    )
 
 
 def _options(args: argparse.Namespace) -> Options:

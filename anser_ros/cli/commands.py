@@ -26,13 +26,14 @@ COMPOSED = {
 
 OFFLINE = {
     'bags': 'record the small simulated sessions of the folder bags/',
+    'batch': 'calibrate, evaluate or diagnose many sessions with Dask, and sum them up',
     'calibrate': 'fit a field model to recorded sessions',
     'compare': 'compare two evaluations of a session, paired, with bootstrap intervals',
     'demo': 'watch a simulated tool being tracked: a live table, a bag, a picture',
     'diagnose': 'find what a model leaves unexplained on a session, name the effect, correct it',
     'doctor': 'look at installation, ports, clock and graph, with a remedy for each problem',
     'error_map': 'learn an error map from tracked and true positions, and apply it to others',
-    'evaluate': 'track a recorded session and compare its poses with the optical ones',
+    'evaluate': 'track recorded sessions and compare their poses with the optical ones',
     'export': 'write poses and fluxes of a bag as CSV, TUM or MATLAB files',
     'handeye': 'frames, lever arm, mount and clocks of two streams of poses, jointly',
     'import': "make a bag of tables (CSV, NumPy, MATLAB), or of another program's bag",

@@ -2,16 +2,16 @@
 
 import argparse
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from anser_ros.cli.diagnosis_report import render
 from anser_ros.cli.diagnosis_words import verdict
-from anser_ros.cli.output import make_folder, say_written, warn_of_snapshot
-from anser_ros.cli.pose_session import add_pose_options, need_model, run_diagnosis
+from anser_ros.cli.output import Result, loss_notes, make_folder, say, snapshot_notes
+from anser_ros.cli.pose_session import add_pose_options, diagnose_pose_session, need_model
 from anser_ros.cli.progress import stages_of
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.sessions.diagnosis import diagnose_session
@@ -25,48 +25,63 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = 'example: anser diagnose bags/moving.mcap --model model.yaml --out result/'
     parser.add_argument('session', help='bag to diagnose (.mcap file or bag folder)')
-    parser.add_argument('--model', help="model file, or 'nominal' for the setup's own geometry")
     parser.add_argument(
         '--out', required=True, type=Path, help='folder for the results, made if missing'
     )
+    add_options(parser)
+    parser.add_argument('--json', action='store_true', help='print diagnosis.json on stdout')
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options that hold for every session."""
+    parser.add_argument('--model', help="model file, or 'nominal' for the setup's own geometry")
     parser.add_argument('--baseline', help='distortion-free recording of the same board')
     add_pose_options(parser)
     add_stated_values(parser, 'accuracy', 'refit', 'tools')
-    parser.add_argument('--json', action='store_true', help='print diagnosis.json on stdout')
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
-    if args.poses:
-        return run_diagnosis(args)
-    need_model(args)
-    session = load_session(args.session).with_stated(stated_values(args))
-    model = model_for(args.model, session, snapshot=True)
-    warn_of_snapshot('diagnose', args.model, model)
-    baseline = load_session(args.baseline) if args.baseline else None
-    make_folder(args.out)
-    console = Console(stderr=True)
-    with stages_of('diagnosing') as say:
-        result = diagnose_session(session, model, baseline, say)
-        say('writing the report')
-        document = to_document(result)
-        text = json.dumps(document, indent=1)
-        (args.out / 'diagnosis.json').write_text(text + '\n', encoding='utf-8')
-        save_model(args.out / 'model.yaml', result.diagnosis.model)
-        page = render(result, document, session=args.session, model=args.model)
-        (args.out / 'report.html').write_text(page, encoding='utf-8')
-    if session.lost:
-        console.print(f'{args.session}: {session.lost}', style='yellow', highlight=False)
-    if args.json:
-        print(text)
-    else:
-        _show(document)
-        print(verdict(document))
-        say_written(*(args.out / name for name in ('report.html', 'model.yaml', 'diagnosis.json')))
+    with stages_of('diagnosing') as tell:
+        result = work(args, tell)
+    say('diagnose', result, as_json=args.json)
     return 0
 
 
-def _show(document: dict[str, Any]) -> None:
+def work(args: argparse.Namespace, tell: Callable[[str], None]) -> Result:
+    """Diagnose the session of the arguments into its folder.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        Of `add_arguments`.
+    tell : callable
+        Is told what has been reached, in words.
+    """
+    if args.poses:
+        return diagnose_pose_session(args)
+    need_model(args)
+    session = load_session(args.session).with_stated(stated_values(args))
+    model = model_for(args.model, session, snapshot=True)
+    baseline = load_session(args.baseline) if args.baseline else None
+    make_folder(args.out)
+    result = diagnose_session(session, model, baseline, tell)
+    tell('writing the report')
+    document = to_document(result)
+    text = json.dumps(document, indent=1)
+    (args.out / 'diagnosis.json').write_text(text + '\n', encoding='utf-8')
+    save_model(args.out / 'model.yaml', result.diagnosis.model)
+    page = render(result, document, session=args.session, model=args.model)
+    (args.out / 'report.html').write_text(page, encoding='utf-8')
+    return Result(
+        document,
+        (*snapshot_notes(args.model, model), *loss_notes(args.session, session.lost)),
+        (_table(document), verdict(document)),
+        tuple(args.out / name for name in ('report.html', 'model.yaml', 'diagnosis.json')),
+    )
+
+
+def _table(document: dict[str, Any]) -> Table:
     held, table = document['held_out'], Table('held out', 'before', 'after')
     for label, key, unit, scale in (
         ('flux residual, pT', 'flux_rms', 't', 1e12),
@@ -75,4 +90,4 @@ def _show(document: dict[str, Any]) -> None:
     ):
         cells = [held[f'{key}_{when}_{unit}'] for when in ('before', 'after')]
         table.add_row(label, *('-' if c is None else f'{scale * c:.4g}' for c in cells))
-    Console().print(table)
+    return table

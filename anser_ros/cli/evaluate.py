@@ -1,17 +1,18 @@
-"""Track a recorded session and compare its poses with the optical ones."""
+"""Track recorded sessions and compare their poses with the optical ones."""
 
 import argparse
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from anser_ros.cli.evaluation_figures import write_figures
-from anser_ros.cli.output import make_folder, say_written, warn_of_snapshot
-from anser_ros.cli.pose_session import add_pose_options, need_model, run_diagnosis
+from anser_ros.cli.output import Result, loss_notes, make_folder, say, snapshot_notes
+from anser_ros.cli.pose_session import add_pose_options, evaluate_pose_session, need_model
 from anser_ros.cli.progress import progress_of
+from anser_ros.cli.session_runs import finish, perform, runs_of
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.errors import ParameterError
 from anser_ros.sessions.chosen_references import parse_references, with_references
@@ -37,11 +38,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'example: anser evaluate bags/metal.mcap --model model.yaml'
         ' --refit --baseline bags/scan.mcap --out result/'
     )
-    parser.add_argument('session', help='bag to track (.mcap file or bag folder)')
-    parser.add_argument('--model', help="model file, or 'nominal' for the setup's own geometry")
     parser.add_argument(
-        '--out', required=True, type=Path, help='folder for the results, made if missing'
+        'sessions', nargs='+', metavar='BAG', help='bags to track (.mcap files or bag folders)'
     )
+    parser.add_argument(
+        '--out',
+        required=True,
+        type=Path,
+        help='folder for the results, made if missing; of several bags each has a folder in it, '
+        'and summary.csv and summary.html tell of all',
+    )
+    add_options(parser)
+    parser.add_argument(
+        '--json', action='store_true', help='print evaluation.json, or the summary, on stdout'
+    )
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Declare the options that hold for every session."""
+    parser.add_argument('--model', help="model file, or 'nominal' for the setup's own geometry")
     parser.add_argument('--baseline', help='distortion-free recording of the same board')
     parser.add_argument(
         '--refit', action='store_true', help='let the model follow the reference sensors'
@@ -70,13 +85,43 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_pose_options(parser)
     add_stated_values(parser, 'accuracy', 'refit', 'tools')
-    parser.add_argument('--json', action='store_true', help='print evaluation.json on stdout')
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
+    if len(args.sessions) > 1:
+        return _several(args)
+    args.session = args.sessions[0]
+    with progress_of('evaluating') as tell:
+        result = work(args, tell)
+    say('evaluate', result, as_json=args.json)
+    return 0
+
+
+def _several(args: argparse.Namespace) -> int:
+    """Evaluate one session after the other, and sum them up."""
+    runs = runs_of('evaluate', args)
+    make_folder(args.out)
+    outcomes = []
+    with progress_of('evaluating') as tell:
+        for count, one in enumerate(runs):
+            tell('evaluating', count / len(runs))
+            outcomes.append(perform(one))
+    return finish('evaluate', 'evaluate', outcomes, args)
+
+
+def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result:
+    """Evaluate the session of the arguments into its folder.
+
+    Parameters
+    ----------
+    args : argparse.Namespace
+        Of `add_arguments`, and ``session``, the one to evaluate.
+    tell : callable
+        Is told the stage and the finished share of it.
+    """
     if args.poses:
-        return run_diagnosis(args, is_evaluation=True)
+        return evaluate_pose_session(args)
     need_model(args)
     session = load_session(args.session).with_stated(stated_values(args))
     if args.references is not None:
@@ -84,21 +129,18 @@ def run(args: argparse.Namespace) -> int:
             raise ParameterError('--references chooses those of a refit; it needs --refit')
         session = with_references(session, parse_references(args.references))
     model = model_for(args.model, session, snapshot=True)
-    warn_of_snapshot('evaluate', args.model, model)
     baseline = load_session(args.baseline) if args.baseline else None
     make_folder(args.out)
-    console = Console(stderr=True)
-    with progress_of('evaluating') as progress:
-        evaluation = track_session(
-            session,
-            model,
-            TrackerSettings(gate=args.gate),
-            baseline=baseline,
-            refit=args.refit,
-            in_phase=args.in_phase,
-            patches=parse_patches(args.patch),
-            progress=lambda share: progress('tracking', share),
-        )
+    evaluation = track_session(
+        session,
+        model,
+        TrackerSettings(gate=args.gate),
+        baseline=baseline,
+        refit=args.refit,
+        in_phase=args.in_phase,
+        patches=parse_patches(args.patch),
+        progress=lambda share: tell('tracking', share),
+    )
     document = to_document(evaluation)
     text = json.dumps(document, indent=1)
     (args.out / 'evaluation.json').write_text(text + '\n', encoding='utf-8')
@@ -110,16 +152,11 @@ def run(args: argparse.Namespace) -> int:
         evaluation, document, args.out, session=args.session, model=args.model,
         jitter_m=session.setup.accuracy.optical_position_m,
     )[-1:]  # fmt: skip
-    if session.lost:
-        console.print(f'{args.session}: {session.lost}', style='yellow', highlight=False)
-    if args.json:
-        print(text)
-    else:
-        Console().print(_table(document))
-        if 'refit' in document:
-            Console().print(_refit_line(document['refit']), highlight=False)
-        say_written(*written)
-    return 0
+    shown: list[Any] = [_table(document)]
+    if 'refit' in document:
+        shown.append(_refit_line(document['refit']))
+    notes = (*snapshot_notes(args.model, model), *loss_notes(args.session, session.lost))
+    return Result(document, notes, tuple(shown), tuple(written))
 
 
 def _refit_line(refit: dict[str, dict[str, int]]) -> str:

@@ -8,10 +8,10 @@ import importlib
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from anser_ros.cli import missing
 from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE
@@ -94,7 +94,8 @@ def exec_node(name: str, arguments: Sequence[str]) -> NoReturn:
 
 def run_verb(name: str, arguments: Sequence[str]) -> int:
     """Run one offline command in this process and return the exit code."""
-    try:
+
+    def work() -> int:
         # Set before numpy is loaded: BLAS threads that wait for one another cost more than they
         # gain.
         os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
@@ -104,32 +105,45 @@ def run_verb(name: str, arguments: Sequence[str]) -> int:
         args = parser.parse_args(arguments)
         with shared_among(cores()):
             return int(module.run(args))
-    except AnserError as error:
-        print(f'anser {name}: {_one_line(error)}', file=sys.stderr)
-        return EXIT_BAD_INPUT
-    except BrokenPipeError:
-        raise
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.split('.')[0] not in missing.PYPI:
-            traceback.print_exc()
-            return EXIT_DEFECT
-        print(f'anser {name}: {missing.words_of(error.name)}', file=sys.stderr)
-        return EXIT_BAD_INPUT
-    except OSError as error:
-        # A file that is not there or can't be written is the caller's input, not a defect.
-        if error.filename is None:
-            traceback.print_exc()
-            return EXIT_DEFECT
-        print(f'anser {name}: {error.filename}: {error.strerror}', file=sys.stderr)
-        return EXIT_BAD_INPUT
+
+    try:
+        code, done, words = attempt(work)
     except SystemExit as leaving:  # the parser has said why
         return leaving.code if isinstance(leaving.code, int) else EXIT_BAD_INPUT
     except KeyboardInterrupt:
-        print(f'anser {name}: interrupted', file=sys.stderr)
-        return EXIT_BAD_INPUT
+        code, done, words = EXIT_BAD_INPUT, None, 'interrupted'
+    if done is not None:
+        return int(done)
+    print(words if code == EXIT_DEFECT else f'anser {name}: {words}', file=sys.stderr)
+    return code
+
+
+def attempt(work: Callable[[], Any]) -> tuple[int, Any, str]:
+    """Do a piece of work of a command, and tell an error of the caller from a defect.
+
+    Returns
+    -------
+    tuple of (int, object, str)
+        The exit code; what the work gave, None where it failed; why it failed: one line for what
+        is the caller's to mend, a traceback for a defect.
+    """
+    try:
+        return EXIT_OK, work(), ''
+    except AnserError as error:
+        return EXIT_BAD_INPUT, None, _one_line(error)
+    except BrokenPipeError:
+        raise
+    except ModuleNotFoundError as error:
+        if error.name is not None and error.name.split('.')[0] in missing.PYPI:
+            return EXIT_BAD_INPUT, None, missing.words_of(error.name)
+        return EXIT_DEFECT, None, traceback.format_exc().rstrip()
+    except OSError as error:
+        # A file that is not there or can't be written is the caller's input, not a defect.
+        if error.filename is not None:
+            return EXIT_BAD_INPUT, None, f'{error.filename}: {error.strerror}'
+        return EXIT_DEFECT, None, traceback.format_exc().rstrip()
     except Exception:  # noqa: BLE001 - the outermost place: whatever is left is a defect
-        traceback.print_exc()
-        return EXIT_DEFECT
+        return EXIT_DEFECT, None, traceback.format_exc().rstrip()
 
 
 def _one_line(error: AnserError) -> str:

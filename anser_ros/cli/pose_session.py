@@ -1,4 +1,4 @@
-"""The options of commands that take a session of poses, and what `diagnose --poses` does."""
+"""The options of commands that take a session of poses, and what they do with one."""
 
 import argparse
 import csv
@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 import yaml
-from rich.console import Console
 from rich.table import Table
 
-from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.output import Result, loss_notes, make_folder
 from anser_ros.cli.pose_report import pose_verdict, render_poses
 from anser_ros.errors import ParameterError
 from anser_ros.poses.diagnosis import PoseDiagnosis, diagnose_poses
@@ -57,33 +56,48 @@ def load_poses(path: Path | str, args: argparse.Namespace) -> PoseSession:
     return read_pose_session(path, topics or None, args.optical)
 
 
-def run_diagnosis(args: argparse.Namespace, *, is_evaluation: bool = False) -> int:
-    """Diagnose a session of poses, or tell its errors; the exit code."""
+def diagnose_pose_session(args: argparse.Namespace) -> Result:
+    """Diagnose a session of poses into the folder of the arguments."""
+    found, document = _found(args)
+    model = yaml.safe_dump(to_model(found), sort_keys=False)
+    (args.out / 'model.yaml').write_text(model, encoding='utf-8')
+    page = render_poses(found, document, str(args.session))
+    (args.out / 'report.html').write_text(page, encoding='utf-8')
+    files = 'diagnosis.json', 'model.yaml', 'report.html'
+    return _result(args, found, document, document, files)
+
+
+def evaluate_pose_session(args: argparse.Namespace) -> Result:
+    """Tell the errors of a session of poses, into the folder of the arguments."""
+    found, diagnosis = _found(args)
+    document = _evaluation(found, diagnosis)
+    _write_poses(args.out / 'poses.csv', found)
+    return _result(args, found, document, diagnosis, ('evaluation.json', 'poses.csv'))
+
+
+def _found(args: argparse.Namespace) -> tuple[PoseDiagnosis, dict[str, Any]]:
     session = load_poses(args.session, args)
     make_folder(args.out)
     found = diagnose_poses(session)
-    document = to_document(found)
-    if is_evaluation:
-        document = _evaluation(found, document)
-        _write_poses(args.out / 'poses.csv', found)
-        files = ['evaluation.json', 'poses.csv']
-    else:
-        model = yaml.safe_dump(to_model(found), sort_keys=False)
-        (args.out / 'model.yaml').write_text(model, encoding='utf-8')
-        page = render_poses(found, document, str(args.session))
-        (args.out / 'report.html').write_text(page, encoding='utf-8')
-        files = ['diagnosis.json', 'model.yaml', 'report.html']
+    return found, to_document(found)
+
+
+def _result(
+    args: argparse.Namespace,
+    found: PoseDiagnosis,
+    document: dict[str, Any],
+    diagnosis: dict[str, Any],
+    files: tuple[str, ...],
+) -> Result:
+    """Write the document into the first of the files, and say all of it."""
     text = json.dumps(document, indent=1)
     (args.out / files[0]).write_text(text + '\n', encoding='utf-8')
-    if session.lost:
-        Console(stderr=True).print(f'{args.session}: {session.lost}', highlight=False)
-    if args.json:
-        print(text)
-        return 0
-    Console().print(_table(to_document(found)))
-    print(pose_verdict(to_document(found)))
-    say_written(*(args.out / name for name in files))
-    return 0
+    return Result(
+        document,
+        loss_notes(args.session, found.session.lost),
+        (_table(diagnosis), pose_verdict(diagnosis)),
+        tuple(args.out / name for name in files),
+    )
 
 
 def _table(document: dict[str, Any]) -> Table:

@@ -1,0 +1,125 @@
+"""One command on many sessions with Dask: on this machine's cores, or on a cluster that is there.
+
+A worker runs the code of the command itself, one session at a time. The scheduler gives the
+session of a worker that dies to another one; what a session left is in its folder and in the
+summary, which is written anew whenever one is done.
+"""
+
+import argparse
+import contextlib
+import importlib
+import logging
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from distributed import Client, KilledWorker, LocalCluster, as_completed
+
+from anser_ros.cli.commands import OFFLINE
+from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, attempt
+from anser_ros.cli.output import make_folder
+from anser_ros.cli.progress import progress_of
+from anser_ros.cli.session_runs import SessionRun, finish, perform, runs_of
+from anser_ros.cli.summary import COMMANDS, Outcome, row_of, write_summary
+from anser_ros.errors import ParameterError
+from anser_ros.parallel import cores
+
+CONNECT_S = 10.0
+"""How long a scheduler is waited for, s."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.epilog = (
+        'example: anser batch evaluate bags/moving.mcap bags/metal.mcap --model model.yaml '
+        '--out results/'
+    )
+    verbs = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
+    for name in COMMANDS:
+        verb = verbs.add_parser(
+            name,
+            help=f'{OFFLINE[name]}, each session by itself',
+            description=f'anser {name} on each session by itself',
+            epilog=f'example: anser batch {name} bags/*.mcap '
+            f'{"" if name == "calibrate" else "--model model.yaml "}--out results/',
+        )
+        verb.add_argument('sessions', nargs='+', metavar='BAG', help='.mcap files or bag folders')
+        verb.add_argument(
+            '--out', required=True, type=Path,
+            help='folder for summary.csv, summary.html and a folder a session, made if missing',
+        )  # fmt: skip
+        where = verb.add_mutually_exclusive_group()
+        where.add_argument(
+            '--scheduler', metavar='ADDRESS',
+            help='Dask scheduler whose workers see the same folders and have this package, e.g. '
+            'tcp://10.0.0.5:8786; by default workers on this machine',
+        )  # fmt: skip
+        where.add_argument(
+            '--workers', type=int, default=cores(), metavar='N',
+            help='processes on this machine, by default one a core',
+        )  # fmt: skip
+        importlib.import_module(f'anser_ros.cli.{name}').add_options(verb)
+        verb.add_argument('--json', action='store_true', help='print the summary on stdout')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; the exit code."""
+    if args.workers < 1:
+        raise ParameterError(f'--workers must be at least 1, got {args.workers}')
+    runs = runs_of(args.command, args)
+    make_folder(args.out)
+    found: dict[str, Outcome] = {}
+    with progress_of('starting workers') as tell, _client(args, len(runs)) as (client, threads):
+        sessions = f'{len(runs)} sessions'
+        tell(sessions, 0.0)
+        for outcome in _outcomes(client, runs, threads):
+            found[outcome.name] = outcome
+            done = [found[one.name] for one in runs if one.name in found]
+            write_summary(args.out, args.command, [row_of(args.command, one) for one in done])
+            tell(sessions, len(done) / len(runs))
+    return finish('batch', args.command, [found[one.name] for one in runs], args)
+
+
+@contextlib.contextmanager
+def _client(args: argparse.Namespace, sessions: int) -> Iterator[tuple[Client, int]]:
+    """A client of the scheduler, and the threads among which a session may share its work."""
+    if args.scheduler is not None:
+        try:
+            client = Client(args.scheduler, timeout=CONNECT_S)
+        except (OSError, ValueError) as error:
+            raise ParameterError(f'no Dask scheduler at {args.scheduler}: {error}') from error
+        with client:
+            yield client, 1
+        return
+    workers = min(args.workers, sessions)
+    # Silent: what becomes of a session is told in its row.
+    with (
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            dashboard_address=None,
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client, max(1, cores() // workers)
+
+
+def _outcomes(client: Client, runs: Sequence[SessionRun], threads: int) -> Iterator[Outcome]:
+    """What became of each run, as they end."""
+    futures = client.map(perform, runs, threads=threads, pure=False)
+    of = dict(zip(futures, runs, strict=True))
+    for future in as_completed(futures):
+        code, outcome, words = attempt(future.result)
+        if outcome is None:
+            outcome = _lost(of[future], future.exception(), code, words)
+        yield outcome
+
+
+def _lost(run: SessionRun, error: Any, code: int, words: str) -> Outcome:
+    """A session that no worker could bring to an end."""
+    if isinstance(error, KilledWorker):
+        line = 'every worker that took it died, as for want of memory'
+        return Outcome(run.name, run.session, EXIT_BAD_INPUT, {}, line)
+    trace = words if code == EXIT_DEFECT else ''
+    return Outcome(run.name, run.session, code, {}, words.splitlines()[-1], trace)

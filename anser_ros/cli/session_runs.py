@@ -1,0 +1,158 @@
+"""One command on each of several sessions: what is done with one, and what it left.
+
+Each session has a folder of its own; one that fails is an outcome as the others are.
+"""
+
+import argparse
+import contextlib
+import importlib
+import json
+import os
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, EXIT_OK, attempt
+from anser_ros.cli.output import Result, make_folder, say_written
+from anser_ros.cli.summary import SCHEMA, Outcome, row_of, table_of, write_summary
+from anser_ros.errors import ParameterError
+from anser_ros.parallel import shared_among
+
+ALONE = threading.Lock()
+"""One session at a time in a process: drawing, the working folder and the threads are shared."""
+
+
+@dataclass(frozen=True)
+class SessionRun:
+    """A command on one session.
+
+    Attributes
+    ----------
+    command : str
+        `calibrate`, `diagnose` or `evaluate`.
+    name : str
+        The session's name in the summary, and of its folder.
+    session : str
+        The bag.
+    args : argparse.Namespace
+        What the command's own ``work`` takes.
+    folder : str
+        The folder from which the paths in the arguments hold.
+    """
+
+    command: str
+    name: str
+    session: str
+    args: argparse.Namespace
+    folder: str
+
+
+def runs_of(command: str, args: argparse.Namespace) -> list[SessionRun]:
+    """The runs of a command on all sessions of its arguments, each into a folder of its own."""
+    runs = []
+    for session, name in zip(args.sessions, names_of(args.sessions), strict=True):
+        own = argparse.Namespace(**{**vars(args), 'session': session, 'sessions': [session]})
+        own.out = args.out / name
+        if command == 'calibrate':
+            own.out, own.report = own.out / 'model.yaml', own.out
+        runs.append(SessionRun(command, name, session, own, os.getcwd()))
+    return runs
+
+
+def names_of(sessions: Sequence[str]) -> list[str]:
+    """Names for sessions by their paths: as many last parts as tell them apart.
+
+    Raises
+    ------
+    ParameterError
+        When a session is given twice.
+    """
+    paths = [Path(session).resolve() for session in sessions]
+    for place, path in enumerate(paths):
+        if path in paths[:place]:
+            raise ParameterError(f'{sessions[place]} is given twice')
+    parts = [(*path.parts[1:-1], path.name if path.is_dir() else path.stem) for path in paths]
+    names = []
+    for own in parts:
+        count = 1
+        while sum(other[-count:] == own[-count:] for other in parts) > 1 and count < len(own):
+            count += 1
+        names.append('-'.join(own[-count:]))
+    doubled = {name for name in names if names.count(name) > 1}
+    return [
+        path.name if name in doubled else name for name, path in zip(names, paths, strict=True)
+    ]
+
+
+def perform(run: SessionRun, threads: int | None = None) -> Outcome:
+    """Do a run in this process, whatever comes of it.
+
+    Parameters
+    ----------
+    run : SessionRun
+    threads : int, optional
+        Among how many threads it may share its work; as many as its caller by default.
+    """
+    module = importlib.import_module(f'anser_ros.cli.{run.command}')
+
+    def work() -> Result:
+        sharing = contextlib.nullcontext() if threads is None else shared_among(threads)
+        with contextlib.chdir(run.folder), sharing:
+            done: Result = module.work(run.args, lambda *_: None)
+            return done
+
+    with ALONE:
+        began_s = time.monotonic()
+        code, result, words = attempt(work)
+        seconds = time.monotonic() - began_s
+    if result is not None:
+        return Outcome(
+            run.name, run.session, code, result.document, '; '.join(result.notes), '', seconds
+        )
+    trace = words if code == EXIT_DEFECT else ''
+    line = f'a defect of the program: {words.splitlines()[-1]}' if trace else words
+    return Outcome(run.name, run.session, code, {}, line, trace, seconds)
+
+
+def finish(verb: str, command: str, outcomes: Sequence[Outcome], args: argparse.Namespace) -> int:
+    """Write and show the summary of all runs; the exit code.
+
+    Parameters
+    ----------
+    verb : str
+        The command that the user gave, for what is said on stderr.
+    command : str
+        The command that ran on each session.
+    outcomes : sequence of Outcome
+    args : argparse.Namespace
+        With ``out``, the folder of the summary, and ``json``.
+
+    Returns
+    -------
+    int
+        0 where all went well, 1 where there was a defect of the program, else 2.
+    """
+    rows = [row_of(command, outcome) for outcome in outcomes]
+    make_folder(args.out)
+    written = write_summary(args.out, command, rows)
+    for outcome in outcomes:
+        if outcome.traceback:
+            print(f'{outcome.session}:\n{outcome.traceback}', file=sys.stderr)
+    if args.json:
+        document = {'schema': SCHEMA, 'command': command, 'sessions': rows}
+        print(json.dumps(document, indent=1))
+    else:
+        Console().print(table_of(command, rows))
+        say_written(*written)
+    failed = [outcome for outcome in outcomes if outcome.code != EXIT_OK]
+    if not failed:
+        return EXIT_OK
+    for outcome in failed:
+        print(f'anser {verb}: {outcome.name}: {outcome.words}', file=sys.stderr)
+    print(f'anser {verb}: {len(failed)} of {len(outcomes)} sessions failed', file=sys.stderr)
+    return EXIT_DEFECT if any(one.code == EXIT_DEFECT for one in failed) else EXIT_BAD_INPUT

@@ -1,0 +1,230 @@
+"""One table of many sessions: a row each, those that failed with why, as CSV, page and text."""
+
+import csv
+import html
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from anser_ros.cli.html_page import page
+
+SCHEMA = 'anser_summary/1'
+"""Name of the layout of what ``--json`` prints."""
+FILES = ('summary.csv', 'summary.html')
+MM, DEG, PT, PERCENT = 1e3, 57.29578, 1e12, 1e2
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command left of one session.
+
+    Attributes
+    ----------
+    name : str
+        The session's name in the summary, and of its folder.
+    session : str
+        The bag.
+    code : int
+        The exit code that the command alone would have had.
+    document : dict
+        The content of its JSON file; empty where it failed.
+    words : str
+        Why it failed, or what users have to know, in one line.
+    traceback : str
+        Of a defect.
+    seconds : float
+        How long it took.
+    """
+
+    name: str
+    session: str
+    code: int
+    document: dict[str, Any]
+    words: str
+    traceback: str = ''
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Column:
+    """A figure of the summary.
+
+    Attributes
+    ----------
+    key : str
+        Its name in CSV and JSON, in SI units.
+    heading : str
+        What people read above it, with the unit there.
+    scale : float
+        From the one unit to the other.
+    is_short : bool
+        Whether the table on the terminal has it too.
+    """
+
+    key: str
+    heading: str
+    scale: float = 1.0
+    is_short: bool = False
+
+
+EVALUATION = (
+    Column('n_sensors', 'coils'),
+    Column('n', 'poses compared'),
+    Column('tracked_fraction', 'tracked %', PERCENT, is_short=True),
+    Column('position_rmse_m', 'RMSE mm', MM, is_short=True),
+    Column('worst_position_rmse_m', 'worst coil mm', MM, is_short=True),
+    Column('orientation_rmse_rad', 'RMSE deg', DEG, is_short=True),
+    Column('worst_orientation_rmse_rad', 'worst coil deg', DEG),
+    Column('n_bodies', 'bodies'),
+    Column('body_tracked_fraction', 'bodies tracked %', PERCENT),
+    Column('body_position_rmse_m', 'bodies mm', MM, is_short=True),
+    Column('body_orientation_rmse_rad', 'bodies deg', DEG),
+)
+DIAGNOSIS = (
+    Column('effects', 'effects', is_short=True),
+    Column('flux_rms_before_t', 'flux pT, before', PT, is_short=True),
+    Column('flux_rms_after_t', 'after', PT, is_short=True),
+    Column('flux_rms_floor_t', 'floor', PT),
+    Column('position_rmse_before_m', 'mm, before', MM, is_short=True),
+    Column('position_rmse_after_m', 'after', MM, is_short=True),
+    Column('orientation_rmse_before_rad', 'deg, before', DEG),
+    Column('orientation_rmse_after_rad', 'after', DEG),
+    Column('unexplained_fraction', 'unexplained %', PERCENT),
+)
+CALIBRATION = (
+    Column('n_measurements', 'readings'),
+    Column('n_dipoles', 'dipoles', is_short=True),
+    Column('flux_rmse_t', 'flux pT', PT, is_short=True),
+    Column('heldout_flux_rmse_t', 'held out pT', PT, is_short=True),
+    Column('heldout_n_rmse_percent', 'held out, % of range', is_short=True),
+    Column('heldout_n_mae_percent', 'held out, % of range, MAE'),
+    Column('effects', 'effects', is_short=True),
+)
+
+
+def _evaluation(document: Mapping[str, Any]) -> Row:
+    row: Row = {}
+    for prefix, group in (('', 'sensors'), ('body_', 'bodies')):
+        rows = list(document[group].values())
+        row[f'n_{group}'] = len(rows)
+        if not prefix:
+            row['n'] = sum(one['n'] for one in rows)
+        if not rows:
+            continue
+        shares = [one['tracked_fraction'] for one in rows]
+        row[f'{prefix}tracked_fraction'] = sum(shares) / len(shares)
+        for key in ('position_rmse_m', 'orientation_rmse_rad'):
+            pairs = [(one['n'], one[key]) for one in rows if one[key] is not None]
+            if pairs:
+                mean = sum(n * root**2 for n, root in pairs) / sum(n for n, _ in pairs)
+                row[f'{prefix}{key}'] = math.sqrt(mean)
+                row[f'worst_{prefix}{key}'] = max(root for _, root in pairs)
+    return row
+
+
+def _diagnosis(document: Mapping[str, Any]) -> Row:
+    names = [effect['name'] for effect in document['effects']]
+    unexplained = document['unexplained']['fraction']
+    return {
+        **document['held_out'],
+        'effects': ' '.join(dict.fromkeys(names)),
+        'unexplained_fraction': unexplained,
+    }
+
+
+def _calibration(document: Mapping[str, Any]) -> Row:
+    names = [effect['name'] for effect in document['effects']]
+    return {**document, 'effects': ' '.join(dict.fromkeys(names))}
+
+
+COMMANDS: dict[str, tuple[tuple[Column, ...], Callable[[Mapping[str, Any]], Row], str]] = {
+    'calibrate': (CALIBRATION, _calibration, 'calibration.json'),
+    'diagnose': (DIAGNOSIS, _diagnosis, 'report.html'),
+    'evaluate': (EVALUATION, _evaluation, 'evaluation.html'),
+}
+"""Of each command its columns, how its document becomes a row, and its file to look at."""
+
+
+def row_of(command: str, outcome: Outcome) -> Row:
+    """A session as plain data, in SI units; None where a session has no such figure."""
+    columns, figures, _ = COMMANDS[command]
+    found = figures(outcome.document) if outcome.document else {}
+    return {
+        'session': outcome.session,
+        'name': outcome.name,
+        'status': 'failed' if outcome.code else 'ok',
+        'message': outcome.words,
+        'seconds': round(outcome.seconds, 3),
+        **{column.key: found.get(column.key) for column in columns},
+    }
+
+
+def write_summary(folder: Path, command: str, rows: Sequence[Row]) -> tuple[Path, ...]:
+    """Write the rows as CSV (SI units) and as a page, and return their paths."""
+    with (folder / FILES[0]).open('w', encoding='utf-8', newline='') as stream:
+        writer = csv.DictWriter(stream, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    (folder / FILES[1]).write_text(_page(command, folder, rows), encoding='utf-8')
+    return tuple(folder / name for name in FILES)
+
+
+def table_of(command: str, rows: Sequence[Row]) -> Table:
+    """The rows for a terminal of 80 columns: names, the most important figures, or why not."""
+    columns = [column for column in COMMANDS[command][0] if column.is_short]
+    table = Table('session', *(column.heading for column in columns))
+    failed = [row for row in rows if row['status'] != 'ok']
+    for row in rows:
+        if row['status'] == 'ok':
+            table.add_row(row['name'], *(_text(column, row) for column in columns))
+        else:
+            table.add_row(row['name'], 'failed', style='red')
+    if failed:
+        table.caption = f'{len(failed)} of {len(rows)} sessions failed'
+    return table
+
+
+def _text(column: Column, row: Row) -> str:
+    value = row[column.key]
+    if value is None:
+        return '-'
+    if isinstance(value, str):
+        return value.replace(' ', '\n')
+    return str(value) if isinstance(value, int) else f'{value * column.scale:.4g}'
+
+
+def _page(command: str, folder: Path, rows: Sequence[Row]) -> str:
+    columns, _, file = COMMANDS[command]
+    failed = sum(row['status'] != 'ok' for row in rows)
+    head = ''.join(
+        f'<th>{html.escape(text)}</th>'
+        for text in ('session', *(column.heading for column in columns), 's', 'what is to know')
+    )
+    lines = []
+    for row in rows:
+        name, cells = html.escape(row['name']), [_text(column, row) for column in columns]
+        if (folder / row['name'] / file).is_file():
+            name = f'<a href="{name}/{file}">{name}</a>'
+        if row['status'] == 'ok':
+            figures = ''.join(f'<td class="n">{html.escape(cell)}</td>' for cell in cells)
+        else:
+            figures = f'<td colspan="{len(columns)}">failed</td>'
+        lines.append(
+            f'<tr><td title="{html.escape(row["session"])}">{name}</td>{figures}'
+            f'<td class="n">{row["seconds"]:.1f}</td><td>{html.escape(row["message"])}</td></tr>'
+        )
+    words = (
+        f'{len(rows)} sessions, {failed} of them failed.' if failed else f'{len(rows)} sessions.'
+    )
+    sections = (
+        f'<h1>anser {command}</h1><p class="verdict">{words}</p>',
+        f'<table><tr>{head}</tr>{"".join(lines)}</table>',
+        '<p class="note">The same in SI units: <code>summary.csv</code>.</p>',
+    )
+    return page(f'anser {command}: summary', sections)
