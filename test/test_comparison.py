@@ -8,10 +8,22 @@ import pytest
 
 from anser_ros.cli.main import main
 from anser_ros.errors import ParameterError
-from anser_ros.sessions.comparison import FEWEST_BLOCKS, compare_errors, read_errors
+from anser_ros.sessions.comparison import (
+    FEWEST_BLOCKS,
+    compare_errors,
+    compare_shares,
+    read_errors,
+)
 from anser_ros.sessions.evaluation import Evaluation
 from anser_ros.sessions.pose_errors import PoseSeries
-from anser_ros.sessions.pose_table import ERRORS_FILE, write_errors
+from anser_ros.sessions.pose_table import (
+    BODIES_FILE,
+    ERRORS_FILE,
+    POSES_FILE,
+    write_body_poses,
+    write_errors,
+    write_poses,
+)
 from anser_ros.tracking.estimate import OK
 
 STEP_NS = 40_000_000
@@ -61,8 +73,29 @@ def test_few_stretches_give_no_interval_and_no_common_frame_is_refused():
         compare_errors(short, {(1, 'a'): 1.0}, np.random.default_rng(1))
 
 
+def test_the_share_of_frames_with_a_pose_has_a_verdict_of_its_own():
+    def states(share, seed):
+        had = np.random.default_rng(seed).random(FRAMES) < share
+        return {key: float(pose) for key, pose in zip(errors(1.0), had, strict=True)}
+
+    rng = np.random.default_rng(1)
+    found = compare_shares(states(0.9, 5), states(0.6, 6), rng)['a']
+    assert found.verdict == 'a' and found.n == FRAMES
+    assert found.low < -0.3 < found.high, 'the true difference is 30 %'
+    assert compare_shares(states(0.6, 6), states(0.9, 5), rng)['a'].verdict == 'b'
+    pairs = [(states(0.8, s), states(0.8, 100 + s)) for s in range(40)]
+    called = sum(compare_shares(*pair, rng)['a'].verdict != 'neither' for pair in pairs)
+    assert called <= 6, 'of 40, two are expected'
+
+
 def evaluation_of(found):
-    estimates = tuple(SimpleNamespace(stamp_ns=stamp, state=OK) for stamp, _ in found)
+    estimates = tuple(
+        SimpleNamespace(
+            stamp_ns=stamp, state=OK if rank % 50 else 'residual', position=np.zeros(3),
+            axis=np.zeros(3), sigma_position_m=1e-4, residual_t=1e-9,
+        )
+        for rank, (stamp, _) in enumerate(found)
+    )  # fmt: skip
     sizes = np.array(list(found.values()))
     sizes[5] = np.nan
     return Evaluation({'a': PoseSeries('a', estimates, sizes, 2 * sizes)}, {}, 1e-3)
@@ -71,7 +104,10 @@ def evaluation_of(found):
 def test_the_command(tmp_path, capsys):
     for name, scale in (('one', 2.0), ('two', 1.0)):
         (tmp_path / name).mkdir()
-        write_errors(tmp_path / name / ERRORS_FILE, evaluation_of(errors(scale)))
+        evaluation = evaluation_of(errors(scale))
+        write_errors(tmp_path / name / ERRORS_FILE, evaluation)
+        write_poses(tmp_path / name / POSES_FILE, evaluation)
+        write_body_poses(tmp_path / name / BODIES_FILE, evaluation)
     read = read_errors(tmp_path / 'one')
     assert len(read['position']) == FRAMES - 1
     key = next(iter(read['position']))
@@ -81,7 +117,14 @@ def test_the_command(tmp_path, capsys):
     document = json.loads(capsys.readouterr().out)
     assert document == json.loads((tmp_path / 'out' / 'comparison.json').read_text())
     assert document['position']['a']['better'] == 'b'
+    assert document['coverage']['a']['better'] == 'neither'
+    assert document['coverage']['a']['share_a'] == pytest.approx(0.98)
     assert (tmp_path / 'out' / 'comparison.png').read_bytes()[:4] == b'\x89PNG'
+    assert main(['compare', *folders]) == 0
+    out = capsys.readouterr().out
+    assert max(map(len, out.split('position error: ')[0].splitlines())) <= 80
+    assert 'position error: second better for 1 of 1' in out
+    assert 'frames with a pose: no difference of 1' in out
     assert main(['compare', folders[0], str(tmp_path)]) == 2
     assert 'is it a folder of anser evaluate?' in capsys.readouterr().err
     (tmp_path / 'two' / ERRORS_FILE).write_text('a,b\n1,2\n')

@@ -13,6 +13,7 @@ import zstandard
 from scipy.io import loadmat, savemat
 
 from anser_ros.cli.main import main
+from anser_ros.poses.recording import read_pose_session
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.bag import Salvage, iter_messages, read_bag
 
@@ -271,3 +272,33 @@ def test_export_of_poses_and_fluxes(tmp_path, moving, capsys):
     rows = json.loads(capsys.readouterr().out)['rows']
     assert rows['optical_tool_a.csv'] == len(track.stamp_ns)
     assert main(['export', 'nowhere.mcap', '--out', str(tmp_path)]) == 2
+
+
+def test_tables_of_tracked_poses_become_a_session_of_poses(tmp_path, capsys):
+    """No setup and no fluxes: what `diagnose --poses` takes."""
+    rows = [f'{0.05 * k},{k},0,100,1,0,0,0' for k in range(1, 30)]
+    (tmp_path / 'em.csv').write_text('\n'.join(['t,x,y,z,qw,qx,qy,qz', *rows]))
+    table = {
+        'file': 'em.csv', 'stamp': 't', 'position': ['x', 'y', 'z'], 'unit': 'mm',
+        'quaternion': ['qw', 'qx', 'qy', 'qz'], 'order': 'wxyz',
+    }  # fmt: skip
+    document = {
+        'schema': 'anser_import/1', 'tracked': [{**table, 'sensor': 'tip'}],
+        'poses': [{**table, 'body': 'marker'}],
+    }  # fmt: skip
+    path, out = tmp_path / 'tables.yaml', tmp_path / 'out.mcap'
+    path.write_text(yaml.safe_dump(document))
+    assert main(['import', str(path), '--out', str(out)]) == 0
+    assert '/tracked/tip/pose: 29 messages' in capsys.readouterr().out
+    session = read_pose_session(out)
+    np.testing.assert_allclose(session.sensors['tip'].position[4], [0.005, 0.0, 0.1])
+    np.testing.assert_allclose(session.reference.rotation[0], np.eye(3))
+    for change, said in (
+        ({'tracked': []}, 'needs fluxes'),
+        ({'setup': 'board.yaml'}, 'tracked poses have none'),
+        ({'tracked': [table]}, 'tracked[0] lacks sensor'),
+    ):
+        path.write_text(yaml.safe_dump({**document, **change}))
+        assert main(['import', str(path), '--out', str(tmp_path / 'not.mcap')]) == 2
+        assert said in capsys.readouterr().err
+        assert not (tmp_path / 'not.mcap').exists()

@@ -174,3 +174,20 @@ def test_a_bag_keeps_poses_and_what_was_missing(tmp_path, capsys):
     assert only.reference.size == 1
     with pytest.raises(BagError, match='/tracked/sensor_0/pose'):
         read_pose_session(bag, {'tip': '/nothing'})
+
+
+def test_sensors_have_the_names_that_they_are_given(tmp_path, capsys):
+    path = tool_tracker(tmp_path / 'a.tsv', [(cell(n), cell(n)) for n in (8, 16)])
+    command = ['--name', 'port_10=tip', '--out', str(tmp_path / 'out.mcap')]
+    assert run_verb('import_poses', [str(path), *command]) == 0
+    assert set(read_pose_session(tmp_path / 'out.mcap').sensors) == {'tip', 'port_11'}
+    capsys.readouterr()
+    for name, said in (
+        ('port_12=tip', 'no sensor port_12; there are: port_10, port_11'),
+        ('port_10=port_11', 'must differ in name'),
+        ('port_10', 'takes FOUND=NEW'),
+        ('port_10=a b', 'words joined by /'),
+    ):
+        command = ['--name', name, '--out', str(tmp_path / 'other.mcap')]
+        assert run_verb('import_poses', [str(path), *command]) == 2
+        assert said in capsys.readouterr().err

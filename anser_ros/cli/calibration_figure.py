@@ -27,8 +27,7 @@ def draw_choice(calibration: Calibration, path: Path) -> None:
     left.set(xlabel='dipoles', ylabel='predictive error of held-out blocks, pT', yscale='log')
     for candidate in sorted(calibration.candidates, key=lambda c: c.score)[:6]:
         damping, score = zip(*candidate.curve, strict=True)
-        words = candidate.layout.describe().split(', pulled')[0]
-        right.plot(damping, [1e12 * s for s in score], '.-', label=words)
+        right.plot(damping, [1e12 * s for s in score], '.-', label=candidate.layout.describe())
     right.set(xlabel='damping', xscale='log', yscale='log')
     for panel in (left, right):
         panel.grid(alpha=0.3)

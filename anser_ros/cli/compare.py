@@ -1,7 +1,9 @@
-"""Compare two evaluations of one session, frame by frame, with bootstrap intervals."""
+"""Compare two evaluations of one session: errors frame by frame, and how often there is a pose."""
 
 import argparse
 import json
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,13 +17,23 @@ matplotlib.use('Agg')
 import matplotlib.pyplot as plt
 
 from anser_ros.cli.output import make_folder, say_written
-from anser_ros.sessions.comparison import Compared, compare_errors, read_errors
+from anser_ros.sessions.comparison import (
+    Compared,
+    ComparedShares,
+    compare_errors,
+    compare_shares,
+    read_errors,
+    read_states,
+)
 
 SCHEMA = 'anser_comparison/1'
 SEED = 1
 """Seed of the resamples, so that the same folders give the same intervals."""
 KINDS = (('position', 1e3, 'mm'), ('orientation', 57.29578, 'deg'))
 """What is compared, with the factor to the unit that is shown."""
+
+
+WORDS = {'a': 'first', 'b': 'second', 'neither': '-'}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,59 +57,100 @@ def run(args: argparse.Namespace) -> int:
         one, two = read_errors(args.first), read_errors(args.second)
         rng = np.random.default_rng(SEED)
         found = {kind: compare_errors(one[kind], two[kind], rng) for kind, _, _ in KINDS}
+        shares = compare_shares(read_states(args.first), read_states(args.second), rng)
+    everything: dict[str, Mapping[str, Compared | ComparedShares]] = {**found, 'coverage': shares}
     document: dict[str, Any] = {
         'schema': SCHEMA, 'first': str(args.first), 'second': str(args.second),
-        **{kind: {name: _plain(c) for name, c in found[kind].items()} for kind in found},
+        **{kind: {name: _plain(c) for name, c in all_of.items()}
+           for kind, all_of in everything.items()},
     }  # fmt: skip
     text = json.dumps(document, indent=1)
     if args.out is not None:
         (args.out / 'comparison.json').write_text(text + '\n', encoding='utf-8')
-        draw(found, args.out / 'comparison.png')
+        draw(found, shares, args.out / 'comparison.png')
     if args.json:
         print(text)
         return 0
     for kind, scale, unit in KINDS:
-        Console().print(_table(found[kind], f'{kind}, {unit}', scale))
+        Console().print(_errors(found[kind], f'{kind} error, RMSE, {unit}', scale))
+    Console().print(_shares(shares))
+    print(verdict(everything))
     if args.out is not None:
         say_written(args.out / 'comparison.json', args.out / 'comparison.png')
     return 0
 
 
-def _plain(one: Compared) -> dict[str, Any]:
+def _plain(one: Compared | ComparedShares) -> dict[str, Any]:
     """Plain data; null where there is no number."""
     values = {key: None if value != value else value for key, value in asdict(one).items()}
     return {**values, 'better': one.verdict}
 
 
-def _table(found: dict[str, Compared], title: str, scale: float) -> Table:
-    table = Table(
-        'name', 'pairs', 'only first', 'only second', 'first', 'second', 'second - first, 95 %',
-        'better', title=title,
-    )  # fmt: skip
-    words = {'a': 'first', 'b': 'second', 'neither': '-'}
+def verdict(found: Mapping[str, Mapping[str, Compared | ComparedShares]]) -> str:
+    """Say in a line for how many coils and bodies each is better, in error and in coverage."""
+    words = {'position': 'position error', 'orientation': 'orientation error',
+             'coverage': 'frames with a pose'}  # fmt: skip
+    parts = []
+    for kind, all_of in found.items():
+        count = Counter(one.verdict for one in all_of.values())
+        said = [f'{WORDS[key]} better for {count[key]}' for key in 'ab' if count[key]]
+        parts.append(f'{words[kind]}: {", ".join(said) or "no difference"} of {len(all_of)}')
+    return '; '.join(parts) + '. Errors are those of frames in which both have a pose.'
+
+
+def _errors(found: Mapping[str, Compared], title: str, scale: float) -> Table:
+    """One table of at most 80 columns."""
+    table = Table('name', 'pairs', 'first', 'second', 'difference, 95 %', 'better', title=title)
     for name, one in found.items():
-        low, high = scale * one.low, scale * one.high
-        interval = '-' if np.isnan(low) else f'{low:+.4f} .. {high:+.4f}'
-        roots = [f'{scale * value:.4f}' for value in (one.rmse_a, one.rmse_b)]
-        counts = [str(value) for value in (one.n, one.only_a, one.only_b)]
-        table.add_row(name, *counts, *roots, interval, words[one.verdict])
+        cells = [f'{scale * value:.4f}' for value in (one.rmse_a, one.rmse_b)]
+        table.add_row(name, str(one.n), *cells, _interval(one, scale, 4), WORDS[one.verdict])
     return table
 
 
-def draw(found: dict[str, dict[str, Compared]], path: Path) -> None:
-    """Draw the difference of each name's errors with its interval; left of zero is better."""
-    names = list(found['position'])
+def _shares(found: Mapping[str, ComparedShares]) -> Table:
+    heads = 'name', 'frames', 'first', 'second', 'difference, 95 %', 'better'
+    table = Table(*heads, title='frames with a pose, %')
+    for name, one in found.items():
+        cells = [f'{100 * value:.2f}' for value in (one.share_a, one.share_b)]
+        table.add_row(name, str(one.n), *cells, _interval(one, 100.0, 2), WORDS[one.verdict])
+    return table
+
+
+def _interval(one: Compared | ComparedShares, scale: float, digits: int) -> str:
+    if np.isnan(one.low):
+        return '-'
+    return f'{scale * one.low:+.{digits}f} .. {scale * one.high:+.{digits}f}'
+
+
+def draw(
+    found: Mapping[str, Mapping[str, Compared]],
+    shares: Mapping[str, ComparedShares],
+    path: Path,
+) -> None:
+    """Draw the differences of each name's errors and shares of poses with their intervals.
+
+    Left of zero the second is better in its errors, and right of it in its poses.
+    """
+    names = list(shares)
     figure, panels = plt.subplots(
-        1, 2, figsize=(9, 1.4 + 0.3 * len(names)), layout='constrained', sharey=True
+        1, 3, figsize=(12, 1.4 + 0.3 * len(names)), layout='constrained', sharey=True
     )
-    for panel, (kind, scale, unit) in zip(panels, KINDS, strict=True):
-        for row, one in enumerate(found[kind].values()):
-            middle = scale * (one.rmse_b - one.rmse_a)
-            panel.plot(middle, row, 'o', color='C0')
+    drawn: list[tuple[Mapping[str, Any], float, str]] = [
+        (found[kind], scale, f'{kind} RMSE, second - first, {unit}') for kind, scale, unit in KINDS
+    ]
+    drawn.append((shares, 100.0, 'frames with a pose, second - first, %'))
+    for panel, (all_of, scale, label) in zip(panels, drawn, strict=True):
+        for name, one in all_of.items():
+            row, pair = names.index(name), asdict(one)
+            first, second = (
+                (pair['rmse_a'], pair['rmse_b']) if 'rmse_a' in pair
+                else (pair['share_a'], pair['share_b'])
+            )  # fmt: skip
+            panel.plot(scale * (second - first), row, 'o', color='C0')
             if np.isfinite(one.low):
                 panel.hlines(row, scale * one.low, scale * one.high, color='C0')
         panel.axvline(0.0, color='0.5')
-        panel.set_xlabel(f'{kind} RMSE, second - first, {unit}')
+        panel.set_xlabel(label)
         panel.grid(alpha=0.3, axis='x')
         panel.locator_params(axis='x', nbins=5)
         panel.set_ylim(len(names) - 0.5, -0.5)

@@ -20,7 +20,9 @@ from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.evaluation_document import to_document
 from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.pose_table import (
+    BODIES_FILE,
     ERRORS_FILE,
+    POSES_FILE,
     write_body_poses,
     write_errors,
     write_poses,
@@ -29,7 +31,7 @@ from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.tracking.estimate import TrackerSettings
 
-FILES = ('evaluation.json', 'poses.csv', 'bodies.csv', ERRORS_FILE)
+FILES = ('evaluation.json', POSES_FILE, BODIES_FILE, ERRORS_FILE)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -144,8 +146,8 @@ def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result
     document = to_document(evaluation)
     text = json.dumps(document, indent=1)
     (args.out / 'evaluation.json').write_text(text + '\n', encoding='utf-8')
-    write_poses(args.out / 'poses.csv', evaluation)
-    write_body_poses(args.out / 'bodies.csv', evaluation)
+    write_poses(args.out / POSES_FILE, evaluation)
+    write_body_poses(args.out / BODIES_FILE, evaluation)
     write_errors(args.out / ERRORS_FILE, evaluation)
     written = [args.out / name for name in FILES]
     written += write_figures(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.output import check_new_file, say_written
 from anser_ros.errors import ParameterError
 from anser_ros.sessions.bag_import import import_bag, parse_remaps
 from anser_ros.sessions.table_import import import_tables
@@ -47,16 +47,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
-    make_folder(args.out.parent)
+    check_new_file(args.out)
     is_document = args.source.suffix in DOCUMENTS
     if is_document and (args.remap or args.setup is not None):
         raise ParameterError('--remap and --setup are for bags; the document tells its setup')
     lost, left_out = '', {}
     with Console(stderr=True).status(f'reading {args.source}'):
         if is_document:
-            tables = import_tables(args.source, args.out)
-            counts = {f'/anser/{topic}/flux': n for topic, n in tables.fluxes.items()}
-            counts |= {f'/optical/{body}/pose': n for body, n in tables.poses.items()}
+            counts = import_tables(args.source, args.out).messages
         else:
             setup = '' if args.setup is None else args.setup.read_text(encoding='utf-8')
             bag = import_bag(args.source, args.out, parse_remaps(args.remap), setup)

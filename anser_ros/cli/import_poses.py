@@ -3,10 +3,12 @@
 import argparse
 from pathlib import Path
 
-from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.output import check_new_file, say_written
+from anser_ros.errors import ParameterError
 from anser_ros.poses.forms import ORDERS, UNITS
 from anser_ros.poses.importing import STAMPS, import_poses
 from anser_ros.poses.recording import write_pose_session
+from anser_ros.wire.setup_values import read_name
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,18 +40,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--quaternion', choices=list(ORDERS), help='how the tracked ones are written'
     )
+    parser.add_argument(
+        '--name',
+        action='append',
+        default=[],
+        metavar='FOUND=NEW',
+        help='another name for a sensor than that of its file or port; may be repeated',
+    )
+
+
+def parse_name(text: str) -> tuple[str, str]:
+    """A sensor's name as it is found, and the one that it shall have."""
+    found, _, new = text.partition('=')
+    if not found or not new:
+        raise ParameterError(f'--name takes FOUND=NEW, got {text!r}')
+    return found, read_name(new, '--name')
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
+    names = [parse_name(text) for text in args.name]
+    check_new_file(args.out)
     session = import_poses(
         args.tracked,
         args.reference,
         stamps=args.stamps,
         unit=args.unit,
         quaternion=args.quaternion,
+        names=dict(names),
     )
-    make_folder(args.out.parent)
     write_pose_session(args.out, session)
     sequences = [*session.sensors.values(), *filter(None, [session.reference])]
     for poses in sequences:

@@ -29,6 +29,13 @@ def check_file(path: Path) -> None:
         raise ParameterError(f'no permission to write {path}')
 
 
+def check_new_file(path: Path) -> None:
+    """As `check_file`, for a file that must not be there yet, as a bag must not."""
+    if path.exists():
+        raise ParameterError(f'{path}: is there already')
+    make_folder(path.parent)
+
+
 @dataclass(frozen=True)
 class Result:
     """What a command has found out about a session, and how it says so.

@@ -33,6 +33,7 @@ def import_poses(
     stamps: str = 'host',
     unit: str | None = None,
     quaternion: str | None = None,
+    names: Mapping[str, str] | None = None,
 ) -> PoseSession:
     """Read files of tracked poses, and of the reference's, as one session.
 
@@ -46,10 +47,14 @@ def import_poses(
     quaternion : str, optional
         How the tracked quaternions are written where it is not as usual in their form (`ORDERS`).
 
+    names : mapping, optional
+        What sensors shall be called, by the names that the files give them.
+
     Raises
     ------
     ParameterError
-        When a file has no known form, an option no known value, or numbers of files differ.
+        When a file has no known form, an option no known value, numbers of files differ, or
+        names fit no sensor or become the same.
     PlausibilityError
         When quaternions are not of unit length.
     """
@@ -78,7 +83,20 @@ def import_poses(
             pieces.append((label, time - begin, position, turn))
         if own:
             free = max(float(np.nanmax(p[1])) for p in pieces) + BETWEEN_FILES_S
-    return _session(str(tracked[0]), pieces)
+    return _session(str(tracked[0]), _renamed(pieces, names or {}))
+
+
+def _renamed(
+    pieces: Sequence[tuple[str, Array, Array, Array]], names: Mapping[str, str]
+) -> list[tuple[str, Array, Array, Array]]:
+    found = list(dict.fromkeys(piece[0] for piece in pieces if piece[0] != 'optical'))
+    unknown = sorted(set(names) - set(found))
+    if unknown:
+        raise ParameterError(f'no sensor {", ".join(unknown)}; there are: {", ".join(found)}')
+    called = [names.get(name, name) for name in found]
+    if len(set(called)) < len(called) or 'optical' in called:
+        raise ParameterError(f'sensors must differ in name, and from optical: {", ".join(called)}')
+    return [(names.get(piece[0], piece[0]), *piece[1:]) for piece in pieces]
 
 
 def _begin(label: str, times: Mapping[str, tuple[Array, bool]]) -> float:

@@ -11,16 +11,17 @@ from anser_ros.errors import BagError
 from anser_ros.poses.sequence import PoseSequence, PoseSession, sequence_of
 from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages, stamp_ns
 from anser_ros.wire.bag_writer import SessionWriter
-from anser_ros.wire.setup import topic_of
+from anser_ros.wire.pose_topics import (
+    ENDING,
+    OPTICAL,
+    TRACKED,
+    optical_topic,
+    pose_setup,
+    tracked_topic,
+)
 
 Array = NDArray[np.float64]
 
-TRACKED, OPTICAL = '/tracked/', '/optical/'
-"""What the topics of tracked and of optical poses begin with."""
-ENDING = '/pose'
-"""What the topics of poses end with."""
-SCHEMA = 'anser_poses/1'
-"""Schema of the setup document of a session of poses."""
 NANO = 1e-9  # s in a nanosecond
 
 
@@ -98,9 +99,9 @@ def write_pose_session(path: Path, session: PoseSession, body: str = 'body') -> 
     BagError
         When the file exists already.
     """
-    sequences = [(f'{TRACKED}{topic_of(n)}{ENDING}', s) for n, s in session.sensors.items()]
+    sequences = [(tracked_topic(n), s) for n, s in session.sensors.items()]
     if session.reference is not None:
-        sequences.append((f'{OPTICAL}{topic_of(body)}{ENDING}', session.reference))
+        sequences.append((optical_topic(body), session.reference))
     messages: list[tuple[int, str, list[float], list[float]]] = []
     for topic, poses in sequences:
         stamp = session.start_ns + np.round(poses.time / NANO).astype(np.int64)
@@ -114,9 +115,8 @@ def write_pose_session(path: Path, session: PoseSession, body: str = 'body') -> 
         for late in (session.start_ns + np.round(poses.missing / NANO).astype(np.int64)).tolist():
             messages.append((late, topic, [np.nan] * 3, [np.nan] * 4))
     messages.sort(key=lambda message: message[0])
-    names = ', '.join(session.sensors)
     with SessionWriter(path, frame_id='tracker') as writer:
-        setup = f'schema: {SCHEMA}\nsensors: [{names}]\nbody: {body}\n'
+        setup = pose_setup(session.sensors, body)
         writer.write_setup(setup, messages[0][0] if messages else session.start_ns)
         for stamp_of, topic, position, quaternion in messages:
             writer.write_pose(topic, stamp_of, position, quaternion)

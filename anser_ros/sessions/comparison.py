@@ -1,10 +1,11 @@
-"""Two evaluations of the same frames compared: the difference of their errors, with an interval.
+"""Two evaluations of the same frames compared: errors and shares with a pose, with intervals.
 
 Frames of one moment share what made their errors, so whole stretches of time are resampled (the
 moving-block idea of Künsch, Annals of Statistics 17, 1989), all coils of a stretch together.
 """
 
 import csv
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError
-from anser_ros.sessions.pose_table import ERROR_COLUMNS, ERRORS_FILE
+from anser_ros.sessions.pose_table import (
+    BODIES_FILE,
+    BODY_COLUMNS,
+    ERROR_COLUMNS,
+    ERRORS_FILE,
+    POSE_COLUMNS,
+    POSES_FILE,
+)
+from anser_ros.tracking.estimate import OK
 
 Array = NDArray[np.float64]
 Key = tuple[int, str]
@@ -28,7 +37,26 @@ FEWEST_BLOCKS = 5
 
 
 @dataclass(frozen=True)
-class Compared:
+class Difference:
+    """The interval of a difference, second less first, and which side of zero it is on.
+
+    Attributes
+    ----------
+    low, high : float
+        NaN where the stretches are too few.
+    """
+
+    low: float
+    high: float
+
+    @property
+    def sign(self) -> int:
+        """-1 or 1 where the whole interval is below or above zero, else 0."""
+        return int(self.low > 0) - int(self.high < 0)
+
+
+@dataclass(frozen=True)
+class Compared(Difference):
     """The errors of one coil or body, or of all coils, in the frames that both have.
 
     Attributes
@@ -39,8 +67,6 @@ class Compared:
         Frames that only one of them has a pose for.
     rmse_a, rmse_b : float
         Root mean square of the errors, m or rad.
-    low, high : float
-        Interval of the difference ``rmse_b - rmse_a``; NaN where the stretches are too few.
     """
 
     n: int
@@ -48,15 +74,33 @@ class Compared:
     only_b: int
     rmse_a: float
     rmse_b: float
-    low: float
-    high: float
 
     @property
     def verdict(self) -> str:
-        """Which is better: ``a``, ``b``, or neither, where the interval has room for none."""
-        if np.isfinite(self.low) and self.low > 0:
-            return 'a'
-        return 'b' if np.isfinite(self.high) and self.high < 0 else 'neither'
+        """Which errs less: ``a``, ``b``, or ``neither``, where the interval has room for both."""
+        return {1: 'a', 0: 'neither', -1: 'b'}[self.sign]
+
+
+@dataclass(frozen=True)
+class ComparedShares(Difference):
+    """The shares of frames with a pose, of one coil or body, of the frames that both know.
+
+    Attributes
+    ----------
+    n : int
+        Frames.
+    share_a, share_b : float
+        Shares of them with a pose, 0 to 1.
+    """
+
+    n: int
+    share_a: float
+    share_b: float
+
+    @property
+    def verdict(self) -> str:
+        """Which has poses more often: ``a``, ``b``, or ``neither``."""
+        return {1: 'b', 0: 'neither', -1: 'a'}[self.sign]
 
 
 def read_errors(folder: Path) -> dict[str, dict[Key, float]]:
@@ -67,22 +111,53 @@ def read_errors(folder: Path) -> dict[str, dict[Key, float]]:
     ParameterError
         When the folder has none, or the table is not one of ours.
     """
-    path = folder / ERRORS_FILE
-    if not path.is_file():
-        raise ParameterError(f'{folder}: no {ERRORS_FILE}; is it a folder of anser evaluate?')
     found: dict[str, dict[Key, float]] = {'position': {}, 'orientation': {}}
+
+    def take(row: dict[str, str]) -> None:
+        key = int(row['stamp_ns']), row['name']
+        for kind, unit in (('position', 'm'), ('orientation', 'rad')):
+            found[kind][key] = float(row[f'{kind}_error_{unit}'])
+
+    _each_row(folder, ERRORS_FILE, ERROR_COLUMNS, take)
+    return found
+
+
+def read_states(folder: Path) -> dict[Key, float]:
+    """Whether there is a pose, 1 or 0, by stamp and name of a coil or body.
+
+    Raises
+    ------
+    ParameterError
+        When the folder lacks a table, or one is not ours.
+    """
+    found: dict[Key, float] = {}
+
+    def take_as(column: str) -> Callable[[dict[str, str]], None]:
+        def take(row: dict[str, str]) -> None:
+            found[int(row['stamp_ns']), row[column]] = float(row['status'] == OK)
+
+        return take
+
+    _each_row(folder, POSES_FILE, POSE_COLUMNS, take_as('sensor'))
+    _each_row(folder, BODIES_FILE, BODY_COLUMNS, take_as('body'))
+    return found
+
+
+def _each_row(
+    folder: Path, name: str, columns: tuple[str, ...], take: Callable[[dict[str, str]], None]
+) -> None:
+    path = folder / name
+    if not path.is_file():
+        raise ParameterError(f'{folder}: no {name}; is it a folder of anser evaluate?')
     try:
         with path.open(encoding='utf-8', newline='') as stream:
             reader = csv.DictReader(stream)
-            if tuple(reader.fieldnames or ()) != ERROR_COLUMNS:
-                raise ValueError(f'columns must be {", ".join(ERROR_COLUMNS)}')
+            if tuple(reader.fieldnames or ()) != columns:
+                raise ValueError(f'columns must be {", ".join(columns)}')
             for row in reader:
-                key = int(row['stamp_ns']), row['name']
-                for kind, unit in (('position', 'm'), ('orientation', 'rad')):
-                    found[kind][key] = float(row[f'{kind}_error_{unit}'])
+                take(row)
     except (ValueError, TypeError) as error:
         raise ParameterError(f'{path}: {error}') from error
-    return found
 
 
 def compare_errors(
@@ -95,43 +170,73 @@ def compare_errors(
     ParameterError
         When no frame is in both.
     """
+    return {name: _compare(first, second, name, rng) for name in _names(first, second)}
+
+
+def compare_shares(
+    first: dict[Key, float], second: dict[Key, float], rng: np.random.Generator
+) -> dict[str, ComparedShares]:
+    """Compare how often two evaluations have a pose; states by stamp and name (`read_states`).
+
+    Raises
+    ------
+    ParameterError
+        When no frame is in both.
+    """
+    found = {}
+    for name in _names(first, second):
+        stamps, pairs = _paired(first, second, name)
+        low, high = _interval(stamps, pairs, rng, np.asarray)
+        shares = pairs.mean(axis=1) if stamps.size else np.full(2, np.nan)
+        found[name] = ComparedShares(low, high, stamps.size, float(shares[0]), float(shares[1]))
+    return found
+
+
+def _names(first: dict[Key, float], second: dict[Key, float]) -> list[str]:
     if not first.keys() & second.keys():
         raise ParameterError('the two have no frame in common: are they of the same session?')
-    names = list(dict.fromkeys(name for _, name in (*first, *second)))
-    return {name: _compare(first, second, name, rng) for name in names}
+    return list(dict.fromkeys(name for _, name in (*first, *second)))
+
+
+def _paired(
+    first: dict[Key, float], second: dict[Key, float], name: str
+) -> tuple[NDArray[np.int64], Array]:
+    """Stamps (n,) that both have of a name, and their values (2, n)."""
+    both = sorted(stamp for stamp, other in first if other == name and (stamp, name) in second)
+    pairs = [[values[stamp, name] for stamp in both] for values in (first, second)]
+    return np.array(both, dtype=np.int64), np.array(pairs).reshape(2, -1)
 
 
 def _compare(
     first: dict[Key, float], second: dict[Key, float], name: str, rng: np.random.Generator
 ) -> Compared:
-    one = {stamp for stamp, other in first if other == name}
-    two = {stamp for stamp, other in second if other == name}
-    both = np.array(sorted(one & two), dtype=np.int64)
-    squares = np.array(
-        [[errors[stamp, name] ** 2 for stamp in both.tolist()] for errors in (first, second)]
-    ).reshape(2, -1)
-    low, high = _interval(both, squares, rng)
-    root = np.sqrt(squares.mean(axis=1)) if both.size else np.full(2, np.nan)
+    one, two = (sum(other == name for _, other in errors) for errors in (first, second))
+    both, pairs = _paired(first, second, name)
+    low, high = _interval(both, pairs**2, rng, np.sqrt)
+    root = np.sqrt((pairs**2).mean(axis=1)) if both.size else np.full(2, np.nan)
     return Compared(
-        both.size, len(one - two), len(two - one), float(root[0]), float(root[1]), low, high
+        low, high, both.size, one - both.size, two - both.size, float(root[0]), float(root[1])
     )
 
 
 def _interval(
-    stamps: NDArray[np.int64], squares: Array, rng: np.random.Generator
+    stamps: NDArray[np.int64],
+    values: Array,
+    rng: np.random.Generator,
+    shown: Callable[[Array], Array],
 ) -> tuple[float, float]:
-    """The interval of the difference of the roots, by resampled stretches of time."""
+    """The interval of the difference of two means, as they are shown, by resampled stretches."""
     if not stamps.size:
         return np.nan, np.nan
     _, block = np.unique((stamps - stamps[0]) // BLOCK_NS, return_inverse=True)
     count = int(block.max()) + 1
     if count < FEWEST_BLOCKS:
         return np.nan, np.nan
-    sums = np.array([np.bincount(block, weights=row) for row in squares])
+    sums = np.array([np.bincount(block, weights=row) for row in values])
     sizes = np.bincount(block)
     drawn = rng.integers(0, count, size=(DRAWS, count))
     means = sums[:, drawn].sum(axis=2) / sizes[drawn].sum(axis=1)
-    difference = np.diff(np.sqrt(means), axis=0)[0]
+    difference = np.diff(shown(means), axis=0)[0]
     tail = 50.0 * (1.0 - SHARE)
     low, high = np.percentile(difference, (tail, 100.0 - tail))
     return float(low), float(high)

@@ -21,7 +21,7 @@ BODY_COLUMNS = (
     'residual_t', 'status',
 )  # fmt: skip
 """Columns of the bodies' table; the orientation is a quaternion."""
-ERRORS_FILE = 'errors.csv'
+POSES_FILE, BODIES_FILE, ERRORS_FILE = 'poses.csv', 'bodies.csv', 'errors.csv'
 ERROR_COLUMNS = ('stamp_ns', 'name', 'position_error_m', 'orientation_error_rad')
 """Columns of the table of errors, of coils and bodies."""
 

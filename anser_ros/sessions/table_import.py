@@ -1,9 +1,10 @@
-"""Tables of fluxes and optical poses made into a session, as a small document says.
+"""Tables of fluxes or tracked poses, and of optical poses, made into a session by a document.
 
 The document names the files, their columns, units, the order of quaternions and the time base;
 `docs/howto/import.md` has every key with examples.
 """
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,16 @@ from anser_ros.errors import ParameterError
 from anser_ros.sessions.tables import NumberTable, read_table
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import STALE, FluxPoints, encode_flux
+from anser_ros.wire.pose_topics import (
+    ENDING,
+    OPTICAL,
+    TRACKED,
+    optical_topic,
+    pose_setup,
+    tracked_topic,
+)
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup, parse_setup
+from anser_ros.wire.setup_values import read_name
 from anser_ros.wire.yaml_text import read_yaml
 
 SCHEMA = 'anser_import/1'
@@ -37,10 +47,9 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class ImportedTables:
-    """Number of flux frames by topic, and of poses by body, that were written."""
+    """Number of messages, by topic, that were written."""
 
-    fluxes: dict[str, int]
-    poses: dict[str, int]
+    messages: dict[str, int]
 
 
 def import_tables(document: Path, out: Path) -> ImportedTables:
@@ -73,14 +82,21 @@ class _Import:
     def __init__(self, spec: Mapping[str, Any], folder: Path) -> None:
         if spec.get('schema') != SCHEMA:
             raise ParameterError(f'schema must be {SCHEMA}, got {spec.get("schema")!r}')
-        _known(spec, ('schema', 'setup', 'time', 'fluxes', 'poses'), 'the document')
+        _known(spec, ('schema', 'setup', 'time', 'fluxes', 'tracked', 'poses'), 'the document')
         self._folder = folder
-        path = folder / str(_needed(spec, 'setup', 'the document'))
-        try:
-            self._setup_text = path.read_text(encoding='utf-8')
-        except (OSError, UnicodeDecodeError) as error:
-            raise ParameterError(f'setup {path}: {error}') from error
-        self._setup: Setup = parse_setup(self._setup_text)
+        tables = {key: _tables(spec, key) for key in ('fluxes', 'tracked', 'poses')}
+        if bool(tables['fluxes']) == bool(tables['tracked']):
+            raise ParameterError(
+                'needs fluxes (tables of a board with a setup), or tracked (tables of a tracker '
+                'that gives poses), one of the two'
+            )
+        self._setup: Setup | None = None
+        self._setup_text = ''
+        if tables['fluxes']:
+            self._setup_text = _text_of(folder / str(_needed(spec, 'setup', 'the document')))
+            self._setup = parse_setup(self._setup_text)
+        elif 'setup' in spec:
+            raise ParameterError('a setup describes fluxes; tracked poses have none')
         time = _mapping(spec.get('time', {}), 'time')
         _known(time, ('unit', 'start_ns'), 'time')
         self._time_ns = _choice(time, 'unit', TIME_NS, 's', 'time')
@@ -89,23 +105,33 @@ class _Import:
             raise ParameterError(f'time: start_ns must be a whole number, got {self._start_ns!r}')
         self._entries: list[tuple[int, Callable[[SessionWriter], None]]] = []
         self._tables: dict[Path, NumberTable] = {}
-        self._done: dict[str, dict[str, int]] = {'fluxes': {}, 'poses': {}}
-        fluxes, poses = spec.get('fluxes') or [], spec.get('poses') or []
-        if not isinstance(fluxes, list) or not fluxes:
-            raise ParameterError('fluxes must be a list of tables')
-        for number, entry in enumerate(fluxes):
-            self._add_fluxes(_mapping(entry, f'fluxes[{number}]'), f'fluxes[{number}]')
-        for number, entry in enumerate(poses):
-            self._add_poses(_mapping(entry, f'poses[{number}]'), f'poses[{number}]')
+        self._messages: Counter[str] = Counter()
+        for key, entries in tables.items():
+            for number, entry in enumerate(entries):
+                what = f'{key}[{number}]'
+                if key == 'fluxes':
+                    self._add_fluxes(_mapping(entry, what), what, self._setup)
+                else:
+                    self._add_poses(_mapping(entry, what), what, is_tracked=key == 'tracked')
+        if not self._entries:
+            raise ParameterError('the tables have not one whole row')
+        if self._setup is None:
+            names = {kind: self._names_of(kind) for kind in (TRACKED, OPTICAL)}
+            body = names[OPTICAL][0] if names[OPTICAL] else 'body'
+            self._setup_text = pose_setup(names[TRACKED], body)
+
+    def _names_of(self, kind: str) -> list[str]:
+        return [t[len(kind) : -len(ENDING)] for t in self._messages if t.startswith(kind)]
 
     def write(self, out: Path) -> ImportedTables:
         """Write all by its stamps."""
         self._entries.sort(key=lambda entry: entry[0])
-        with SessionWriter(out, self._setup.frame_id) as writer:
+        frame = 'tracker' if self._setup is None else self._setup.frame_id
+        with SessionWriter(out, frame) as writer:
             writer.write_setup(self._setup_text, self._entries[0][0])
             for _, put in self._entries:
                 put(writer)
-        return ImportedTables(self._done['fluxes'], self._done['poses'])
+        return ImportedTables(dict(self._messages))
 
     def _table(self, entry: Mapping[str, Any], what: str) -> NumberTable:
         path = self._folder / str(_needed(entry, 'file', what))
@@ -130,12 +156,13 @@ class _Import:
             raise ParameterError(f'{table.path}: the same stamp twice; is the unit of time right?')
         return stamps
 
-    def _add_fluxes(self, entry: Mapping[str, Any], what: str) -> None:
+    def _add_fluxes(self, entry: Mapping[str, Any], what: str, setup: Setup | None) -> None:
+        assert setup is not None
         _known(entry, ('file', 'stamp', 'unit', 'sensors', 'array'), what)
         table = self._table(entry, what)
         scale = _choice(entry, 'unit', FLUX_T, 'T', what)
         stamps = self._stamps(table, entry, what)
-        by_name = {sensor.name: sensor for sensor in self._setup.sensors}
+        by_name = {sensor.name: sensor for sensor in setup.sensors}
         given = _needed(entry, 'sensors', what)
         names = list(given)
         unknown = [name for name in names if name not in by_name]
@@ -143,7 +170,7 @@ class _Import:
             raise ParameterError(
                 f'{what}: the setup has no sensor {", ".join(map(str, unknown)) or "named here"}'
             )
-        emitters = len(self._setup.emitter.coils)
+        emitters = len(setup.emitter.coils)
         if 'array' in entry:
             flux = table.array(str(entry['array']))
             wanted = (len(stamps), len(names), emitters)
@@ -174,14 +201,15 @@ class _Import:
             flags = np.where(lacking, STALE, 0)
             points = FluxPoints(channel, flags, values, place, axis)
             self._entries.append((stamp, _flux_putter(f'/anser/{topic}/flux', stamp, points)))
-        done = self._done['fluxes']
-        done[topic] = done.get(topic, 0) + len(stamps)
+        self._messages[f'/anser/{topic}/flux'] += len(stamps)
 
-    def _add_poses(self, entry: Mapping[str, Any], what: str) -> None:
-        _known(entry, ('file', 'stamp', 'body', 'position', 'unit', 'quaternion', 'order'), what)
-        table, body = self._table(entry, what), str(_needed(entry, 'body', what))
-        if body not in self._setup.bodies:
-            raise ParameterError(f'{what}: the setup has no body {body}')
+    def _add_poses(self, entry: Mapping[str, Any], what: str, *, is_tracked: bool) -> None:
+        key = 'sensor' if is_tracked else 'body'
+        _known(entry, ('file', 'stamp', key, 'position', 'unit', 'quaternion', 'order'), what)
+        table, name = self._table(entry, what), read_name(_needed(entry, key, what), what)
+        if self._setup is not None and name not in self._setup.bodies:
+            raise ParameterError(f'{what}: the setup has no body {name}')
+        topic = tracked_topic(name) if is_tracked else optical_topic(name)
         scale = _choice(entry, 'unit', LENGTH_M, 'm', what)
         order = entry.get('order')
         if order not in ORDERS:
@@ -198,9 +226,9 @@ class _Import:
         if (np.abs(length[good] - 1.0) > UNIT_NORM).any():
             raise ParameterError(f'{table.path}: quaternions are not of unit length')
         for row in np.flatnonzero(good).tolist():
-            put = _pose_putter(body, stamps[row], position[row], quaternion[row] / length[row])
+            put = _pose_putter(topic, stamps[row], position[row], quaternion[row] / length[row])
             self._entries.append((stamps[row], put))
-        self._done['poses'][body] = self._done['poses'].get(body, 0) + int(good.sum())
+        self._messages[topic] += int(good.sum())
 
 
 def _flux_putter(topic: str, stamp: int, points: FluxPoints) -> Callable[[SessionWriter], None]:
@@ -212,10 +240,9 @@ def _flux_putter(topic: str, stamp: int, points: FluxPoints) -> Callable[[Sessio
 
 
 def _pose_putter(
-    body: str, stamp: int, position: Array, quaternion: Array
+    topic: str, stamp: int, position: Array, quaternion: Array
 ) -> Callable[[SessionWriter], None]:
     def put(writer: SessionWriter) -> None:
-        topic = f'/optical/{body}/pose'
         writer.write_pose(topic, stamp, position.tolist(), quaternion.tolist())
 
     return put
@@ -240,6 +267,20 @@ def _real(values: Array, table: NumberTable, name: str) -> Array:
     if values.dtype.kind not in 'fiu':
         raise ParameterError(f'{table.path}: {name} has cells that are no real numbers')
     return np.asarray(values, dtype=np.float64)
+
+
+def _tables(spec: Mapping[str, Any], key: str) -> list[Any]:
+    tables = spec.get(key) or []
+    if not isinstance(tables, list):
+        raise ParameterError(f'{key} must be a list of tables')
+    return tables
+
+
+def _text_of(path: Path) -> str:
+    try:
+        return path.read_text(encoding='utf-8')
+    except (OSError, UnicodeDecodeError) as error:
+        raise ParameterError(f'setup {path}: {error}') from error
 
 
 def _mapping(value: Any, what: str) -> Mapping[str, Any]:

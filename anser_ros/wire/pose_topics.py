@@ -1,0 +1,27 @@
+"""Topics of poses, and the setup document of a session that has nothing else."""
+
+from collections.abc import Iterable
+
+from anser_ros.wire.setup import topic_of
+
+TRACKED, OPTICAL = '/tracked/', '/optical/'
+"""What the topics of tracked and of optical poses begin with."""
+ENDING = '/pose'
+"""What the topics of poses end with."""
+SCHEMA = 'anser_poses/1'
+"""Schema of the setup document of a session of poses."""
+
+
+def tracked_topic(sensor: str) -> str:
+    """Topic of a sensor of a tracker that gives poses."""
+    return f'{TRACKED}{topic_of(sensor)}{ENDING}'
+
+
+def optical_topic(body: str) -> str:
+    """Topic of a body's optical poses."""
+    return f'{OPTICAL}{topic_of(body)}{ENDING}'
+
+
+def pose_setup(sensors: Iterable[str], body: str) -> str:
+    """The setup document of a session of poses, as text."""
+    return f'schema: {SCHEMA}\nsensors: [{", ".join(sensors)}]\nbody: {body}\n'
