@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = (
         'example: anser batch evaluate bags/moving.mcap bags/metal.mcap --model model.yaml '
-        '--out results/'
+        '--out results/ (made if missing)'
     )
     verbs = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
     for name in COMMANDS:

@@ -51,7 +51,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--setup', type=Path, metavar='FILE', help='setup document that the tip is written into'
     )
     parser.add_argument(
-        '--out', type=Path, help='folder for pivot.json, tips.yaml and report.html'
+        '--out',
+        type=Path,
+        help='folder for pivot.json, tips.yaml and report.html, made if missing',
     )
     limits = PivotLimits()
     parser.add_argument(
