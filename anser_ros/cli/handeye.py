@@ -62,7 +62,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--quaternion', choices=list(ORDERS), help='of files: how the tracked ones are written'
     )
     parser.add_argument(
-        '--out', type=Path, help='folder for handeye.yaml, handeye.json and report.html'
+        '--out',
+        type=Path,
+        help='folder for handeye.yaml, handeye.json and report.html, made if missing',
     )
     parser.add_argument('--json', action='store_true', help='print handeye.json on stdout')
 
