@@ -28,6 +28,7 @@ setup(
     name=PACKAGE,
     version=VERSION,
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
+    package_data={f'{PACKAGE}.web': ['*.js', '*.css']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
@@ -48,7 +49,10 @@ setup(
         'matplotlib>=3.8',
         'distributed>=2024.8',
     ],
-    extras_require={'docs': ['sphinx>=9', 'myst-parser>=5', 'furo>=2025.9']},
+    extras_require={
+        'dashboard': ['nicegui>=3.0', 'fastapi>=0.110', 'uvicorn>=0.30'],
+        'docs': ['sphinx>=9', 'myst-parser>=5', 'furo>=2025.9'],
+    },
     python_requires='>=3.11',
     zip_safe=True,
     maintainer='anser_ros maintainers',

@@ -36,6 +36,8 @@ ARGUMENTS = {
     'record': ('true', 'whether a bag is recorded'),
     'directory': ('recordings', 'folder of the bags'),
     'watch': ('false', 'whether effects that the model lacks are reported in /diagnostics'),
+    'dashboard': ('false', 'whether the live view is served to a browser on this machine'),
+    'dashboard_port': ('8642', 'TCP port of the live view'),
     'openigtlink': ('false', 'whether poses are served to 3D Slicer'),
     'igtl_host': ('127.0.0.1', 'address that OpenIGTLink is served on; 0.0.0.0 for all'),
     'igtl_port': ('18944', 'TCP port of OpenIGTLink'),
@@ -127,6 +129,13 @@ def generate_launch_description():
                         wanted('record'),
                         directory=value('directory'),
                         optical=value('optical'),
+                    ),
+                    process(
+                        'dashboard',
+                        wanted('dashboard'),
+                        directory=value('directory'),
+                        optical=value('optical'),
+                        port=value('dashboard_port'),
                     ),
                     process('watcher', wanted('watch'), optical=value('optical'), **model),
                     process(

@@ -40,8 +40,9 @@ STOP_TIMEOUT_S = 5.0
 
 # What was started since the last test ended; Python tells of each at the moment of its start.
 # What the libraries ask, once, about the machine does not count: the standard library `uname`,
-# numpy 1.26 `lscpu`, matplotlib for the list of fonts that it keeps `fc-list`.
-ASKED_BY_LIBRARIES = {'uname', 'lscpu', 'fc-list'}
+# numpy 1.26 `lscpu`, matplotlib for the list of fonts that it keeps `fc-list`,
+# what NiceGUI imports the linker's list of libraries.
+ASKED_BY_LIBRARIES = {'uname', 'lscpu', 'fc-list', '/sbin/ldconfig'}
 started: list[str] = []
 
 

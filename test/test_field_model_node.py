@@ -1,5 +1,8 @@
 """The node field_model over DDS: the model that it serves, and its services."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 from graph_bench import FIRST_NS, Bench, reference_specs
 from tracking_world import certain_model
@@ -86,6 +89,45 @@ def test_services_of_the_field_model(server, tmp_path):
     before = stamp_of(server.models[-1])
     assert call(server, Trigger, 'reset').success
     server.spin_until(lambda: stamp_of(server.models[-1]) > before)
+    assert server.node.counters['callback_faults'] == 0
+
+
+def test_another_model_while_it_runs(server, tmp_path):
+    """It is served, and followed with the baseline of before; one that does not fit is refused."""
+    from rclpy.parameter import Parameter
+    from std_srvs.srv import Trigger
+
+    from anser_ros.nodes.model_clouds import read_dipoles
+    from anser_ros.sessions.session import sensor_table
+
+    def give(name):
+        return server.node.set_parameters([Parameter('model_file', value=str(tmp_path / name))])[0]
+
+    model = certain_model()
+    save_model(tmp_path / 'better.yaml', replace(model, moments=1.01 * model.moments))
+    save_model(tmp_path / 'other.yaml', replace(model, emitters=tuple('abcdefgh')))
+    server.say_setup()
+    server.spin_until(lambda: len(server.models) == 1)
+    references = sensor_table(reference_specs())
+    clean = model.flux(references.position, references.axis)
+    for i in range(8):
+        points = server.points(clean, channels=references.channel)
+        server.reference.publish(server.cloud.message(points, FIRST_NS + i * 40_000_000))
+    server.spin_until(lambda: server.node.counters['frames'] == 8)
+    assert call(server, Trigger, 'set_baseline').success
+    before = len(server.models)
+    for name, why in (('other.yaml', 'emitters'), ('nowhere.yaml', 'nowhere.yaml')):
+        refused = give(name)
+        assert not refused.successful
+        assert why in refused.reason
+        assert server.node.parameters.model_file != str(tmp_path / name)
+    assert give('better.yaml').successful
+    server.spin_until(lambda: len(server.models) > before)
+    served = read_dipoles(server.models[-1])
+    np.testing.assert_allclose(served.moments, 1.01 * model.moments)
+    points = server.points(clean, channels=references.channel)
+    server.reference.publish(server.cloud.message(points, FIRST_NS + 400_000_000))
+    server.spin_until(lambda: server.node.counters['refits'] == 1)
     assert server.node.counters['callback_faults'] == 0
 
 

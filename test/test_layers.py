@@ -40,7 +40,8 @@ ALLOWED = {
     'api': CORE,
     '__init__.py': {'api', 'sessions', 'wire'},
     'cli': {*CORE, 'simulation', 'measured', 'experiments'},
-    'nodes': {*CORE, 'simulation'},
+    'web': {*CORE, 'cli'},
+    'nodes': {*CORE, 'simulation', 'web'},
 }  # fmt: skip
 # Libraries that only some places may know.
 ROOMS = {
@@ -55,6 +56,9 @@ ROOMS = {
     'matplotlib': ('diagnosis/', 'experiments/', 'cli/'),
     'distributed': ('cli/batch.py',),
     'magpylib': (),
+    'nicegui': ('web/',),
+    'fastapi': ('web/',),
+    'uvicorn': ('web/',),
 }
 
 

@@ -44,14 +44,29 @@ def imported():
     return found - set(sys.stdlib_module_names) - {'anser_ros'}
 
 
-def required():
-    """Return the distributions that `setup.py` asks for, in lower case."""
+def asked_for(keyword):
+    """Return what `setup.py` says under a keyword."""
     (call,) = (
         node
         for node in ast.walk(ast.parse((REPO / 'setup.py').read_text()))
-        if isinstance(node, ast.keyword) and node.arg == 'install_requires'
+        if isinstance(node, ast.keyword) and node.arg == keyword
     )
-    return {re.split('[<>=]', line)[0].lower() for line in ast.literal_eval(call.value)}
+    return ast.literal_eval(call.value)
+
+
+def names_of(lines):
+    """Return the distributions of requirements, in lower case."""
+    return {re.split('[<>=]', line)[0].lower() for line in lines}
+
+
+def required():
+    """Return the distributions that every installation needs."""
+    return names_of(asked_for('install_requires'))
+
+
+def optional():
+    """Return the distributions that the live view in the browser needs."""
+    return names_of(asked_for('extras_require')['dashboard'])
 
 
 def package(tag):
@@ -63,7 +78,7 @@ def test_every_import_is_asked_for_and_nothing_else():
     ros = {name for name in package('exec_depend') if not name.startswith('python3-')}
     known = packages_distributions()
     names = {name.lower() for module in imported() - ros for name in known.get(module, [module])}
-    assert names == required() - {SETUPTOOLS}
+    assert names == (required() | optional()) - {SETUPTOOLS}
     assert ros - OPTIONAL <= imported()
 
 
@@ -74,7 +89,8 @@ def test_package_xml_has_what_rosdep_knows():
 
 def test_what_rosdep_does_not_know_is_asked_for_where_it_is_needed(monkeypatch, capsys):
     """A package that only PyPI has is missing on an installation by rosdep alone."""
-    assert set(missing.PYPI.values()) == required() - set(ROSDEP) - {SETUPTOOLS}
+    needed = required() - set(ROSDEP) - {SETUPTOOLS}
+    assert needed <= set(missing.PYPI.values()) <= needed | optional()
     assert set(missing.NEEDED) <= set(NODES)
     assert {name for names in missing.NEEDED.values() for name in names} <= set(missing.PYPI)
     found = missing.find_spec
@@ -120,7 +136,7 @@ def test_the_pinned_environments_have_all_of_it(kind):
     text = (REPO / '.ci' / f'requirements-{kind}.txt').read_text().lower()
     pinned = set(re.findall('^([a-z0-9_-]+)==', text, re.MULTILINE))
     ros = {f'ros-{name.replace("_", "-")}' for name in package('exec_depend')}
-    missing = required() - pinned
+    missing = (required() | optional()) - pinned
     assert not missing
     ros -= {f'ros-{name.replace("_", "-")}' for name in OPTIONAL}
     assert {name for name in ros if not name.startswith('ros-python3-')} <= pinned

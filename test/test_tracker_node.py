@@ -101,6 +101,43 @@ def test_states_without_model_setup_or_data(tracker):
     tracker.spin_until(lambda: tracker.state('anser/tracker: tool_a') == 'stale')
 
 
+def test_another_model_while_it_runs(tracker, tmp_path):
+    """The effects of a model that is loaded are undone, and with the one of before no longer."""
+    from rclpy.parameter import Parameter
+
+    from anser_ros.field.model import EffectRecord
+    from anser_ros.sessions.model_file import save_model
+
+    def give(name):
+        return tracker.node.set_parameters([Parameter('model_file', value=name)])[0]
+
+    def place(gain=1.0):
+        tracker.poses.clear()
+        flux = fluxes(certain_model(), SENSORS, position, rotation, rng)
+        tracker.say_flux(np.vstack([gain * flux[:1], flux[1:]]))
+        tracker.spin_until(lambda: BODY in tracker.poses)
+        return SENSORS.name[0] in tracker.poses
+
+    rng = np.random.default_rng(5)
+    position, rotation = random_pose(rng)
+    record = EffectRecord(
+        'sensor_gain', {'channel': int(SENSORS.channel[0]), 'gain': 1.2, 'phase_deg': 0.0}
+    )
+    with_gain = replace(certain_model(), effects=(record,))
+    save_model(tmp_path / 'gain.yaml', with_gain)
+    ready(tracker)
+    assert place()
+    assert give(str(tmp_path / 'gain.yaml')).successful
+    assert tracker.node.status().values['corrected'] == 'sensor_gain (channel 0)'
+    assert place(1.2), 'with a fifth more of signal it is where it was'
+    assert give('').successful
+    assert not tracker.node.status().values['corrected']
+    refused = give(str(tmp_path / 'nowhere.yaml'))
+    assert not refused.successful
+    assert tracker.node.parameters.model_file == ''
+    assert tracker.node.counters['callback_faults'] == 0
+
+
 def test_the_gate_may_change_while_it_runs(tracker):
     from rclpy.parameter import Parameter
 

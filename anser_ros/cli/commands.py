@@ -17,6 +17,7 @@ NODES = {
     'cu_simulator': 'a control unit behind a pseudo-terminal',
     'corrector': 'corrects the poses of a tracker of poses by a model of diagnose --poses',
     'monitor': 'a live table of sensors, rates and latencies',
+    'dashboard': 'a live view in the browser, with the loop of record, diagnose and correct',
     'watcher': 'names live, in /diagnostics, what the model lacks',
 }
 

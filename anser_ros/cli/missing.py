@@ -9,9 +9,11 @@ PYPI = {
     'mcap': 'mcap',
     'mcap_ros2': 'mcap-ros2-support',
     'zstandard': 'zstandard',
+    'nicegui': 'nicegui',
 }
 """Modules without a key of rosdep, and what they are called on PyPI."""
 NEEDED = {
+    'dashboard': ('nicegui',),
     'recorder': ('mcap',),
     'replay': ('mcap', 'mcap_ros2', 'zstandard'),
 }

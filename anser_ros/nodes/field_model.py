@@ -45,10 +45,10 @@ from anser_ros.refit.change import MOST_RATE_HZ, Pace
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.result import RefitResult
 from anser_ros.sessions.baseline import board_place_of, check_clean, clean_flux
-from anser_ros.sessions.model_file import SNAPSHOT, as_saved, is_snapshot, load_model, save_model
+from anser_ros.sessions.model_file import SNAPSHOT, as_saved, is_snapshot, save_model
 from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session, sensor_table
-from anser_ros.sessions.starting_model import NOMINAL, is_nominal, starting_model
+from anser_ros.sessions.starting_model import NOMINAL, is_nominal, model_of, starting_model
 from anser_ros.wire.setup import Setup, parse_setup
 
 
@@ -57,7 +57,9 @@ class FieldModelParameters:
     """Parameters of the field model's server."""
 
     model_file: str = parameter(
-        NOMINAL, "model to start from: a file, or nominal for that of the setup's own geometry"
+        NOMINAL,
+        "model to start from: a file, or nominal for that of the setup's own geometry",
+        live=True,
     )
     allow_uncalibrated: bool = parameter(
         False, 'whether trackers may give poses by the nominal model', live=True
@@ -111,7 +113,7 @@ class FieldModelNode(AnserNode):
         super().__init__(**options)
         table = self.parameters
         self._stated = stated_by(table)
-        self._file_model = None if table.model_file == NOMINAL else load_model(table.model_file)
+        self._file_model = model_of(table.model_file)
         self._baseline_bag = load_session(table.baseline_file) if table.baseline_file else None
         self._setup_text = self._no_baseline = ''
         self._setup: Setup | None = None
@@ -121,6 +123,7 @@ class FieldModelNode(AnserNode):
         self._model: FieldModel | None = None
         self._refit: LiveRefit | None = None
         self._result: RefitResult | None = None
+        self._baseline: NDArray[np.complex128] | None = None
         self._frozen = self._unfit = False
         self._board_place: BoardPlace | None = None
         self._misplaced = ''
@@ -179,7 +182,7 @@ class FieldModelNode(AnserNode):
             return
         self._setup_text, self._setup = message.data, setup
         self._trouble.forget()
-        self._refit = self._result = None
+        self._refit = self._result = self._baseline = None
         self._references = sensor_table(setup.reference_sensors)
         self._frames = Intake(self._references.channel, self.count)
         self._window = ReadingWindow(
@@ -381,9 +384,37 @@ class FieldModelNode(AnserNode):
         self._refit, self._patches = start_refit(
             self._setup, self._base, self._references, baseline, tuple(self._patch_topics)
         )
+        self._baseline = baseline
         self._result, self._heard_s, self._no_baseline = None, time.monotonic(), ''
         self._tell_following()
         self.count('baselines')
+
+    def _exchange(self, file_model: FieldModel | None) -> None:
+        """Start from another model; the baseline holds, as no model is in the readings.
+
+        Raises
+        ------
+        ModelFileError, SetupError
+            When there is no such model for the setup.
+        """
+        setup, baseline, references = self._setup, self._baseline, self._references
+        base = file_model if setup is None else starting_model(setup, file_model)
+        started = None
+        if setup and base and baseline is not None and references is not None:
+            started = start_refit(setup, base, references, baseline, tuple(self._patch_topics))
+        self._file_model, self._base = file_model, base
+        if base is None:
+            return
+        if setup is not None and references is not None:
+            self._board_place = board_place_of(base, references, setup)
+        self._misplaced, self._has_looked = '', False
+        self._refit, self._patches = started or (None, None)
+        self._result, self._unfit, self._heard_s = None, False, time.monotonic()
+        self._trouble.forget()
+        self._writer.name_origin(base)
+        # As after a reset: it is no answer of the references.
+        state = REFERENCES_LOST if self._follows else ''
+        self._serve(base, self.get_clock().now().nanoseconds, state)
 
     # Services -----------------------------------------------------------------------------
 
@@ -432,7 +463,9 @@ class FieldModelNode(AnserNode):
         self.warn(counter, str(error))
 
     def on_parameters(self, old: FieldModelParameters, new: FieldModelParameters) -> None:
-        """Go on at the new rate, or no longer."""
+        """Go on with the new model, at the new rate, or no longer."""
+        if old.model_file != new.model_file:
+            self._exchange(model_of(new.model_file))
         self._pace.rate_hz = new.refit_rate_hz
         self._tell_following()
         if self._model is not None and old.allow_uncalibrated != new.allow_uncalibrated:

@@ -21,7 +21,7 @@ from anser_ros.wire.setup import parse_setup, topic_of
 
 TRACKER, FIELD_MODEL = 'tracker', 'field_model'
 # They take what there is, and nobody waits for them alone.
-PASSIVE = ('recorder', 'openigtlink', 'monitor', 'watcher')
+PASSIVE = ('recorder', 'openigtlink', 'monitor', 'watcher', 'dashboard')
 LOOK_S = 3.3
 """Least time to look for others: nodes that are not ours announce themselves a few times at their
 start and then every three seconds, and who joins in between does not know them before."""

@@ -59,6 +59,11 @@ class OpticalTrace:
             self.position.append(position)
             self.quaternion.append(turn)
 
+    def forget(self, but: int) -> None:
+        """Keep the last poses alone."""
+        for values in (self.stamp_s, self.position, self.quaternion):
+            del values[:-but]
+
     def track(self, since: int = 0) -> PoseTrack | None:
         """The poses from number `since` on, None when there are less than two."""
         if len(self.stamp_s) - since < 2:

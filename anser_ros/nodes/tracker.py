@@ -36,9 +36,8 @@ from anser_ros.nodes.pose_output import PoseTopic, transform_message, transform_
 from anser_ros.nodes.readiness import digest_of
 from anser_ros.nodes.stated_parameters import stated, stated_by
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import sensor_table
-from anser_ros.sessions.starting_model import NOMINAL, check_emitters
+from anser_ros.sessions.starting_model import check_emitters, model_of
 from anser_ros.sessions.tracker_settings import settings_for
 from anser_ros.tracking.estimate import OK, USUAL_GATE, TrackerSettings
 from anser_ros.tracking.tip import Tip
@@ -70,6 +69,7 @@ class TrackerParameters:
         '',
         'model whose effects apply, and its field until field_model speaks; empty or nominal for '
         'none',
+        live=True,
     )
     tips_file: str = parameter(
         '', "tips.yaml of pivot, or a setup document, whose tips go before the setup's own"
@@ -194,8 +194,7 @@ class TrackerNode(AnserNode):
         table = self.parameters
         self._settings = settings_of(table)
         self._stated = stated_by(table)
-        has_file = table.model_file not in ('', NOMINAL)
-        self._file_model = load_model(table.model_file) if has_file else None
+        self._file_model = model_of(table.model_file)
         self._file_tips = tips_of_file(table.tips_file)
         self._tips: dict[str, Tip] = {}
         self._setup_text = ''
@@ -427,10 +426,24 @@ class TrackerNode(AnserNode):
         self.warn(counter, str(error))
 
     def on_parameters(self, old: TrackerParameters, new: TrackerParameters) -> None:
-        """Track on with the new settings, from where the tools were."""
+        """Track on with the new settings or model, from where the tools were."""
+        if old.model_file != new.model_file:
+            self._exchange(model_of(new.model_file))
         self._settings = settings_of(new)
         if self._tracker is not None and self._setup is not None:
             self._tracker = self._tracker.with_settings(settings_for(self._setup, self._settings))
+
+    def _exchange(self, file_model: FieldModel | None) -> None:
+        """Undo the effects of another model; until that is served too, state other_model."""
+        setup = self._setup
+        if setup is not None and file_model is not None:
+            check_emitters(setup, file_model)
+        self._file_model = file_model
+        if setup is not None:
+            box = settings_for(setup, self._settings).box
+            allowed = self.parameters.allow_uncalibrated
+            self._in_force = ModelInForce(setup, box, file_model, allowed)
+            self._use_model()
 
     def status(self) -> Status:
         """Return what the tracker lacks, if anything, and its counters."""

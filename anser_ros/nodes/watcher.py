@@ -44,7 +44,9 @@ class WatcherParameters:
     """Parameters of the watcher."""
 
     model_file: str = parameter(
-        NOMINAL, "the tracker's model: a file, or nominal for that of the setup's own geometry"
+        NOMINAL,
+        "the tracker's model: a file, or nominal for that of the setup's own geometry",
+        live=True,
     )
     optical: str = optical_parameter()
     baseline_file: str = parameter(
@@ -91,7 +93,7 @@ class Watcher(AnserNode):
         table = self.parameters
         self._stated = stated_by(table)
         self._baseline_bag = load_session(table.baseline_file) if table.baseline_file else None
-        self._setup_text = ''
+        self._setup_text = self._offered = ''
         self._window: SlidingWindow | None = None
         self._watch: Watch | None = None
         self._sighting: Sighting | None = None
@@ -120,16 +122,31 @@ class Watcher(AnserNode):
     def _on_setup(self, message: String) -> None:
         if message.data == self._setup_text:
             return
+        self._offered = message.data
         try:
-            setup = parse_setup(message.data).with_stated(self._stated)
-            # An empty window has a session's setup already, and a model must fit that.
-            empty = empty_session(setup, LIVE)
-            model = model_for(self.parameters.model_file, empty)
-            prepared = prepare(empty, model, self._baseline_bag)
+            self._begin(message.data)
         except AnserError as error:
             self._refuse('setups_refused', error)
-            return
-        self._setup_text, self._trouble = message.data, ''
+
+    def on_parameters(self, old: WatcherParameters, new: WatcherParameters) -> None:
+        """Begin anew with another model."""
+        if old.model_file != new.model_file and self._offered:
+            self._begin(self._offered)
+
+    def _begin(self, text: str) -> None:
+        """Watch what a setup's fluxes say, from an empty window on.
+
+        Raises
+        ------
+        AnserError
+            When the setup is none, or model or baseline do not fit it.
+        """
+        setup = parse_setup(text).with_stated(self._stated)
+        # An empty window has a session's setup already, and a model must fit that.
+        empty = empty_session(setup, LIVE)
+        model = model_for(self.parameters.model_file, empty)
+        prepared = prepare(empty, model, self._baseline_bag)
+        self._setup_text, self._trouble = text, ''
         self._window = SlidingWindow(setup, self.parameters.window_s, self.parameters.frames)
         self._watch = Watch(prepared)
         self._sighting, self._known = None, {}

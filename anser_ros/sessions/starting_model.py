@@ -33,6 +33,17 @@ def board_of(setup: Setup) -> Board:
     )
 
 
+def model_of(name: str) -> FieldModel | None:
+    """The model of a file, None for an empty name and for that of the setup's own geometry.
+
+    Raises
+    ------
+    ModelFileError
+        When the file is no model, or a snapshot of a refit.
+    """
+    return None if name in ('', NOMINAL) else load_model(name)
+
+
 def starting_model(setup: Setup, given: FieldModel | None) -> FieldModel:
     """The model to start from live: the given one, or the nominal one of the setup's geometry.
 

@@ -1,0 +1,102 @@
+"""A live view in the browser: scene, states, curves, and the loop of diagnosis and correction."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from std_msgs.msg import String
+
+from anser_ros.nodes import qos
+from anser_ros.nodes.chain_client import ChainClient
+from anser_ros.nodes.live_view import LiveView
+from anser_ros.nodes.node import AnserNode, Level, Status, main
+from anser_ros.nodes.parameters import parameter
+from anser_ros.nodes.polled import polling_node
+from anser_ros.nodes.shared_names import optical_parameter
+from anser_ros.nodes.view_source import ViewSource
+
+
+@dataclass(frozen=True)
+class DashboardParameters:
+    """Parameters of the live view."""
+
+    host: str = parameter(
+        '127.0.0.1', 'address that the page is served on; any but this machine needs a token'
+    )
+    port: int = parameter(
+        8642, 'TCP port of the page; 0 for any that is free', minimum=0, maximum=65535
+    )
+    token_file: str = parameter(
+        '', 'file with the token that browsers have to know; empty: a new one, printed at the '
+        'start, where other machines can reach the page',
+    )  # fmt: skip
+    directory: str = parameter(
+        'recordings', "the recorder's folder; all that the page reads and writes lies in it"
+    )
+    optical: str = optical_parameter()
+
+
+class Dashboard(AnserNode):
+    """Serves the page. It only listens; what is clicked goes to services and to commands."""
+
+    NAME = 'dashboard'
+    PARAMETERS = DashboardParameters
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        # Loaded here, for the help of the node must not need what may be missing.
+        from anser_ros.web.folder import RecordingFolder
+        from anser_ros.web.loop import CorrectionLoop
+        from anser_ros.web.page import Pages
+        from anser_ros.web.server import PageServer, token_for
+
+        table = self.parameters
+        space = self.get_namespace()
+        self._streams = polling_node(f'{self.get_name()}_streams', space)
+        self._client = ChainClient(self, self._view, self._mark)
+        self._source = ViewSource(
+            self._streams, table.optical, self._refuse, self._client.is_there
+        )
+        self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
+        folder = RecordingFolder(Path(table.directory))
+        self._loop = CorrectionLoop(self._client, folder)
+        self._pages = Pages(self._source, self._loop, self._guard)
+        self._pages.register()
+        token = token_for(table.host, table.token_file)
+        self._server = PageServer(table.host, table.port, token, folder)
+        self._server.start()
+        # Not in the log, which goes out on the graph: the address has the token in it.
+        print(f'live view: {self._server.url}', flush=True)
+
+    def _on_setup(self, message: String) -> None:
+        self._source.setup_text = message.data
+
+    def _view(self) -> LiveView | None:
+        return self._source.view
+
+    def _mark(self, words: str) -> None:
+        self._source.mark(words)
+
+    def _refuse(self, words: str) -> None:
+        self.warn('messages_refused', words)
+
+    def status(self) -> Status:
+        """Return how many pages look on."""
+        job = self._loop.job
+        values = {
+            'pages': self._server.guard.pages,
+            'command': '' if job is None else job.kind,
+            'last_trouble': self._loop.said if self._loop.is_trouble else '',
+        }
+        return Status('', Level.OK, f'{self._pages.count} pages open', values)
+
+    def close(self) -> None:
+        """End the page, and a command that runs."""
+        self._loop.cancel()
+        self._server.end()
+        self._streams.destroy_node()
+
+
+if __name__ == '__main__':
+    sys.exit(main(Dashboard))

@@ -1,0 +1,1 @@
+"""The live view's page in the browser, without ROS: layout, jobs, files, who may look."""

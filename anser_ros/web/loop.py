@@ -1,0 +1,318 @@
+"""The loop that a person closes on the page: record, diagnose, load the better model, or undo."""
+
+import asyncio
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from anser_ros.cli.diagnosis_words import verdict
+from anser_ros.errors import AnserError, ParameterError
+from anser_ros.web.folder import RecordingFolder
+from anser_ros.web.job import Job
+
+CALIBRATE, DIAGNOSE = 'calibrate', 'diagnose'
+NOMINAL = 'nominal'
+SETTLING_S = 2.0
+"""Time, s, after a change of the model that the figures after it leave out: warm starts and
+averages of before have their end in it."""
+MOST_UNDONE = 20
+"""Changes of the model that can be undone."""
+
+
+class Chain(Protocol):
+    """What the page can ask of the running nodes."""
+
+    async def trigger(self, service: str) -> str:
+        """Call a service and return its answer; AnserError where it refuses."""
+
+    async def model_files(self) -> dict[str, str]:
+        """The model file of each node that has one, ``field_model`` first."""
+
+    async def load_model(self, files: Mapping[str, str]) -> None:
+        """Give nodes other model files; AnserError where one refuses."""
+
+    async def baseline_file(self) -> str:
+        """The recording without metal that the nodes were started with; empty for none."""
+
+    def figures(self, since_s: float) -> dict[str, float | None]:
+        """How well it goes: ``tracked``, ``error_mm``, ``residual_pt`` of the last seconds."""
+
+    def mark(self, words: str) -> None:
+        """Mark this moment in the curves."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a command has found.
+
+    Attributes
+    ----------
+    kind : `CALIBRATE` or `DIAGNOSE`
+    recording : str
+        Name of the bag.
+    folder : Path
+        Its results.
+    words : str
+        The finding in a short paragraph.
+    rows : tuple of (label, before, after)
+        Figures on data held out, as text.
+    """
+
+    kind: str
+    recording: str
+    folder: Path
+    words: str
+    rows: tuple[tuple[str, str, str], ...]
+
+    @property
+    def model(self) -> Path:
+        """The model that it wrote."""
+        return self.folder / 'model.yaml'
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A change of the model: what was there before, and how well it went with that."""
+
+    before: dict[str, str]
+    figures: dict[str, float | None]
+    at_s: float
+
+
+class CorrectionLoop:
+    """State of the loop, one for all pages; every step says in words how it went.
+
+    Attributes
+    ----------
+    chosen : str
+        The recording that commands work on.
+    job : Job or None
+        The command that runs, or ran last.
+    found : Found or None
+        What the last one that succeeded has found.
+    names : tuple of str
+        The recordings that there are, the newest first.
+    said, is_trouble : str, bool
+        How the last step went, and whether badly.
+    model : str
+        The file of the model in force, as ``field_model`` has it.
+    """
+
+    def __init__(self, chain: Chain, folder: RecordingFolder) -> None:
+        self._chain, self.folder = chain, folder
+        self.chosen, self.model = '', ''
+        self.job: Job | None = None
+        self.found: Found | None = None
+        self.said, self.is_trouble = '', False
+        self.names: tuple[str, ...] = ()
+        self._loaded: list[Loaded] = []
+        self._busy = asyncio.Lock()
+
+    # What can be done ---------------------------------------------------------------------
+
+    @property
+    def is_running(self) -> bool:
+        """Whether a command runs."""
+        return self.job is not None and self.job.exit_code is None
+
+    @property
+    def can_load(self) -> bool:
+        """Whether there is a model to load that is not in force."""
+        return self.found is not None and str(self.found.model) != self.model
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether a model was loaded here."""
+        return bool(self._loaded)
+
+    async def record(self) -> None:
+        """Begin a bag."""
+        await self._step(self._record())
+
+    async def stop(self) -> None:
+        """End the bag and choose it."""
+        await self._step(self._stop())
+
+    async def set_baseline(self) -> None:
+        """Take what the references read now for what they read without metal."""
+        await self._step(self._set_baseline())
+
+    async def calibrate(self) -> None:
+        """Fit a model to the chosen recording."""
+        await self._step(self._start(CALIBRATE))
+
+    async def diagnose(self) -> None:
+        """Find what the model in force lacks on the chosen recording."""
+        await self._step(self._start(DIAGNOSE))
+
+    async def load(self) -> None:
+        """Put the model that was found in force."""
+        await self._step(self._load())
+
+    async def undo(self) -> None:
+        """Put the model in force that was there before."""
+        await self._step(self._undo())
+
+    def refresh_names(self) -> None:
+        """See which recordings there are."""
+        self.names = tuple(self.folder.recordings())
+        if self.chosen not in self.names:
+            self.chosen = self.names[0] if self.names else ''
+
+    def cancel(self) -> None:
+        """End the command that runs."""
+        if self.job is not None:
+            self.job.cancel()
+
+    async def look(self) -> None:
+        """Ask which model is in force."""
+        self.model = (await self._chain.model_files()).get('field_model', '')
+
+    # How it is done -----------------------------------------------------------------------
+
+    async def _step(self, step: Any) -> None:
+        async with self._busy:  # one after the other, whoever clicks
+            try:
+                self.said, self.is_trouble = await step, False
+            except AnserError as error:
+                self.said, self.is_trouble = ' '.join(str(error).split()), True
+
+    async def _record(self) -> str:
+        return f'recording to {Path(await self._chain.trigger("recorder/start")).name}'
+
+    async def _stop(self) -> str:
+        said = await self._chain.trigger('recorder/stop')
+        self.refresh_names()
+        if not self.names:
+            raise ParameterError(
+                f'{said}; but {self.folder.path} holds no recording: give the live view and the '
+                'recorder the same directory'
+            )
+        self.chosen = self.names[0]
+        return said
+
+    async def _set_baseline(self) -> str:
+        return await self._chain.trigger('field_model/set_baseline')
+
+    async def _start(self, kind: str) -> str:
+        if self.is_running:
+            raise ParameterError('a command runs already')
+        name = self.chosen
+        bag = self.folder.recording(name)
+        options: list[str] = []
+        if kind == DIAGNOSE:
+            await self.look()
+            options += ['--model', self.model or NOMINAL]
+            baseline = await self._chain.baseline_file()
+            options += ['--baseline', baseline] if baseline else []
+        folder = self.folder.new_result(kind, name)
+        if kind == DIAGNOSE:
+            options += ['--out', str(folder)]
+        else:
+            options += ['--out', str(folder / 'model.yaml'), '--report', str(folder)]
+        self.job = job = Job(kind, [str(bag), *options, '--json'], folder)
+        self._running = asyncio.create_task(self._finish(job, name))
+        return f'{kind} {name}'
+
+    async def _finish(self, job: Job, name: str) -> None:
+        await job.run()
+        if job.failure:
+            self.said, self.is_trouble = job.failure, True
+            return
+        document = json.loads((job.folder / f'{_NOUN[job.kind]}.json').read_text('utf-8'))
+        words, rows = _READ[job.kind](document)
+        self.found = Found(job.kind, name, job.folder, words, rows)
+        self.said, self.is_trouble = f'{job.kind} {name}: done in {job.seconds:.0f} s', False
+
+    async def _load(self) -> str:
+        if self.found is None:
+            raise ParameterError('there is no model to load yet')
+        before = await self._chain.model_files()
+        figures = self._chain.figures(0.0)
+        await self._exchange(before, dict.fromkeys(before, str(self.found.model)))
+        self._loaded = [*self._loaded[-MOST_UNDONE + 1 :], Loaded(before, figures, time.time())]
+        self._chain.mark('model loaded')
+        return 'the new model is in force'
+
+    async def _undo(self) -> str:
+        if not self._loaded:
+            raise ParameterError('nothing was loaded here')
+        last = self._loaded[-1]
+        await self._exchange(await self._chain.model_files(), last.before)
+        self._loaded.pop()
+        self._chain.mark('undone')
+        return 'the model of before is in force again'
+
+    async def _exchange(self, present: Mapping[str, str], wanted: Mapping[str, str]) -> None:
+        """Give the nodes other models; where one refuses, all keep what they had."""
+        try:
+            await self._chain.load_model(wanted)
+        except AnserError:
+            await self._chain.load_model(present)
+            raise
+        finally:
+            await self.look()
+
+    # What is shown ------------------------------------------------------------------------
+
+    def comparison(self) -> list[tuple[str, str, str]]:
+        """Rows of label, before and after: live, where a model was loaded, and held out."""
+        rows = []
+        if self._loaded:
+            last = self._loaded[-1]
+            now = self._chain.figures(last.at_s + SETTLING_S)
+            for label, key, digits in LIVE_ROWS:
+                pair = [_text(figures.get(key), digits) for figures in (last.figures, now)]
+                rows.append((label, *pair))
+        return rows
+
+
+LIVE_ROWS = (
+    ('tracked frames, %', 'tracked_percent', 0),
+    ('error, mm', 'error_mm', 2),
+    ('residual, pT', 'residual_pt', 0),
+)
+"""Figures of the last seconds, live: label, key, digits behind the point."""
+_NOUN = {CALIBRATE: 'calibration', DIAGNOSE: 'diagnosis'}
+
+
+def _text(value: float | None, digits: int) -> str:
+    return '–' if value is None else f'{value:.{digits}f}'
+
+
+def _scaled(value: float | None, scale: float) -> float | None:
+    return None if value is None else scale * value
+
+
+def _read_diagnosis(document: dict[str, Any]) -> tuple[str, tuple[tuple[str, str, str], ...]]:
+    held = document['held_out']
+    rows = []
+    for label, key, unit, scale, digits in (
+        ('residual, pT', 'flux_rms', 't', 1e12, 0),
+        ('position error, mm', 'position_rmse', 'm', 1e3, 2),
+        ('orientation error, deg', 'orientation_rmse', 'rad', 57.29578, 2),
+    ):
+        pair = [
+            _text(_scaled(held[f'{key}_{when}_{unit}'], scale), digits)
+            for when in ('before', 'after')
+        ]
+        rows.append((label, pair[0], pair[1]))
+    return verdict(document), tuple(rows)
+
+
+def _read_calibration(document: dict[str, Any]) -> tuple[str, tuple[tuple[str, str, str], ...]]:
+    before = _scaled(document.get('nominal_flux_rmse_t'), 1e12)
+    after = _scaled(document['heldout_flux_rmse_t'], 1e12)
+    words = (
+        f'A model of {document["n_dipoles"]} dipoles from {document["n_measurements"]} readings '
+        f'an emitter; on data that took no part its residual is {_text(after, 0)} pT, '
+        f'{document["heldout_n_rmse_percent"]:.3f} % of the range.'
+    )
+    rows = (('residual, pT (before: nominal model)', _text(before, 0), _text(after, 0)),)
+    return words, rows
+
+
+_READ = {CALIBRATE: _read_calibration, DIAGNOSE: _read_diagnosis}

@@ -1,0 +1,298 @@
+"""Parts of the live view, without a browser: who may look, what it may touch, the loop."""
+
+import asyncio
+import json
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip('nicegui', reason='nicegui is not installed')
+
+from dashboard_world import OFF_M, ten_sensors
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from rclpy.serialization import serialize_message
+
+from anser_ros.errors import BagError, ParameterError
+from anser_ros.nodes.causes import Told
+from anser_ros.nodes.live_view import LiveView, read_pose
+from anser_ros.web import loop as loop_module
+from anser_ros.web.folder import RESULTS, RecordingFolder
+from anser_ros.web.guard import COOKIE, MOST_PAGES, Guard
+from anser_ros.web.job import Job
+from anser_ros.web.loop import CorrectionLoop
+from anser_ros.web.server import LEAST_TOKEN, PageServer, token_for
+from anser_ros.wire.setup import parse_setup
+
+TOKEN = 'a-token-of-enough-letters'
+
+
+def asked(guard, path='/', kind='http', query='', **headers):
+    """Ask a guard; return the first thing that it sends, or ``passed``."""
+    sent = []
+    scope = {
+        'type': kind, 'path': path, 'query_string': query.encode(),
+        'headers': [(k.encode(), v.encode()) for k, v in {'host': 'localhost', **headers}.items()],
+    }  # fmt: skip
+
+    async def receive():
+        return {'type': 'websocket.connect'}
+
+    async def send(message):
+        sent.append(message)
+
+    asyncio.run(guard(scope, receive, send))
+    return sent[0]
+
+
+async def inner(_scope, _receive, send):
+    await send('passed')
+
+
+@pytest.mark.parametrize('kind', ['http', 'websocket'])
+def test_the_guard_knows_this_machine_and_the_token(kind):
+    local, far = Guard(inner, ''), Guard(inner, TOKEN)
+    for host in ('localhost:8642', '127.0.0.1:1', '[::1]:8642'):
+        assert asked(local, kind=kind, host=host, origin=f'http://{host}') == 'passed'
+    refused = [
+        asked(local, kind=kind, host='elsewhere.example:8642'),  # a name that leads here
+        asked(local, kind=kind, origin='http://elsewhere.example'),
+        asked(far, kind=kind, host='board.lab'),
+        asked(far, kind=kind, query='token=wrong'),
+        asked(far, kind=kind, cookie=f'{COOKIE}=wrong'),
+        asked(far, kind=kind, cookie=f'{COOKIE}={TOKEN}', origin='http://elsewhere.example'),
+    ]
+    codes = [m.get('status', m.get('code')) for m in refused]
+    assert codes == ([403, 403, 401, 401, 401, 403] if kind == 'http' else [1008] * 6)
+    assert asked(far, kind=kind, host='board.lab', cookie=f'{COOKIE}={TOKEN}') == 'passed'
+
+
+def test_the_guard_takes_the_token_out_of_the_address():
+    answer = asked(Guard(inner, TOKEN), query=f'token={TOKEN}')
+    assert answer['status'] == 303
+    headers = dict(answer['headers'])
+    assert headers[b'location'] == b'/'
+    assert headers[b'set-cookie'].decode().startswith(f'{COOKIE}={TOKEN}; HttpOnly')
+
+
+def test_the_guard_bounds_the_pages():
+    guard = Guard(inner, '')
+    assert asked(guard, query='EIO=4&transport=polling')['status'] == 403
+    guard.pages = MOST_PAGES
+    assert asked(guard)['status'] == 503
+    assert asked(guard, kind='websocket')['code'] == 1013
+    assert asked(guard, path='/_nicegui/file.js') == 'passed', 'for the pages that are open'
+
+
+def test_other_machines_need_a_token(tmp_path):
+    assert token_for('127.0.0.1', '') == ''
+    assert len({token_for('0.0.0.0', '') for _ in range(3)}) == 3
+    assert len(token_for('0.0.0.0', '')) >= LEAST_TOKEN
+    file = tmp_path / 'token'
+    file.write_text(f'{TOKEN}\n')
+    assert token_for('127.0.0.1', str(file)) == TOKEN
+    file.write_text('short')
+    for path in (file, tmp_path / 'nowhere'):
+        with pytest.raises(ParameterError, match='token_file'):
+            token_for('0.0.0.0', str(path))
+
+
+def test_an_address_that_is_taken_is_said(tmp_path):
+    with pytest.raises(ParameterError, match=r'203\.0\.113\.7:8642'):
+        PageServer('203.0.113.7', 8642, TOKEN, RecordingFolder(tmp_path))
+
+
+def bag(path):
+    path.mkdir(parents=True)
+    (path / 'a_0.mcap').write_bytes(b'')
+
+
+def test_no_name_leads_out_of_the_folder(tmp_path):
+    folder = RecordingFolder(tmp_path / 'bags')
+    assert folder.recordings() == []
+    bag(tmp_path / 'bags' / 'one')
+    bag(tmp_path / 'secret')
+    (tmp_path / 'bags' / 'link').symlink_to(tmp_path / 'secret')
+    assert folder.recordings() == ['one']
+    assert folder.recording('one') == tmp_path / 'bags' / 'one'
+    for name in ('../secret', 'link', '', '.', '..', str(tmp_path / 'secret'), 'two'):
+        with pytest.raises(BagError, match='holds no recording'):
+            folder.recording(name)
+    first, second = (folder.new_result('diagnose', 'one') for _ in range(2))
+    assert first.name != second.name
+    (first / 'report.html').write_text('<p>')
+    (first / 'other.txt').write_text('')
+    (first / 'choice.png').symlink_to('/etc/hostname')
+    (tmp_path / 'bags' / 'report.html').write_text('')
+    assert folder.shown(first.name, 'report.html') == first / 'report.html'
+    for result, name in (
+        (first.name, 'other.txt'), (first.name, 'choice.png'), ('..', 'report.html'),
+        (f'../{RESULTS}/{first.name}', 'report.html'), (first.name, '../report.html'),
+    ):  # fmt: skip
+        assert folder.shown(result, name) is None
+
+
+def test_progress_is_read_from_what_a_command_says(tmp_path):
+    job = Job('calibrate', [], tmp_path)
+    job.take_line('calibrating: layouts, 43%, about 5 s left')
+    assert (job.share, job.stage) == (0.43, 'layouts, 43%, about 5 s left')
+    job.take_line('diagnosing: search, after 12 s')
+    assert math.isnan(job.share)
+    assert job.stage == 'search, after 12 s'
+
+
+@pytest.mark.processes
+def test_a_job_tells_why_it_failed_and_can_be_ended(tmp_path):
+    job = Job('calibrate', [str(tmp_path / 'nowhere'), '--out', str(tmp_path / 'm')], tmp_path)
+    asyncio.run(job.run())
+    assert job.exit_code == 2
+    assert job.failure.startswith('anser calibrate: ')
+    ended = Job('warm_up', [], tmp_path)
+
+    async def cancelled():
+        task = asyncio.create_task(ended.run())
+        await asyncio.sleep(0.2)
+        ended.cancel()
+        await asyncio.wait_for(task, 5.0)
+
+    asyncio.run(cancelled())
+    assert ended.failure == 'warm_up was cancelled'
+
+
+class FakeChain:
+    """Nodes that do what they are asked, or refuse."""
+
+    def __init__(self):
+        self.files = {'field_model': 'nominal', 'tracker': ''}
+        self.refuses = ''
+        self.asked, self.marks = [], []
+
+    async def trigger(self, service):
+        self.asked.append(service)
+        if self.refuses == service:
+            raise ParameterError('refused, here')
+        return f'{service}: bags/one'
+
+    async def model_files(self):
+        return dict(self.files)
+
+    async def load_model(self, files):
+        for name, path in files.items():
+            if self.refuses == name and path:
+                raise ParameterError(f'{name}: not a model')
+            self.files[name] = path
+
+    async def baseline_file(self):
+        return 'clean.mcap'
+
+    def figures(self, since_s):
+        return {'tracked_percent': 50.0 if since_s == 0.0 else 100.0, 'error_mm': None}
+
+    def mark(self, words):
+        self.marks.append(words)
+
+
+DIAGNOSIS = {
+    'held_out': {
+        'flux_rms_before_t': 5e-9, 'flux_rms_after_t': 1e-10, 'flux_rms_floor_t': 1e-10,
+        'position_rmse_before_m': 4e-3, 'position_rmse_after_m': 2e-4,
+        'orientation_rmse_before_rad': None, 'orientation_rmse_after_rad': None,
+    },
+    'effects': [{'name': 'sensor_gain', 'parameters': {'channel': 3, 'gain': 1.1}}],
+    'unexplained': {'fraction': 0.0, 'depends_on': []},
+}  # fmt: skip
+
+
+def test_the_loop_from_recording_to_undo(tmp_path, monkeypatch):
+    class Instant(Job):
+        async def run(self):
+            (self.folder / 'diagnosis.json').write_text(json.dumps(DIAGNOSIS))
+            self.exit_code = 0
+
+    monkeypatch.setattr(loop_module, 'Job', Instant)
+    chain = FakeChain()
+    loop = CorrectionLoop(chain, RecordingFolder(tmp_path))
+
+    async def closed():
+        await loop.diagnose()
+        assert loop.is_trouble, 'there is no recording yet'
+        await loop.load()
+        assert loop.is_trouble, 'and no model'
+        await loop.record()
+        bag(tmp_path / 'one')
+        await loop.stop()
+        assert loop.chosen == 'one'
+        await loop.diagnose()
+        assert loop.job._arguments == [
+            str(tmp_path / 'one'), '--model', 'nominal', '--baseline', 'clean.mcap',
+            '--out', str(loop.job.folder), '--json',
+        ]  # fmt: skip
+        await asyncio.sleep(0.05)
+        assert 'sensor_gain (channel 3, gain 1.1)' in loop.found.words
+        assert loop.found.rows[0] == ('residual, pT', '5000', '100')
+        assert loop.found.rows[1] == ('position error, mm', '4.00', '0.20')
+        assert loop.found.rows[2][1:] == ('–', '–')
+        assert loop.comparison() == []
+        chain.refuses = 'tracker'
+        await loop.load()
+        assert (loop.said, loop.is_trouble) == ('tracker: not a model', True)
+        assert chain.files == {'field_model': 'nominal', 'tracker': ''}, 'all or none'
+        chain.refuses = ''
+        await loop.load()
+        assert set(chain.files.values()) == {str(loop.found.model)}
+        assert not loop.can_load
+        assert loop.comparison()[0] == ('tracked frames, %', '50', '100')
+        await loop.undo()
+        assert chain.files == {'field_model': 'nominal', 'tracker': ''}
+        assert chain.marks == ['model loaded', 'undone']
+        assert loop.can_load
+        assert not loop.can_undo
+
+    asyncio.run(closed())
+    assert chain.asked == ['recorder/start', 'recorder/stop']
+
+
+def pose(stamp_s, place, sigma_m=0.0):
+    message = PoseWithCovarianceStamped() if sigma_m else PoseStamped()
+    message.header.frame_id = 'left_fg'  # a length that needs padding
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(round(1e9 * stamp_s), 10**9)
+    at = (message.pose.pose if sigma_m else message.pose).position
+    at.x, at.y, at.z = place
+    if sigma_m:
+        message.pose.covariance = np.diag([sigma_m**2, 0, 0, 1, 1, 1]).astype(float).ravel()
+    return bytes(serialize_message(message)), {}
+
+
+@pytest.mark.parametrize('frame', ['', 'f', 'fg', 'left_fg', 'right_fg'])
+def test_poses_are_read_from_their_bytes(frame):
+    message = PoseStamped()
+    message.header.frame_id = frame
+    message.header.stamp.sec, message.header.stamp.nanosec = 12, 500_000_000
+    message.pose.position.y = 3.0
+    stamp_s, values = read_pose(bytes(serialize_message(message)))
+    assert stamp_s == 12.5
+    assert values.tolist() == [0, 3, 0, 0, 0, 0, 1]
+    with pytest.raises(ValueError, match='no pose'):
+        read_pose(bytes(serialize_message(message))[:-8])
+
+
+def test_the_view_has_place_ellipsoid_error_and_residual():
+    view = LiveView(parse_setup(ten_sensors()), 'anser')
+    assert view.frame() == [None] * 11
+    view.take_optical('pen', [pose(t, (0.1, 0.0, 0.2)) for t in (1.0, 1.02, 1.04)])
+    view.take_pose(2, [pose(1.01, (9.0, 9.0, 9.0), 1.0), pose(1.03, (0.1, OFF_M, 0.22), 1e-3)])
+    told = Told(0, 'ok', {'residual_t': '2e-10', 'rate_hz': '25', 'frame_rate_hz': '50'})
+    view.take_told('anser/tracker: pen/c2', told)
+    view.add_point()
+    row = view.frame()[2]
+    assert row[:7] == [0.1, OFF_M, 0.22, 0, 0, 0, 1]
+    axes = np.array(row[7:]).reshape(3, 3)
+    assert np.abs(axes).sum(0).tolist() == [3e-3, 0, 0], 'three sigma along x'
+    assert view.rate_hz[2] > 0
+    assert view.error_m[2] == pytest.approx(OFF_M), 'of the pose shown, coil 2 is 20 mm up the pen'
+    assert np.isnan(np.delete(view.error_m, 2)).all()
+    figures = view.figures()
+    assert figures.tracked == 0.5
+    assert figures.error_m == pytest.approx(OFF_M)
+    assert figures.residual_t == 2e-10
+    assert view.points[-1][2][2] == 2e-10
