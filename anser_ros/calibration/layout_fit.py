@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.calibration.coaxial import fit_coaxial
 from anser_ros.calibration.dipole_sites import DipoleSites
 from anser_ros.calibration.factors import ComplexArray
 from anser_ros.calibration.layouts import Generator, Layout, place
@@ -100,6 +101,7 @@ def optimise_positions(
     weights: Sequence[Array],
     dipoles: DipoleSites,
     prior: ComplexArray | None,
+    layout: Layout,
 ) -> DipoleSites:
     """Return dipoles moved to where they explain the measurements best.
 
@@ -113,11 +115,15 @@ def optimise_positions(
         The dipoles to start from.
     prior : ndarray, shape (N, K), complex, or None
         Moments towards which the damping pulls, A m^2.
+    layout : Layout
+        Of the dipoles: those on an axis stay on it, all others move each by itself.
     """
     rows = sum(m.flux.shape[0] * m.flux.shape[1] for m in corrected)
     step = max(1, -(-rows // MOST_MOVING_ROWS))
     thin = [m.frames(np.arange(0, len(m.time), step)) for m in corrected]
     shares = [w[::step] for w in weights]
+    if layout.kind == 'coaxial':
+        return fit_coaxial(thin, shares, dipoles, layout.count)
     return PositionFitter(thin, shares, dipoles, MOVING_DAMPING, prior).fit().dipoles
 
 
@@ -159,7 +165,9 @@ def fit_layout(
         layer = place(rich_layout(measurements, generator), generator)
         rich = MomentFitter(measurements, layer, RICH_DAMPING, accuracy)
         reference = rich.fit(3, exact=False)
-        dipoles = optimise_positions(reference.measurements, reference.weights, dipoles, prior)
+        dipoles = optimise_positions(
+            reference.measurements, reference.weights, dipoles, prior, layout
+        )
         prior = prior_of(layout, dipoles, drawn)
     fitter = MomentFitter(measurements, dipoles, damping, accuracy, prior)
     fit = fitter.fit(alternations, progress, exact)

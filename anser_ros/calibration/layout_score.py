@@ -165,7 +165,7 @@ class LayoutScorer:
             chi, count = np.zeros(len(dampings)), 0.0
             sites, moments_prior = dipoles, prior
             if layout.moved:
-                sites = self._moved_without(fold, dipoles, prior)
+                sites = self._moved_without(fold, dipoles, prior, layout)
                 moments_prior = prior_of(layout, sites, drawn)
             matrices, grams = same or self._tables(sites)
             start = None if moments_prior is None else as_real(moments_prior) / self.noise_t
@@ -192,7 +192,7 @@ class LayoutScorer:
         return matrices, dict(zip(folds, grams, strict=True))
 
     def _moved_without(
-        self, fold: int, dipoles: DipoleSites, prior: ComplexArray | None
+        self, fold: int, dipoles: DipoleSites, prior: ComplexArray | None, layout: Layout
     ) -> DipoleSites:
         kept = [body.folds != fold for body in self._bodies]
         return optimise_positions(
@@ -200,6 +200,7 @@ class LayoutScorer:
             [body.weights[k] for body, k in zip(self._bodies, kept, strict=True)],
             dipoles,
             prior,
+            layout,
         )
 
     @property

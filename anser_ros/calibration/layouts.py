@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.calibration.coaxial import FIRST_SPACING_M, coaxial
 from anser_ros.calibration.dipole_sites import DipoleSites
 
 Array = NDArray[np.float64]
@@ -57,11 +58,11 @@ class Layout:
 
     Attributes
     ----------
-    kind : {'layer', 'layer_xyz', 'coils'}
-        A layer of z-dipoles, a layer of dipoles with three free components, or z-dipoles on the
-        coils.
+    kind : {'layer', 'layer_xyz', 'coils', 'coaxial'}
+        A layer of z-dipoles, a layer of dipoles with three free components, z-dipoles on the
+        coils, or dipoles along an axis of its own for each coil.
     count : int
-        Number of dipoles along a side of the layer, or of each coil.
+        Number of dipoles along a side of the layer, of each coil, or along each axis.
     extension : float
         Size of the layer as a multiple of the field generator's.
     depth_m : float
@@ -87,6 +88,8 @@ class Layout:
         drawn = ', pulled to the drawn board' if self.prior == 'nominal' else ''
         drawn += ', positions optimised' if self.moved else ''
         drawn += ', in overlapping regions' if self.local else ''
+        if self.kind == 'coaxial':
+            return f'{self.count} on an axis of its own for every emitter, place and axis free'
         if self.kind == 'coils':
             return f'{self.count}x{self.count} z-dipoles on every coil{drawn}'
         parts = 'z-dipoles' if self.kind == 'layer' else 'three-component dipoles'
@@ -107,6 +110,10 @@ def place(layout: Layout, generator: Generator) -> DipoleSites:
     """Return the dipoles of a layout over a field generator."""
     if layout.kind == 'coils':
         return _on_coils(layout, generator)
+    if layout.kind == 'coaxial':
+        count = len(generator.centres)
+        upright, spacing = np.tile(UNIT_Z, (count, 1)), np.full(count, FIRST_SPACING_M)
+        return coaxial(generator.centres, upright, layout.count, spacing)
     flat = grid(layout.count, generator.half_extent * layout.extension)
     middle = generator.middle
     positions = np.empty((flat.shape[0], 3))

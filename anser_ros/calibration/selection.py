@@ -51,6 +51,8 @@ MOVING = (
 )
 """Layouts from which dipoles are moved to better places; a moved dipole does the work of several
 fixed ones, so that these are small."""
+COAXIAL = tuple(Layout('coaxial', n, 1.0, 0.0, moved=True) for n in (1, 3, 5))
+"""Layouts for emitters that nobody has drawn: see `coaxial`."""
 LOCAL_COUNT = 10
 """Dipoles along a side of the layer that every region of a local model has."""
 LOCAL_READINGS = 24
@@ -201,6 +203,8 @@ class _Search:
         moving = [m for m in moving if MOVING_READINGS * len(place(m, self.generator)) <= rows]
         if moving:
             found.append(min(map(self.score, moving), key=lambda c: c.score))
+        if self.drawn is None:
+            found += [self.score(layout) for layout in COAXIAL]
         if rows >= LOCAL_READINGS * LOCAL_COUNT**2:
             depth = max(best.layout.depth_m, 0.0)
             common = self.score(Layout('layer', LOCAL_COUNT, EXTENSIONS[1], depth, self.prior))

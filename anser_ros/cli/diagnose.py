@@ -13,7 +13,7 @@ from anser_ros.cli.diagnosis_words import verdict
 from anser_ros.cli.output import Result, loss_notes, make_folder, say, snapshot_notes
 from anser_ros.cli.pose_session import add_pose_options, diagnose_pose_session, need_model
 from anser_ros.cli.progress import stages_of
-from anser_ros.cli.stated_values import add_stated_values, stated_values
+from anser_ros.cli.stated_values import add_resurveyed, add_stated_values, stated_values
 from anser_ros.sessions.diagnosis import diagnose_session
 from anser_ros.sessions.diagnosis_document import to_document
 from anser_ros.sessions.model_file import save_model
@@ -36,6 +36,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Declare the options that hold for every session."""
     parser.add_argument('--model', help="model file, or 'nominal' for the setup's own geometry")
     parser.add_argument('--baseline', help='distortion-free recording of the same board')
+    add_resurveyed(parser)
     add_pose_options(parser)
     add_stated_values(parser, 'accuracy', 'refit', 'tools')
 
@@ -62,7 +63,7 @@ def work(args: argparse.Namespace, tell: Callable[[str], None]) -> Result:
         return diagnose_pose_session(args)
     need_model(args)
     session = load_session(args.session).with_stated(stated_values(args))
-    model = model_for(args.model, session, snapshot=True)
+    model = model_for(args.model, session, snapshot=True, resurveyed=args.resurveyed)
     baseline = load_session(args.baseline) if args.baseline else None
     make_folder(args.out)
     result = diagnose_session(session, model, baseline, tell)

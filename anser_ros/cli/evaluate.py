@@ -13,7 +13,7 @@ from anser_ros.cli.output import Result, loss_notes, make_folder, say, snapshot_
 from anser_ros.cli.pose_session import add_pose_options, evaluate_pose_session, need_model
 from anser_ros.cli.progress import progress_of
 from anser_ros.cli.session_runs import finish, perform, runs_of
-from anser_ros.cli.stated_values import add_stated_values, stated_values
+from anser_ros.cli.stated_values import add_resurveyed, add_stated_values, stated_values
 from anser_ros.errors import ParameterError
 from anser_ros.sessions.chosen_references import parse_references, with_references
 from anser_ros.sessions.evaluation import track_session
@@ -75,6 +75,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar='BODY=TOPIC',
         help='body that carries reference coils too, and the topic of its poses in the bag',
     )
+    add_resurveyed(parser)
     parser.add_argument(
         '--in-phase', action='store_true', help="use in-phase fluxes only, the article's way"
     )
@@ -130,7 +131,7 @@ def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result
         if not args.refit:
             raise ParameterError('--references chooses those of a refit; it needs --refit')
         session = with_references(session, parse_references(args.references))
-    model = model_for(args.model, session, snapshot=True)
+    model = model_for(args.model, session, snapshot=True, resurveyed=args.resurveyed)
     baseline = load_session(args.baseline) if args.baseline else None
     make_folder(args.out)
     evaluation = track_session(
@@ -170,8 +171,8 @@ def _refit_line(refit: dict[str, dict[str, int]]) -> str:
 
 def _table(document: dict[str, Any]) -> Table:
     table = Table('sensor', 'frames', 'tracked', 'RMSE mm', 'PRC95 mm', 'RMSE deg', 'PRC95 deg')
-    for group in ('sensors', 'bodies'):
-        for name, row in document[group].items():
+    for group in ('sensors', 'bodies', 'sources'):
+        for name, row in document.get(group, {}).items():
             cells = [
                 _cell(row[key], scale)
                 for key, scale in (
@@ -181,7 +182,8 @@ def _table(document: dict[str, Any]) -> Table:
                     ('orientation_prc95_rad', 57.29578),
                 )
             ]
-            table.add_row(name, str(row['n']), f'{row["tracked_fraction"]:.1%}', *cells)
+            shown = f'source seen from {name}' if group == 'sources' else name
+            table.add_row(shown, str(row['n']), f'{row["tracked_fraction"]:.1%}', *cells)
     return table
 
 

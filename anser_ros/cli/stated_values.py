@@ -1,4 +1,4 @@
-"""The option ``--set NAME=VALUE``, which states a value before the setup document does."""
+"""Options that several commands share: values stated, bodies surveyed anew."""
 
 import argparse
 
@@ -22,3 +22,15 @@ def add_stated_values(parser: argparse.ArgumentParser, *sections: str) -> None:
 def stated_values(args: argparse.Namespace) -> dict[str, float]:
     """The values that the command line states; raises `ParameterError` as `parse_entries`."""
     return parse_entries(args.stated)
+
+
+def add_resurveyed(parser: argparse.ArgumentParser) -> None:
+    """Declare the option ``--resurveyed BODY``, of commands that take a model to a session."""
+    parser.add_argument(
+        '--resurveyed',
+        action='append',
+        default=[],
+        metavar='BODY',
+        help='the sensors on BODY are those of the model, surveyed anew: what it knows of their '
+        'channels holds, the places and axes are those of the session; may be repeated',
+    )

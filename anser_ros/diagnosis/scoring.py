@@ -200,13 +200,13 @@ class Scorer:
         self.held_out = self.sums.held_out(self.prior, folds) + state.penalty
 
     def score(self, term: 'Term') -> Score | None:
-        """Worth of a candidate; None when it touches no value."""
+        """Worth of a candidate; None when it touches no value, or is at a dipole's own place."""
         probe = self.state.design(term, probe=True)
         width = _width(probe)
         if width == 0:
             return None
         own = block_sums(self.state, probe, self.blocks)
-        if not np.any(own.normal):
+        if not np.any(own.normal) or not np.isfinite(own.normal).all():
             return None
         sums = self._beside(probe, own)
         scale = np.sqrt(np.diag(own.normal.sum(axis=0)))

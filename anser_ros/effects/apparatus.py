@@ -6,13 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.dipoles import Dipoles
-from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.sensor import SensorTable, clusters_of
 
 Array = NDArray[np.float64]
-
-SAME_CENTRE_M = 2e-3
-"""Tool sensors closer together than this (m) are one cluster: coils of a triaxial sensor share a
-centre within winding tolerances of some 0.1 mm, separate sensors are centimetres apart."""
 
 
 @dataclass(frozen=True)
@@ -63,14 +59,9 @@ class Apparatus:
 
     def clusters(self) -> list[tuple[int, ...]]:
         """Channels of tool sensors that share one centre, where there are two or more."""
-        groups = []
-        for table in self.tools:
-            left = list(range(len(table)))
-            while left:
-                first = table.position[left[0]]
-                apart = np.linalg.norm(table.position[left] - first, axis=1)
-                near = [i for i, d in zip(left, apart, strict=True) if d < SAME_CENTRE_M]
-                left = [i for i in left if i not in near]
-                if len(near) > 1:
-                    groups.append(tuple(int(table.channel[i]) for i in near))
-        return groups
+        return [
+            tuple(table.channel[rows].tolist())
+            for table in self.tools
+            for rows in clusters_of(table)
+            if rows.size > 1
+        ]

@@ -123,6 +123,15 @@ class Correction:
             out = term.effect.table(term, out)
         return out
 
+    def gain_changes(self) -> Array | None:
+        """Changes of gains since the model was made that sensors may share, shape (G, S).
+
+        Relative, one standard deviation each; None where no effect tells of any.
+        """
+        told = [term.effect.gain_changes(term, self.surveyed) for term in self.terms]
+        known = [changes for changes in told if changes is not None]
+        return np.concatenate(known) if known else None
+
     def optical(self, track: PoseTrack) -> PoseTrack:
         """An optical track on the fluxes' clock and in fg."""
         # As in the forward chain: the order in which the effects are listed.

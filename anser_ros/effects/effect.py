@@ -263,6 +263,10 @@ class Effect(Generic[TermT]):
         """Mixing of the channels, shape (S, S): row the channel that is read."""
         return None
 
+    def gain_changes(self, term: TermT, sensors: SensorTable) -> Array | None:
+        """Relative changes of gains since, one standard deviation each, shape (G, S)."""
+        return None
+
     def offset(
         self, term: TermT, channels: NDArray[np.int64], emitters: int
     ) -> ComplexArray | None:

@@ -20,8 +20,12 @@ from anser_ros.effects.effect import (
 from anser_ros.effects.term import Term
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
-from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.sensor import SensorTable, clusters_of
 from anser_ros.physics.tangent import tilted
+
+LEAST_SHARED = 0.5
+"""Share of the gains' variance in common from which on the channels at one place are one sensor:
+coils that are wound one by one have next to none, the axes of a chip nearly all."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,10 +38,13 @@ class SpreadTerm(Term):
         Their channels.
     spread : float
         Standard deviation of the population, in the values' unit.
+    shared : float
+        Share of the population's variance that the channels at one place have in common.
     """
 
     members: tuple[int, ...]
     spread: float
+    shared: float = 0.0
 
     @property
     def values(self) -> Array:
@@ -70,7 +77,7 @@ class SensorSpread(Effect[SpreadTerm]):
             self.name,
             {
                 'spread': term.spread, 'channels': list(term.members), 'values': values,
-                'uncertainty': sigma,
+                'uncertainty': sigma, **({'shared': term.shared} if term.shared else {}),
             },
             {'values': sigma},
         )  # fmt: skip
@@ -86,7 +93,8 @@ class SensorSpread(Effect[SpreadTerm]):
             )
         theta = (values - np.array(self.offset_of_values)).ravel()
         spread = float(record.parameters.get('spread', 0.0))
-        return SpreadTerm(self, {}, theta, members=channels, spread=spread)
+        shared = float(record.parameters.get('shared', 0.0))
+        return SpreadTerm(self, {}, theta, members=channels, spread=spread, shared=shared)
 
 
 class SensorGainSpread(SensorSpread):
@@ -103,6 +111,22 @@ class SensorGainSpread(SensorSpread):
         """The gains on the diagonal."""
         parts = term.of(channels)
         return np.asarray(unit_matrix(channels.size) + np.diag(parts[:, 0] + 1j * parts[:, 1]))
+
+    def gain_changes(self, term: SpreadTerm, sensors: SensorTable) -> Array | None:
+        """A change for each place, where sensors at one place have their gains in common.
+
+        How far a gain moves until the next session, one session cannot tell. What it differs by
+        among sensors of a kind is its natural size: the axes of one chip go up and down together.
+        """
+        if term.shared < LEAST_SHARED:
+            return None
+        members = np.isin(sensors.channel, term.members)
+        places = [rows[members[rows]] for rows in clusters_of(sensors)]
+        places = [rows for rows in places if rows.size]
+        out = np.zeros((len(places), len(sensors)))
+        for row, channels in enumerate(places):
+            out[row, channels] = np.sqrt(term.shared) * term.spread
+        return out
 
 
 class SensorAxisSpread(SensorSpread):

@@ -20,6 +20,12 @@ Array = NDArray[np.float64]
 
 BODY = 'patch'
 AXES = 'xyz'
+UPWARDS = np.diag([1.0, -1.0, -1.0])
+"""Turns the magnet's frame so that the patch is above it, as tools are above a board."""
+VOLUME = ((-0.06, -0.06, 0.01), (0.06, 0.06, 0.08))
+"""Where the patch may be, m."""
+STATED = {'flux_noise_t': 3e-6, 'optical_position_m': 2e-4, 'optical_rotation_rad': 8e-3}
+"""Noise of the magnetometers and jitter of the optical system, as this setup states them."""
 
 
 def patch_in_fg(recording: Recording) -> tuple[Array, Array]:
@@ -28,7 +34,7 @@ def patch_in_fg(recording: Recording) -> tuple[Array, Array]:
     The patch's own frame has its origin at the middle of the sensors and the optical axes.
     """
     middle = recording.sensor_m.mean(axis=1)
-    turn = recording.magnet_rotation.swapaxes(1, 2)
+    turn = UPWARDS @ recording.magnet_rotation.swapaxes(1, 2)
     return turn, np.einsum('fij,fj->fi', turn, middle - recording.magnet_m)
 
 
@@ -51,7 +57,7 @@ def setup_of(recording: Recording) -> Setup:
     geometry = {'radius_m': RADIUS_M, 'half_length_m': HALF_LENGTH_M}
     emitter = Emitter('cylinder_magnet', geometry, (Coil('magnet', (0.0, 0.0, 0.0), 0.0, 1.0),))
     rate = 1.0 / float(np.median(np.diff(recording.stamp_s)))
-    return Setup('fg', rate, emitter, sensors)
+    return Setup('fg', rate, emitter, sensors, VOLUME, STATED)
 
 
 def write_session(recording: Recording, path: Path) -> None:

@@ -12,6 +12,10 @@ LARGEST_FLUX_T = 1.0
 """A reading with a component beyond this, T, is taken for a fault of the electronics. The emitters
 make microtesla at most, so that any flux density that could be real is far smaller."""
 
+SAME_CENTRE_M = 2e-3
+"""Sensors of a body closer together than this (m) are one cluster: coils of a triaxial sensor
+share a centre within winding tolerances of some 0.1 mm, separate sensors are centimetres apart."""
+
 
 @dataclass(frozen=True)
 class SensorTable:
@@ -95,3 +99,18 @@ class SensorTable:
         """
         turned = np.einsum('...ij,sj->...si', rotation, self.position)
         return turned + position[..., None, :], np.einsum('...ij,sj->...si', rotation, self.axis)
+
+
+def clusters_of(sensors: SensorTable) -> list[NDArray[np.int64]]:
+    """Return the rows of the sensors of each body that share a centre; most often one, or three.
+
+    The first row of a table that is left opens a cluster of those near it.
+    """
+    groups = []
+    for body in dict.fromkeys(sensors.body):
+        left = np.array([row for row, name in enumerate(sensors.body) if name == body])
+        while left.size:
+            apart = np.linalg.norm(sensors.position[left] - sensors.position[left[0]], axis=1)
+            groups.append(left[apart < SAME_CENTRE_M])
+            left = left[apart >= SAME_CENTRE_M]
+    return groups

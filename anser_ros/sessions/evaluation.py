@@ -4,17 +4,19 @@ The stages are `prepare`, `track` and `compare`; each can be called alone, and `
 all of them. What they give is written by `evaluation_document` and `pose_table`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from anser_ros.field.model import FieldModel
+from anser_ros.field.symmetry import symmetry_axis
 from anser_ros.sessions.follower import ModelFollower, RefitSummary
 from anser_ros.sessions.pose_errors import PoseSeries, body_series, sensor_series
 from anser_ros.sessions.prepared import PreparedSession, prepare, with_truth
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.tracked_session import Progress, TrackedSession, in_phase_model, track
 from anser_ros.tracking.estimate import TrackerSettings
+from anser_ros.tracking.source_track import seen_from
 
 
 @dataclass(frozen=True)
@@ -30,12 +32,16 @@ class Evaluation:
         Mean wall time that a frame took.
     refit : RefitSummary or None
         What the refit did; None where the model did not follow the references.
+    sources : dict of str to PoseSeries
+        Of every body, where the field is the same all around an axis: place and axis of the source
+        in the body's frame, and their errors.
     """
 
     sensors: dict[str, PoseSeries]
     bodies: dict[str, PoseSeries]
     seconds_per_frame: float
     refit: RefitSummary | None = None
+    sources: dict[str, PoseSeries] = field(default_factory=dict)
 
 
 def track_session(
@@ -97,4 +103,19 @@ def compare(prepared: PreparedSession, tracked: TrackedSession) -> Evaluation:
         if tool.body in tracked.estimates:
             given = tracked.estimates[tool.body]
             bodies[tool.body] = body_series(tool.body, given, position, true.rotation)
-    return Evaluation(sensors, bodies, tracked.seconds_per_frame, tracked.refit)
+    sources = _sources(prepared, tracked)
+    return Evaluation(sensors, bodies, tracked.seconds_per_frame, tracked.refit, sources)
+
+
+def _sources(prepared: PreparedSession, tracked: TrackedSession) -> dict[str, PoseSeries]:
+    """Compare where bodies saw the source with where the optical poses say it was."""
+    model, out = prepared.model, {}
+    axis = symmetry_axis(model.positions, model.directions, model.moments)
+    for tool in prepared.session.tools:
+        if axis is None or tool.body not in tracked.sources:
+            continue
+        true = with_truth(tool, prepared.correction)
+        position = np.where(true.has_pose[:, None], true.position, np.nan)
+        place, direction = seen_from(axis, position, true.rotation)
+        out[tool.body] = sensor_series(tool.body, tracked.sources[tool.body], place, direction)
+    return out

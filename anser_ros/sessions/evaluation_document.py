@@ -20,6 +20,8 @@ def to_document(evaluation: Evaluation) -> dict[str, Any]:
         'sensors': {name: metrics(series) for name, series in evaluation.sensors.items()},
         'bodies': {name: metrics(series) for name, series in evaluation.bodies.items()},
     }
+    if evaluation.sources:
+        document['sources'] = {name: metrics(s) for name, s in evaluation.sources.items()}
     if evaluation.refit is not None:
         document['refit'] = {
             'states': dict(evaluation.refit.states),

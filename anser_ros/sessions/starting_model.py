@@ -1,10 +1,13 @@
 """The field model that a command starts from: a file, or the nominal one of the setup."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from anser_ros.effects.effect import Remedy
+from anser_ros.effects.registry import effect_named
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.nominal import nominal_model
@@ -70,10 +73,13 @@ def check_emitters(setup: Setup, given: FieldModel) -> None:
     check_made_for(given, setup, 'the setup')
 
 
-def model_for(name: str, session: 'Session', snapshot: bool = False) -> FieldModel:
+def model_for(
+    name: str, session: 'Session', snapshot: bool = False, resurveyed: Sequence[str] = ()
+) -> FieldModel:
     """The model that ``name`` stands for: a file's path, or ``nominal``.
 
-    ``snapshot`` says whether a snapshot of a refit will do, which is no calibration.
+    ``snapshot`` says whether a snapshot of a refit will do, which is no calibration, and
+    ``resurveyed`` names bodies whose sensors are the same, surveyed anew.
 
     Raises
     ------
@@ -85,7 +91,7 @@ def model_for(name: str, session: 'Session', snapshot: bool = False) -> FieldMod
     """
     if name == NOMINAL:
         return nominal_model(board_of(session.setup))
-    model = load_model(name, snapshot)
+    model = with_new_survey(load_model(name, snapshot), session.setup, resurveyed)
     check_fits(model, session)
     return model
 
@@ -100,6 +106,36 @@ def made_for(model: FieldModel, setup: Setup) -> FieldModel:
     before = {} if model.made_for is None else model.made_for.bodies
     identity = setup.identity
     return replace(model, made_for=Identity(identity.board, {**before, **identity.bodies}))
+
+
+def with_new_survey(model: FieldModel, setup: Setup, bodies: Sequence[str]) -> FieldModel:
+    """Return the model for bodies whose sensors are the same, but surveyed anew.
+
+    What a model knows of channels, such as their gains, still holds. Places and axes of sensors
+    are now as the new survey has them: effects that corrected the old one fall away.
+
+    Raises
+    ------
+    ModelFileError
+        When the setup has no such body, or the model does not tell what it was made for.
+    """
+    made, kept = model.made_for, model.effects
+    for body in bodies:
+        if body not in setup.identity.bodies:
+            raise ModelFileError(f'no body {body} in the setup to be surveyed anew')
+        if made is None:
+            raise ModelFileError(
+                f'the model {model.fingerprint} does not tell what it was made for'
+            )
+        made = Identity(made.board, {**made.bodies, body: setup.identity.bodies[body]})
+        kept = tuple(
+            effect for effect in kept
+            if not (
+                effect_named(effect.name).remedy is Remedy.SENSORS
+                and body in _bodies_of(replace(model, effects=(effect,)), setup)
+            )
+        )  # fmt: skip
+    return replace(model, made_for=made, effects=kept)
 
 
 def check_made_for(model: FieldModel, setup: Setup, where: str) -> None:

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from anser_ros.errors import BagError
 from anser_ros.field.model import FieldModel
@@ -28,11 +28,15 @@ class TrackedSession:
         Mean wall time that a frame took, the refit included.
     refit : RefitSummary or None
         What the refit did; None where the model did not follow the references.
+    sources : dict of str to tuple of PoseEstimate
+        Of every body by its name, where the field is the same all around an axis: place and axis
+        of the source in the body's frame.
     """
 
     estimates: dict[str, tuple[PoseEstimate, ...]]
     seconds_per_frame: float
     refit: RefitSummary | None = None
+    sources: dict[str, tuple[PoseEstimate, ...]] = field(default_factory=dict)
 
 
 def in_phase_model(model: FieldModel) -> FieldModel:
@@ -74,6 +78,7 @@ def track(
         raise BagError(f'{prepared.session.path}: the session has no tool fluxes to track')
     tracker = _tracker(prepared, settings or TrackerSettings(), follows=follower is not None)
     estimates: dict[str, list[PoseEstimate]] = {}
+    sources: dict[str, list[PoseEstimate]] = {}
     frames = list(frames_of(prepared.session))
     start = time.perf_counter()
     for count, frame in enumerate(frames, start=1):
@@ -87,11 +92,15 @@ def track(
             )
             for estimate in found:
                 estimates.setdefault(estimate.name, []).append(estimate)
+            for body, source in tracker.sources.items():
+                sources.setdefault(body, []).append(source)
         if progress is not None:
             progress(count / len(frames))
     seconds = (time.perf_counter() - start) / max(len(frames), 1)
     by_name = {name: tuple(given) for name, given in estimates.items()}
-    return TrackedSession(by_name, seconds, None if follower is None else follower.summary)
+    summary = None if follower is None else follower.summary
+    seen_from = {name: tuple(given) for name, given in sources.items()}
+    return TrackedSession(by_name, seconds, summary, seen_from)
 
 
 def _tracker(prepared: PreparedSession, settings: TrackerSettings, *, follows: bool) -> Tracker:

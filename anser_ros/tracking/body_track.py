@@ -123,8 +123,9 @@ class _BodyFrame:
         They are those that the coils' own solves reckoned with, where these were near.
         """
         weights = np.tile(self.inverse_sigma, (len(used), 1))
+        gains = self.coils.subset(used).gain_errors(self.flux[used])
         if self.context.modes is None:
-            return np.zeros((0, weights.size))
+            return common_factor(gains, weights)
         coils, (position, rotation) = self.coils.subset(used), start
         points, axes = coils.offsets @ rotation.T + position, coils.axes @ rotation.T
         known = [self.single[i].error for i in used.tolist()]
@@ -136,7 +137,8 @@ class _BodyFrame:
             fresh = take_errors(self.context, points[far], axes[far], coils.lengths[far])
             for i, error in zip(far, fresh, strict=True):
                 known[i] = error
-        return common_factor(np.array([e.errors for e in known if e is not None]), weights)
+        shared = np.array([e.errors for e in known if e is not None])
+        return common_factor(np.concatenate([shared, gains], axis=1), weights)
 
     def nearer(self, start: Start, used: NDArray[np.int64]) -> Start:
         """A start moved to where the coils' own good poses agree best."""

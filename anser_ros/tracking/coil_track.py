@@ -19,6 +19,8 @@ from anser_ros.tracking.uncertainty import chi2_limit, coil_covariance
 Array = NDArray[np.float64]
 Start = tuple[Array, Array]
 
+UNKNOWNS = 5
+"""Numbers that a coil's pose has."""
 SELDOM = 0.1
 """Probability of a residual beyond which it counts as more than noise and widens the sigma of its
 frame. Smaller, and slight distortion is not seen; larger, and plain noise widens many poses."""
@@ -160,17 +162,23 @@ class _CoilFrame:
 
 @dataclass(frozen=True)
 class CoilResult:
-    """An estimate with the solution behind it and the errors reckoned with (None: not solved)."""
+    """An estimate with the solution behind it and the errors reckoned with (None: not solved).
+
+    ``heard`` says of a coil that nothing was solved for that its fluxes are good all the same.
+    """
 
     estimate: PoseEstimate
     solution: CoilSolution | None
     cold: bool = False
     error: PoseErrors | None = None
+    heard: bool = False
 
     @property
     def usable(self) -> bool:
         """Whether a body may use the coil: it has a solution, and is not among metal."""
-        return self.solution is not None and not (self.error and self.error.among_metal)
+        return (self.heard or self.solution is not None) and not (
+            self.error and self.error.among_metal
+        )
 
 
 def take_errors(
@@ -267,6 +275,10 @@ def track_coil(
         return CoilResult(
             no_pose(name, stamp_ns, states.NO_SIGNAL, context.model_id, reason), None
         )
+    if context.readings < UNKNOWNS:
+        reason = f'{context.readings} readings do not tell the {UNKNOWNS} numbers of a pose'
+        unknown = no_pose(name, stamp_ns, states.AMBIGUOUS, context.model_id, reason)
+        return CoilResult(unknown, None, heard=True)
     frame = _CoilFrame(name, length, stamp_ns, flux, context, settings)
     solution = _from_good(track, frame)
     if solution is not None:

@@ -28,11 +28,16 @@ PARALLEL = 0.05
 
 @dataclass(frozen=True)
 class BodyCoils:
-    """Coils of a tool in its own frame: offsets (S, 3) m, unit axes (S, 3), lengths (S,) m."""
+    """Coils of a tool in its own frame: offsets (S, 3) m, unit axes (S, 3), lengths (S,) m.
+
+    ``changes`` (G, S) are relative changes of gains that several coils may have in common, one
+    standard deviation each; None where there are none.
+    """
 
     offsets: Array
     axes: Array
     lengths: Array
+    changes: Array | None = None
 
     @cached_property
     def observable(self) -> bool:
@@ -54,7 +59,14 @@ class BodyCoils:
             np.ascontiguousarray(self.offsets[keep]),
             np.ascontiguousarray(self.axes[keep]),
             np.ascontiguousarray(self.lengths[keep]),
+            None if self.changes is None else np.ascontiguousarray(self.changes[:, keep]),
         )
+
+    def gain_errors(self, flux: Array) -> Array:
+        """What the changes of gains make of fluxes (S, 2K): (S, G, 2K), T."""
+        if self.changes is None:
+            return np.zeros((len(flux), 0, flux.shape[1]))
+        return np.asarray(self.changes.T[:, :, None] * flux[:, None, :])
 
 
 @dataclass(frozen=True)

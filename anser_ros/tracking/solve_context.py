@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.model import FieldModel
+from anser_ros.field.symmetry import SymmetryAxis, symmetry_axis
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.error_whitening import error_whitening, source_spacing
@@ -165,6 +166,17 @@ class SolveContext:
     def grid(self) -> SeedGrid:
         """Grid of the cold start."""
         return self.starts.grid(self.field, self.sigma)
+
+    @cached_property
+    def readings(self) -> int:
+        """Flux components that the field makes: a constant one has no quadrature."""
+        return int((self.field.moments != 0.0).any(axis=0).sum())
+
+    @cached_property
+    def symmetry(self) -> SymmetryAxis | None:
+        """The axis about which the field is the same all around, where it has one."""
+        moments = self.field.moments.view(np.complex128)
+        return symmetry_axis(self.field.positions, self.field.directions, moments)
 
     @cached_property
     def relative_error(self) -> float:

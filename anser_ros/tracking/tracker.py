@@ -21,13 +21,14 @@ from anser_ros.integrity.freshness import Freshness
 from anser_ros.integrity.withheld import Withheld
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.tracking import estimate as states
-from anser_ros.tracking.body_track import BodyTrack, track_body
+from anser_ros.tracking.body_track import BodyResult, BodyTrack, track_body
 from anser_ros.tracking.coil_track import CoilResult, CoilTrack, prepare, track_coil
 from anser_ros.tracking.emitters import FEWEST_EMITTERS, ReducedScene, without_dead
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.judgement import Judgement, RigidBody
 from anser_ros.tracking.rigid import BodyCoils
 from anser_ros.tracking.solve_context import SolveContext, build_context
+from anser_ros.tracking.source_track import SourceFrame, SourceTrack, track_source
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -56,6 +57,9 @@ class Tracker:
         readings that were not used: ``readings_missing``, ``readings_saturated``,
         ``readings_stale``, ``readings_dropped``, ``readings_not_finite``, ``readings_absurd``,
         ``readings_stuck``.
+    sources : dict of str to PoseEstimate
+        Of each body in the last frame, where the field is the same all around an axis: place (m)
+        and axis of the source in the body's frame. A body has no pose of its own there.
 
     Raises
     ------
@@ -83,6 +87,8 @@ class Tracker:
         self.counters: Counter[str] = Counter()
         self._coil_tracks = {name: CoilTrack() for name in sensors.name}
         self._body_tracks = {name: BodyTrack() for name in dict.fromkeys(sensors.body)}
+        self._source_tracks: dict[str, SourceTrack] = {}
+        self.sources: dict[str, PoseEstimate] = {}
         self._intake = Intake(sensors.channel, self._count, spares_dead=True, error=TrackingError)
         self._freshness = Freshness()
         self._judgement = Judgement()
@@ -111,7 +117,11 @@ class Tracker:
         self._bodies: dict[str, tuple[NDArray[np.int64], BodyCoils]] = {}
         for body in self._body_tracks:
             rows = np.array([i for i, name in enumerate(table.body) if name == body])
-            coils = BodyCoils(table.position[rows], table.axis[rows], table.length[rows])
+            changes = None if self._correction is None else self._correction.gain_changes()
+            coils = BodyCoils(
+                table.position[rows], table.axis[rows], table.length[rows],
+                None if changes is None else changes[:, rows],
+            )  # fmt: skip
             if coils.observable:
                 self._bodies[body] = (rows, coils)
 
@@ -185,6 +195,8 @@ class Tracker:
             coil.forget()
         for body in self._body_tracks.values():
             body.forget()
+        for source in self._source_tracks.values():
+            source.forget()
 
     def update(
         self,
@@ -291,15 +303,30 @@ class Tracker:
         values = flux.view(np.float64)
         coils = self._solved_coils(stamp_ns, values, codes, context)
         bodies = []
+        self.sources.clear()
         for name, (rows, table) in self._bodies.items():
             single = [coils[i] for i in rows]
             usable = np.array([coil.usable for coil in single])
+            if context.symmetry is not None:
+                frame = SourceFrame(
+                    name, stamp_ns, table, values[rows], context.symmetry, context, self.settings
+                )
+                bodies.append(RigidBody(rows, table, self._source(frame, usable)))
+                continue
             result = track_body(
                 self._body_tracks[name], name, table, stamp_ns, values[rows], usable, single,
                 context, self.settings,
             )  # fmt: skip
             bodies.append(RigidBody(rows, table, result))
         yield from self._judgement.judged(stamp_ns, coils, bodies, self.settings)
+
+    def _source(self, frame: SourceFrame, usable: NDArray[np.bool_]) -> BodyResult:
+        """Find the source in a body's frame; its pose stays unknown by a turn about the axis."""
+        track = self._source_tracks.setdefault(frame.name, SourceTrack())
+        self.sources[frame.name] = track_source(track, frame, usable)
+        reason = 'the field is the same all around its axis: a turn about it stays unknown'
+        model_id = frame.context.model_id
+        return BodyResult(no_pose(frame.name, frame.stamp_ns, states.AMBIGUOUS, model_id, reason))
 
     def _solved_coils(
         self, stamp_ns: int, values: Array, codes: NDArray[np.int64], context: SolveContext

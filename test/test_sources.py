@@ -1,0 +1,236 @@
+"""Emitters without a drawing, and an axisymmetric one seen from an array of sensors.
+
+The world is a loop of current of a finite size; the models are dipoles on an axis.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from anser_ros.calibration.coaxial import coaxial, fit_coaxial
+from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows
+from anser_ros.calibration.layouts import Generator, Layout, place
+from anser_ros.effects.correction import Correction
+from anser_ros.errors import ModelFileError
+from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import EffectRecord, FieldModel
+from anser_ros.field.symmetry import symmetry_axis
+from anser_ros.fingerprint import Identity
+from anser_ros.physics.sensor import SensorTable, clusters_of
+from anser_ros.physics.tracks import loop_field
+from anser_ros.physics.volume import TrackedVolume
+from anser_ros.sessions.starting_model import with_new_survey
+from anser_ros.tracking.estimate import OK
+from anser_ros.tracking.source_track import seen_from
+from anser_ros.tracking.tracker import Tracker, TrackerSettings
+from anser_ros.wire.config_folder import read_config
+from anser_ros.wire.setup import parse_setup
+
+CENTRE = np.array([0.004, -0.003, 0.002])
+AXIS = np.array([0.3, -0.2, 0.9]) / np.linalg.norm([0.3, -0.2, 0.9])
+RADIUS_M, MOMENT_AM2, NOISE_T = 0.008, 0.5, 2e-7
+
+
+def source_field(points):
+    """Field (P, 3), T, of a round loop of current."""
+    angle = 2 * np.pi * np.arange(90) / 90
+    ring = RADIUS_M * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    current = MOMENT_AM2 / (np.pi * RADIUS_M**2)
+    return loop_field(ring @ _upright().T + CENTRE, points, current)
+
+
+def _upright():
+    """Rotation matrix that takes +z to the loop's axis."""
+    across = np.cross([0.0, 1.0, 0.0], AXIS)
+    across /= np.linalg.norm(across)
+    return np.stack([across, np.cross(AXIS, across), AXIS], axis=1)
+
+
+def array_of_sensors(rng):
+    """Seven three-axis sensors, about 25 mm from each other, each turned at random."""
+    places = 0.03 * rng.uniform(-1.0, 1.0, size=(7, 3)) * [1.0, 1.0, 0.3]
+    turns = Rotation.random(7, random_state=1).as_matrix()
+    axes = turns.transpose(0, 2, 1).reshape(-1, 3)
+    names = tuple(f'array/{k}/{a}' for k in range(7) for a in 'xyz')
+    return SensorTable(
+        np.arange(21), names, ('array',) * 21, np.repeat(places, 3, axis=0), axes, np.zeros(21)
+    )
+
+
+def recorded(table, rng, frames=40, gains=None):
+    """Readings of the array around the source, 60 to 100 mm away, and its true poses."""
+    place = rng.uniform([-0.03, -0.03, 0.06], [0.03, 0.03, 0.1], size=(frames, 3))
+    turn = Rotation.from_rotvec(0.5 * rng.normal(size=(frames, 3))).as_matrix()
+    points, axes = table.placed(place, turn)
+    flux = np.einsum('pi,pi->p', source_field(points.reshape(-1, 3)), axes.reshape(-1, 3))
+    flux = flux.reshape(frames, -1) * (1.0 if gains is None else gains)
+    flux = flux + NOISE_T * rng.normal(size=flux.shape)
+    valid = np.ones(flux.shape, dtype=bool)
+    return Measurements(
+        'array', table, 5.0 * np.arange(frames), flux[:, :, None].astype(complex), valid,
+        np.zeros(flux.shape, dtype=int), place, turn, np.ones(frames, dtype=bool),
+    )  # fmt: skip
+
+
+def fitted(measured, count):
+    """The dipoles that are found, their moments and the residual, T rms."""
+    start = place(
+        Layout('coaxial', count, 1.0, 0.0), Generator(np.zeros((1, 3)), np.zeros(1), 0.1)
+    )
+    weights = [np.ones(measured.valid.shape)]
+    sites = fit_coaxial([measured], weights, start, count)
+    basis, flux = basis_rows(measured, sites), measured.flux.reshape(-1, 1)
+    moments = np.linalg.lstsq(basis, flux, rcond=None)[0]
+    return sites, moments, float(np.sqrt(np.mean(np.abs(flux - basis @ moments) ** 2)))
+
+
+@pytest.fixture(scope='module')
+def model():
+    """The source as a scan of 60 frames has it."""
+    rng = np.random.default_rng(3)
+    sites, moments, _ = fitted(recorded(array_of_sensors(rng), rng, 60), 3)
+    return FieldModel(sites.positions, sites.directions, moments, ('loop',), (1.0,))
+
+
+class TestCoaxial:
+    def test_place_and_axis_are_found_and_the_size_needs_three_dipoles(self):
+        rng = np.random.default_rng(2)
+        measured = recorded(array_of_sensors(rng), rng, 60)
+        sites, moments, left = fitted(measured, 3)
+        assert np.linalg.norm(sites.positions[1] - CENTRE) < 3e-4
+        assert abs(sites.directions[1] @ AXIS) > 1.0 - 1e-6
+        assert moments.sum().real == pytest.approx(MOMENT_AM2, rel=0.01)
+        assert left < 1.1 * NOISE_T
+        assert fitted(measured, 1)[2] > 1.6 * NOISE_T
+
+    def test_each_emitter_has_an_axis_of_its_own(self):
+        rng = np.random.default_rng(4)
+        measured = recorded(array_of_sensors(rng), rng)
+        other = coaxial(np.array([[0.02, 0.01, 0.0]]), np.array([[1.0, 0.0, 0.0]]), 1, np.zeros(1))
+        second = (basis_rows(measured, other) @ [[0.3]]).reshape(*measured.valid.shape, 1)
+        both = replace(measured, flux=np.concatenate([measured.flux, second], axis=2))
+        centres = np.array([[0.0, 0.0, 0.0], [0.03, 0.0, 0.0]])
+        start = place(Layout('coaxial', 1, 1.0, 0.0), Generator(centres, np.zeros(2), 0.03))
+        sites = fit_coaxial([both], [np.ones(measured.valid.shape)], start, 1)
+        np.testing.assert_allclose(sites.positions[1], other.positions[0], atol=1e-6)
+        np.testing.assert_allclose(np.abs(sites.directions[1]), [1.0, 0.0, 0.0], atol=1e-5)
+        assert np.linalg.norm(sites.positions[0] - CENTRE) < 2e-3
+
+
+class TestSymmetry:
+    def test_dipoles_on_a_line_are_the_same_all_around(self, model):
+        axis = symmetry_axis(model.positions, model.directions, model.moments)
+        assert abs(axis.direction @ AXIS) > 1.0 - 1e-5
+        assert np.linalg.norm(axis.point - CENTRE) < 2e-3
+
+    def test_one_beside_the_line_or_across_it_is_not(self, model):
+        beside = DipoleSites(model.positions + [[0, 0, 0], [1e-4, 0, 0], [0, 0, 0]], AXIS[None])
+        assert symmetry_axis(beside.positions, model.directions, model.moments) is None
+        across = model.directions.copy()
+        across[1] = np.cross(across[1], [1.0, 0.0, 0.0])
+        assert symmetry_axis(model.positions, across, model.moments) is None
+
+    def test_three_components_at_one_place_are_one_vector(self):
+        places, moments = np.tile(CENTRE, (3, 1)), AXIS[:, None].astype(complex)
+        axis = symmetry_axis(places, np.eye(3), moments)
+        np.testing.assert_allclose(axis.direction, AXIS, atol=1e-12)
+
+
+class TestSeenFromABody:
+    SETTINGS = TrackerSettings(
+        flux_noise_t=NOISE_T, volume=TrackedVolume((-0.08, -0.08, 0.03), (0.08, 0.08, 0.13))
+    )
+
+    def found(self, model, measured):
+        """Places, axes and sigmas (F, ...) from a cold start in every frame, and the truth."""
+        tracker = Tracker(model, measured.sensors, self.SETTINGS)
+        out = []
+        for k, flux in enumerate(measured.flux):
+            poses = tracker.update(10**10 * (k + 1), measured.sensors.channel, flux)
+            assert all(pose.state != OK for pose in poses), 'no pose of six numbers is known'
+            out.append(tracker.sources['array'])
+        axis = symmetry_axis(model.positions, model.directions, model.moments)
+        true = seen_from(axis, measured.position, measured.rotation)
+        return out, true
+
+    def test_a_cold_start_finds_it_to_its_sigma(self, model):
+        rng = np.random.default_rng(8)
+        found, (place_m, axis) = self.found(model, recorded(array_of_sensors(rng), rng, 30))
+        assert [e.reason for e in found if e.state != OK] == []
+        miss = np.array([e.position for e in found]) - place_m
+        cosine = np.sum(np.array([e.axis for e in found]) * axis, axis=1)
+        assert np.linalg.norm(miss, axis=1).max() < 1e-3 and cosine.min() > np.cos(0.02)
+        inverse = np.linalg.inv([e.covariance[:3, :3] for e in found])
+        chi2 = np.einsum('fi,fij,fj->f', miss, inverse, miss)
+        assert 1.0 < np.mean(chi2) < 6.0
+
+    def test_a_model_that_knows_how_gains_change_is_nearer_and_less_sure(self, model):
+        rng = np.random.default_rng(9)
+        table = array_of_sensors(rng)
+        gains = np.repeat(1.0 + 0.01 * rng.normal(size=7), 3)
+        told = EffectRecord(
+            'sensor_gain_spread',
+            {
+                'spread': 0.01, 'shared': 0.95, 'channels': list(range(21)),
+                'values': [[1.0, 0.0]] * 21,
+            },
+        )  # fmt: skip
+        measured = recorded(table, rng, 30, gains)
+        errors, sigmas = [], []
+        settings = replace(self.SETTINGS, gate=1e3, adaptive=False)
+        for effects in ((), (told,)):
+            tracker = Tracker(replace(model, effects=effects), table, settings)
+            axis = symmetry_axis(model.positions, model.directions, model.moments)
+            true, _ = seen_from(axis, measured.position, measured.rotation)
+            for k, flux in enumerate(measured.flux):
+                tracker.update(10**10 * (k + 1), table.channel, flux)
+                errors.append(np.linalg.norm(tracker.sources['array'].position - true[k]))
+                sigmas.append(tracker.sources['array'].sigma_position_m)
+        before, after = np.sqrt(np.mean(np.square(np.reshape(errors, (2, -1))), axis=1))
+        assert after < 0.8 * before
+        assert before > 3.0 * np.mean(sigmas[:30]) and after < 2.0 * np.mean(sigmas[30:])
+
+    def test_separate_coils_have_no_gain_in_common(self):
+        table = array_of_sensors(np.random.default_rng(1))
+        assert [rows.tolist() for rows in clusters_of(table)][1] == [3, 4, 5]
+        record = EffectRecord(
+            'sensor_gain_spread',
+            {'spread': 0.01, 'shared': 0.2, 'channels': [0, 1], 'values': [[1.0, 0.0]] * 2},
+        )
+        assert Correction.of((record,), table, (1.0,)).gain_changes() is None
+
+    def test_a_distance_beyond_the_volume_is_said(self, model):
+        rng = np.random.default_rng(8)
+        measured = recorded(array_of_sensors(rng), rng, 2)
+        settings = replace(
+            self.SETTINGS, volume=TrackedVolume((-0.05, -0.05, 0.2), (0.05, 0.05, 0.3))
+        )
+        tracker = Tracker(model, measured.sensors, settings)
+        tracker.update(10**10, measured.sensors.channel, measured.flux[0])
+        assert tracker.sources['array'].state != OK
+
+
+class TestNewSurvey:
+    def test_gains_stay_and_places_fall_away(self, model):
+        setup = parse_setup(read_config('demo_setup.yaml'))
+        body = setup.bodies[0]
+        channels = [s.channel for s in setup.sensors if s.body == body][:2]
+        gains = EffectRecord(
+            'sensor_gain_spread',
+            {'spread': 0.01, 'channels': channels, 'values': [[1.0, 0.0]] * 2},
+        )
+        places = EffectRecord(
+            'sensor_place_spread',
+            {'spread': 1e-4, 'channels': channels, 'values': [[0.0, 0.0, 1e-4]] * 2},
+        )
+        made = Identity(setup.identity.board, {**setup.identity.bodies, body: '00000000'})
+        old = replace(model, effects=(gains, places), made_for=made)
+        new = with_new_survey(old, setup, [body])
+        assert new.effects == (gains,)
+        assert new.made_for.bodies[body] == setup.identity.bodies[body]
+        with pytest.raises(ModelFileError, match='no body'):
+            with_new_survey(old, setup, ['nobody'])
+        with pytest.raises(ModelFileError, match='does not tell'):
+            with_new_survey(replace(old, made_for=None), setup, [body])
