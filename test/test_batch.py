@@ -76,7 +76,9 @@ def test_a_worker_that_dies_loses_nothing(sessions, alone, tmp_path, capfd):
     from distributed import LocalCluster
 
     done = []
-    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address='127.0.0.1:0'
+    ) as cluster:
         arguments = ['batch', 'evaluate', *sessions, '--poses', '--out', str(tmp_path)]
         arguments += ['--scheduler', cluster.scheduler_address]
         batch = threading.Thread(target=lambda: done.append(main(arguments)))

@@ -54,6 +54,7 @@ ROOMS = {
     'pyigtl': (),
     'rich': ('nodes/', 'cli/'),
     'matplotlib': ('diagnosis/', 'experiments/', 'cli/'),
+    'dask': ('cli/batch.py',),
     'distributed': ('cli/batch.py',),
     'magpylib': (),
     'nicegui': ('web/',),

@@ -5,6 +5,7 @@ from importlib.util import find_spec
 from anser_ros.errors import AnserError
 
 PYPI = {
+    'dask': 'dask',
     'distributed': 'distributed',
     'mcap': 'mcap',
     'mcap_ros2': 'mcap-ros2-support',

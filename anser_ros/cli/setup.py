@@ -1,0 +1,164 @@
+"""Write a setup document by questions or options, check it, and draw it."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.setup_figure import draw_setup
+from anser_ros.cli.setup_parts import (
+    ANSER,
+    COIL_COLUMNS,
+    GEOMETRY,
+    SENSOR_COLUMNS,
+    Document,
+    advice_on,
+    anser_emitter,
+    coil_of,
+    document_of,
+    emitter_of,
+    number_of,
+    numbers_of,
+    rows_of,
+    sensor_of,
+    text_of,
+)
+from anser_ros.cli.setup_questions import ask_all
+from anser_ros.cli.stated_values import add_stated_values, stated_values
+from anser_ros.errors import ParameterError
+from anser_ros.sessions.starting_model import board_of
+from anser_ros.wire.config_folder import read_config
+from anser_ros.wire.setup import Setup, parse_setup
+
+SCHEMA = 'anser_setup_result/1'
+DOCUMENT, PICTURE = 'setup.yaml', 'setup.png'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.epilog = (
+        'examples: anser setup --out my_setup/ (asks); anser setup --board anser '
+        '--sensor "0,pen/tip,pen,0,0,0,z" --sensor "16,ref/0,fg,150,0,20,1 0 1" --out my_setup/; '
+        'anser setup config/demo_setup.yaml --out picture/ (checks and draws it)'
+    )
+    parser.add_argument('document', nargs='?', help='a setup document to check and draw')
+    parser.add_argument(
+        '--out', required=True, type=Path,
+        help=f'folder for {DOCUMENT} and {PICTURE}, made if missing',
+    )  # fmt: skip
+    parser.add_argument(
+        '--board',
+        choices=[ANSER, *GEOMETRY],
+        help='the Anser v1 board, or how its coils are drawn',
+    )
+    parser.add_argument(
+        '--geometry', action='append', default=[], metavar='KEY=VALUE',
+        help='of all emitter coils, SI units: ' + '; '.join(f'{k}: {", ".join(v)}' for k, v in
+                                                            GEOMETRY.items()),
+    )  # fmt: skip
+    parser.add_argument(
+        '--coil', action='append', default=[], metavar='X,Y,Z,TURN,TONE',
+        help='an emitter coil: centre in mm, turn about z in degrees, tone in Hz; may be repeated',
+    )  # fmt: skip
+    parser.add_argument(
+        '--coils', type=Path, metavar='CSV', help=f'emitter coils: {",".join(COIL_COLUMNS)}'
+    )
+    parser.add_argument(
+        '--sensor', action='append', default=[], metavar='CHANNEL,NAME,BODY,X,Y,Z,AXIS[,LENGTH]',
+        help='a coil that listens, mm in the frame of its body, which is fg for a reference coil; '
+        'the axis is x, -x, ... or three numbers with blanks; may be repeated',
+    )  # fmt: skip
+    parser.add_argument(
+        '--sensors', type=Path, action='append', default=[], metavar='CSV',
+        help=f'such coils: {",".join(SENSOR_COLUMNS)}[,length_mm]; may be repeated',
+    )  # fmt: skip
+    parser.add_argument('--rate', type=float, default=50.0, help='flux windows a second (50)')
+    parser.add_argument(
+        '--volume', metavar='X,Y,Z,X,Y,Z',
+        help='two corners of the tracked volume, mm; over the board by its size by default',
+    )  # fmt: skip
+    add_stated_values(parser, 'accuracy', 'refit', 'tools')
+    parser.add_argument('--json', action='store_true', help='print what was written and advised')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; the exit code."""
+    parts = [args.board, args.geometry, args.coil, args.coils, args.sensor, args.sensors]
+    make_folder(args.out)
+    if args.document is not None:
+        if any(parts) or args.volume or args.stated:
+            raise ParameterError('a document states all; options are for a new one')
+        text = read_config(args.document)
+        setup = parse_setup(text)
+    elif any(parts):
+        text, setup = text_of(_document(args))
+    else:
+        text, setup = text_of(ask_all(_ask, _say))
+    return _write(args, text, setup)
+
+
+def _document(args: argparse.Namespace) -> Document:
+    """The document that the options state."""
+    if args.board is None:
+        raise ParameterError(f'--board is needed: {", ".join([ANSER, *GEOMETRY])}')
+    coils = [coil_of(f'coil{rank}', text) for rank, text in enumerate(args.coil)]
+    if args.coils is not None:
+        for row in rows_of(args.coils, COIL_COLUMNS):
+            name, _, rest = row.partition(',')
+            coils.append(coil_of(name, rest))
+    if args.board == ANSER:
+        if coils or args.geometry:
+            raise ParameterError('the Anser board has its own coils; name another kind of board')
+        emitter = anser_emitter()
+    else:
+        emitter = emitter_of(args.board, _geometry(args.geometry), coils)
+    rows = [*args.sensor, *(row for path in args.sensors for row in rows_of(path, SENSOR_COLUMNS))]
+    volume = None if args.volume is None else numbers_of(args.volume, (6,), '--volume')
+    sensors = [sensor_of(row) for row in rows]
+    return document_of(emitter, sensors, args.rate, volume, stated_values(args))
+
+
+def _geometry(entries: list[str]) -> dict[str, float]:
+    found = {}
+    for entry in entries:
+        key, _, value = entry.partition('=')
+        found[key] = number_of(value, f'--geometry {key}')
+    return found
+
+
+def _write(args: argparse.Namespace, text: str, setup: Setup) -> int:
+    """Write document and picture; nothing is written of a board that cannot be drawn."""
+    if args.document is None:
+        board_of(setup)
+    advice = advice_on(setup)
+    written = [args.out / PICTURE]
+    draw_setup(setup, written[0])
+    if args.document is None:
+        written.insert(0, args.out / DOCUMENT)
+        written[0].write_text(text, encoding='utf-8')
+    for line in advice:
+        print(f'anser setup: {line}', file=sys.stderr)
+    if args.json:
+        files = [str(path) for path in written]
+        print(json.dumps({'schema': SCHEMA, 'files': files, 'advice': advice}, indent=1))
+        return 0
+    print(
+        f'{len(setup.emitter.coils)} emitter coils, {len(setup.reference_sensors)} reference '
+        f'coils, tools: {", ".join(setup.bodies) or "none"}'
+    )
+    say_written(*written)
+    return 0
+
+
+def _ask(question: str) -> str:
+    """As `input`, with the question on stderr: stdout is for what comes out."""
+    print(question, end='', file=sys.stderr, flush=True)
+    line = sys.stdin.readline()
+    if not line:
+        raise EOFError
+    return line
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr)

@@ -1,0 +1,230 @@
+"""A setup document put together from its parts: texts that people type, in mm and degrees."""
+
+import csv
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from anser_ros.errors import ParameterError
+from anser_ros.settings import SECTIONS
+from anser_ros.wire.config_folder import read_config
+from anser_ros.wire.setup import FIELD_GENERATOR, SCHEMA, Setup, parse_setup
+from anser_ros.wire.yaml_text import read_yaml
+
+ANSER, ANSER_FILE = 'anser', 'demo_setup.yaml'
+"""The board that is known by name, and the file of `config/` that has it."""
+SPIRAL = ('turns', 'pitch_m', 'layers', 'thickness_m', 'current_a')
+GEOMETRY = {
+    'square_spiral_pcb': ('side_m', *SPIRAL),
+    'rectangular_spiral_pcb': ('side_x_m', 'side_y_m', *SPIRAL),
+    'rectangular_loop': ('side_x_m', 'side_y_m', 'turns', 'current_a'),
+    'circular_loop': ('radius_m', 'turns', 'current_a'),
+}
+"""What is asked of the coils of a kind of board."""
+WHOLE = ('turns', 'layers')
+DIRECTIONS = {
+    f'{sign}{name}': [factor * float(axis == name) for axis in 'xyz']
+    for name in 'xyz'
+    for sign, factor in (('', 1.0), ('+', 1.0), ('-', -1.0))
+}
+"""Directions that have a name."""
+SENSOR_COLUMNS = ('channel', 'name', 'body', 'x_mm', 'y_mm', 'z_mm', 'axis')
+COIL_COLUMNS = ('name', 'x_mm', 'y_mm', 'z_mm', 'turn_deg', 'tone_hz')
+LEAST_EMITTERS = 6
+"""Emitter coils from which on a single coil can be tracked: a pose has five unknowns."""
+FEWEST_WINDOWS = 1.0
+"""Least distance of two tones, in windows a second: nearer ones leak into each other."""
+PARALLEL = 0.999
+"""Cosine from which on two axes count as parallel, 2.6 degrees."""
+
+Document = dict[str, Any]
+
+
+def number_of(text: str, what: str) -> float:
+    """A finite number.
+
+    Raises
+    ------
+    ParameterError
+        When it is none.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = float('nan')
+    if not np.isfinite(value):
+        raise ParameterError(f'{what} must be a number, got {text.strip()!r}')
+    return value
+
+
+def numbers_of(text: str, counts: Sequence[int], what: str) -> list[float]:
+    """Numbers with commas or blanks between them, as many as one of the counts says."""
+    parts = text.replace(',', ' ').split()
+    if len(parts) not in counts:
+        wanted = ' or '.join(map(str, counts))
+        raise ParameterError(f'{what} takes {wanted} numbers, got {text.strip()!r}')
+    return [number_of(part, what) for part in parts]
+
+
+def metres(values: Sequence[float]) -> list[float]:
+    """Lengths in mm as lengths in m, without the rounding of the division in the document."""
+    return [round(1e-3 * value, 9) for value in values]
+
+
+def emitter_of(kind: str, geometry: Mapping[str, float], coils: list[Document]) -> Document:
+    """The section of a board; its values are checked with the whole document."""
+    if kind not in GEOMETRY:
+        raise ParameterError(f'no board {kind}; there are: {", ".join([ANSER, *GEOMETRY])}')
+    values = {k: int(v) if k in WHOLE and v == int(v) else v for k, v in geometry.items()}
+    return {'kind': kind, **values, 'coils': coils}
+
+
+def anser_emitter() -> Document:
+    """The section of the Anser v1 board."""
+    emitter: Document = read_yaml(read_config(ANSER_FILE))['emitter']
+    return emitter
+
+
+def coil_of(name: str, text: str) -> Document:
+    """An emitter coil from ``x, y, z, turn about z, tone`` in mm, degrees and Hz."""
+    x, y, z, turn, tone = numbers_of(text, (5,), f'coil {name}')
+    return {
+        'name': name, 'centre_m': metres((x, y, z)), 'rotation_deg': turn, 'frequency_hz': tone,
+    }  # fmt: skip
+
+
+def sensor_of(text: str, body: str = '') -> Document:
+    """A sensor from ``channel, name, body, x, y, z, axis[, length]``, mm; axis as `axis_of`.
+
+    Where a ``body`` is given it does not stand in the text.
+    """
+    cells = [cell.strip() for cell in text.split(',')]
+    if body:
+        cells.insert(2, body)
+    if len(cells) not in (7, 8):
+        names = [name for name in SENSOR_COLUMNS if not body or name != 'body']
+        raise ParameterError(f'a sensor takes {",".join(names)}[,length_mm], got {text.strip()!r}')
+    what = f'sensor {cells[1]}'
+    channel = number_of(cells[0], f'{what}: channel')
+    if channel != int(channel):
+        raise ParameterError(f'{what}: channel must be a whole number, got {cells[0]}')
+    return {
+        'channel': int(channel), 'name': cells[1], 'body': cells[2],
+        'position_m': metres([number_of(cell, what) for cell in cells[3:6]]),
+        'axis': axis_of(cells[6], what),
+        'length_m': metres([number_of(cells[7], what)])[0] if len(cells) == 8 else 0.0,
+    }  # fmt: skip
+
+
+def axis_of(text: str, what: str) -> list[float]:
+    """A direction: x, -z and the like, or three numbers of any length, blanks between them."""
+    if text.lower() in DIRECTIONS:
+        return DIRECTIONS[text.lower()]
+    if len(text.split()) != 3:
+        raise ParameterError(f'{what}: axis is x, -x, ... or three numbers, got {text!r}')
+    values = np.array(numbers_of(text, (3,), f'{what}: axis'))
+    length = float(np.linalg.norm(values))
+    if length == 0.0:
+        raise ParameterError(f'{what}: an axis has a length')
+    return [round(float(value), 9) for value in values / length]
+
+
+def rows_of(path: Path, columns: Sequence[str]) -> list[str]:
+    """The rows of a CSV file with a head, each as the text that is typed for it.
+
+    Raises
+    ------
+    ParameterError
+        When the head is another one, or there is no row.
+    """
+    with path.open(encoding='utf-8-sig', newline='') as stream:
+        reader = csv.DictReader(stream)
+        extra = [name for name in reader.fieldnames or () if name == 'length_mm']
+        found = [name for name in reader.fieldnames or () if name not in extra]
+        if set(found) != set(columns):
+            raise ParameterError(
+                f'{path}: columns must be {",".join(columns)}, got {",".join(found)}'
+            )
+        rows = [
+            ','.join((row[name] or '').strip() for name in (*columns, *extra)) for row in reader
+        ]
+    if not rows:
+        raise ParameterError(f'{path}: no rows')
+    return [row.rstrip(',') for row in rows]
+
+
+def document_of(
+    emitter: Document,
+    sensors: list[Document],
+    rate_hz: float,
+    volume_mm: Sequence[float] | None,
+    stated: Mapping[str, float],
+) -> Document:
+    """The whole document as plain data."""
+    document: Document = {
+        'schema': SCHEMA, 'frame_id': FIELD_GENERATOR, 'flux_rate_hz': rate_hz, 'flux_unit': 'T',
+        'emitter': emitter, 'sensors': sensors,
+    }  # fmt: skip
+    if volume_mm is not None:
+        low, high = metres(volume_mm[:3]), metres(volume_mm[3:])
+        document['volume'] = {'low_m': low, 'high_m': high}
+    for section, names in SECTIONS.items():
+        values = {name: stated[name] for name in names if name in stated}
+        if values:
+            document[section] = values
+    return document
+
+
+class _Lines(yaml.SafeDumper):
+    """Writes the coils and sensors of a document in a line each, as the files of `config/` do."""
+
+    def represent_mapping(self, tag: str, mapping: Any, flow_style: bool | None = None) -> Any:
+        is_row = 'name' in dict(mapping)
+        return super().represent_mapping(tag, mapping, flow_style=is_row or flow_style)
+
+    def represent_sequence(self, tag: str, sequence: Any, flow_style: bool | None = None) -> Any:
+        is_vector = all(isinstance(value, int | float) for value in sequence)
+        return super().represent_sequence(tag, sequence, flow_style=is_vector or flow_style)
+
+
+def text_of(document: Document) -> tuple[str, Setup]:
+    """The document as YAML, and what readers make of it.
+
+    Raises
+    ------
+    SetupError
+        When the document breaks a rule.
+    """
+    plain = yaml.safe_load(yaml.safe_dump(document))  # nothing in it is shared
+    text = yaml.dump(plain, Dumper=_Lines, sort_keys=False, width=200)
+    return text, parse_setup(text)
+
+
+def advice_on(setup: Setup) -> list[str]:
+    """What is allowed, and will be missed later; a line each."""
+    found, emitters = [], setup.emitter.coils
+    if len(emitters) < LEAST_EMITTERS:
+        found.append(
+            f'{len(emitters)} emitter coils: a single coil is tracked from {LEAST_EMITTERS} on'
+        )
+    tones = sorted((coil.frequency_hz, coil.name) for coil in emitters)
+    for (one, name), (other, neighbour) in itertools.pairwise(tones):
+        if other - one < FEWEST_WINDOWS * setup.flux_rate_hz:
+            found.append(
+                f'tones of {name} and {neighbour} are {other - one:g} Hz apart, nearer than '
+                f'{setup.flux_rate_hz:g} windows a second tell them apart'
+            )
+    for body in setup.bodies:
+        axes = np.array([sensor.axis for sensor in setup.sensors if sensor.body == body])
+        if (np.abs(axes @ axes[0]) > PARALLEL).all():
+            found.append(f'{body}: all coils are parallel, so its roll is not seen: no whole pose')
+    count, least = len(setup.reference_sensors), setup.refit.min_references
+    if count < least:
+        found.append(
+            f'{count} reference coils: the model follows metal from {least} on, well from 16'
+        )
+    return found

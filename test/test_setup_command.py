@@ -1,0 +1,109 @@
+"""`anser setup`: options and questions give the same document, checked and drawn."""
+
+import io
+import json
+import sys
+
+import pytest
+
+from anser_ros.cli.main import main
+from anser_ros.cli.setup_parts import GEOMETRY, coil_of, document_of, emitter_of, text_of
+from anser_ros.physics.board import KINDS
+from anser_ros.sessions.starting_model import board_of
+from anser_ros.wire.setup import parse_setup
+
+SENSORS = ('0,pen/tip,pen,0,0,0,z', '1,pen/back,pen,0,0,-40,x,8', '16,ref/0,fg,150,0,20,1 0 1')
+COILS = ('-80,0,0,0,1000', '80,0,0,0,1200', '0,80,0,30,1400')
+
+
+def options(folder):
+    geometry = [f'--geometry={entry}' for entry in ('radius_m=0.04', 'turns=60', 'current_a=0.2')]
+    coils = [f'--coil={text}' for text in COILS]
+    sensors = [f'--sensor={text}' for text in SENSORS]
+    return ['setup', '--board', 'circular_loop', *geometry, *coils, *sensors, '--out', str(folder)]
+
+
+def test_options_make_a_document_and_a_picture(tmp_path, capsys):
+    assert main([*options(tmp_path), '--volume=-100,-100,50,100,100,250', '--json']) == 0
+    out, said = capsys.readouterr()
+    setup = parse_setup((tmp_path / 'setup.yaml').read_text())
+    assert [coil.centre_m for coil in setup.emitter.coils][2] == (0.0, 0.08, 0.0)
+    assert setup.emitter.coils[2].rotation_deg == 30.0
+    back = setup.sensors[1]
+    assert (back.channel, back.position_m, back.length_m) == (1, (0.0, 0.0, -0.04), 0.008)
+    assert setup.reference_sensors[0].axis == pytest.approx((0.5**0.5, 0.0, 0.5**0.5))
+    assert setup.volume == ((-0.1, -0.1, 0.05), (0.1, 0.1, 0.25))
+    assert (tmp_path / 'setup.png').read_bytes()[:4] == b'\x89PNG'
+    document = json.loads(out)
+    assert len(document['files']) == 2
+    assert any('single coil' in line for line in document['advice'])
+    assert 'reference coils' in said
+    assert main(['setup', str(tmp_path / 'setup.yaml'), '--out', str(tmp_path / 'again')]) == 0
+    assert (tmp_path / 'again' / 'setup.png').exists()
+    assert not (tmp_path / 'again' / 'setup.yaml').exists()
+
+
+def test_questions_ask_again_until_the_answer_is_right(tmp_path, capsys, monkeypatch):
+    rows = [text.replace(',pen,', ',', 1) for text in SENSORS[:2]]
+    answers = [
+        'hexagon', 'circular_loop', 'four', '0.04', '60', '0.2', '3', *COILS,
+        '', 'pen', '2', rows[0], rows[0], '1,pen/back,0,0,-40,q', rows[1], '',
+        '1', SENSORS[2].replace(',fg,', ',', 1), '', '',
+    ]  # fmt: skip
+    monkeypatch.setattr(sys, 'stdin', io.StringIO('\n'.join(answers) + '\n'))
+    assert main(['setup', '--out', str(tmp_path / 'asked')]) == 0
+    said = capsys.readouterr().err
+    for words in ('there are: anser', "must be a number, got 'four'", 'at least one tool',
+                  'appears twice', 'axis is x, -x'):  # fmt: skip
+        assert words in said
+    assert main(options(tmp_path / 'stated')) == 0
+    asked, stated = ((tmp_path / n / 'setup.yaml').read_text() for n in ('asked', 'stated'))
+    assert asked == stated
+    monkeypatch.setattr(sys, 'stdin', io.StringIO('anser\n'))
+    assert main(['setup', '--out', str(tmp_path / 'cut')]) == 2
+    assert 'no answer to: name of a tool' in capsys.readouterr().err
+    assert not (tmp_path / 'cut' / 'setup.yaml').exists()
+
+
+def test_tables_are_taken_as_rows(tmp_path, capsys):
+    (tmp_path / 'tool.csv').write_text(
+        'channel,name,body,axis,x_mm,y_mm,z_mm\n0,pen/tip,pen,-z,1,2,3\n1,pen/b,pen,0 3 4,0,0,9\n'
+    )
+    command = ['setup', '--board', 'anser', '--sensors', str(tmp_path / 'tool.csv')]
+    assert main([*command, '--set', 'flux_noise_t=5e-11', '--out', str(tmp_path)]) == 0
+    setup = parse_setup((tmp_path / 'setup.yaml').read_text())
+    assert len(setup.emitter.coils) == 8 and setup.accuracy.flux_noise_t == 5e-11
+    assert [s.axis for s in setup.sensors] == [(0.0, 0.0, -1.0), (0.0, 0.6, 0.8)]
+    assert setup.sensors[0].position_m == (0.001, 0.002, 0.003)
+    (tmp_path / 'tool.csv').write_text('channel,name\n0,a\n')
+    assert main([*command, '--out', str(tmp_path / 'no')]) == 2
+    assert 'columns must be channel,name,body' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('change', 'said'),
+    [
+        (['--sensor', '0,a/b,a,0,0,0,z'], 'channel 0 appears twice'),
+        (['--coil', '0,0,0,0'], 'takes 5 numbers'),
+        (['--geometry', 'side_m=x'], 'must be a number'),
+        (['--volume', '0,0,0'], '--volume takes 6 numbers'),
+        (['config/demo_setup.yaml'], 'a document states all'),
+    ],
+)
+def test_what_is_wrong_is_one_line_and_nothing_is_written(tmp_path, capsys, change, said):
+    assert main([*options(tmp_path), *change]) == 2
+    words = capsys.readouterr().err
+    assert said in words and words.count('\n') == 1
+    assert not (tmp_path / 'setup.yaml').exists()
+
+
+def test_what_is_asked_draws_every_kind_of_board():
+    assert set(GEOMETRY) == set(KINDS)
+    sizes = {'turns': 10, 'layers': 2, 'pitch_m': 0.001}
+    for kind, keys in GEOMETRY.items():
+        geometry = {key: sizes.get(key, 0.05) for key in keys}
+        emitter = emitter_of(kind, geometry, [coil_of('one', '0 0 0 0 1000')])
+        sensor = {'channel': 0, 'name': 'a/b', 'body': 'a', 'position_m': [0, 0, 0],
+                  'axis': [0, 0, 1]}  # fmt: skip
+        _, setup = text_of(document_of(emitter, [sensor], 50.0, None, {}))
+        assert abs(board_of(setup).moments()[0, 2]) > 0
