@@ -179,7 +179,7 @@ def document_of(
     return document
 
 
-class _Lines(yaml.SafeDumper):
+class _RowDumper(yaml.SafeDumper):
     """Writes the coils and sensors of a document in a line each, as the files of `config/` do."""
 
     def represent_mapping(self, tag: str, mapping: Any, flow_style: bool | None = None) -> Any:
@@ -200,7 +200,7 @@ def text_of(document: Document) -> tuple[str, Setup]:
         When the document breaks a rule.
     """
     plain = yaml.safe_load(yaml.safe_dump(document))  # nothing in it is shared
-    text = yaml.dump(plain, Dumper=_Lines, sort_keys=False, width=200)
+    text = yaml.dump(plain, Dumper=_RowDumper, sort_keys=False, width=200)
     return text, parse_setup(text)
 
 
