@@ -222,7 +222,13 @@ def bottom_layer(
         layer = _build(BELOW, rows, own, _upright(own), points, excitation, region.half)
         if layer.misfit(sources) <= GOOD_ENOUGH:
             return layer
-    positions = np.concatenate([_lattice(region, *SHALLOW), deep])
+    return bottom_layer_of_board(region, excitation)
+
+
+def bottom_layer_of_board(region: Region, excitation: Excitation) -> Layer:
+    """Return the layer for clouds below the board, whatever model it is added to."""
+    points = region.volume.samples(*SAMPLES)
+    positions = np.concatenate([_lattice(region, *SHALLOW), _lattice(region, *DEEP)])
     return _build(BELOW, None, positions, _upright(positions), points, excitation, region.half)
 
 

@@ -83,6 +83,8 @@ class CloudPrior:
         Readings, survey errors included, of draws from the normalised prior.
     draw_moments : ndarray, shape (N K, D)
         Moments of the layer of the same draws.
+    scale : float
+        What ``covariance`` was divided by.
     """
 
     name: str
@@ -94,6 +96,7 @@ class CloudPrior:
     transfer: Array
     draw_readings: Array
     draw_moments: Array
+    scale: float
 
 
 class _Sources:
@@ -178,7 +181,8 @@ class _Sources:
         return np.asarray(out * np.sqrt(self.volumes)[:, None, None, None])
 
 
-def _frequency_tilt(frequencies_hz: Array) -> Array:
+def frequency_tilt(frequencies_hz: Array) -> Array:
+    """Return `FREQUENCY_SLOPE` times log(f_k / f_mean), (K,)."""
     logs = np.log(frequencies_hz)
     return np.asarray(FREQUENCY_SLOPE * (logs - logs.mean()))
 
@@ -212,7 +216,7 @@ def build_prior(
     """
     n_refs, k = len(references), excitation.shape[1]
     sources = _Sources(cloud, excitation, response)
-    tilt = _frequency_tilt(frequencies_hz)
+    tilt = frequency_tilt(frequencies_hz)
     alike = 1.0 + np.outer(tilt, tilt)
     basis = vector_basis(references.position, references.axis, references.length, cloud.positions)
     covariance = sources.covariance(basis, basis) * alike[:, None, :]
@@ -241,6 +245,7 @@ def build_prior(
         transfer.reshape(-1, n_refs * k),
         readings / np.sqrt(scale),
         moments / np.sqrt(scale),
+        scale,
     )
 
 

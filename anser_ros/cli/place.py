@@ -1,0 +1,301 @@
+"""Propose places and axes of reference coils, and say what error each number of them leaves."""
+
+import argparse
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.place_figure import write_figure
+from anser_ros.cli.stated_values import add_stated_values, stated_values
+from anser_ros.errors import ParameterError, SetupError
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.clouds import Region
+from anser_ros.refit.design import Design, StatedMetal, choose, family, random_designs
+from anser_ros.refit.excitation import Excitation, region_of
+from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.session import sensor_table
+from anser_ros.sessions.volume import stated_volume
+from anser_ros.wire.config_folder import read_config
+from anser_ros.wire.setup import FIELD_GENERATOR, Setup, parse_setup
+
+Array = NDArray[np.float64]
+
+SCHEMA = 'anser_places/1'
+DOCUMENT, TABLE, FIGURE = 'places.json', 'places.csv', 'places.png'
+KINDS = ('below', 'around')
+SPACING = 0.4
+"""Distance of neighbouring places of a plane, in halves of the board."""
+FRAME_HEIGHTS, FRAME_WIDTH, FRAME_PLACES = (0.15, 0.7, 1.3), 1.15, 12
+"""Heights and half width of the frame, in halves of the board, and places at each height."""
+AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, -1, -1]]) / np.sqrt(
+    np.array([[1], [1], [1], [3], [3]])
+)
+"""Axes that a coil may have where nobody states them: three of a cluster, and two oblique ones."""
+LENGTH_M = 0.008
+"""Length of a coil that is not stated, m."""
+MOST_CANDIDATES = 400
+"""Coils to choose from; more take minutes and gigabytes."""
+RANDOM_TRIES, SEED = 20, 1
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """What was found: the candidates, the designs by their number of coils, and random ones."""
+
+    candidates: SensorTable
+    region: Region
+    metals: list[StatedMetal]
+    designs: list[Design]
+    random: dict[int, list[Design]]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.epilog = 'example: anser place setup.yaml --references 8 --from frame --out places/'
+    parser.add_argument('setup', help='setup document: a path, or a file of config/')
+    parser.add_argument('--references', type=int, required=True, metavar='N', help='coils wanted')
+    parser.add_argument(
+        '--from',
+        dest='origin',
+        default='setup',
+        metavar='WHERE',
+        help="places to choose from: 'setup' (its own reference sensors, the default), 'frame' "
+        '(around the board), plane=Z (a lattice at that height, m), or a CSV file with x_m, y_m, '
+        'z_m and, where they are given, ax, ay, az, length_m',
+    )
+    parser.add_argument(
+        '--metal',
+        default=','.join(KINDS),
+        help='family of metals: below the board, around the volume, or both (%(default)s)',
+    )
+    parser.add_argument(
+        '--error-mm',
+        type=float,
+        default=5.0,
+        help='error of poses that each metal makes while nobody corrects it (%(default)s)',
+    )
+    parser.add_argument('--out', required=True, type=Path, help='folder, made if missing')
+    add_stated_values(parser, 'accuracy', 'refit')
+    parser.add_argument('--json', action='store_true', help=f'print {DOCUMENT} on stdout')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; the exit code."""
+    kinds = [kind.strip() for kind in args.metal.split(',')]
+    unknown = sorted(set(kinds) - set(KINDS))
+    if unknown or not kinds:
+        raise ParameterError(f'--metal {args.metal}: wanted some of {", ".join(KINDS)}')
+    if not (np.isfinite(args.error_mm) and args.error_mm > 0.0):
+        raise ParameterError(f'--error-mm must be positive, got {args.error_mm}')
+    setup = parse_setup(read_config(args.setup)).with_stated(stated_values(args))
+    proposal = propose(setup, args.references, args.origin, kinds, 1e-3 * args.error_mm)
+    make_folder(args.out)
+    document = to_document(proposal, args.origin)
+    text = json.dumps(document, indent=1)
+    (args.out / DOCUMENT).write_text(text + '\n', encoding='utf-8')
+    _write_table(args.out / TABLE, document['places'])
+    write_figure(
+        args.out / FIGURE, proposal.candidates, proposal.region, proposal.designs, proposal.random
+    )
+    if args.json:
+        print(text)
+    else:
+        Console().print(_table(document))
+        say_written(*(args.out / name for name in (DOCUMENT, TABLE, FIGURE)))
+    return 0
+
+
+def propose(setup: Setup, count: int, origin: str, kinds: list[str], error_m: float) -> Proposal:
+    """Choose reference coils of a setup.
+
+    Parameters
+    ----------
+    setup : Setup
+    count : int
+        Coils wanted.
+    origin : str
+        ``setup``, ``frame``, ``plane=Z`` or the path of a CSV file.
+    kinds : list of str
+        Of `KINDS`.
+    error_m : float
+        Error of poses that each metal makes while nobody corrects it, m.
+
+    Raises
+    ------
+    ParameterError
+        When there are not as many places, or the list of them can't be read.
+    SetupError
+        When the board can't be drawn from the setup.
+    """
+    field = Drawing.of(setup).field
+    if field is None:
+        raise SetupError(f'a board of the kind {setup.emitter.kind!r} is not drawn')
+    whole = region_of(field)
+    region = Region(whole.centre, whole.half, stated_volume(setup))
+    candidates = candidates_of(setup, origin, region)
+    if not 1 <= count <= len(candidates):
+        raise ParameterError(
+            f'--references {count}: there are {len(candidates)} coils to choose from'
+        )
+    k = len(setup.emitter_names)
+    excitation = Excitation('board', np.ones(k), np.ones(k, dtype=complex), field)
+    metals = family(
+        candidates, excitation, region, setup.frequencies_hz, setup.refit, kinds, error_m
+    )
+    designs = choose(metals, count, k)
+    rng = np.random.default_rng(SEED)
+    counts = sorted({2**i for i in range(10) if 2**i < count} | {count})
+    drawn = {n: random_designs(metals, n, k, RANDOM_TRIES, rng) for n in counts}
+    return Proposal(candidates, region, metals, designs, drawn)
+
+
+def candidates_of(setup: Setup, origin: str, region: Region) -> SensorTable:
+    """Return the coils to choose from; raises as `propose`."""
+    if origin == 'setup':
+        table = sensor_table(setup.reference_sensors)
+        if not len(table):
+            raise ParameterError('the setup has no reference sensors; say --from frame or plane=Z')
+        return _bounded(table, origin)
+    half, middle = region.half, region.centre
+    if origin == 'frame':
+        angle = 2.0 * np.pi * np.arange(FRAME_PLACES) / FRAME_PLACES
+        rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        rim *= FRAME_WIDTH * half / np.abs(rim).max(axis=1, keepdims=True)
+        places = np.concatenate(
+            [np.column_stack([rim + middle, np.full(len(rim), z * half)]) for z in FRAME_HEIGHTS]
+        )
+        return _bounded(_every_axis(places), origin)
+    if origin.startswith('plane='):
+        try:
+            height = float(origin.removeprefix('plane='))
+        except ValueError:
+            height = float('nan')
+        if not np.isfinite(height):
+            raise ParameterError(f'--from {origin}: the height must be a number, m')
+        line = SPACING * half * np.arange(-3, 4)
+        x, y = np.meshgrid(line + middle[0], line + middle[1], indexing='ij')
+        places = np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)
+        return _bounded(_every_axis(places), origin)
+    return _bounded(_read(Path(origin)), origin)
+
+
+def _bounded(table: SensorTable, origin: str) -> SensorTable:
+    if len(table) > MOST_CANDIDATES:
+        raise ParameterError(
+            f'--from {origin}: {len(table)} coils to choose from, {MOST_CANDIDATES} at most'
+        )
+    return table
+
+
+def _every_axis(places: Array) -> SensorTable:
+    """Coils at places (P, 3) with each of the axes."""
+    return _coils(np.repeat(places, len(AXES), axis=0), np.tile(AXES, (len(places), 1)), LENGTH_M)
+
+
+def _coils(places: Array, axes: Array, length_m: float | Array) -> SensorTable:
+    count = len(places)
+    return SensorTable(
+        channel=np.arange(count),
+        name=tuple(f'place/{i}' for i in range(count)),
+        body=(FIELD_GENERATOR,) * count,
+        position=places,
+        axis=axes / np.linalg.norm(axes, axis=1, keepdims=True),
+        length=np.broadcast_to(np.asarray(length_m, dtype=np.float64), (count,)).copy(),
+    )
+
+
+def _read(path: Path) -> SensorTable:
+    """Return the coils of a list of places."""
+    with path.open(encoding='utf-8', newline='') as stream:
+        rows = list(csv.DictReader(stream))
+    if not rows:
+        raise ParameterError(f'{path}: no rows')
+    places = _numbers(path, rows, ('x_m', 'y_m', 'z_m'))
+    if 'ax' not in rows[0]:
+        return _every_axis(places)
+    axes = _numbers(path, rows, ('ax', 'ay', 'az'))
+    if not (np.linalg.norm(axes, axis=1) > 0.0).all():
+        raise ParameterError(f'{path}: an axis has no length')
+    length: float | Array = LENGTH_M
+    if 'length_m' in rows[0]:
+        length = _numbers(path, rows, ('length_m',))[:, 0]
+    return _coils(places, axes, length)
+
+
+def _numbers(path: Path, rows: list[dict[str, str]], names: tuple[str, ...]) -> Array:
+    try:
+        values = np.array([[float(row[name]) for name in names] for row in rows])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ParameterError(
+            f'{path}: needs the columns {", ".join(names)} with numbers: {error}'
+        ) from error
+    if not np.isfinite(values).all():
+        raise ParameterError(f'{path}: the columns {", ".join(names)} must be finite')
+    return values
+
+
+def to_document(proposal: Proposal, origin: str) -> dict[str, Any]:
+    """Return a proposal as plain data."""
+    table, best = proposal.candidates, proposal.designs[-1]
+    names = [metal.name for metal in proposal.metals]
+    return {
+        'schema': SCHEMA,
+        'from': origin,
+        'metals': names,
+        'uncorrected_error_m': proposal.metals[0].error_m,
+        'places': [
+            {
+                'name': table.name[i],
+                'channel': int(table.channel[i]),
+                'position_m': table.position[i].tolist(),
+                'axis': table.axis[i].tolist(),
+                'length_m': float(table.length[i]),
+            }
+            for i in best.coils
+        ],
+        'expected': [
+            {
+                'references': len(design.coils),
+                'error_m': design.error_m,
+                'by_metal_m': dict(zip(names, design.errors_m.tolist(), strict=True)),
+            }
+            for design in proposal.designs
+        ],
+        'random': [
+            {
+                'references': count,
+                'mean_error_m': float(np.mean([d.error_m for d in drawn])),
+                'best_error_m': float(min(d.error_m for d in drawn)),
+                'worst_error_m': float(max(d.error_m for d in drawn)),
+            }
+            for count, drawn in proposal.random.items()
+        ],
+    }
+
+
+def _table(document: dict[str, Any]) -> Table:
+    drawn = {row['references']: row for row in document['random']}
+    table = Table('references', 'expected error mm', 'random places mm (best to worst)')
+    for row in document['expected']:
+        other = drawn.get(row['references'])
+        if other is not None:
+            spread = f'{1e3 * other["best_error_m"]:.3f} to {1e3 * other["worst_error_m"]:.3f}'
+            cell = f'{1e3 * other["mean_error_m"]:.3f} ({spread})'
+            table.add_row(str(row['references']), f'{1e3 * row["error_m"]:.3f}', cell)
+    return table
+
+
+def _write_table(path: Path, places: list[dict[str, Any]]) -> None:
+    with path.open('w', encoding='utf-8', newline='') as stream:
+        writer = csv.writer(stream, lineterminator='\n')
+        writer.writerow(['name', 'x_m', 'y_m', 'z_m', 'ax', 'ay', 'az', 'length_m'])
+        for row in places:
+            writer.writerow([row['name'], *row['position_m'], *row['axis'], row['length_m']])

@@ -1,0 +1,225 @@
+"""Where reference coils tell most: the expected error of poses over a family of metals.
+
+For metal of a known kind and strength everything is Gaussian, so what any choice of coils would
+leave unknown follows before a coil is glued on: the posterior covariance of the metal's
+coordinates (`refit.reduced`), as poses feel them. Coils are chosen one after the other, each the
+one that leaves least, and are then exchanged while that helps (Fedorov, Theory of Optimal
+Experiments, 1972).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.clouds import Cloud, Region, below, overhead
+from anser_ros.refit.excitation import Excitation
+from anser_ros.refit.layer import bottom_layer_of_board, box_layer
+from anser_ros.refit.prior import UPRIGHT, Response, build_prior
+from anser_ros.refit.reduced import reduced
+from anser_ros.settings import RefitSettings
+
+Array = NDArray[np.float64]
+
+BELOW, AROUND = (0.2, 0.5, 1.1), (0.25, 0.6)
+"""Standoffs of the family's metals below the board and around the volume, in halves of the
+board."""
+GRADIENT = 3.0
+"""Field of a dipole over its gradient times the distance: an error of the field moves a pose by
+a third of the height times its share of the field."""
+MOST_EXCHANGES = 3
+"""Rounds of exchanging every coil; the second seldom finds more than a percent."""
+
+
+@dataclass(frozen=True)
+class StatedMetal:
+    """One metal of the family, for C candidate coils.
+
+    Attributes
+    ----------
+    name : str
+    cross : ndarray, shape (D, C K)
+        Covariance of what poses feel of the metal, m, with the readings, in noise deviations.
+    covariance : ndarray, shape (C K, C K)
+        Of the readings, noise and drift included.
+    error_m : float
+        Error of poses while nobody corrects it, root mean square.
+    """
+
+    name: str
+    cross: Array
+    covariance: Array
+    error_m: float
+
+
+@dataclass(frozen=True)
+class Design:
+    """A choice of coils.
+
+    Attributes
+    ----------
+    coils : tuple of int
+        Rows of the candidates, in the order in which they were chosen.
+    errors_m : ndarray, shape (metals,)
+        Expected error of poses that they leave, of each metal.
+    """
+
+    coils: tuple[int, ...]
+    errors_m: Array
+
+    @property
+    def error_m(self) -> float:
+        """Root mean square over the metals."""
+        return float(np.sqrt(np.mean(self.errors_m**2)))
+
+
+def clouds_of(region: Region, kinds: Sequence[str]) -> list[tuple[Cloud, Response]]:
+    """Return the family's metals of the kinds ``below`` and ``around``."""
+    out: list[tuple[Cloud, Response]] = []
+    if 'below' in kinds:
+        out += [(below(region, part * region.half), UPRIGHT) for part in BELOW]
+    if 'around' in kinds:
+        out += [(overhead(region, part * region.half), Response()) for part in AROUND]
+    return out
+
+
+def family(
+    candidates: SensorTable,
+    excitation: Excitation,
+    region: Region,
+    frequencies_hz: Sequence[float],
+    settings: RefitSettings,
+    kinds: Sequence[str],
+    error_m: float,
+) -> list[StatedMetal]:
+    """Return the metals of the stated kinds, each as strong as to make poses wrong by an error.
+
+    Parameters
+    ----------
+    candidates : SensorTable
+        Coils, of which some will be chosen; places and axes in fg.
+    excitation : Excitation
+        Field of the board.
+    region : Region
+    frequencies_hz : sequence of float, length K
+    settings : RefitSettings
+        Noise, errors of the survey, and drift of the emitters.
+    kinds : sequence of str
+        Of ``below`` and ``around``.
+    error_m : float
+        Root mean square error of poses in the volume that each metal makes.
+    """
+    noise = settings.accuracy.flux_noise_t
+    clean = np.einsum('pa,pka->pk', candidates.axis, excitation.field(candidates.position))
+    count, k = clean.shape
+    others = np.eye(count * k)
+    drift = np.zeros((count * k, k))
+    for emitter in range(k):
+        drift[emitter::k, emitter] = clean[:, emitter] * settings.emitter_drift / noise
+    others += drift @ drift.T
+    points = region.volume.samples()
+    size = np.linalg.norm(excitation.field(points), axis=(1, 2))
+    per_field = float((points[:, 2] / size).mean()) / GRADIENT
+    bottom, box = bottom_layer_of_board(region, excitation), box_layer(region, excitation)
+    metals = []
+    for cloud, response in clouds_of(region, kinds):
+        layer = box if cloud.overhead else bottom
+        field = excitation.field(cloud.positions)
+        rng = np.random.default_rng(settings.seed)
+        prior = build_prior(
+            cloud, response, layer, candidates, field, np.array(frequencies_hz),
+            settings.accuracy, rng,
+        )  # fmt: skip
+        few = reduced(prior, response, field, np.array(frequencies_hz), rng)
+        # Per noise deviation of the readings; the metric is a sum over the samples.
+        felt = few.felt * noise * per_field / np.sqrt(len(layer.points))
+        strength = (error_m / float(np.linalg.norm(felt))) ** 2
+        metals.append(
+            StatedMetal(
+                cloud.name,
+                strength * felt[:, None] * few.cross,
+                strength * prior.covariance + others,
+                error_m,
+            )
+        )
+    return metals
+
+
+def _rows(coils: Sequence[int], k: int) -> NDArray[np.int64]:
+    return (np.asarray(coils, dtype=np.int64)[:, None] * k + np.arange(k)).ravel()
+
+
+def expected_errors(metals: Sequence[StatedMetal], coils: Sequence[int], k: int) -> Array:
+    """Return the error of poses (metals,), m, that some coils of K readings each leave."""
+    rows = _rows(coils, k)
+    out = []
+    for metal in metals:
+        known = 0.0
+        if len(rows):
+            factor = np.linalg.cholesky(metal.covariance[np.ix_(rows, rows)])
+            known = float((np.linalg.solve(factor, metal.cross[:, rows].T) ** 2).sum())
+        out.append(np.sqrt(max(metal.error_m**2 - known, 0.0)))
+    return np.array(out)
+
+
+def _gains(metals: Sequence[StatedMetal], coils: Sequence[int], k: int) -> Array:
+    """Return how much each candidate (C,) would lower the mean square error of some coils, m^2."""
+    rows = _rows(coils, k)
+    total = np.zeros(len(metals[0].covariance) // k)
+    for metal in metals:
+        cross, covariance = metal.cross, metal.covariance
+        blocks = np.stack([covariance[i : i + k, i : i + k] for i in range(0, len(covariance), k)])
+        if len(rows):
+            factor = np.linalg.cholesky(covariance[np.ix_(rows, rows)])
+            half = np.linalg.solve(factor, covariance[rows])
+            cross = cross - np.linalg.solve(factor, cross[:, rows].T).T @ half
+            parts = half.reshape(len(rows), -1, k)
+            blocks = blocks - np.einsum('rck,rcl->ckl', parts, parts, optimize=True)
+        each = cross.reshape(len(cross), -1, k).transpose(1, 2, 0)
+        total += np.einsum('ckd,ckd->c', each, np.linalg.solve(blocks, each))
+    total[list(coils)] = -np.inf
+    return total / len(metals)
+
+
+def choose(
+    metals: Sequence[StatedMetal], count: int, k: int, exchange: bool = True
+) -> list[Design]:
+    """Return the best choices of 1 to ``count`` coils, each one found from the one before.
+
+    Parameters
+    ----------
+    metals : sequence of StatedMetal
+    count : int
+        At most the number of candidates.
+    k : int
+        Readings of a coil.
+    exchange : bool
+        Whether coils of the last choice are exchanged for better ones.
+    """
+    coils: list[int] = []
+    designs = []
+    while len(coils) < count:
+        coils.append(int(_gains(metals, coils, k).argmax()))
+        designs.append(Design(tuple(coils), expected_errors(metals, coils, k)))
+    for _ in range(MOST_EXCHANGES if exchange else 0):
+        before = tuple(coils)
+        for i in range(len(coils)):
+            others = coils[:i] + coils[i + 1 :]
+            coils[i] = int(_gains(metals, others, k).argmax())
+        if tuple(coils) == before:
+            break
+        found = Design(tuple(coils), expected_errors(metals, coils, k))
+        if found.error_m < designs[-1].error_m:
+            designs[-1] = found
+    return designs
+
+
+def random_designs(
+    metals: Sequence[StatedMetal], count: int, k: int, tries: int, rng: np.random.Generator
+) -> list[Design]:
+    """Return random choices of so many coils."""
+    total = len(metals[0].covariance) // k
+    drawn = (rng.permutation(total)[:count].tolist() for _ in range(tries))
+    return [Design(tuple(coils), expected_errors(metals, coils, k)) for coils in drawn]

@@ -1,0 +1,100 @@
+"""Places of reference coils: chosen by the error that they leave, from what a user can use."""
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+from refit_world import anser_world
+
+from anser_ros.cli.main import main
+from anser_ros.refit.clouds import Region
+from anser_ros.refit.design import choose, expected_errors, family, random_designs
+from anser_ros.refit.excitation import Excitation, region_of
+from anser_ros.settings import RefitSettings
+
+UNCORRECTED_M = 5e-3
+K = 8
+
+
+@pytest.fixture(scope='module')
+def metals():
+    """The family of metals, for ten coils around the board."""
+    world = anser_world(32)
+    whole = region_of(world.board.field)
+    excitation = Excitation('board', np.ones(K), np.ones(K, dtype=complex), world.board.field)
+    return family(
+        world.references.select(np.arange(0, 30, 3)), excitation,
+        Region(whole.centre, whole.half), world.model.frequencies_hz, RefitSettings(),
+        ('below',), UNCORRECTED_M,
+    )  # fmt: skip
+
+
+def test_more_coils_leave_less_error(metals):
+    errors = [design.error_m for design in choose(metals, 10, K)]
+    assert len(errors) == 10
+    assert (np.diff(errors) < 0.0).all()
+    assert errors[0] < UNCORRECTED_M
+    np.testing.assert_allclose(expected_errors(metals, (), K), UNCORRECTED_M)
+
+
+def test_the_order_of_the_coils_does_not_matter(metals):
+    np.testing.assert_allclose(
+        expected_errors(metals, (7, 2, 5), K), expected_errors(metals, (2, 5, 7), K)
+    )
+
+
+def test_the_choice_is_about_the_best_of_all(metals):
+    every = [
+        float(np.sqrt(np.mean(expected_errors(metals, pick, K) ** 2)))
+        for pick in itertools.combinations(range(10), 3)
+    ]
+    chosen = choose(metals, 3, K)[-1]
+    assert len(set(chosen.coils)) == 3
+    assert chosen.error_m <= min(every) * 1.05
+    drawn = random_designs(metals, 3, K, 20, np.random.default_rng(1))
+    assert chosen.error_m < np.mean([design.error_m for design in drawn])
+
+
+def test_the_same_coil_twice_tells_little_more(metals):
+    """Noise and survey are all that a second coil at the same place averages."""
+    one = expected_errors(metals, (0,), K)
+    assert (expected_errors(metals, (0, 4), K) < one).all()
+
+
+def test_a_list_of_places_gives_a_table_and_a_picture(tmp_path, capsys):
+    angle = np.linspace(0.0, 2.0 * np.pi, 7)[:-1]
+    lines = ['x_m,y_m,z_m', *(f'{0.17 * np.cos(a)},{0.17 * np.sin(a)},0.05' for a in angle)]
+    places = tmp_path / 'places.csv'
+    places.write_text('\n'.join(lines) + '\n')
+    arguments = ['place', 'demo_setup.yaml', '--references', '3', '--from', str(places), '--json']
+    assert main([*arguments, '--metal', 'below', '--out', str(tmp_path / 'out')]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document == json.loads((tmp_path / 'out' / 'places.json').read_text())
+    assert [row['references'] for row in document['expected']] == [1, 2, 3]
+    for row in document['places']:
+        assert np.hypot(*row['position_m'][:2]) == pytest.approx(0.17)
+        assert np.linalg.norm(row['axis']) == pytest.approx(1.0)
+    random = document['random'][-1]
+    assert document['expected'][-1]['error_m'] <= random['best_error_m'] * 1.01
+    assert len((tmp_path / 'out' / 'places.csv').read_text().splitlines()) == 4
+    assert (tmp_path / 'out' / 'places.png').stat().st_size > 5000
+
+
+@pytest.mark.parametrize(
+    ('more', 'said'),
+    [
+        (['--references', '0'], 'coils to choose from'),
+        (['--references', '99'], 'coils to choose from'),
+        (['--references', '2', '--metal', 'above'], '--metal'),
+        (['--references', '2', '--error-mm', '-1'], '--error-mm'),
+        (['--references', '2', '--from', 'plane=x'], 'height'),
+        (['--references', '2', '--from', 'nowhere.csv'], 'nowhere.csv'),
+    ],
+)
+def test_bad_input_is_one_line(more, said, tmp_path, capsys):
+    assert main(['place', 'demo_setup.yaml', *more, '--out', str(tmp_path / 'out')]) == 2
+    words = capsys.readouterr().err
+    assert said in words
+    assert len(words.splitlines()) == 1
+    assert not (tmp_path / 'out').exists()
