@@ -43,8 +43,8 @@ OFFLINE = {
     'measured': "other people's measurements: what they contain, and the error before and after",
     'paper': "redo the article's experiments: Tables II to V, Figs. 2 and 5 to 10",
     'pivot': 'the tip of a stylus, from poses while it turns about its tip',
-    'setup': 'write a setup document by questions or options, check it, and draw it',
     'place': 'propose places of reference coils, with the error that each number of them leaves',
+    'setup': 'write a setup document by questions or options, check it, and draw it',
     'views': 'write the views of RViz and Foxglove for a setup document',
     'warm_up': 'compile all kernels once, before the first start of a node',
 }
