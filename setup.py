@@ -47,6 +47,7 @@ setup(
         'zstandard>=0.22',
         'rich>=13',
         'matplotlib>=3.8',
+        'allantools>=2024.6',
         'dask>=2024.8',
         'distributed>=2024.8',
     ],

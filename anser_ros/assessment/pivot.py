@@ -209,7 +209,7 @@ def _solved(place: Array, turn: Array, jitter: float) -> tuple[Array, Array, Arr
     right[:3] += np.einsum('nji,j->i', turn, shift)
     right[3:] -= count * shift
     solution = inverse @ right
-    return solution[:3], solution[3:] + shift, inverse
+    return np.asarray(solution[:3]), np.asarray(solution[3:] + shift), np.asarray(inverse)
 
 
 def _covariance(

@@ -11,16 +11,20 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import AnserError, BagError
 from anser_ros.poses.importing import import_poses
-from anser_ros.poses.recording import ENDING, OPTICAL, read_pose_session
+from anser_ros.poses.recording import read_pose_session
 from anser_ros.poses.sequence import PoseSequence, PoseSession, sequence_of
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.session import NANO, load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.tracking.estimate import OK
 from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages
+from anser_ros.wire.pose_topics import ENDING, OPTICAL
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
 Array = NDArray[np.float64]
+
+TOOL = 'tool'
+"""What the body of a file of poses is called that names none."""
 
 
 @dataclass(frozen=True)
@@ -94,8 +98,11 @@ def read_poses(
         found = _recorded(path, wanted)
     else:
         session = import_poses([source])
-        name = _only(str(path), 'sensor', wanted.sensor, list(session.sensors))
-        found = AssessedPoses(name, session.sensors[name], session)
+        sensor = _only(str(path), 'sensor', wanted.sensor, list(session.sensors))
+        # A file of one sensor is named after itself, and the tool is the same in the next file.
+        name = wanted.body or (sensor if len(session.sensors) > 1 else TOOL)
+        poses = replace(session.sensors[sensor], name=name)
+        found = AssessedPoses(name, poses, replace(session, sensors={name: poses}))
     return found if wanted.tip is None else _carried(found, wanted.tip)
 
 

@@ -26,6 +26,7 @@ COMPOSED = {
 }
 
 OFFLINE = {
+    'accuracy': 'jitter, drift, distances, rotations, latency by published protocols',
     'bags': 'record the small simulated sessions of the folder bags/',
     'batch': 'calibrate, evaluate or diagnose many sessions with Dask, and sum them up',
     'calibrate': 'fit a field model to recorded sessions',

@@ -5,6 +5,7 @@ from importlib.util import find_spec
 from anser_ros.errors import AnserError
 
 PYPI = {
+    'allantools': 'allantools',
     'dask': 'dask',
     'distributed': 'distributed',
     'mcap': 'mcap',

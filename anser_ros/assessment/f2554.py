@@ -1,0 +1,120 @@
+"""The figures of ASTM F2554: readings of a single point, and distances between known points.
+
+ASTM F2554, "Standard Practice for Measurement of Positional Accuracy of Computer Assisted Surgical
+Systems": how far readings of one location scatter while the tool is turned about it, and how far
+distances between points of a phantom are from the true ones.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.assessment.hummel import ErrorGroup, grouped, rigid_distance
+from anser_ros.assessment.intervals import (
+    IntervalEstimate,
+    blocks_of_time,
+    mitk_statistics,
+    summarised,
+    vertex_weights,
+)
+from anser_ros.assessment.stillness import StillPoint
+from anser_ros.errors import FitError
+from anser_ros.poses.sequence import PoseSequence
+
+Array = NDArray[np.float64]
+
+FEWEST_READINGS = 10
+MOST_READINGS = 2000  # readings that take part, evenly over the recording
+BLOCKS = 20  # stretches of time that are drawn again: a hand's tilt takes about a second
+FAR_FACTOR, FAR_M = 12.0, 0.05
+"""Distance of readings from their median beyond which they are no readings of one location."""
+
+
+def single_point(
+    poses: PoseSequence, rng: np.random.Generator
+) -> tuple[ErrorGroup, dict[str, IntervalEstimate]]:
+    """Distances of the readings from their mean, mm, and the largest between two of them, m.
+
+    Parameters
+    ----------
+    poses : PoseSequence
+        Of the tip, while it stays at one location.
+
+    Raises
+    ------
+    FitError
+        When there are too few readings, or they are of several locations.
+    """
+    if poses.size < FEWEST_READINGS:
+        raise FitError(f'{poses.size} readings; a point takes {FEWEST_READINGS} or more')
+    rows = np.linspace(0, poses.size - 1, min(poses.size, MOST_READINGS)).astype(int)
+    place, time = poses.position[rows], poses.time[rows]
+    spread = float(
+        np.linalg.norm(np.percentile(place, 95, axis=0) - np.percentile(place, 5, axis=0))
+    )
+    if spread > FAR_M:
+        raise FitError(
+            f'the readings extend over {1e3 * spread:.0f} mm: they are of several locations, or '
+            'of the sensor and not of the tip (give the tip with --tip)'
+        )
+    size = 1e3 * np.linalg.norm(place - place.mean(axis=0), axis=1)
+    group = grouped('mm', [f'Reading at {t:.2f} s' for t in time], size,
+                    blocks_of_time(time, BLOCKS), rng)  # fmt: skip
+    return group, {'span_m': IntervalEstimate(_span(place))}
+
+
+def _span(place: Array) -> float:
+    """Largest distance of two of some places, m; exact for those that are farthest out."""
+    rest = place - place.mean(axis=0)
+    outer = rest[np.argsort(-np.linalg.norm(rest, axis=1))[:200]]
+    return float(np.max(np.linalg.norm(outer[:, None] - outer[None], axis=2)))
+
+
+def point_to_point(
+    points: Sequence[StillPoint], true: Array, rng: np.random.Generator
+) -> tuple[ErrorGroup, dict[str, IntervalEstimate]]:
+    """Errors of all distances between points, mm, and what a rigid fit of the points leaves, m.
+
+    Parameters
+    ----------
+    points : sequence of StillPoint
+    true : ndarray, shape (n, 3)
+        Their places on the phantom, m, in any frame, in the same order.
+
+    Raises
+    ------
+    FitError
+        When the numbers differ, there are too few, or the order is not that of the truth.
+    """
+    if len(points) != len(true):
+        raise FitError(f'{len(points)} points were found, and the truth has {len(true)}')
+    if len(points) < 3:
+        raise FitError(f'{len(points)} points; distances take three or more')
+    place = np.array([p.position for p in points])
+    first, second = np.triu_indices(len(points), 1)
+    measured = np.linalg.norm(place[first] - place[second], axis=1)
+    wanted = np.linalg.norm(true[first] - true[second], axis=1)
+    signed = 1e3 * (measured - wanted)
+    if float(np.median(np.abs(signed))) > 0.25 * 1e3 * float(np.median(wanted)):
+        raise FitError(
+            f'distances are {np.median(np.abs(signed)):.0f} mm off in the median: the points are '
+            'not in the order of the truth, or a unit is wrong'
+        )
+    pairs = np.stack([first, second], axis=1)
+    words = [f'Distance {a + 1} to {b + 1}' for a, b in pairs]
+    weights = vertex_weights(pairs, rng)
+    group = ErrorGroup(
+        'mm', tuple(words), np.abs(signed), signed,
+        summarised(np.abs(signed), weights, len(points)),
+    )  # fmt: skip
+    mean = summarised(signed, weights, len(points))['Mean']
+    return group, {
+        'mean_error_m': IntervalEstimate(1e-3 * mean.value, 1e-3 * mean.low, 1e-3 * mean.high),
+        'standard_deviation_of_error_m': IntervalEstimate(
+            1e-3 * mitk_statistics(signed)['Sample Standard Deviation']
+        ),
+        'least_error_m': IntervalEstimate(1e-3 * float(signed.min())),
+        'greatest_error_m': IntervalEstimate(1e-3 * float(signed.max())),
+        'rigid_fit_m': IntervalEstimate(rigid_distance(true, place)),
+    }

@@ -1,0 +1,85 @@
+"""A folder of earlier assessments, one small file each, and the verdict on a new one."""
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from anser_ros.assessment.control import ALERT, FAIL, Verdict, judged, worst
+from anser_ros.assessment.protocols import Assessment
+from anser_ros.errors import ParameterError
+
+SCHEMA = 'anser_accuracy_history/1'
+
+
+def figures_of(found: Assessment) -> dict[str, float]:
+    """All figures of an assessment by name; of groups their mean and root mean square."""
+    figures = {name: estimate.value for name, estimate in found.estimates.items()}
+    for name, group in found.groups.items():
+        figures |= {f'{name}/{key}': group.summary[key].value for key in ('Mean', 'RMS')}
+    return figures
+
+
+def judge(
+    found: Assessment, folder: Path, tolerances: Mapping[str, float]
+) -> tuple[str, dict[str, Verdict], int]:
+    """State of a session, the verdict on each figure, and how many earlier sessions there are.
+
+    Sessions of the same protocol and body count, but no later ones, and no figure that was an
+    alert or failed in its session.
+
+    Raises
+    ------
+    ParameterError
+        When a tolerance is of a figure that there is none of, or a file is none of a history.
+    """
+    figures = figures_of(found)
+    unknown = sorted(set(tolerances) - set(figures))
+    if unknown:
+        raise ParameterError(f'no figure {unknown[0]!r}; there are: {", ".join(figures)}')
+    earlier = [entry for entry in _entries(folder, found) if entry['start_ns'] < found.start_ns]
+    verdicts = {}
+    for name, value in figures.items():
+        values = [
+            float(e['figures'][name])
+            for e in earlier
+            if e['figures'].get(name) is not None and e['states'].get(name) not in (ALERT, FAIL)
+        ]
+        verdicts[name] = judged(value, values, tolerances.get(name))
+    return worst(verdicts), verdicts, len(earlier)
+
+
+def keep(found: Assessment, folder: Path, verdicts: Mapping[str, Verdict]) -> Path:
+    """Write a session into the history; the same recording again takes its own place."""
+    figures = figures_of(found)
+    document = {
+        'schema': SCHEMA, 'protocol': found.protocol, 'body': found.body,
+        'start_ns': found.start_ns, 'recordings': list(found.recordings),
+        'figures': {name: v if np.isfinite(v) else None for name, v in figures.items()},
+        'states': {name: verdict.state for name, verdict in verdicts.items()},
+    }  # fmt: skip
+    body = re.sub(r'[^A-Za-z0-9_]+', '_', found.body)
+    path = folder / f'{found.start_ns}_{found.protocol}_{body}.json'
+    path.write_text(json.dumps(document, indent=1) + '\n', encoding='utf-8')
+    return path
+
+
+def _entries(folder: Path, found: Assessment) -> list[dict[str, Any]]:
+    """Entries of the same protocol and body, the oldest first."""
+    entries = []
+    for path in sorted(folder.glob('*.json')):
+        try:
+            entry = json.loads(path.read_text(encoding='utf-8'))
+            wanted = entry['schema'] == SCHEMA
+            same = (entry['protocol'], entry['body']) == (found.protocol, found.body)
+            complete = {'start_ns', 'figures', 'states'} <= entry.keys()
+        except (ValueError, KeyError, TypeError) as error:
+            raise ParameterError(f'{path}: no entry of a history') from error
+        if not (wanted and complete):
+            raise ParameterError(f'{path}: no entry of a history, {SCHEMA}')
+        if same:
+            entries.append(entry)
+    return sorted(entries, key=lambda entry: int(entry['start_ns']))

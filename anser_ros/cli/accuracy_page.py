@@ -1,0 +1,144 @@
+"""An assessment as one self-contained page: figures, what they are made from, pictures."""
+
+import html
+from typing import Any
+
+import matplotlib
+
+matplotlib.use('Agg')
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from anser_ros.assessment.protocols import PROTOCOLS, Assessment
+from anser_ros.cli.accuracy_document import figure_rows
+from anser_ros.cli.diagnosis_figures import image
+from anser_ros.cli.html_page import page, table
+
+MOST_ROWS = 500  # rows of a table of single errors; all are in accuracy.json
+
+
+def render(found: Assessment, document: dict[str, Any]) -> str:
+    """Return the page."""
+    files = ', '.join(found.recordings[:3]) + (' ...' if len(found.recordings) > 3 else '')
+    sections = [
+        f'<h1>Accuracy of {html.escape(found.body)}: {found.protocol}</h1>'
+        f'<p class="note">{html.escape(PROTOCOLS[found.protocol])}; '
+        f'<code>{html.escape(files)}</code></p>',
+        _verdict(document),
+        table(('figure', 'value', '95 % interval', 'state'), figure_rows(found, document)),
+        *(f'<p class="note">{html.escape(words)}</p>' for words in found.notes),
+    ]
+    if found.allan:
+        sections += ['<h2>Allan deviation</h2>', image(_allan(found))]
+    if found.groups:
+        sections += ['<h2>Errors</h2>', image(_errors(found))]
+    if found.speeds:
+        sections += ['<h2>By speed</h2>', image(_speeds(found)), _speed_table(found)]
+    if found.points:
+        sections += ['<h2>Points</h2>', image(_points(found)), _point_table(found)]
+    for name, group in found.groups.items():
+        if len(group.errors) > MOST_ROWS:
+            continue
+        rows = [
+            (words, f'{size:.3f}', f'{signed:+.3f}')
+            for words, size, signed in zip(
+                group.descriptions, group.errors, group.signed, strict=True
+            )
+        ]
+        sections += [
+            f'<h2>{html.escape(name)}</h2>',
+            table(('', f'error, {group.unit}', f'measured less true, {group.unit}'), rows),
+        ]
+    return page('Accuracy', sections)
+
+
+def _verdict(document: dict[str, Any]) -> str:
+    if 'qa' not in document:
+        return ''
+    qa = document['qa']
+    words = '; '.join(
+        f'{name}: {one["state"]}, {one["words"]}'
+        for name, one in qa['figures'].items()
+        if one['state'] != 'pass'
+    )
+    text = f'{qa["state"]}, beside {qa["earlier_sessions"]} earlier sessions. {words}'
+    return f'<p class="verdict">{html.escape(text)}</p>'
+
+
+def _allan(found: Assessment) -> Figure:
+    figure, axes = plt.subplots(figsize=(9, 4), layout='constrained')
+    for axis, curve in found.allan.items():
+        axes.plot(curve.tau_s, 1e3 * curve.deviation, 'o-', ms=3, label=axis)
+        axes.fill_between(curve.tau_s, 1e3 * curve.low, 1e3 * curve.high, alpha=0.2)
+    axes.set(xlabel='averaging time, s', ylabel='overlapping Allan deviation, mm',
+             xscale='log', yscale='log')  # fmt: skip
+    axes.grid(alpha=0.3, which='both')
+    figure.legend(loc='outside right upper')
+    return figure
+
+
+def _errors(found: Assessment) -> Figure:
+    count = len(found.groups)
+    figure, panels = plt.subplots(1, count, figsize=(9, 3.2), layout='constrained', squeeze=False)
+    for panel, (name, group) in zip(panels[0], found.groups.items(), strict=True):
+        panel.hist(group.signed, bins=min(30, max(5, group.signed.size // 4)))
+        panel.axvline(0.0, color='0.5')
+        panel.set(xlabel=f'measured less true, {group.unit}')
+        panel.set_title(name, fontsize=9)
+    panels[0][0].set_ylabel('number')
+    return figure
+
+
+def _speeds(found: Assessment) -> Figure:
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout='constrained')
+    speed = [1e3 * g.mean_m_s for g in found.speeds]
+    for panel, scale, series in (
+        (left, 1e3, [('live', [g.error_live_m for g in found.speeds]),
+                     ('offset taken out', [g.error_m for g in found.speeds])]),
+        (right, 1e3, [('', [g.latency_s for g in found.speeds])]),
+    ):  # fmt: skip
+        for label, estimates in series:
+            value = scale * np.array([e.value for e in estimates])
+            bars = scale * np.array([[e.value - e.low, e.high - e.value] for e in estimates]).T
+            panel.errorbar(speed, value, yerr=np.maximum(bars, 0.0), fmt='o-', ms=3, label=label)
+        panel.set_xlabel('speed, mm/s')
+        panel.grid(alpha=0.3)
+    left.set_ylabel('error, rms mm')
+    left.legend()
+    right.set_ylabel('latency against the reference, ms')
+    return figure
+
+
+def _speed_table(found: Assessment) -> str:
+    rows = [
+        (f'{1e3 * g.low_m_s:.0f} to {1e3 * g.high_m_s:.0f}', str(g.n),
+         f'{1e3 * g.error_live_m.value:.2f}', f'{1e3 * g.error_m.value:.2f}',
+         f'{1e3 * g.latency_s.value:.1f} ({1e3 * g.latency_s.low:.1f} .. '
+         f'{1e3 * g.latency_s.high:.1f})')
+        for g in found.speeds
+    ]  # fmt: skip
+    head = ('speed, mm/s', 'poses', 'error live, rms mm', 'offset taken out, rms mm',
+            'latency, ms')  # fmt: skip
+    return table(head, rows)
+
+
+def _points(found: Assessment) -> Figure:
+    place = 1e3 * np.array([p.position for p in found.points])
+    figure, panels = plt.subplots(1, 2, figsize=(9, 4), layout='constrained')
+    for panel, (a, b) in zip(panels, ((0, 1), (0, 2)), strict=True):
+        panel.plot(place[:, a], place[:, b], 'o-', ms=4, lw=0.5)
+        for number in range(0, len(place), max(1, len(place) // 20)):
+            panel.annotate(str(number + 1), place[number, [a, b]], fontsize=7)
+        panel.set(xlabel=f'{"xyz"[a]}, mm', ylabel=f'{"xyz"[b]}, mm', aspect='equal')
+        panel.grid(alpha=0.3)
+    return figure
+
+
+def _point_table(found: Assessment) -> str:
+    rows = [
+        (str(k), f'{p.begin_s:.1f} to {p.end_s:.1f}', str(p.n),
+         ' '.join(f'{1e3 * v:.2f}' for v in p.position), f'{1e3 * p.jitter_m:.3f}')
+        for k, p in enumerate(found.points, start=1)
+    ]  # fmt: skip
+    return table(('point', 'time, s', 'poses', 'position, mm', 'jitter, rms mm'), rows)

@@ -1,0 +1,406 @@
+"""Published protocols: against closed forms and truth, by MITK's names, and over sessions."""
+
+import json
+
+import numpy as np
+import pytest
+from pose_world import World
+from scipy.spatial.transform import Rotation
+
+from anser_ros.assessment.control import ALERT, FAIL, NOTE, PASS, judged
+from anser_ros.assessment.dynamic import assess_motion
+from anser_ros.assessment.f2554 import point_to_point, single_point
+from anser_ros.assessment.hummel import Grid, distance_errors, grid_points, rotation_errors
+from anser_ros.assessment.intervals import (
+    cluster_weights,
+    deviation_interval,
+    independent_for_variance,
+    mitk_statistics,
+    summarised,
+)
+from anser_ros.assessment.metal import metal_shifts
+from anser_ros.assessment.stability import allan_deviation, assess_rest
+from anser_ros.assessment.stillness import StillPoint, still_points
+from anser_ros.cli.main import run_verb
+from anser_ros.errors import FitError, ParameterError
+from anser_ros.poses.hand_eye_fit import fit_hand_eye
+from anser_ros.poses.recording import write_pose_session
+from anser_ros.poses.sequence import sequence_of
+
+RATE = 20.0
+STILL = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def rng_of(seed):
+    return np.random.default_rng(seed)
+
+
+def point(place, turn=None):
+    return StillPoint(0.0, 1.0, np.asarray(place), np.eye(3) if turn is None else turn, 0.0, 9)
+
+
+def board(rows, columns, spacing=0.05):
+    return np.array([[r * spacing, c * spacing, 0.0] for r in range(rows) for c in range(columns)])
+
+
+def visited(points, turns, seed, noise_m=2e-4):
+    """Poses of a tool that rests on points for two seconds each, and is lifted in between."""
+    rng, places, ways = rng_of(seed), [], []
+    for k, (here, turn) in enumerate(zip(points, turns, strict=True)):
+        count = int(rng.uniform(34, 46))
+        places += [here] * count
+        ways += [turn] * count
+        if k + 1 < len(points):
+            between = (turns[k + 1] * turn.inv()).as_rotvec()
+            for u in np.linspace(0, 1, 22)[1:-1]:
+                lift = np.array([0, 0, 0.12 * u * (1 - u)])
+                places.append(here + (points[k + 1] - here) * u + lift)
+                ways.append(Rotation.from_rotvec(u * between) * turn)
+    place = np.array(places)
+    turn = Rotation.from_rotvec(2e-3 * rng.normal(size=place.shape)) * Rotation.concatenate(ways)
+    place = place + noise_m * rng.normal(size=place.shape)
+    return sequence_of('pen', np.arange(len(place)) / RATE, place, turn.as_quat())
+
+
+def write_tum(path, poses):
+    np.savetxt(path, np.c_[poses.time + 100, poses.position, poses.quaternion], fmt='%.9f')
+    return str(path)
+
+
+class TestStatistics:
+    def test_names_and_quartiles_are_mitks(self):
+        """Elements of the sorted list at n/4, n/2 and n/4 + n/2, rounded down; worked by hand."""
+        found = mitk_statistics(np.array([5.0, 1.0, 4.0, 2.0, 3.0, 7.0, 6.0]))
+        assert found == pytest.approx({
+            'N': 7, 'Mean': 4, 'Min': 1, 'Max': 7, 'Quartile 1': 2, 'Median': 4, 'Quartile 3': 5,
+            'Variance': 4, 'Sample Variance': 28 / 6, 'Standard Deviation': 2,
+            'Sample Standard Deviation': np.sqrt(28 / 6),
+        })  # fmt: skip
+
+    def test_intervals_of_clusters_hold_the_truth(self):
+        """Errors in clusters that share a part: resampling single ones would be too narrow."""
+        hits, narrow = [], []
+        for seed in range(5000, 5120):
+            rng = rng_of(seed)
+            clusters = np.repeat(np.arange(20), 10)
+            values = 3.0 + rng.normal(size=20)[clusters] + rng.normal(size=200)
+            for box, labels, count in ((hits, clusters, 20), (narrow, np.arange(200), 200)):
+                found = summarised(values, cluster_weights(labels, rng, 300), count)['Mean']
+                box.append(found.low < 3.0 < found.high)
+        assert 0.88 < np.mean(hits) < 0.995
+        assert np.mean(narrow) < 0.75
+
+    def test_a_deviation_of_correlated_values_has_a_wider_interval(self):
+        hits, widths = [], []
+        for seed in range(5200, 5300):
+            noise = rng_of(seed).normal(size=1200)
+            values = np.zeros(1000)
+            state = 0.0
+            for k, step in enumerate(noise):
+                state = 0.9 * state + step
+                if k >= 200:
+                    values[k - 200] = state
+            freedoms = independent_for_variance(values) - 1
+            found = deviation_interval(float(np.std(values, ddof=1)), freedoms)
+            hits.append(found.low < 1 / np.sqrt(1 - 0.81) < found.high)
+            widths.append(freedoms)
+        assert 0.85 < np.mean(hits) <= 1.0
+        assert np.median(widths) < 250  # of a thousand values
+
+    @pytest.mark.parametrize(
+        ('make', 'law'),
+        [
+            (lambda rng, n: rng.normal(size=n), lambda tau: np.sqrt(0.02 / tau)),
+            (lambda rng, n: np.cumsum(rng.normal(size=n)), lambda tau: np.sqrt(50 * tau / 3)),
+        ],
+    )
+    def test_allan_deviations_follow_their_laws(self, make, law):
+        """White noise falls, and a random walk grows, as the root of the averaging time."""
+        hits = []
+        for seed in range(5300, 5312):
+            curve = allan_deviation(make(rng_of(seed), 4000), 50.0)
+            long = curve.tau_s > 0.3  # the discrete walk has reached its law
+            low, high, true = curve.low[long], curve.high[long], law(curve.tau_s[long])
+            hits += list((low < true) & (true < high))
+        assert 0.88 < np.mean(hits) <= 1.0
+
+    def test_a_ramp_is_a_drift(self):
+        time = np.arange(0, 200, 0.02)
+        place = np.outer(time, [2e-6, 0, 0]) + 1e-4 * rng_of(1).normal(size=(time.size, 3))
+        found = assess_rest(sequence_of('pen', time, place, np.tile(STILL, (time.size, 1))))
+        drift = found.estimates['position_drift_x_m_per_h']
+        assert drift.low < 2e-6 * 3600 < drift.high and drift.low > 6e-3
+        other = found.estimates['position_drift_y_m_per_h']
+        assert other.low < 0 < other.high
+        jitter = found.estimates['position_jitter_y_m']
+        assert jitter.value == pytest.approx(1e-4, rel=0.03)
+        assert jitter.low < jitter.value < jitter.high < 1.05 * jitter.value
+        curve = found.allan['x']
+        at = curve.tau_s > 30
+        np.testing.assert_allclose(
+            curve.deviation[at], 2e-6 * curve.tau_s[at] / np.sqrt(2), rtol=0.15
+        )
+
+
+class TestPauses:
+    @pytest.mark.parametrize('noise_m', [1e-4, 8e-4])
+    def test_every_rest_is_one_point(self, noise_m):
+        rng = rng_of(6)
+        true = board(3, 4)
+        turns = [Rotation.from_rotvec(rng.normal(0, 0.05, 3)) for _ in true]
+        found = still_points(visited(true, turns, 6, noise_m))
+        assert len(found) == 12
+        place = np.array([p.position for p in found])
+        assert np.abs(place - true).max() < 5 * noise_m / np.sqrt(20)
+        assert all(0.5 < p.jitter_m / (noise_m * np.sqrt(3)) < 1.5 for p in found)
+
+    def test_turns_about_one_place_are_points_too(self):
+        turns = [Rotation.from_rotvec([0, 0, np.deg2rad(11.25 * k)]) for k in range(8)]
+        found = still_points(visited(np.zeros((8, 3)), turns, 7))
+        assert len(found) == 8
+
+    def test_a_moving_tool_has_none(self):
+        time = np.arange(0, 20, 0.05)
+        place = np.stack([0.1 * np.sin(time), 0.1 * np.cos(time), 0 * time], axis=1)
+        assert still_points(sequence_of('p', time, place, np.tile(STILL, (time.size, 1)))) == []
+
+
+class TestHummel:
+    def test_distances_and_descriptions_are_mitks(self):
+        grid = Grid.of(90, None, 0.05)
+        place = board(9, 10)
+        place[0] += [0.0, 0.0012, 0.0]  # the first hole is nearer to its neighbour in the row
+        found = distance_errors(place.reshape(9, 10, 3), grid, rng_of(1))
+        assert {name: g.errors.size for name, g in found.items()} == {
+            '5 cm distance errors': 161, '15 cm distance errors': 123,
+            '30 cm distance errors': 66, 'accumulated distance errors': 81,
+        }  # fmt: skip
+        five = found['5 cm distance errors']
+        assert five.descriptions[0] == 'Distance(1) 1/1 to 1/2'
+        assert five.descriptions[81] == 'Distance(82) 1/1 to 2/1'
+        assert five.descriptions[-1] == 'Distance(161) 8/10 to 9/10'
+        assert five.signed[0] == pytest.approx(-1.2) and five.errors[0] == pytest.approx(1.2)
+        assert np.count_nonzero(five.errors > 1e-9) == 2
+        accumulated = found['accumulated distance errors']
+        assert accumulated.descriptions[8] == 'Distance(9) 1/1 to 1/10'
+        np.testing.assert_allclose(accumulated.errors[:9], 1.2)
+        small = distance_errors(board(3, 4).reshape(3, 4, 3), Grid.of(12, None, 0.05), rng_of(1))
+        words = small['5 cm distance errors'].descriptions
+        assert len(words) == 17
+        assert (words[0], words[-1]) == ('Distance 4/4 to 4/5', 'Distance 5/7 to 6/7')
+
+    def test_points_in_another_order_are_refused(self):
+        grid, place = Grid.of(25, None, 0.05), board(5, 5).reshape(5, 5, 3)
+        turned = place.copy()
+        turned[1::2] = turned[1::2, ::-1]
+        points = [point(p) for p in turned.reshape(-1, 3)]
+        with pytest.raises(FitError, match='--order serpentine'):
+            grid_points(points, grid)
+        np.testing.assert_array_equal(grid_points(points, grid, 'serpentine'), place)
+        shuffled = [points[k] for k in rng_of(1).permutation(25)]
+        with pytest.raises(FitError, match='row by row'):
+            grid_points(shuffled, grid)
+        with pytest.raises(ParameterError, match='--grid'):
+            Grid.of(24, None, 0.05)
+
+    def test_the_interval_holds_what_repetition_gives(self):
+        grid, true, rng = Grid.of(12, None, 0.05), board(3, 4).reshape(3, 4, 3), rng_of(8)
+
+        def mean(errors):
+            return float(errors.mean())
+
+        many = [mean(abs(np.linalg.norm(np.diff(true + e, axis=1), axis=2) * 1e3 - 50))
+                for e in rng.normal(0, 4e-4, (2000, *true.shape))]  # fmt: skip
+        hits = []
+        for _ in range(60):
+            noisy = true + rng.normal(0, 4e-4, true.shape)
+            found = distance_errors(noisy, grid, rng)['5 cm distance errors'].summary['Mean']
+            hits.append(found.low < np.mean(many) < found.high)
+        assert 0.83 < np.mean(hits) <= 1.0
+
+    def test_turns_of_the_ring(self):
+        angles = np.cumsum([0.0, 11.25, 11.75, 10.25])
+        turns = Rotation.from_rotvec(np.deg2rad(angles)[:, None] * [[0.0, 0.0, 1.0]])
+        points = [point(np.zeros(3), m) for m in turns.as_matrix()]
+        found = rotation_errors(points, 11.25, None, rng_of(1))
+        np.testing.assert_allclose(found.signed, [0.0, 0.5, -1.0], atol=1e-9)
+        assert found.descriptions[0] == 'Rotation Error ROT1 / ROT2'
+        along = rotation_errors(points, 11.25, np.array([1.0, 0.0, 0.0]), rng_of(1))
+        np.testing.assert_allclose(along.signed, found.signed, atol=1e-9)
+        with pytest.raises(FitError, match='order of the holes'):
+            rotation_errors(points, 11.25, np.array([0.0, 0.0, 1.0]), rng_of(1))
+
+    def test_metal_shifts_a_tool_at_rest(self):
+        rng, time = rng_of(9), np.arange(0, 30, 0.05)
+
+        def rest(shift):
+            place = np.array([shift, 0.0, 0.2]) + 2e-4 * rng.normal(size=(time.size, 3))
+            return sequence_of('pen', time, place, np.tile(STILL, (time.size, 1)))
+
+        found = metal_shifts(rest(0.0), [('1', rest(1e-3)), ('2', rest(0.0))])
+        assert found['position_shift_1_m'].low < 1e-3 < found['position_shift_1_m'].high
+        assert found['position_shift_2_m'].low < 2e-5 < found['position_shift_1_m'].low
+
+
+class TestF2554:
+    def test_a_scale_error_is_in_every_distance(self):
+        true = rng_of(3).uniform(0, 0.3, (12, 3))
+        measured = 1.01 * true @ Rotation.random(random_state=1).as_matrix()
+        group, estimates = point_to_point([point(p) for p in measured], true, rng_of(1))
+        first, second = np.triu_indices(12, 1)
+        wanted = np.linalg.norm(true[first] - true[second], axis=1)
+        np.testing.assert_allclose(group.signed, 1e3 * 0.01 * wanted, rtol=1e-9)
+        mean = estimates['mean_error_m']
+        assert mean.value == pytest.approx(0.01 * wanted.mean()) and mean.low > 0
+        with pytest.raises(FitError, match='not in the order'):
+            point_to_point([point(p) for p in measured[::-1] * [9, 1, 1]], true, rng_of(1))
+        with pytest.raises(FitError, match='the truth has 12'):
+            point_to_point([point(p) for p in measured[:5]], true, rng_of(1))
+
+    def test_readings_of_one_location(self):
+        rng, time = rng_of(4), np.arange(0, 20, 0.05)
+        place = np.array([0.1, 0.0, 0.2]) + 3e-4 * rng.normal(size=(time.size, 3))
+        poses = sequence_of('tip', time, place, np.tile(STILL, (time.size, 1)))
+        group, estimates = single_point(poses, rng)
+        assert group.summary['RMS'].low < 3e-4 * np.sqrt(3) * 1e3 < group.summary['RMS'].high
+        assert 1e-3 < estimates['span_m'].value < 3e-3
+        far = sequence_of('tip', time, 300 * (place - place[0]), poses.quaternion)
+        with pytest.raises(FitError, match='give the tip with --tip'):
+            single_point(far, rng)
+
+
+def test_latency_and_error_by_speed():
+    world = World(4300, sensors=1, duration=25.0)
+    world.offset = 0.04
+    found = fit_hand_eye(world.session())
+    motion = assess_motion(found, 'sensor_0', rng_of(1))
+    latency = motion.estimates['latency_s']
+    assert latency.low < 0.04 < latency.high and latency.high - latency.low < 4e-3
+    slow, fast = motion.groups[0], motion.groups[-1]
+    assert fast.latency_s.low < 0.04 < fast.latency_s.high
+    # What is late by 40 ms is off by as much of its way.
+    assert fast.error_live_m.value > 0.03 * fast.low_m_s
+    assert slow.error_m.value < 1e-3 < fast.error_live_m.value
+
+
+class TestControl:
+    QUIET = (1.00, 1.02, 0.98, 1.01, 0.99, 1.0)
+
+    @pytest.mark.parametrize(
+        ('value', 'earlier', 'tolerance', 'state'),
+        [
+            (1.01, QUIET, None, PASS), (1.06, QUIET, None, NOTE), (1.2, QUIET, None, ALERT),
+            (0.8, QUIET, None, ALERT), (1.01, QUIET, 0.5, FAIL), (9.0, QUIET[:4], None, PASS),
+            (9.0, QUIET[:4], 2.0, FAIL), (float('nan'), QUIET, None, FAIL),
+            (1.02, (0.9, 1.0, 0.95, 1.02, *[1.01] * 7), None, NOTE),
+        ],
+    )  # fmt: skip
+    def test_states(self, value, earlier, tolerance, state):
+        assert judged(value, earlier, tolerance).state == state
+
+    def test_sessions_in_a_folder(self, tmp_path, capsys):
+        rng = rng_of(12)
+        history = tmp_path / 'qa'
+
+        def session(day, noise_m, *options):
+            time = np.arange(0, 6, 0.05)
+            place = np.array([0.1, 0.0, 0.2]) + noise_m * rng.normal(size=(time.size, 3))
+            poses = sequence_of('pen', time + 1000 * day, place, np.tile(STILL, (time.size, 1)))
+            path = write_tum(tmp_path / f'{day}.tum', poses)
+            command = ['rest', path, '--history', str(history), '--json', *options]
+            code = run_verb('accuracy', command)
+            said = capsys.readouterr()
+            return code, json.loads(said.out)['qa'] if not code else said.err
+
+        for day in range(1, 8):
+            code, qa = session(day, 2e-4)
+            assert code == 0 and qa['earlier_sessions'] == day - 1
+        name = 'position_jitter_rms_m'
+        assert qa['figures'][name]['state'] in (PASS, NOTE)
+        assert session(8, 2e-4, '--limit', f'{name}=1e-4')[1]['figures'][name]['state'] == FAIL
+        qa = session(9, 1.5e-3)[1]
+        assert qa['state'] == ALERT and qa['figures'][name]['state'] == ALERT
+        assert 'above the mean' in qa['figures'][name]['words']
+        # Neither what failed nor the alert makes limits wider; a repeat takes its own place.
+        assert session(10, 2e-4)[1]['figures'][name]['sessions'] == 7
+        assert session(10, 2e-4)[1]['earlier_sessions'] == 9
+        code, words = session(11, 2e-4, '--limit', 'speed=1')
+        assert code == 2 and "no figure 'speed'" in words
+        (history / 'z.json').write_text('{}')
+        assert 'no entry of a history' in session(12, 2e-4)[1]
+
+
+class TestCommand:
+    def test_a_board_in_one_recording_and_in_one_a_point(self, tmp_path, capsys):
+        rng = rng_of(15)
+        true = board(3, 4) + rng.normal(0, 3e-4, (12, 3))
+        turns = [Rotation.identity()] * 12
+        one = write_tum(tmp_path / 'board.tum', visited(true, turns, 15))
+        out = tmp_path / 'o'
+        assert run_verb('accuracy', ['grid', one, '--out', str(out), '--json']) == 0
+        document = json.loads(capsys.readouterr().out)
+        assert json.loads((out / 'accuracy.json').read_text()) == document
+        assert document['groups']['5 cm distance errors']['statistics']['N'] == 17
+        assert len(document['points']) == 12
+        assert '<img' in (out / 'report.html').read_text(encoding='utf-8')
+        many = [
+            write_tum(tmp_path / f'{k:02d}.tum', visited(true[[k]], turns[:1], 100 + k))
+            for k in range(12)
+        ]
+        assert run_verb('accuracy', ['grid', *many, '--json']) == 0
+        other = json.loads(capsys.readouterr().out)['groups']['5 cm distance errors']
+        for a, b in zip(
+            other['errors'], document['groups']['5 cm distance errors']['errors'], strict=True
+        ):
+            assert a['description'] == b['description']
+            assert a['signedError'] == pytest.approx(b['signedError'], abs=0.3)
+        rows = '\n'.join(','.join(map(str, 1e3 * p)) for p in board(3, 4))
+        (tmp_path / 'truth.csv').write_text(f'x_mm,y_mm,z_mm\n{rows}\n')
+        truth = ['--truth', str(tmp_path / 'truth.csv')]
+        assert run_verb('accuracy', ['point-to-point', one, *truth]) == 0
+        assert 'rigid_fit_m' in capsys.readouterr().out
+
+    @pytest.mark.parametrize(
+        ('options', 'words'),
+        [
+            (['grid', 'board.tum', '--grid', '3by4'], '--grid takes'),
+            (['grid', 'board.tum', '--grid', '2x4'], 'a board of 2 x 4 holes takes 8'),
+            (['rest', 'board.tum'], 'a rest is of one that stays'),
+            (['rest', 'board.tum', 'board.tum'], 'rest takes one recording'),
+            (['metal', 'board.tum'], 'without metal first'),
+            (['dynamic', 'board.tum'], 'needs a moving reference'),
+            (['point-to-point', 'board.tum'], '--truth FILE.csv'),
+            (['rotation', 'board.tum', '--axis', '1,2'], '--axis takes three numbers'),
+            (['grid', 'board.tum', '--limit', 'x'], '--limit takes'),
+            (['grid', 'board.tum', '--pause-s', '-1'], '--pause-s must be positive'),
+        ],
+    )
+    def test_what_is_not_right_is_said_in_a_line(
+        self, options, words, tmp_path, monkeypatch, capsys
+    ):
+        monkeypatch.chdir(tmp_path)
+        write_tum(tmp_path / 'board.tum', visited(board(3, 4), [Rotation.identity()] * 12, 1))
+        assert run_verb('accuracy', options) == 2
+        last = capsys.readouterr().err.strip().splitlines()[-1]
+        assert words in last and last.startswith('anser accuracy: ')
+
+    def test_points_against_the_optical_reference(self, tmp_path, capsys):
+        """A bag with a body that rests now and then, seen by both trackers."""
+        rng = rng_of(21)
+        true = rng.uniform(-0.1, 0.1, (8, 3)) + [0, 0, 0.3]
+        turns = list(Rotation.from_rotvec(rng.normal(0, 0.4, (8, 3))))
+        world = World(1, sensors=1)
+        body = visited(true, turns, 3, 0.0)
+        world.duration = float(body.time[-1])
+        turned = Rotation.from_quat(body.quaternion)
+        lever = np.array([0.02, 0.01, -0.03])
+        place = body.position + turned.apply(lever) + 2e-4 * rng.normal(size=body.position.shape)
+        tracked = sequence_of('pen', body.time, place, body.quaternion)
+        session = world.session()
+        session = type(session)('bag', 10**9, {'pen': tracked}, body)
+        write_pose_session(tmp_path / 'a.mcap', session)
+        command = ['point-to-point', str(tmp_path / 'a.mcap'), '--json']
+        assert run_verb('accuracy', command) == 0
+        document = json.loads(capsys.readouterr().out)
+        assert document['groups']['point to point distance errors']['statistics']['Mean'] < 0.3
+        assert len(document['points']) == 8
