@@ -1,11 +1,11 @@
 """A chain that is not there: a node that says what a chain of ten sensors would say."""
 
 import math
-import shutil
 import threading
 import time
 
 import pytest
+from chromium import browser_of
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.executors import SingleThreadedExecutor
@@ -20,18 +20,13 @@ SENSORS = 10
 RADIUS_M = 0.08
 OFF_M = 0.002
 """How far the tracked poses are from the optical ones, m, along z."""
-BROWSER_OPTIONS = (
-    '--no-sandbox', '--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader',
-)  # fmt: skip
-"""A browser without window and graphics card, in a container too."""
 
 
 def browser_path():
     """Return the browser, or skip where there is none, or nothing to drive it with."""
     pytest.importorskip('playwright', reason='playwright is not installed')
     pytest.importorskip('nicegui', reason='nicegui is not installed')
-    names = 'chromium', 'chromium-browser', 'google-chrome'
-    path = next(filter(None, map(shutil.which, names)), None)
+    path = browser_of()
     if path is None:
         pytest.skip('no Chromium is installed (apt install chromium)')
     return path

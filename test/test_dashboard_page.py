@@ -3,7 +3,8 @@
 import time
 
 import pytest
-from dashboard_world import BROWSER_OPTIONS, SENSORS, PretendedChain, browser_path
+from chromium import BROWSER_OPTIONS
+from dashboard_world import SENSORS, PretendedChain, browser_path
 
 SECONDS = 2.5
 
