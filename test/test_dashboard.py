@@ -3,6 +3,7 @@
 import asyncio
 import json
 import math
+import threading
 
 import numpy as np
 import pytest
@@ -12,9 +13,11 @@ pytest.importorskip('nicegui', reason='nicegui is not installed')
 from dashboard_world import OFF_M, ten_sensors
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.serialization import serialize_message
+from tracking_world import certain_model
 
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.nodes.causes import Told
+from anser_ros.nodes.chain_client import ChainClient, ChainError
 from anser_ros.nodes.live_view import LiveView, read_pose
 from anser_ros.web import loop as loop_module
 from anser_ros.web.folder import RESULTS, RecordingFolder
@@ -296,3 +299,43 @@ def test_the_view_has_place_ellipsoid_error_and_residual():
     assert figures.error_m == pytest.approx(OFF_M)
     assert figures.residual_t == 2e-10
     assert view.points[-1][2][2] == 2e-10
+
+
+def test_the_nodes_are_asked_for_services_and_models(ros, tmp_path):
+    from rclpy.executors import SingleThreadedExecutor
+
+    from anser_ros.nodes.field_model import FieldModelNode
+    from anser_ros.sessions.model_file import save_model
+
+    server, asker = FieldModelNode(), ros.create_node('asker', namespace='anser')
+    client = ChainClient(asker, lambda: None, print)
+    executor = SingleThreadedExecutor()
+    for node in (server, asker):
+        executor.add_node(node)
+    thread = threading.Thread(target=executor.spin, daemon=True)
+    thread.start()
+    save_model(tmp_path / 'model.yaml', certain_model())
+    files = {'field_model': str(tmp_path / 'model.yaml')}
+
+    async def asked_for():
+        async with asyncio.timeout(10.0):
+            while not (client.is_there('field_model/set_baseline') and await client.model_files()):
+                await asyncio.sleep(0.05)
+        assert await client.model_files() == {'field_model': 'nominal'}
+        assert await client.baseline_file() == ''
+        with pytest.raises(ChainError, match='no setup yet'):
+            await client.trigger('field_model/set_baseline')
+        with pytest.raises(ChainError, match='nobody offers'):
+            await client.trigger('recorder/start')
+        with pytest.raises(ChainError, match=r'field_model: .*nowhere'):
+            await client.load_model({'field_model': str(tmp_path / 'nowhere.yaml')})
+        await client.load_model(files)
+        assert await client.model_files() == files
+
+    try:
+        asyncio.run(asked_for())
+    finally:
+        executor.shutdown()
+        thread.join(5.0)
+        for node in (server, asker):
+            node.destroy_node()

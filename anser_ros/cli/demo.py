@@ -16,6 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from anser_ros.cli import missing
 from anser_ros.cli.demo_report import FROZEN, MEANINGS, draw, load, summarise
 from anser_ros.cli.output import make_folder
 from anser_ros.cli.supervisor import Supervisor, tail
@@ -38,6 +39,8 @@ METAL_RADIUS_M = 0.1
 NO_GATE = {'gate': 1e6, 'adaptive': False}
 POLL_S = 0.05
 """Time from one look at the processes to the next, s."""
+DASHBOARD_PORT = 8642
+"""Of the live view on this machine, as its parameter has it by default."""
 # The file that the monitor writes.
 DATA = 'demo.npz'
 SHARED_TOPICS = ('setup', 'tool/flux', 'reference/flux')
@@ -53,6 +56,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='folder, made if missing, for a new folder with bag, picture and logs (%(default)s)',
     )  # fmt: skip
     parser.add_argument('--rate', type=float, default=50.0, metavar='HZ', help='poses a second')
+    parser.add_argument(
+        '--dashboard', action='store_true', help='serve the live view to a browser, too'
+    )
     parser.add_argument('--no-metal', action='store_true', help='simulate no steel disc')
     parser.add_argument('--no-picture', action='store_true', help='draw no picture at the end')
     parser.add_argument(
@@ -76,6 +82,8 @@ def run(args: argparse.Namespace) -> int:
         raise ParameterError(f'--duration must be 1 to 3600 s, got {args.duration:g}')
     if not 1.0 <= args.rate <= 200.0:
         raise ParameterError(f'--rate must be 1 to 200 Hz, got {args.rate:g}')
+    if args.dashboard:
+        missing.check('dashboard')
     stopped: list[int] = []
     before = {
         number: signal.signal(number, lambda got, _: stopped.append(got))
@@ -103,6 +111,8 @@ def _run_in(folder: Path, args: argparse.Namespace, stopped: list[int]) -> int:
                 return _report(folder, args, interrupted=True)
             for name, command in _commands(folder, ports / 'cu', args):
                 supervisor.start(name, command)
+            if args.dashboard:
+                _say(f'live view: http://127.0.0.1:{DASHBOARD_PORT}/', args)
             monitor = supervisor.start(
                 'monitor', _monitor(folder / DATA, args), on_terminal=not args.json
             )
@@ -236,6 +246,11 @@ def _commands(folder: Path, port: Path, args: argparse.Namespace) -> list[tuple[
         ('field_model_frozen', node_command('field_model', *apart, model_file=model)),
         ('tracker_frozen', node_command('tracker', *apart, **NO_GATE)),
         ('recorder', node_command('recorder', directory=folder, name='bag')),
+        *(
+            [('dashboard', node_command('dashboard', directory=folder, port=DASHBOARD_PORT))]
+            if args.dashboard
+            else []
+        ),
     ]
 
 

@@ -52,8 +52,7 @@ class Dashboard(AnserNode):
         from anser_ros.web.server import PageServer, token_for
 
         table = self.parameters
-        space = self.get_namespace()
-        self._streams = polling_node(f'{self.get_name()}_streams', space)
+        self._streams = polling_node(self.get_name(), self.get_namespace())
         self._client = ChainClient(self, self._view, self._mark)
         self._source = ViewSource(
             self._streams, table.optical, self._refuse, self._client.is_there

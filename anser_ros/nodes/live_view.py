@@ -118,6 +118,8 @@ class LiveView:
         newest, info = messages[-1]
         sent_ns = info.get('received_timestamp') or info.get('source_timestamp') or 0
         stamp_s, values = read_pose(newest)
+        if not np.isfinite(values).all():
+            raise ValueError('a pose is not finite')
         self._stamp_s[number], self._pose[number] = stamp_s, values[:POSE]
         self._covariance[number] = values[POSE:].reshape(6, 6)[:3, :3]
         self._heard_s[number] = time.monotonic()

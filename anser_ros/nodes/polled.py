@@ -13,12 +13,15 @@ from rclpy.qos import QoSProfile
 from anser_ros.errors import LayoutError
 from anser_ros.nodes import incoming
 
+STREAMS = '_streams'
+"""What the name of the node that is polled has behind that of its process."""
+
 
 def polling_node(name: str, namespace: str) -> Node:
-    """Return a node that no executor may be given: its subscriptions are polled."""
+    """Return a node beside another one, for no executor: its subscriptions are polled."""
     return Node(
-        name, namespace=namespace, start_parameter_services=False, enable_rosout=False,
-        use_global_arguments=False,
+        f'{name}{STREAMS}', namespace=namespace, start_parameter_services=False,
+        enable_rosout=False, use_global_arguments=False,
     )  # fmt: skip
 
 

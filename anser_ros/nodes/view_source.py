@@ -19,7 +19,7 @@ from anser_ros.errors import AnserError
 from anser_ros.nodes import qos
 from anser_ros.nodes.causes import Told
 from anser_ros.nodes.live_view import LiveView, known
-from anser_ros.nodes.polled import Polled
+from anser_ros.nodes.polled import STREAMS, Polled
 from anser_ros.nodes.processor import Processor
 from anser_ros.nodes.shared_names import optical_topic
 from anser_ros.wire.setup import parse_setup, topic_of
@@ -34,6 +34,8 @@ MOST_MARKS = 20
 """Moments that are marked in the curves."""
 MOST_METAL = 400
 """Balls of metal that are drawn."""
+MOST_TOLD = 4096
+"""Names in diagnostics of which what was said is kept: several lines for each of 1000 sensors."""
 COIL_M = 0.07
 """Side of an emitter coil, m, that is drawn where the setup does not tell it."""
 
@@ -70,6 +72,7 @@ class ViewSource:
         is_there: Callable[[str], bool],
     ) -> None:
         self._node, self._optical_space = node, optical
+        self._own = {node.get_fully_qualified_name().strip('/').removesuffix(STREAMS)}
         self._refused, self._is_there = refused, is_there
         self.namespace = node.get_namespace().strip('/')
         self.view: LiveView | None = None
@@ -135,6 +138,9 @@ class ViewSource:
 
     def _take_told(self, message: DiagnosticArray) -> None:
         for status in message.status:
+            is_ours = status.name.startswith(f'{self.namespace}/')
+            if not is_ours or (status.name not in self._told and len(self._told) >= MOST_TOLD):
+                continue
             values = {pair.key: pair.value for pair in status.values}
             told = Told(status.level[0], status.message, values)
             self._told[status.name] = told
@@ -238,7 +244,7 @@ class ViewSource:
         found = []
         for name, told in self._told.items():
             home, _, short = name.rpartition('/')
-            if home == self.namespace and ':' not in name and short != self._node.get_name():
+            if home == self.namespace and ':' not in name and name not in self._own:
                 if view.silent_s(name) > SILENT_S:
                     told = Told(3, 'silent', {})
                 found.append((short, told.level, told.message))

@@ -45,6 +45,9 @@ class Scene {
     this.scene.add(sun);
     this.controls = new OrbitControls(this.camera, this.renderer.domElement);
     this.controls.addEventListener("change", () => this.draw());
+    this.controls.addEventListener("start", () => (this.seen = null));
+    this.extent = new THREE.Box3();
+    this.seen = null; // the view that follows the size of the panel, until somebody turns it
     this.fixed = new THREE.Group();
     this.moving = new THREE.Group();
     this.scene.add(this.fixed, this.moving);
@@ -64,24 +67,45 @@ class Scene {
     this.renderer.setSize(width, height);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
+    if (this.seen) this.look(this.seen);
     this.draw();
   }
 
   look(from) {
-    const far = 2.1 * this.size;
-    const to = { space: [0.85, -1.35, 0.95], top: [0, -0.001, 2], front: [0, -2, 0.3], side: [2, 0, 0.3] };
-    const [x, y, z] = to[from];
-    const middle = 0.3 * this.size;
-    this.controls.target.set(0, 0, middle);
-    this.camera.position.set(far * x, far * y, middle + far * z);
+    const to = { space: [0.85, -1.35, 0.6], top: [0, -0.001, 1], front: [0, -1, 0.1], side: [1, 0, 0.1] };
+    const way = new THREE.Vector3(...to[from]).normalize();
+    const middle = this.extent.getCenter(new THREE.Vector3());
+    this.seen = from;
+    this.controls.target.copy(middle);
+    // As near as all corners of board and volume are in sight.
+    for (let far = 0.2 * this.size; far < 20 * this.size; far *= 1.04) {
+      this.camera.position.copy(middle).addScaledVector(way, far);
+      this.camera.lookAt(middle);
+      this.camera.updateMatrixWorld();
+      if (this.corners().every((corner) => this.isSeen(corner))) break;
+    }
     this.controls.update();
     this.draw();
+  }
+
+  corners() {
+    const { min, max } = this.extent;
+    return [min.x, max.x].flatMap((x) => [min.y, max.y].flatMap((y) => [min.z, max.z].map((z) => new THREE.Vector3(x, y, z))));
+  }
+
+  isSeen(corner) {
+    const { x, y, z } = corner.project(this.camera);
+    return Math.abs(x) < 0.96 && y < 0.96 && y > -0.82 && z < 1; // below is the key
   }
 
   setup(world, targets) {
     for (const group of [this.fixed, this.moving]) group.clear();
     this.size = Math.max(0.1, world.reach_m * 2);
     this.unit = this.size / 100; // what small things are measured by
+    const [x, y] = world.board_m;
+    const [low, high] = world.volume_m;
+    this.extent.set(new THREE.Vector3(-x, -y, 0), new THREE.Vector3(x, y, 0));
+    this.extent.expandByPoint(new THREE.Vector3(...low)).expandByPoint(new THREE.Vector3(...high));
     this.board(world);
     this.targets = targets.map((target, rank) => this.target(target, colour(target, rank)));
     this.look("space");

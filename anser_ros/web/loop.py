@@ -128,6 +128,13 @@ class CorrectionLoop:
         """Whether a model was loaded here."""
         return bool(self._loaded)
 
+    @property
+    def model_name(self) -> str:
+        """The model in force: its place in the folder of recordings, else its whole path."""
+        path = Path(self.model)
+        inside = path.is_relative_to(self.folder.path)
+        return str(path.relative_to(self.folder.path)) if inside else self.model
+
     async def record(self) -> None:
         """Begin a bag."""
         await self._step(self._record())

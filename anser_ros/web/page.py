@@ -1,6 +1,7 @@
 """The page: header, what moves (`instrument.js`), and the loop with its buttons."""
 
 import asyncio
+import contextlib
 import math
 from collections.abc import Awaitable, Callable
 from html import escape
@@ -10,12 +11,15 @@ from typing import Any, Protocol
 from nicegui import app, ui
 from nicegui.element import Element
 
+from anser_ros.errors import AnserError
 from anser_ros.web.loop import CALIBRATE, CorrectionLoop
 
 TICK_S = 1.0 / 12.0
 """Time between two pictures of the scene, s: poses at 10 Hz and more."""
 POINT_TICKS = 6
 """Pictures between two points of the curves, and between two looks at everything else."""
+LOOK_S = 5.0
+"""Time between two looks at which model is in force, s."""
 STYLE = Path(__file__).with_name('page.css').read_text(encoding='utf-8')
 LEVELS = ('ok', 'warn', 'bad', 'bad')
 """Classes of the levels of diagnostic_msgs."""
@@ -119,7 +123,7 @@ class Screen:
             self._report = _button('Report', self._open_report, 'description')
             self._load = _button('Load corrected model', loop.load, 'check')
             self._undo = _button('Undo', loop.undo, 'undo')
-        self._model = ui.label().classes('words').mark('model')
+        self._model = ui.label().classes('words path').mark('model')
         self._live = ui.html(sanitize=False).mark('live')
         _heading('Watcher')
         self._findings = ui.html(sanitize=False).mark('findings')
@@ -226,7 +230,7 @@ class Screen:
         self._enable(self._report, found is not None)
         self._enable(self._load, loop.can_load)
         self._enable(self._undo, loop.can_undo)
-        self._text(self._model, f'in force: {loop.model}' if loop.model else '')
+        self._text(self._model, f'in force: {loop.model_name}' if loop.model else '')
         self._html(self._live, _table('live, last 10 s', loop.comparison()))
 
     def _show_share(self, share: float) -> None:
@@ -305,6 +309,7 @@ class Pages:
             client.on_delete(lambda: self._screens.pop(client.id, None))
 
         app.on_startup(self._drive)
+        app.on_startup(self._watch_model)
 
     @property
     def count(self) -> int:
@@ -320,6 +325,14 @@ class Pages:
             # What is late is left out, not made up for.
             due_s = max(due_s + TICK_S, clock.time())
             await asyncio.sleep(due_s - clock.time())
+
+    async def _watch_model(self) -> None:
+        """Ask now and then which model is in force, which others may change too."""
+        while True:
+            if self._screens:
+                with contextlib.suppress(AnserError):
+                    await self._loop.look()
+            await asyncio.sleep(LOOK_S)
 
     def _move(self) -> None:
         """Look at the topics, and show on all pages what is due."""
