@@ -15,6 +15,7 @@ from anser_ros.effects.saturation import compressed
 from anser_ros.effects.term import Term
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
+from anser_ros.physics.sensor import SensorTable
 
 CONTRACT = {
     'sensor_gain', 'sensor_axis', 'sensor_polarity', 'sensor_size', 'lever_arm', 'registration',
@@ -44,6 +45,12 @@ def test_every_name_of_the_contract_is_found():
 def test_effects_declare_what_the_search_needs(scenery):
     """Whoever adds an effect of a family must give what that family is refined with."""
     apparatus = scenery[1].apparatus
+    places = np.repeat(0.05 * np.random.default_rng(1).normal(size=(13, 3)), 3, axis=0)
+    array = SensorTable(
+        1000 + np.arange(39), tuple(map(str, range(39))), ('array',) * 39, places,
+        np.tile(np.eye(3), (13, 1)), np.zeros(39),
+    )  # fmt: skip
+    apparatus = replace(apparatus, tools=(*apparatus.tools, array))
     for name, effect in all_effects().items():
         terms = [*effect.candidates(apparatus)]
         if effect.still is not None:

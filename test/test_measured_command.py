@@ -8,18 +8,48 @@ import numpy as np
 import pytest
 
 from anser_ros.cli import measured
-from anser_ros.cli.main import main
+from anser_ros.cli.main import main as measured_main
 from anser_ros.measured import ReportRow
+from anser_ros.measured.recipe import Recipe
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get('ANSER_SHARED', ROOT.parent / 'shared'))
 
 
 def test_unknown_data_set_and_missing_folder(capsys, tmp_path):
-    assert main(['measured', 'nothing']) == 2
+    assert measured_main(['measured', 'nothing']) == 2
     assert 'no data set' in capsys.readouterr().err
-    assert main(['measured', 'anser_board', '--shared', str(tmp_path)]) == 2
+    assert measured_main(['measured', 'anser_board', '--shared', str(tmp_path)]) == 2
     assert 'no measured data' in capsys.readouterr().err
+
+
+def test_a_recipe_is_commands_that_anybody_can_type(capsys, tmp_path, monkeypatch):
+    (tmp_path / 'measured' / 'set').mkdir(parents=True)
+    typed = []
+
+    def run(command):
+        typed.append(command)
+        print('not shown')
+        return 0 if command[0] == 'calibrate' else 2
+
+    def recipe(verb):
+        return Recipe(
+            'set', lambda folder, into: [into / f'{folder.name}.mcap'],
+            lambda bags, out: [[verb, str(bags[0])]],
+            lambda bags, out: [
+                ReportRow('set', 'figure', 2.0, 1.0, 'mm', 1.1, True, 'nothing', 0.9)
+            ],
+        )  # fmt: skip
+
+    monkeypatch.setattr(measured.main, 'main', run)
+    monkeypatch.setattr(measured, 'RECIPES', {'set': recipe('calibrate')})
+    assert measured_main(['measured', 'set', '--shared', str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert typed[0][1].endswith('set.mcap') and '$ anser calibrate' in out
+    assert 'not shown' not in out and '0.9 mm' in out
+    monkeypatch.setattr(measured, 'RECIPES', {'set': recipe('evaluate')})
+    assert measured_main(['measured', 'set', '--shared', str(tmp_path)]) == 2
+    assert 'anser evaluate ended with 2' in capsys.readouterr().err
 
 
 def test_numbers_that_are_missing_are_null():
@@ -32,7 +62,7 @@ def test_numbers_that_are_missing_are_null():
 
 @pytest.mark.skipif(not (SHARED / 'measured').is_dir(), reason='no shared measured data')
 def test_json_alone_on_stdout(capsys, tmp_path):
-    code = main(
+    code = measured_main(
         ['measured', 'anser_board', '--json', '--out', str(tmp_path), '--shared', str(SHARED)]
     )
     out = capsys.readouterr().out

@@ -12,7 +12,11 @@ from scipy.spatial.transform import Rotation
 from anser_ros.calibration.coaxial import coaxial, fit_coaxial
 from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows
 from anser_ros.calibration.layouts import Generator, Layout, place
+from anser_ros.diagnosis import outlying
+from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.correction import Correction
+from anser_ros.effects.registry import effect_named
+from anser_ros.effects.view import View
 from anser_ros.errors import ModelFileError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel
@@ -28,6 +32,8 @@ from anser_ros.tracking.tracker import Tracker, TrackerSettings
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import parse_setup
 
+EFFECT = effect_named('sensor_gain_spread')
+NONE = EffectRecord(EFFECT.name, {'channels': [999], 'values': [[1.0, 0.0]]})
 CENTRE = np.array([0.004, -0.003, 0.002])
 AXIS = np.array([0.3, -0.2, 0.9]) / np.linalg.norm([0.3, -0.2, 0.9])
 RADIUS_M, MOMENT_AM2, NOISE_T = 0.008, 0.5, 2e-7
@@ -210,6 +216,63 @@ class TestSeenFromABody:
         tracker = Tracker(model, measured.sensors, settings)
         tracker.update(10**10, measured.sensors.channel, measured.flux[0])
         assert tracker.sources['array'].state != OK
+
+
+class TestGainsInADiagnosis:
+    def view(self, term, frames=3):
+        """Three-axis sensors of one body in a linear field, with a term's gains in force."""
+        rng = np.random.default_rng(2)
+        flux = 1e-6 * (rng.normal(size=(frames, 39, 2)) + 1j * rng.normal(size=(frames, 39, 2)))
+        matrix = EFFECT.channel_matrix(term, np.arange(39))
+        linear = np.einsum('st,ftk->fsk', matrix, flux)
+        places = np.repeat(0.05 * rng.normal(size=(13, 3)), 3, axis=0)
+        names = tuple(map(str, range(39)))
+        table = SensorTable(
+            np.arange(39), names, ('array',) * 39, places, np.tile(np.eye(3), (13, 1)),
+            np.zeros(39),
+        )  # fmt: skip
+        nothing = np.zeros((frames, 39, 3, 2))
+        return table, View(
+            np.arange(frames), table, nothing[:, 0, :, 0], np.tile(np.eye(3), (frames, 1, 1)),
+            np.zeros((frames, 6)), nothing[..., 0], nothing[..., 0], linear, linear, nothing,
+            nothing, nothing, None, None, np.ones(2), False,
+        )  # fmt: skip
+
+    def terms(self, table):
+        box = np.zeros((2, 3))
+        return EFFECT.candidates(Apparatus((table,), None, 2, np.ones(2), 1.0, None, box, box))
+
+    def test_its_columns_are_the_change_of_the_fluxes(self):
+        table, _ = self.view(EFFECT.term(NONE))
+        (term,) = self.terms(table)
+        rng = np.random.default_rng(3)
+        here = term.with_theta(0.02 * rng.normal(size=26))
+        step = 1e-6 * rng.normal(size=26)
+        (_, before), (_, after) = self.view(here), self.view(here.with_theta(here.theta + step))
+        slope = EFFECT.columns(here, before) @ step
+        np.testing.assert_allclose(after.linear - before.linear, slope, rtol=1e-5, atol=1e-18)
+        assert len(self.terms(table.select(np.arange(30)))) == 0, 'ten places are no population'
+
+    def test_its_record_has_a_value_for_each_channel(self):
+        table, _ = self.view(EFFECT.term(NONE))
+        (term,) = self.terms(table)
+        theta = np.zeros(26)
+        theta[6] = 0.03
+        record = EFFECT.record(term.with_theta(theta), 1e-8 * np.eye(26))
+        read = EFFECT.term(record)
+        np.testing.assert_allclose(read.values[9:12, 0], 0.03)
+        assert np.count_nonzero(read.values) == 3
+        assert record.parameters['spread'] == pytest.approx(np.std(theta[::2]))
+        changes = EFFECT.gain_changes(read, table)
+        assert changes.shape == (13, 39) and np.count_nonzero(changes) == 39
+
+    def test_a_reading_of_few_values_is_no_outlier_for_its_noise(self):
+        white = np.zeros((3000, 2 * 6))
+        white[:, :6] = np.random.default_rng(1).normal(size=(3000, 6))
+        readings = outlying._by_reading(white**2, 6, 1)
+        ratio = outlying._ratio(outlying.READING_RATIO, outlying._values(white**2, 6, 1))
+        assert not outlying._stands_out(readings, ratio).any()
+        assert outlying._ratio(outlying.READING_RATIO, 16) == outlying.READING_RATIO
 
 
 class TestNewSurvey:

@@ -143,6 +143,34 @@ def test_a_channel_far_outside_its_population_stands_alone(dirty):
     assert not population.stand_alone(found)
 
 
+def test_gains_that_the_axes_of_a_chip_share_are_found_to_be_shared():
+    rng = np.random.default_rng(4)
+    sensors = scene(rng, side=2).measurements.sensors
+    names = tuple(f'{k}/{axis}' for k in range(12) for axis in 'xyz')
+    places = np.repeat(0.02 * rng.normal(size=(12, 3)), 3, axis=0)
+    chips = replace(
+        sensors, channel=np.arange(36), name=names, body=('patch',) * 36, position=places,
+        axis=np.tile(np.eye(3), (12, 1)), length=np.zeros(36),
+    )  # fmt: skip
+    told = replace(scene(rng, side=2).measurements, body='patch', sensors=chips)
+    population = Population(SensorParameters([told], ('gains',)))
+    information = np.zeros((72, 72))
+    information[::2, ::2] = np.eye(36) / 2e-3**2
+    shared = {}
+    for kind, chip in (('axes of a chip', 3), ('coils', 1)):
+        truth = np.repeat(0.01 * rng.normal(size=36 // chip), chip)
+        values = np.zeros(72)
+        values[::2] = truth + 2e-3 * rng.normal(size=36)
+        likelihood = Likelihood(information, information @ values)
+        before = population.fit(likelihood)
+        after = population.with_common_gains(likelihood, before)
+        shared[kind] = after.shared
+        errors = [np.sqrt(np.mean((p.values[::2] - truth) ** 2)) for p in (before, after)]
+        assert errors[1] < (0.75 if chip == 3 else 1.05) * errors[0]
+        assert after.width[0] == pytest.approx(0.01, rel=0.5)
+    assert shared['axes of a chip'] > 0.95 and shared['coils'] < 0.5
+
+
 def test_what_the_data_do_not_tell_stays_at_zero(dirty):
     told, _, _ = dirty
     population = Population(SensorParameters([told], ('axes', 'lever_arm')))

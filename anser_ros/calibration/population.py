@@ -7,7 +7,7 @@ larger with it than without. A channel far outside its population is taken out a
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,8 @@ smaller errors change no pose, and a field's model is not exact to so little."""
 FAR = 6.0
 """Size of a channel's value, in widths of the others' population, from which on it stands alone. A
 value of a Gaussian population of ten is that far out once in ten million."""
+FEWEST_PLACES = 4
+"""Places with several sensors from which on it can be said what these have in common."""
 FEWEST = 4
 """Channels that a population needs for one of them to be judged by the others."""
 
@@ -69,20 +71,23 @@ class Posterior:
     covariance : ndarray, shape (Q, Q)
     evidence : float
         Log probability of the data, up to a constant.
+    shared : float
+        Share of the gains' variance that sensors at one place have in common.
     """
 
     values: Array
     width: Array
     covariance: Array
     evidence: float
+    shared: float = 0.0
 
 
-def solve(likelihood: Likelihood, width: Array) -> Posterior:
-    """The parameters for given prior widths."""
-    scaled = width[:, None] * likelihood.information * width[None, :]
-    inner = np.eye(width.size) + scaled
+def solve(likelihood: Likelihood, width: Array, root: Array | None = None) -> Posterior:
+    """The parameters for given prior widths, or a root (Q, Q) of the prior covariance."""
+    root = np.diag(width) if root is None else root
+    inner = np.eye(width.size) + root.T @ likelihood.information @ root
     # In units of the widths, a parameter that is held fixed does no harm.
-    covariance = width[:, None] * np.linalg.solve(inner, np.diag(width))
+    covariance = root @ np.linalg.solve(inner, root.T)
     covariance = (covariance + covariance.T) / 2.0
     values = covariance @ likelihood.natural
     log_size = float(np.linalg.slogdet(inner)[1])
@@ -138,6 +143,36 @@ class Population:
                 width[rows] = np.clip(new, NARROWEST[kind], PRIOR[kind])
             found = solve(likelihood, width)
         return found
+
+    def with_common_gains(self, likelihood: Likelihood, found: Posterior) -> Posterior:
+        """Weigh gains with what sensors at one place have in common, as much as the data say.
+
+        The prior covariance of the gains at a place is ``a + b`` on its diagonal and ``a`` beside
+        it; both are those of most probable data (expectation and maximisation by turns). Channels
+        that stand alone have no part in it.
+        """
+        places = [
+            rows for rows in self.parameters.gains_at_one_place()
+            if not np.isin(rows, self.alone['gains']).any()
+        ]  # fmt: skip
+        if len(places) < FEWEST_PLACES:
+            return found
+        freedom, width = sum(rows.size - 1 for rows in places), found.width.copy()
+        common = own = 0.5 * float(width[places[0][0]]) ** 2
+        for _ in range(ROUNDS):
+            root = np.diag(width)
+            for rows in places:
+                block = np.full((rows.size, rows.size), common) + own * np.eye(rows.size)
+                root[np.ix_(rows, rows)] = np.linalg.cholesky(block)
+            found = solve(likelihood, width, root)
+            second = found.covariance + np.outer(found.values, found.values)
+            blocks = [second[np.ix_(rows, rows)] for rows in places]
+            inside = sum(float(np.trace(b) - b.mean() * len(b)) for b in blocks)
+            own = max(inside / freedom, NARROWEST['gains'] ** 2)
+            common = float(np.mean([b.mean() - own / len(b) for b in blocks]))
+            common = max(common, NARROWEST['gains'] ** 2)
+        width[np.concatenate(places)] = np.sqrt(common + own)
+        return replace(found, width=width, shared=common / (common + own))
 
     def stand_alone(self, found: Posterior) -> bool:
         """Take channels far outside their population out of it; return whether there are any."""

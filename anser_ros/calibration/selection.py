@@ -204,7 +204,8 @@ class _Search:
         if moving:
             found.append(min(map(self.score, moving), key=lambda c: c.score))
         if self.drawn is None:
-            found += [self.score(layout) for layout in COAXIAL]
+            # A few dipoles more cost a tracker nothing: the best of them, not the leanest.
+            found.append(min(map(self.score, COAXIAL), key=lambda c: c.score))
         if rows >= LOCAL_READINGS * LOCAL_COUNT**2:
             depth = max(best.layout.depth_m, 0.0)
             common = self.score(Layout('layer', LOCAL_COUNT, EXTENSIONS[1], depth, self.prior))

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
-from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.sensor import SensorTable, clusters_of
 from anser_ros.physics.tangent import tangents, tilted
 
 Array = NDArray[np.float64]
@@ -194,6 +194,14 @@ class SensorParameters:
         for kind in self.kinds:
             rows = self.rows(kind)
             out += [(kind, rows[0::2]), (kind, rows[1::2])] if kind == 'gains' else [(kind, rows)]
+        return out
+
+    def gains_at_one_place(self) -> list[NDArray[np.int64]]:
+        """Indices of the gains (their real parts) of the sensors at each place with several."""
+        out = []
+        for body, table in zip(self.bodies, self.tables, strict=True):
+            if (own := self.slices.get(('gains', body))) is not None:
+                out += [own.start + 2 * rows for rows in clusters_of(table) if rows.size > 1]
         return out
 
     def rule(self) -> Array:

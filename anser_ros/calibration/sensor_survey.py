@@ -208,6 +208,7 @@ class SensorSurveyor:
                 break
         posterior, left_out, evidence = self.population.chosen(self.likelihood)
         if 'gains' in evidence:
+            posterior = self.population.with_common_gains(self.likelihood, posterior)
             values, common = self.parameters.by_rule(posterior.values)
             posterior, self.field = replace(posterior, values=values), self.field * common
         self.values = posterior.values

@@ -11,7 +11,6 @@ from anser_ros.calibration.sensor_parameters import EACH, SensorParameters
 from anser_ros.calibration.sensor_survey import SurveyResult
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord
-from anser_ros.physics.sensor import clusters_of
 from anser_ros.physics.tangent import tilted
 
 Array = NDArray[np.float64]
@@ -22,8 +21,6 @@ SPREADS = {
     'places': 'sensor_place_spread',
 }
 """Names of the populations' effects."""
-FEWEST_PLACES = 4
-"""Places with more than one sensor from which on it is judged what these have in common."""
 FEWEST_REFLECTED = 1e-3
 """Share of frames with a wrong optical pose from which on they are told."""
 
@@ -136,8 +133,8 @@ def _population(result: SurveyResult, kind: str) -> list[EffectRecord]:
     if kind == 'gains':
         listed = values + [1.0, 0.0]
         stated['phase_spread_rad'] = float(width[1])
-        if (shared := shared_gain(parameters, values[:, 0])) > 0.0:
-            stated['shared'] = shared
+        if found.shared > 0.0:
+            stated['shared'] = found.shared
     more = {}
     if kind == 'axes':
         axes = np.concatenate([table.axis for table in parameters.tables])
@@ -155,25 +152,6 @@ def _population(result: SurveyResult, kind: str) -> list[EffectRecord]:
         _evidence(result, kind),
     )
     return [record, *records]
-
-
-def shared_gain(parameters: SensorParameters, gains: Array) -> float:
-    """Return the share of the gains' variance that sensors at one place have in common.
-
-    It is the intraclass correlation (Fisher); 0 where no two sensors are at one place.
-    """
-    first, groups = 0, []
-    for table in parameters.tables:
-        groups += [first + rows for rows in clusters_of(table) if rows.size > 1]
-        first += len(table)
-    if len(groups) < FEWEST_PLACES:
-        return 0.0
-    inside = sum(float(((gains[g] - gains[g].mean()) ** 2).sum()) for g in groups)
-    freedom = sum(g.size - 1 for g in groups)
-    within = inside / freedom
-    between = float(np.var([gains[g].mean() for g in groups], ddof=1))
-    own = between - within * len(groups) / sum(g.size for g in groups)
-    return float(np.clip(own / max(own + within, 1e-300), 0.0, 1.0))
 
 
 def _single(

@@ -23,9 +23,11 @@ from anser_ros.sessions.pose_table import (
     BODIES_FILE,
     ERRORS_FILE,
     POSES_FILE,
+    SOURCES_FILE,
     write_body_poses,
     write_errors,
     write_poses,
+    write_sources,
 )
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for
@@ -151,6 +153,9 @@ def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result
     write_body_poses(args.out / BODIES_FILE, evaluation)
     write_errors(args.out / ERRORS_FILE, evaluation)
     written = [args.out / name for name in FILES]
+    if evaluation.sources:
+        written.append(args.out / SOURCES_FILE)
+        write_sources(written[-1], evaluation)
     written += write_figures(
         evaluation, document, args.out, session=args.session, model=args.model,
         jitter_m=session.setup.accuracy.optical_position_m,

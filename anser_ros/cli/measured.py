@@ -1,9 +1,12 @@
 """The command that analyses other people's measurements and compares errors before and after."""
 
 import argparse
+import contextlib
+import io
 import json
 import math
 import os
+import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
@@ -13,6 +16,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from anser_ros.cli import main
 from anser_ros.cli.output import make_folder, say_written
 from anser_ros.errors import ParameterError
 from anser_ros.measured import (
@@ -21,11 +25,12 @@ from anser_ros.measured import (
     hpi_coils,
     hpi_session,
     magnet_patch,
-    magnet_session,
+    magnet_step,
     navion,
     navion_report,
     navion_session,
 )
+from anser_ros.measured.recipe import Recipe
 
 Study = Callable[[Path], tuple[list[ReportRow], str]]
 
@@ -35,9 +40,9 @@ def _navion(folder: Path) -> tuple[list[ReportRow], str]:
     return navion.rows(analysis, folder), navion_report.tables(analysis)
 
 
-def _magnet_patch(folder: Path) -> tuple[list[ReportRow], str]:
-    analysis = magnet_patch.analyse(folder)
-    return magnet_patch.rows(analysis), magnet_patch.tables(analysis)
+def _magnet_step(folder: Path) -> tuple[list[ReportRow], str]:
+    analysis = magnet_step.analyse(folder.with_name(magnet_patch.NAME))
+    return magnet_step.rows(analysis), magnet_step.tables(analysis)
 
 
 def _hpi_coils(folder: Path) -> tuple[list[ReportRow], str]:
@@ -52,17 +57,20 @@ def _anser_board(folder: Path) -> tuple[list[ReportRow], str]:
 
 STUDIES: dict[str, Study] = {
     navion.NAME: _navion,
-    magnet_patch.NAME: _magnet_patch,
+    magnet_step.NAME: _magnet_step,
     hpi_coils.NAME: _hpi_coils,
     anser_board.NAME: _anser_board,
 }
-"""Analysis of each data set, which gives the rows of its figures and a text of its candidates."""
+"""Analysis of each data set without a recipe: rows of its figures, text of its candidates."""
+RECIPES: dict[str, Recipe] = {recipe.name: recipe for recipe in (magnet_patch.RECIPE,)}
+"""Data sets that the shipped commands are run on."""
 SESSIONS: dict[str, Callable[[Path, Path], list[Path]]] = {
     navion.NAME: navion_session.write_sessions,
-    magnet_patch.NAME: magnet_session.write_sessions,
+    **{name: recipe.write_sessions for name, recipe in RECIPES.items()},
     hpi_coils.NAME: hpi_session.write_sessions,
 }
 """Function of each data set with fluxes that writes its sessions as bags."""
+NAMES = (*RECIPES, *STUDIES)
 SHARED = 'ANSER_SHARED'
 SCHEMA = 'anser_measured/1'
 
@@ -73,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'datasets',
         nargs='*',
         metavar='DATASET',
-        help=f'some of {", ".join(STUDIES)}; all by default',
+        help=f'some of {", ".join(NAMES)}; all by default',
     )
     parser.add_argument(
         '--shared',
@@ -96,17 +104,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command and return the exit code."""
-    wrong = [name for name in args.datasets if name not in STUDIES]
+    wrong = [name for name in args.datasets if name not in (*RECIPES, *STUDIES)]
     if wrong:
-        raise ParameterError(f'no data set {wrong[0]!r}; there are {", ".join(STUDIES)}')
+        raise ParameterError(f'no data set {wrong[0]!r}; there are {", ".join(NAMES)}')
     shared = shared_folder(args.shared)
     console = Console(stderr=args.json, width=None if os.isatty(1) else 200)
     for folder in filter(None, (args.out, args.bags)):
         make_folder(folder)
     rows: list[ReportRow] = []
+    names = args.datasets or (*RECIPES, *STUDIES)
     if args.bags is not None:
-        _write_bags(args.datasets or STUDIES, shared, args.bags, console)
-    for name in args.datasets or STUDIES:
+        _write_bags(names, shared, args.bags, console)
+    for name in names:
+        if name in RECIPES:
+            rows += _cook(RECIPES[name], shared / 'measured' / name, args, console)
+            continue
         found, text = STUDIES[name](shared / 'measured' / name)
         rows += found
         if not args.quiet and not args.json:
@@ -123,6 +135,32 @@ def run(args: argparse.Namespace) -> int:
         if args.out is not None:
             say_written(args.out)
     return 0
+
+
+def _cook(
+    recipe: Recipe, folder: Path, args: argparse.Namespace, console: Console
+) -> list[ReportRow]:
+    """Run a recipe's commands; the figures that they give."""
+    with tempfile.TemporaryDirectory(prefix='anser_measured_') as made:
+        out = Path(made) if args.out is None else args.out / recipe.name
+        make_folder(out)
+        bags = recipe.write_sessions(folder, Path(made) / 'bags')
+        for command in recipe.commands(bags, out):
+            if not args.quiet:
+                console.print(f'$ anser {" ".join(command)}', highlight=False, soft_wrap=True)
+            said = io.StringIO()
+            with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+                code = main.main(command)
+            if code:
+                raise ParameterError(
+                    f'{recipe.name}: anser {command[0]} ended with {code}: {_last(said)}'
+                )
+        return recipe.rows(bags, out)
+
+
+def _last(said: io.StringIO) -> str:
+    """The last line that a command said."""
+    return (said.getvalue().strip().splitlines() or ['nothing said'])[-1]
 
 
 def _write_bags(names: Iterable[str], shared: Path, into: Path, console: Console) -> None:
@@ -167,12 +205,13 @@ def to_document(rows: list[ReportRow]) -> dict[str, Any]:
 def table(rows: list[ReportRow]) -> Table:
     """Return the rows as a table for the terminal."""
     out = Table(title='Measured data: before and after, on data that took no part')
-    for heading in ('data set', 'figure', 'before', 'after', 'target', 'met', 'chosen on'):
-        number = heading in ('before', 'after', 'target')
+    figures = ('before', 'after', 'special', 'target')
+    for heading in ('data set', 'figure', *figures, 'met', 'chosen on'):
+        number = heading in figures
         out.add_column(heading, justify='right' if number else 'left', overflow='fold')
     for row in rows:
         met = {None: '', True: 'yes', False: 'no'}[row.met]
-        values = [_number(value) for value in (row.before, row.after, row.target)]
+        values = [_number(value) for value in (row.before, row.after, row.special, row.target)]
         values = [f'{value} {row.unit}'.strip() if value else '' for value in values]
         out.add_row(row.dataset, row.figure, *values, met, row.chosen_on)
     return out

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
+from scipy.special import chdtri
 
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.effects.effect import Family
@@ -18,7 +19,9 @@ bad ones in a row are seen, and motion changes little over so many."""
 READING_RATIO, FRAME_RATIO = 6.0, 2.5
 """Mean squares over the neighbours' median from which a reading (16 values with 8 emitters) or a
 frame (ten times as many) is no member of the same distribution; normal noise in 8 values
-or more passes less than once in 1e6."""
+or more passes less than once in 1e6. Of fewer values the ratio of so rare a noise is larger."""
+RARE = 1e-6
+"""Probability that noise alone makes so large a reading or frame."""
 JUMP_RATIO = 40.0
 """The same for a frame whose pose's own directions are left in: the optical jitter along them is
 larger than the noise and differs from pose to pose, so only a glitch stands out so far."""
@@ -41,7 +44,9 @@ def find_outliers(state: State) -> tuple[Mask, ...]:
         count = np.maximum(good.sum(axis=1), 1)
         frames = np.where(good, readings, 0.0).sum(axis=1) / count
         jumps = np.where(good, _by_reading(size, good.shape[1], emitters), 0.0).sum(axis=1) / count
-        bad = _stands_out(readings, READING_RATIO) | _stands_out(frames[:, None], FRAME_RATIO)
+        values = _values(white, good.shape[1], emitters)
+        bad = _stands_out(readings, _ratio(READING_RATIO, values))
+        bad |= _stands_out(frames[:, None], _ratio(FRAME_RATIO, values * good.shape[1]))
         if not moves:
             bad |= _stands_out(jumps[:, None], JUMP_RATIO)
         masks.append(bad & good)
@@ -49,9 +54,20 @@ def find_outliers(state: State) -> tuple[Mask, ...]:
 
 
 def _by_reading(values: Array, sensors: int, emitters: int) -> Array:
-    """Mean over the parts of each sensor's phasors, (F, S)."""
+    """Mean over the parts of each sensor's phasors that are anything, (F, S)."""
     shaped = values.reshape(values.shape[0], 2, sensors, emitters)
-    return np.asarray(shaped.mean(axis=(1, 3)))
+    return np.asarray(shaped.sum(axis=(1, 3)) / _values(values, sensors, emitters))
+
+
+def _values(values: Array, sensors: int, emitters: int) -> int:
+    """Parts of a reading that are anything: constant fields have no quadrature."""
+    shaped = values.reshape(values.shape[0], 2, sensors, emitters)
+    return max(int(shaped.any(axis=(0, 2)).sum()), 1)
+
+
+def _ratio(usual: float, values: int) -> float:
+    """Mean square of so many values beyond which it is no noise."""
+    return max(usual, float(chdtri(values, RARE)) / values)
 
 
 def _stands_out(values: Array, ratio: float) -> Mask:

@@ -1,12 +1,13 @@
 """Errors that all sensors have, each its own: populations of gains, axes and places."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import (
     Array,
     ComplexArray,
@@ -18,6 +19,7 @@ from anser_ros.effects.effect import (
     unit_matrix,
 )
 from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable, clusters_of
@@ -34,6 +36,9 @@ class SpreadTerm(Term):
 
     Attributes
     ----------
+    groups : tuple of int
+        Which value each channel has, where several have one: row of the values by member. Empty
+        where each has its own.
     members : tuple of int
         Their channels.
     spread : float
@@ -45,10 +50,13 @@ class SpreadTerm(Term):
     members: tuple[int, ...]
     spread: float
     shared: float = 0.0
+    groups: tuple[int, ...] = ()
 
     @property
     def values(self) -> Array:
         """The values, a row a channel."""
+        if self.groups:
+            return self.theta.reshape(max(self.groups) + 1, -1)[list(self.groups)]
         return self.theta.reshape(len(self.members), -1)
 
     def of(self, channels: NDArray[np.generic]) -> Array:
@@ -61,8 +69,16 @@ class SpreadTerm(Term):
         return out
 
 
+MANY = 12
+"""Places of sensors from which on a population is looked for by a diagnosis; of fewer, each sensor
+that is off is named by itself."""
+
+
 class SensorSpread(Effect[SpreadTerm]):
-    """Found by a calibration, which has every channel in many poses; a model carries it."""
+    """Found by a calibration, which has every channel in many poses; a model carries it.
+
+    A diagnosis finds gains that sensors at one place share.
+    """
 
     family = Family.SEEN
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'spread': (0.0, 0.3)}
@@ -71,7 +87,8 @@ class SensorSpread(Effect[SpreadTerm]):
 
     def record(self, term: SpreadTerm, covariance: Array) -> EffectRecord:
         """Spread, channels, and each channel's values with their uncertainty."""
-        sigma = sigmas(covariance).reshape(term.values.shape).tolist()
+        of_sigma = term.with_theta(sigmas(covariance))
+        sigma = of_sigma.values.tolist()
         values = (term.values + np.array(self.offset_of_values)).tolist()
         return EffectRecord(
             self.name,
@@ -102,10 +119,53 @@ class SensorGainSpread(SensorSpread):
 
     name = 'sensor_gain_spread'
     summary = 'every channel has a gain of its own'
+    family = Family.STEADY
     units: ClassVar[Mapping[str, str]] = {'spread': '1', 'channels': '1', 'values': '1'}
     remedy = Remedy.FLUX
     width = 2
     offset_of_values = (1.0, 0.0)
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[SpreadTerm]:
+        """All sensors of a body that has many, those at one place with a gain in common."""
+        out = []
+        for table in apparatus.tools:
+            places = clusters_of(table)
+            if len(places) < MANY or len(places) == len(table):
+                continue
+            groups = np.zeros(len(table), dtype=np.int64)
+            for number, rows in enumerate(places):
+                groups[rows] = number
+            out.append(
+                SpreadTerm(
+                    self, {'body': table.body[0]}, np.zeros(2 * len(places)),
+                    members=tuple(table.channel.tolist()), spread=0.0, shared=1.0,
+                    groups=tuple(groups.tolist()),
+                )
+            )  # fmt: skip
+        return out
+
+    def prior(self, term: SpreadTerm) -> Array:
+        """Gains of a kind of sensor are within some percent of each other."""
+        return np.full(term.theta.size, 0.05)
+
+    def columns(self, term: SpreadTerm, view: View) -> ComplexArray | None:
+        """Each place's own fluxes, in phase and turned by a quarter."""
+        if not term.groups or view.is_reference:
+            return None
+        out, found = view.columns(term.theta.size), False
+        gains = 1.0 + term.values[:, 0] + 1j * term.values[:, 1]
+        for channel, group, gain in zip(term.members, term.groups, gains, strict=True):
+            row = view.row(channel)
+            if row is not None:
+                found = True
+                own = view.linear[:, row] / gain
+                out[:, row, :, 2 * group], out[:, row, :, 2 * group + 1] = own, 1j * own
+        return out if found else None
+
+    def record(self, term: SpreadTerm, covariance: Array) -> EffectRecord:
+        """As any population's; the spread is that of the gains that were found."""
+        width = float(np.std(term.theta[0::2])) if term.groups else term.spread
+        return super().record(replace(term, spread=width), covariance)
 
     def channel_matrix(self, term: SpreadTerm, channels: NDArray[np.int64]) -> ComplexArray | None:
         """The gains on the diagonal."""

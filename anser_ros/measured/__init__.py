@@ -1,8 +1,9 @@
-"""Importers of other people's measurements: each finds what its data contain and scores it.
+"""Importers of other people's measurements, and recipes of commands that find what is in them.
 
-The module of a data set has its ``NAME``, ``analyse(folder)``, ``rows(analysis)``, which returns
-its `ReportRow` list, and ``tables(analysis)``, the text of all candidates. `cli/measured.py` lists
-the data sets.
+A data set has a ``RECIPE`` (`recipe.Recipe`): its sessions, the commands that are run on them, and
+the figures that these give. Sets that the commands do not reach yet have ``analyse(folder)``,
+``rows(analysis)``, which returns a `ReportRow` list, and ``tables(analysis)``, the text of all
+candidates, instead. `cli/measured.py` lists the data sets.
 """
 
 from dataclasses import dataclass
@@ -28,6 +29,9 @@ class ReportRow:
         Whether it does; None without a target.
     chosen_on : str
         What the effects were chosen and fitted on, and what the figure was scored on.
+    special : float or None
+        `after` of code that was written for this data set alone, where a recipe has taken its
+        place: see docs/results/README.md.
     """
 
     dataset: str
@@ -38,3 +42,4 @@ class ReportRow:
     target: float | None
     met: bool | None
     chosen_on: str
+    special: float | None = None

@@ -5,6 +5,7 @@ sensors' constant offsets make a point-dipole model believe that the patch is so
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +13,12 @@ from numpy.typing import NDArray
 from anser_ros.measured import ReportRow
 from anser_ros.measured.candidates import CandidateSearch, search_text
 from anser_ros.measured.magnet_fit import Jitter, MagnetFit, fit, search
-from anser_ros.measured.magnet_model import Recording, Source
+from anser_ros.measured.magnet_model import Recording, Source, point_source
+from anser_ros.measured.magnet_patch import as_recording, read_poses
 
 Array = NDArray[np.float64]
 
+NAME = 'magnet_step'
 ROBOT = Jitter(1e-5, 1e-4)
 """Jitter of the robot's poses, m and rad."""
 FIRST_NOISE_T = 5e-6
@@ -57,6 +60,12 @@ class StepAnalysis:
     sensors: MagnetFit
 
 
+def analyse(folder: Path) -> StepAnalysis:
+    """Everything of the robot's file."""
+    parts, _ = read_poses(folder / 'step1.csv', 'M')
+    return analyse_step(as_recording('step1', parts, np.zeros(3)), point_source())
+
+
 def analyse_step(recording: Recording, source: Source) -> StepAnalysis:
     """Choose the effects on blocks of poses; then free the patch and each sensor."""
     rich = ('pickup', 'source_size', 'registration', 'sensor_position')
@@ -86,14 +95,14 @@ def scatter_mm(model: MagnetFit) -> float:
     return 1e3 * float(np.sqrt(np.mean(np.sum((places - places.mean(axis=0)) ** 2, axis=1))))
 
 
-def step_rows(dataset: str, step: StepAnalysis) -> list[ReportRow]:
+def rows(step: StepAnalysis) -> list[ReportRow]:
     """Rows of the table."""
     noise = step.final.noise_t
     chosen = f'{", ".join(step.search.chosen)}: chosen and scored on blocks of poses left out'
     sigma = 2.0 * float(np.linalg.norm(step.final.sigma['registration'][:3]))
     return [
         ReportRow(
-            dataset,
+            NAME,
             'step1: held-out field residual (noise incl.)',
             1e6 * noise * step.search.start,
             1e6 * noise * step.search.end,
@@ -103,7 +112,7 @@ def step_rows(dataset: str, step: StepAnalysis) -> list[ReportRow]:
             chosen,
         ),
         ReportRow(
-            dataset,
+            NAME,
             f'step1: distance of the patch from its stated place (1 sigma {sigma:.2f} mm)',
             shift_mm(step.naive),
             shift_mm(step.final),
@@ -113,7 +122,7 @@ def step_rows(dataset: str, step: StepAnalysis) -> list[ReportRow]:
             'before: point dipole; after: with the effects above; all poses',
         ),
         ReportRow(
-            dataset,
+            NAME,
             'step1: scatter of the single sensors about the stated grid, rms',
             np.nan,
             scatter_mm(step.sensors),
@@ -125,9 +134,9 @@ def step_rows(dataset: str, step: StepAnalysis) -> list[ReportRow]:
     ]
 
 
-def step_text(step: StepAnalysis) -> str:
+def tables(step: StepAnalysis) -> str:
     """Candidates and the sensors' places."""
-    lines = [search_text('magnet_patch, step1', step.search, 'of the noise')]
+    lines = [search_text(NAME, step.search, 'of the noise')]
     lines.append(f'  noise {1e6 * step.final.noise_t:.2f} uT')
     for title, model in (('point dipole', step.naive), ('with the effects', step.final)):
         shift = 2.0 * model.found['registration'][:3]

@@ -117,5 +117,6 @@ def _sources(prepared: PreparedSession, tracked: TrackedSession) -> dict[str, Po
         true = with_truth(tool, prepared.correction)
         position = np.where(true.has_pose[:, None], true.position, np.nan)
         place, direction = seen_from(axis, position, true.rotation)
-        out[tool.body] = sensor_series(tool.body, tracked.sources[tool.body], place, direction)
+        name = f'{tool.body}/source'
+        out[tool.body] = sensor_series(name, tracked.sources[tool.body], place, direction)
     return out

@@ -22,6 +22,7 @@ BODY_COLUMNS = (
 )  # fmt: skip
 """Columns of the bodies' table; the orientation is a quaternion."""
 POSES_FILE, BODIES_FILE, ERRORS_FILE = 'poses.csv', 'bodies.csv', 'errors.csv'
+SOURCES_FILE = 'sources.csv'
 ERROR_COLUMNS = ('stamp_ns', 'name', 'position_error_m', 'orientation_error_rad')
 """Columns of the table of errors, of coils and bodies."""
 
@@ -39,11 +40,21 @@ def write_body_poses(path: Path, evaluation: Evaluation) -> None:
     _write(path, BODY_COLUMNS, rows)
 
 
+def write_sources(path: Path, evaluation: Evaluation) -> None:
+    """Write where each body saw the source, in the body's frame, or why it did not."""
+    rows = [row for series in evaluation.sources.values() for row in _sensor_rows(series)]
+    _write(path, POSE_COLUMNS, rows)
+
+
 def write_errors(path: Path, evaluation: Evaluation) -> None:
-    """Write the error of every pose that has an optical one, of coils and then of bodies."""
+    """Write the error of every pose that has an optical one, of coils, bodies and sources."""
     rows = [
         [estimate.stamp_ns, series.name, f'{place:.9g}', f'{turn:.9g}']
-        for series in (*evaluation.sensors.values(), *evaluation.bodies.values())
+        for series in (
+            *evaluation.sensors.values(),
+            *evaluation.bodies.values(),
+            *evaluation.sources.values(),
+        )
         for estimate, place, turn in zip(
             series.estimates, series.position_error.tolist(), series.orientation_error.tolist(),
             strict=True,

@@ -1,0 +1,46 @@
+"""A data set as a recipe: its sessions, the shipped commands that are run on them, the figures."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from anser_ros.measured import ReportRow
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What `anser measured` does with a data set.
+
+    Attributes
+    ----------
+    name : str
+        Folder of the data.
+    write_sessions : callable
+        From the folder of the data and that of the bags to the bags written there.
+    commands : callable
+        From the bags and the folder for results to the command lines, in their order: verb and
+        arguments of `anser`, as anybody would type them.
+    rows : callable
+        From the bags and the folder to the figures, read from what the commands wrote.
+    """
+
+    name: str
+    write_sessions: Callable[[Path, Path], list[Path]]
+    commands: Callable[[list[Path], Path], list[list[str]]]
+    rows: Callable[[list[Path], Path], list[ReportRow]]
+
+
+def ran(folder: Path, name: str) -> dict[str, Any]:
+    """Return the document of a name that a command wrote into its folder."""
+    document: dict[str, Any] = json.loads((folder / name).read_text(encoding='utf-8'))
+    return document
+
+
+def figure(document: dict[str, Any], *keys: str) -> float:
+    """Return a number of a document by its keys; nan where it is null or not there."""
+    value: Any = document
+    for key in keys:
+        value = value.get(key) if isinstance(value, dict) else None
+    return float('nan') if value is None else float(value)
