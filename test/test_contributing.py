@@ -36,7 +36,7 @@ def test_the_names_in_the_recipes_are_those_of_the_code():
         'cli/commands.py': ('NODES', 'OFFLINE'),
         'physics/board.py': ('KINDS',),
         'tracking/estimate.py': ('STATES', 'TrackerSettings'),
-        'cli/measured.py': ('RECIPES', 'SESSIONS'),
+        'cli/measured.py': ('RECIPES',),
         'tracking/coil_track.py': ('_judge',),
     }.items():
         code = (REPO / 'anser_ros' / path).read_text()
