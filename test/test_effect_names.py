@@ -15,6 +15,7 @@ import pytest
 from conftest import by_room
 
 import anser_ros.effects as package
+import anser_ros.poses.effects as pose_package
 from anser_ros.effects.effect import Effect
 from anser_ros.effects.registry import all_effects
 from anser_ros.effects.term import Term
@@ -36,8 +37,13 @@ FILES = sorted(
 )
 
 
-def members(base):
-    """The names of all classes in the effects' room that derive from a base."""
+NO_EFFECTS = {'PoseEffect', 'FrameTerm', 'Mount', 'OpticalFrame'}
+"""Classes in the room of effects on poses that are none: their base, and the two unknown frames,
+which are always fitted."""
+
+
+def members(base, package=package):
+    """The names of all classes in a room of effects that derive from a base."""
     found = set()
     for info in pkgutil.iter_modules(package.__path__):
         module = importlib.import_module(f'{package.__name__}.{info.name}')
@@ -51,6 +57,7 @@ def members(base):
 
 NAMES = {*all_effects(), 'metal_remainder'}
 CLASSES = members(Effect) | members(Term)
+CLASSES |= (members(Effect, pose_package) | members(Term, pose_package)) - NO_EFFECTS
 
 
 def special_cases(text):

@@ -11,7 +11,7 @@ instead of fluxes. `Term`, records, priors and costs of parameters are the same.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,9 +80,24 @@ class PoseView:
     velocity: Array
 
 
+class Role(Enum):
+    """What an effect is to the search, which asks for this and for no effect by its name."""
+
+    PLAIN = 'plain'
+    CLOCK = 'clock'
+    """Moves the times of poses; found before a filter is judged, whose first order is a delay."""
+    FILTER = 'filter'
+    """A low pass with a time constant: no slopes, tried at some of them when the rest is found."""
+    SCALE = 'scale'
+    """One scale of all positions, which is a part of a map."""
+    MAP = 'map'
+    """A map of the places, that a map of a higher degree contains."""
+
+
 class PoseEffect(Effect[Term]):
     """Base of the effects on poses: it changes nothing."""
 
+    role = Role.PLAIN
     blocks_in_space = False
     """Whether blocks of space and not of time decide on it."""
 
@@ -118,6 +133,18 @@ class PoseEffect(Effect[Term]):
     def observed(self, sight: 'PoseSight') -> Sequence[EffectRecord]:
         """What is seen of the effect without a fit; nothing where it has parameters to fit."""
         return ()
+
+    def bent(self, term: Term) -> Term:
+        """Of a map: without its linear part, which something else has."""
+        return term
+
+    def whole(self, term: Term) -> Term:
+        """Of a map: with its linear part, on all sensors, with parameters of zero."""
+        return term
+
+    def rival(self, term: Term) -> Term:
+        """Of a filter: the same smoothing without a delay, what a noisy reference asks for."""
+        return term
 
     def acts_on(self, term: Term, sensor: str) -> bool:
         """Whether a term is about a sensor: its own, or all where the site names none."""
@@ -172,6 +199,12 @@ class PoseSight:
     blocks: tuple[NDArray[np.int64], ...]
 
 
-def is_of(term: Term, kind: type[Any]) -> bool:
-    """Whether a term is of a kind of effect."""
-    return isinstance(term.effect, kind)
+def effect_of(term: Term) -> PoseEffect:
+    """The effect of a term of poses."""
+    assert isinstance(term.effect, PoseEffect)
+    return term.effect
+
+
+def is_of(term: Term, role: Role) -> bool:
+    """Whether the effect of a term has a role."""
+    return effect_of(term).role is role

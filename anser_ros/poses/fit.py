@@ -175,24 +175,29 @@ def noise_of(part: PosePart, with_stamps: bool = True) -> tuple[PoseNoise, float
     if not len(residual):
         return part.noise, 0.0
     squares = np.mean(residual**2, axis=0)
-    start = [np.sqrt(squares[:3].mean()), np.sqrt(squares[3:].mean())]
-    start = [max(s, low) for s, low in zip(start, SMALLEST_NOISE, strict=True)]
+    own = squares[:3].sum(), squares[3:].sum()
+    start = [max(np.sqrt(s / 3), low) for s, low in zip(own, SMALLEST_NOISE, strict=True)]
+    moved = velocity * residual
+    moved_m, moved_rad = moved[:, :3].sum(axis=1), moved[:, 3:].sum(axis=1)
+    speed_m, speed_rad = (np.sum(part**2, axis=1) for part in np.split(velocity, 2, axis=1))
 
     def cost(log: Array) -> float:
-        place, turn = np.exp(log[0]), np.exp(log[1])
-        stamp = float(np.exp(log[2])) if with_stamps else 0.0
-        noise = PoseNoise(float(place), float(turn), stamp)
-        white = noise.whitened(residual, velocity)
-        scale = np.repeat([stamp / place, stamp / turn], 3)
-        along = np.sum((velocity * scale) ** 2, axis=1)
-        spread = 6 * log[0] + 6 * log[1] + np.mean(np.log1p(along))
-        return float(np.sum(white**2) / len(residual) + spread)
+        """Sum of the whitened squares (`PoseNoise.whitened`) and of the spreads' logarithms."""
+        place, turn = np.exp(-2 * log[0]), np.exp(-2 * log[1])
+        fixed = own[0] * place + own[1] * turn + 6 * log[0] + 6 * log[1]
+        if not with_stamps:
+            return float(fixed)
+        stamp = np.exp(2 * log[2])
+        along = stamp * (speed_m * place + speed_rad * turn)
+        less = stamp * (moved_m * place + moved_rad * turn) ** 2 / (1 + along)
+        return float(fixed - less.mean() + np.log1p(along).mean())
 
+    if not with_stamps:  # the mean squares are the likeliest
+        plain = PoseNoise(float(start[0]), float(start[1]))
+        return plain, cost(np.log(start)) * len(residual)
     tries = [np.log([start[0], start[1], stamp]) for stamp in (0.002, 0.02)]
-    if not with_stamps:
-        tries = [np.log(start)]
     best = min((minimize(cost, at, method='Nelder-Mead', options={'xatol': 1e-3, 'fatol': 1e-6,
                'maxiter': 300}) for at in tries), key=lambda r: float(r.fun))  # fmt: skip
     values = np.exp(best.x)
-    stamp = min(float(values[2]), LARGEST_STAMP_S) if with_stamps else 0.0
+    stamp = min(float(values[2]), LARGEST_STAMP_S)
     return PoseNoise(float(values[0]), float(values[1]), stamp), float(best.fun) * len(residual)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.diagnosis.scoring import BlockSums
 from anser_ros.effects.term import Term
-from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView
+from anser_ros.poses.effect import PoseSetting, PoseView, effect_of
 from anser_ros.poses.effects.hand_eye import FrameTerm, Mount, OpticalFrame
 from anser_ros.poses.path import OpticalPath
 from anser_ros.poses.sequence import PoseSequence
@@ -111,8 +111,7 @@ def _predicted(
     mount, lever = np.eye(3), np.zeros(3)
     position, rotation = sensor.position, sensor.rotation
     for term in terms:
-        effect = term.effect
-        assert isinstance(effect, PoseEffect)
+        effect = effect_of(term)
         path = effect.filter(term, path) if effect.acts_on(term, sensor.name) else path
         time = effect.clock(term, sensor.name, time)
         position, rotation = effect.corrected(term, sensor.name, position, rotation)
@@ -126,8 +125,7 @@ def _predicted(
             mount, lever = term.rotation, term.translation
     optical, turn, velocity, known = path.at(time)
     for term in terms:
-        assert isinstance(term.effect, PoseEffect)
-        optical = term.effect.seen(term, optical)
+        optical = effect_of(term).seen(term, optical)
     body = frame @ turn
     arm = body @ lever
     said = optical @ frame.T + arm + shift
@@ -220,9 +218,7 @@ class PoseState:
         for part, label in zip(self.parts, labels, strict=True):
             columns = np.zeros((part.residual.shape[0], 6, total))
             for term, a, b in zip(wanted, edges[:-1], edges[1:], strict=True):
-                effect = term.effect
-                assert isinstance(effect, PoseEffect)
-                slope = effect.slopes(term, part.view)
+                slope = effect_of(term).slopes(term, part.view)
                 if slope is not None:
                     columns[:, :, a:b] = slope
             white = part.white

@@ -13,12 +13,8 @@ from numpy.typing import NDArray
 
 from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN, PER_PARAMETER
 from anser_ros.effects.term import Term
-from anser_ros.poses.effect import PoseEffect, is_of
-from anser_ros.poses.effects.clock import PoseClockRate, PoseTimeOffset
-from anser_ros.poses.effects.field_distortion import FieldDistortion
+from anser_ros.poses.effect import Role, effect_of, is_of
 from anser_ros.poses.effects.hand_eye import FrameTerm
-from anser_ros.poses.effects.optical_scale import PoseOpticalScale
-from anser_ros.poses.effects.tracker_lag import TrackerLag
 from anser_ros.poses.fit import FOLDS, LARGEST_STAMP_S, PoseFit, fit_poses, noise_of, standing_out
 from anser_ros.poses.problem import PoseNoise, PosePart
 from anser_ros.poses.registry import pose_effects
@@ -137,7 +133,7 @@ def price(term: Term, total: float, fit: PoseFit) -> float:
         squares = {p.view.sensor: float(np.sum(p.white**2)) for p in parts}
         total *= squares[str(term.site['sensor'])] / max(sum(squares.values()), 1e-300)
     parameters = max(term.complexity, 1)
-    share = MAP_SHARE if is_of(term, FieldDistortion) else LEAST_SHARE
+    share = MAP_SHARE if is_of(term, Role.MAP) else LEAST_SHARE
     return max(LEAST_GAIN + PER_PARAMETER * parameters, share * total / misfit)
 
 
@@ -148,7 +144,7 @@ def _best_addition(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | No
     promising: list[tuple[float, Term]] = []
     for effect in pose_effects().values():
         for term in _beside_scale(effect.sites(setting), fit.terms):
-            if term.seat in force or _is_part(term, fit.terms) or is_of(term, TrackerLag):
+            if term.seat in force or _is_part(term, fit.terms) or is_of(term, Role.FILTER):
                 continue
             if 6 * POSES_A_PARAMETER * term.theta.size > fit.state.count:
                 continue
@@ -164,7 +160,7 @@ def _best_addition(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | No
         if found is not None:
             accepted.append(found)
     best = _simplest(accepted) if accepted else None
-    if best is not None and isinstance(best.terms[-1].effect, PoseTimeOffset | PoseClockRate):
+    if best is not None and is_of(best.terms[-1], Role.CLOCK):
         return best
     # A filter rounds off turning points, which looks like a scale or a map.
     lagging, filtered = _with_lag(fit, refused)
@@ -180,16 +176,16 @@ def _best_addition(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | No
 
 def _beside_scale(sites: Sequence[Term], force: Sequence[Term]) -> list[Term]:
     """Maps beside a scale in force begin with the second degree: the first is the scale's."""
-    if not any(is_of(term, PoseOpticalScale) for term in force):
+    if not any(is_of(term, Role.SCALE) for term in force):
         return list(sites)
-    maps = [t for t in sites if isinstance(t.effect, FieldDistortion) and 'sensor' not in t.site]
-    bent = [FieldDistortion().bent(t) for t in maps if int(t.site['degree']) > 1]
+    maps = [t for t in sites if is_of(t, Role.MAP) and 'sensor' not in t.site]
+    bent = [effect_of(t).bent(t) for t in maps if int(t.site['degree']) > 1]
     return [t for t in sites if t not in maps] + bent
 
 
 def _simplest(accepted: list[tuple[float, PoseFit]]) -> PoseFit:
     """The one that gains most; a map only when no effect with few numbers is left."""
-    plain = [pair for pair in accepted if not is_of(pair[1].terms[-1], FieldDistortion)]
+    plain = [pair for pair in accepted if not is_of(pair[1].terms[-1], Role.MAP)]
     return max(plain or accepted, key=lambda pair: pair[0])[1]
 
 
@@ -208,7 +204,7 @@ def _accepted(
     if not term.effect.possible(term.effect.record(trial.terms[last], trial.covariance_of(last))):
         refused.append((term.label, 'parameters that no instrument has'))
         return None
-    if is_of(term, PoseOpticalScale) and not _one_scale(trial):
+    if is_of(term, Role.SCALE) and not _one_scale(trial):
         refused.append((term.label, 'sensors of one reference see different scales'))
         return None
     return gain - AS_GOOD_PER_PARAMETER * term.complexity, trial
@@ -216,10 +212,10 @@ def _accepted(
 
 def _is_part(term: Term, others: Sequence[Term]) -> bool:
     """Whether one of some maps contains what a scale, or a map of a lower degree, is."""
-    if not is_of(term, PoseOpticalScale) and not is_of(term, FieldDistortion):
+    if not is_of(term, Role.SCALE) and not is_of(term, Role.MAP):
         return False
     for other in others:
-        if other is term or not is_of(other, FieldDistortion):
+        if other is term or not is_of(other, Role.MAP):
             continue
         if other.site.get('sensor') not in (None, term.site.get('sensor')):
             continue
@@ -237,12 +233,13 @@ def _with_lag(
 
     Also the best fit with a low pass or a smooth reference, whether it pays or not.
     """
-    lag = TrackerLag()
-    if any(is_of(term, TrackerLag) for term in fit.terms):
+    if any(is_of(term, Role.FILTER) for term in fit.terms):
         return None, None
     trials = [
         fit_poses(fit.state.problem, [*fit.terms, term], 3)
-        for term in lag.sites(fit.state.problem.setting)
+        for effect in pose_effects().values()
+        if effect.role is Role.FILTER
+        for term in effect.sites(fit.state.problem.setting)
     ]
     trial = _finest_lag(min(trials, key=lambda t: t.state.sum_of_squares))
     term = trial.terms[-1]
@@ -250,7 +247,7 @@ def _with_lag(
     interval = float(np.median(np.diff(fit.state.problem.path.knots)))
     noisy = float(term.theta[0]) < SMOOTH_STEPS * interval
     widths = [term.with_theta(factor * term.theta) for factor in (0.5, 1.0, 2.0) if noisy]
-    rivals = [fit_poses(fit.state.problem, [*fit.terms, lag.rival(t)], 3) for t in widths]
+    rivals = [fit_poses(fit.state.problem, [*fit.terms, effect_of(t).rival(t)], 3) for t in widths]
     best = min([fit, *rivals], key=lambda f: f.held_out())
     gain = _gain(best, trial, term)
     need = price(term, fit.held_out(), fit)
@@ -264,8 +261,7 @@ def _with_lag(
 
 def _probe(fit: PoseFit, term: Term) -> float:
     """Gain that a term promises, linear about the fit."""
-    effect = term.effect
-    assert isinstance(effect, PoseEffect)
+    effect = effect_of(term)
     prior = np.concatenate([fit.prior, effect.prior(term)])
     state = fit.state.problem.state([*fit.terms, term])
     gains = []
@@ -276,8 +272,7 @@ def _probe(fit: PoseFit, term: Term) -> float:
 
 
 def _gain(before: PoseFit, after: PoseFit, term: Term) -> float:
-    effect = term.effect
-    assert isinstance(effect, PoseEffect)
+    effect = effect_of(term)
     ways = (False, True) if effect.blocks_in_space else (False,)
     return min((before.held_out(w) - after.held_out(w)) / after.misfit for w in ways)
 
@@ -288,7 +283,7 @@ def _finest_lag(fit: PoseFit) -> PoseFit:
     for factor in (1.4, 1.4, 1.2, 1.1, 1.05, 1.02):
         for direction in (factor, 1 / factor):
             terms = [
-                t.with_theta(t.theta * direction) if is_of(t, TrackerLag) else t
+                t.with_theta(t.theta * direction) if is_of(t, Role.FILTER) else t
                 for t in best.terms
             ]
             trial = fit_poses(best.state.problem, terms, 3)
@@ -311,7 +306,7 @@ def _one_scale(fit: PoseFit) -> bool:
         )  # fmt: skip
         terms = [t for t in fit.terms if str(t.site.get('sensor', poses.name)) == poses.name]
         one = fit_poses(alone, terms)
-        index = next(k for k, t in enumerate(one.terms) if is_of(t, PoseOpticalScale))
+        index = next(k for k, t in enumerate(one.terms) if is_of(t, Role.SCALE))
         scale = 1e-3 * float(one.terms[index].theta[0])
         found.append((scale, 1e-3 * float(np.sqrt(one.covariance_of(index)[0, 0]))))
     for scale, sigma in found:
@@ -324,12 +319,12 @@ def _one_scale(fit: PoseFit) -> bool:
 
 def _one_map(fit: PoseFit) -> PoseFit:
     """A whole map instead of a scale and what is bent besides, where it explains as much."""
-    bent = [t for t in fit.terms if is_of(t, FieldDistortion) and 'lowest' in t.site]
-    rest = [t for t in fit.terms if t not in bent and not is_of(t, PoseOpticalScale)]
+    bent = [t for t in fit.terms if is_of(t, Role.MAP) and 'lowest' in t.site]
+    rest = [t for t in fit.terms if t not in bent and not is_of(t, Role.SCALE)]
     if not bent or len(rest) + len(bent) == len(fit.terms):
         return fit
     problem = fit.state.problem
-    whole = FieldDistortion().at(problem.setting, int(bent[0].site['degree']), None)
+    whole = effect_of(bent[0]).whole(bent[0])
     trial = fit_poses(problem, [*rest, whole])
     return trial if trial.held_out(True) < (1 + LEAST_SHARE) * fit.held_out(True) else fit
 
@@ -348,7 +343,7 @@ def _settled(
                 continue
             rest = [t for t in fit.terms if t is not term]
             without = fit_poses(fit.state.problem, rest)
-            if any(is_of(t, TrackerLag) for t in rest):
+            if any(is_of(t, Role.FILTER) for t in rest):
                 without = _finest_lag(without)
             gain = _gain(without, fit, term)
             left = without.held_out()

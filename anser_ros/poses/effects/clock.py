@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from anser_ros.effects.effect import Remedy, needed, sigmas
 from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
-from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView
+from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView, Role
 
 Array = NDArray[np.float64]
 
@@ -26,6 +26,7 @@ class PoseTimeOffset(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'offset_s': 's'}
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'offset_s': (-5.0, 5.0)}
     remedy = Remedy.OPTICAL
+    role = Role.CLOCK
 
     def sites(self, setting: PoseSetting) -> Sequence[Term]:
         """One offset for all sensors, and one a sensor."""
@@ -63,6 +64,7 @@ class PoseClockRate(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'rate_ppm': '1e-6'}
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'rate_ppm': (-3e3, 3e3)}
     remedy = Remedy.OPTICAL
+    role = Role.CLOCK
 
     def sites(self, setting: PoseSetting) -> Sequence[Term]:
         """One rate for all sensors."""

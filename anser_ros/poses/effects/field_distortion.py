@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from anser_ros.effects.effect import Remedy, needed, sigmas
 from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
-from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView
+from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView, Role
 
 Array = NDArray[np.float64]
 
@@ -40,6 +40,7 @@ class FieldDistortion(PoseEffect):
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'strain': (0.0, 0.2)}
     remedy = Remedy.SENSORS
     blocks_in_space = True
+    role = Role.MAP
 
     def sites(self, setting: PoseSetting) -> Sequence[Term]:
         """Each degree, for all sensors together and for each alone."""
@@ -57,6 +58,12 @@ class FieldDistortion(PoseEffect):
         """The map without its linear part, which something else has."""
         site = {**term.site, 'lowest': 2}
         count = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, int(site['degree']), 2).shape[1]
+        return Term(self, site, np.zeros(3 * count))
+
+    def whole(self, term: Term) -> Term:
+        """The map of the same degree with its linear part, on all sensors."""
+        site = {k: v for k, v in term.site.items() if k not in ('lowest', 'sensor')}
+        count = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, int(site['degree'])).shape[1]
         return Term(self, site, np.zeros(3 * count))
 
     def prior(self, term: Term) -> Array:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from anser_ros.effects.effect import Remedy, needed, sigmas
 from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
-from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView
+from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView, Role
 
 Array = NDArray[np.float64]
 
@@ -23,6 +23,7 @@ class PoseOpticalScale(PoseEffect):
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'scale': (0.9, 1.1)}
     remedy = Remedy.OPTICAL
     blocks_in_space = True
+    role = Role.SCALE
 
     def sites(self, setting: PoseSetting) -> Sequence[Term]:
         """One reference for all sensors; its scale about the middle of what it saw."""

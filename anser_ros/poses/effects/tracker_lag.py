@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from anser_ros.effects.effect import Remedy, needed, sigmas
 from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
-from anser_ros.poses.effect import PoseEffect, PoseSetting
+from anser_ros.poses.effect import PoseEffect, PoseSetting, Role
 from anser_ros.poses.path import OpticalPath
 
 Array = NDArray[np.float64]
@@ -34,6 +34,7 @@ class TrackerLag(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'tau_s': 's'}
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'tau_s': (0.0, 1.0)}
     remedy = Remedy.NONE
+    role = Role.FILTER
 
     def sites(self, setting: PoseSetting) -> Sequence[Term]:
         """All sensors of a tracker are filtered alike."""
@@ -48,7 +49,7 @@ class TrackerLag(PoseEffect):
         return path.filtered(float(term.theta[0]), TWO_SIDED in term.site)
 
     def rival(self, term: Term) -> Term:
-        """The same smoothing without a sense of time: what a noisy reference would ask for."""
+        """The same smoothing without a sense of time."""
         return Term(self, {TWO_SIDED: True}, term.theta)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
