@@ -235,7 +235,7 @@ def test_every_frame_is_answered_under_its_own_stamp(make):
 
     rig, got = make(refit_rate_hz=10.0), []
     rig.peer.create_subscription(PointCloud2, 'field_model', got.append, qos.LATCHED)
-    rig.until(lambda: rig.node._models.get_subscription_count() > 0)
+    rig.until(lambda: rig.node._output.models.get_subscription_count() > 0)
     rig.start()
     answered, models = [], rig.node.counters['models']
     for _ in range(12):
@@ -365,8 +365,8 @@ def test_lost_references_are_told_to_the_trackers_and_to_the_operator(make):
     from anser_ros.nodes.model_intake import ModelIntake
 
     rig, intake, given = make(references_age_s=0.5, refit_rate_hz=1000.0), ModelIntake(), []
-    rig.node._errors.publish = lambda message: intake.take_error(message)
-    rig.node._models.publish = lambda message: given.append(intake.take(message))
+    rig.node._output.errors.publish = lambda message: intake.take_error(message)
+    rig.node._output.models.publish = lambda message: given.append(intake.take(message))
     rig.start()
     change = rig.world.metal(HEAD)
     for _ in range(3):

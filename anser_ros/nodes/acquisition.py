@@ -8,7 +8,6 @@ import sys
 import threading
 import time
 from collections import Counter
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from std_msgs.msg import String
 
 from anser_ros.errors import AnserError, PortError
 from anser_ros.nodes import qos
+from anser_ros.nodes.acquisition_parameters import AcquisitionParameters
 from anser_ros.nodes.backlog import Backlog
 from anser_ros.nodes.clouds import FluxCloud
 from anser_ros.nodes.fault_memory import FAULTS, RecentFaults, device_words
@@ -26,8 +26,8 @@ from anser_ros.nodes.handover import HandedFlux
 from anser_ros.nodes.measured_accuracy import MeasuredAccuracy
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.overload import too_slow
-from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.process import TURN_S
+from anser_ros.nodes.stream_interval import Interval
 from anser_ros.nodes.stream_status import (
     clock_troubles,
     clock_values,
@@ -40,7 +40,7 @@ from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.frames import TYPE_OF
 from anser_ros.wire.points import FluxPoints, as_sent
-from anser_ros.wire.port import DEFAULT_BAUD, Batch, ControlUnitPort, PortState, find_port
+from anser_ros.wire.port import Batch, ControlUnitPort, PortState, find_port
 from anser_ros.wire.protocols import PROTOCOLS
 from anser_ros.wire.records import (
     DeviceStatus,
@@ -70,74 +70,6 @@ WAIT_S = 0.1
 """Longest wait for blocks, s: how late the end of the node or a change is noticed in a silence."""
 GOODBYE_S = 0.1
 """Time, s, that the last messages get to leave before the process ends."""
-
-
-@dataclass(frozen=True)
-class AcquisitionParameters:
-    """Parameters of the acquisition."""
-
-    device: str = parameter(
-        '/dev/ttyACM0', "the control unit's port, or auto: listen on all ports for its hello"
-    )
-    protocol: str = parameter(
-        'anser', 'how the control unit speaks on its line', choices=tuple(PROTOCOLS)
-    )
-    baud: int = parameter(
-        DEFAULT_BAUD, 'line speed; without meaning over USB', minimum=9600, maximum=50_000_000
-    )
-    setup_file: str = parameter('demo_setup.yaml', 'setup document: a path, or a file of config/')
-    channels_file: str = parameter(
-        'demo_channels.yaml', 'channel calibration: a path, or a file of config/'
-    )
-    window_s: float = parameter(
-        0.02, 'length of a demodulation window, s', minimum=0.005, maximum=0.05, live=True
-    )
-    rate_hz: float = parameter(
-        0.0,
-        'windows a second, may overlap; 0 for the rate of the setup document',
-        minimum=0.0,
-        maximum=1000.0,
-        live=True,
-    )
-    mains_hz: float = parameter(
-        0.0,
-        'mains whose harmonics are fitted too; 0 for none',
-        minimum=0.0,
-        maximum=400.0,
-        live=True,
-    )
-    set_frequencies: bool = parameter(
-        True, 'whether the control unit is told to drive the tones of the setup document'
-    )
-    silence_s: float = parameter(
-        1.5, 'time without a byte that counts as a fault, s', minimum=0.1, maximum=60.0
-    )
-
-
-@dataclass
-class Interval:
-    """What happened since the last diagnostics."""
-
-    begin_s: float
-    frames: int = 0
-    delay_sum_s: float = 0.0
-    delay_max_s: float = 0.0
-    flags: np.ndarray | None = None
-    staleness: Staleness | None = None
-    repeats: int = 0
-    duplicates: int = 0
-    skipped: int = 0
-
-    def add(self, frame: FluxFrame, delay_s: float) -> None:
-        """Note a published frame."""
-        self.frames += 1
-        self.delay_sum_s += delay_s
-        self.delay_max_s = max(self.delay_max_s, delay_s)
-        known = self.flags is not None and self.flags.shape == frame.flags.shape
-        self.flags = self.flags | frame.flags if known else frame.flags
-        now = frame.staleness
-        self.staleness = self.staleness | now if known and self.staleness else now
-        self.repeats += frame.repeats
 
 
 class Acquisition(AnserNode):

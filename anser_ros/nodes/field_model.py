@@ -7,7 +7,6 @@ import math
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,78 +26,28 @@ from anser_ros.integrity.withheld import (
     REFERENCES_LOST,
     TWO_SOURCES,
     UNCALIBRATED,
-    code_of,
 )
 from anser_ros.nodes import qos, refit_status
 from anser_ros.nodes.diagnostics import Trouble
+from anser_ros.nodes.field_model_parameters import FieldModelParameters
 from anser_ros.nodes.flux_reader import read_frame
 from anser_ros.nodes.metal_view import MetalView
-from anser_ros.nodes.model_clouds import ModelWriter
+from anser_ros.nodes.model_output import ModelOutput
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.one_source import OneSource, said_of
-from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.patches import Patches, start_refit
-from anser_ros.nodes.stated_parameters import stated, stated_by
+from anser_ros.nodes.stated_parameters import stated_by
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.baseline import ReadingWindow, check_enough
-from anser_ros.refit.change import MOST_RATE_HZ, Pace
+from anser_ros.refit.change import Pace
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.result import RefitResult
-from anser_ros.sessions.baseline import board_place_of, check_clean, clean_flux
+from anser_ros.sessions.baseline import board_place_of, clean_flux, clean_mean
 from anser_ros.sessions.model_file import SNAPSHOT, as_saved, is_snapshot, save_model
 from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session, sensor_table
-from anser_ros.sessions.starting_model import NOMINAL, is_nominal, model_of, starting_model
+from anser_ros.sessions.starting_model import is_nominal, model_of, starting_model
 from anser_ros.wire.setup import Setup, parse_setup
-
-
-@dataclass(frozen=True)
-class FieldModelParameters:
-    """Parameters of the field model's server."""
-
-    model_file: str = parameter(
-        NOMINAL,
-        "model to start from: a file, or nominal for that of the setup's own geometry",
-        live=True,
-    )
-    allow_uncalibrated: bool = parameter(
-        False, 'whether trackers may give poses by the nominal model', live=True
-    )
-    refit: bool = parameter(
-        True, 'whether the model follows the reference sensors once a baseline is set', live=True
-    )
-    baseline_file: str = parameter(
-        '', 'distortion-free recording of the same board; empty: wait for set_baseline'
-    )
-    baseline_at_start: bool = parameter(
-        False, 'whether the first readings are the distortion-free ones'
-    )
-    baseline_s: float = parameter(
-        1.0, 'time that a baseline is averaged over, s', minimum=0.05, maximum=60.0
-    )
-    refit_rate_hz: float = parameter(
-        MOST_RATE_HZ, 'most refits a second, by the stamps', minimum=2.0, maximum=1000.0, live=True
-    )
-    patches: tuple[str, ...] = parameter(
-        (), 'reference coils that move: entries body=topic, the topic a PoseStamped of that body'
-    )
-    save_file: str = parameter(
-        'field_model.yaml', 'where the service save writes the model', live=True
-    )
-    flux_noise_t: float = stated('flux_noise_t')
-    reference_position_m: float = stated('reference_position_m')
-    reference_axis_rad: float = stated('reference_axis_rad')
-    reference_gain: float = stated('reference_gain')
-    patch_position_m: float = stated('patch_position_m')
-    patch_rotation_rad: float = stated('patch_rotation_rad')
-    emitter_drift: float = stated('emitter_drift')
-    min_references: int = stated('min_references')
-    average_frames: int = stated('average_frames')
-    persistence: float = stated('persistence')
-    hold_frames: int = stated('hold_frames')
-    references_age_s: float = stated('references_age_s')
-    error_modes: int = stated('error_modes')
-    seed: int = stated('seed')
 
 
 class FieldModelNode(AnserNode):
@@ -134,11 +83,7 @@ class FieldModelNode(AnserNode):
         self._refit_s = 0.0
         self._heard_s = 0.0
         self._pace = Pace(table.refit_rate_hz)
-        self._writer = ModelWriter()
-        self._models = self.create_publisher(PointCloud2, 'field_model', qos.MODELS)
-        self._errors = self.create_publisher(PointCloud2, 'field_model_error', qos.MODEL_ERRORS)
-        self.offer(self._errors, lasts=True)
-        self.offer(self._models, lasts=True)
+        self._output = ModelOutput(self)
         self._metal = MetalView(self)
         self._sources = [
             OneSource(
@@ -160,7 +105,7 @@ class FieldModelNode(AnserNode):
         self.create_service(Trigger, 'field_model/set_baseline', self._on_set_baseline)
         if self._file_model is not None:
             self._base = self._file_model
-            self._writer.name_origin(self._file_model)
+            self._output.name_origin(self._file_model)
             self._serve(self._file_model, self.get_clock().now().nanoseconds)
 
     # What is subscribed to ----------------------------------------------------------------
@@ -190,7 +135,7 @@ class FieldModelNode(AnserNode):
         )
         self._board_place = board_place_of(base, self._references, setup)
         self._misplaced, self._has_looked = '', False
-        self._writer.name_origin(base)
+        self._output.name_origin(base)
         told, self._unfit, self._base = not self._unfit, False, base
         if base is not self._model or not told:
             self._serve(base, self.get_clock().now().nanoseconds)
@@ -324,18 +269,7 @@ class FieldModelNode(AnserNode):
         elif not withheld and self._is_uncalibrated:
             withheld = UNCALIBRATED
         self._stamp_ns = stamp_ns if stamp_ns != self._stamp_ns else stamp_ns + 1
-        frame_id = self._frame_id
-        # The uncertainty goes first, so that a receiver has both when the model comes.
-        error = self._writer.new_error(
-            model, frame_id, self._stamp_ns, self._follows, code_of(withheld)
-        )
-        dipoles = self._writer.dipoles(model, frame_id, self._stamp_ns)
-        if error is not None:
-            self.hand_over(self._errors, error)
-        self.hand_over(self._models, dipoles)
-        if error is not None:
-            self._errors.publish(error)
-        self._models.publish(dipoles)
+        self._output.publish(model, self._frame_id, self._stamp_ns, self._follows, withheld)
         if model is not self._model:
             self.count('models')
         self._model = model
@@ -349,24 +283,10 @@ class FieldModelNode(AnserNode):
     def _begin(self, window: ReadingWindow, setup: Setup) -> None:
         """Take the first readings for the distortion-free ones, or wait for others."""
         try:
-            self._follow(self._clean_mean(window, setup))
+            self._follow(clean_mean(window, self._base, self._references, setup))
         except FitError as error:
             self._refuse_baseline(error)
             window.clear()
-
-    def _clean_mean(self, window: ReadingWindow, setup: Setup) -> NDArray[np.complex128]:
-        """Return the mean readings (S, K), T, of a window in which there seems to be no metal.
-
-        Raises
-        ------
-        FitError
-            When they change, or are not what the references read without metal.
-        """
-        mean = window.still_mean()
-        if self._base is not None and self._references is not None:
-            sigma = setup.accuracy.flux_noise_t / math.sqrt(len(window))
-            check_clean(self._base, self._references, mean, sigma, setup)
-        return mean
 
     def _refuse_baseline(self, error: AnserError) -> None:
         self._no_baseline = str(error)
@@ -374,7 +294,7 @@ class FieldModelNode(AnserNode):
 
     def _tell_following(self) -> None:
         """Let receivers know, when it has changed, whether frames are answered from now on."""
-        if self._model is not None and not self._writer.has_told(self._follows):
+        if self._model is not None and not self._output.has_told(self._follows):
             self._serve(self._model, self.get_clock().now().nanoseconds)
 
     def _follow(self, baseline: NDArray[np.complex128]) -> None:
@@ -411,7 +331,7 @@ class FieldModelNode(AnserNode):
         self._refit, self._patches = started or (None, None)
         self._result, self._unfit, self._heard_s = None, False, time.monotonic()
         self._trouble.forget()
-        self._writer.name_origin(base)
+        self._output.name_origin(base)
         # As after a reset: it is no answer of the references.
         state = REFERENCES_LOST if self._follows else ''
         self._serve(base, self.get_clock().now().nanoseconds, state)
@@ -449,7 +369,7 @@ class FieldModelNode(AnserNode):
     def _on_set_baseline(self, _request: Any, response: Any) -> Any:
         if self._window is None or self._setup is None:
             raise FitError('no setup yet')
-        baseline = self._clean_mean(self._window, self._setup)
+        baseline = clean_mean(self._window, self._base, self._references, self._setup)
         good = check_enough(baseline, self._setup.refit.min_references)
         self._follow(baseline)
         response.success = True
@@ -516,15 +436,9 @@ class FieldModelNode(AnserNode):
         return math.inf if setup is None else setup.refit.references_age_s
 
     def _activity(self, values: dict[str, object]) -> str:
-        if self._frozen:
-            return 'held as it is: freeze was called'
-        if self._refit is None or not self.parameters.refit:
-            missing = f', no baseline: {self._no_baseline}' if self._no_baseline else ''
-            return (
-                f'constant{missing or ", no baseline yet"}'
-                if self.parameters.refit
-                else 'constant'
-            )
+        wanted = self.parameters.refit
+        if self._frozen or not wanted or self._refit is None:
+            return refit_status.rest_words(self._frozen, wanted, self._no_baseline)
         values |= refit_status.refit_values(self._result)
         return refit_status.refit_words(self._result)
 

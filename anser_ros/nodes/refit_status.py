@@ -52,6 +52,15 @@ def refit_words(result: RefitResult | None) -> str:
     return result.state if not result.reason else f'{result.state}: {result.reason}'
 
 
+def rest_words(is_held: bool, is_wanted: bool, no_baseline: str) -> str:
+    """Return why the model does not follow the references."""
+    if is_held:
+        return 'held as it is: freeze was called'
+    if not is_wanted:
+        return 'constant'
+    return f'constant, no baseline: {no_baseline}' if no_baseline else 'constant, no baseline yet'
+
+
 def reference_statuses(result: RefitResult | None) -> list[Status]:
     """Return a line for every reference sensor that the refit looked at."""
     if result is None:

@@ -1,5 +1,6 @@
 """What a session's reference sensors read without metal, from a recording of the same board."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,7 @@ from anser_ros.integrity.clean_references import (
     check_steady,
 )
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.refit.baseline import FELT
+from anser_ros.refit.baseline import FELT, ReadingWindow
 from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import is_nominal
@@ -128,6 +129,23 @@ def board_place_of(model: FieldModel, sensors: SensorTable, setup: Setup) -> Boa
 def _is_without_metal(model: FieldModel) -> bool:
     """Whether all effects of a model are those of sensors, emitters and optics."""
     return all(is_undone(record) for record in model.effects)
+
+
+def clean_mean(
+    window: ReadingWindow, model: FieldModel | None, sensors: SensorTable | None, setup: Setup
+) -> ComplexArray:
+    """Return the mean readings (R, K), T, of a window in which there seems to be no metal.
+
+    Raises
+    ------
+    FitError
+        When they change, or are not what the references read without metal.
+    """
+    mean = window.still_mean()
+    if model is not None and sensors is not None:
+        sigma = setup.accuracy.flux_noise_t / math.sqrt(len(window))
+        check_clean(model, sensors, mean, sigma, setup)
+    return mean
 
 
 def steady_sigma(recording: Session) -> float:
