@@ -7,8 +7,9 @@ READY_OLDEST = $(VENV_OLDEST)/.installed-oldest
 # One thread each: two cores are shared with the processes under test.
 # Compiled bytecode is kept, as every process under test would compile all modules again.
 ENVIRONMENT = OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=
-# Two processes run the tests, as test/conftest.py shares them out. ARGS='-n 0' has one alone.
-WORKERS = -n 2 --dist loadgroup --no-loadscope-reorder
+# Three processes run the tests, as test/conftest.py shares them out: on two cores one calculates
+# while two mostly wait for nodes. ARGS='-n 0' has one alone.
+WORKERS = -n 3 --dist loadgroup --no-loadscope-reorder
 ARGS ?=
 # What the installation is made of: a new command or version installs anew.
 PACKAGING = setup.py package.xml anser_ros/cli/commands.py

@@ -36,6 +36,10 @@ from domain_pool import DomainPool
 REPO = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get('ANSER_SHARED', REPO.parent / 'shared'))
 STOP_TIMEOUT_S = 5.0
+CHAINS = ('unit', 'recording')
+"""What feeds the chain of nodes of a test."""
+PLAYED = ('test_main_job', 'test_refit_live', 'test_replay', 'test_watcher')
+"""Files of chains of nodes that a recording feeds, about half the time of all chains."""
 
 
 # What was started since the last test ended; Python tells of each at the moment of its start.
@@ -65,15 +69,16 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 def pytest_itemcollected(item: pytest.Item) -> None:
     """Mark a test that takes a ROS domain, and name the group that one worker takes as a whole.
 
-    Of two workers one takes the tests whose nodes are processes, which mostly wait, and the other
-    the files that calculate: so only one chain of nodes runs at a time, and a file's fixtures are
-    made once. Nodes in the test's own process do what the test says, and count as calculation.
+    Of three workers two take the tests whose nodes are processes, which mostly wait, and the third
+    the files that calculate: so two chains of nodes run at a time, one that a simulated unit feeds
+    and one that a recording does, and a file's fixtures are made once. Nodes in the test's own
+    process do what the test says, and count as calculation.
     This must be done as soon as a test is known: later, pytest-xdist has read the groups already.
     """
     if _has_nodes(item):
         item.add_marker('processes')
     if 'PYTEST_XDIST_WORKER' in os.environ:
-        item.add_marker(pytest.mark.xdist_group('nodes' if _has_chain(item) else _room(item)))
+        item.add_marker(pytest.mark.xdist_group(_chain(item) or _room(item)))
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -83,7 +88,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Shuffle if asked to; of two workers' tests put chains of nodes and long files first.
+    """Shuffle if asked to; of several workers' tests put chains of nodes and long files first.
 
     Last come the files whose nodes leave the machine to others, for whichever worker is free.
     """
@@ -96,11 +101,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items.sort(key=lambda item: files.index(item.path))  # its fixtures are made once
     if 'PYTEST_XDIST_WORKER' in os.environ:
         long = {_room(item) for item in items if item.get_closest_marker('long')}
-        items.sort(key=lambda i: (not _has_chain(i), _is_light(i), _room(i) not in long))
+        chains = ('', *CHAINS)
+        items.sort(key=lambda i: (-chains.index(_chain(i)), _is_light(i), _room(i) not in long))
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Refuse a pytest whose test names do not carry the groups: both workers would start nodes."""
+    """Refuse a pytest whose test names do not carry the groups: all workers would start nodes."""
     names = [item.nodeid for item in session.items]
     if 'PYTEST_XDIST_WORKER' in os.environ and not all('@' in name for name in names):
         raise pytest.UsageError('this pytest and pytest-xdist do not know groups together')
@@ -108,7 +114,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Give a test marked ``realtime`` the machine alone: the other worker waits between its tests.
+    """Give a test marked ``realtime`` the machine alone: other workers wait between their tests.
 
     All tests of a run share a lock that such a test takes for itself. A gate before the lock keeps
     those that come later from passing the one that waits.
@@ -128,8 +134,8 @@ _begun: list[pytest.Item] = []
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Let the worker that calculates give way to the nodes that the other one has started."""
-    if 'PYTEST_XDIST_WORKER' in os.environ and not _begun and not _has_chain(item):
+    """Let a worker that begins with calculations give way to nodes that others have started."""
+    if 'PYTEST_XDIST_WORKER' in os.environ and not _begun and not _chain(item):
         os.nice(10)
     _begun.append(item)
 
@@ -142,10 +148,12 @@ def _is_light(item: pytest.Item) -> bool:
     return item.get_closest_marker('light') is not None
 
 
-def _has_chain(item: pytest.Item) -> bool:
-    """Return whether a test's nodes are other processes that ask much of the machine."""
+def _chain(item: pytest.Item) -> str:
+    """Return what feeds a test's nodes if they are other processes that ask much, or nothing."""
     names = getattr(item, 'fixturenames', ())
-    return _has_nodes(item) and not _is_light(item) and ('start' in names or 'ros' not in names)
+    if not _has_nodes(item) or _is_light(item) or ('start' not in names and 'ros' in names):
+        return ''
+    return CHAINS[item.path.stem in PLAYED]
 
 
 def _room(item: pytest.Item) -> str:

@@ -146,10 +146,15 @@ def ready(bench):
 
 
 def tracker_bench(ros):
-    """Yield a bench beside a tracker that hears it."""
+    """Yield a bench beside a tracker that hears it.
+
+    No frame grows stale: how old one is when it is told of is a matter of the machine.
+    """
+    from rclpy.parameter import Parameter
+
     from anser_ros.nodes.tracker import TrackerNode
 
-    node = TrackerNode()
+    node = TrackerNode(parameter_overrides=[Parameter('stale_after_s', value=30.0)])
     bench = Bench(ros, node)
     bench.connect(bench.setup, bench.flux, bench.model)
     yield bench

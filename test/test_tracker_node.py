@@ -85,6 +85,8 @@ def test_nothing_is_published_unless_ok(tracker):
 
 
 def test_states_without_model_setup_or_data(tracker):
+    from rclpy.parameter import Parameter
+
     rng = np.random.default_rng(3)
     flux = fluxes(certain_model(), SENSORS, *random_pose(rng), rng)
     tracker.say_flux(flux)
@@ -96,6 +98,7 @@ def test_states_without_model_setup_or_data(tracker):
     tracker.node.publish_diagnostics()
     tracker.spin_until(lambda: tracker.state('anser/tracker: tool_a') == 'no_model')
     assert tracker.state('anser/tracker') == 'no field model yet'
+    tracker.node.set_parameters([Parameter('stale_after_s', value=0.3)])
     time.sleep(0.4)
     tracker.node.publish_diagnostics()
     tracker.spin_until(lambda: tracker.state('anser/tracker: tool_a') == 'stale')
@@ -172,7 +175,7 @@ def test_transforms_where_they_are_installed(tracker, monkeypatch):
 
 
 def test_the_volume_of_the_setup_holds_unless_a_parameter_says_another(tracker):
-    from anser_ros.nodes.tracker import TrackerParameters, settings_of
+    from anser_ros.nodes.tracker_parameters import TrackerParameters, settings_of
 
     rng, node = np.random.default_rng(8), tracker.node
     box = ((-0.1, -0.1, 0.2), (0.1, 0.1, 0.3))
