@@ -206,8 +206,9 @@ def _demo_model() -> FieldModel:
     return load_model(config_path('demo_model.yaml'))
 
 
-PARTS = {'coils': (_track, _watch_samples), 'metal and bodies': (_refit, _solve_body, _track)}
-"""What each of the processes does. What one has compiled the other one loads."""
+PARTS = {'coils': (_track,), 'metal and bodies': (_solve_body, _refit, _watch_samples)}
+"""What each of the processes does, both for as long. What one has compiled the other one loads: so
+bodies, which coils come to last, are the second one's first."""
 
 
 if __name__ == '__main__':

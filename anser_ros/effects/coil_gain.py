@@ -6,6 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.complex_gain import figures_of, theta_of
 from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed, unit_matrix
 from anser_ros.effects.term import Term
 from anser_ros.effects.view import View
@@ -47,29 +48,12 @@ class CoilGain(Effect[Term]):
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """The record has the gain's size and phase."""
-        gain = 1 + complex(*term.theta)
-        turn = np.array([gain.real, gain.imag]) / abs(gain)
-        across = np.array([-turn[1], turn[0]]) / abs(gain)
-        return EffectRecord(
-            self.name,
-            {
-                'coil': term.site['coil'],
-                'gain': abs(gain),
-                'phase_deg': float(np.degrees(np.angle(gain))),
-            },
-            {
-                'gain': float(np.sqrt(turn @ covariance @ turn)),
-                'phase_deg': float(np.degrees(np.sqrt(across @ covariance @ across))),
-            },
-        )
+        figures, sigmas = figures_of(term.theta, covariance)
+        return EffectRecord(self.name, {'coil': term.site['coil'], **figures}, sigmas)
 
     def term(self, record: EffectRecord) -> Term:
         """From gain and phase."""
-        gain = float(needed(record, 'gain')) * np.exp(
-            1j * np.radians(float(record.parameters.get('phase_deg', 0.0)))
-        )
-        theta = np.array([gain.real - 1, gain.imag])
-        return Term(self, {'coil': int(needed(record, 'coil'))}, theta)
+        return Term(self, {'coil': int(needed(record, 'coil'))}, theta_of(record))
 
 
 EFFECTS = (CoilGain(),)

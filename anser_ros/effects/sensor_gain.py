@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.complex_gain import figures_of, theta_of
 from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed, unit_matrix
 from anser_ros.effects.term import Term
 from anser_ros.effects.view import View
@@ -53,28 +54,12 @@ class SensorGain(Effect[Term]):
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """The record has the gain's size and phase."""
-        gain = complex(1 + term.theta[0], term.theta[1])
-        turn = np.array([gain.real, gain.imag]) / abs(gain)
-        sigma_gain = float(np.sqrt(turn @ covariance @ turn))
-        across = np.array([-turn[1], turn[0]]) / abs(gain)
-        sigma_phase = float(np.sqrt(across @ covariance @ across))
-        return EffectRecord(
-            self.name,
-            {
-                'channel': term.site['channel'],
-                'gain': abs(gain),
-                'phase_deg': float(np.degrees(np.angle(gain))),
-            },
-            {'gain': sigma_gain, 'phase_deg': float(np.degrees(sigma_phase))},
-        )
+        figures, sigmas = figures_of(term.theta, covariance)
+        return EffectRecord(self.name, {'channel': term.site['channel'], **figures}, sigmas)
 
     def term(self, record: EffectRecord) -> Term:
         """From gain and phase."""
-        gain = float(needed(record, 'gain')) * np.exp(
-            1j * np.radians(float(record.parameters.get('phase_deg', 0.0)))
-        )
-        theta = np.array([gain.real - 1, gain.imag])
-        return Term(self, {'channel': int(needed(record, 'channel'))}, theta)
+        return Term(self, {'channel': int(needed(record, 'channel'))}, theta_of(record))
 
 
 EFFECTS = (SensorGain(),)

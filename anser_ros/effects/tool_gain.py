@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.complex_gain import figures_of, theta_of
 from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed
 from anser_ros.effects.term import Term
 from anser_ros.effects.view import View
@@ -54,29 +55,14 @@ class ToolGain(Effect[Term]):
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """The record has the gain's size and phase."""
-        gain = 1 + complex(*term.theta)
-        turn = np.array([gain.real, gain.imag]) / abs(gain)
-        across = np.array([-turn[1], turn[0]]) / abs(gain)
+        figures, sigmas = figures_of(term.theta, covariance)
         return EffectRecord(
-            self.name,
-            {
-                'channels': list(term.site['channels']),
-                'gain': abs(gain),
-                'phase_deg': float(np.degrees(np.angle(gain))),
-            },
-            {
-                'gain': float(np.sqrt(turn @ covariance @ turn)),
-                'phase_deg': float(np.degrees(np.sqrt(across @ covariance @ across))),
-            },
+            self.name, {'channels': list(term.site['channels']), **figures}, sigmas
         )
 
     def term(self, record: EffectRecord) -> Term:
         """From gain and phase."""
-        gain = float(needed(record, 'gain')) * np.exp(
-            1j * np.radians(float(record.parameters.get('phase_deg', 0.0)))
-        )
-        theta = np.array([gain.real - 1, gain.imag])
-        return Term(self, {'channels': tuple(needed(record, 'channels'))}, theta)
+        return Term(self, {'channels': tuple(needed(record, 'channels'))}, theta_of(record))
 
 
 EFFECTS = (ToolGain(),)

@@ -20,7 +20,6 @@ from std_srvs.srv import SetBool, Trigger
 from anser_ros.errors import AnserError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
-from anser_ros.integrity.board_place import BoardPlace
 from anser_ros.integrity.withheld import (
     OTHER_MODEL,
     REFERENCES_LOST,
@@ -36,6 +35,7 @@ from anser_ros.nodes.model_output import ModelOutput
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.one_source import OneSource, said_of
 from anser_ros.nodes.patches import Patches, start_refit
+from anser_ros.nodes.place_watch import PlaceWatch
 from anser_ros.nodes.stated_parameters import stated_by
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.baseline import ReadingWindow, check_enough
@@ -74,9 +74,7 @@ class FieldModelNode(AnserNode):
         self._result: RefitResult | None = None
         self._baseline: NDArray[np.complex128] | None = None
         self._frozen = self._unfit = False
-        self._board_place: BoardPlace | None = None
-        self._misplaced = ''
-        self._has_looked = False
+        self._place = PlaceWatch()
         self._trouble = Trouble()
         self._frames: Intake | None = None
         self._stamp_ns = 0
@@ -133,8 +131,7 @@ class FieldModelNode(AnserNode):
         self._window = ReadingWindow(
             self._references, len(base.emitters), self.parameters.baseline_s
         )
-        self._board_place = board_place_of(base, self._references, setup)
-        self._misplaced, self._has_looked = '', False
+        self._place = PlaceWatch(board_place_of(base, self._references, setup))
         self._output.name_origin(base)
         told, self._unfit, self._base = not self._unfit, False, base
         if base is not self._model or not told:
@@ -186,33 +183,14 @@ class FieldModelNode(AnserNode):
             for kind, many in frame.kinds.items():
                 self.count(f'readings_{kind}', many)
             window.add(frame)
-            self._look(frame, window)
+            if self._place.look(frame, window) and self._model is not None:
+                self._serve(self._model, self.get_clock().now().nanoseconds)
             if self._refit is None and self.parameters.baseline_at_start and window.full:
                 self._begin(window, setup)
             if self._refit is not None and self._follows:
                 self._update(self._refit, frame)
         except AnserError as error:
             self._refuse('fluxes_refused', error)
-
-    def _look(self, frame: Frame, window: ReadingWindow) -> None:
-        """Withhold poses as long as the references have the board elsewhere than the model.
-
-        The first frame with enough readings tells; after that a model that was found to lie aside
-        is asked again with every whole window.
-        """
-        if self._board_place is None or (
-            self._has_looked and not (self._misplaced and window.full)
-        ):
-            return
-        flux = window.mean() if self._has_looked else frame.readings
-        before, self._misplaced = self._misplaced, ''
-        try:
-            self._has_looked |= self._board_place.check(flux)
-        except FitError as error:
-            self._has_looked, self._misplaced = True, str(error)
-            window.clear()
-        if self._model is not None and bool(before) != bool(self._misplaced):
-            self._serve(self._model, self.get_clock().now().nanoseconds)
 
     def _update(self, refit: LiveRefit, frame: Frame) -> None:
         """Let the model follow the references, not more often than wanted.
@@ -264,7 +242,7 @@ class FieldModelNode(AnserNode):
         The model of a frame of readings has their stamp, which may be of another day. ``withheld``
         is the state for which trackers are to give no pose, or not for long.
         """
-        if self._unfit or self._misplaced:
+        if self._unfit or self._place.misplaced:
             withheld = OTHER_MODEL
         elif not withheld and self._is_uncalibrated:
             withheld = UNCALIBRATED
@@ -400,8 +378,8 @@ class FieldModelNode(AnserNode):
             return Status('', Level.ERROR, f'{TWO_SOURCES}: {said}', values)
         if self._unfit:
             return Status('', Level.ERROR, f'{OTHER_MODEL}: {self._trouble.last}', values)
-        if self._misplaced:
-            return Status('', Level.ERROR, f'{OTHER_MODEL}: {self._misplaced}', values)
+        if self._place.misplaced:
+            return Status('', Level.ERROR, f'{OTHER_MODEL}: {self._place.misplaced}', values)
         if model is None:
             return Status('', Level.WARN, self._trouble.last or 'no setup yet', values)
         values |= {

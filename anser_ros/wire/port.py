@@ -7,16 +7,11 @@ pauses after an unplugged cable.
 
 from __future__ import annotations
 
-import contextlib
-import errno
-import io
-import os
 import queue
-import select
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from enum import Enum
 
@@ -26,27 +21,15 @@ from serial.tools import list_ports
 from anser_ros.errors import PortError
 from anser_ros.wire.protocols import ANSER, SerialProtocol
 from anser_ros.wire.records import Hello, Payload, Record, SampleBlock
+from anser_ros.wire.serial_line import cause_of, close_line, open_line, receiver_of
 
 DEFAULT_BAUD = 12_000_000
 """Baud rate of the port; USB devices ignore it."""
-_READ_TIMEOUT_S = 0.05
-"""Longest time that a read waits, s, before the thread looks whether it has to end."""
-_WRITE_TIMEOUT_S = 0.2
-"""Longest time that a write may take, s; commands are short, so that a longer one is a fault."""
 _COMMANDS = 64
 """Commands that may wait to be written, and of which the time is remembered; they are answered
 within a second, and asked at most a few times a second."""
 _GARBAGE_BYTES = 256
 """Bytes without a record within a second beyond which the line counts as garbled."""
-_READ_BYTES = 1 << 16
-"""Largest number of bytes of one read."""
-OPEN_FAILURES = {
-    errno.EAGAIN: 'another program uses it',
-    errno.EBUSY: 'another program uses it',
-    errno.ENOTTY: 'it is no serial port',
-    errno.EACCES: 'no permission (is the user in its group, often dialout?)',
-}
-"""Plain words for messages of the operating system."""
 
 
 class PortState(Enum):
@@ -214,7 +197,7 @@ class ControlUnitPort:
         wait = pause
         while not self._stopping.is_set():
             try:
-                port = _open(self.device, self._baud)
+                port = open_line(self.device, self._baud)
             except PortError as error:
                 self.counters.open_failures += 1
                 self.state, self.reason = PortState.ABSENT, str(error)
@@ -234,9 +217,9 @@ class ControlUnitPort:
                 # pyserial raises TypeError when the descriptor vanishes between two of its calls
                 if not self._stopping.is_set():
                     self.counters.unplug += 1
-                    self.state, self.reason = PortState.ABSENT, f'unplugged: {_cause(error)}'
+                    self.state, self.reason = PortState.ABSENT, f'unplugged: {cause_of(error)}'
             finally:
-                _close(port)
+                close_line(port)
                 self._hand_over()
                 self._queue.put(Batch(time.monotonic_ns(), (), connected=False))
             wait = pause if time.monotonic() - opened > longest else min(2 * wait, longest)
@@ -247,7 +230,7 @@ class ControlUnitPort:
         last_byte = last_record = time.monotonic()
         garbage_bytes = 0
         reader = self._reader
-        receive = _receiver(port)
+        receive = receiver_of(port)
         while not self._stopping.is_set():
             while self._commands:
                 tag, command = self._commands.popleft()
@@ -312,64 +295,6 @@ class ControlUnitPort:
         self._next_sequence = (sequence + 1) % 2**32
 
 
-def _open(device: str, baud: int) -> serial.SerialBase:
-    try:
-        return serial.serial_for_url(
-            device,
-            baudrate=baud,
-            timeout=_READ_TIMEOUT_S,
-            write_timeout=_WRITE_TIMEOUT_S,
-            exclusive=True,
-        )
-    except (serial.SerialException, OSError, ValueError, LookupError) as error:
-        # pyserial raises LookupError for options of a URL that it does not know
-        raise PortError(f'cannot open {device}: {_cause(error)}') from error
-
-
-def _cause(error: BaseException) -> str:
-    """Return the reason in a few words, since pyserial quotes the system several times."""
-    root = error
-    while isinstance(root.__context__, Exception):
-        root = root.__context__
-    if len(root.args) == 2 and isinstance(root.args[0], int):
-        return OPEN_FAILURES.get(root.args[0], str(root.args[1]))
-    return ' '.join(str(root).split()) or type(root).__name__
-
-
-def _receiver(port: serial.SerialBase) -> Callable[[], bytes]:
-    """Return a function that waits for bytes and takes all there are; empty when time is over.
-
-    pyserial's own read costs several system calls and a byte of its own for every wake-up, which
-    at a thousand blocks a second is most of the work. Where there is a descriptor, two will do.
-    A terminal hands out four kilobytes at a time; all that is there is taken before any of it is
-    looked at, so that nothing waits for the work on what came before it.
-    """
-    try:
-        descriptor = port.fileno()
-    except (AttributeError, OSError, io.UnsupportedOperation):
-        return lambda: bytes(port.read(port.in_waiting or 1))
-
-    def receive() -> bytes:
-        if not select.select([descriptor], [], [], _READ_TIMEOUT_S)[0]:
-            return b''
-        data = os.read(descriptor, _READ_BYTES)
-        if not data:
-            raise serial.SerialException('the device is gone')
-        while len(data) < _READ_BYTES and select.select([descriptor], [], [], 0.0)[0]:
-            more = os.read(descriptor, _READ_BYTES)
-            if not more:
-                break  # the next read will find it gone
-            data += more
-        return data
-
-    return receive
-
-
-def _close(port: serial.SerialBase) -> None:
-    with contextlib.suppress(serial.SerialException, OSError):
-        port.close()
-
-
 def find_port(
     candidates: Iterable[str] | None = None,
     *,
@@ -394,7 +319,7 @@ def find_port(
     devices: list[str] = list(candidates or (port.device for port in list_ports.comports()))
     for device in devices:
         try:
-            port = _open(device, baud)
+            port = open_line(device, baud)
         except PortError:
             continue
         reader = protocol.make_reader()
@@ -407,5 +332,5 @@ def find_port(
         except (serial.SerialException, OSError):
             continue
         finally:
-            _close(port)
+            close_line(port)
     raise PortError(f'no control unit speaks on any of {len(devices)} serial ports')

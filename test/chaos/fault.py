@@ -63,3 +63,7 @@ class Command:
     what: str
     arguments: Callable[..., list[object]]
     says: str
+
+
+def nothing() -> None:
+    """Take nothing away: what a fault leaves when it has gone by itself."""

@@ -23,8 +23,10 @@ from pathlib import Path
 import numpy as np
 from fault import Command, Fault
 from faults_files import COMMANDS
-from faults_graph import GRAPH, MODELS, PROCESSES
+from faults_graph import GRAPH
 from faults_line import CLOCK, REFERENCES, SERIAL
+from faults_models import MODELS
+from faults_processes import PROCESSES
 from rig import RATE_HZ, Rig
 from table import ALLOWED_S, Row, line, write_docs
 from witness import WINDOW_S, is_wrong
