@@ -207,8 +207,8 @@ def test_a_model_beside_its_board_gives_no_poses_until_the_references_agree(make
     from std_msgs.msg import String
 
     rig = make(baseline_at_start=True)
-    codes, write = [], rig.node._writer.new_error
-    rig.node._writer.new_error = lambda *given: codes.append(given[-1]) or write(*given)
+    codes, write = [], rig.node._output.new_error
+    rig.node._output.new_error = lambda *given: codes.append(given[-1]) or write(*given)
     table = rig.world.references
     there = table.position - [0.002, 0.0, 0.0]
     aside = rig.world.model.flux(there, table.axis, table.length)
@@ -267,7 +267,7 @@ def test_coils_on_a_patch_take_part_where_the_pose_says(make):
     world, place = rig.world, np.array([0.02, 0.05, 0.16])
     offsets = np.array([c[0] for c in PATCH_COILS])
     axes = np.array([c[1] for c in PATCH_COILS])
-    take = rig.node._pose_taker('patch')
+    take = rig.node._moving.pose_taker('patch')
 
     def frame(change, shift=0.0, lost=False):
         points = place + offsets + [0.0, 0.0, shift]
@@ -278,7 +278,7 @@ def test_coils_on_a_patch_take_part_where_the_pose_says(make):
             table = world.references.select([0, 1]).with_geometry(points, axes, np.zeros(2))
             flux = flux + world.metal(HEAD, table)
         rig.stamp_ns += STEP_NS
-        rig.node._on_tool_flux(rig.message([40, 41], flux))
+        rig.node._moving.on_flux(rig.message([40, 41], flux))
         rig.stamp_ns -= STEP_NS
         rig.say(world.metal(HEAD) if change else 0.0)
         time.sleep(0.002)

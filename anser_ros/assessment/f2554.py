@@ -24,7 +24,7 @@ from anser_ros.poses.sequence import PoseSequence
 
 Array = NDArray[np.float64]
 
-FEWEST_READINGS = 10
+FEWEST_READINGS = 10  # of a point: fewer give no mean that a bad reading leaves alone
 MOST_READINGS = 2000  # readings that take part, evenly over the recording
 BLOCKS = 20  # stretches of time that are drawn again: a hand's tilt takes about a second
 FAR_FACTOR, FAR_M = 12.0, 0.05

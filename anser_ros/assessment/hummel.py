@@ -31,6 +31,7 @@ WRONG_ORDER = 0.5
 in the error of another order, below which that one is it."""
 NEIGHBOURS = '5 cm distance errors'
 STEPS = ((NEIGHBOURS, 1), ('15 cm distance errors', 3), ('30 cm distance errors', 6))
+"""Kinds of distances, and how many spacings of the board's points each is."""
 ACCUMULATED = 'accumulated distance errors'
 ROTATION = 'Rotation error statistics'
 ORDERS = ('rows', 'serpentine')

@@ -43,7 +43,7 @@ SMALLEST_SIGMA_M = 1e-7  # of a coordinate; what is exact has no scale
 
 @dataclass(frozen=True)
 class PivotLimits:
-    """What is refused.
+    """Bounds from which on a pivot calibration is refused.
 
     Attributes
     ----------

@@ -24,7 +24,7 @@ FEWEST_POSES = 50  # poses below which nothing is said of a rest
 AXES = ('x', 'y', 'z')
 EVEN = 1.5
 """Interval of two poses, in median intervals, from which on the series is not evenly spaced."""
-HOUR_S = 3600.0
+HOUR_S = 3600.0  # seconds in an hour
 FARTHEST_M = 0.02
 """Extent of the poses, m, from which on they are of a tool that was moved: the central 90 %."""
 LEAST_TERMS = 4  # averages that an Allan deviation needs to be shown

@@ -1,4 +1,4 @@
-"""`accuracy.json`, and its figures as rows of text."""
+"""The document `accuracy.json`, and its figures as rows of text."""
 
 from collections.abc import Mapping
 from typing import Any

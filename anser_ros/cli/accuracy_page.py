@@ -19,7 +19,7 @@ MOST_ROWS = 500  # rows of a table of single errors; all are in accuracy.json
 
 
 def render(found: Assessment, document: dict[str, Any]) -> str:
-    """Return the page."""
+    """Return the page of an assessment as HTML."""
     files = ', '.join(found.recordings[:3]) + (' ...' if len(found.recordings) > 3 else '')
     sections = [
         f'<h1>Accuracy of {html.escape(found.body)}: {found.protocol}</h1>'

@@ -44,6 +44,7 @@ LENGTH_M = 0.008
 MOST_CANDIDATES = 400
 """Coils to choose from; more take minutes and gigabytes."""
 RANDOM_TRIES, SEED = 20, 1
+"""Choices by chance that the found one is compared with, and the seed of these."""
 
 
 @dataclass(frozen=True)

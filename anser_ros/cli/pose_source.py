@@ -17,6 +17,7 @@ from anser_ros.wire.setup_tips import read_tips
 PATIENCE_S = 20.0
 """Time, s, that the look at the graph may take beyond what it was asked for: ROS has to start."""
 LONGEST_LOOK_S = 3600.0
+"""Longest time that a command listens to live poses, s: an hour, more is a recording's work."""
 
 
 def add_source_options(parser: argparse.ArgumentParser, *, tip: bool = True) -> None:

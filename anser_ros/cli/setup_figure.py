@@ -16,6 +16,7 @@ from anser_ros.sessions.volume import pose_volume
 from anser_ros.wire.setup import SensorSpec, Setup
 
 SIDES = ((0, 1, 'from above'), (0, 2, 'from the side'))
+"""Panels: the two coordinates that each shows, and its title."""
 ARROW = 0.08
 """Length of a coil's axis as drawn, as a part of what the panel shows."""
 SMALLEST_MM = 5.0

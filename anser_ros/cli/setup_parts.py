@@ -45,7 +45,7 @@ Document = dict[str, Any]
 
 
 def number_of(text: str, what: str) -> float:
-    """A finite number.
+    """Return the finite number that a text says.
 
     Raises
     ------

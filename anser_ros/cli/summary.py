@@ -16,6 +16,7 @@ SCHEMA = 'anser_summary/1'
 """Name of the layout of what ``--json`` prints."""
 FILES = ('summary.csv', 'summary.html')
 MM, DEG, PT, PERCENT = 1e3, 57.29578, 1e12, 1e2
+"""Factors from SI to the units of the table: mm a metre, degrees a radian, pT a tesla, percent."""
 
 Row = dict[str, Any]
 

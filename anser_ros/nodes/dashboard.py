@@ -38,7 +38,10 @@ class DashboardParameters:
 
 
 class Dashboard(AnserNode):
-    """Serves the page. It only listens; what is clicked goes to services and to commands."""
+    """Serves the live view to browsers.
+
+    It only listens; what is clicked goes to services and to commands.
+    """
 
     NAME = 'dashboard'
     PARAMETERS = DashboardParameters

@@ -6,12 +6,10 @@
 import math
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
@@ -32,9 +30,10 @@ from anser_ros.nodes.field_model_parameters import FieldModelParameters
 from anser_ros.nodes.flux_reader import read_frame
 from anser_ros.nodes.metal_view import MetalView
 from anser_ros.nodes.model_output import ModelOutput
+from anser_ros.nodes.moving_coils import MovingCoils
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.one_source import OneSource, said_of
-from anser_ros.nodes.patches import Patches, start_refit
+from anser_ros.nodes.patches import start_refit
 from anser_ros.nodes.place_watch import PlaceWatch
 from anser_ros.nodes.stated_parameters import stated_by
 from anser_ros.physics.sensor import SensorTable
@@ -89,14 +88,9 @@ class FieldModelNode(AnserNode):
             ),
             OneSource(self, PointCloud2, 'reference/flux', self._on_flux, qos.STREAM),
         ]
-        self._patch_topics = parse_patches(table.patches)
-        self._patches: Patches | None = None
-        for body, topic in self._patch_topics.items():
-            self.create_subscription(PoseStamped, topic, self._pose_taker(body), qos.STREAM)
-        if self._patch_topics:
-            self._sources.append(
-                OneSource(self, PointCloud2, 'tool/flux', self._on_tool_flux, qos.STREAM)
-            )
+        topics = parse_patches(table.patches)
+        self._moving = MovingCoils(self, topics, lambda: self._frame_id, self._refuse)
+        self._sources += self._moving.sources
         self.create_service(Trigger, 'field_model/reset', self._on_reset)
         self.create_service(Trigger, 'field_model/save', self._on_save)
         self.create_service(SetBool, 'field_model/freeze', self._on_freeze)
@@ -148,26 +142,6 @@ class FieldModelNode(AnserNode):
         ):
             self.get_logger().warning(refit_status.no_baseline(self.get_namespace()))
 
-    def _pose_taker(self, body: str) -> Callable[[PoseStamped], None]:
-        def take(message: PoseStamped) -> None:
-            if self._patches is None:
-                return
-            try:
-                self._patches.take_pose(body, message)
-            except AnserError as error:
-                self._refuse('patch_poses_refused', error)
-
-        return take
-
-    def _on_tool_flux(self, message: PointCloud2) -> None:
-        if self._patches is None:
-            return
-        try:
-            stamp_ns, points = read_frame(message, self._frame_id, self.count)
-            self._patches.take_flux(stamp_ns, points.channel, points.flux, points.flags)
-        except AnserError as error:
-            self._refuse('patch_fluxes_refused', error)
-
     def _on_flux(self, message: PointCloud2) -> None:
         setup, window, frames = self._setup, self._window, self._frames
         if setup is None or window is None or frames is None:
@@ -205,14 +179,14 @@ class FieldModelNode(AnserNode):
                 self._serve(self._model, stamp_ns, self._withheld)
             return
         begin_s = time.monotonic()
-        if self._patches is None:
+        if self._moving.patches is None:
             self._result = refit.follow(frame)
         else:
-            moved = self._patches.moved_refit(refit, stamp_ns)
+            moved = self._moving.patches.moved_refit(refit, stamp_ns)
             if moved is not None:  # the patches' new places have been worked out
                 self._refit = refit = moved
                 self.count('patch_moves')
-            self._result = self._patches.follow(refit, frame)
+            self._result = self._moving.patches.follow(refit, frame)
         self.count('refits')
         model = self._result.model if self._result.is_answer else self._model
         if model is not None:
@@ -279,8 +253,8 @@ class FieldModelNode(AnserNode):
         """Refit from now on to what differs from a baseline, shape (S, K), T."""
         if self._base is None or self._references is None or self._setup is None:
             raise FitError('no setup yet')
-        self._refit, self._patches = start_refit(
-            self._setup, self._base, self._references, baseline, tuple(self._patch_topics)
+        self._refit, self._moving.patches = start_refit(
+            self._setup, self._base, self._references, baseline, self._moving.bodies
         )
         self._baseline = baseline
         self._result, self._heard_s, self._no_baseline = None, time.monotonic(), ''
@@ -299,14 +273,13 @@ class FieldModelNode(AnserNode):
         base = file_model if setup is None else starting_model(setup, file_model)
         started = None
         if setup and base and baseline is not None and references is not None:
-            started = start_refit(setup, base, references, baseline, tuple(self._patch_topics))
+            started = start_refit(setup, base, references, baseline, self._moving.bodies)
         self._file_model, self._base = file_model, base
         if base is None:
             return
-        if setup is not None and references is not None:
-            self._board_place = board_place_of(base, references, setup)
-        self._misplaced, self._has_looked = '', False
-        self._refit, self._patches = started or (None, None)
+        is_seen = setup is not None and references is not None
+        self._place = PlaceWatch(board_place_of(base, references, setup) if is_seen else None)
+        self._refit, self._moving.patches = started or (None, None)
         self._result, self._unfit, self._heard_s = None, False, time.monotonic()
         self._trouble.forget()
         self._output.name_origin(base)

@@ -62,7 +62,7 @@ class Polled:
         return found
 
     def close(self) -> None:
-        """Subscribe no longer."""
+        """End the subscription and forget what came by it."""
         self._node.destroy_subscription(self._subscription)
 
 

@@ -13,6 +13,7 @@ NAME = 'anser_pose_look'
 SLICE_S = 0.1
 """Longest time that one message is waited for, s."""
 SECOND_NS = 1_000_000_000
+"""Nanoseconds in a second."""
 
 
 def main(topic: str, seconds: float) -> None:

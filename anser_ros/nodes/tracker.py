@@ -28,7 +28,7 @@ from anser_ros.nodes.model_in_force import ModelInForce
 from anser_ros.nodes.model_intake import GivenModel, ModelIntake
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.one_source import OneSource, said_of
-from anser_ros.nodes.overload import too_slow
+from anser_ros.nodes.overload import Load
 from anser_ros.nodes.pose_output import PoseTopic, transform_message, transform_publisher
 from anser_ros.nodes.readiness import digest_of
 from anser_ros.nodes.stated_parameters import stated_by
@@ -88,7 +88,7 @@ class TrackerNode(AnserNode):
         self._solve_s = 0.0
         self._backlog = Backlog()
         self._told_s = 0.0
-        self._told_frames = (0, 0)
+        self._load = Load()
         self._model_age_ns = 0
         self._transforms = transform_publisher(self) if table.publish_tf else None
         warm_up()
@@ -324,7 +324,9 @@ class TrackerNode(AnserNode):
     def status(self) -> Status:
         """Return what the tracker lacks, if anything, and its counters."""
         self._told_s = time.monotonic()
-        slow = self._slow_words()
+        slow = self._load.words(self.counters['frames_skipped'], self.counters['frames'])
+        if slow:
+            self.warn('seconds_too_slow', slow)
         tracker, newest = self._tracker, self._intake.newest
         values: dict[str, object] = {'frame_time_s': self._solve_s}
         values['model_age_s_max'] = self._model_age_ns / SECOND_NS
@@ -371,16 +373,6 @@ class TrackerNode(AnserNode):
                 '', Level.WARN, f'{tracked}; a gate of {gate:g} lets wrong poses out', values
             )
         return Status('', Level.OK, tracked, values)
-
-    def _slow_words(self) -> str:
-        """What part of the frames since the last look was skipped, in words."""
-        now = self.counters['frames_skipped'], self.counters['frames']
-        skipped, worked = now[0] - self._told_frames[0], now[1] - self._told_frames[1]
-        self._told_frames = now
-        slow = too_slow(skipped, worked)
-        if slow:
-            self.warn('seconds_too_slow', slow)
-        return slow
 
     def _ready_for(self) -> str:
         """Digest of the setup that no pose will be lost of: all listeners and the model are there.

@@ -180,7 +180,7 @@ class ViewSource:
         }
 
     def frame(self) -> list[Any]:
-        """The targets' places."""
+        """Return the places of all targets that the view shows."""
         return [] if self.view is None else self.view.frame()
 
     def table(self) -> list[list[Any]]:

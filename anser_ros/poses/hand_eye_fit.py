@@ -262,7 +262,7 @@ def _told(
 
 def _middle(terms: tuple[Term, ...]) -> float:
     """When the offset is the offset: at stamp zero where no rate is known."""
-    middles = [t.site['middle_s'] for t in terms if isinstance(t.effect, PoseClockRate)]
+    middles = [t.site['middle_s'] for t in terms if 'middle_s' in t.site]
     return float(middles[0]) if middles else 0.0
 
 

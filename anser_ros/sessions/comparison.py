@@ -51,7 +51,7 @@ class Difference:
 
     @property
     def sign(self) -> int:
-        """-1 or 1 where the whole interval is below or above zero, else 0."""
+        """Sign of the difference where the whole interval is on one side of zero, else 0."""
         return int(self.low > 0) - int(self.high < 0)
 
 

@@ -17,7 +17,9 @@ COOKIE = 'anser_token'
 LOOPBACK = ('127.0.0.1', 'localhost', '::1')
 """Names of this machine for itself."""
 POLICY = (1008, 'not allowed')
+"""Code and reason of closing a web socket (RFC 6455) whose page may not be there."""
 FULL = (1013, 'too many pages')
+"""The same where as many pages are open as may be."""
 
 
 def is_local(host: str) -> bool:

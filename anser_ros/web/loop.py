@@ -136,7 +136,7 @@ class CorrectionLoop:
         return str(path.relative_to(self.folder.path)) if inside else self.model
 
     async def record(self) -> None:
-        """Begin a bag."""
+        """Begin to record another bag."""
         await self._step(self._record())
 
     async def stop(self) -> None:

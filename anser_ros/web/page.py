@@ -67,7 +67,7 @@ class Instrument(Element, component='instrument.js'):
 
 
 class Screen:
-    """One open page."""
+    """One page that is open in a browser."""
 
     def __init__(self, source: ShownGraph, loop: CorrectionLoop) -> None:
         self._source, self._loop = source, loop
@@ -149,7 +149,7 @@ class Screen:
     # What is shown ------------------------------------------------------------------------
 
     def show_frame(self, rows: list[Any]) -> None:
-        """Move what moves."""
+        """Move what has moved since the last frame."""
         if self._is_ready and self._version == self._source.version:
             self._instrument.run_method('frame', rows)
 

@@ -106,7 +106,7 @@ class PageServer:
         return f'http://{host}:{self.port}/' + (f'?token={self._token}' if self._token else '')
 
     def start(self) -> None:
-        """Begin to serve."""
+        """Begin to serve pages to browsers."""
         self._thread.start()
 
     def end(self) -> None:
