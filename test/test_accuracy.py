@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.assessment.control import ALERT, FAIL, NOTE, PASS, judged
 from anser_ros.assessment.dynamic import assess_motion
-from anser_ros.assessment.f2554 import point_to_point, single_point
+from anser_ros.assessment.f2554 import point_to_point, single_point, standing_alone
 from anser_ros.assessment.hummel import Grid, distance_errors, grid_points, rotation_errors
 from anser_ros.assessment.intervals import (
     cluster_weights,
@@ -143,7 +143,7 @@ class TestStatistics:
 
 
 class TestPauses:
-    @pytest.mark.parametrize('noise_m', [1e-4, 8e-4])
+    @pytest.mark.parametrize('noise_m', [1e-4, 1.5e-3])
     def test_every_rest_is_one_point(self, noise_m):
         rng = rng_of(6)
         true = board(3, 4)
@@ -163,6 +163,13 @@ class TestPauses:
         time = np.arange(0, 20, 0.05)
         place = np.stack([0.1 * np.sin(time), 0.1 * np.cos(time), 0 * time], axis=1)
         assert still_points(sequence_of('p', time, place, np.tile(STILL, (time.size, 1)))) == []
+
+    @pytest.mark.parametrize('interval_s', [0.02, 1.0])
+    def test_a_scan_that_steps_on_with_every_pose_has_none(self, interval_s):
+        place = board(31, 31, 0.01)
+        turns = np.tile(STILL, (len(place), 1))
+        scan = sequence_of('p', interval_s * np.arange(len(place)), place, turns)
+        assert still_points(scan) == []
 
 
 class TestHummel:
@@ -254,6 +261,10 @@ class TestF2554:
         assert mean.value == pytest.approx(0.01 * wanted.mean()) and mean.low > 0
         with pytest.raises(FitError, match='not in the order'):
             point_to_point([point(p) for p in measured[::-1] * [9, 1, 1]], true, rng_of(1))
+        measured[3] += [0.0, 0.0, 0.02]
+        number, before, after = standing_alone(measured, true)
+        assert number == 3 and after < 0.5 * before
+        assert standing_alone(np.delete(measured, 3, axis=0), np.delete(true, 3, axis=0)) is None
         with pytest.raises(FitError, match='the truth has 12'):
             point_to_point([point(p) for p in measured[:5]], true, rng_of(1))
 

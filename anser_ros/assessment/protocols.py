@@ -1,13 +1,13 @@
 """One assessment a protocol: from the poses of recordings to figures with intervals."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.assessment.dynamic import SpeedGroup, assess_motion
-from anser_ros.assessment.f2554 import point_to_point, single_point
+from anser_ros.assessment.f2554 import point_to_point, single_point, standing_alone
 from anser_ros.assessment.hummel import (
     ORDERS,
     RING_STEP_DEG,
@@ -27,6 +27,7 @@ from anser_ros.assessment.stability import AllanCurve, assess_rest
 from anser_ros.assessment.stillness import PauseRule, StillPoint, point_of, still_points
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.poses.hand_eye_fit import HandEye, fit_hand_eye
+from anser_ros.poses.sequence import PoseSequence
 
 Array = NDArray[np.float64]
 
@@ -167,10 +168,6 @@ def points_of(recordings: Sequence[AssessedPoses], rule: PauseRule) -> list[Stil
     return pauses
 
 
-def _filled(empty: Assessment, **values: object) -> Assessment:
-    return Assessment(**{**{k: getattr(empty, k) for k in empty.__dataclass_fields__}, **values})
-
-
 def _rest(
     empty: Assessment,
     recordings: Sequence[AssessedPoses],
@@ -184,7 +181,7 @@ def _rest(
             f'poses lack: the Allan deviation is of the longest stretch without a gap, '
             f'{found.even_share:.0%} of the poses'
         )
-    return _filled(empty, estimates=found.estimates, allan=found.allan, notes=tuple(notes))
+    return replace(empty, estimates=found.estimates, allan=found.allan, notes=tuple(notes))
 
 
 def _grid(
@@ -200,7 +197,7 @@ def _grid(
         'grid_matching_fre_m': IntervalEstimate(matching_error(place, grid)),
         'point_jitter_rms_m': _jitter(points),
     }
-    return _filled(
+    return replace(
         empty, estimates=estimates, groups=distance_errors(place, grid, rng), points=tuple(points)
     )
 
@@ -225,7 +222,7 @@ def _rotation(
         ),
         'point_jitter_rms_m': _jitter(points),
     }
-    return _filled(empty, estimates=estimates, groups={ROTATION: group}, points=tuple(points))
+    return replace(empty, estimates=estimates, groups={ROTATION: group}, points=tuple(points))
 
 
 def _metal(
@@ -238,7 +235,7 @@ def _metal(
     others = [(n, r.poses) for n, r in zip(names, recordings[1:], strict=True)]
     shifts = metal_shifts(recordings[0].poses, others)
     notes = [f'{n} is {r.session.path}' for n, r in zip(names, recordings[1:], strict=True)]
-    return _filled(empty, estimates=shifts, notes=tuple(notes))
+    return replace(empty, estimates=shifts, notes=tuple(notes))
 
 
 def _single_point(
@@ -248,7 +245,7 @@ def _single_point(
     rng: np.random.Generator,
 ) -> Assessment:
     group, estimates = single_point(recordings[0].poses, rng)
-    return _filled(empty, estimates=estimates, groups={'single point deviations': group})
+    return replace(empty, estimates=estimates, groups={'single point deviations': group})
 
 
 def _point_to_point(
@@ -257,36 +254,56 @@ def _point_to_point(
     options: ProtocolOptions,
     rng: np.random.Generator,
 ) -> Assessment:
-    points = points_of(recordings, options.pause)
-    notes: tuple[str, ...] = ()
-    true = options.truth
+    true, notes = options.truth, []
     if true is None:
-        if len(recordings) > 1 or recordings[0].session.reference is None:
+        first = recordings[0]
+        if len(recordings) > 1 or first.session.reference is None:
             raise ParameterError(
                 'point-to-point needs the true points: --truth FILE.csv, or one recording with '
                 'an optical reference'
             )
-        found = fit_hand_eye(recordings[0].session)
-        true = _optical_points(found, recordings[0].poses.name, points)
-        notes = ('the truth is the optical reference, whose own error is in the figures',)
+        found = fit_hand_eye(first.session)
+        # As they are meant, where units or quaternions say something else.
+        recordings = [replace(first, poses=found.session.sensors[first.poses.name])]
+        points = points_of(recordings, options.pause)
+        true = _optical_points(found, recordings[0].poses, points)
+        notes.append('the truth is the optical reference, whose own error is in the figures')
+    else:
+        points = points_of(recordings, options.pause)
     group, estimates = point_to_point(points, true, rng)
-    return _filled(
-        empty, estimates={**estimates, 'point_jitter_rms_m': _jitter(points)},
-        groups={'point to point distance errors': group}, points=tuple(points), notes=notes,
-    )  # fmt: skip
+    alone = standing_alone(np.array([p.position for p in points]), true)
+    if alone is not None:
+        number, before, after = alone
+        notes.append(
+            f'point {number + 1} stands out: a rigid fit leaves {1e3 * before:.2f} mm with it and '
+            f'{1e3 * after:.2f} mm without'
+        )
+    return replace(
+        empty,
+        estimates={**estimates, 'point_jitter_rms_m': _jitter(points)},
+        groups={'point to point distance errors': group},
+        points=tuple(points),
+        notes=tuple(notes),
+    )
 
 
-def _optical_points(found: HandEye, sensor: str, points: Sequence[StillPoint]) -> Array:
+def _optical_points(found: HandEye, poses: PoseSequence, points: Sequence[StillPoint]) -> Array:
     """Where the optical reference puts the sensor in each pause, m, tracker's frame."""
-    part = next(p for p in found.fit.state.parts if p.view.sensor == sensor)
+    problem = found.fit.state.problem
+    same = np.zeros(poses.size, dtype=np.int64)
+    every = replace(
+        problem, sensors=(poses,), blocks=(same,), places=(same,), weight=(np.ones(poses.size),),
+        noise=problem.noise[:1],
+    )  # fmt: skip
+    part = every.state(found.fit.terms).parts[0]
     places = []
     for point in points:
-        inside = (part.view.time >= point.begin_s) & (part.view.time <= point.end_s) & part.used
+        inside = (poses.time >= point.begin_s) & (poses.time <= point.end_s) & part.used
         if not inside.any():
             raise FitError(
                 f'the reference does not see the tool in the pause at {point.begin_s:.1f} s'
             )
-        places.append(part.view.position[inside].mean(axis=0))
+        places.append(np.median(part.view.position[inside], axis=0))
     return np.array(places)
 
 
@@ -302,4 +319,4 @@ def _dynamic(
     found = fit_hand_eye(session)
     motion = assess_motion(found, recordings[0].poses.name, rng)
     notes = ('latency is against the reference and its clock, whose own latency is in it',)
-    return _filled(empty, estimates=motion.estimates, speeds=motion.groups, notes=notes)
+    return replace(empty, estimates=motion.estimates, speeds=motion.groups, notes=notes)

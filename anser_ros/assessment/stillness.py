@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +15,17 @@ Array = NDArray[np.float64]
 WINDOW_S, WINDOW_POSES = 0.25, 3.0
 """Window whose middle pose is compared with its neighbours', s and poses: noise has fallen in it,
 and a hand has moved by more than a pause may."""
+FEWEST_WINDOWS = 4
+"""Windows of a pause, each half over the one before: fewer don't show whether the tool moved."""
 NOISE_TIMES = 5.0  # windows' own scatter by which their middle may differ in a pause
 LEAST_MOVE_M, LEAST_MOVE_RAD = 0.7e-3, 0.012
 """Difference that is a move whatever the noise: m, rad. A hand that holds a tool on a divot moves
 it by less."""
+MOST_MOVE_M, MOST_MOVE_RAD = 2.5e-3, 0.05
+"""Difference that is a move however noisy: m, rad. A scan that steps on with every pose is noise
+by its differences, and no rest."""
+LONGER = 1.5
+"""Share of the shortest pause that the fewest windows of a noisy tracker may take."""
 LONGEST_GAP_S = 1.0  # silence that ends a pause
 
 
@@ -100,16 +106,22 @@ def still_points(poses: PoseSequence, rule: PauseRule | None = None) -> list[Sti
     if poses.size < 2 * WINDOW_POSES:
         return []
     length = max(WINDOW_S, WINDOW_POSES * float(np.median(np.diff(poses.time))))
-    labels = np.floor((poses.time - poses.time[0]) / length).astype(np.int64)
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(labels)) + 1, [labels.size]])
-    rows = [(int(a), int(b)) for a, b in pairwise(starts) if b - a > 1]
+    rows = _windows(poses.time, length)
+    # The middle of a longer window is quieter, as long as a pause still has some of them.
+    while rows and 2 * length * (FEWEST_WINDOWS + 1) / 2 <= rule.least_s * LONGER:
+        if NOISE_TIMES * _noise(poses, rows)[0] < MOST_MOVE_M:
+            break
+        length *= 2
+        rows = _windows(poses.time, length)
     if not rows:
         return []
     place = np.array([np.median(poses.position[a:b], axis=0) for a, b in rows])
     turns = Rotation.concatenate(
         [Rotation.from_quat(poses.quaternion[a:b]).mean() for a, b in rows]
     )
-    moved_m, moved_rad = _tolerances(poses, rows)
+    noise = _noise(poses, rows)
+    moved_m = float(np.clip(NOISE_TIMES * noise[0], LEAST_MOVE_M, MOST_MOVE_M))
+    moved_rad = float(np.clip(NOISE_TIMES * noise[1], LEAST_MOVE_RAD, MOST_MOVE_RAD))
     begins = np.array([poses.time[a] for a, _ in rows])
     ends = np.array([poses.time[b - 1] for _, b in rows])
     runs = _runs(place, turns, begins, ends, (moved_m, moved_rad), rule.least_s)
@@ -120,8 +132,19 @@ def still_points(poses: PoseSequence, rule: PauseRule | None = None) -> list[Sti
     return _merged(poses, points, rule)
 
 
-def _tolerances(poses: PoseSequence, rows: Sequence[tuple[int, int]]) -> tuple[float, float]:
-    """Moves, m and rad, that are more than the noise of a window's middle."""
+def _windows(time: Array, length: float) -> list[tuple[int, int]]:
+    """First and beyond-last row of windows of some length, s, each half over the one before.
+
+    Those with fewer than two poses are left out.
+    """
+    begins = np.arange(time[0], time[-1], length / 2)
+    first = np.searchsorted(time, begins - 1e-9)
+    last = np.searchsorted(time, begins + length - 1e-9)
+    return [(int(a), int(b)) for a, b in zip(first, last, strict=True) if b - a > 1]
+
+
+def _noise(poses: PoseSequence, rows: Sequence[tuple[int, int]]) -> tuple[float, float]:
+    """Noise, m and rad, of the mean of a window at rest: of the quiet ones."""
     places, angles = [], []
     for a, b in rows:
         count = b - a
@@ -130,9 +153,7 @@ def _tolerances(poses: PoseSequence, rows: Sequence[tuple[int, int]]) -> tuple[f
         turns = Rotation.from_quat(poses.quaternion[a:b])
         size = (turns[:-1].inv() * turns[1:]).magnitude()
         angles.append(np.sqrt(np.mean(size**2) / 2 / count))
-    # Of windows at rest, which are the quiet ones.
-    noise = [float(np.percentile(values, 25)) for values in (places, angles)]
-    return max(LEAST_MOVE_M, NOISE_TIMES * noise[0]), max(LEAST_MOVE_RAD, NOISE_TIMES * noise[1])
+    return float(np.percentile(places, 25)), float(np.percentile(angles, 25))
 
 
 def _runs(
@@ -151,7 +172,7 @@ def _runs(
             if not is_near or begins[last + 1] - ends[last] > LONGEST_GAP_S:
                 break
             last += 1
-        if ends[last] - begins[first] >= least_s:
+        if ends[last] - begins[first] >= least_s and last - first + 1 >= FEWEST_WINDOWS:
             runs.append((first, last))
             first = last + 1
         else:

@@ -12,15 +12,17 @@ from rclpy.qos import qos_profile_sensor_data
 NAME = 'anser_pose_look'
 SLICE_S = 0.1
 """Longest time that one message is waited for, s."""
+FIRST_S = 10.0
+"""Least time, s, that the first pose is waited for: a graph takes seconds to be discovered."""
 SECOND_NS = 1_000_000_000
 """Nanoseconds in a second."""
 
 
 def main(topic: str, seconds: float) -> None:
-    """Listen for so long from the first pose on, or as long for one; print the poses."""
+    """Listen for so long from the first pose on; print the poses."""
     rclpy.init()
     node = rclpy.create_node(NAME)
-    end = time.monotonic() + seconds
+    end = time.monotonic() + max(seconds, FIRST_S)
     heard = 0
 
     def take(message: PoseStamped) -> None:
@@ -45,7 +47,8 @@ def main(topic: str, seconds: float) -> None:
         ]  # fmt: skip
         words = ', '.join(sorted(known)) or 'none'
         print(
-            f'no pose on {topic} within {seconds:g} s; topics of poses: {words}', file=sys.stderr
+            f'no pose on {topic} within {max(seconds, FIRST_S):g} s; topics of poses: {words}',
+            file=sys.stderr,
         )
     executor.shutdown()
     node.destroy_node()

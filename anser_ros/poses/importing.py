@@ -150,7 +150,8 @@ def _session(path: str, pieces: Sequence[tuple[str, Array, Array, Array]]) -> Po
         time, position, turn = (np.concatenate([p[i] for p in chosen]) for i in (1, 2, 3))
         known = np.isfinite(time)
         sequences[label] = sequence_of(label, time[known] - start, position[known], turn[known])
-    reference = sequences.pop('optical', None)
+    # A file of optical poses alone is somebody's tracker too.
+    reference = sequences.pop('optical', None) if len(sequences) > 1 else None
     if not any(poses.size for poses in sequences.values()):
         raise ParameterError(f'{path}: not one whole pose with a time')
     # A bag's stamp of zero means none.
