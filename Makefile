@@ -15,7 +15,7 @@ ARGS ?=
 PACKAGING = setup.py package.xml anser_ros/cli/commands.py
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-quick test-oldest lint format types parameters bench chaos soak paper loop measured docs clean
+.PHONY: help demo test test-quick test-oldest lint format types parameters bench browser chaos soak paper loop measured docs clean
 
 help:
 	@echo 'make demo [DURATION=30]  watch a simulated tool being tracked'
@@ -23,6 +23,7 @@ help:
 	@echo 'make test-quick          the same without the tests that start processes or take long'
 	@echo 'make test-oldest         tests with the oldest dependencies (needs Python 3.12)'
 	@echo 'make bench               speed and accuracy beside rivals, writes bench.json'
+	@echo 'make browser             the live view in a headless Chromium: closes the loop by clicking alone'
 	@echo 'make chaos               faults on the running nodes, with exact truth; ARGS=--list names them'
 	@echo 'make soak DURATION=3600  growth of memory, files, threads and latency of every node'
 	@echo 'make docs                the documentation as a site, out/docs/index.html'
@@ -73,6 +74,9 @@ test-oldest: $(READY_OLDEST)
 
 bench: $(READY)
 	@$(ENVIRONMENT) $(VENV)/bin/python test/bench/run.py $(ARGS)
+
+browser: $(READY)
+	@$(ENVIRONMENT) $(VENV)/bin/python test/browser/run.py $(ARGS)
 
 chaos: $(READY)
 	@$(ENVIRONMENT) $(VENV)/bin/python test/chaos/run.py $(ARGS)

@@ -19,7 +19,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from anser_ros.cli.commands import NODES
-from anser_ros.cli.missing import PYPI
+from anser_ros.cli.missing import OPTIONAL, PYPI
 from anser_ros.errors import ParameterError
 
 SCHEMA = 'anser_doctor/1'
@@ -116,7 +116,8 @@ def packages(has: Callable[[str], Any] = find_spec) -> list[Observation]:
     for module in (*MODULES, *PYPI):
         name = DISTRIBUTIONS.get(module, module)
         if not has(module):
-            found.append(Observation(name, BAD, 'not installed', f'pip install {name}'))
+            state = NOTE if module in OPTIONAL else BAD
+            found.append(Observation(name, state, 'not installed', f'pip install {name}'))
             continue
         try:
             text = version(name)

@@ -14,6 +14,8 @@ PYPI = {
     'nicegui': 'nicegui',
 }
 """Modules without a key of rosdep, and what they are called on PyPI."""
+OPTIONAL = ('nicegui',)
+"""Of these, what only somebody needs who wants the live view in a browser."""
 NEEDED = {
     'dashboard': ('nicegui',),
     'recorder': ('mcap',),

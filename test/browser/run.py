@@ -45,11 +45,11 @@ def main() -> int:
         os.environ.setdefault(threads, '1')
     with tempfile.TemporaryDirectory(prefix='anser_browser_') as name:
         folder = Path(name)
-        with _chain(folder, args) as dashboard, _browser(_address(dashboard)) as page:
+        with _chain(folder, args) as chain, _browser(_address(chain['dashboard'])) as page:
             found = Trial(page, folder, args.pictures).run(args)
             found['put_in'] = json.loads((folder / 'truth.json').read_text(encoding='utf-8'))
             if args.processor:
-                found['processor'] = _processor(dashboard, page, args.processor)
+                found['processor'] = _processor(chain, page, args.processor)
     found['put_in'].pop('answers', None)
     print(json.dumps(found, indent=1, ensure_ascii=False))
     return 0 if found['closed'] else 1
@@ -72,7 +72,7 @@ def _arguments() -> argparse.Namespace:
 
 
 @contextmanager
-def _chain(folder: Path, args: argparse.Namespace) -> Iterator[Child]:
+def _chain(folder: Path, args: argparse.Namespace) -> Iterator[dict[str, Child]]:
     model, port = config_path('demo_model.yaml'), folder / 'cu'
     commands = {
         'live': node_command(
@@ -93,7 +93,7 @@ def _chain(folder: Path, args: argparse.Namespace) -> Iterator[Child]:
     with Supervisor(folder / 'logs') as supervisor:
         children = {name: supervisor.start(name, words) for name, words in commands.items()}
         try:
-            yield children['dashboard']
+            yield children
         except BaseException:
             for child in children.values():
                 print(f'{child.name}:\n{tail(child)}', file=sys.stderr)
@@ -210,13 +210,17 @@ def _fell(pair: list[str]) -> bool:
     return after < before
 
 
-def _processor(dashboard: Child, page: Any, seconds: float) -> dict[str, float]:
-    """Shares of one processor that the live view takes: a page open, and none."""
-    shares = {'page_open': _share(dashboard.process.pid, seconds)}
+def _processor(chain: dict[str, Child], page: Any, seconds: float) -> dict[str, float]:
+    """Shares of one processor: of the live view with a page and without, of the chain beside it
+    and alone."""
+    view, live = (chain[name].process.pid for name in ('dashboard', 'live'))
+    shares = {'page_open': _share(view, seconds), 'chain_with_page': _share(live, seconds)}
     page.goto('about:blank')
     time.sleep(8.0)  # the server waits for a page to come back
-    shares['no_page'] = _share(dashboard.process.pid, seconds)
-    return shares
+    shares |= {'no_page': _share(view, seconds)}
+    chain['dashboard'].process.terminate()
+    chain['dashboard'].process.wait()
+    return shares | {'chain_alone': _share(live, seconds)}
 
 
 def _share(pid: int, seconds: float) -> float:
