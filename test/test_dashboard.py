@@ -1,5 +1,6 @@
 """Parts of the live view, without a browser: who may look, what it may touch, the loop."""
 
+import argparse
 import asyncio
 import json
 import math
@@ -15,9 +16,11 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.serialization import serialize_message
 from tracking_world import certain_model
 
+from anser_ros.cli import demo
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.nodes.causes import Told
 from anser_ros.nodes.chain_client import ChainClient, ChainError
+from anser_ros.nodes.dashboard import DashboardParameters
 from anser_ros.nodes.live_view import LiveView, read_pose
 from anser_ros.web import loop as loop_module
 from anser_ros.web.folder import RESULTS, RecordingFolder
@@ -103,6 +106,16 @@ def test_other_machines_need_a_token(tmp_path):
 def test_an_address_that_is_taken_is_said(tmp_path):
     with pytest.raises(ParameterError, match=r'203\.0\.113\.7:8642'):
         PageServer('203.0.113.7', 8642, TOKEN, RecordingFolder(tmp_path))
+
+
+def test_the_demo_serves_it_if_asked_to(tmp_path):
+    parser = argparse.ArgumentParser()
+    demo.add_arguments(parser)
+    for words, served in (([], False), (['--dashboard'], True)):
+        commands = dict(demo._commands(tmp_path, tmp_path / 'cu', parser.parse_args(words)))
+        assert ('dashboard' in commands) == served
+    assert f'port:={DashboardParameters.port}' in commands['dashboard']
+    assert f'directory:={tmp_path}' in commands['dashboard']
 
 
 def bag(path):

@@ -71,6 +71,7 @@ class Screen:
 
     def __init__(self, source: ShownGraph, loop: CorrectionLoop) -> None:
         self._source, self._loop = source, loop
+        self._client = ui.context.client
         self._version, self._is_ready = -1, False
         self._shown: dict[str, Any] = {}
         ui.add_css(STYLE)
@@ -148,9 +149,14 @@ class Screen:
 
     # What is shown ------------------------------------------------------------------------
 
+    @property
+    def is_seen(self) -> bool:
+        """Whether the browser is connected."""
+        return bool(self._client.has_socket_connection)
+
     def show_frame(self, rows: list[Any]) -> None:
         """Move what has moved since the last frame."""
-        if self._is_ready and self._version == self._source.version:
+        if self.is_seen and self._is_ready and self._version == self._source.version:
             self._instrument.run_method('frame', rows)
 
     def refresh(self) -> None:
@@ -341,7 +347,7 @@ class Pages:
         if self._ticks % POINT_TICKS == 0:
             self._source.add_point()
             self._loop.refresh_names()
-            for screen in screens:
+            for screen in filter(lambda screen: screen.is_seen, screens):
                 screen.refresh()
         self._ticks += 1
         rows = self._source.frame() if screens else []

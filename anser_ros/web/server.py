@@ -21,6 +21,9 @@ MOST_BYTES = 262_144
 """Largest message that a page may send, bytes: a click is a few hundred."""
 MOST_CONNECTIONS = 64
 """Connections at a time, those of a page's files among them."""
+PATIENCE_S = 20.0
+"""Time that a page may be silent, s, before it is taken for gone; it is loaded anew when it comes
+back. Shorter, and a browser that is busy drawing loses its page."""
 END_S = 2.0
 """Time that open connections have at the end, s."""
 SANDBOX = "sandbox; default-src 'none'; img-src data:; style-src 'unsafe-inline'"
@@ -86,7 +89,8 @@ class PageServer:
 
         ui.run_with(
             inner, title='anser_ros', tailwind=False, message_history_length=0,
-            binding_refresh_interval=None, show_welcome_message=False, reconnect_timeout=5.0,
+            binding_refresh_interval=None, show_welcome_message=False,
+            reconnect_timeout=PATIENCE_S,
         )  # fmt: skip
         self.guard = Guard(inner, token)
         config = uvicorn.Config(
