@@ -1,11 +1,15 @@
 """Several nodes in one process: what they hand over, and that they are the nodes they were."""
 
+import signal
+import socket
 import threading
+from dataclasses import make_dataclass
 
 import numpy as np
 import pytest
 from conftest import spin_until
 
+from anser_ros.errors import ParameterError
 from anser_ros.nodes.handover import Aside, HandedFlux, Handover, Taking
 from anser_ros.wire.points import FluxPoints, as_sent, decode_flux, encode_flux
 
@@ -51,6 +55,39 @@ def test_what_takes_long_is_done_aside_with_the_newest():
     assert done == ['a1', 'a4', 'b4'] and len(skipped) == 4
 
 
+def test_what_is_worked_on_aside_has_nothing_to_do_with_a_node_that_is_gone(ros):
+    """The thread ends with its node, and what it still does then is no fault of a callback."""
+    from std_msgs.msg import String
+
+    from anser_ros.nodes import qos
+    from anser_ros.nodes.node import AnserNode
+
+    began, goes_on = threading.Event(), threading.Event()
+
+    class Slow(AnserNode):
+        NAME = 'slow'
+        WORKS_ASIDE = True
+
+        def take(self, _what):
+            began.set()
+            goes_on.wait(10)
+            self.get_clock().now()
+            raise RuntimeError('the node is gone')
+
+    handover = Handover()
+    handover.offer('/anser/news')
+    node = Slow(handover=handover)
+    node.create_subscription(String, 'news', node.take, qos.STREAM)
+    handover.give('/anser/news', 'first')
+    assert began.wait(10)
+    assert not node.stop_working(), 'it is still at it'
+    thread = node._aside._thread
+    node.destroy_node()
+    goes_on.set()
+    thread.join(10)
+    assert not thread.is_alive() and node.counters['callback_faults'] == 0
+
+
 def test_what_is_put_off_is_done_one_thing_a_pause_while_there_are_pauses():
     handover, done, can = Handover(), [], [False, True]
 
@@ -85,7 +122,10 @@ def test_handed_fluxes_are_those_that_are_published():
 
 def test_parameters_of_one_node_are_given_to_it_alone():
     process = pytest.importorskip('anser_ros.nodes.process')
-    tracker, server = type('T', (), {'NAME': 'tracker'}), type('S', (), {'NAME': 'field_model'})
+    tracker, server = (
+        type('T', (), {'NAME': name, 'PARAMETERS': make_dataclass('P', [(known, float, 0.0)])})
+        for name, known in (('tracker', 'gate'), ('field_model', 'refit'))
+    )
     arguments = ['live', '--ros-args', '-p', 'tracker:gate:=4', '-p', 'model_file:=a:b', '-r',
                  'tracker:__node:=other', '--param', 'field_model:refit:=false']  # fmt: skip
     common, meant = process._meant_for((server, tracker), arguments)
@@ -95,6 +135,26 @@ def test_parameters_of_one_node_are_given_to_it_alone():
         'field_model': ['--ros-args', '--param', 'refit:=false'],
     }
     assert process._meant_for((tracker,), arguments)[0] == arguments
+    for wrong, said in (
+        ('tracker:refit:=true', 'tracker has no parameter refit; field_model has it'),
+        ('tracker:nothing:=1', 'tracker has no parameter nothing$'),
+    ):
+        with pytest.raises(ParameterError, match=said):
+            process._meant_for((server, tracker), ['live', '--ros-args', '-p', wrong])
+
+
+def test_a_file_tells_which_values_it_has_for_one_node(tmp_path):
+    names_for = pytest.importorskip('anser_ros.nodes.parameter_files').names_for
+    file = tmp_path / 'p.yaml'
+    file.write_text(
+        '/**:\n  ros__parameters: {common: 1}\n'
+        '/anser/tracker:\n  ros__parameters: {gate: 4.0, refit: true}\n'
+        '/anser:\n  field_model:\n    ros__parameters: {refit: true}\n'
+    )
+    arguments = ['live', '--ros-args', '--params-file', str(file)]
+    assert list(names_for(arguments, 'tracker')) == ['gate', 'refit']
+    assert list(names_for(arguments, 'field_model')) == ['refit']
+    assert list(names_for(arguments, 'acquisition')) == []
 
 
 def test_frames_are_handed_over_as_objects_while_two_senders_are_still_told(ros):
@@ -174,3 +234,28 @@ def test_what_several_nodes_cannot_be_given_is_one_line(start, words, said):
     process = start('live', '--ros-args', *words)
     assert process.popen.wait(30) == 2
     assert said in process.output and 'Traceback' not in process.output
+
+
+@pytest.mark.parametrize('is_noticed', [True, False])
+def test_who_is_given_up_says_good_bye_to_devices_first(monkeypatch, is_noticed):
+    """A process too busy to notice Ctrl-C ends all the same; the unit must not stream on."""
+    process = pytest.importorskip('anser_ros.nodes.process')
+    done = []
+
+    def fail():
+        done.append('broken')
+        raise OSError('unplugged')
+
+    monkeypatch.setattr(process, 'NOTICE_S', 10.0 if is_noticed else 0.02)
+    monkeypatch.setattr(process.os, '_exit', lambda code: done.append(code))
+    signals = process._Signals.__new__(process._Signals)
+    signals._noticed = threading.Event()
+    signals.farewells = [fail, lambda: done.append('stopped')]
+    signals._reader, writer = socket.socketpair()
+    writer.send(bytes([signal.SIGINT]))
+    if is_noticed:
+        signals._noticed.set()
+    signals._watch()
+    assert done == ([] if is_noticed else ['broken', 'stopped', 0])
+    writer.close()
+    signals._reader.close()

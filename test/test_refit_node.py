@@ -177,9 +177,18 @@ def test_a_baseline_of_too_few_is_refused_and_the_old_one_holds(make):
         rig.say(few)
     state = rig.node.status()
     assert state.level == Level.WARN and state.message.startswith('few_references: 3 usable')
+    said = 'a new baseline was refused: '
+    assert said not in state.message
     with pytest.raises(FitError, match='3 of 16 reference sensors; 4 are needed'):
         rig.node._on_set_baseline(Trigger.Request(), Trigger.Response())
     assert rig.node._refit is refit
+    state = rig.node.status()
+    assert state.level == Level.WARN and said + 'a baseline of 3 of 16' in state.message
+    for _ in range(20):
+        rig.say(0.0)
+    assert said in rig.node.status().message, 'until there is one'
+    assert rig.node._on_set_baseline(Trigger.Request(), Trigger.Response()).success
+    assert said not in rig.node.status().message
 
 
 def test_metal_at_rest_is_in_no_baseline(make):

@@ -315,6 +315,14 @@ class Acquisition(AnserNode):
         self._closing.set()
         self._worker.join(2.0)
 
+    def farewell(self) -> None:
+        """Tell the control unit to stop, whatever the other threads are at."""
+        self._closing.set()
+        port = self._port
+        if port is not None:
+            port.send(Stop())
+            time.sleep(GOODBYE_S)
+
     def status(self) -> Status:
         """State of the port and the stream."""
         interval, self._interval = self._interval, Interval(time.monotonic())

@@ -320,8 +320,12 @@ class FieldModelNode(AnserNode):
     def _on_set_baseline(self, _request: Any, response: Any) -> Any:
         if self._window is None or self._setup is None:
             raise FitError('no setup yet')
-        baseline = clean_mean(self._window, self._base, self._references, self._setup)
-        good = check_enough(baseline, self._setup.refit.min_references)
+        try:
+            baseline = clean_mean(self._window, self._base, self._references, self._setup)
+            good = check_enough(baseline, self._setup.refit.min_references)
+        except FitError as error:  # stays in the state until there is one: a reply is soon gone
+            self._no_baseline = str(error)
+            raise
         self._follow(baseline)
         response.success = True
         response.message = f'baseline of {good} references over {len(self._window)} frames'
@@ -377,7 +381,7 @@ class FieldModelNode(AnserNode):
             said = f'{REFERENCES_LOST}: no reference fluxes for {silent_s:.1f} s'
             return Status('', Level.ERROR, said, values)
         is_troubled = values.get('refit_state') in refit_status.TROUBLED
-        is_troubled |= bool(self._no_baseline and self._refit is None and self.parameters.refit)
+        is_troubled |= bool(self._no_baseline and self.parameters.refit)
         level = Level.WARN if is_troubled or self._is_uncalibrated else Level.OK
         return Status('', level, activity, values)
 
@@ -391,7 +395,7 @@ class FieldModelNode(AnserNode):
         if self._frozen or not wanted or self._refit is None:
             return refit_status.rest_words(self._frozen, wanted, self._no_baseline)
         values |= refit_status.refit_values(self._result)
-        return refit_status.refit_words(self._result)
+        return refit_status.refit_words(self._result, self._no_baseline)
 
     def part_statuses(self) -> list[Status]:
         """Return a line for every reference sensor that the refit looks at."""

@@ -69,12 +69,14 @@ class Aside:
             self._waiting[topic] = taker, what
             self._news.notify()
 
-    def end(self, timeout_s: float) -> None:
-        """End the thread, after what it works on now if that is soon over."""
+    def end(self, timeout_s: float) -> bool:
+        """End the thread after what it works on now; whether that was soon enough over."""
         with self._news:
             self._is_ending = True
             self._news.notify()
-        self._thread.join(timeout_s)
+        if threading.current_thread() is not self._thread:
+            self._thread.join(timeout_s)
+        return not self._thread.is_alive()
 
     def _run(self) -> None:
         while True:

@@ -51,9 +51,6 @@ the next time: other nodes of the process wait meanwhile."""
 LONGEST_END_S = 0.2
 """Time, s, that the end of a process waits for what its nodes work on aside: longer than a frame
 takes. The start of a refit takes seconds, which nobody waits for."""
-# Parameters that rclpy itself declares or reads.
-FOREIGN_PARAMETERS = ('use_sim_time', 'start_type_description_service')
-FOREIGN_PREFIXES = ('qos_overrides.',)
 
 
 @dataclass(frozen=True)
@@ -105,6 +102,7 @@ class AnserNode(Node):
         self.exit_code: int | None = None
         self._throttle = Throttle(WARNING_PERIOD_S)
         self._fault: str | None = None
+        self._is_ending = False
         self._faults_reported = 0
         self.started_s = time.monotonic()
         options.setdefault('namespace', NAMESPACE)
@@ -143,6 +141,9 @@ class AnserNode(Node):
 
     def close(self) -> None:
         """Release what the node holds; called once at the end, signals already ignored."""
+
+    def farewell(self) -> None:
+        """Tell devices that it is over where the process is given up; in a thread of its own."""
 
     # What a node uses ---------------------------------------------------------------------
 
@@ -280,10 +281,15 @@ class AnserNode(Node):
         aside = self._aside = self._aside or Aside(lambda: self.count('frames_skipped'))
         return lambda what: aside.put(topic, taker, what)
 
-    def stop_working(self) -> None:
-        """End what is worked on aside; the process is about to end."""
-        if self._aside is not None:
-            self._aside.end(LONGEST_END_S)
+    def stop_working(self) -> bool:
+        """End what is worked on aside; False where that still goes on after a while."""
+        self._is_ending = True
+        return self._aside is None or self._aside.end(LONGEST_END_S)
+
+    def destroy_node(self) -> None:
+        """Destroy the node as rclpy does; nothing is worked on aside for it afterwards."""
+        self.stop_working()
+        super().destroy_node()
 
     def _in_turn(self, callback: Callable, longest_s: float = -1.0) -> Callable:
         """A callback that waits for another one of this node in another thread.
@@ -312,7 +318,7 @@ class AnserNode(Node):
                 reason = ' '.join(str(error).split())
                 self.warn(f'refused_{type(error).__name__}', reason)
             except Exception as error:  # noqa: BLE001 - the node must outlive any callback
-                if self.context.ok():
+                if self.context.ok() and not self._is_ending:
                     reason = f'{type(error).__name__}: {error}'
                     self._report_fault(reason)
             if is_service:
@@ -333,11 +339,11 @@ class AnserNode(Node):
 
     def _declare_table(self) -> Any:
         table = self.PARAMETERS
-        kinds, values = parameters.types(table), {}
+        values: dict[str, Any] = {}
         # rclpy drops overrides that nobody declares; a misspelt name must not pass silently.
         others = {name for node in self._beside for name in parameters.types(node.PARAMETERS)}
         given = [name for name in self._parameter_overrides if name not in others]
-        unknown = [name for name in given if not _is_known(name, kinds)]
+        unknown = [name for name in given if not parameters.is_known(table, name)]
         if unknown:
             parameters.build(table, dict.fromkeys(sorted(unknown)))
         for name, rule in parameters.rules(table).items():
@@ -353,7 +359,7 @@ class AnserNode(Node):
         return parameters.build(table, values)
 
     def _on_set_parameters(self, changed: Sequence[Parameter]) -> SetParametersResult:
-        own = {p.name: p.value for p in changed if not _is_foreign(p.name)}
+        own = {p.name: p.value for p in changed if not parameters.is_foreign(p.name)}
         if not own:
             return SetParametersResult(successful=True)
         old = self.parameters
@@ -366,14 +372,6 @@ class AnserNode(Node):
             self.parameters = old
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
-
-
-def _is_foreign(name: str) -> bool:
-    return name in FOREIGN_PARAMETERS or name.startswith(FOREIGN_PREFIXES)
-
-
-def _is_known(name: str, kinds: dict[str, Any]) -> bool:
-    return name in kinds or _is_foreign(name)
 
 
 def _as_ros(value: Any) -> Any:

@@ -38,7 +38,7 @@ def complaints(arguments: Sequence[str], node: str) -> list[str]:
             document = read_yaml(Path(value).read_text(encoding='utf-8'))
         except (OSError, ValueError, yaml.YAMLError):
             continue
-        keys = list(_sections(document))
+        keys = [key for key, _ in _sections(document)]
         names = [key.rsplit('/', 1)[-1] for key in keys]
         if node in names or any(name in WILDCARDS for name in names):
             continue
@@ -46,6 +46,20 @@ def complaints(arguments: Sequence[str], node: str) -> list[str]:
         hint = f"is '{keys[names.index(close[0])]}' meant?" if close else f'it has: {_list(keys)}'
         found.append(f'{value} has nothing for {node}; {hint}')
     return found
+
+
+def names_for(arguments: Sequence[str], node: str) -> Iterator[str]:
+    """Yield the names of the values that parameter files have in sections of just this node."""
+    for option, value in itertools.pairwise(arguments):
+        if option != OPTION:
+            continue
+        try:
+            document = read_yaml(Path(value).read_text(encoding='utf-8'))
+        except (OSError, ValueError, yaml.YAMLError):
+            continue
+        for key, values in _sections(document):
+            if key.rsplit('/', 1)[-1] == node and isinstance(values, dict):
+                yield from map(str, values)
 
 
 def checked(name: str, nodes: Collection[str]) -> str:
@@ -64,7 +78,7 @@ def checked(name: str, nodes: Collection[str]) -> str:
         document = read_yaml(read_config(name))
     except (ValueError, yaml.YAMLError) as error:
         raise ParameterError(f'{path}: no YAML: {" ".join(str(error).split())}') from error
-    keys = list(_sections(document))
+    keys = [key for key, _ in _sections(document)]
     if not keys:
         raise ParameterError(f'{path}: no section with {LEAF}')
     for key in keys:
@@ -76,12 +90,12 @@ def checked(name: str, nodes: Collection[str]) -> str:
     return path
 
 
-def _sections(document: Any, path: str = '') -> Iterator[str]:
-    """Yield the full name of every section that holds parameters."""
+def _sections(document: Any, path: str = '') -> Iterator[tuple[str, Any]]:
+    """Yield the full name of every section that holds parameters, and what it holds."""
     if not isinstance(document, dict):
         return
     if LEAF in document:
-        yield path
+        yield path, document[LEAF]
     for key, value in document.items():
         if key != LEAF:
             yield from _sections(value, f'{path}/{key}' if path else str(key))

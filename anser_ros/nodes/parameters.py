@@ -62,6 +62,22 @@ def rules(table: type) -> dict[str, Rule]:
     return {field.name: field.metadata['rule'] for field in dataclasses.fields(table)}
 
 
+FOREIGN = ('use_sim_time', 'start_type_description_service')
+"""Parameters that rclpy itself declares or reads ..."""
+FOREIGN_PREFIXES = ('qos_overrides.',)
+"""... and what the names of others begin with."""
+
+
+def is_foreign(name: str) -> bool:
+    """Whether a parameter is rclpy's own."""
+    return name in FOREIGN or name.startswith(FOREIGN_PREFIXES)
+
+
+def is_known(table: type, name: str) -> bool:
+    """Whether a node with a table knows a parameter."""
+    return name in types(table) or is_foreign(name)
+
+
 def types(table: type) -> dict[str, Any]:
     """Return the type of every parameter of a table."""
     hints = typing.get_type_hints(table)

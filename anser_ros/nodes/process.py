@@ -8,7 +8,7 @@ import socket
 import sys
 import threading
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
@@ -144,10 +144,19 @@ def _meant_for(
         value = next(left, '') if text in ('-p', '--param') else None
         node, _, rule = (value or '').partition(':')
         if len(classes) > 1 and node in meant and ':=' in rule:
+            _check_known(classes, node, rule.partition(':=')[0])
             meant[node] += [text, rule]
         else:
             common += [text] if value is None else [text, value]
     return common, meant
+
+
+def _check_known(classes: 'Sequence[type[AnserNode]]', node: str, name: str) -> None:
+    """Refuse a value for one node among several that another one of them knows, or none."""
+    owners = [c.NAME for c in classes if parameters.is_known(c.PARAMETERS, name)]
+    if node not in owners:
+        hint = f'; {" and ".join(owners)} has it' if owners else ''
+        raise ParameterError(f'{node} has no parameter {name}{hint}')
 
 
 class _Interrupted(BaseException):
@@ -176,6 +185,8 @@ class _Signals:
         self.is_node_made = False
         self.caught: list[int] = []
         self._noticed = threading.Event()
+        # What devices have to be told where the process is given up.
+        self.farewells: list[Callable[[], object]] = []
         for number in ENDING:
             signal.signal(number, self._catch)
         # Python's handlers wait for the main thread; this channel does not.
@@ -198,7 +209,14 @@ class _Signals:
     def _watch(self) -> None:
         while self._reader.recv(1)[0] not in ENDING:
             pass
-        if not self._noticed.wait(NOTICE_S):
+        if self._noticed.wait(NOTICE_S):
+            return
+        for farewell in self.farewells:
+            try:
+                farewell()
+            except Exception:  # noqa: BLE001 - the process ends, whatever a device says
+                traceback.print_exc()
+        if not self._noticed.is_set():
             sys.stderr.flush()
             os._exit(0)
 
@@ -234,6 +252,7 @@ def _run(
                 arguments_of = meant[node_class.NAME]
                 options = {'handover': handover, 'beside': classes, 'cli_args': arguments_of}
             nodes.append(node_class(**own, **options))
+            signals.farewells.append(nodes[-1].farewell)
         _complain(nodes, arguments)
         for node in nodes:
             executor.add_node(node)
@@ -248,18 +267,32 @@ def _run(
         signals.ignore()
         for node in nodes:
             node.close()
+        working = [node for node in nodes if not node.stop_working()]
         for node in nodes:
-            node.stop_working()
             node.publish_end()
         if nodes:
             executor.shutdown(timeout_sec=1.0)
+        if working:  # a thread that still calculates must not meet a node that is gone
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
         for node in nodes:
             node.destroy_node()
     return code
 
 
 def _complain(nodes: 'Sequence[AnserNode]', arguments: Sequence[str]) -> None:
-    """Warn of parameter files that say nothing to any of the nodes."""
+    """Warn of parameter files that say nothing to any of the nodes.
+
+    Raises
+    ------
+    ParameterError
+        When the section of one node among several has a value that it does not know.
+    """
+    for node in nodes if len(nodes) > 1 else ():
+        for name in parameter_files.names_for(arguments, node.get_name()):
+            if not parameters.is_known(node.PARAMETERS, name):
+                raise ParameterError(f'{node.get_name()} has no parameter {name}')
     said = [parameter_files.complaints(arguments, node.get_name()) for node in nodes]
     if all(said):
         for text in said[-1]:

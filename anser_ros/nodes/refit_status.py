@@ -45,11 +45,15 @@ def refit_values(result: RefitResult | None) -> dict[str, object]:
     }
 
 
-def refit_words(result: RefitResult | None) -> str:
-    """Return what the refit did in this frame, and why where something was in its way."""
+def refit_words(result: RefitResult | None, refused: str = '') -> str:
+    """Return what the refit did in this frame, and why where something was in its way.
+
+    ``refused`` is why a baseline that was asked for since then is none.
+    """
+    words = f'; a new baseline was refused: {refused}' if refused else ''
     if result is None:
-        return 'baseline set'
-    return result.state if not result.reason else f'{result.state}: {result.reason}'
+        return f'baseline set{words}'
+    return (result.state if not result.reason else f'{result.state}: {result.reason}') + words
 
 
 def rest_words(is_held: bool, is_wanted: bool, no_baseline: str) -> str:
