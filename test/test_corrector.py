@@ -1,5 +1,6 @@
 """A pose model applied: errors fall on poses that it has not seen, and it says where it can't."""
 
+import json
 import time
 
 import numpy as np
@@ -124,3 +125,35 @@ def test_the_node_corrects_what_comes_and_tells_what_does_not(ros, bent, tmp_pat
     finally:
         node.destroy_node()
         other.destroy_node()
+
+
+def test_a_map_of_points_is_applied_where_it_is_confirmed(tmp_path, capsys):
+    """`error_map` writes what the corrector takes; mere noise is not corrected."""
+    from anser_ros.cli.main import main
+
+    rng = np.random.default_rng(5)
+    true = np.stack(np.meshgrid(*2 * [np.linspace(-0.1, 0.1, 8)], [0.0]), -1).reshape(-1, 3)
+    turn, shift = Rotation.from_rotvec([0.3, 1.0, -0.4]), np.array([0.4, 0.1, -0.2])
+    for name, bend in (('bent', 0.03), ('noisy', 0.0)):
+        tracked = turn.apply(true * [1.0 + bend, 1.0, 1.0] + 2e-4 * rng.normal(size=true.shape))
+        tracked += shift
+        for file, points, head in (('em', tracked, 'x_m,y_m,z_m'), ('true', true, 'x_m,y_m,z_m')):
+            np.savetxt(tmp_path / f'{file}.csv', points, delimiter=',', header=head, comments='')
+        out = tmp_path / name
+        command = ['error_map', str(tmp_path / 'em.csv'), '--true', str(tmp_path / 'true.csv')]
+        assert main([*command, '--register', '--sensor', 'tip', '--out', str(out)]) == 0
+        said = capsys.readouterr().out
+        assert ('nothing is corrected' in said) == (name == 'noisy')
+        document = json.loads((out / 'error_map.json').read_text())
+        assert document['confirmed'] == (name == 'bent')
+        assert document['before']['out_of_plane_rmse_m'] == pytest.approx(2e-4, rel=0.3)
+        corrector = PoseCorrector(yaml.safe_load((out / 'model.yaml').read_text()))
+        fixed = np.array(
+            [corrector.correct('tip', 1, p, np.array([0, 0, 0, 1.0])).position for p in tracked]
+        )
+        left = (fixed - shift) @ turn.as_matrix() - true
+        rms = np.sqrt(np.mean(np.sum(left[:, :2] ** 2, axis=1)))
+        assert rms < 4e-4
+        np.testing.assert_array_equal(fixed, tracked) if name == 'noisy' else None
+    away = corrector.correct('tip', 1, tracked[0] + 1.0, np.array([0, 0, 0, 1.0]))
+    assert away.state == 'outside_support'

@@ -36,7 +36,7 @@ ALLOWED = {
     'assessment': {'poses', 'sessions', 'tracking', 'field', 'physics', 'wire'},
     'simulation': {'sessions', 'effects', 'field', 'metal', 'physics', 'signals', 'wire'},
     'measured': CORE,
-    'experiments': {*CORE, 'simulation'},
+    'experiments': {*CORE, 'simulation', 'measured'},
     'api': CORE,
     '__init__.py': {'api', 'sessions', 'wire'},
     'cli': {*CORE, 'simulation', 'measured', 'experiments'},

@@ -1,17 +1,15 @@
 """The article's experiments on small recordings of our own simulator."""
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from anser_ros.calibration.error_map import IDENTITY
 from anser_ros.cli.main import main
-from anser_ros.errors import BagError
-from anser_ros.experiments import article, error_maps
+from anser_ros.errors import BagError, FitError
+from anser_ros.experiments import article
 from anser_ros.experiments.bound import position_bound
-from anser_ros.experiments.error_maps import board_folder, board_places, board_runs
+from anser_ros.experiments.error_maps import board_folder, board_runs
 from anser_ros.experiments.figures import draw_all
 from anser_ros.experiments.methods import article_model, centres_extension, drawn_model
 from anser_ros.experiments.recordings import (
@@ -25,6 +23,7 @@ from anser_ros.experiments.report import write_report
 from anser_ros.experiments.simulated import Raster, simulate_recordings
 from anser_ros.experiments.study import Study, field_errors, outer_planes
 from anser_ros.experiments.tracking_errors import statistics, track
+from anser_ros.measured import anser_board
 
 
 @pytest.fixture(scope='module')
@@ -163,7 +162,7 @@ def test_corrected_errors_keep_what_was_not_tracked(recordings):
 
 
 def test_fiducials_are_read_aligned_and_mapped(tmp_path):
-    places = board_places()
+    places = anser_board.places()
     assert places.shape == (41, 3)
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     tracked = 1e3 * (places + 0.02 * places * np.abs(places)[:, ::-1] / 0.06) @ turn.T + 150.0
@@ -171,51 +170,15 @@ def test_fiducials_are_read_aligned_and_mapped(tmp_path):
     (tmp_path / 'run.fcsv').write_text('# markups\n' + '\n'.join(lines) + '\n')
     (run,) = board_runs(tmp_path)
     assert run.points == 41
-    assert run.after_m < 0.8 * run.before_m
+    assert run.after_m < 0.8 * run.before_m and run.confirmed
+    assert run.across_m < 1e-5
     assert board_runs(tmp_path / 'nowhere') == []
     (tmp_path / 'run.fcsv').write_text('a,b,c,d\n')
     with pytest.raises(BagError, match='no table of fiducials'):
         board_runs(tmp_path)
     (tmp_path / 'run.fcsv').write_text(lines[0] + '\n')
-    with pytest.raises(BagError, match='41 fiducials expected, got 1'):
+    with pytest.raises(FitError, match='41 fiducials expected, got 1'):
         board_runs(tmp_path)
-
-
-@pytest.mark.long
-@pytest.mark.skipif(not board_folder().is_dir(), reason='the measured board is not at hand')
-def test_the_measured_board_in_blocks_that_took_no_part():
-    files = [board_folder() / f'{name}.fcsv' for name in ('standard_data_grid', 'steel_shield')]
-    runs = {
-        path.stem: error_maps.judged(path.stem, error_maps.read_fiducials(path), board_places())
-        for path in files
-    }
-    assert 1e3 * runs['standard_data_grid'].before_m == pytest.approx(2.34, abs=0.01)
-    assert 1e3 * runs['steel_shield'].before_m == pytest.approx(5.39, abs=0.01)
-    assert runs['standard_data_grid'].after_m < 0.65 * runs['standard_data_grid'].before_m
-    # Where there is nothing smooth to learn, an honest figure may rise, by a little.
-    assert all(run.after_m < 1.04 * run.before_m for run in runs.values())
-
-
-def test_a_held_out_block_knows_nothing_of_itself(monkeypatch):
-    """What is reported at one place does not change what its block is judged with."""
-    places = board_places()
-    seen = []
-
-    def learn(tracked, true):
-        seen.append((tracked.copy(), true.copy()))
-        return SimpleNamespace(apply=np.copy, shape=IDENTITY)
-
-    monkeypatch.setattr(error_maps, 'learn_error_map', learn)
-    found = places + 0.02 * places * np.abs(places)[:, ::-1] / 0.06
-    error_maps.judged('one', found, places)
-    moved = found.copy()
-    moved[0] += [0.05, 0.02, 0.01]
-    error_maps.judged('other', moved, places)
-    before, after = seen[: len(seen) // 2], seen[len(seen) // 2 :]
-    same = [np.array_equal(a[0], b[0]) for a, b in zip(before, after, strict=True)]
-    assert same.count(True) == 1
-    (block,) = (true for (_, true), equal in zip(before, same, strict=True) if equal)
-    assert not (block == places[0]).all(axis=1).any()
 
 
 def test_error_map_command(tmp_path, capsys):

@@ -9,6 +9,11 @@ solves for. Trend, length and noise are chosen by the error in held-out blocks o
 blocks that took no part in that choice decide whether the map helps; if not, it is the identity.
 The error that is reported is that of a third set of blocks, which took part neither in the choice
 nor in that decision nor in the fit.
+
+Points of two frames are registered first, by every fit anew from its own points, so that no place
+helps to align what it judges. Where such places lie in a plane, the error across it is told apart
+and not corrected: whatever flattens the points brings them nearer to the plane, and tells nothing
+of what lies above it.
 """
 
 from collections.abc import Sequence
@@ -16,9 +21,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import RBFInterpolator
+from scipy.spatial.transform import Rotation
 
 from anser_ros.calibration.blocks import fold_of_frames
+from anser_ros.calibration.position_map import IDENTITY, PositionMap, Shape
 from anser_ros.errors import FitError
 
 Array = NDArray[np.float64]
@@ -37,89 +43,34 @@ NOISES = (0.03, 0.1, 0.3, 1.0)
 that follows nearly every point to one that hardly follows any."""
 TRENDS = (0, 1)
 """Degrees of the polynomial trend that are tried: a constant shift and an affine map."""
-FLAT = 1e-6
-"""A direction in which the points extend less than this part of the largest extent carries no
-trend and no distance: what differs there is the rounding of the numbers."""
+CLEAR = 2.0
+"""Standard errors by which the held-out error must fall for a gain to be claimed: with five blocks
+chance alone does so once in twenty."""
+PLANE = 0.02
+"""Thickness of the true places (root mean square) over their extent, below which they count as a
+plane: a board that is drilled on a machine is thinner, a volume is not."""
 
 
 @dataclass(frozen=True)
-class Shape:
-    """A choice of map.
+class HeldOutError:
+    """Root mean square errors, m, of places that took no part.
 
     Attributes
     ----------
-    trend : int
-        Polynomial degree of the trend; -1 for no map.
-    length_m : float
-        Covariance length, m; 0 for a trend alone.
-    noise : float
-        Noise as a part of the errors' standard deviation about the trend.
+    whole : float
+        Of the distance.
+    in_plane, out_of_plane : float or None
+        Along and across the plane of the true places, where these were registered and lie in one.
     """
 
-    trend: int
-    length_m: float
-    noise: float
+    whole: float
+    in_plane: float | None = None
+    out_of_plane: float | None = None
 
-    def describe(self) -> str:
-        """Return the shape in words for a report."""
-        if self.trend < 0:
-            return 'no correction'
-        trend = 'shift' if self.trend == 0 else 'affine'
-        if self.length_m == 0.0:
-            return trend
-        return f'{trend}, smooth over {1e3 * self.length_m:.0f} mm'
-
-
-IDENTITY = Shape(-1, 0.0, 0.0)
-"""The shape of a map that corrects nothing."""
-
-
-class PositionMap:
-    """What a map of one shape, fitted to some points, adds to tracked positions.
-
-    Parameters
-    ----------
-    places : ndarray, shape (M, 3)
-        Tracked positions, m.
-    errors : ndarray, shape (M, 3)
-        True less tracked positions, m.
-    shape : Shape
-    """
-
-    def __init__(self, places: Array, errors: Array, shape: Shape) -> None:
-        self.shape = shape
-        self._middle = places.mean(axis=0)
-        _, spread, axes = np.linalg.svd(places - self._middle, full_matrices=False)
-        self._axes = axes[spread > FLAT * spread[0]]
-        if shape.length_m > 0.0:
-            self._smooth = RBFInterpolator(
-                self._reduced(places),
-                errors,
-                kernel='gaussian',
-                epsilon=np.sqrt(0.5) / shape.length_m,
-                smoothing=shape.noise**2,
-                degree=shape.trend,
-            )
-        elif shape.trend >= 0:
-            columns = _trend_columns(self._reduced(places), shape.trend)
-            self._trend = np.linalg.lstsq(columns, errors, rcond=None)[0]
-
-    def __call__(self, tracked: Array) -> Array:
-        """Return what to add to tracked positions (P, 3), m."""
-        if self.shape.trend < 0:
-            return np.zeros_like(tracked)
-        where = self._reduced(tracked)
-        if self.shape.length_m > 0.0:
-            return np.asarray(self._smooth(where))
-        return np.asarray(_trend_columns(where, self.shape.trend) @ self._trend)
-
-    def _reduced(self, places: Array) -> Array:
-        return np.asarray((places - self._middle) @ self._axes.T)
-
-
-def _trend_columns(places: Array, degree: int) -> Array:
-    ones = np.ones((len(places), 1))
-    return ones if degree == 0 else np.concatenate([ones, places], axis=1)
+    @property
+    def judged(self) -> float:
+        """The one that a map is chosen and judged by."""
+        return self.whole if self.in_plane is None else self.in_plane
 
 
 @dataclass(frozen=True)
@@ -130,20 +81,44 @@ class ErrorMap:
     ----------
     correction : PositionMap
         What it adds to tracked positions.
-    n_points : int
-        Points that it was learnt from.
-    before_m, after_m : float
-        Root mean square error (m) without a map and with one, in blocks held out of choice,
-        decision and fit. The latter may be the larger: then the map does not help.
+    rotation, translation : ndarray, shapes (3, 3) and (3,)
+        From the frame of the true positions to that of the tracked ones, m; none where both are
+        in one frame.
+    places, errors : ndarray, shape (M, 3)
+        The tracked positions that it was learnt from, and what they lacked, m.
+    before, after : HeldOutError
+        Without a map and with one, in blocks held out of registration, choice, decision and fit.
+        The latter may be the larger: then the map does not help.
+    clearness : float
+        The fall of the held-out mean square from one to the other, in its standard errors.
     tried : tuple of (Shape, float)
         Every shape with its held-out error (m), by which the shape was chosen.
     """
 
     correction: PositionMap
-    n_points: int
-    before_m: float
-    after_m: float
+    rotation: Array
+    translation: Array
+    places: Array
+    errors: Array
+    before: HeldOutError
+    after: HeldOutError
+    clearness: float
     tried: tuple[tuple[Shape, float], ...]
+
+    @property
+    def n_points(self) -> int:
+        """Points that it was learnt from."""
+        return len(self.places)
+
+    @property
+    def before_m(self) -> float:
+        """The error without a map that counts, m."""
+        return self.before.judged
+
+    @property
+    def after_m(self) -> float:
+        """The error with what the other blocks decide that counts, m."""
+        return self.after.judged
 
     @property
     def shape(self) -> Shape:
@@ -155,18 +130,25 @@ class ErrorMap:
         """Whether the map is more than the identity."""
         return self.shape.trend >= 0
 
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether blocks that took no part confirm the map clearly, so that it may be used."""
+        return bool(self.helps and self.clearness > CLEAR)
+
     def apply(self, tracked: Array) -> Array:
         """Return corrected positions (P, 3), m."""
         return np.asarray(tracked + self.correction(tracked))
 
 
-def learn_error_map(tracked: Array, true: Array) -> ErrorMap:
+def learn_error_map(tracked: Array, true: Array, *, registers: bool = False) -> ErrorMap:
     """Learn a map from points at which both positions are known.
 
     Parameters
     ----------
     tracked, true : ndarray, shape (M, 3)
-        m, in one frame.
+        m, in one frame, or in two.
+    registers : bool
+        Whether each has a frame of its own. Then a shift or turn of all is no error.
 
     Raises
     ------
@@ -186,16 +168,72 @@ def learn_error_map(tracked: Array, true: Array) -> ErrorMap:
         )
     rows = np.flatnonzero(good)
     rows = rows[:: -(-rows.size // MOST_POINTS)]
-    places, errors = tracked[rows], true[rows] - tracked[rows]
-    held_out = _HeldOut(places, errors, fold_of_frames([places])[0], _shapes(places))
+    points = _Pairs(tracked[rows], true[rows], registers)
+    held_out = _HeldOut(points, _shapes(points.tracked))
+    everything = np.ones(len(rows), dtype=bool)
+    rotation, translation = points.registration(everything)
+    errors = points.errors(everything, rotation, translation)
     shape = held_out.shapes[held_out.decide(held_out.everything)]
+    before, after = (held_out.nested(decided=decided) for decided in (False, True))
     return ErrorMap(
-        PositionMap(places, errors, shape),
-        len(places),
-        float(np.sqrt((errors**2).sum(axis=1).mean())),
-        float(np.sqrt(held_out.square_of_decisions() / len(places))),
+        PositionMap(points.tracked, errors, shape),
+        rotation,
+        translation,
+        points.tracked,
+        errors,
+        held_out.error_of(before),
+        held_out.error_of(after),
+        held_out.clearness(before, after),
         held_out.tried(),
     )
+
+
+class _Pairs:
+    """Tracked and true positions (M, 3), and what parts of them tell."""
+
+    def __init__(self, tracked: Array, true: Array, registers: bool) -> None:
+        self.tracked, self.true, self._registers = tracked, true, registers
+        # Blocks of space that do not depend on what is judged.
+        self.folds = fold_of_frames([true if registers else tracked])[0]
+        _, spread, axes = np.linalg.svd(true - true.mean(axis=0), full_matrices=False)
+        if registers and spread[1] < PLANE * spread[0]:
+            raise FitError('an error map needs places that are not all on a line')
+        is_plane = registers and spread[2] < PLANE * spread[0]
+        self.normal: Array | None = axes[2] if is_plane else None
+
+    def registration(self, train: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """Rotation and translation (m) from the frame of the true positions to the tracked."""
+        if not self._registers:
+            return np.eye(3), np.zeros(3)
+        middle, aim = self.true[train].mean(axis=0), self.tracked[train].mean(axis=0)
+        turn = Rotation.align_vectors(self.tracked[train] - aim, self.true[train] - middle)[0]
+        return turn.as_matrix(), np.asarray(aim - turn.apply(middle))
+
+    def errors(self, some: NDArray[np.bool_], rotation: Array, translation: Array) -> Array:
+        """What the tracked positions lack, m, in their frame; without what is not corrected."""
+        lacking = self.true[some] @ rotation.T + translation - self.tracked[some]
+        if self.normal is None:
+            return np.asarray(lacking)
+        normal = rotation @ self.normal
+        return np.asarray(lacking - np.outer(lacking @ normal, normal))
+
+    def left(
+        self, train: NDArray[np.bool_], test: NDArray[np.bool_], shapes: Sequence[Shape]
+    ) -> list[Array]:
+        """Errors (P, 3), m, of test points by maps of each shape; frame of the true ones."""
+        rotation, translation = self.registration(train)
+        known = self.errors(train, rotation, translation)
+        found = []
+        for shape in shapes:
+            corrected = PositionMap(self.tracked[train], known, shape)(self.tracked[test])
+            place = (self.tracked[test] + corrected - translation) @ rotation
+            found.append(np.asarray(place - self.true[test]))
+        return found
+
+    def judged(self, errors: Array) -> float:
+        """Sum of squares, m^2, that a map is judged by."""
+        whole = float(np.sum(errors**2))
+        return whole if self.normal is None else whole - float(np.sum((errors @ self.normal) ** 2))
 
 
 def _shapes(places: Array) -> list[Shape]:
@@ -217,28 +255,22 @@ class _HeldOut:
     others.
     """
 
-    def __init__(
-        self, places: Array, errors: Array, folds: NDArray[np.int64], shapes: Sequence[Shape]
-    ) -> None:
+    def __init__(self, points: _Pairs, shapes: Sequence[Shape]) -> None:
         self.shapes = shapes
-        self.everything = frozenset(int(fold) for fold in np.unique(folds))
-        self._points = places, errors, folds
+        self.everything = frozenset(int(fold) for fold in np.unique(points.folds))
+        self._points = points
         self._squares: dict[tuple[frozenset[int], int], Array] = {}
+
+    def _left(self, known: frozenset[int], fold: int, shapes: Sequence[Shape]) -> list[Array]:
+        folds = self._points.folds
+        return self._points.left(np.isin(folds, list(known)), folds == fold, shapes)
 
     def squares(self, known: frozenset[int], fold: int) -> Array:
         """Return the sum of squares (m^2) in a fold, by shape, of maps fitted to known folds."""
         key = known, fold
         if key not in self._squares:
-            places, errors, folds = self._points
-            train, test = np.isin(folds, list(known)), folds == fold
-            self._squares[key] = np.array(
-                [
-                    np.sum((errors[test] - part(places[test])) ** 2)
-                    for part in (
-                        PositionMap(places[train], errors[train], shape) for shape in self.shapes
-                    )
-                ]
-            )
+            left = self._left(known, fold, self.shapes)
+            self._squares[key] = np.array([self._points.judged(errors) for errors in left])
         return self._squares[key]
 
     def choose(self, known: frozenset[int]) -> int:
@@ -256,18 +288,40 @@ class _HeldOut:
         chosen = sum(self.squares(rest, fold)[self.choose(rest)] for fold, rest in rests.items())
         return self.choose(known) if chosen < plain else 0
 
-    def square_of_decisions(self) -> float:
-        """Return the sum of squares (m^2) in each fold of what the other folds decide."""
-        rests = {fold: self.everything - {fold} for fold in self.everything}
-        return float(
-            sum(self.squares(rest, fold)[self.decide(rest)] for fold, rest in rests.items())
+    def nested(self, *, decided: bool) -> list[Array]:
+        """Return the errors in each fold of what the other folds decide, or of no map."""
+        parts = []
+        for fold in sorted(self.everything):
+            rest = self.everything - {fold}
+            shape = self.shapes[self.decide(rest) if decided else 0]
+            parts += self._left(rest, fold, [shape])
+        return parts
+
+    def clearness(self, before: Sequence[Array], after: Sequence[Array]) -> float:
+        """Return the fall of the mean square in standard errors of the blocks' own falls."""
+        falls = np.array(
+            [
+                (self._points.judged(one) - self._points.judged(other)) / len(one)
+                for one, other in zip(before, after, strict=True)
+            ]
         )
+        spread = float(falls.std(ddof=1)) / np.sqrt(len(falls))
+        return float(falls.mean()) / spread if spread > 0 else 0.0
+
+    def error_of(self, parts: Sequence[Array]) -> HeldOutError:
+        """Return the root mean squares of errors by fold."""
+        errors, normal = np.concatenate(parts), self._points.normal
+        whole = float(np.sqrt(np.sum(errors**2) / len(errors)))
+        if normal is None:
+            return HeldOutError(whole)
+        along = float(np.sqrt(self._points.judged(errors) / len(errors)))
+        return HeldOutError(whole, along, float(np.sqrt(np.mean((errors @ normal) ** 2))))
 
     def tried(self) -> tuple[tuple[Shape, float], ...]:
         """Return every shape with its held-out error, m."""
         squares = self._crossed(self.everything)
         return tuple(
-            (shape, float(np.sqrt(square / len(self._points[0]))))
+            (shape, float(np.sqrt(square / len(self._points.true))))
             for shape, square in zip(self.shapes, squares, strict=True)
         )
 

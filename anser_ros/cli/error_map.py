@@ -1,4 +1,4 @@
-"""Learn an error map from tracked and true positions, and apply it to others."""
+"""Learn a correction of positions where true ones are known, and apply it to others."""
 
 import argparse
 import csv
@@ -7,32 +7,49 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
-from rich.console import Console
 
-from anser_ros.calibration.error_map import ErrorMap, learn_error_map
+from anser_ros.calibration.error_map import ErrorMap, HeldOutError, learn_error_map
 from anser_ros.cli.output import make_folder, say_written
 from anser_ros.errors import FitError, ParameterError, PlausibilityError
+from anser_ros.poses.point_model import to_point_model
 from anser_ros.sessions.plausibility import check_points
+from anser_ros.wire.fiducials import read_fiducials
 
 SCHEMA = 'anser_error_map/1'
 TRACKED = ('x_m', 'y_m', 'z_m')
 TRUE = ('true_x_m', 'true_y_m', 'true_z_m')
+MARKUPS = '.fcsv'
 
 Array = NDArray[np.float64]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument(
-        'points', type=Path, help=f'CSV with the columns {", ".join((*TRACKED, *TRUE))}'
+    parser.epilog = (
+        'examples: anser error_map points.csv --out map/ --apply poses.csv; '
+        'anser error_map tracked.fcsv --true board.csv --register --out map/'
     )
+    parser.add_argument(
+        'points', type=Path,
+        help=f'CSV with the columns {", ".join((*TRACKED, *TRUE))}; or, with --true, tracked '
+        f'positions: a CSV with {", ".join(TRACKED)}, or a list of 3D Slicer ({MARKUPS}, mm)',
+    )  # fmt: skip
+    parser.add_argument(
+        '--true', type=Path, metavar='PLACES', help='the true positions, a row a tracked one'
+    )
+    parser.add_argument(
+        '--register', action='store_true',
+        help='the true positions are in a frame of their own: a shift or turn is no error',
+    )  # fmt: skip
     parser.add_argument(
         '--out',
         required=True,
         type=Path,
-        help='folder for error_map.json, made if missing',
+        help='folder for error_map.json and model.yaml, made if missing',
     )
+    parser.add_argument('--sensor', default='sensor', help='whose poses the model is for')
     parser.add_argument(
         '--apply', type=Path, metavar='POSES', help='CSV to correct, e.g. poses.csv of evaluate'
     )
@@ -41,32 +58,67 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command and return the exit code."""
-    rows, _ = _read(args.points)
     make_folder(args.out)
-    tracked, true = (_columns(rows, names, args.points) for names in (TRACKED, TRUE))
+    tracked, true = _points(args)
     try:
         check_points(tracked, true)
     except PlausibilityError as error:
         raise PlausibilityError(f'{args.points}: {error}') from error
-    error_map = learn_error_map(tracked, true)
+    error_map = learn_error_map(tracked, true, registers=args.register)
     if args.apply is not None:
         poses, names = _read(args.apply)
-        corrected = error_map.apply(_columns(poses, TRACKED, args.apply))
+        places = _columns(poses, TRACKED, args.apply)
+        corrected = error_map.apply(places) if error_map.is_confirmed else places
     text = json.dumps(to_document(error_map), indent=1)
     (args.out / 'error_map.json').write_text(text + '\n', encoding='utf-8')
+    model = to_point_model(error_map, args.sensor, str(args.points))
+    text_of_model = yaml.safe_dump(model, sort_keys=False)
+    (args.out / 'model.yaml').write_text(text_of_model, encoding='utf-8')
     if args.apply is not None:
         _write(args.out / 'corrected.csv', poses, names, corrected)
     if args.json:
         print(text)
     else:
-        Console().print(
-            f'{error_map.shape.describe()}: held out {1e3 * error_map.before_m:.3f} mm rms '
-            f'without, {1e3 * error_map.after_m:.3f} mm with',
-            highlight=False,
+        print(verdict(error_map))
+        files = ['error_map.json', 'model.yaml'] + (
+            [] if args.apply is None else ['corrected.csv']
         )
-        files = ['error_map.json'] + ([] if args.apply is None else ['corrected.csv'])
         say_written(*(args.out / name for name in files))
     return 0
+
+
+def verdict(error_map: ErrorMap) -> str:
+    """Say in a line what places that took no part say of the map."""
+    before, after = 1e3 * error_map.before_m, 1e3 * error_map.after_m
+    along = 'in the plane of the places, ' if error_map.before.in_plane is not None else ''
+    figures = f'held out, {along}{before:.3f} mm rms without a map, {after:.3f} mm with'
+    if error_map.is_confirmed:
+        return f'{error_map.shape.describe()}: {figures}'
+    if not error_map.helps:
+        return f'no map helps: {figures}, so nothing is corrected'
+    return (
+        f'{error_map.shape.describe()}: no gain is shown: {figures} '
+        f'({error_map.clearness:+.1f} standard errors), so nothing is corrected'
+    )
+
+
+def _points(args: argparse.Namespace) -> tuple[Array, Array]:
+    """Tracked and true positions, m."""
+    if args.true is None:
+        if args.points.suffix == MARKUPS:
+            raise ParameterError(f'{args.points} has tracked positions only; --true is needed')
+        rows, _ = _read(args.points)
+        return _columns(rows, TRACKED, args.points), _columns(rows, TRUE, args.points)
+    tracked, true = (
+        read_fiducials(path) if path.suffix == MARKUPS else _columns(_read(path)[0], TRACKED, path)
+        for path in (args.points, args.true)
+    )
+    if len(tracked) != len(true):
+        raise ParameterError(
+            f'{args.points} has {len(tracked)} positions and {args.true} {len(true)}; '
+            'they belong together row by row'
+        )
+    return tracked, true
 
 
 def to_document(error_map: ErrorMap) -> dict[str, Any]:
@@ -74,13 +126,25 @@ def to_document(error_map: ErrorMap) -> dict[str, Any]:
     return {
         'schema': SCHEMA,
         'map': error_map.shape.describe(),
+        'confirmed': error_map.is_confirmed,
+        'clearness': error_map.clearness,
         'heldout_rmse_before_m': error_map.before_m,
         'heldout_rmse_after_m': error_map.after_m,
+        'before': _plain(error_map.before),
+        'after': _plain(error_map.after),
         'n_points': error_map.n_points,
         'tried': [
             {'map': shape.describe(), 'noise_share': shape.noise, 'heldout_rmse_m': error}
             for shape, error in error_map.tried
         ],
+    }
+
+
+def _plain(error: HeldOutError) -> dict[str, float | None]:
+    return {
+        'rmse_m': error.whole,
+        'in_plane_rmse_m': error.in_plane,
+        'out_of_plane_rmse_m': error.out_of_plane,
     }
 
 

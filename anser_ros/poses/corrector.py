@@ -13,6 +13,7 @@ from anser_ros.poses.convention import PoseReading
 from anser_ros.poses.document import MODEL_SCHEMA
 from anser_ros.poses.effects.clock import PoseTimeOffset
 from anser_ros.poses.effects.field_distortion import UNIT_M, FieldDistortion, monomials
+from anser_ros.poses.point_model import SMOOTH, smooth_map
 from anser_ros.poses.sequence import FARTHEST, NO_TURN, PoseSequence
 
 Array = NDArray[np.float64]
@@ -81,7 +82,9 @@ class PoseCorrector:
         self.sensors = {str(r.parameters['sensor']) for r in records if r.name == 'hand_eye'}
         self._offsets = [r for r in records if r.name == PoseTimeOffset.name]
         bend = FieldDistortion()
-        self._maps = [(bend.term(r), r) for r in records if r.name == bend.name]
+        maps = [r for r in records if r.name == bend.name]
+        self._smooth = [smooth_map(r) for r in maps if r.parameters.get('kind') == SMOOTH]
+        self._maps = [(bend.term(r), r) for r in maps if r.parameters.get('kind') != SMOOTH]
         self._bend = bend
         self._reading = PoseReading()
         for record in records:
@@ -125,6 +128,8 @@ class PoseCorrector:
                 # Outside it is held at the border: a polynomial knows nothing beyond it.
                 variance += self._map_variance(record, inside)
                 place = place + self._bend.shift(term, inside[None])[0]
+        for added in self._smooth:
+            place = place + added(inside[None])[0]
         covariance = np.diag(np.repeat([variance, self._turn**2], 3))
         state = OK if away == 0.0 else OUTSIDE
         return CorrectedPose(state, stamp_ns - round(1e9 * late), place, turn, covariance)

@@ -1,0 +1,73 @@
+"""An error map of points as a model of poses, which the corrector applies like any other."""
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from anser_ros.calibration.error_map import ErrorMap
+from anser_ros.calibration.position_map import PositionMap, Shape
+from anser_ros.effects.effect import needed
+from anser_ros.field.model import EffectRecord
+from anser_ros.poses.document import MODEL_SCHEMA
+from anser_ros.poses.effects.field_distortion import FieldDistortion
+
+SMOOTH = 'smooth'
+"""The kind of a map that is told by the points that it was learnt from."""
+
+
+def to_point_model(found: ErrorMap, sensor: str, source: str) -> dict[str, Any]:
+    """What a corrector needs of an error map; a map that is not confirmed is none.
+
+    Parameters
+    ----------
+    found : ErrorMap
+    sensor : str
+        Whose poses are to be corrected.
+    source : str
+        Where the points are from.
+    """
+    turn = Rotation.from_matrix(found.rotation).as_rotvec(degrees=True)
+    frames = {
+        'sensor': sensor,
+        'registration_rotation_deg': turn.tolist(),
+        'registration_translation_m': found.translation.tolist(),
+    }
+    effects = [{'name': 'hand_eye', 'parameters': frames, 'uncertainty': {}}]
+    if found.is_confirmed:
+        shape, moved = found.shape, found.correction(found.places)
+        parameters = {
+            'sensor': sensor, 'kind': SMOOTH, 'trend': shape.trend, 'length_m': shape.length_m,
+            'noise': shape.noise, 'rms_m': float(np.sqrt(np.mean(np.sum(moved**2, axis=1)))),
+            'places_m': found.places.tolist(), 'errors_m': found.errors.tolist(),
+        }  # fmt: skip
+        effects.append({'name': FieldDistortion.name, 'parameters': parameters, 'uncertainty': {}})
+    best = found.after if found.is_confirmed else found.before
+    return {
+        'schema': MODEL_SCHEMA,
+        'provenance': {'points': source},
+        'held_out_position_rmse_m': best.whole,
+        'held_out_orientation_rmse_rad': float(np.pi),  # points tell nothing of it
+        'support': {
+            'low_m': found.places.min(axis=0).tolist(),
+            'high_m': found.places.max(axis=0).tolist(),
+        },
+        'effects': effects,
+    }
+
+
+def smooth_map(record: EffectRecord) -> PositionMap:
+    """The map of a record: what is added to tracked positions.
+
+    Raises
+    ------
+    EffectError
+        When a parameter is missing.
+    """
+    places, errors = (
+        np.asarray(needed(record, key), dtype=np.float64).reshape(-1, 3)
+        for key in ('places_m', 'errors_m')
+    )
+    values = [needed(record, key) for key in ('trend', 'length_m', 'noise')]
+    shape = Shape(int(values[0]), float(values[1]), float(values[2]))
+    return PositionMap(places, errors, shape)
