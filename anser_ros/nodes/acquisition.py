@@ -51,7 +51,6 @@ from anser_ros.wire.records import (
     ReplyCode,
     SampleBlock,
     Start,
-    Stop,
 )
 from anser_ros.wire.setup import Setup, dump_setup, parse_setup
 from anser_ros.wire.stream_control import StreamControl
@@ -68,8 +67,6 @@ FEW_BLOCKS = 4
 and the work on those before is not over when it comes; more, and that of the second time isn't."""
 WAIT_S = 0.1
 """Longest wait for blocks, s: how late the end of the node or a change is noticed in a silence."""
-GOODBYE_S = 0.1
-"""Time, s, that the last messages get to leave before the process ends."""
 
 
 class Acquisition(AnserNode):
@@ -125,8 +122,7 @@ class Acquisition(AnserNode):
         while not self._closing.is_set():
             step()
         if self._port is not None:
-            self._port.send(Stop())
-            time.sleep(GOODBYE_S)
+            self._port.end_stream()
             self._port.stop()
 
     def _step(self) -> None:
@@ -318,10 +314,8 @@ class Acquisition(AnserNode):
     def farewell(self) -> None:
         """Tell the control unit to stop, whatever the other threads are at."""
         self._closing.set()
-        port = self._port
-        if port is not None:
-            port.send(Stop())
-            time.sleep(GOODBYE_S)
+        if self._port is not None:
+            self._port.end_stream()
 
     def status(self) -> Status:
         """State of the port and the stream."""

@@ -18,12 +18,7 @@ from std_srvs.srv import SetBool, Trigger
 from anser_ros.errors import AnserError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
-from anser_ros.integrity.withheld import (
-    OTHER_MODEL,
-    REFERENCES_LOST,
-    TWO_SOURCES,
-    UNCALIBRATED,
-)
+from anser_ros.integrity import withheld as why
 from anser_ros.nodes import qos, refit_status
 from anser_ros.nodes.diagnostics import Trouble
 from anser_ros.nodes.field_model_parameters import FieldModelParameters
@@ -217,9 +212,9 @@ class FieldModelNode(AnserNode):
         is the state for which trackers are to give no pose, or not for long.
         """
         if self._unfit or self._place.misplaced:
-            withheld = OTHER_MODEL
+            withheld = why.OTHER_MODEL
         elif not withheld and self._is_uncalibrated:
-            withheld = UNCALIBRATED
+            withheld = why.UNCALIBRATED
         self._stamp_ns = stamp_ns if stamp_ns != self._stamp_ns else stamp_ns + 1
         self._output.publish(model, self._frame_id, self._stamp_ns, self._follows, withheld)
         if model is not self._model:
@@ -284,7 +279,7 @@ class FieldModelNode(AnserNode):
         self._trouble.forget()
         self._output.name_origin(base)
         # As after a reset: it is no answer of the references.
-        state = REFERENCES_LOST if self._follows else ''
+        state = why.REFERENCES_LOST if self._follows else ''
         self._serve(base, self.get_clock().now().nanoseconds, state)
 
     # Services -----------------------------------------------------------------------------
@@ -296,7 +291,7 @@ class FieldModelNode(AnserNode):
             self._refit.reset()
         self._result = None
         # It is no answer of the references: trackers wait for the next one.
-        state = REFERENCES_LOST if self._follows else ''
+        state = why.REFERENCES_LOST if self._follows else ''
         self._serve(self._base, self.get_clock().now().nanoseconds, state)
         response.success, response.message = True, 'the model is the one from the start'
         return response
@@ -352,11 +347,11 @@ class FieldModelNode(AnserNode):
         values: dict[str, object] = {'last_refusal': self._trouble.last}
         said = said_of(self._sources)
         if said:
-            return Status('', Level.ERROR, f'{TWO_SOURCES}: {said}', values)
+            return Status('', Level.ERROR, f'{why.TWO_SOURCES}: {said}', values)
         if self._unfit:
-            return Status('', Level.ERROR, f'{OTHER_MODEL}: {self._trouble.last}', values)
+            return Status('', Level.ERROR, f'{why.OTHER_MODEL}: {self._trouble.last}', values)
         if self._place.misplaced:
-            return Status('', Level.ERROR, f'{OTHER_MODEL}: {self._place.misplaced}', values)
+            return Status('', Level.ERROR, f'{why.OTHER_MODEL}: {self._place.misplaced}', values)
         if model is None:
             return Status('', Level.WARN, self._trouble.last or 'no setup yet', values)
         values |= {
@@ -368,7 +363,7 @@ class FieldModelNode(AnserNode):
         }
         activity = self._activity(values)
         if self._is_uncalibrated:
-            activity = f'{UNCALIBRATED}: calibrate, or set allow_uncalibrated; {activity}'
+            activity = f'{why.UNCALIBRATED}: calibrate, or set allow_uncalibrated; {activity}'
         dead = '' if self._frames is None else ', '.join(self._frames.dead)
         values['dead_emitters'] = dead
         if dead:
@@ -378,7 +373,7 @@ class FieldModelNode(AnserNode):
             return Status('', Level.WARN, f'{activity}; lately: {trouble}', values)
         silent_s = time.monotonic() - self._heard_s
         if self._follows and silent_s > self._longest_s:
-            said = f'{REFERENCES_LOST}: no reference fluxes for {silent_s:.1f} s'
+            said = f'{why.REFERENCES_LOST}: no reference fluxes for {silent_s:.1f} s'
             return Status('', Level.ERROR, said, values)
         is_troubled = values.get('refit_state') in refit_status.TROUBLED
         is_troubled |= bool(self._no_baseline and self.parameters.refit)
@@ -391,9 +386,8 @@ class FieldModelNode(AnserNode):
         return math.inf if setup is None else setup.refit.references_age_s
 
     def _activity(self, values: dict[str, object]) -> str:
-        wanted = self.parameters.refit
-        if self._frozen or not wanted or self._refit is None:
-            return refit_status.rest_words(self._frozen, wanted, self._no_baseline)
+        if self._frozen or self._refit is None or not self.parameters.refit:
+            return refit_status.rest_words(self._frozen, self.parameters.refit, self._no_baseline)
         values |= refit_status.refit_values(self._result)
         return refit_status.refit_words(self._result, self._no_baseline)
 

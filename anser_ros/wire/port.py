@@ -20,9 +20,11 @@ from serial.tools import list_ports
 
 from anser_ros.errors import PortError
 from anser_ros.wire.protocols import ANSER, SerialProtocol
-from anser_ros.wire.records import Hello, Payload, Record, SampleBlock
+from anser_ros.wire.records import Hello, Payload, Record, SampleBlock, Stop
 from anser_ros.wire.serial_line import cause_of, close_line, open_line, receiver_of
 
+GOODBYE_S = 0.1
+"""Time, s, that the last messages get to leave before the process ends."""
 DEFAULT_BAUD = 12_000_000
 """Baud rate of the port; USB devices ignore it."""
 _COMMANDS = 64
@@ -140,6 +142,11 @@ class ControlUnitPort:
             raise PortError(f'the port {self.device} was started before')
         self._thread = threading.Thread(target=self._run, name='control_unit_port', daemon=True)
         self._thread.start()
+
+    def end_stream(self) -> None:
+        """Tell the control unit to stop, and give the message time to leave."""
+        self.send(Stop())
+        time.sleep(GOODBYE_S)
 
     def stop(self, timeout_s: float = 1.0) -> None:
         """End the reader thread and close the port."""
