@@ -36,10 +36,12 @@ from domain_pool import DomainPool
 REPO = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get('ANSER_SHARED', REPO.parent / 'shared'))
 STOP_TIMEOUT_S = 5.0
-CHAINS = ('unit', 'recording')
-"""What feeds the chain of nodes of a test."""
-PLAYED = ('test_main_job', 'test_refit_live', 'test_replay', 'test_watcher')
-"""Files of chains of nodes that a recording feeds, about half the time of all chains."""
+CHAINS = ('alone', 'recording', 'unit')
+"""Tests that take the machine alone, and chains of nodes by what feeds them, in this order: who
+takes the machine waits for the tests that run, and at the beginning these are few and short."""
+PLAYED = ('test_replay', 'test_main_job', 'test_refit_live', 'test_watcher')
+"""Files of chains of nodes that a recording feeds, about half the time of all chains; the first
+one's tests are short."""
 
 
 # What was started since the last test ended; Python tells of each at the moment of its start.
@@ -60,7 +62,7 @@ sys.addaudithook(_note_start)
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile the kernels before two workers and the nodes of their tests each compile them."""
+    """Compile the kernels before all workers and the nodes of their tests compile them."""
     if session.config.getoption('numprocesses', None):
         command = [sys.executable, '-P', '-m', 'anser_ros.cli.main', 'warm_up']
         subprocess.run(command, cwd=REPO, check=True, stdout=subprocess.DEVNULL)
@@ -69,10 +71,10 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 def pytest_itemcollected(item: pytest.Item) -> None:
     """Mark a test that takes a ROS domain, and name the group that one worker takes as a whole.
 
-    Of three workers two take the tests whose nodes are processes, which mostly wait, and the third
-    the files that calculate: so two chains of nodes run at a time, one that a simulated unit feeds
-    and one that a recording does, and a file's fixtures are made once. Nodes in the test's own
-    process do what the test says, and count as calculation.
+    Of three workers one begins with the tests that need the machine alone, and then calculates;
+    two take the tests whose nodes are processes, which mostly wait: so two chains of nodes run at
+    a time, one that a simulated unit feeds and one that a recording does, and a file's fixtures
+    are made once. Nodes in the test's own process do what the test says: calculation.
     This must be done as soon as a test is known: later, pytest-xdist has read the groups already.
     """
     if _has_nodes(item):
@@ -88,12 +90,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Shuffle if asked to; of several workers' tests put chains of nodes and long files first.
+    """Shuffle if asked to; of several workers' tests put `CHAINS` and long files first.
 
     Last come the files whose nodes leave the machine to others, for whichever worker is free.
     """
     seed = config.getoption('shuffle')
-    if seed is not None:
+    if seed is None:
+        items.sort(key=lambda item: item.path.stem != PLAYED[0])
+    else:
         rng = random.Random(seed)
         files = list(dict.fromkeys(item.path for item in items))
         rng.shuffle(files)
@@ -101,8 +105,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items.sort(key=lambda item: files.index(item.path))  # its fixtures are made once
     if 'PYTEST_XDIST_WORKER' in os.environ:
         long = {_room(item) for item in items if item.get_closest_marker('long')}
-        chains = ('', *CHAINS)
-        items.sort(key=lambda i: (-chains.index(_chain(i)), _is_light(i), _room(i) not in long))
+        chains = (*CHAINS, '')
+        items.sort(key=lambda i: (chains.index(_chain(i)), _is_light(i), _room(i) not in long))
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
@@ -121,7 +125,7 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """
     if 'PYTEST_XDIST_WORKER' not in os.environ:
         return (yield)
-    alone = item.get_closest_marker('realtime') is not None
+    alone = _takes_machine(item)
     shared = item.config._tmp_path_factory.getbasetemp().parent  # the workers' folders are in it
     with open(shared / 'gate.lock', 'w') as gate, open(shared / 'tests.lock', 'w') as lock:
         fcntl.flock(gate, fcntl.LOCK_EX)
@@ -130,14 +134,14 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
         return (yield)
 
 
-_begun: list[pytest.Item] = []
+_calculates: list[bool] = []
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Let a worker that begins with calculations give way to nodes that others have started."""
-    if 'PYTEST_XDIST_WORKER' in os.environ and not _begun and not _chain(item):
+    """Let a worker that goes over to calculations give way to nodes that others have started."""
+    if 'PYTEST_XDIST_WORKER' in os.environ and not _calculates and not _chain(item):
         os.nice(10)
-    _begun.append(item)
+        _calculates.append(True)
 
 
 def _has_nodes(item: pytest.Item) -> bool:
@@ -149,11 +153,17 @@ def _is_light(item: pytest.Item) -> bool:
 
 
 def _chain(item: pytest.Item) -> str:
-    """Return what feeds a test's nodes if they are other processes that ask much, or nothing."""
+    """Return which group of `CHAINS` a test is of; nothing where it mostly calculates."""
+    if _takes_machine(item):
+        return CHAINS[0]
     names = getattr(item, 'fixturenames', ())
     if not _has_nodes(item) or _is_light(item) or ('start' not in names and 'ros' in names):
         return ''
-    return CHAINS[item.path.stem in PLAYED]
+    return CHAINS[1 if item.path.stem in PLAYED else 2]
+
+
+def _takes_machine(item: pytest.Item) -> bool:
+    return item.get_closest_marker('realtime') is not None
 
 
 def _room(item: pytest.Item) -> str:
