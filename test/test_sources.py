@@ -12,6 +12,8 @@ from scipy.spatial.transform import Rotation
 from anser_ros.calibration.coaxial import coaxial, fit_coaxial
 from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows
 from anser_ros.calibration.layouts import Generator, Layout, place
+from anser_ros.calibration.sensor_survey import SensorSurveyor
+from anser_ros.calibration.survey_records import corrections
 from anser_ros.diagnosis import outlying
 from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.correction import Correction
@@ -26,6 +28,7 @@ from anser_ros.physics.sensor import SensorTable, clusters_of
 from anser_ros.physics.tracks import loop_field
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.sessions.starting_model import with_new_survey
+from anser_ros.settings import Accuracy
 from anser_ros.tracking.estimate import OK
 from anser_ros.tracking.source_track import seen_from
 from anser_ros.tracking.tracker import Tracker, TrackerSettings
@@ -123,6 +126,27 @@ class TestCoaxial:
         np.testing.assert_allclose(sites.positions[1], other.positions[0], atol=1e-6)
         np.testing.assert_allclose(np.abs(sites.directions[1]), [1.0, 0.0, 0.0], atol=1e-5)
         assert np.linalg.norm(sites.positions[0] - CENTRE) < 2e-3
+
+
+class TestPickup:
+    def test_a_constant_field_in_every_sensor_is_found_and_taken_off(self):
+        rng = np.random.default_rng(5)
+        measured = recorded(array_of_sensors(rng), rng, 60)
+        added = 5e-6 * rng.normal(size=(21, 1))
+        dirty = replace(measured, flux=measured.flux + added)
+        accuracy = Accuracy(
+            flux_noise_t=NOISE_T, optical_position_m=1e-5, optical_rotation_rad=1e-4
+        )
+        generator = Generator(np.zeros((1, 3)), np.zeros(1), 0.1)
+        found = SensorSurveyor([dirty], ('offsets',), generator, accuracy).fit()
+        assert set(found.evidence) == {'offsets'}
+        left = found.survey('array').pickup - added
+        assert np.sqrt(np.mean(np.abs(left) ** 2)) < 0.1 * np.sqrt(np.mean(added**2))
+        (record,) = (r for r in corrections(found) if r.name == 'sensor_pickup_spread')
+        assert record.parameters['spread'] == pytest.approx(5e-6 / np.sqrt(2.0), rel=0.4)
+        undone = Correction.of((record,), dirty.sensors, (1.0,))
+        flux = undone.flux(0.0, dirty.sensors.channel, dirty.flux[3])
+        np.testing.assert_allclose(flux, measured.flux[3] - left, atol=1e-12)
 
 
 class TestSymmetry:

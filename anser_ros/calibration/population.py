@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.calibration.sensor_parameters import (
-    EACH,
     POPULATIONS,
     PRIOR,
     USEFUL,
@@ -25,8 +24,8 @@ Index = NDArray[np.int64]
 
 ROUNDS = 40
 """Fixed-point steps of the widths; they settle within some ten."""
-NARROWEST = {'gains': 1e-6, 'axes': 1e-6, 'places': 1e-7}
-"""Least width of a population, in its own unit (relative, rad, m): no spread at all."""
+NARROWEST = {'gains': 1e-6, 'axes': 1e-6, 'places': 1e-7, 'offsets': 1e-9}
+"""Least width of a population, in its own unit (relative, rad, m, relative): no spread at all."""
 LEAST_EVIDENCE = 5.0
 """Gain of the log probability for which a kind of error is kept: odds of 150 to 1."""
 LEAST_SHARE = 0.01
@@ -176,12 +175,12 @@ class Population:
 
     def stand_alone(self, found: Posterior) -> bool:
         """Take channels far outside their population out of it; return whether there are any."""
-        changed = False
+        changed, each = False, self.parameters.each
         for kind in POPULATIONS:
             rows = self.parameters.rows(kind)
-            if kind not in self.parameters.kinds or rows.size < FEWEST * EACH[kind]:
+            if kind not in self.parameters.kinds or rows.size < FEWEST * each[kind]:
                 continue
-            rows = rows.reshape(-1, EACH[kind])
+            rows = rows.reshape(-1, each[kind])
             inside = ~np.isin(rows[:, 0], self.alone[kind])
             size = np.sqrt((found.values[rows] ** 2).mean(axis=1))
             if inside.sum() < FEWEST:

@@ -22,21 +22,25 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 KINDS = ('gains', 'axes', 'places', 'lever_arm', 'time_offset', 'clock_rate')
-POPULATIONS = ('gains', 'axes', 'places')
+EXTRA_KINDS = ('offsets',)
+"""Kinds that are estimated only when they are asked for: constant phasors of every channel, such
+as the field of the surroundings in magnetometers, which coils at tones of their own do not see."""
+POPULATIONS = ('gains', 'axes', 'places', 'offsets')
 """Kinds that every sensor has a value of: one population with one spread."""
 CLOCKS = ('time_offset', 'clock_rate')
 """Kinds that all bodies share."""
 EACH = {'gains': 2, 'axes': 2, 'places': 3}
-"""Parameters a sensor."""
+"""Parameters a sensor; offsets have the two parts of every emitter's phasor."""
 PRIOR = {
     'gains': 0.05, 'axes': 0.05, 'places': 5e-3, 'lever_arm': 5e-3,
-    'time_offset': 0.1, 'clock_rate': 3e-3,
+    'time_offset': 0.1, 'clock_rate': 3e-3, 'offsets': 0.3,
 }  # fmt: skip
-"""Standard deviation of each parameter before any data: relative, rad, m, m, s, s a second. They
+"""Standard deviation of each parameter before any data: relative, rad, m, m, s, s a second; offsets
+are relative to the fluxes' root mean square. They
 are wide for a tool that was built and surveyed at all, and only hold what the data leave open."""
 USEFUL = {
     'gains': 2e-3, 'axes': 5e-3, 'places': 2e-4, 'lever_arm': 2e-4, 'time_offset': 1e-3,
-    'clock_rate': 1e-4,
+    'clock_rate': 1e-4, 'offsets': 2e-3,
 }  # fmt: skip
 """Standard deviation, in the parameters' own units, beyond which a scan does not tell them: that
 much makes errors of some tenths of a millimetre, as a tool that was not calibrated has."""
@@ -66,6 +70,8 @@ class Survey:
         Shift of each sensor in the body's frame, m, without the lever arm.
     lever_arm : ndarray, shape (3,)
         Shift of all sensors in the body's frame, m.
+    pickup : ndarray, shape (S, K), complex
+        Added to each sensor's fluxes, T.
     offset_s, rate : float
         An optical stamp t counts as ``t (1 + rate) + offset_s``.
     """
@@ -74,6 +80,7 @@ class Survey:
     axis: Array
     place: Array
     lever_arm: Array
+    pickup: ComplexArray
     offset_s: float
     rate: float
 
@@ -86,7 +93,7 @@ class Survey:
         sensors = measurements.sensors
         out = replace(
             measurements,
-            flux=measurements.flux / self.gain[:, None],
+            flux=(measurements.flux - self.pickup) / self.gain[:, None],
             sensors=sensors.with_geometry(
                 sensors.position + self.place + self.lever_arm, self.axis
             ),
@@ -159,8 +166,13 @@ class SensorParameters:
         told = set(kinds) if all(is_followed(m) for m in measurements) else {*kinds} - {*CLOCKS}
         if not all(has_turned(m) for m in measurements):
             told -= {'lever_arm'}
-        self.asked = tuple(kind for kind in KINDS if kind in kinds)
-        self.kinds = tuple(kind for kind in KINDS if kind in told)
+        known = (*KINDS, *EXTRA_KINDS)
+        self.asked = tuple(kind for kind in known if kind in kinds)
+        self.kinds = tuple(kind for kind in known if kind in told)
+        self.emitters = int(measurements[0].flux.shape[2])
+        self.each = {**EACH, 'offsets': 2 * self.emitters}
+        power = [np.mean(np.abs(m.flux[m.usable]) ** 2) for m in measurements if m.usable.any()]
+        self.unit_t = float(np.sqrt(np.mean(power))) if power else 1.0
         self.bodies = list(dict.fromkeys(m.body for m in measurements))
         tables = {m.body: m.sensors for m in measurements}
         self.tables: list[SensorTable] = [tables[body] for body in self.bodies]
@@ -171,7 +183,7 @@ class SensorParameters:
         for body, table in zip(self.bodies, self.tables, strict=True):
             for kind in self.kinds:
                 if kind not in CLOCKS:
-                    self._add(kind, body, EACH[kind] * len(table) if kind in EACH else 3)
+                    self._add(kind, body, self.each[kind] * len(table) if kind in self.each else 3)
         for kind in self.kinds:
             if kind in CLOCKS:
                 self._add(kind, '', 1)
@@ -238,7 +250,7 @@ class SensorParameters:
         if (kind, body) not in self.slices:
             return None
         part = values[self.slices[kind, body]]
-        return part.reshape(-1, EACH[kind]) if kind in EACH else part
+        return part.reshape(-1, self.each[kind]) if kind in self.each else part
 
     def survey(self, body: str, values: Array) -> Survey:
         """Return the survey of a body's sensors for all parameters, shape (Q,)."""
@@ -256,7 +268,12 @@ class SensorParameters:
         for index, kind in enumerate(CLOCKS):
             if (part := self.of(kind, '', values)) is not None:
                 clock[index] = float(part[0])
-        return Survey(gain, axis, place, lever, clock[0] - clock[1] * self.middle_s, clock[1])
+        pickup = np.zeros((len(table), self.emitters), complex)
+        if (pairs := self.of('offsets', body, values)) is not None:
+            pickup = self.unit_t * (pairs[:, 0::2] + 1j * pairs[:, 1::2])
+        return Survey(
+            gain, axis, place, lever, pickup, clock[0] - clock[1] * self.middle_s, clock[1]
+        )
 
     def derivatives(
         self, part: Measurements, modelled: ComplexArray, by_place: ComplexArray,
@@ -286,6 +303,11 @@ class SensorParameters:
         if (own := self.slices.get(('gains', part.body))) is not None:
             out[:, each, own.start + 2 * each] = modelled
             out[:, each, own.start + 2 * each + 1] = 1j * modelled
+        if (own := self.slices.get(('offsets', part.body))) is not None:
+            for k in range(emitters):
+                column = own.start + 2 * (emitters * each + k)
+                out[:, each, column, k] = self.unit_t
+                out[:, each, column + 1, k] = 1j * self.unit_t
         if (own := self.slices.get(('axes', part.body))) is not None:
             surveyed = self.tables[self.bodies.index(part.body)].axis
             across = np.einsum('fij,stj->fsti', part.rotation, tangents(surveyed))

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from anser_ros.calibration.disturbances import spans_of
 from anser_ros.calibration.population import FAR
-from anser_ros.calibration.sensor_parameters import EACH, SensorParameters
+from anser_ros.calibration.sensor_parameters import SensorParameters
 from anser_ros.calibration.sensor_survey import SurveyResult
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord
@@ -19,6 +19,7 @@ SPREADS = {
     'gains': 'sensor_gain_spread',
     'axes': 'sensor_axis_spread',
     'places': 'sensor_place_spread',
+    'offsets': 'sensor_pickup_spread',
 }
 """Names of the populations' effects."""
 FEWEST_REFLECTED = 1e-3
@@ -28,6 +29,7 @@ FEWEST_REFLECTED = 1e-3
 UNITS = {
     'gains': (100.0, '%'), 'axes': (1e3, 'mrad'), 'places': (1e3, 'mm'),
     'lever_arm': (1e3, 'mm'), 'time_offset': (1e3, 'ms'), 'clock_rate': (1e6, 'ppm'),
+    'offsets': (100.0, '% of the fluxes'),
 }  # fmt: skip
 """Factor and unit in which each kind of parameter is told to people."""
 
@@ -116,16 +118,17 @@ def _clock(result: SurveyResult, sigma: Array) -> list[EffectRecord]:
 def _population(result: SurveyResult, kind: str) -> list[EffectRecord]:
     """The population's record, and one for each channel that stands outside it."""
     parameters, found = result.parameters, result.posterior
-    rows = parameters.rows(kind).reshape(-1, EACH[kind])
+    rows = parameters.rows(kind).reshape(-1, parameters.each[kind])
     sigma = np.sqrt(np.maximum(np.diag(found.covariance), 0.0))[rows]
-    values = found.values[rows].copy()
+    unit = parameters.unit_t if kind == 'offsets' else 1.0
+    values, sigma = unit * found.values[rows], unit * sigma
     channels = np.concatenate([table.channel for table in parameters.tables])
     alone = np.isin(rows[:, 0], result.alone[kind])
     records = [
         _single(parameters, kind, int(i), values[i], sigma[i]) for i in np.flatnonzero(alone)
     ]
     members = rows[~alone]
-    width = found.width[members[0]] if members.size else np.zeros(EACH[kind])
+    width = unit * found.width[members[0]] if members.size else np.zeros(parameters.each[kind])
     # A width is known as well as that many squares of Gaussian numbers tell.
     relative = 1.0 / np.sqrt(2.0 * max(members.size / (2 if kind == 'gains' else 1), 1.0))
     keep, listed = ~alone, values
@@ -169,6 +172,13 @@ def _single(
                 'phase_deg': float(np.degrees(np.angle(gain))),
             },
             {'gain': float(sigma[0]), 'phase_deg': float(np.degrees(sigma[1] / abs(gain)))},
+            evidence,
+        )
+    if kind == 'offsets':
+        return EffectRecord(
+            'pickup',
+            {'channel': channel, 'phasor_t': value.reshape(-1, 2).tolist()},
+            {'phasor_t': sigma.reshape(-1, 2).tolist()},
             evidence,
         )
     if kind == 'places':

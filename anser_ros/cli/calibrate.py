@@ -13,7 +13,7 @@ from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.document import to_document
 from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.result import Calibration
-from anser_ros.calibration.sensor_parameters import KINDS
+from anser_ros.calibration.sensor_parameters import EXTRA_KINDS, KINDS
 from anser_ros.cli.calibration_figure import draw_choice, draw_populations
 from anser_ros.cli.output import Result, check_file, loss_notes, make_folder, say
 from anser_ros.cli.progress import progress_of
@@ -59,7 +59,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--estimate', type=_kinds, default=KINDS, metavar='LIST',
         help='find these of sensors and clock together with the field, where the scan speaks for '
-        f'them; "none" takes all as the setup says; by default {",".join(KINDS)}',
+        f'them; "none" takes all as the setup says; by default {",".join(KINDS)}; '
+        f'{",".join(EXTRA_KINDS)} only when named',
     )  # fmt: skip
     parser.add_argument(
         '--damping', type=float, help='damping of the moments; chosen by held-out error by default'
@@ -78,9 +79,12 @@ def _kinds(text: str) -> tuple[str, ...]:
     if text == 'none':
         return ()
     kinds = tuple(part for part in text.split(',') if part)
-    unknown = [kind for kind in kinds if kind not in KINDS]
+    known = (*KINDS, *EXTRA_KINDS)
+    unknown = [kind for kind in kinds if kind not in known]
     if unknown or not kinds:
-        raise argparse.ArgumentTypeError(f'must be among {",".join(KINDS)}, got {text!r}')
+        raise argparse.ArgumentTypeError(
+            f'must be among {",".join((*KINDS, *EXTRA_KINDS))}, got {text!r}'
+        )
     return kinds
 
 

@@ -89,7 +89,7 @@ class SensorSpread(Effect[SpreadTerm]):
         """Spread, channels, and each channel's values with their uncertainty."""
         of_sigma = term.with_theta(sigmas(covariance))
         sigma = of_sigma.values.tolist()
-        values = (term.values + np.array(self.offset_of_values)).tolist()
+        values = (term.values + self._offset(term.values.shape[1])).tolist()
         return EffectRecord(
             self.name,
             {
@@ -99,16 +99,21 @@ class SensorSpread(Effect[SpreadTerm]):
             {'values': sigma},
         )  # fmt: skip
 
+    def _offset(self, width: int) -> Array:
+        """What the values of a sound channel are."""
+        return np.array(self.offset_of_values or (0.0,) * width)
+
     def term(self, record: EffectRecord) -> SpreadTerm:
         """From the channels and their values."""
         channels = tuple(int(channel) for channel in needed(record, 'channels'))
         values = np.asarray(needed(record, 'values'), dtype=np.float64)
-        if values.shape != (len(channels), self.width) or len(set(channels)) != len(channels):
+        width = self.width or (values.shape[1] if values.ndim == 2 else 2)
+        if values.shape != (len(channels), width) or len(set(channels)) != len(channels):
             raise ModelFileError(
-                f'model: {record.name} needs {self.width} values for each of its '
+                f'model: {record.name} needs {width} values for each of its '
                 f'{len(channels)} channels, got {values.shape}'
             )
-        theta = (values - np.array(self.offset_of_values)).ravel()
+        theta = (values - self._offset(width)).ravel()
         spread = float(record.parameters.get('spread', 0.0))
         shared = float(record.parameters.get('shared', 0.0))
         return SpreadTerm(self, {}, theta, members=channels, spread=spread, shared=shared)
@@ -219,4 +224,21 @@ class SensorPlaceSpread(SensorSpread):
         return sensors.with_geometry(position=sensors.position + term.of(sensors.channel))
 
 
-EFFECTS = (SensorGainSpread(), SensorAxisSpread(), SensorPlaceSpread())
+class SensorPickupSpread(SensorSpread):
+    """Values are the real and imaginary part of each emitter's phasor in each channel, T."""
+
+    name = 'sensor_pickup_spread'
+    summary = 'a constant phasor of its own is added to every channel'
+    units: ClassVar[Mapping[str, str]] = {'spread': 'T', 'channels': '1', 'values': 'T'}
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'spread': (0.0, 1.0)}
+    remedy = Remedy.FLUX
+
+    def offset(
+        self, term: SpreadTerm, channels: NDArray[np.int64], emitters: int
+    ) -> ComplexArray | None:
+        """The phasors."""
+        parts = term.of(channels)
+        return np.asarray(parts[:, 0::2] + 1j * parts[:, 1::2])
+
+
+EFFECTS = (SensorGainSpread(), SensorAxisSpread(), SensorPlaceSpread(), SensorPickupSpread())
