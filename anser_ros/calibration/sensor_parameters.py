@@ -35,9 +35,9 @@ PRIOR = {
     'gains': 0.05, 'axes': 0.05, 'places': 5e-3, 'lever_arm': 5e-3,
     'time_offset': 0.1, 'clock_rate': 3e-3, 'offsets': 0.3,
 }  # fmt: skip
-"""Standard deviation of each parameter before any data: relative, rad, m, m, s, s a second; offsets
-are relative to the fluxes' root mean square. They
-are wide for a tool that was built and surveyed at all, and only hold what the data leave open."""
+"""Standard deviation of each parameter before any data: relative, rad, m, m, s, s a second;
+offsets are relative to the fluxes' root mean square. They are wide for a tool that was built and
+surveyed at all, and only hold what the data leave open."""
 USEFUL = {
     'gains': 2e-3, 'axes': 5e-3, 'places': 2e-4, 'lever_arm': 2e-4, 'time_offset': 1e-3,
     'clock_rate': 1e-4, 'offsets': 2e-3,
