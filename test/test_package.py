@@ -181,6 +181,7 @@ class TestConsole:
     def test_every_command_that_writes_says_that_it_makes_folders(self, name, capsys):
         assert cli.main([name, '--help']) == 0
         words = ' '.join(capsys.readouterr().out.split())
+        assert 'example' in words
         assert 'made if missing' in words or '--out' not in words
 
     def test_help(self, verb, capsys):

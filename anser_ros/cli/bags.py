@@ -37,6 +37,7 @@ and 0.4 mrad each."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.epilog = 'example: anser bags --out bags/'
     parser.add_argument('--setup', type=Path, default=Path('config/demo_setup.yaml'))
     parser.add_argument(
         '--out', type=Path, default=Path('bags'), metavar='DIR',

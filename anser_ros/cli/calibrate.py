@@ -150,7 +150,7 @@ def _options(args: argparse.Namespace) -> Options:
 def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
     table = Table(title='calibration', show_header=False)
     held_out = calibration.held_out
-    rows = (
+    rows: tuple[tuple[str, str], ...] = (
         ('readings an emitter', f'{document["n_measurements"]}'),
         ('dipoles', calibration.layout.describe()),
         ('damping', f'{calibration.damping:g}'),
@@ -160,6 +160,11 @@ def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
         ("the field model's own error, T", f'{held_out.flux_error_t:.3g}'),
         ('noise, T a component', f'{calibration.fit.noise_t:.3g}'),
     )
+    if optical := document['optical_noise']:
+        told = (
+            f'{1e3 * optical["position_m"]:.3f} mm, {57.29578 * optical["rotation_rad"]:.4f} deg'
+        )
+        rows += (('optical jitter a component, at most', told),)
     for name, value in rows:
         table.add_row(name, value)
     for effect in calibration.model.effects:

@@ -48,6 +48,7 @@ SHARED_TOPICS = ('setup', 'tool/flux', 'reference/flux')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command line of the demo."""
+    parser.epilog = 'example: anser demo --duration 30'
     parser.add_argument(
         '--duration', type=float, default=30.0, metavar='S', help='time from the first pose on'
     )

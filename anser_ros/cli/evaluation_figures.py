@@ -124,6 +124,7 @@ def by_coil(evaluation: Evaluation) -> Figure:
             panel.vlines(middle, row - 0.3, row + 0.3, color='C1', lw=2)
         panel.set(xlabel=unit)
         panel.set_xlim(left=0.0)
+        panel.locator_params(axis='x', nbins=5)
         panel.grid(alpha=0.3, axis='x')
     panels[0].set_yticks(np.arange(1, len(found) + 1), list(found))
     panels[0].invert_yaxis()

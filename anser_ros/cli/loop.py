@@ -41,6 +41,7 @@ effect."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.epilog = 'example: anser loop --effect coil_gain --seed 31'
     known = ', '.join(sorted(CATALOGUE))
     parser.add_argument(
         '--effect', nargs='+', default=[RANDOM], metavar='NAME',

@@ -77,6 +77,7 @@ SCHEMA = 'anser_measured/1'
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.epilog = 'example: anser measured anser_board --out measured/'
     parser.add_argument(
         'datasets',
         nargs='*',

@@ -35,6 +35,7 @@ SHOWN = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.epilog = 'example: anser paper --simulate --out paper/'
     parser.add_argument(
         '--sessions',
         type=Path,

@@ -168,5 +168,6 @@ def _bland_altman(state: PoseState) -> Figure:
         for line in (middle - spread, middle, middle + spread):
             panel.axhline(line, color='0.4', lw=0.8)
         panel.set(xlabel=f'{name}, mm')
+        panel.locator_params(axis='x', nbins=5)
     panels[0].set_ylabel('tracked less optical, mm')
     return figure

@@ -33,6 +33,7 @@ PACKAGE = 'anser_ros.'
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command line, which has no options."""
+    parser.epilog = 'example: anser warm_up'
 
 
 def run(_args: argparse.Namespace) -> int:
