@@ -71,6 +71,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help='reference sensors that the refit may use; the others count as not there',
     )
     parser.add_argument(
+        '--witnesses',
+        action='store_true',
+        help='let a refit heed what the coils of rigid tools contradict; for few references',
+    )
+    parser.add_argument(
         '--patch',
         action='append',
         default=[],
@@ -129,6 +134,8 @@ def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result
         return evaluate_pose_session(args)
     need_model(args)
     session = load_session(args.session).with_stated(stated_values(args))
+    if args.witnesses and not args.refit:
+        raise ParameterError('--witnesses tell a refit of metal; they need --refit')
     if args.references is not None:
         if not args.refit:
             raise ParameterError('--references chooses those of a refit; it needs --refit')
@@ -144,6 +151,7 @@ def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result
         refit=args.refit,
         in_phase=args.in_phase,
         patches=parse_patches(args.patch),
+        witnesses=args.witnesses,
         progress=lambda share: tell('tracking', share),
     )
     document = to_document(evaluation)

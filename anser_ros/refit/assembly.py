@@ -13,6 +13,7 @@ from anser_ros.refit.evidence import FrameEvidence
 from anser_ros.refit.layer import Layer, component_rows
 from anser_ros.refit.modes import ErrorLevel, PosteriorModes, error_level, error_modes
 from anser_ros.refit.posterior import Bank, make_room
+from anser_ros.refit.witness import Witness
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -119,6 +120,7 @@ class Assembly:
         phase: ComplexArray,
         unit: float,
         n_modes: int,
+        witness: Witness | None = None,
     ) -> FieldModel:
         """Return the refitted model of one frame.
 
@@ -139,6 +141,8 @@ class Assembly:
         unit : float
             T of a noise unit.
         n_modes : int
+        witness : Witness, optional
+            What tools told of the hypotheses' errors.
         """
         active = [h for h in np.flatnonzero(weights > NEGLIGIBLE).tolist() if h > 0]
         layers = {layer.name: layer for layer in (bank.prior(h).layer for h in active)}
@@ -147,10 +151,12 @@ class Assembly:
         moments[: len(self.base.moments)] = self.base.moments * (1.0 + drift)
         scale = phase * unit
         parts = {h: bank.moments(seen, h) * scale for h in active}
+        if witness is not None:
+            parts |= {h: part + witness.moments(bank, h) * scale for h, part in parts.items()}
         for h, part in parts.items():
             moments[place.rows(bank, h)] += weights[h] * part
         change = _Change(stamp_ns, bank, seen, weights, parts, scale, place)
-        modes, rest = self._uncertainty(change, typical, n_modes)
+        modes, rest = self._uncertainty(change, typical, n_modes, witness)
         return replace(
             self.base,
             positions=place.positions,
@@ -160,7 +166,9 @@ class Assembly:
             flux_error_t=rest,
         )
 
-    def _uncertainty(self, change: '_Change', typical: float, n_modes: int) -> Uncertainty:
+    def _uncertainty(
+        self, change: '_Change', typical: float, n_modes: int, witness: Witness | None = None
+    ) -> Uncertainty:
         """Return all modes and the remaining error, unchanged for a while to spare receivers."""
         bank, place, weights = change.bank, change.place, change.weights
         ranked = sorted(change.parts, key=lambda h: -float(weights[h]))
@@ -174,9 +182,15 @@ class Assembly:
         key = (bank.rows.tobytes(), names, level, steps, place.name)
         self._count += 1
         kept = self._whole.get(key)
-        if kept is not None and self._count - kept[0] < KEEP_FRAMES:
+        if witness is None and kept is not None and self._count - kept[0] < KEEP_FRAMES:
             return kept[1]
         inflation = INFLATION_STEP**steps
+        if witness is not None:
+            own, rest = change.modes(witness.modes(bank, best, n_modes - 1), best, n_modes)
+            own, rest = own * inflation, rest * inflation
+            if rival is not None:
+                own[-1] += np.sqrt(weights[best] * weights[rival]) * change.between(best, rival)
+            return self._with_base(own, rest)
         errors = self._error(change, best, level, n_modes - 1)
         if errors is None:
             if self._interim is None or self._interim[0] != key:

@@ -7,7 +7,7 @@ figures, and what was tried and left.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 
 import numpy as np
@@ -42,6 +42,8 @@ from anser_ros.refit.result import (
 )
 from anser_ros.refit.slots import SLOTS, BodySlots
 from anser_ros.refit.tables import build_tables
+from anser_ros.refit.tool_readings import ToolReading
+from anser_ros.refit.witness import Witness
 from anser_ros.settings import RefitSettings
 
 Array = NDArray[np.float64]
@@ -100,6 +102,7 @@ class LiveRefit:
         self.baseline = checked_baseline(model, references, baseline)
         self._row_noise = _checked_noise(noise, len(references), len(model.emitters))
         self._tables = build_tables(model, references, self.settings, drawing, volume)
+        self._witness: Witness | None = None
         self._prepare()
         self.reset()
         self._warm_up()
@@ -148,6 +151,8 @@ class LiveRefit:
         for _, slots in self._banks.values():
             slots.clear()
         self._assembly.forget()
+        if self._witness is not None:
+            self._witness.forget()
         self._last_ns = 0
         self._last_model = self.model
 
@@ -352,11 +357,16 @@ class LiveRefit:
             drift[~sure] = 0.0
         model, state, reason = self.model, FROZEN, ''
         unit = self.settings.accuracy.flux_noise_t
+        if self._witness is not None:
+            if moving:
+                self._witness.predict(stamp_ns, bank, seen, weights, drift)
+            else:
+                self._witness.forget()
         if moving or sure.any():
             phase = self._tables.excitation.phase
             model = self._assembly.model(
                 stamp_ns, bank, seen, weights, drift, typical, phase, unit,
-                self.settings.error_modes,
+                self.settings.error_modes, self._witness if moving else None,
             )  # fmt: skip
             state = REFIT
         if self._watch.is_outvoted:
@@ -383,6 +393,32 @@ class LiveRefit:
             )
         )
 
+    def heed_tools(self, flux_noise_t: float) -> None:
+        """From now on let `witnessed` have a say; the noise is of the tools' components, T."""
+        self._witness = Witness(self._tables, self.model, self.settings.tools, flux_noise_t)
+
+    def witnessed(self, readings: Sequence[ToolReading]) -> None:
+        """Take in what tools read in the last frame, after its poses have been given.
+
+        So the poses of the next frame know of it, and no reading counts twice.
+        """
+        if self._witness is None:
+            return
+        if self._weights[0] >= NOTHING:
+            self._witness.learn(readings)
+            return
+        bank, _ = self._bank()
+        told = self._witness.update(readings)
+        if not told:
+            return
+        gain = np.full(len(self._weights), -np.inf)
+        for h, name in enumerate(bank.names):
+            if name in told:
+                gain[h] = told[name]
+        weights = self._weights * np.exp(gain - gain.max())
+        if weights.sum() > 0.0:
+            self._weights = weights / weights.sum()
+
     def _finish(self, result: RefitResult) -> RefitResult:
         self._last_model = result.model
         return result
@@ -391,6 +427,8 @@ class LiveRefit:
         """Return to the calibrated model, which is no answer: nobody knows where metal is."""
         self._weights = _fresh_weights(len(self._weights))
         self._average.forget()
+        if self._witness is not None:
+            self._witness.forget()
         count = int(self._in_use().sum())
         need = self.settings.min_references
         self._distance = self._residual = np.empty(0)

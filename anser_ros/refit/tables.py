@@ -26,6 +26,7 @@ from anser_ros.refit.prior import (
     Response,
     build_prior,
 )
+from anser_ros.refit.reduced import ReducedPrior, reduced
 from anser_ros.refit.search import COARSE, body_factor
 from anser_ros.settings import RefitSettings
 
@@ -91,6 +92,18 @@ class RefitTables:
             np.array(self.frequencies_hz),
             self.settings.accuracy,
             np.random.default_rng([self.settings.seed, body]),
+        )
+
+    def reduced(self, prior: CloudPrior) -> ReducedPrior:
+        """Return a hypothesis of these tables, or a body of theirs, in few numbers."""
+        told = {p.name: response for (_, response, _), p in
+                zip(self.hypotheses, self.priors, strict=True)}  # fmt: skip
+        return reduced(
+            prior,
+            told.get(prior.name, BODY),
+            self.excitation.field(prior.cloud.positions),
+            np.array(self.frequencies_hz),
+            np.random.default_rng(self.settings.seed),
         )
 
 

@@ -53,6 +53,7 @@ def track_session(
     in_phase: bool = False,
     progress: Progress | None = None,
     patches: dict[str, str] | None = None,
+    witnesses: bool = False,
 ) -> Evaluation:
     """Track every tool sensor and body of a session at every frame, and compare with the optics.
 
@@ -74,6 +75,8 @@ def track_session(
         Called with the finished share, 0 to 1.
     patches : dict of str to str, optional
         Bodies that carry further reference coils, each with the topic of its poses in the bag.
+    witnesses : bool
+        Whether the refit also heeds what the coils of rigid tools contradict.
 
     Raises
     ------
@@ -84,7 +87,7 @@ def track_session(
     """
     used = in_phase_model(model) if in_phase else model
     prepared = prepare(session, used, baseline if refit else None)
-    follower = ModelFollower(prepared, patches) if refit else None
+    follower = ModelFollower(prepared, patches, witnesses) if refit else None
     tracked = track(prepared, settings, follower, in_phase, progress)
     return compare(prepared, tracked)
 

@@ -1,7 +1,10 @@
 """The field model that follows a recorded session's reference sensors, as it does live."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from anser_ros.errors import BagError, FitError
 from anser_ros.integrity.ageing import ModelAge, Standing
@@ -10,11 +13,14 @@ from anser_ros.refit.baseline import check_enough
 from anser_ros.refit.change import Pace
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.result import RefitResult
+from anser_ros.refit.tool_readings import ToolReading
 from anser_ros.sessions.baseline import Baseline
 from anser_ros.sessions.frames import FrameReadings, SessionFrame
 from anser_ros.sessions.patches import PatchFollower
 from anser_ros.sessions.prepared import PreparedSession
+from anser_ros.sessions.session import NANO, tracking_noise
 from anser_ros.sessions.volume import stated_volume
+from anser_ros.tracking.estimate import OK, PoseEstimate
 
 
 @dataclass
@@ -39,6 +45,8 @@ class ModelFollower:
         With references and a baseline.
     patches : dict of str to str, optional
         Bodies that carry further reference coils, each with the topic of its poses in the bag.
+    witnesses : bool
+        Whether what tools' coils contradict tells of metal, too.
 
     Attributes
     ----------
@@ -52,7 +60,12 @@ class ModelFollower:
         sensors, or when the session lacks what a patch needs.
     """
 
-    def __init__(self, prepared: PreparedSession, patches: dict[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        prepared: PreparedSession,
+        patches: dict[str, str] | None = None,
+        witnesses: bool = False,
+    ) -> None:
         session, baseline = prepared.session, prepared.baseline
         if session.reference is None:
             raise BagError(f'{session.path}: a refit needs reference fluxes, the session has none')
@@ -67,6 +80,12 @@ class ModelFollower:
             raise BagError(f'{baseline.path}: {error}') from error
         self._patches = PatchFollower(prepared, patches) if patches else None
         self._refit = self._patches or _refit_of(prepared, baseline)
+        self._prepared, self._heeds_tools = prepared, witnesses
+        if witnesses:
+            if not isinstance(self._refit, LiveRefit):
+                why = 'patches move' if patches else 'there are no reference sensors'
+                raise BagError(f'{session.path}: tools cannot be witnesses where {why}')
+            self._refit.heed_tools(tracking_noise(session.setup))
         self._pace = Pace()
         self._age = ModelAge(session.setup.refit.references_age_s, prepared.volume)
         self._result: RefitResult | None = None
@@ -86,6 +105,31 @@ class ModelFollower:
         if result is not None and result.withheld not in ('', REFERENCES_LOST):
             return Standing(standing.model, Withheld(result.withheld, result.reason))
         return standing
+
+    def witnessed(
+        self, stamp_ns: int, tools: FrameReadings, found: Sequence[PoseEstimate]
+    ) -> None:
+        """Let a frame's tools tell of metal, at the poses that were found for their bodies."""
+        if not self._heeds_tools or not isinstance(self._refit, LiveRefit):
+            return
+        correction, flux = self._prepared.correction, tools.flux
+        if correction.changes_flux:
+            time = (stamp_ns - self._prepared.session.start_ns) * NANO
+            flux = correction.flux(time, tools.channels, flux)
+        usable = (tools.flags == 0) & np.isfinite(flux).all(axis=1)
+        sensors, readings = correction.sensors(), []
+        for estimate in found:
+            if estimate.state != OK or estimate.rotation is None:
+                continue
+            table = sensors.of_body(estimate.name)
+            rows = np.array([np.flatnonzero(tools.channels == c)[0] for c in table.channel])
+            kept = np.flatnonzero(usable[rows])
+            readings.append(
+                ToolReading(
+                    table.select(kept), flux[rows[kept]], estimate.position, estimate.rotation
+                )
+            )
+        self._refit.witnessed(readings)
 
     def _follow(self, stamp_ns: int, reference: FrameReadings) -> None:
         """Take in one frame of the references."""

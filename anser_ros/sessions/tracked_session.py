@@ -90,6 +90,8 @@ def track(
             found = tracker.update(
                 frame.stamp_ns, seen.channels, seen.flux, seen.flags, standing.withheld
             )
+            if follower is not None:
+                follower.witnessed(frame.stamp_ns, seen, found)
             for estimate in found:
                 estimates.setdefault(estimate.name, []).append(estimate)
             for body, source in tracker.sources.items():

@@ -1,6 +1,7 @@
 """Fewer references: error, poses withheld and honesty against their number.
 
     python test/bench/bench_references.py [--counts 0,4] [--boards 3] [--seed 1] [--every 4]
+                                          [--witnesses] [--kinds approach,over]
 
 Recorded sessions are compared with the optical pose, which jitters by 0.12 mm. Scenes of the
 independent field world (`world/`: its boards, tools and metal, eight seconds each) have an exact
@@ -41,7 +42,8 @@ from anser_ros.sessions.session import Session, load_session  # noqa: E402
 
 COUNTS = (0, 2, 4, 8, 16, 32)
 KINDS = ('approach', 'sweep', 'beside', 'over', 'two_metals')
-SPAN_S = 8.0
+CLEAN_S, SPAN_S = 1.5, 8.0
+"""A scene's beginning, before most metal has come, and its middle; nothing is recorded between."""
 SIGMAS, GROSS_M = 3.0, 1e-3
 TARGETS = {
     ('approach', 'coils', 4): 0.6, ('approach', 'coils', 8): 0.25, ('approach', 'body', 0): 3.0,
@@ -83,7 +85,7 @@ def judged(series: Sequence[PoseSeries], jitter_m: float) -> dict[str, float]:
     }
 
 
-def of_recordings(counts: Sequence[int], every: int) -> Iterator[dict[str, Any]]:
+def of_recordings(counts: Sequence[int], every: int, witnesses: bool) -> Iterator[dict[str, Any]]:
     """Both online sessions, single coils and the body."""
     scan, paths = recordings()
     baseline = load_session(scan)
@@ -91,7 +93,11 @@ def of_recordings(counts: Sequence[int], every: int) -> Iterator[dict[str, Any]]
     for name in (name for name in paths if name.startswith('online/')):
         session = thinned(load_session(paths[name]), every)
         for count in counts:
-            found = track_session(few(session, count), model, baseline=baseline, refit=True)
+            found = track_session(
+                few(session, count), model, baseline=baseline, refit=True,
+                witnesses=witnesses and count > 0,
+            )  # fmt: skip
+
             for what, series in (('coils', found.sensors), ('body', found.bodies)):
                 figures = judged(list(series.values()), JITTER_M)
                 target = TARGETS.get((name.split('/')[1], what, count))
@@ -113,7 +119,9 @@ def scene(board: Any, kind: str, seed: Sequence[int], folder: Path) -> tuple[Ses
     getattr(scenarios, kind)(lab, rng)
     low, high = board.heights_m
     wander = Wander.drawn(rng, [-0.125, -0.125, low], [0.125, 0.125, high])
-    time = rng.uniform(8.0, 24.0) + np.arange(0.0, SPAN_S, 1.0 / recording.FLUX_HZ)
+    step = 1.0 / recording.FLUX_HZ
+    begin = np.arange(0.0, CLEAN_S, step)
+    time = np.concatenate([begin, rng.uniform(8.0, 24.0) + np.arange(0.0, SPAN_S, step)])
     position, rotation = wander.at(time)
     true = read_fluxes(lab, time, position, rotation)
     fluxes = measured(lab, time, true, FLUX_NOISE_T, rng)
@@ -133,7 +141,9 @@ def exact(session: Session, position: Any, rotation: Any) -> Session:
     return replace(session, tools=tools)
 
 
-def of_scenes(counts: Sequence[int], n_boards: int, seed: int) -> Iterator[dict[str, Any]]:
+def of_scenes(
+    counts: Sequence[int], n_boards: int, seed: int, witnesses: bool, kinds: Sequence[str] = KINDS
+) -> Iterator[dict[str, Any]]:
     """Scenes of other boards, tools and metal with exact truth."""
     totals: dict[tuple[int, str], list[dict[str, float]]] = {}
     with tempfile.TemporaryDirectory() as name:
@@ -147,13 +157,14 @@ def of_scenes(counts: Sequence[int], n_boards: int, seed: int) -> Iterator[dict[
             )
             baseline = load_session(scan)
             model = calibrate_sessions([baseline], Options(layout=LAYOUT, damping=1e-6)).model
-            for kind in KINDS:
+            for kind in kinds:
                 told = [seed, index, 2, *kind.encode()]
                 session = exact(*scene(board, kind, told, folder))
                 for count in counts:
                     found = track_session(
-                        few(session, count), model, baseline=baseline, refit=True
-                    )
+                        few(session, count), model, baseline=baseline, refit=True,
+                        witnesses=witnesses and count > 0,
+                    )  # fmt: skip
                     for what, series in (('coils', found.sensors), ('body', found.bodies)):
                         figures = judged(list(series.values()), 0.0)
                         totals.setdefault((count, what), []).append(figures)
@@ -181,9 +192,16 @@ def of_scenes(counts: Sequence[int], n_boards: int, seed: int) -> Iterator[dict[
 def rows(
     counts: Sequence[int] = COUNTS, n_boards: int = 2, seed: int = REPORTED_SEED, every: int = 1
 ) -> Iterator[dict[str, Any]]:
-    """All figures."""
-    yield from of_recordings(counts, every)
-    yield from of_scenes(counts, n_boards, seed)
+    """All figures, by the references alone and with the tools as witnesses."""
+    for witnesses, label in ((False, ''), (True, 'with witnesses, ')):
+        yield from named(label, of_recordings(counts, every, witnesses))
+        yield from named(label, of_scenes(counts, n_boards, seed, witnesses))
+
+
+def named(label: str, rows: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """Rows with a label before their names."""
+    for row in rows:
+        yield {**row, 'name': label + row['name']}
 
 
 def main() -> None:
@@ -193,12 +211,15 @@ def main() -> None:
     parser.add_argument('--boards', type=int, default=2, help='0: the recordings only')
     parser.add_argument('--seed', type=int, default=REPORTED_SEED)
     parser.add_argument('--every', type=int, default=1, help='frames; 0: the scenes only')
+    parser.add_argument('--kinds', default=','.join(KINDS), help='of metal, of the scenes')
+    parser.add_argument('--witnesses', action='store_true', help='the tools tell of metal, too')
     args = parser.parse_args()
     counts = [int(count) for count in args.counts.split(',')]
     parts = []
     if args.every:
-        parts.append(of_recordings(counts, args.every))
-    parts.append(of_scenes(counts, args.boards, args.seed))
+        parts.append(of_recordings(counts, args.every, args.witnesses))
+    kinds = args.kinds.split(',')
+    parts.append(of_scenes(counts, args.boards, args.seed, args.witnesses, kinds))
     for part in parts:
         for row in part:
             target = '' if row.get('target') is None else f'   (target {row["target"]:g})'

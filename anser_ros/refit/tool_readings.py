@@ -1,0 +1,143 @@
+"""What the coils of a rigid tool read, by its pose, by their own errors, and by nothing else.
+
+The readings of a tool's coils are compared at the pose that was found for it. The pose is free, so
+what a step or turn of the tool would make of them says nothing (`ToolRows.pose`). What is wrong
+with the coils themselves (gain, place and axis) is the same in every frame, and `CoilErrors`
+learns it from what no metal explains: a wrong gain must not be taken for metal.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.field.model import FieldModel
+from anser_ros.physics.dipole import flux_jacobian
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.references import tangents
+from anser_ros.settings import ToolSettings
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+FREE_M, FREE_RAD = 0.02, 0.2
+"""Error of the pose at which a tool's readings are compared: any that matters."""
+KEPT = 0.03
+"""Share of a tool's stated errors that is never learnt away."""
+SHARE = 0.1
+"""Weight of a frame from which a tool's errors are learnt: the model's own error hardly changes
+from one frame to the next."""
+
+
+@dataclass(frozen=True)
+class ToolReading:
+    """What the coils of one rigid tool read at a pose that was found for it.
+
+    Attributes
+    ----------
+    table : SensorTable
+        The S coils in the tool's frame.
+    flux : ndarray, shape (S, K), complex
+        T.
+    position, rotation : ndarray, shapes (3,), (3, 3)
+        Of the tool, m, frame fg.
+    """
+
+    table: SensorTable
+    flux: ComplexArray
+    position: Array
+    rotation: Array
+
+
+class CoilErrors:
+    """What is wrong with a tool's coils: gain, place and axis of each, learnt without metal.
+
+    Parameters
+    ----------
+    table : SensorTable
+        The S coils.
+    tools : ToolSettings
+        How well they are known before.
+    """
+
+    def __init__(self, table: SensorTable, tools: ToolSettings) -> None:
+        gain, place, axis = (
+            tools.tool_coil_gain, tools.tool_coil_position_m, tools.tool_coil_axis_rad
+        )  # fmt: skip
+        self.names = table.name
+        self._prior = np.maximum(
+            np.tile([gain, gain, place, place, place, axis, axis], len(table)), 1e-9
+        )
+        self._precision = np.diag(self._prior**-2.0)
+        self._told = np.zeros(len(self._prior))
+        self._solved: tuple[Array, Array] | None = None
+
+    @property
+    def posterior(self) -> tuple[Array, Array]:
+        """Mean (7 S,) and covariance of gain (re, im), place (3, m) and axis (2, rad)."""
+        if self._solved is None:
+            covariance = np.linalg.inv(self._precision)
+            mean = covariance @ self._told
+            covariance[np.diag_indices_from(covariance)] += (KEPT * self._prior) ** 2
+            self._solved = mean, covariance
+        return self._solved
+
+    def learn(self, white: Array, values: Array) -> None:
+        """Take in whitened readings (n,) that errors make by the matrix ``white`` (n, 7 S)."""
+        self._precision += SHARE * white.T @ white
+        self._told += SHARE * white.T @ values
+        self._solved = None
+
+
+@dataclass(frozen=True)
+class ToolRows:
+    """A tool's readings linearised at a pose, in noise units turned to the emitters' phases.
+
+    Attributes
+    ----------
+    at, axes : ndarray, shape (S, 3)
+        Places and axes of the coils, frame fg.
+    left : ndarray, shape (S K,), complex
+        What they read beyond the model.
+    pose : ndarray, shape (S K, 6), complex
+        By a large step or turn of the tool.
+    own : ndarray, shape (S K, 7 S), complex
+        By the errors of the coils, in the order of `CoilErrors`.
+    """
+
+    at: Array
+    axes: Array
+    left: ComplexArray
+    pose: ComplexArray
+    own: ComplexArray
+
+
+def linearised(
+    reading: ToolReading, model: FieldModel, moments: ComplexArray, turn: ComplexArray
+) -> ToolRows:
+    """Return a tool's readings beside those of a model's dipoles with some moments (N, K).
+
+    ``turn`` (K,) takes fluxes to noise units and to the emitters' phases.
+    """
+    table = reading.table
+    at, axes = table.placed(reading.position, reading.rotation)
+    flux, d_at, d_axis = flux_jacobian(
+        at, axes, table.length, model.positions, model.directions, moments
+    )
+    by_place, by_axis = d_at * turn, d_axis * turn
+    count, k = flux.shape
+    arm = at - reading.position
+    pose = np.empty((count, k, 6), dtype=complex)
+    for i, unit in enumerate(np.eye(3)):
+        pose[:, :, i] = FREE_M * by_place[:, i]
+        turned = np.einsum('sj,sjk->sk', np.cross(unit, arm), by_place)
+        turned += np.einsum('sj,sjk->sk', np.cross(unit, axes), by_axis)
+        pose[:, :, 3 + i] = FREE_RAD * turned
+    own = np.zeros((count, k, count, 7), dtype=complex)
+    across = np.einsum('ij,saj->sai', reading.rotation, tangents(table.axis))
+    for s in range(count):
+        own[s, :, s, 0], own[s, :, s, 1] = flux[s] * turn, 1j * flux[s] * turn
+        own[s, :, s, 2:5] = (reading.rotation.T @ by_place[s]).T
+        own[s, :, s, 5:7] = (across[s] @ by_axis[s]).T
+    left = ((reading.flux - flux) * turn).ravel()
+    return ToolRows(at, axes, left, pose.reshape(-1, 6), own.reshape(count * k, -1))

@@ -1,0 +1,287 @@
+"""Tools as witnesses of metal: what their coils contradict updates what the references leave open.
+
+The references tell a hypothesis' metal with an error that is known (`refit.posterior`). A tool
+that wanders through the field sees this error: of the readings of its coils a pose takes six
+numbers, and all others are left. They enter a Kalman filter over the coordinates of the error
+(`refit.reduced`), one filter a hypothesis, after the poses of their frame have been given: the
+next frame's poses are then independent of them, and nothing is counted twice.
+
+Metal moves slowly, and with it the error that the references make of it. So the error is a
+stationary process that is remembered for `MEMORY_S`; the references of every frame say anew how
+large it can be.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from anser_ros.field.model import FieldModel
+from anser_ros.physics.dipole import flux_basis
+from anser_ros.refit.evidence import STRENGTHS, FrameEvidence
+from anser_ros.refit.layer import component_rows
+from anser_ros.refit.modes import PosteriorModes
+from anser_ros.refit.posterior import Bank
+from anser_ros.refit.reduced import ReducedPrior
+from anser_ros.refit.tables import RefitTables
+from anser_ros.refit.tool_readings import CoilErrors, ToolReading, linearised
+from anser_ros.settings import ToolSettings
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+Floats = NDArray[np.floating[Any]]
+
+MEMORY_S = 2.0
+"""Time over which the references' error stays the same: with half a second errors are a tenth
+larger, with five no smaller (four references, the head at the board)."""
+ODD = 1.5
+"""Squared misfit of a tool's readings, over what is expected, from which they count less."""
+CONSIDERED = 1e-3
+"""Probability from which on a hypothesis has a filter."""
+ELSEWHERE = 0.1
+"""Weight of the whole volume beside the surroundings of the tools, where modes are chosen."""
+NEAR_M = 0.01
+"""How far around the coils that is, m."""
+SPARSE = 30
+"""Every so many of a layer's samples stand for the volume before a tool was seen."""
+_AROUND = np.array([[0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+NANO = 1e-9
+
+
+@dataclass
+class _Filter:
+    """The error of the references' posterior: mean (D, 2), covariance (2, D, D)."""
+
+    mean: Array
+    covariance: Array
+    prior: Array
+
+
+class Witness:
+    """The filters of all hypotheses that count.
+
+    Parameters
+    ----------
+    tables : RefitTables
+    model : FieldModel
+        Calibrated.
+    tools : ToolSettings
+        How well the tools are known.
+    flux_noise_t : float
+        Noise of a phasor component of the tools' readings, T.
+    """
+
+    def __init__(
+        self, tables: RefitTables, model: FieldModel, tools: ToolSettings, flux_noise_t: float
+    ) -> None:
+        self._tables, self._model, self._tools = tables, model, tools
+        self._noise = math.hypot(flux_noise_t, model.flux_error_t)
+        self._turn = tables.excitation.phase.conj() / tables.settings.accuracy.flux_noise_t
+        self._reduced: dict[str, ReducedPrior] = {}
+        self._tool_errors: dict[tuple[str, ...], CoilErrors] = {}
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget all that was seen."""
+        self._filters: dict[str, _Filter] = {}
+        self._last_ns, self._step_s = 0, 0.04
+        self._near: Array | None = None
+        self._frame: tuple[Bank, FrameEvidence, ComplexArray] | None = None
+
+    def _reduced_of(self, bank: Bank, hypothesis: int) -> ReducedPrior:
+        prior = bank.prior(hypothesis)
+        if prior.name not in self._reduced:
+            self._reduced[prior.name] = self._tables.reduced(prior)
+        return self._reduced[prior.name]
+
+    def predict(
+        self, stamp_ns: int, bank: Bank, seen: FrameEvidence, weights: Array, drift: ComplexArray
+    ) -> None:
+        """Take in what the references of a frame say."""
+        age = max(stamp_ns - self._last_ns, 0) * NANO
+        self._last_ns = stamp_ns
+        if 0.0 < age < MEMORY_S:
+            self._step_s = age
+        keep = math.exp(-age / MEMORY_S)
+        self._frame = bank, seen, drift
+        self._best = bank.names[1 + int(weights[1:].argmax())]
+        filters = {}
+        for h in np.flatnonzero(weights > CONSIDERED).tolist():
+            if h == 0:
+                continue
+            name = bank.prior(h).name
+            prior = self._posterior(bank, seen, h)
+            before = self._filters.get(name)
+            if before is None:
+                filters[name] = _Filter(np.zeros((prior.shape[1], 2)), prior.copy(), prior)
+                continue
+            growth = [
+                max(float(np.trace(now) / np.trace(old)), 1e-3)
+                for now, old in zip(prior, before.prior, strict=True)
+            ]
+            scaled = before.covariance * np.array(growth)[:, None, None]
+            covariance = keep**2 * scaled + (1.0 - keep**2) * prior
+            filters[name] = _Filter(keep * before.mean, covariance, prior)
+        self._filters = filters
+
+    def _posterior(self, bank: Bank, seen: FrameEvidence, h: int) -> Array:
+        """Return the covariance (2, D, D) that the references of a frame leave."""
+        reduced = self._reduced_of(bank, h)
+        across = reduced.cross[:, bank.rows] @ bank.bases[h]
+        out = np.empty((2, len(across), len(across)))
+        for part in range(2):
+            a = float(STRENGTHS[int(seen.strength[h, part].argmax())])
+            gain = a * a / (a * bank.spectra[h] + seen.noise**2)
+            out[part] = a * np.eye(len(across)) - (across * gain) @ across.T
+            out[part][np.diag_indices(len(across))] += 1e-9 * a
+        return out
+
+    def moments(self, bank: Bank, h: int) -> ComplexArray:
+        """Return what the tools add to a hypothesis' moments (N, K), in units of the noise."""
+        state = self._filters[bank.prior(h).name]
+        reduced = self._reduced_of(bank, h)
+        flat = reduced.basis.reshape(-1, len(state.mean)) @ state.mean
+        return np.asarray((flat @ np.array([1.0, 1.0j])).reshape(len(reduced.basis), -1))
+
+    def modes(self, bank: Bank, h: int, count: int) -> PosteriorModes:
+        """Return the principal modes of a hypothesis' error after the tools' readings.
+
+        They are those that are felt where tools were last, and what they leave is told there.
+        """
+        state = self._filters[bank.prior(h).name]
+        reduced = self._reduced_of(bank, h)
+        d, k = len(state.mean), bank.width
+        layer = bank.prior(h).layer
+        points = layer.points[::SPARSE] if self._near is None else self._near
+        weight = points[:, 2]
+        rows = component_rows(points, layer.positions, layer.directions)
+        rows = rows * np.repeat(weight / weight.mean(), 3)[:, None]
+        field = (rows @ reduced.basis.astype(float)).reshape(-1, d)
+        gram = field.T @ field
+        # What is felt elsewhere counts as well, a little: the tool moves on, others come.
+        gram += np.diag(ELSEWHERE * np.trace(gram) / (reduced.felt**2).sum() * reduced.felt**2)
+        root = np.linalg.cholesky(gram)
+        values, vectors = [], []
+        for part in range(2):
+            w, v = np.linalg.eigh(root.T @ state.covariance[part] @ root)
+            values.append(np.maximum(w[::-1][:count], 0.0))
+            vectors.append(solve_triangular(root.T, v[:, ::-1][:, :count]))
+        value, part_of = np.concatenate(values), np.repeat([0, 1], len(values[0]))
+        best = np.argsort(-value)[:count]
+        columns = np.concatenate(vectors, axis=1)[:, best] * np.sqrt(value[best])
+        moments = reduced.basis.reshape(-1, d) @ columns * np.where(part_of[best] == 0, 1.0, 1j)
+        left = 0.0
+        for part in range(2):
+            mine = columns[:, part_of[best] == part]
+            left += float((field @ (state.covariance[part] - mine @ mine.T) * field).sum())
+        rest = math.sqrt(max(left, 0.0) / (2.0 * len(field)))
+        shape = len(layer.positions), k, len(best)
+        return PosteriorModes(
+            np.ascontiguousarray(moments.reshape(shape).transpose(2, 0, 1)), rest
+        )
+
+    def learn(self, readings: Sequence[ToolReading]) -> None:
+        """Take in what tools read while there is no metal: whatever is odd is theirs."""
+        for reading in readings:
+            rows = linearised(reading, self._model, self._model.moments, self._turn)
+            errors = self._errors(reading)
+            for part in (np.real, np.imag):
+                pose, own, left = part(rows.pose), part(rows.own), part(rows.left)
+                factor = np.linalg.cholesky(self._noise_of(len(left)) + pose @ pose.T)
+                errors.learn(*_whitened(factor, own, left))
+
+    def update(self, readings: Sequence[ToolReading]) -> dict[str, float]:
+        """Take in what tools read in the frame of the last references.
+
+        Returns
+        -------
+        dict of str to float
+            Logarithm of the readings' likelihood under each hypothesis that has a filter.
+        """
+        if self._frame is None or not readings:
+            return {}
+        bank, seen, drift = self._frame
+        evidence = dict.fromkeys(self._filters, 0.0)
+        names = {name: h for h, name in enumerate(bank.names)}
+        # What stays wrong for as long as the memory lasts may count once in it, not every frame.
+        lasting = 1.0 + MEMORY_S / self._step_s
+        near = []
+        for reading in readings:
+            moments = self._model.moments * (1.0 + drift)
+            rows = linearised(reading, self._model, moments, self._turn)
+            errors = self._errors(reading)
+            mean, covariance = errors.posterior
+            parts = [(p(rows.pose), p(rows.own)) for p in (np.real, np.imag)]
+            noise = self._noise_of(len(rows.left))
+            factors = [
+                np.linalg.cholesky(noise + lasting * own @ covariance @ own.T + pose @ pose.T)
+                for pose, own in parts
+            ]
+            known = []
+            for name, state in self._filters.items():
+                h = names[name]
+                layer, length = bank.prior(h).layer, reading.table.length
+                basis = flux_basis(rows.at, rows.axes, length, layer.positions, layer.directions)
+                off = rows.left - (basis @ bank.moments(seen, h)).ravel()
+                told = basis @ self._reduced_of(bank, h).basis.astype(np.float64)
+                told = told.reshape(off.size, len(state.mean))
+                for i, (values, (pose, own)) in enumerate(
+                    zip((off.real, off.imag), parts, strict=True)
+                ):
+                    if name == self._best:
+                        open_metal = lasting * told @ state.covariance[i] @ told.T
+                        factor = np.linalg.cholesky(noise + open_metal + pose @ pose.T)
+                        known.append(
+                            _whitened(factor, own, np.asarray(values - told @ state.mean[:, i]))
+                        )
+                    rest = values - own @ mean
+                    evidence[name] += _kalman(state, i, factors[i], told, rest)
+            for white, values in known:
+                errors.learn(white, values)
+            near.append((rows.at[:, None] + NEAR_M * _AROUND).reshape(-1, 3))
+        self._near = np.concatenate(near)
+        return evidence
+
+    def _errors(self, reading: ToolReading) -> CoilErrors:
+        names = reading.table.name
+        if names not in self._tool_errors:
+            self._tool_errors[names] = CoilErrors(reading.table, self._tools)
+        return self._tool_errors[names]
+
+    def _noise_of(self, count: int) -> Array:
+        nominal = self._tables.settings.accuracy.flux_noise_t
+        return np.asarray((self._noise / nominal) ** 2 * np.eye(count))
+
+
+def _whitened(factor: Floats, rows: Floats, values: Floats) -> tuple[Array, Array]:
+    """Return rows (n, m) and values (n,) whose noise has the Cholesky factor given, made white."""
+    white = solve_triangular(factor, np.column_stack([rows, values]), lower=True)
+    return white[:, :-1], white[:, -1]
+
+
+def _kalman(state: _Filter, part: int, factor: Floats, rows: Floats, values: Floats) -> float:
+    """Update one part of a filter with readings; return their log likelihood.
+
+    Readings that contradict hypothesis and tool by more than `ODD` count as much less as they do.
+    """
+    a, z = _whitened(factor, rows, values)
+    mean, covariance = state.mean[:, part], state.covariance[part]
+    pa = covariance @ a.T
+    off = z - a @ mean
+    s = np.eye(len(z)) + a @ pa
+    chol = cho_factor(s, lower=True)
+    solved = cho_solve(chol, off)
+    misfit = float(off @ solved)
+    scale = misfit / len(z)
+    if scale > ODD:
+        s += (scale - 1.0) * np.eye(len(z))
+        chol = cho_factor(s, lower=True)
+        solved = cho_solve(chol, off)
+        misfit = float(off @ solved)
+    state.mean[:, part] = mean + pa @ solved
+    state.covariance[part] = covariance - pa @ cho_solve(chol, pa.T)
+    return -0.5 * misfit - float(np.log(np.diagonal(chol[0])).sum())

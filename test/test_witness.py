@@ -1,0 +1,154 @@
+"""Tools as witnesses of metal: what a rigid tool's coils contradict helps few references."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from refit_world import NOISE_T, anser_world, metal_block, metal_flux
+
+from anser_ros.cli.main import main
+from anser_ros.errors import BagError
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.live_refit import LiveRefit
+from anser_ros.refit.tool_readings import CoilErrors, ToolReading, linearised
+from anser_ros.sessions.chosen_references import with_references
+from anser_ros.sessions.evaluation import track_session
+from anser_ros.sessions.model_file import load_model
+from anser_ros.sessions.session import load_session
+from anser_ros.settings import RefitSettings, ToolSettings
+
+REPO = Path(__file__).resolve().parents[1]
+STEP_NS = 40_000_000
+FRAMES = 25
+METAL = metal_block([0.03, -0.02, -0.09], [0.1, 0.12, 0.06])
+"""Points whose answers do not touch each other, which is no cloud of the refit's."""
+
+pytestmark = pytest.mark.usefixtures('shared_tables')
+
+
+def tool(count: int = 9) -> SensorTable:
+    """Three clusters of three coils."""
+    return SensorTable(
+        channel=np.arange(count),
+        name=tuple(f'tool/{i}' for i in range(count)),
+        body=('tool',) * count,
+        position=np.repeat([[0, 0, -0.03], [0, 0, 0], [0, 0, 0.03]], 3, axis=0).astype(float),
+        axis=np.tile(np.eye(3), (3, 1)),
+        length=np.zeros(count),
+    )
+
+
+@pytest.fixture(scope='module')
+def world():
+    return anser_world(16)
+
+
+def few(world) -> LiveRefit:
+    """A refit to four coils."""
+    rows = [0, 4, 8, 12]
+    return LiveRefit(
+        world.model, world.references.select(rows), world.baseline[rows], RefitSettings(),
+        world.board.field,
+    )  # fmt: skip
+
+
+def flux_at(world, place, metal=METAL):
+    """The tool's fluxes (S, K) with its axes along those of fg, and its coils' places."""
+    at, axes = tool().placed(place, np.eye(3))
+    flux = world.model.flux(at, axes).astype(complex)
+    return (flux if metal is None else flux + metal_flux(world.board, metal, at, axes)), at, axes
+
+
+def way(frame: int) -> np.ndarray:
+    """Where the tool is."""
+    angle = 0.15 * frame
+    return np.array([0.05 * np.cos(angle), 0.05 * np.sin(angle), 0.14])
+
+
+def followed(world, witnesses: bool, gain=None, off_m: float = 0.0):
+    """Error of the field where the tool is over its change, the last frames of a walk."""
+    refit, rng = few(world), np.random.default_rng(4)
+    rows = [0, 4, 8, 12]
+    if witnesses:
+        refit.heed_tools(NOISE_T)
+    share, gain = [], np.ones(9) if gain is None else gain
+    for frame in range(2 * FRAMES):
+        metal = METAL if frame >= FRAMES else None
+        reading = world.baseline[rows] + world.noise(rng)[rows]
+        if metal is not None:
+            reading = reading + world.metal(metal)[rows]
+        result = refit.update((1 + frame) * STEP_NS, world.references.channel[rows], reading)
+        place = way(frame)
+        flux, at, axes = flux_at(world, place, metal)
+        if frame >= 2 * FRAMES - 5:
+            change = flux - world.model.flux(at, axes)
+            left = flux - result.model.flux(at, axes)
+            share.append(np.linalg.norm(left) / np.linalg.norm(change))
+        noise = NOISE_T * (rng.normal(size=(9, 8)) + 1j * rng.normal(size=(9, 8)))
+        told = place + off_m * rng.normal(size=3)
+        refit.witnessed([ToolReading(tool(), gain[:, None] * flux + noise, told, np.eye(3))])
+    return float(np.mean(share)), refit
+
+
+@pytest.fixture(scope='module')
+def alone(world):
+    return followed(world, witnesses=False)[0]
+
+
+def test_a_tool_tells_what_few_references_leave_open(world, alone):
+    share, _ = followed(world, witnesses=True, off_m=2e-4)
+    assert share < 0.6 * alone
+
+
+def test_a_wrong_gain_is_learnt_and_is_no_metal(world, alone):
+    gain = np.ones(9)
+    gain[4] = 1.01
+    share, _ = followed(world, witnesses=True, gain=gain)
+    assert share < 0.8 * alone
+
+
+def test_a_step_of_the_tool_is_no_metal(world):
+    """To first order; what is left of a step of a tenth of a millimetre is below the noise."""
+    place, step = way(0), np.array([1e-4, -5e-5, 8e-5])
+    flux, _, _ = flux_at(world, place + step, None)
+    rows = linearised(
+        ToolReading(tool(), flux, place, np.eye(3)), world.model, world.model.moments,
+        np.full(8, 1.0 / NOISE_T, dtype=complex),
+    )  # fmt: skip
+    pose = rows.pose.real
+    rest = rows.left.real - pose @ np.linalg.lstsq(pose, rows.left.real, rcond=None)[0]
+    assert np.abs(rows.left.real).max() > 5.0
+    assert np.abs(rest).max() < 0.2
+
+
+def test_the_errors_of_coils_have_the_sigma_that_they_say():
+    rng, tools = np.random.default_rng(2), ToolSettings()
+    table = tool(3)
+    scale = np.tile([tools.tool_coil_gain] * 2 + [tools.tool_coil_position_m] * 3
+                    + [tools.tool_coil_axis_rad] * 2, 3)  # fmt: skip
+    scores = []
+    for _ in range(40):
+        errors, true = CoilErrors(table, tools), scale * rng.normal(size=21)
+        for _ in range(5):
+            rows = rng.normal(size=(30, 21)) / scale
+            errors.learn(rows, rows @ true + rng.normal(size=30))
+        mean, covariance = errors.posterior
+        scores.append((mean - true) / np.sqrt(np.diagonal(covariance)))
+    assert 0.2 < np.sqrt(np.mean(np.square(scores))) < 1.1
+    assert np.sqrt(np.diagonal(covariance)).max() < scale.max()
+
+
+def test_witnesses_need_a_refit_and_references(tmp_path, capsys):
+    bag, model = REPO / 'bags' / 'metal.mcap', REPO / 'config' / 'demo_model.yaml'
+    arguments = ['evaluate', str(bag), '--model', str(model), '--witnesses']
+    assert main([*arguments, '--out', str(tmp_path)]) == 2
+    assert '--refit' in capsys.readouterr().err
+    session, clean = load_session(bag), load_session(REPO / 'bags' / 'factory.mcap')
+    short = replace(session, tools=tuple(t.frames(slice(0, 2)) for t in session.tools),
+                    reference=session.reference.frames(slice(0, 2)))  # fmt: skip
+    with pytest.raises(BagError, match='no reference sensors'):
+        track_session(
+            with_references(short, ()), load_model(model), baseline=clean, refit=True,
+            witnesses=True,
+        )  # fmt: skip
