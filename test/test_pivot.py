@@ -177,6 +177,13 @@ class TestDocument:
             parse_setup(with_tip)
 
 
+def test_slicer_gets_the_tip_as_a_body():
+    igtl = pytest.importorskip('anser_ros.nodes.openigtlink')
+    setup = parse_setup(DEMO).with_tips({'tool_a': TestDocument.SPEC})
+    table = igtl.OpenIGTLinkParameters(coils=False)
+    assert set(igtl.devices_of(setup, table)) == {'tool_a', 'tool_a/tip'}
+
+
 def write_tum(path, poses):
     np.savetxt(path, np.c_[poses.time + 100, poses.position, poses.quaternion], fmt='%.9f')
     return str(path)

@@ -1,14 +1,19 @@
 """Repeated assessments against control limits: pass, note, alert or fail.
 
 A figure's limits are those of Shewhart's chart of individual values: the mean of earlier
-sessions, and two and three times the deviation that neighbouring sessions show (the mean of their
-differences over 1.128). A tolerance that is stated is a limit of its own.
+sessions, and multiples of the deviation that neighbouring sessions show (the mean of their
+differences over 1.128). The multiples are those of two and three deviations of a known law, made
+larger for what few sessions leave unknown (Student's t) and for the number of figures that are
+watched (Bonferroni), so that a session in order is a note once in 22 times and an alert once in
+370. A tolerance that is stated is a limit of its own.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
+from scipy import stats
 
 PASS, NOTE, ALERT, FAIL = 'pass', 'note', 'alert', 'fail'
 STATES = (PASS, NOTE, ALERT, FAIL)
@@ -16,7 +21,10 @@ STATES = (PASS, NOTE, ALERT, FAIL)
 FEWEST = 5
 """Earlier sessions without which there are no limits: those of fewer are chance."""
 WARNING, ACTION = 2.0, 3.0
-"""Deviations from the mean from which a figure is a note, and an alert."""
+"""Deviations of a known normal law from which a figure is a note, and an alert."""
+FREEDOMS = 0.62
+"""Degrees of freedom of a deviation from differences of neighbours, a session beyond the first: so
+much less do they tell than the sum of squares would."""
 RUN = 8
 """Sessions in a row on one side of the mean that are a note: chance makes it once in 256."""
 DIFFERENCE = 1.128
@@ -39,6 +47,24 @@ class ControlLimits:
     n: int
     mean: float
     sigma: float
+
+    def reach(self, deviations: float, figures: int) -> float:
+        """How far a figure in order may be from the mean, in deviations, for one of so many.
+
+        Parameters
+        ----------
+        deviations : float
+            Where the limit would be with mean and deviation known, and a single figure.
+        figures : int
+        """
+        return _multiple(self.n, deviations, figures)
+
+
+@cache
+def _multiple(count: int, deviations: float, figures: int) -> float:
+    share = 2 * stats.norm.sf(deviations) / figures
+    wide = stats.t.isf(share / 2, max(FREEDOMS * (count - 1), 1.0))
+    return float(wide * np.sqrt(1 + 1 / count))
 
 
 @dataclass(frozen=True)
@@ -74,7 +100,9 @@ def limits_of(earlier: Sequence[float]) -> ControlLimits | None:
     return ControlLimits(int(values.size), mean, max(sigma, SMALLEST_SHARE * abs(mean), 1e-12))
 
 
-def judged(value: float, earlier: Sequence[float], tolerance: float | None = None) -> Verdict:
+def judged(
+    value: float, earlier: Sequence[float], tolerance: float | None = None, figures: int = 1
+) -> Verdict:
     """What a figure is worth.
 
     Parameters
@@ -84,6 +112,8 @@ def judged(value: float, earlier: Sequence[float], tolerance: float | None = Non
         The same figure of sessions that were in order, the oldest first.
     tolerance : float, optional
         Largest size that it may have.
+    figures : int
+        How many figures are watched with it.
     """
     limits = limits_of(earlier)
     if not np.isfinite(value):
@@ -91,15 +121,15 @@ def judged(value: float, earlier: Sequence[float], tolerance: float | None = Non
     if tolerance is not None and abs(value) > tolerance:
         return Verdict(FAIL, f'beyond the tolerance of {tolerance:.4g}', limits, tolerance)
     if limits is None:
-        return Verdict(
-            PASS, f'{len(earlier)} of {FEWEST} sessions that make limits', None, tolerance
-        )
+        words = f'{len(earlier)} of {FEWEST} sessions that make limits'
+        return Verdict(PASS, words, None, tolerance)
     off = (value - limits.mean) / limits.sigma
-    words = f'{abs(off):.1f} deviations {"above" if off > 0 else "below"} the mean'
-    if abs(off) > ACTION:
-        return Verdict(ALERT, words, limits, tolerance)
-    if abs(off) > WARNING:
-        return Verdict(NOTE, words, limits, tolerance)
+    side = 'above' if off > 0 else 'below'
+    for state, deviations in ((ALERT, ACTION), (NOTE, WARNING)):
+        reach = limits.reach(deviations, figures)
+        if abs(off) > reach:
+            words = f'{abs(off):.1f} deviations {side} the mean, {state} from {reach:.1f}'
+            return Verdict(state, words, limits, tolerance)
     last = np.sign(np.array([*earlier, value])[-RUN:] - limits.mean)
     if last.size == RUN and abs(last.sum()) == RUN:
         return Verdict(NOTE, f'{RUN} sessions in a row on one side of the mean', limits, tolerance)

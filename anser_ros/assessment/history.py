@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from anser_ros.assessment.control import ALERT, FAIL, Verdict, judged, worst
-from anser_ros.assessment.protocols import Assessment
+from anser_ros.assessment.protocols import WATCHED, Assessment
 from anser_ros.errors import ParameterError
 
 SCHEMA = 'anser_accuracy_history/1'
@@ -21,6 +21,10 @@ def figures_of(found: Assessment) -> dict[str, float]:
     for name, group in found.groups.items():
         figures |= {f'{name}/{key}': group.summary[key].value for key in ('Mean', 'RMS')}
     return figures
+
+
+def _is_watched(name: str, protocol: str) -> bool:
+    return any(name.startswith(w) or name.endswith(w) for w in WATCHED[protocol])
 
 
 def judge(
@@ -41,14 +45,17 @@ def judge(
     if unknown:
         raise ParameterError(f'no figure {unknown[0]!r}; there are: {", ".join(figures)}')
     earlier = [entry for entry in _entries(folder, found) if entry['start_ns'] < found.start_ns]
+    watched = [n for n in figures if _is_watched(n, found.protocol)]
     verdicts = {}
-    for name, value in figures.items():
+    for name in [*watched, *(n for n in tolerances if n not in watched)]:
         values = [
             float(e['figures'][name])
             for e in earlier
-            if e['figures'].get(name) is not None and e['states'].get(name) not in (ALERT, FAIL)
+            if name in watched
+            and e['figures'].get(name) is not None
+            and e['states'].get(name) not in (ALERT, FAIL)
         ]
-        verdicts[name] = judged(value, values, tolerances.get(name))
+        verdicts[name] = judged(figures[name], values, tolerances.get(name), len(watched))
     return worst(verdicts), verdicts, len(earlier)
 
 

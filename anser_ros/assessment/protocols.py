@@ -107,6 +107,17 @@ PROTOCOLS = {
     'dynamic': 'a moving tool against a moving reference: error and latency by speed',
 }
 """Every protocol with what it takes."""
+WATCHED = {
+    'rest': ('position_jitter_rms_m', 'orientation_jitter_rms_rad'),
+    'grid': ('grid_matching_fre_m', '/Mean'),
+    'rotation': ('/Mean',),
+    'metal': ('position_shift',),
+    'single-point': ('/RMS',),
+    'point-to-point': ('/RMS',),
+    'dynamic': ('dynamic_error_rms_m', 'latency_s'),
+}
+"""Figures, or beginnings or endings of their names, that have control limits: the more, the wider
+all limits must be for sessions in order to pass."""
 ONE = ('rest', 'single-point', 'dynamic')
 """Protocols of a single recording."""
 

@@ -3,6 +3,7 @@
 import argparse
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ from anser_ros.errors import ParameterError
 
 SEED = 1
 """Seed of the resamples, so that the same recordings give the same intervals."""
+NO_DATE_NS = 10**18
+"""Stamp, ns, before which a recording does not say when it was made: it would be of 2001."""
 OPTICAL_TRUTH = 'optical'
 COLORS = {'pass': 'green', 'note': 'yellow', 'alert': 'magenta', 'fail': 'red'}
 
@@ -99,6 +102,8 @@ def run(args: argparse.Namespace) -> int:
             recordings.append(read_poses(path, wanted))
         progress(args.protocol, 0.5)
         found = assess(args.protocol, recordings, options, np.random.default_rng(SEED))
+    if found.start_ns < NO_DATE_NS:  # a device's own counter: the file tells when
+        found = replace(found, start_ns=args.recordings[0].stat().st_mtime_ns)
     verdicts: dict[str, Verdict] = {}
     state, sessions = '', 0
     if args.history is not None or tolerances:

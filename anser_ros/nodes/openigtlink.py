@@ -17,6 +17,7 @@ from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.wire import igtl
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
+from anser_ros.wire.setup_tips import tip_name
 
 WATCH_PERIOD_S = 0.05
 """How often sensors are looked at that have fallen silent, s."""
@@ -212,7 +213,7 @@ def check_templates(table: OpenIGTLinkParameters) -> None:
 
 
 def devices_of(setup: Setup, table: OpenIGTLinkParameters) -> dict[str, str]:
-    """Device of each body and, where they are wanted, of each coil.
+    """Device of each body, of its tip and, where they are wanted, of each coil.
 
     Raises
     ------
@@ -225,7 +226,8 @@ def devices_of(setup: Setup, table: OpenIGTLinkParameters) -> dict[str, str]:
         )
         for sensor in (setup.tool_sensors if table.coils else ())
     }
-    named |= {body: table.body_name.format(body=body) for body in setup.bodies}
+    bodies = (*setup.bodies, *map(tip_name, setup.tips))
+    named |= {body: table.body_name.format(body=body) for body in bodies}
     return igtl.device_names(named)
 
 

@@ -18,6 +18,7 @@ from anser_ros.errors import SetupError
 from anser_ros.nodes import qos
 from anser_ros.nodes.node import AnserNode
 from anser_ros.wire.setup import parse_setup, topic_of
+from anser_ros.wire.setup_tips import tip_name
 
 TRACKER, FIELD_MODEL = 'tracker', 'field_model'
 # They take what there is, and nobody waits for them alone.
@@ -73,7 +74,7 @@ class Readiness:
             names = [sensor.name for sensor in setup.tool_sensors]
             self._poses = [
                 f'{topic_of(name)}/{kind}'
-                for name in (*names, *setup.bodies)
+                for name in (*names, *setup.bodies, *map(tip_name, setup.tips))
                 for kind in ('pose', 'pose_with_covariance')
             ]
         except SetupError:
