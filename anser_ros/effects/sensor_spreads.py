@@ -236,7 +236,7 @@ class SensorPickupSpread(SensorSpread):
     def offset(
         self, term: SpreadTerm, channels: NDArray[np.int64], emitters: int
     ) -> ComplexArray | None:
-        """The phasors."""
+        """Return the phasors that the term adds, T."""
         parts = term.of(channels)
         return np.asarray(parts[:, 0::2] + 1j * parts[:, 1::2])
 

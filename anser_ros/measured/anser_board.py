@@ -1,4 +1,4 @@
-"""What a real Anser tracker reported at the places of a flat board: is there an error to map?
+"""What a real Anser tracker reported at the places of a flat board, and whether it can be mapped.
 
 Positions only, no fluxes (github kilianod5150/Matlab-Anser, BSD-3; read where they lie). The
 places are those of a board with 41 holes; the tracker's points are registered to them, and an

@@ -49,7 +49,9 @@ NEAR_M = 0.01
 SPARSE = 30
 """Every so many of a layer's samples stand for the volume before a tool was seen."""
 _AROUND = np.array([[0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+"""A coil's own place and the corners of a tetrahedron around it, in units of `NEAR_M`."""
 NANO = 1e-9
+"""Seconds in a nanosecond."""
 
 
 @dataclass
