@@ -101,6 +101,20 @@ def test_a_tool_tells_what_few_references_leave_open(world, alone):
     assert share < 0.6 * alone
 
 
+def test_metal_that_has_left_is_forgotten(world):
+    _, refit = followed(world, witnesses=True)
+    rows, rng = [0, 4, 8, 12], np.random.default_rng(8)
+    states = []
+    for frame in range(2 * FRAMES, 2 * FRAMES + 12):
+        reading = world.baseline[rows] + world.noise(rng)[rows]
+        result = refit.update((1 + frame) * STEP_NS, world.references.channel[rows], reading)
+        states.append(result.state)
+        flux, _, _ = flux_at(world, way(frame), None)
+        noise = NOISE_T * (rng.normal(size=(9, 8)) + 1j * rng.normal(size=(9, 8)))
+        refit.witnessed([ToolReading(tool(), flux + noise, way(frame), np.eye(3))])
+    assert states[-1] == 'frozen'
+
+
 def test_a_wrong_gain_is_learnt_and_is_no_metal(world, alone):
     gain = np.ones(9)
     gain[4] = 1.01

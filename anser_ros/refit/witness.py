@@ -202,13 +202,15 @@ class Witness:
         Returns
         -------
         dict of str to float
-            Logarithm of the readings' likelihood under each hypothesis that has a filter.
+            Logarithm of the readings' likelihood under each hypothesis that has a filter, and
+            where nothing has changed.
         """
         if self._frame is None or not readings:
             return {}
         bank, seen, drift = self._frame
         evidence = dict.fromkeys(self._filters, 0.0)
         names = {name: h for h, name in enumerate(bank.names)}
+        evidence[bank.names[0]] = 0.0
         # What stays wrong for as long as the memory lasts may count once in it, not every frame.
         lasting = 1.0 + MEMORY_S / self._step_s
         near = []
@@ -223,6 +225,12 @@ class Witness:
                 np.linalg.cholesky(noise + lasting * own @ covariance @ own.T + pose @ pose.T)
                 for pose, own in parts
             ]
+            for factor, part, (_, own) in zip(factors, (np.real, np.imag), parts, strict=True):
+                white = solve_triangular(factor, part(rows.left) - own @ mean, lower=True)
+                misfit = float(white @ white)
+                scale = max(misfit / len(white), 1.0)
+                scale = scale if scale > ODD else 1.0
+                evidence[bank.names[0]] -= 0.5 * (misfit / scale + len(white) * math.log(scale))
             known = []
             for name, state in self._filters.items():
                 h = names[name]
