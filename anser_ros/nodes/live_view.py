@@ -52,13 +52,13 @@ def read_pose(data: bytes) -> tuple[float, Array]:
 
 @dataclass(frozen=True)
 class Figures:
-    """How well it goes: medians over the coils and a stretch of time, NaN where nothing is known.
+    """How well it goes, over all coils and a stretch of time; NaN where nothing is known.
 
     Attributes
     ----------
-    tracked : share of frames with a pose
-    error_m : distance to the optical pose
-    residual_t : of the fluxes, T
+    tracked : mean share of frames with a pose
+    error_m : root mean square distance to the optical pose, of those with a pose
+    residual_t : root mean square residual of the fluxes, T, whether with a pose or without
     seconds : the stretch
     """
 
@@ -245,7 +245,7 @@ class LiveView:
             np.array([point[part][:coils] for point in points]) for part in (1, 2, 3)
         )
         return Figures(
-            _middle(tracked, np.mean), _middle(error, np.median), _middle(residual, np.median),
+            _middle(tracked, np.mean), _middle(error, _rms), _middle(residual, _rms),
             points[-1][0] - points[0][0],
         )  # fmt: skip
 
@@ -258,6 +258,10 @@ def known(value: float, digits: int = 3) -> float | None:
 def _middle(values: Array, of: Any) -> float:
     known = values[np.isfinite(values)]
     return float(of(known)) if known.size else math.nan
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _number(told: Told | None, key: str) -> float:

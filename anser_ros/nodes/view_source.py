@@ -120,6 +120,9 @@ class ViewSource:
         except AnserError as error:
             self._refused(str(error))
             return
+        if self.view is not None and setup.has_same_board(self.view.setup):
+            self.view.setup = setup  # another rate or noise: what is shown goes on
+            return
         for polled in (*self._poses, *self._optical.values()):
             polled.close()
         view = LiveView(setup, self.namespace)

@@ -229,7 +229,7 @@ class Curves {
     this.chart.setOption(
       {
         animation: false,
-        grid: { left: 46, right: 10, top: 8, bottom: 22 },
+        grid: { left: 46, right: 14, top: 17, bottom: 22 },
         xAxis: { type: "time", axisLabel: { ...text, formatter: "{mm}:{ss}", hideOverlap: true }, splitLine: { show: true, lineStyle: { color: "#eef2f6" } } },
         yAxis: {
           type: "log", axisLabel: { ...text, formatter: (v) => `${+v.toPrecision(2)}` },
@@ -261,7 +261,7 @@ class Curves {
     const lines = this.marks.map(([time, words]) => ({ xAxis: 1e3 * time, label: { formatter: words } }));
     const markLine = {
       symbol: "none", silent: true, data: lines, lineStyle: { color: "#0f766e", type: "solid" },
-      label: { position: "insideEndTop", fontSize: 10, color: "#0f766e" },
+      label: { position: "end", distance: 2, fontSize: 10, color: "#0f766e" },
     };
     this.chart.setOption({
       series: this.data.map((curve, rank) => (rank ? { data: curve } : { data: curve, markLine })),

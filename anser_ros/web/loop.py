@@ -279,8 +279,8 @@ class CorrectionLoop:
 
 LIVE_ROWS = (
     ('tracked frames, %', 'tracked_percent', 0),
-    ('error, mm', 'error_mm', 2),
-    ('residual, pT', 'residual_pt', 0),
+    ('error, mm rms', 'error_mm', 2),
+    ('residual, pT rms', 'residual_pt', 0),
 )
 """Figures of the last seconds, live: label, key, digits behind the point."""
 _NOUN = {CALIBRATE: 'calibration', DIAGNOSE: 'diagnosis'}

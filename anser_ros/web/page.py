@@ -85,7 +85,7 @@ class Screen:
             self._figures = [_figure(label) for label in FIGURES]
         with ui.element('div').classes('chain'):
             self._nodes = ui.html(sanitize=False).classes('nodes')
-            self._why = ui.label().classes('why').mark('why')
+            self._why = ui.html(sanitize=False).classes('why').mark('why')
         with ui.element('div').classes('desk'):
             self._instrument = Instrument().on('ready', self._ready)
             with ui.element('div').classes('panel loop'):
@@ -205,7 +205,8 @@ class Screen:
             f'<span class="dot {LEVELS[level]}" title="{escape(said)}">{escape(name)}</span>'
             for name, level, said in status['nodes']
         ))  # fmt: skip
-        self._text(self._why, '  ·  '.join(status['why']))
+        why = escape('  ·  '.join(status['why']))
+        self._html(self._why, f'<span title="{why}">{why}</span>')
         self._html(self._findings, ''.join(
             f'<div class="finding dot {LEVELS[level]}">{escape(words)}</div>'
             for level, words in status['findings']

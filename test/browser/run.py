@@ -48,11 +48,12 @@ def main() -> int:
         with _chain(folder, args) as chain, _browser(_address(chain['dashboard'])) as page:
             found = Trial(page, folder, args.pictures).run(args)
             found['put_in'] = json.loads((folder / 'truth.json').read_text(encoding='utf-8'))
+            print(json.dumps(found, ensure_ascii=False), file=sys.stderr, flush=True)
             if args.processor:
                 found['processor'] = _processor(chain, page, args.processor)
     found['put_in'].pop('answers', None)
     print(json.dumps(found, indent=1, ensure_ascii=False))
-    return 0 if found['closed'] else 1
+    return 0 if args.look or found['closed'] else 1
 
 
 def _arguments() -> argparse.Namespace:
@@ -63,6 +64,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument('--rate', type=float, default=25.0, metavar='HZ', help='of the fluxes')
     parser.add_argument('--metal', action='store_true', help='a steel disc comes and goes')
     parser.add_argument('--watch', action='store_true', help='the watcher runs too')
+    parser.add_argument('--look', action='store_true', help='only look; nothing is clicked')
     parser.add_argument('--calibrate', action='store_true', help='also calibrate by a click')
     parser.add_argument('--pictures', type=Path, metavar='DIR', help='folder for pictures')
     parser.add_argument(
@@ -136,7 +138,15 @@ class Trial:
         page.wait_for_selector('.instrument[data-poses]:not([data-poses="0"])')
         page.wait_for_timeout(1e3 * FIGURES_S)
         self._picture('before')
-        found: dict[str, Any] = {'poses_hz': self._rate()}
+        found: dict[str, Any] = {'poses_hz': self._rate(), 'header': self._header()}
+        return found if args.look else found | self._loop(args)
+
+    def _header(self) -> dict[str, str]:
+        figures = [f.inner_text().split('\n') for f in self.page.locator('.bar .figure').all()]
+        return {label: value for value, label in figures}
+
+    def _loop(self, args: argparse.Namespace) -> dict[str, Any]:
+        page, found = self.page, {}
         self._click('Record')
         page.wait_for_timeout(1e3 * args.record)
         self._click('Stop')
@@ -162,7 +172,7 @@ class Trial:
         page.wait_for_timeout(4e3)
         found['after_undo'] = page.locator('.bar .pill').inner_text()
         live = found['tables']['live, last 10 s']
-        found['closed'] = _fell(live['tracked frames, %'][::-1]) or _fell(live['error, mm'])
+        found['closed'] = _fell(live['tracked frames, %'][::-1]) or _fell(live['error, mm rms'])
         return found
 
     def _click(self, name: str) -> None:
