@@ -9,21 +9,24 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from anser_ros.calibration import sensor_survey
 from anser_ros.calibration.coaxial import coaxial, fit_coaxial
 from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows
 from anser_ros.calibration.layouts import Generator, Layout, place
+from anser_ros.calibration.requirements import check_measurements
 from anser_ros.calibration.sensor_survey import SensorSurveyor
-from anser_ros.calibration.survey_records import corrections
+from anser_ros.calibration.survey_records import corrections, tellings
 from anser_ros.diagnosis import outlying
 from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.correction import Correction
 from anser_ros.effects.registry import effect_named
 from anser_ros.effects.view import View
-from anser_ros.errors import ModelFileError
+from anser_ros.errors import FitError, ModelFileError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.field.symmetry import symmetry_axis
 from anser_ros.fingerprint import Identity
+from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable, clusters_of
 from anser_ros.physics.tracks import loop_field
 from anser_ros.physics.volume import TrackedVolume
@@ -126,6 +129,43 @@ class TestCoaxial:
         np.testing.assert_allclose(sites.positions[1], other.positions[0], atol=1e-6)
         np.testing.assert_allclose(np.abs(sites.directions[1]), [1.0, 0.0, 0.0], atol=1e-5)
         assert np.linalg.norm(sites.positions[0] - CENTRE) < 2e-3
+
+
+@pytest.mark.parametrize('rate_hz', [0.2, 25.0])
+def test_poses_that_are_seconds_apart_say_nothing_of_movement(rate_hz, monkeypatch):
+    def suspicious(time, *others):
+        return (time > time[20]) & (time < time[30])
+
+    monkeypatch.setattr(sensor_survey, 'unsteady_tool', suspicious)
+    monkeypatch.setattr(sensor_survey, 'SMALL_STEP', -1.0)  # all steps are taken
+    rng = np.random.default_rng(7)
+    measured = recorded(array_of_sensors(rng), rng, 60)
+    time = np.arange(60) / rate_hz
+    quaternion = Rotation.from_matrix(measured.rotation).as_quat()
+    track = PoseTrack(time, measured.position, quaternion)
+    measured = replace(measured, time=time, track=track)
+    generator = Generator(np.zeros((1, 3)), np.zeros(1), 0.1)
+    accuracy = Accuracy(flux_noise_t=NOISE_T, optical_position_m=1e-5, optical_rotation_rad=1e-4)
+    found = SensorSurveyor([measured], ('gains',), generator, accuracy).fit()
+    assert bool(tellings(found, [measured])) is (rate_hz > 1.0)
+
+
+class TestFewPoses:
+    def test_many_sensors_make_up_for_poses_where_the_field_alone_is_fitted(self):
+        rng = np.random.default_rng(6)
+        one = array_of_sensors(rng)
+        other = replace(
+            one, channel=one.channel + 21, name=tuple(f'b{n}' for n in one.name),
+            position=one.position + [0.0, 0.0, 0.02],
+        )  # fmt: skip
+        measured = recorded(one.joined(other), rng, 4)
+        assert check_measurements([measured], 36, field_alone=True) == 168
+        with pytest.raises(FitError, match=r'at least 10 frames .* got 4; --estimate none'):
+            check_measurements([measured], 36)
+        with pytest.raises(FitError, match=r'at least 3 frames .* got 2$'):
+            check_measurements([measured.frames(slice(2))], 36, field_alone=True)
+        with pytest.raises(FitError, match=r'at least 10 frames .* got 4$'):
+            check_measurements([recorded(one, rng, 4)], 36, field_alone=True)
 
 
 class TestPickup:

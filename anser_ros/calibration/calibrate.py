@@ -97,7 +97,7 @@ def calibrate(
     """
     options = options or Options()
     needed = COUNTS[0] ** 2 if options.layout is None else len(place(options.layout, generator))
-    readings = check_measurements(measurements, needed)
+    readings = check_measurements(measurements, needed, not options.estimate)
     scan = _surveyed(measurements, generator, options, nominal, progress, steady)
     posed, options = list(scan.measurements), replace(options, accuracy=scan.accuracy)
     thin = thin_frames(posed)

@@ -12,6 +12,9 @@ from anser_ros.field.measurements import Measurements
 FEWEST_FRAMES = 10
 """Frames with poses below which no calibration is tried. It only catches recordings that are
 empty or cut; how many readings a model needs depends on its dipoles."""
+FEWEST_POSES, MANY_SENSORS = 3, 30
+"""Frames that do where a body has many sensors: each of them is another reading. With fewer poses
+none could be held out and the others still tell how the field changes between them."""
 FLATTEST = 0.002
 """Least thickness (rms) of the cloud of sensor positions, as a fraction of its extent (rms). In a
 flatter cloud the field's change across it is not determined."""
@@ -23,7 +26,9 @@ DISAGREEMENT = 10.0
 count as recorded with different boards. Sessions of one board have a ratio near one."""
 
 
-def check_measurements(measurements: Sequence[Measurements], needed: int) -> int:
+def check_measurements(
+    measurements: Sequence[Measurements], needed: int, field_alone: bool = False
+) -> int:
     """Check that measurements determine a field model.
 
     Parameters
@@ -32,6 +37,8 @@ def check_measurements(measurements: Sequence[Measurements], needed: int) -> int
         Tool measurements, one a body and session.
     needed : int
         Number of readings an emitter that the dipoles need.
+    field_alone : bool
+        Whether nothing is estimated of the sensors, so that few poses of many sensors do.
 
     Returns
     -------
@@ -56,10 +63,15 @@ def check_measurements(measurements: Sequence[Measurements], needed: int) -> int
                 f'got 0 of {len(m.time)} (is /optical/{m.body}/pose recorded?)'
             )
     frames = sum(int(m.usable.any(axis=1).sum()) for m in measurements)
-    if frames < FEWEST_FRAMES:
+    many = all(len(m.sensors) >= MANY_SENSORS for m in measurements)
+    fewest = FEWEST_POSES if many and field_alone else FEWEST_FRAMES
+    if frames < fewest:
+        hint = ''
+        if many and frames >= FEWEST_POSES:
+            hint = '; --estimate none fits the field alone to so few poses of so many sensors'
         raise FitError(
-            f'a calibration needs at least {FEWEST_FRAMES} frames with poses and valid fluxes, '
-            f'got {frames}'
+            f'a calibration needs at least {fewest} frames with poses and valid fluxes, '
+            f'got {frames}{hint}'
         )
     readings = sum(int(m.usable.sum()) for m in measurements)
     if readings < needed:

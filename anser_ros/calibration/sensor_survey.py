@@ -35,7 +35,7 @@ from anser_ros.calibration.pose_correction import (
 )
 from anser_ros.calibration.prior import DrawnBoard
 from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
-from anser_ros.calibration.sensor_parameters import PRIOR, SensorParameters, Survey
+from anser_ros.calibration.sensor_parameters import PRIOR, SensorParameters, Survey, is_followed
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy
@@ -342,8 +342,11 @@ class SensorSurveyor:
             bad = glitches(scaled, seen & tool.known, self.accuracy.pose_jitter)
             frame_power = (size * usable).sum(axis=1) / np.maximum(usable.sum(axis=1), 1.0)
             good = seen & tool.known & ~bad
-            moving = unsteady_tool(at.part.time, at.part.position, frame_power, good)
-            tool.steady = tool.known & ~moving if watch else tool.known
+            tool.steady = tool.known
+            # Poses that are seconds apart show each place once: what is missed there is no motion.
+            if watch and is_followed(tool.measured):
+                moving = unsteady_tool(at.part.time, at.part.position, frame_power, good)
+                tool.steady = tool.known & ~moving
             sound = tool.steady & ~bad
             tool.weights = outlier_weights(left, usable * sound[:, None])
             power += float((tool.weights * size).sum()) * left.shape[2]
