@@ -35,9 +35,10 @@ BAGS = ('.mcap', '.db3', '.bag')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = (
-        'example: anser handeye session.mcap --out result/'
-        '   files: anser handeye em.csv --reference optical.tum --out result/'
+        'example: anser handeye session.mcap --out result/\n'
+        '         anser handeye em.csv --reference optical.tum --out result/'
     )
     parser.add_argument(
         'tracked', nargs='+', type=Path,
