@@ -199,7 +199,13 @@ def to_document(rows: list[ReportRow]) -> dict[str, Any]:
 
     return {
         'schema': SCHEMA,
-        'rows': [{key: plain(value) for key, value in asdict(row).items()} for row in rows],
+        'rows': [
+            {
+                'name': f'{row.dataset}: {row.figure}',
+                **{key: plain(value) for key, value in asdict(row).items()},
+            }
+            for row in rows
+        ],
     }
 
 
