@@ -4,6 +4,7 @@ import argparse
 import asyncio
 import json
 import math
+import socket
 import threading
 
 import numpy as np
@@ -16,8 +17,10 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.serialization import serialize_message
 from tracking_world import certain_model
 
-from anser_ros.cli import demo
+from anser_ros.cli import demo, missing
+from anser_ros.cli.main import main
 from anser_ros.errors import BagError, ParameterError
+from anser_ros.nodes import live_view
 from anser_ros.nodes.causes import Told
 from anser_ros.nodes.chain_client import ChainClient, ChainError
 from anser_ros.nodes.dashboard import DashboardParameters
@@ -101,6 +104,19 @@ def test_other_machines_need_a_token(tmp_path):
     for path in (file, tmp_path / 'nowhere'):
         with pytest.raises(ParameterError, match='token_file'):
             token_for('0.0.0.0', str(path))
+
+
+def test_who_comes_before_the_page_is_served_waits_for_it(tmp_path):
+    server = PageServer('127.0.0.1', 0, '', RecordingFolder(tmp_path))
+    with socket.create_connection(('127.0.0.1', server.port), 1.0):
+        server.end()
+
+
+def test_what_is_missing_is_said_in_a_line(monkeypatch, capsys):
+    monkeypatch.setattr(missing, 'find_spec', lambda name: name != 'nicegui')
+    assert main(['dashboard']) == 2
+    said = capsys.readouterr().err
+    assert said == 'anser dashboard: nicegui is not installed: pip install nicegui\n'
 
 
 def test_an_address_that_is_taken_is_said(tmp_path):
@@ -292,7 +308,8 @@ def test_poses_are_read_from_their_bytes(frame):
         read_pose(bytes(serialize_message(message))[:-8])
 
 
-def test_the_view_has_place_ellipsoid_error_and_residual():
+def test_the_view_has_place_ellipsoid_error_and_residual(monkeypatch):
+    monkeypatch.setattr(live_view, 'FRESH_S', math.inf)
     view = LiveView(parse_setup(ten_sensors()), 'anser')
     assert view.frame() == [None] * 11
     view.take_optical('pen', [pose(t, (0.1, 0.0, 0.2)) for t in (1.0, 1.02, 1.04)])

@@ -73,6 +73,7 @@ class PageServer:
             self._socket = socket.socket(family, socket.SOCK_STREAM)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             self._socket.bind((host, port))
+            self._socket.listen()  # who comes before the server is up waits for it
         except OSError as error:
             if hasattr(self, '_socket'):
                 self._socket.close()
