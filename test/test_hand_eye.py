@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from conftest import REPO
 from pose_world import FRAME, SHIFT, World
 from scipy.spatial.transform import Rotation
 
@@ -170,7 +171,19 @@ def test_the_command_takes_a_bag_or_files(tmp_path, capsys):
     assert 'no second stream' in capsys.readouterr().err
     assert run_verb('handeye', [str(bag), *files[1:]]) == 2
     assert run_verb('handeye', [*files, '--optical', '/optical/x/pose']) == 2
-    assert 'topics of a bag' in capsys.readouterr().err
+    assert 'about a bag' in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_fluxes_are_tracked_with_a_model(capsys):
+    model = str(REPO / 'config' / 'demo_model.yaml')
+    command = [str(REPO / 'bags' / 'moving.mcap'), '--model', model, '--json']
+    assert run_verb('handeye', command) == 0
+    document = json.loads(capsys.readouterr().out)
+    # The simulated camera reports the tool's own pose in the board's frame.
+    np.testing.assert_allclose(document['registration_matrix'], np.eye(4), atol=2e-3)
+    np.testing.assert_allclose(document['sensors']['tool_a']['lever_arm_m'], 0.0, atol=1e-3)
+    assert abs(document['clock']['offset_s']) < 5e-3
 
 
 def test_pairs_must_be_pairs():

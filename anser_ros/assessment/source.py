@@ -38,7 +38,7 @@ class PoseSource:
     body : str
         Of a session of fluxes, or of the setup document that a bag of poses has.
     sensor : str
-        Of a file of poses that has several.
+        Of a file of poses, or of a bag, that has several.
     model : str
         With which a session of fluxes is tracked (a file, or ``nominal``); empty: poses are read.
     optical : str
@@ -135,8 +135,15 @@ def _recorded(path: str | os.PathLike[str], wanted: PoseSource) -> AssessedPoses
     theirs = [t for t in topics for b in bodies if t.endswith(f'/{topic_of(b)}{ENDING}')]
     ours = [t for t in topics if not t.startswith(OPTICAL)]
     own = [topic for topic in theirs if topic in ours]
+    if wanted.sensor and not wanted.topic:
+        own = [t for t in ours if t.endswith(f'/{topic_of(wanted.sensor)}{ENDING}')]
+        if not own:
+            raise BagError(
+                f'{os.fspath(path)}: no poses of {wanted.sensor}; topics of poses: '
+                f'{", ".join(ours) or "none"}'
+            )
     chosen = wanted.topic or _only(os.fspath(path), 'topic', '', own or ours)
-    if wanted.body and not wanted.topic and not own:
+    if wanted.body and not (wanted.topic or wanted.sensor) and not own:
         raise BagError(f'{os.fspath(path)}: no poses of {wanted.body}; with --model its fluxes '
                        'are tracked')  # fmt: skip
     named = chosen[: -len(ENDING)].lstrip('/') if chosen.endswith(ENDING) else chosen

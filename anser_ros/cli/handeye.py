@@ -16,6 +16,7 @@ from rich.table import Table
 matplotlib.use('Agg')
 import matplotlib.pyplot as plt
 
+from anser_ros.assessment.source import PoseSource, read_poses
 from anser_ros.cli.diagnosis_figures import image
 from anser_ros.cli.html_page import page, table
 from anser_ros.cli.output import make_folder, say_written
@@ -49,6 +50,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='files of the second stream, as many and in the same order',
     )  # fmt: skip
     add_topic_options(parser, 'stream')
+    parser.add_argument(
+        '--model', default='', help="track the bag's fluxes with this model (or 'nominal')"
+    )
+    parser.add_argument('--body', default='', help='with --model: the tool, of several')
     parser.add_argument(
         '--pairs', action='store_true',
         help='static poses: the n-th of one stream with the n-th of the other, without clocks',
@@ -106,9 +111,13 @@ def _session(args: argparse.Namespace) -> PoseSession:
     if first.is_dir() or first.suffix in BAGS:
         if len(args.tracked) > 1 or args.reference:
             raise ParameterError('one bag has both streams; --reference is for files of poses')
+        if args.model:
+            if args.topics or args.optical:
+                raise ParameterError('--model tracks the fluxes of a body and takes no topics')
+            return read_poses(first, PoseSource(model=args.model, body=args.body)).session
         return load_poses(first, args)
-    if args.topics or args.optical:
-        raise ParameterError('--tracked and --optical name topics of a bag')
+    if args.topics or args.optical or args.model:
+        raise ParameterError('--tracked, --model and --optical are about a bag')
     return import_poses(
         args.tracked, args.reference, stamps=args.stamps, unit=args.unit,
         quaternion=args.quaternion,

@@ -31,7 +31,9 @@ def add_source_options(parser: argparse.ArgumentParser, *, tip: bool = True) -> 
         help="track the bag's fluxes with this model (or 'nominal') instead of reading poses",
     )  # fmt: skip
     parser.add_argument('--body', default='', help='tool that is meant, where there are several')
-    parser.add_argument('--sensor', default='', help='sensor that is meant in a file of several')
+    parser.add_argument(
+        '--sensor', default='', help='sensor that is meant, of several in a bag or file'
+    )
     if tip:
         parser.add_argument(
             '--tip', type=Path, metavar='FILE',
