@@ -144,7 +144,10 @@ def test_monitor_measures_error_rate_and_latency(ros, start, tmp_path):
         '-p', f'output:={output}',
     )  # fmt: skip
 
+    sent_s = []
+
     def publish():
+        sent_s.append(time.monotonic())
         now = node.get_clock().now().to_msg()
         exact = PoseStamped()
         exact.header.stamp = now
@@ -177,7 +180,8 @@ def test_monitor_measures_error_rate_and_latency(ros, start, tmp_path):
     summary = summarise(load(output))['chains']
     assert summary['live']['position_rmse_m'] == pytest.approx(0.001)
     assert summary['frozen']['position_rmse_m'] == pytest.approx(0.02)
-    assert summary['live']['rate_hz'] == pytest.approx(50, rel=0.2)
+    told_hz = (len(sent_s) - 1) / (sent_s[-1] - sent_s[0])  # 50 where the machine keeps up
+    assert summary['live']['rate_hz'] == pytest.approx(told_hz, rel=0.2)
     assert 0 <= summary['live']['latency_prc50_s'] < 0.1
     draw(load(output), tmp_path / 'demo.png')
     assert (tmp_path / 'demo.png').read_bytes()[:8] == b'\x89PNG\r\n\x1a\n'

@@ -54,7 +54,7 @@ def test_two_publishers_give_no_poses_and_their_models_are_not_obeyed(tracker):
     tracker.peer.destroy_publisher(first)
     gone_s = time.monotonic()
     while not tracker.poses:
-        assert time.monotonic() - gone_s < 1.3, node.status()
+        assert time.monotonic() - gone_s < 2.0, node.status()
         send(second, 1)
     # Another model on the same topic is not obeyed, and whose holds is asked when one has gone.
     models = node.counters['models']
