@@ -17,7 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 # All of this must stand in the environment before the first ROS module is imported.
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -116,22 +116,31 @@ def pytest_collection_finish(session: pytest.Session) -> None:
         raise pytest.UsageError('this pytest and pytest-xdist do not know groups together')
 
 
+_held: list[IO[str]] = []
+
+
 @pytest.hookimpl(wrapper=True, tryfirst=True)
-def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[None]:
     """Give a test marked ``realtime`` the machine alone: other workers wait between their tests.
 
-    All tests of a run share a lock that such a test takes for itself. A gate before the lock keeps
-    those that come later from passing the one that waits.
+    All tests of a run share a lock that such a test takes for itself, and leaves to the next one
+    of its kind. A gate before the lock keeps those that come later from passing the one that
+    waits.
     """
     if 'PYTEST_XDIST_WORKER' not in os.environ:
         return (yield)
     alone = _takes_machine(item)
-    shared = item.config._tmp_path_factory.getbasetemp().parent  # the workers' folders are in it
-    with open(shared / 'gate.lock', 'w') as gate, open(shared / 'tests.lock', 'w') as lock:
-        fcntl.flock(gate, fcntl.LOCK_EX)
-        fcntl.flock(lock, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
-        fcntl.flock(gate, fcntl.LOCK_UN)
+    if not _held:
+        shared = item.config._tmp_path_factory.getbasetemp().parent  # the workers' are in it
+        _held.append((shared / 'tests.lock').open('w'))
+        with (shared / 'gate.lock').open('w') as gate:
+            fcntl.flock(gate, fcntl.LOCK_EX)
+            fcntl.flock(_held[0], fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
+    try:
         return (yield)
+    finally:
+        if not (alone and nextitem is not None and _takes_machine(nextitem)):
+            _held.pop().close()
 
 
 _calculates: list[bool] = []
