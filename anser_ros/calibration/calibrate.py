@@ -96,10 +96,29 @@ def calibrate(
         When the measurements cannot determine a model, or one field cannot explain all sessions.
     """
     options = options or Options()
-    needed = COUNTS[0] ** 2 if options.layout is None else len(place(options.layout, generator))
-    readings = check_measurements(measurements, needed, not options.estimate)
-    scan = _surveyed(measurements, generator, options, nominal, progress, steady)
+    scan = survey(measurements, generator, options, nominal, progress, steady)
+    return fit_scan(scan, names, generator, emitters, frequencies_hz, options, nominal, progress)
+
+
+def fit_scan(
+    scan: Scan,
+    names: Sequence[str],
+    generator: Generator,
+    emitters: tuple[str, ...],
+    frequencies_hz: tuple[float, ...],
+    options: Options,
+    nominal: FieldModel | None = None,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Choose and fit a field model to a scan that was surveyed; arguments as of `calibrate`.
+
+    Raises
+    ------
+    FitError
+        When one field cannot explain all sessions.
+    """
     posed, options = list(scan.measurements), replace(options, accuracy=scan.accuracy)
+    readings = sum(int(m.usable.sum()) for m in posed)
     thin = thin_frames(posed)
     folds = fold_of_frames([m.position for m in thin])
     drawn = None if nominal is None else DrawnBoard(nominal, thin)
@@ -123,7 +142,7 @@ def calibrate(
         moments=fit.moments,
         emitters=emitters,
         frequencies_hz=frequencies_hz,
-        flux_error_t=held_out.flux_error_t,
+        flux_error_t=float(np.hypot(held_out.flux_error_t, scan.field_sigma_t)),
         effects=scan.corrections,
     )
     calibration = Calibration(
@@ -134,15 +153,25 @@ def calibrate(
     return replace(calibration, model=replace(model, provenance=provenance(calibration, names)))
 
 
-def _surveyed(
+def survey(
     measurements: Sequence[Measurements],
     generator: Generator,
     options: Options,
-    nominal: FieldModel | None,
-    progress: Progress | None,
-    steady: Sequence[NDArray[np.bool_]] | None,
+    nominal: FieldModel | None = None,
+    progress: Progress | None = None,
+    steady: Sequence[NDArray[np.bool_]] | None = None,
 ) -> Scan:
-    """Return the measurements as sound sensors would have given them, and what was not."""
+    """Return the measurements as sound sensors would have given them, and what was not.
+
+    Arguments as of `calibrate`.
+
+    Raises
+    ------
+    FitError
+        When the measurements cannot determine a model.
+    """
+    needed = COUNTS[0] ** 2 if options.layout is None else len(place(options.layout, generator))
+    check_measurements(measurements, needed, not options.estimate)
     if not options.estimate:
         return Scan(tuple(with_pose(m) for m in measurements), options.accuracy)
     surveyor = SensorSurveyor(

@@ -69,6 +69,9 @@ class Scan:
         What the scan contained besides.
     survey : SurveyResult or None
         How that was found; None where nothing was estimated.
+    field_sigma_t : float
+        Standard deviation of what was taken off the fluxes, T a phasor component: the field that
+        is learnt from them is no better.
     """
 
     measurements: tuple[Measurements, ...]
@@ -76,6 +79,7 @@ class Scan:
     corrections: tuple[EffectRecord, ...] = ()
     tellings: tuple[EffectRecord, ...] = ()
     survey: SurveyResult | None = None
+    field_sigma_t: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -142,6 +146,6 @@ def provenance(calibration: Calibration, names: Sequence[str]) -> Mapping[str, A
         'heldout_flux_rmse_t': rms(held_out.error),
         'heldout_marginal_rmse_t': float(np.sqrt(np.mean(as_real(held_out.left_over) ** 2))),
         'heldout_chi_square': held_out.chi_square,
-        'flux_error_t': held_out.flux_error_t,
+        'flux_error_t': calibration.model.flux_error_t,
         'nominal_flux_rmse_t': calibration.nominal_rmse_t,
     }

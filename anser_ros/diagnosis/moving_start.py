@@ -71,14 +71,48 @@ def _starts(
     excess = scorer.state.sum_of_squares - scorer.state.count
     if alone < max(FREER * one_place + LEAST_MORE, LEAST_OF_EXCESS * excess):
         return []
-    points = np.array([centre for centre, _, _ in places])
-    course = points[_smoothest(points, gains)]
-    best = int(np.argmax([gains[:, i].max() for i in range(blocks.size)]))
-    sums = places[int(np.argmax(gains[:, best]))][1]
-    solution = _estimate(sums.part(np.array([best])))
+    course, solution = _course([(centre, own) for centre, own, _ in places], gains)
     time = (blocks + 0.5) * problem.apparatus.duration / (blocks.max() + 1)
     starts = effect.along(time, course, solution, problem.apparatus)
     return [(alone, start) for start in starts]
+
+
+def course_of(
+    effect: Effect[Term], scored: Sequence[tuple[Term, Score]]
+) -> tuple[Array, Array] | None:
+    """Return where metal at rest fits best in each block.
+
+    Parameters
+    ----------
+    effect : Effect
+        Metal at rest.
+    scored : sequence of (Term, Score)
+        Candidates, those of other effects among them.
+
+    Returns
+    -------
+    course : ndarray, shape (B, 3)
+        m, frame fg.
+    solution : ndarray
+        Of the probe in the block where it explains most.
+    """
+    places = [
+        (rest.centre, score.own)
+        for term, score in scored
+        if term.effect is effect and (rest := term.effect.resting(term)) is not None
+    ]
+    if not places:
+        return None
+    gains = np.array([s.explained_alone(np.full(s.size, NO_PRIOR)) for _, s in places])
+    return _course(places, gains)
+
+
+def _course(places: Sequence[tuple[Array, BlockSums]], gains: Array) -> tuple[Array, Array]:
+    """The smoothest course, and the solution of the block in which a place explains most."""
+    points = np.array([centre for centre, _ in places])
+    best = int(np.argmax(gains.max(axis=0)))
+    sums = places[int(np.argmax(gains[:, best]))][1]
+    return points[_smoothest(points, gains)], _estimate(sums.part(np.array([best])))
 
 
 def _smoothest(points: Array, gains: Array) -> NDArray[np.int64]:

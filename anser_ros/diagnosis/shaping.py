@@ -44,9 +44,9 @@ class Shaping:
         body = _body(fit.terms[index])
         if body is None or body.richness == self.richness:
             return fit
-        return self._freed(self._bodied(fit, index, body), index)
+        return self.freed(self._bodied(fit, index, body), index)
 
-    def _freed(self, fit: Fit, index: int) -> Fit:
+    def freed(self, fit: Fit, index: int) -> Fit:
         """The fit with a freer course, as long as its parameters pay."""
         for knots in self.richness.knots:
             body = _body(fit.terms[index])
@@ -69,7 +69,7 @@ class Shaping:
         too.
         """
         if first.richness is not None:
-            return self._shaped_as(fit, index, first, [first.kind]) or fit
+            return self.shaped_as(fit, index, first, [first.kind]) or fit
         half = self.fitter.problem.in_blocks(self.fitter.blocks, EVERY_OTHER)
         trial = replace(self, fitter=replace(self.fitter, problem=half, iterations=TRIALS))
         starts, families = [trial.fitter.fit(fit.terms, 0)], [[COMPACT], [*SPACINGS]]
@@ -82,7 +82,7 @@ class Shaping:
             for start in starts
             for kinds in families
             if (body := _body(start.terms[index])) is not None
-            and (other := trial._shaped_as(start, index, body, kinds))
+            and (other := trial.shaped_as(start, index, body, kinds))
         ]
         if not shaped:
             return fit
@@ -90,9 +90,9 @@ class Shaping:
         body = _body(best.terms[index])
         assert body is not None
         best = self.fitter.fit(best.terms, 0)
-        return self._shaped_as(best, index, body, [body.kind]) or best
+        return self.shaped_as(best, index, body, [body.kind]) or best
 
-    def _shaped_as(self, fit: Fit, index: int, body: BodyTerm, kinds: Sequence[str]) -> Fit | None:
+    def shaped_as(self, fit: Fit, index: int, body: BodyTerm, kinds: Sequence[str]) -> Fit | None:
         """The fit with the best of some kinds of bodies; None where none beats no body at all."""
         fitter = self.fitter
         bare = _with(fit.terms, index, body.with_theta(_without_amounts(body)))

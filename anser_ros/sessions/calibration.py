@@ -7,14 +7,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.calibration.calibrate import Options, calibrate
+from anser_ros.calibration.calibrate import Options, fit_scan, survey
 from anser_ros.calibration.disturbances import outside, spans_of, unsteady_references
 from anser_ros.calibration.layouts import Generator
-from anser_ros.calibration.result import Calibration
+from anser_ros.calibration.result import Calibration, Scan
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.sessions.baseline import readings_of
 from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.scan_metal import without_resting_metal
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import made_for
 from anser_ros.wire.setup import Setup
@@ -66,11 +67,21 @@ def calibrate_sessions(
     setup = sessions[0].setup
     measurements = [tool for session in sessions for tool in session.tools]
     names = [Path(session.path).name for session in sessions for _ in session.tools]
-    calibration = calibrate(
-        measurements, names, generator_of(setup), setup.emitter_names, setup.frequencies_hz,
-        replace(options, accuracy=setup.accuracy), Drawing.of(setup).model, progress,
-        [_steady(session, tool) for session in sessions for tool in session.tools],
-    )  # fmt: skip
+    options = replace(options, accuracy=setup.accuracy)
+    generator, nominal = generator_of(setup), Drawing.of(setup).model
+    steady = [_steady(session, tool) for session in sessions for tool in session.tools]
+    scan = survey(measurements, generator, options, nominal, progress, steady)
+
+    def fitted(scan: Scan, options: Options) -> Calibration:
+        return fit_scan(
+            scan, names, generator, setup.emitter_names, setup.frequencies_hz, options, nominal,
+            progress,
+        )  # fmt: skip
+
+    calibration = fitted(scan, options)
+    bare = without_resting_metal(sessions, calibration, progress)
+    if bare is not None:
+        calibration = fitted(bare, replace(options, layout=calibration.layout))
     model = calibration.model
     for session in sessions:
         model = made_for(model, session.setup)

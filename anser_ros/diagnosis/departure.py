@@ -1,0 +1,230 @@
+"""What metal does at rest, told by how it moves: for a field that was learnt with it nearby.
+
+While it moves, tools and references see the metal where it is, less the metal where it rested.
+Body and path are fitted to that as to any metal that moves; a path starts straight away from where
+it is strongest, as far along as the references' change tells, and the best of several is refined.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.diagnosis.decisions import SOMETHING_LEFT
+from anser_ros.diagnosis.fit import Fit, Fitter
+from anser_ros.diagnosis.moving_start import course_of
+from anser_ros.diagnosis.outlying import without_outliers
+from anser_ros.diagnosis.prepare import test_blocks, train_blocks
+from anser_ros.diagnosis.problem import Problem, State, evaluate
+from anser_ros.diagnosis.rich_modes import rich_modes
+from anser_ros.diagnosis.scoring import Scorer
+from anser_ros.diagnosis.shaping import Shaping
+from anser_ros.effects.body_term import Richness
+from anser_ros.effects.departed_metal import DepartedMetal, DepartedTerm
+from anser_ros.effects.metal_path import FreePath
+from anser_ros.effects.view import View
+from anser_ros.metal.body import COMPACT, SPACINGS, body_sizes
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+FOLDS = 4
+"""Parts of the cross-validation over time blocks."""
+KNOTS = 9
+"""Knots of a path to begin with: three seconds apart in half a minute of moving."""
+FINE_KNOTS = 17
+"""Knots at last. A spline of few pieces cannot rest at its ends, where what is asked is told: with
+nine the metal at rest was half again too strong, with 17 and with 25 right."""
+WAYS = (0.12, 0.24)
+"""Lengths of the ways that are tried, m: the shorter about a hand's way, twice it, and between
+them the fit finds its way."""
+SLOPE = 0.57
+"""Share of a way that goes down, for ways to the side: metal that goes away does not come nearer
+to the tools above the board, and hardly ever goes level."""
+AROUND = 8
+"""Directions to the side."""
+FEW_FRAMES, SOME_FRAMES, MANY_FRAMES = 25, 60, 300
+"""Frames of a tool, about, on which ways are compared, refined, and fitted at last."""
+REFINED = 2
+"""Ways that are refined."""
+BODY = Richness(90, (25,), SOMETHING_LEFT)
+"""How finely the body is shaped, and the path divided beyond `FINE_KNOTS` where much is left."""
+STEPS = 6
+"""Steps of a fit."""
+EXPLAINED = 0.1
+"""Share of the power in unseen blocks, beyond the noise's, that may stay: with more, the body is
+no picture of this metal, and what it does at rest would be a guess."""
+KNOWN = 0.3
+"""Standard deviation of what the metal does at rest, relative to that, from which on it is not
+taken off: it would be made worse as likely as better."""
+
+
+@dataclass(frozen=True)
+class Departure:
+    """Metal that moved during a scan, and where it rested.
+
+    Attributes
+    ----------
+    fit : Fit
+        Its body and path.
+    before, after : float
+        Mean whitened square of the median frame in unseen blocks, without and with it.
+    """
+
+    fit: Fit
+    before: float
+    after: float
+
+    @property
+    def term(self) -> DepartedTerm:
+        """The metal."""
+        term = self.fit.terms[0]
+        assert isinstance(term, DepartedTerm)
+        return term
+
+    @property
+    def is_understood(self) -> bool:
+        """Whether body and path foretell the unseen blocks."""
+        return self.after < max(2.0, EXPLAINED * self.before)
+
+    def rest_flux(self, view: View) -> tuple[ComplexArray, Array]:
+        """What the metal at rest adds to a view (F, S, K), and its standard deviation, T."""
+        term = self.term
+        effect = term.effect
+        assert isinstance(effect, DepartedMetal)
+        columns = effect.rest_columns(term.free(), view)
+        flux = term.alone.flux(term.resting(view), np.zeros(3))
+        assert columns is not None
+        variance = np.einsum(
+            'fskp,pq,fskq->fsk', columns, self.fit.covariance, columns.conj(), optimize=True
+        )
+        return flux, np.sqrt(np.maximum(variance.real, 0.0) / 2.0)
+
+
+def departure(problem: Problem, rest_s: float) -> Departure | None:
+    """Find metal that moves in a problem whose model and baseline have it at rest.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of the time in which something moves, with references.
+    rest_s : float
+        When it rests, s.
+
+    Returns
+    -------
+    Departure or None
+        None without references, or where no body explains anything.
+    """
+    if problem.references is None:
+        return None
+    blocks = train_blocks()
+    effect = DepartedMetal(rest_s=rest_s)
+    few, some = (_thinned(problem.in_blocks(blocks), count) for count in (FEW_FRAMES, SOME_FRAMES))
+    starts = _ranked(few, effect, blocks)
+    fits = [_refined(some, start, kind, blocks) for start, kind in starts[:REFINED]]
+    known = [fit for fit in fits if fit is not None]
+    if not known:
+        return None
+    fitter = Fitter(some, blocks, FOLDS, STEPS)
+    best = Shaping(fitter, BODY).freed(min(known, key=fitter.held_out), 0)
+    cleaned = without_outliers(problem, evaluate(problem, best.terms))
+    last = Fitter(_thinned(cleaned.in_blocks(blocks), MANY_FRAMES), blocks, FOLDS, STEPS)
+    fit = last.fit(best.terms)
+    unseen = cleaned.in_blocks(test_blocks())
+    return Departure(fit, _power(evaluate(unseen, ())), _power(evaluate(unseen, fit.terms)))
+
+
+def _power(state: State) -> float:
+    """Mean whitened square of the median frame of the tools and references."""
+    each = [np.sum(part.white**2, axis=1) for part in state.parts]
+    count = [np.count_nonzero(part.whitener.weight, axis=1) for part in state.parts]
+    used = np.concatenate(count)
+    return float(np.median(np.concatenate(each)[used > 0] / used[used > 0]))
+
+
+def _thinned(problem: Problem, frames: int) -> Problem:
+    """About so many frames a tool."""
+    most = max((tool.time.size for tool in problem.tools), default=0)
+    step = max(1, round(most / frames))
+    keep = [np.arange(0, tool.time.size, step) for tool in problem.tools]
+    return problem.frames(keep, np.arange(problem.reference_blocks.size))
+
+
+def _ranked(
+    problem: Problem, effect: DepartedMetal, blocks: NDArray[np.int64]
+) -> list[tuple[DepartedTerm, str]]:
+    """Starts with their kinds of body, the one that foretells left-out blocks best first."""
+    state = evaluate(problem, ())
+    found = []
+    for start, kinds in _starts(problem, state, effect, blocks):
+        for kind in kinds:
+
+            def unit(view: View, modes: Array, start: DepartedTerm = start, kind: str = kind):  # type: ignore[no-untyped-def]
+                return start.with_body(kind, modes, np.ones(modes.shape[1])).unit(view)
+
+            none = [np.zeros((*part.white.shape, 0)) for part in state.parts]
+            modes = rich_modes(
+                state, (list(none), np.zeros(0)), unit, body_sizes(kind), blocks, FOLDS,
+                BODY.modes,
+            )  # fmt: skip
+            if modes is not None:
+                found.append((modes[0], start, kind))
+    found.sort(key=lambda one: one[0])
+    return [(start, kind) for _, start, kind in found]
+
+
+def _starts(
+    problem: Problem, state: State, effect: DepartedMetal, blocks: NDArray[np.int64]
+) -> Iterator[tuple[DepartedTerm, list[str]]]:
+    """Paths to try: along the best places block by block, and ways away from the strongest one."""
+    duration, still = problem.apparatus.duration, effect.still
+    assert still is not None and problem.references is not None
+    knots = np.linspace(0.0, duration, KNOTS)
+    scorer = Scorer(state, blocks, FOLDS)
+    scored = [
+        (term, score)
+        for term in still.candidates(problem.apparatus)
+        if (score := scorer.score(term)) is not None
+    ]
+    course, solution = course_of(still, scored) or (np.zeros((0, 3)), np.zeros(2))
+    if not len(course):
+        return
+    time = (blocks + 0.5) * duration / (blocks.max() + 1)
+    path, theta = FreePath.through(knots, time, course)
+    yield effect.starting(path, theta, duration, solution), [COMPACT]
+    readings = problem.references.readings
+    change = np.abs(readings.flux - problem.references.baseline)
+    size = np.sqrt(np.where(readings.valid[..., None], change**2, 0.0).mean(axis=(1, 2)))
+    near = np.sqrt(size / max(float(size.max()), 1e-300))
+    closest = course[int(np.argmax(np.interp(time, readings.time, near)))]
+    for way in _ways():
+        centres = closest + (1.0 - near)[:, None] * way
+        path, theta = FreePath.through(knots, readings.time, centres)
+        yield effect.starting(path, theta, duration, solution), [COMPACT, *SPACINGS]
+
+
+def _ways() -> list[Array]:
+    """Ways from where metal is strongest to where it rests, m."""
+    level = np.sqrt(1.0 - SLOPE**2)
+    turns = 2.0 * np.pi * np.arange(AROUND) / AROUND
+    aside = [np.array([level * np.cos(a), level * np.sin(a), -SLOPE]) for a in turns]
+    return [length * way for way in (np.array([0.0, 0.0, -1.0]), *aside) for length in WAYS]
+
+
+def _refined(
+    problem: Problem, start: DepartedTerm, kind: str, blocks: NDArray[np.int64]
+) -> Fit | None:
+    """Body and path together, first coarsely; the body is shaped anew for the finer path."""
+    fitter = Fitter(problem, blocks, FOLDS, STEPS)
+    shaping = Shaping(fitter, BODY)
+    fit = shaping.shaped_as(fitter.fit([start.hold()], 0), 0, start, [kind])
+    if fit is None:
+        return None
+    coarse = fit.terms[0].free()
+    assert isinstance(coarse, DepartedTerm)
+    fine = coarse.freer(FINE_KNOTS)
+    assert fine is not None
+    fit = fitter.fit([fine])
+    return shaping.shaped_as(fit, 0, fine.with_theta(fit.terms[0].theta), [kind])

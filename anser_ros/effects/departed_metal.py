@@ -1,0 +1,80 @@
+"""Metal that rested near while a field was learnt, and moves: what its moving changes.
+
+The learnt field has the metal at rest in it, and so have the references' steady readings. What is
+left is the field of the metal where it is, less that of the same metal where it rested: so its
+moving tells what it does at rest.
+"""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.effects.metal_path import MetalPath
+from anser_ros.effects.moving_metal import MovingMetal, MovingTerm
+from anser_ros.effects.view import View
+from anser_ros.field.dipoles import Dipoles
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DepartedTerm(MovingTerm):
+    """Moving metal relative to where it is at ``rest_s``, s since the session's start."""
+
+    rest_s: float
+
+    @property
+    def alone(self) -> MovingTerm:
+        """The metal itself, relative to none."""
+        return MovingTerm(**{f.name: getattr(self, f.name) for f in fields(MovingTerm)})
+
+    def resting(self, view: View) -> View:
+        """The view as if all of it were recorded while the metal rests."""
+        return replace(view, time=np.full(view.time.shape, self.rest_s))
+
+    def flux(self, view: View, shift: Array) -> ComplexArray:
+        """Flux (F, S, K) of the whole body, moved by a shift (m), less that at rest."""
+        return self.alone.flux(view, shift) - self.alone.flux(self.resting(view), shift)
+
+    def unit(self, view: View) -> NDArray[np.inexact]:
+        """The same of each mode of unit amplitude, (F, S, K, m)."""
+        return np.asarray(self.alone.unit(view) - self.alone.unit(self.resting(view)))
+
+    def at_rest(self, illumination: Dipoles, omega: Array) -> Dipoles:
+        """The dipoles that stand for the metal at rest."""
+        centre = self.centres(np.array([self.rest_s]))[0]
+        return self.shapes.sources(centre, self.couplings, illumination, omega)
+
+
+@dataclass(frozen=True)
+class DepartedMetal(MovingMetal):
+    """Metal on a free path from its rest and back; no effect of a model, which has none of it.
+
+    Attributes
+    ----------
+    rest_s : float
+        When it rests, s since the session's start.
+    """
+
+    rest_s: float
+
+    def starting(
+        self, path: MetalPath, course: Array, duration: float, alpha: Array
+    ) -> DepartedTerm:
+        """A simple body on a path; arguments as of `MovingMetal.starting`."""
+        plain = super().starting(path, course, duration, alpha)
+        parts = {f.name: getattr(plain, f.name) for f in fields(MovingTerm)}
+        return DepartedTerm(**parts, rest_s=self.rest_s)
+
+    def columns(self, term: MovingTerm, view: View) -> ComplexArray | None:
+        """Derivatives where the metal is, less those where it rests."""
+        assert isinstance(term, DepartedTerm)
+        there = super().columns(term.alone, view)
+        rest = super().columns(term.alone, term.resting(view))
+        return None if there is None or rest is None else there - rest
+
+    def rest_columns(self, term: DepartedTerm, view: View) -> ComplexArray | None:
+        """Derivatives (F, S, K, q) of what the metal at rest adds to a view."""
+        return super().columns(term.alone, term.resting(view))

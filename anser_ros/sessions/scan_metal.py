@@ -1,0 +1,219 @@
+"""Metal that moved during a scan and rested near it before and after: taken off the scan.
+
+Frames in which it moves are left out of a calibration, but a field that is learnt from the others
+has the resting metal in it. How it moves tells what it does at rest
+(`anser_ros.diagnosis.departure`); that is taken off the scan's fluxes, and the field is fitted
+again.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from anser_ros.calibration.disturbances import spans_of
+from anser_ros.calibration.result import Calibration, Scan
+from anser_ros.diagnosis.departure import KNOWN, Departure, departure
+from anser_ros.diagnosis.prepare import build_problem
+from anser_ros.diagnosis.problem import Problem
+from anser_ros.diagnosis.whitening import Spread
+from anser_ros.effects.prediction import tool_view
+from anser_ros.errors import DiagnosisError
+from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import EffectRecord
+from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.session import Session
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+BESIDE_S = 1.0
+"""Time (s) before and after something is seen to move that is looked at as well: it begins to move
+before it is seen."""
+FEWEST_STEADY = 10
+"""Frames of the references at rest, of which their steady readings are the mean, at least."""
+LEARNT_M = 0.015
+"""Distance (m) of a coil from where the field was learnt, up to which it takes part: frames in
+which metal moves were not learnt from, and farther off the field is foretold less well."""
+ASKED = 60
+"""Frames of a tool, about, in which the uncertainty of the metal at rest is worked out."""
+
+
+@dataclass(frozen=True)
+class RestingMetal:
+    """What metal at rest did to the fluxes of a session's tools.
+
+    Attributes
+    ----------
+    flux : tuple of ndarray, one a tool, shape (F, S, K), complex
+        In the frames that a scan holds, T.
+    sigma_t : float
+        Its standard deviation, root mean square of a phasor component, T.
+    record : EffectRecord
+        Where it rested, and where it came.
+    """
+
+    flux: tuple[NDArray[np.complex128], ...]
+    sigma_t: float
+    record: EffectRecord
+
+
+def without_resting_metal(
+    sessions: Sequence[Session],
+    calibration: Calibration,
+    progress: Callable[[str, float], None] | None = None,
+) -> Scan | None:
+    """Return a scan without metal that rested during it; None where there is none to take off.
+
+    Parameters
+    ----------
+    sessions : sequence of Session
+        That were calibrated.
+    calibration : Calibration
+        With the metal in its field.
+    progress : callable, optional
+        Told the name of the stage.
+    """
+    scan = calibration.scan
+    if scan.survey is None:
+        return None
+    measurements, start, found = list(scan.measurements), 0, []
+    tellings = list(scan.tellings)
+    for session in sessions:
+        rows = range(start, start + len(session.tools))
+        start += len(session.tools)
+        spans = [
+            span
+            for row, tool in zip(rows, session.tools, strict=True)
+            for span in spans_of(tool.time, ~scan.survey.steady[row])
+        ]
+        if not spans or session.reference is None:
+            continue
+        if progress is not None:
+            progress('metal at rest', 0.0)
+        ends = min(s.start_s for s in spans), max(s.end_s for s in spans)
+        metal = _resting(session, calibration, [measurements[row] for row in rows], ends)
+        if metal is None:
+            continue
+        for row, flux in zip(rows, metal.flux, strict=True):
+            whole = measurements[row]
+            usable = whole.usable[:, :, None]
+            measurements[row] = replace(
+                whole, flux=np.where(usable, whole.flux - flux, whole.flux)
+            )
+        found.append(metal)
+        tellings = [_told(telling, metal, ends) for telling in tellings]
+    if not found:
+        return None
+    sigma = float(np.sqrt(np.mean([metal.sigma_t**2 for metal in found])))
+    return replace(
+        scan, measurements=tuple(measurements), tellings=tuple(tellings), field_sigma_t=sigma
+    )
+
+
+def _told(telling: EffectRecord, metal: RestingMetal, ends: tuple[float, float]) -> EffectRecord:
+    """The telling of a span in which this metal moved, with where it rested."""
+    told = telling.parameters
+    if not ends[0] <= told['t_start_s'] <= ends[1]:
+        return telling
+    return replace(
+        telling,
+        parameters={**metal.record.parameters, **told},
+        uncertainty={**telling.uncertainty, **metal.record.uncertainty},
+        evidence={**telling.evidence, **metal.record.evidence},
+    )
+
+
+def _resting(
+    session: Session,
+    calibration: Calibration,
+    kept: Sequence[Measurements],
+    ends: tuple[float, float],
+) -> RestingMetal | None:
+    """What metal that moves between two times does at rest to the frames that are kept."""
+    begin, end = ends[0] - BESIDE_S, ends[1] + BESIDE_S
+    problem = _problem(session, calibration, begin, end)
+    if problem is None:
+        return None
+    # Before it moved, or, where it moved from the start, after.
+    first = min(float(tool.time[0]) for tool in session.tools)
+    rest_s = 0.0 if begin > first else problem.apparatus.duration
+    found = departure(problem, rest_s)
+    if found is None or not found.is_understood:
+        return None
+    flux, variance, power = [], [], []
+    for tool in kept:
+        view = tool_view(tool, (), problem.fields)
+        flux.append(found.term.alone.flux(found.term.resting(view), np.zeros(3)))
+        some = np.arange(0, tool.time.size, max(1, tool.time.size // ASKED))
+        there, sigma = found.rest_flux(view.frames(some))
+        variance.append(np.mean(sigma**2))
+        power.append(np.mean(np.abs(there) ** 2) / 2.0)
+    if np.mean(variance) > KNOWN**2 * np.mean(power):
+        return None
+    return RestingMetal(tuple(flux), float(np.sqrt(np.mean(variance))), _record(found, power))
+
+
+def _record(found: Departure, power: Sequence[float]) -> EffectRecord:
+    """Where the metal rested and where it came, and how strong it was at rest."""
+    term, rest = found.term, np.array([found.term.rest_s])
+    path = np.linspace(0.0, term.duration, 8 * max(term.knots, 1))
+    way = term.centres(path) - term.centres(rest)
+    farthest = int(np.argmax(np.linalg.norm(way, axis=1)))
+    return EffectRecord(
+        term.effect.name,
+        {
+            'start_m': term.centres(rest)[0].tolist(),
+            'way_m': way[farthest].tolist(),
+            'rest_flux_rms_t': float(np.sqrt(np.mean(power))),
+        },
+        {},
+        {'misfit_before': found.before, 'misfit_after': found.after},
+    )
+
+
+def _problem(
+    session: Session, calibration: Calibration, begin: float, end: float
+) -> Problem | None:
+    """The time between two times as a problem of its own, which starts at zero."""
+    scan, reference, setup = calibration.scan, session.reference, session.setup
+    assert scan.survey is not None and reference is not None
+    inside = (reference.time >= begin) & (reference.time <= end)
+    if (~inside).sum() < FEWEST_STEADY:
+        return None
+    steady = np.where(reference.valid[..., None], reference.flux, np.nan)[~inside]
+    known = np.isfinite(steady).all(axis=2).any(axis=0)
+    baseline = np.full(steady.shape[1:], np.nan, dtype=np.complex128)
+    baseline[known] = np.nanmean(steady[:, known], axis=0)
+    learnt = cKDTree(np.concatenate([m.placed()[0].reshape(-1, 3) for m in scan.measurements]))
+    tools = [
+        _near(learnt, _between(scan.survey.survey(tool.body).apply(tool), begin, end))
+        for tool in session.tools
+    ]
+    accuracy = replace(scan.accuracy, flux_noise_t=scan.survey.noise_t)
+    noise = float(np.hypot(scan.survey.noise_t, calibration.model.flux_error_t))
+    try:
+        return build_problem(
+            tools, _between(reference, begin, end), baseline, calibration.model,
+            Drawing.of(setup).model, Spread(noise, accuracy),
+        )  # fmt: skip
+    except DiagnosisError:
+        return None  # too few frames with a pose
+
+
+def _near(learnt: cKDTree, tool: Measurements) -> Measurements:
+    """The frames with a pose in which all coils are near where the field was learnt."""
+    posed = tool.frames(tool.has_pose)
+    distance, _ = learnt.query(posed.placed()[0])
+    return posed.frames((distance < LEARNT_M).all(axis=1))
+
+
+def _between(measurements: Measurements, begin: float, end: float) -> Measurements:
+    """The frames between two times, the first of which becomes zero."""
+    inside = (measurements.time >= begin) & (measurements.time <= end)
+    part, track = measurements.frames(inside), measurements.track
+    if track is not None:
+        track = replace(track, time=track.time - begin)
+    return replace(part, time=part.time - begin, track=track)
