@@ -11,7 +11,12 @@ from anser_ros.calibration.disturbances import outside, spans_of, unsteady_refer
 from anser_ros.calibration.population import Likelihood, Population, solve
 from anser_ros.calibration.sensor_parameters import KINDS, SensorParameters
 from anser_ros.calibration.sensor_survey import SensorSurveyor
-from anser_ros.calibration.survey_records import corrections, tellings, untold_words
+from anser_ros.calibration.survey_records import (
+    contradiction_words,
+    corrections,
+    tellings,
+    untold_words,
+)
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
@@ -220,3 +225,23 @@ def test_tangents_are_across():
     pair = tangents(axes)
     assert np.allclose(np.einsum('stj,sj->st', pair, axes), 0)
     assert np.allclose(np.einsum('stj,suj->stu', pair, pair), np.eye(2))
+
+
+def test_sessions_that_say_different_things_of_a_sensor_are_told(dirty):
+    told, whole, _ = dirty
+    halves = [told.frames(np.arange(0, 250)), told.frames(np.arange(250, 500))]
+    changed = halves[1].flux.copy()
+    changed[:, 4] *= 1.01
+    other = replace(halves[1], flux=changed)
+    generator = scene(np.random.default_rng(5), side=2).generator
+    same, differ = (
+        SensorSurveyor([halves[0], second], KINDS, generator, Accuracy()).fit()
+        for second in (halves[1], other)
+    )
+    assert whole.contradictions == () and same.contradictions == ()
+    assert [c.place for c in differ.contradictions] == ['tool/1/y']
+    found = differ.contradictions[0]
+    assert (found.kind, found.sessions) == ('gains', (0, 1))
+    assert found.size == pytest.approx(0.01, rel=0.05)
+    (line,) = contradiction_words(differ, ['monday.mcap', 'tuesday.mcap'])
+    assert line.startswith('gains of tool/1/y: monday.mcap and tuesday.mcap differ by ')

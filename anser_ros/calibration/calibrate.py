@@ -24,12 +24,15 @@ from anser_ros.calibration.selection import (
     thin_frames,
 )
 from anser_ros.calibration.sensor_survey import SensorSurveyor
-from anser_ros.calibration.survey_records import corrections, tellings
+from anser_ros.calibration.survey_records import contradiction_words, corrections, tellings
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
+
+FEW_SENSORS = 1.0 / 3.0
+"""Share of the sensors of which sessions may say different things and be of one board."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +138,8 @@ def fit_scan(
         posed, chosen.layout, damping, generator, options.accuracy, nominal, progress=progress
     )
     dipoles, fit = whole.dipoles, whole.fit
-    check_agreement(posed, names, fit, _fitter(chosen, generator, options, nominal))
+    if not _is_explained(scan):
+        check_agreement(posed, names, fit, _fitter(chosen, generator, options, nominal))
     model = FieldModel(
         positions=dipoles.positions,
         directions=dipoles.directions,
@@ -148,7 +152,7 @@ def fit_scan(
     calibration = Calibration(
         model, fit, held_out, None if nominal is None else residuals(posed, nominal).rmse_t,
         selection.candidates, chosen, chosen.layout, damping, readings, residuals(posed, model),
-        scan,
+        scan, () if scan.survey is None else contradiction_words(scan.survey, names),
     )  # fmt: skip
     return replace(calibration, model=replace(model, provenance=provenance(calibration, names)))
 
@@ -187,6 +191,14 @@ def survey(
     )
     corrected = tuple(with_pose(result.survey(m.body).apply(m)) for m in sound)
     return Scan(corrected, accuracy, corrections(result), tellings(result, measurements), result)
+
+
+def _is_explained(scan: Scan) -> bool:
+    """Whether sessions disagree in few sensors: that is told, and is no other board."""
+    if scan.survey is None:
+        return False
+    sensors = sum(len(table) for table in scan.survey.parameters.tables)
+    return 0 < len(scan.survey.contradictions) <= FEW_SENSORS * sensors
 
 
 def _fitter(

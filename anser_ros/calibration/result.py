@@ -13,7 +13,7 @@ from anser_ros.calibration.layout_score import LayoutCandidate
 from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.moments import MomentFit
 from anser_ros.calibration.readings import usable_readings
-from anser_ros.calibration.sensor_survey import SurveyResult
+from anser_ros.calibration.survey_result import SurveyResult
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.settings import Accuracy
@@ -111,6 +111,8 @@ class Calibration:
         Residuals of the model on all readings that it was fitted to.
     scan : Scan
         The scan with what was wrong with it.
+    contradictions : tuple of str
+        A line for every sensor of which two sessions say different things.
     """
 
     model: FieldModel
@@ -124,6 +126,7 @@ class Calibration:
     n_measurements: int
     residuals: Residuals
     scan: Scan
+    contradictions: tuple[str, ...] = ()
 
     @property
     def better_than_nominal(self) -> bool:

@@ -18,10 +18,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.calibration.contradictions import Contradiction, contradictions
 from anser_ros.calibration.dipole_sites import basis_rows
 from anser_ros.calibration.disturbances import glitches, outside, spans_of, unsteady_tool
 from anser_ros.calibration.factors import ComplexArray, as_real
-from anser_ros.calibration.joint_system import FieldModes, JointSystem, Linear, linearise
+from anser_ros.calibration.joint_system import (
+    Eliminated,
+    FieldModes,
+    JointSystem,
+    Linear,
+    linearise,
+)
 from anser_ros.calibration.layout_fit import RICH_DAMPING, rich_layout
 from anser_ros.calibration.layouts import Generator, place
 from anser_ros.calibration.moments import MomentFitter, Progress
@@ -35,7 +42,13 @@ from anser_ros.calibration.pose_correction import (
 )
 from anser_ros.calibration.prior import DrawnBoard
 from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
-from anser_ros.calibration.sensor_parameters import PRIOR, SensorParameters, Survey, is_followed
+from anser_ros.calibration.sensor_parameters import (
+    PRIOR,
+    SensorParameters,
+    Survey,
+    is_followed,
+)
+from anser_ros.calibration.survey_result import SurveyResult
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy
@@ -90,53 +103,6 @@ class _Tool:
     @property
     def kept(self) -> NDArray[np.bool_]:
         return np.asarray((self.weights > 0.0).any(axis=1))
-
-
-@dataclass(frozen=True)
-class SurveyResult:
-    """What a scan says of its own sensors, clock and optics.
-
-    Attributes
-    ----------
-    parameters : SensorParameters
-        What was asked for.
-    posterior : Posterior
-        Values, prior widths and covariance of all parameters.
-    left_out : tuple of str
-        Kinds that the data do not speak for.
-    evidence : dict of str to float
-        Gain of the log probability by each other kind.
-    noise_t : float
-        Noise of a phasor component, with what the field's model misses, T.
-    optical : OpticalNoise
-        Jitter of the optical poses.
-    alone : dict of str to ndarray of int
-        Parameters of channels that stand outside their population.
-    kept, steady : tuple of ndarray of bool
-        Frames of each of the measurements whose pose and field are sound, and those in which
-        nothing moved.
-    reflected : float
-        Share of the frames whose pose is not where the fluxes put it.
-    untold : dict of str to float
-        Kinds that the scan does not tell, with the standard deviation that it leaves; these are
-        as the setup says, or as their prior makes them.
-    """
-
-    parameters: SensorParameters
-    posterior: Posterior
-    left_out: tuple[str, ...]
-    evidence: dict[str, float]
-    noise_t: float
-    optical: OpticalNoise
-    alone: dict[str, NDArray[np.int64]]
-    kept: tuple[NDArray[np.bool_], ...]
-    steady: tuple[NDArray[np.bool_], ...]
-    reflected: float
-    untold: dict[str, float]
-
-    def survey(self, body: str) -> Survey:
-        """The survey of a body's sensors."""
-        return self.parameters.survey(body, self.posterior.values)
 
 
 class SensorSurveyor:
@@ -220,8 +186,28 @@ class SensorSurveyor:
         return SurveyResult(
             self.parameters, posterior, left_out, evidence, self.noise_t, self.optical,
             self.population.alone, kept, steady, reflected,
-            self._untold(),
+            self._untold(), self._contradictions(tools, tuple(evidence)),
         )  # fmt: skip
+
+    def _sums(
+        self, tools: Sequence[_Tool], parameters: SensorParameters, linear: Sequence[Linear]
+    ) -> Eliminated:
+        """What the tools say of some parameters beside the field."""
+        system = JointSystem(parameters, self.modes, self.field.shape[1])
+        for tool, at in zip(tools, linear, strict=True):
+            share = interpolation_share(at.part)
+            system.add(at, tool.weights, self.noise_t, self.optical.jitter, share)
+        precision = 1.0 / (self.field_width * self.flux_rms * self.modes.size) ** 2
+        return system.eliminate(precision, self.middle - self.field)
+
+    def _contradictions(
+        self, tools: Sequence[_Tool], kinds: Sequence[str]
+    ) -> tuple[Contradiction, ...]:
+        def sums(parameters: SensorParameters, parts: Sequence[Measurements]) -> Eliminated:
+            linear = [linearise(part, self.modes, self.field) for part in parts]
+            return self._sums(tools, parameters, linear)
+
+        return contradictions([self._corrected(tool) for tool in tools], kinds, sums)
 
     def _untold(self) -> dict[str, float]:
         """Kinds that the scan does not tell, those among them that were not even tried."""
@@ -287,12 +273,7 @@ class SensorSurveyor:
         linear = [linearise(self._corrected(tool), self.modes, self.field) for tool in tools]
         if inspect:
             self._inspect(tools, linear, watch)
-        system = JointSystem(self.parameters, self.modes, self.field.shape[1])
-        for tool, at in zip(tools, linear, strict=True):
-            share = interpolation_share(at.part)
-            system.add(at, tool.weights, self.noise_t, self.optical.jitter, share)
-        precision = 1.0 / (self.field_width * self.flux_rms * self.modes.size) ** 2
-        rest = system.eliminate(precision, self.middle - self.field)
+        rest = self._sums(tools, self.parameters, linear)
         # Errors of the field's model are alike in neighbouring frames: the scatter of whole
         # stretches tells how much less the data say than independent readings would.
         scatter = rest.scores.T @ rest.scores

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from anser_ros.calibration.disturbances import spans_of
 from anser_ros.calibration.population import FAR
 from anser_ros.calibration.sensor_parameters import SensorParameters
-from anser_ros.calibration.sensor_survey import SurveyResult
+from anser_ros.calibration.survey_result import SurveyResult
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.tangent import tilted
@@ -41,6 +41,20 @@ def untold_words(result: SurveyResult) -> tuple[str, ...]:
         factor, unit = UNITS[kind]
         kept = 'it is weighed with its prior' if kind in result.evidence else "the setup's is kept"
         words.append(f'{kind}: the scan tells it to {_short(factor * size)} {unit} only; {kept}')
+    return tuple(words)
+
+
+def contradiction_words(result: SurveyResult, names: Sequence[str]) -> tuple[str, ...]:
+    """Return a line for every parameter of which two of the named measurements disagree."""
+    words = []
+    for found in result.contradictions:
+        factor, unit = UNITS[found.kind]
+        one, other = (names[i] for i in found.sessions)
+        words.append(
+            f'{found.kind}{" of " if found.place else ""}{found.place}: {one} and {other} differ '
+            f'by {_short(factor * found.size)} {unit} (known to {_short(factor * found.sigma)}); '
+            'did something change between them?'
+        )
     return tuple(words)
 
 

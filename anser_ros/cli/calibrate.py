@@ -135,7 +135,11 @@ def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result
     save_model(args.out, calibration.model)
     return Result(
         document,
-        (*(note for notes in lost for note in notes), *document['unobservable']),
+        (
+            *(note for notes in lost for note in notes),
+            *document['unobservable'],
+            *document['contradictions'],
+        ),
         (_table(calibration, document),),
         (args.out, *(() if args.report is None else (args.report,))),
     )

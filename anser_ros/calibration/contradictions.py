@@ -1,0 +1,117 @@
+"""Sessions of one tool that tell different things of its sensors.
+
+Every session gets parameters of its own, beside the field that all share, about the joint
+estimate: what two sessions then say of a sensor must differ by no more than is uncertain of it.
+Clocks are left out: an optical tracker that was started anew has another offset by right.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.calibration.joint_system import Eliminated
+from anser_ros.calibration.sensor_parameters import CLOCKS, EACH, PRIOR, USEFUL, SensorParameters
+from anser_ros.field.measurements import Measurements
+
+Array = NDArray[np.float64]
+
+CERTAIN = 6.0
+"""Standard deviations between two sessions from which on they contradict each other: a value of a
+normal variable is that far out once in a billion."""
+FELT = 0.5
+"""Share of the useful size of a parameter (`USEFUL`) below which a difference is not told: it
+moves poses by less than a tenth of a millimetre."""
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """A sensor, or body, of which two sessions say different things.
+
+    Attributes
+    ----------
+    kind : str
+        Of `sensor_parameters.KINDS`.
+    place : str
+        Name of the sensor, or of the body.
+    size, sigma : float
+        Difference and its standard deviation, in the parameter's unit.
+    sessions : tuple of two int
+        Which of the measurements.
+    """
+
+    kind: str
+    place: str
+    size: float
+    sigma: float
+    sessions: tuple[int, int]
+
+
+def contradictions(
+    parts: Sequence[Measurements], kinds: Sequence[str], sums: Callable[..., Eliminated]
+) -> tuple[Contradiction, ...]:
+    """Return of what two sessions say different things, the worst pair of each once.
+
+    Parameters
+    ----------
+    parts : sequence of Measurements
+        One a body and session, corrected by the joint estimate.
+    kinds : sequence of str
+        What is corrected.
+    sums : callable
+        Given parameters and measurements, what these say of the parameters beside the field.
+    """
+    bodies = [part.body for part in parts]
+    if len(set(bodies)) == len(bodies):
+        return ()
+    apart = [replace(part, body=str(i)) for i, part in enumerate(parts)]
+    parameters = SensorParameters(apart, [kind for kind in kinds if kind not in CLOCKS])
+    rest = sums(parameters, apart)
+    width = np.empty(len(parameters))
+    for kind in parameters.kinds:
+        width[parameters.rows(kind)] = PRIOR[kind]
+    # By the scatter of whole stretches; a contradiction scatters its own parameters' scores alone.
+    power = (rest.scores**2).sum(axis=0) / np.maximum(np.diag(rest.information), 1e-300)
+    inflation = max(1.0, float(np.median(power)))
+    information = rest.information / inflation + parameters.rule()
+    scaled = np.eye(width.size) + width[:, None] * information * width[None, :]
+    covariance = width[:, None] * np.linalg.solve(scaled, np.diag(width))
+    change = covariance @ rest.gradient / inflation
+    worst: dict[tuple[str, str], Contradiction] = {}
+    for i, j in combinations(range(len(bodies)), 2):
+        if bodies[i] != bodies[j]:
+            continue
+        for kind in parameters.kinds:
+            for name, one, other in _pairs(parameters, kind, i, j):
+                difference = change[one] - change[other]
+                variance = np.diag(
+                    covariance[np.ix_(one, one)]
+                    + covariance[np.ix_(other, other)]
+                    - covariance[np.ix_(one, other)]
+                    - covariance[np.ix_(other, one)]
+                )
+                sigma = float(np.sqrt(variance[int(np.argmax(np.abs(difference)))]))
+                size = float(np.linalg.norm(difference))
+                found = Contradiction(kind, name or bodies[i], size, sigma, (i, j))
+                known = worst.get((kind, found.place))
+                if size < max(FELT * USEFUL[kind], CERTAIN * sigma):
+                    continue
+                if known is None or size / sigma > known.size / known.sigma:
+                    worst[kind, found.place] = found
+    return tuple(worst.values())
+
+
+def _pairs(
+    parameters: SensorParameters, kind: str, i: int, j: int
+) -> list[tuple[str, NDArray[np.int64], NDArray[np.int64]]]:
+    """Each sensor's name (none for a body's own) with its rows for two of the measurements."""
+    slices = [parameters.slices[kind, str(index)] for index in (i, j)]
+    one, other = (np.arange(s.start, s.stop) for s in slices)
+    if kind not in EACH:
+        return [('', one, other)]
+    each = EACH[kind]
+    return list(
+        zip(parameters.tables[i].name, one.reshape(-1, each), other.reshape(-1, each), strict=True)
+    )
