@@ -74,8 +74,8 @@ def glitches(steps: Array, usable: Mask, stated: Array) -> Mask:
     return np.asarray((np.abs(steps - middle) > GLITCH * np.maximum(spread, stated)).any(axis=1))
 
 
-def _bins(time: Array) -> NDArray[np.int64]:
-    """Number of the stretch of each frame."""
+def stretches(time: Array) -> NDArray[np.int64]:
+    """Number of the stretch of time that each frame is in, shape (F,)."""
     if time.size < 2:
         return np.zeros(time.size, dtype=np.int64)
     length = max(BIN_S, BIN_FRAMES * float(np.median(np.diff(time))))
@@ -88,7 +88,7 @@ def unsteady_references(reference: Measurements) -> Mask:
     The noise is that of differences between frames; steady is what most stretches agree on.
     """
     good = reference.valid.all(axis=0)
-    bins = _bins(reference.time)
+    bins = stretches(reference.time)
     count = int(bins.max()) + 1 if bins.size else 0
     out = np.zeros(reference.time.size, dtype=bool)
     if not good.any() or count < 3:
@@ -130,7 +130,7 @@ def unsteady_tool(time: Array, place: Array, power: Array, usable: Mask) -> Mask
     usable : ndarray of bool, shape (F,)
         Frames to judge by.
     """
-    bins = _bins(time)
+    bins = stretches(time)
     count = int(bins.max()) + 1 if bins.size else 0
     size = np.bincount(bins[usable], minlength=count)
     if (size > 0).sum() < 3:

@@ -44,6 +44,20 @@ def untold_words(result: SurveyResult) -> tuple[str, ...]:
     return tuple(words)
 
 
+def drift_tellings(strength: NDArray[np.complex128]) -> tuple[EffectRecord, ...]:
+    """Return the emitters that drifted in a scan, from their strengths (F, K), and how far."""
+    size = np.abs(strength)
+    records = []
+    for coil in np.flatnonzero((strength != 1.0).any(axis=0)).tolist():
+        course = size[:, coil]
+        way = float(course.max() - course.min())
+        falls = int(np.argmax(course)) < int(np.argmin(course))
+        records.append(
+            EffectRecord('coil_drift', {'coil': coil, 'amount': -way if falls else way})
+        )
+    return tuple(records)
+
+
 def contradiction_words(result: SurveyResult, names: Sequence[str]) -> tuple[str, ...]:
     """Return a line for every parameter of which two of the named measurements disagree."""
     words = []

@@ -9,10 +9,13 @@ from numpy.typing import NDArray
 
 from anser_ros.calibration.calibrate import Options, fit_scan, survey
 from anser_ros.calibration.disturbances import outside, spans_of, unsteady_references
+from anser_ros.calibration.emitter_drift import at_strength, emitter_strength
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.result import Calibration, Scan
+from anser_ros.calibration.survey_records import drift_tellings
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.baseline import readings_of
 from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.scan_metal import without_resting_metal
@@ -64,13 +67,18 @@ def calibrate_sessions(
     How accurate fluxes and poses are is what the first session's setup states. What the references
     of the first session that has them read is kept with the model, for baselines to be compared.
     """
-    setup = sessions[0].setup
+    setup, drifts = sessions[0].setup, []
+    if options.estimate:
+        constant = [_at_constant_strength(session) for session in sessions]
+        sessions = [session for session, _ in constant]
+        drifts = [record for _, records in constant for record in records]
     measurements = [tool for session in sessions for tool in session.tools]
     names = [Path(session.path).name for session in sessions for _ in session.tools]
     options = replace(options, accuracy=setup.accuracy)
     generator, nominal = generator_of(setup), Drawing.of(setup).model
     steady = [_steady(session, tool) for session in sessions for tool in session.tools]
     scan = survey(measurements, generator, options, nominal, progress, steady)
+    scan = replace(scan, tellings=(*scan.tellings, *drifts))
 
     def fitted(scan: Scan, options: Options) -> Calibration:
         return fit_scan(
@@ -87,6 +95,19 @@ def calibrate_sessions(
         model = made_for(model, session.setup)
     kept = next((r for r in map(readings_of, sessions) if r is not None), None)
     return replace(calibration, model=replace(model, references=kept))
+
+
+def _at_constant_strength(session: Session) -> tuple[Session, tuple[EffectRecord, ...]]:
+    """A session as emitters that do not drift would have given it, and which of them do."""
+    reference = session.reference
+    if reference is None:
+        return session, ()
+    strength = emitter_strength(reference)
+    if (strength == 1.0).all():
+        return session, ()
+    tools = tuple(at_strength(tool, reference.time, strength) for tool in session.tools)
+    constant = at_strength(reference, reference.time, strength)
+    return replace(session, tools=tools, reference=constant), drift_tellings(strength)
 
 
 def _steady(session: Session, tool: Measurements) -> NDArray[np.bool_]:
