@@ -1,6 +1,6 @@
 """Small worlds for the tests of calibration: coils as dipoles, tools on a lattice, jitter."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -9,7 +9,9 @@ from anser_ros.calibration.dipole_sites import DipoleSites
 from anser_ros.calibration.layouts import Generator
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_basis
+from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.tangent import tilted
 
 NOISE_T = 40e-12
 JITTER_M = 0.07e-3
@@ -32,6 +34,84 @@ class Scene:
         """True flux (P, K)."""
         basis = flux_basis(points, axes, lengths, self.dipoles.positions, self.dipoles.directions)
         return basis @ self.moments
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What is wrong with a scan that a hand made.
+
+    Spreads of the gains (relative), axes (rad) and places (m), a lever arm (m), how late the
+    optical tracker's stamps are (s), its jitter relative to the usual, and the share of its poses
+    that are reflected.
+    """
+
+    gain: float = 0.004
+    axis: float = 0.008
+    place_m: float = 0.12e-3
+    lever_m: tuple = (0.3e-3, -0.4e-3, 0.2e-3)
+    offset_s: float = 0.018
+    jitter: float = 1.0
+    reflected: float = 0.003
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The errors that a scan has, by the rules for what no data tell."""
+
+    gain: np.ndarray
+    axis: np.ndarray
+    place: np.ndarray
+    lever: np.ndarray
+
+
+def hand(time, turn_rad=0.6):
+    """A hand's path through the volume, with turns."""
+    waves = [np.sin(w * time + p) for w, p in ((0.9, 0.0), (1.3, 1.0), (1.7, 2.0))]
+    position = np.stack(waves, axis=1) * [0.09, 0.09, 0.03] + [0.0, 0.0, 0.14]
+    turns = [np.sin(w * time + p) for w, p in ((0.7, 2.0), (1.1, 0.5), (0.8, 1.0))]
+    return position, Rotation.from_rotvec(turn_rad * np.stack(turns, axis=1))
+
+
+def moved_scan(world, table, rng, seconds, errors, turn_rad=0.6):
+    """A scan at 25 Hz by a tool with these errors, and the truth about them."""
+    count = len(table)
+    gain = 1 + errors.gain * (rng.normal(size=count) + 1.25j * rng.normal(size=count))
+    gain *= 1 / gain.mean()
+    gain /= np.abs(gain).mean()
+    axis = tilted(table.axis, errors.axis * rng.normal(size=(count, 2)))
+    place = errors.place_m * rng.normal(size=(count, 3))
+    lever = np.array(errors.lever_m) + (place.mean(axis=0) if count == 1 else 0.0)
+    place -= place.mean(axis=0)
+    time = np.arange(round(25.0 * seconds)) / 25.0
+    position, turn = hand(time, turn_rad)
+    points, axes = table.with_geometry(table.position + place + lever, axis).placed(
+        position, turn.as_matrix()
+    )
+    flux = world.flux(points.reshape(-1, 3), axes.reshape(-1, 3)).reshape(time.size, count, -1)
+    flux = flux * gain[:, None]
+    flux = flux + NOISE_T * (rng.normal(size=flux.shape) + 1j * rng.normal(size=flux.shape))
+    seen = np.arange(-0.3, time[-1] + 0.3, 1 / 60.0)
+    there, turned = hand(seen, turn_rad)
+    there += errors.jitter * JITTER_M * rng.normal(size=there.shape)
+    jitter = Rotation.from_rotvec(errors.jitter * JITTER_RAD * rng.normal(size=there.shape))
+    there[rng.uniform(size=seen.size) < errors.reflected] += [0.02, -0.01, 0.015]
+    track = PoseTrack(seen - errors.offset_s, there, (jitter * turned).as_quat())
+    at, rotation, has_pose = track.at(time)
+    told = replace(
+        world.measurements, sensors=table, time=time, flux=flux, position=at, rotation=rotation,
+        has_pose=has_pose, track=track, valid=np.ones((time.size, count), dtype=bool),
+        flags=np.zeros((time.size, count), dtype=np.int64),
+    )  # fmt: skip
+    return told, Truth(gain, axis, place, lever)
+
+
+def tool_of(count):
+    """A tool of so many coils: triaxial clusters 30 mm apart, the last one perhaps not whole."""
+    index = np.arange(count)
+    place = np.stack([0.0 * index, 0.01 * (index // 3 % 2), 0.03 * (index // 3 - 1.0)], axis=1)
+    axes = np.eye(3)[index % 3]
+    names = tuple(f'tool/{i // 3}/{"xyz"[i % 3]}' for i in range(count))
+    return SensorTable(index, names, ('tool',) * count, place, axes, np.zeros(count))
 
 
 def tool(length=0.0):

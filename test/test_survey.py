@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_world import JITTER_M, JITTER_RAD, NOISE_T, scene
+from calibration_world import JITTER_M, JITTER_RAD, NOISE_T, hand, scene
 from scipy.spatial.transform import Rotation
 
 from anser_ros.calibration.disturbances import outside, spans_of, unsteady_references
@@ -27,14 +27,6 @@ from anser_ros.settings import Accuracy
 FRAMES, RATE_HZ, OPTICAL_HZ = 500, 25.0, 60.0
 OFFSET_S, LEVER_M = 0.018, np.array([0.3e-3, -0.4e-3, 0.2e-3])
 GLITCHES = (100, 400, 777)
-
-
-def hand(time):
-    """A hand's path through the volume, with turns by half a right angle."""
-    waves = [np.sin(w * time + p) for w, p in ((0.9, 0.0), (1.3, 1.0), (1.7, 2.0))]
-    position = np.stack(waves, axis=1) * [0.09, 0.09, 0.03] + [0.0, 0.0, 0.14]
-    turns = [np.sin(w * time + p) for w, p in ((0.7, 2.0), (1.1, 0.5), (0.8, 1.0))]
-    return position, Rotation.from_rotvec(0.6 * np.stack(turns, axis=1))
 
 
 @pytest.fixture(scope='module')

@@ -46,8 +46,6 @@ AROUND = 8
 """Directions to the side."""
 FEW_FRAMES, SOME_FRAMES, MANY_FRAMES = 25, 60, 300
 """Frames of a tool, about, on which ways are compared, refined, and fitted at last."""
-REFINED = 2
-"""Ways that are refined."""
 BODY = Richness(90, (25,), SOMETHING_LEFT)
 """How finely the body is shaped, and the path divided beyond `FINE_KNOTS` where much is left."""
 STEPS = 6
@@ -122,8 +120,8 @@ def departure(problem: Problem, rest_s: float) -> Departure | None:
     blocks = train_blocks()
     effect = DepartedMetal(rest_s=rest_s)
     few, some = (_thinned(problem.in_blocks(blocks), count) for count in (FEW_FRAMES, SOME_FRAMES))
-    starts = _ranked(few, effect, blocks)
-    fits = [_refined(some, start, kind, blocks) for start, kind in starts[:REFINED]]
+    best_starts = _best_starts(few, effect, blocks)
+    fits = [_refined(some, start, kind, blocks) for start, kind in best_starts]
     known = [fit for fit in fits if fit is not None]
     if not known:
         return None
@@ -152,10 +150,10 @@ def _thinned(problem: Problem, frames: int) -> Problem:
     return problem.frames(keep, np.arange(problem.reference_blocks.size))
 
 
-def _ranked(
+def _best_starts(
     problem: Problem, effect: DepartedMetal, blocks: NDArray[np.int64]
 ) -> list[tuple[DepartedTerm, str]]:
-    """Starts with their kinds of body, the one that foretells left-out blocks best first."""
+    """The start that foretells left-out blocks best with a compact body, and with pieces."""
     state = evaluate(problem, ())
     found = []
     for start, kinds in _starts(problem, state, effect, blocks):
@@ -171,8 +169,12 @@ def _ranked(
             )  # fmt: skip
             if modes is not None:
                 found.append((modes[0], start, kind))
-    found.sort(key=lambda one: one[0])
-    return [(start, kind) for _, start, kind in found]
+    best = []
+    for compact in (True, False):
+        group = [one for one in found if (one[2] == COMPACT) == compact]
+        if group:
+            best.append(min(group, key=lambda one: one[0])[1:])
+    return best
 
 
 def _starts(
