@@ -87,6 +87,7 @@ def test_what_metal_does_at_rest_is_found_from_how_it_moves(scanned, monkeypatch
     problem, resting = scanned
     monkeypatch.setattr(departing, '_ways', lambda: [np.array([0.1, -0.06, -0.06])])
     monkeypatch.setattr(departing, 'MANY_FRAMES', 100)
+    monkeypatch.setattr(departing, 'SPACINGS', {})
     found = departure(problem, 0.0)
     assert found is not None and found.is_understood and found.before > 5.0 * found.after
     view = evaluate(problem.in_blocks(np.array([3, 12])), ()).parts[0].view

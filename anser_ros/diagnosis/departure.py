@@ -7,6 +7,7 @@ it is strongest, as far along as the references' change tells, and the best of s
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,9 +78,7 @@ class Departure:
     @property
     def term(self) -> DepartedTerm:
         """The metal."""
-        term = self.fit.terms[0]
-        assert isinstance(term, DepartedTerm)
-        return term
+        return cast(DepartedTerm, self.fit.terms[0])
 
     @property
     def is_understood(self) -> bool:
@@ -88,16 +87,12 @@ class Departure:
 
     def rest_flux(self, view: View) -> tuple[ComplexArray, Array]:
         """What the metal at rest adds to a view (F, S, K), and its standard deviation, T."""
-        term = self.term
-        effect = term.effect
-        assert isinstance(effect, DepartedMetal)
-        columns = effect.rest_columns(term.free(), view)
-        flux = term.alone.flux(term.resting(view), np.zeros(3))
-        assert columns is not None
+        columns = self.term.rest_columns(view)
         variance = np.einsum(
             'fskp,pq,fskq->fsk', columns, self.fit.covariance, columns.conj(), optimize=True
         )
-        return flux, np.sqrt(np.maximum(variance.real, 0.0) / 2.0)
+        sigma = np.sqrt(np.maximum(variance.real, 0.0) / 2.0)
+        return self.term.rest_flux(view), sigma
 
 
 def departure(problem: Problem, rest_s: float) -> Departure | None:
@@ -224,9 +219,7 @@ def _refined(
     fit = shaping.shaped_as(fitter.fit([start.hold()], 0), 0, start, [kind])
     if fit is None:
         return None
-    coarse = fit.terms[0].free()
-    assert isinstance(coarse, DepartedTerm)
-    fine = coarse.freer(FINE_KNOTS)
-    assert fine is not None
+    coarse = cast(DepartedTerm, fit.terms[0].free())
+    fine = coarse.freer(FINE_KNOTS) or coarse
     fit = fitter.fit([fine])
     return shaping.shaped_as(fit, 0, fine.with_theta(fit.terms[0].theta), [kind])

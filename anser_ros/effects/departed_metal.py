@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from anser_ros.effects.metal_path import MetalPath
 from anser_ros.effects.moving_metal import MovingMetal, MovingTerm
 from anser_ros.effects.view import View
-from anser_ros.field.dipoles import Dipoles
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -42,10 +41,14 @@ class DepartedTerm(MovingTerm):
         """The same of each mode of unit amplitude, (F, S, K, m)."""
         return np.asarray(self.alone.unit(view) - self.alone.unit(self.resting(view)))
 
-    def at_rest(self, illumination: Dipoles, omega: Array) -> Dipoles:
-        """The dipoles that stand for the metal at rest."""
-        centre = self.centres(np.array([self.rest_s]))[0]
-        return self.shapes.sources(centre, self.couplings, illumination, omega)
+    def rest_flux(self, view: View) -> ComplexArray:
+        """What the metal at rest adds to a view, (F, S, K), T."""
+        return self.alone.flux(self.resting(view), np.zeros(3))
+
+    def rest_columns(self, view: View) -> ComplexArray:
+        """Its derivatives by the parameters, (F, S, K, q)."""
+        columns = MovingMetal().columns(self.alone.free(), self.resting(view))
+        return np.zeros((*view.flux.shape, 0), complex) if columns is None else columns
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,3 @@ class DepartedMetal(MovingMetal):
         there = super().columns(term.alone, view)
         rest = super().columns(term.alone, term.resting(view))
         return None if there is None or rest is None else there - rest
-
-    def rest_columns(self, term: DepartedTerm, view: View) -> ComplexArray | None:
-        """Derivatives (F, S, K, q) of what the metal at rest adds to a view."""
-        return super().columns(term.alone, term.resting(view))

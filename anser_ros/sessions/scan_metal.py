@@ -146,7 +146,7 @@ def _resting(
     flux, variance, power = [], [], []
     for tool in kept:
         view = tool_view(tool, (), problem.fields)
-        flux.append(found.term.alone.flux(found.term.resting(view), np.zeros(3)))
+        flux.append(found.term.rest_flux(view))
         some = np.arange(0, tool.time.size, max(1, tool.time.size // ASKED))
         there, sigma = found.rest_flux(view.frames(some))
         variance.append(np.mean(sigma**2))
