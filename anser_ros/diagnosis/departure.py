@@ -77,7 +77,7 @@ class Departure:
 
     @property
     def term(self) -> DepartedTerm:
-        """The metal."""
+        """The metal with its body and path, as it was fitted."""
         return cast(DepartedTerm, self.fit.terms[0])
 
     @property
