@@ -26,9 +26,11 @@ JUMP_RATIO = 40.0
 """The same for a frame whose pose's own directions are left in: the optical jitter along them is
 larger than the noise and differs from pose to pose, so only a glitch stands out so far."""
 WHOLE = 0.5
-"""Share of a frame's readings, and of frames that lost any, from which whole frames are out."""
+"""Share of a frame's readings, and of frames that lost any, from which whole frames are out: more
+bad than good, so that what is left of the frame is not to be believed either."""
 OFTEN = 0.2
-"""Share of the frames with an outlier from which a channel that has it is named."""
+"""Share of the frames with an outlier from which a channel that has it is named: of nine channels
+that are hit by chance each has a ninth."""
 
 
 def find_outliers(state: State) -> tuple[Mask, ...]:

@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 SLOTS = 3
 """Compact bodies that are full hypotheses at a time."""
 BETTER = 3.0
-"""Gain of approximate log evidence for which a body takes another's slot."""
+"""Gain of approximate log evidence for which a body takes another's slot: odds of twenty to
+one, so that two that explain alike do not take turns."""
 EVERY = 4
 """Frames from one look at all bodies to the next."""
 PRESENT = 1.15
