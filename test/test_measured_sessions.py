@@ -70,15 +70,16 @@ class TestNavion:
         row = tool.sensors.name.index('plate/s3/y')
         assert tool.flux[1, row, 2].real == pytest.approx(data.coils.field_t[1, 2, 3, 1], rel=1e-6)
         centres, axes = tool.placed()
-        np.testing.assert_allclose(centres[1, row], [0.1, 0.1, 0.05])
-        np.testing.assert_allclose(axes[1, row], [0.0, 1.0, 0.0])
+        # Above the magnets, which are towards the data set's +y.
+        np.testing.assert_allclose(centres[1, row], [0.1, 0.05, 0.19], atol=1e-12)
+        np.testing.assert_allclose(axes[1, row], [0.0, 0.0, -1.0], atol=1e-12)
 
     def test_one_sensor_visits_all_places(self, tmp_path, rng):
         data, path = plate_data(rng), tmp_path / 'sensor.mcap'
         navion_session.write_sensor(data, self.EMITTER, path)
         (tool,) = load_session(path).tools
         assert tool.flux.shape == (8, 3, 3) and tool.has_pose.all()
-        np.testing.assert_allclose(tool.position[6], [0.1, -0.1, 0.05])
+        np.testing.assert_allclose(tool.position[6], [0.1, 0.05, 0.39])
         np.testing.assert_allclose(tool.flux[6].real, data.coils.field_t[1, :, 2].T, rtol=1e-6)
 
     @pytest.mark.skipif(not NAVION.is_dir(), reason='no shared measured data')
@@ -121,6 +122,7 @@ def test_the_command_writes_bags_and_says_what_has_none(tmp_path, monkeypatch, c
     monkeypatch.setattr(
         measured, 'STUDIES', dict.fromkeys(('navion', 'anser_board'), lambda f: ([], ''))
     )
+    monkeypatch.setattr(measured, 'RECIPES', {})
     monkeypatch.setattr(
         measured, 'SESSIONS', {'navion': lambda folder, into: [into / f'{folder.name}.mcap']}
     )

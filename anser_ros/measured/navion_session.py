@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from anser_ros.measured.navion_data import NavionData, load
 from anser_ros.measured.navion_sources import locate_magnets
@@ -26,15 +27,28 @@ Array = NDArray[np.float64]
 PLATE, SENSOR = 'plate', 'sensor'
 AXES = 'xyz'
 KIND = 'electromagnet'
+TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""From the data set's axes to those of fg: the magnets stand beside the plate, towards +y."""
+PLANE_M = 0.29
+"""The data set's y at which fg has its plane z = 0: where one dipole a magnet is found to lie."""
+VOLUME = ((-0.15, -0.15, 0.1), (0.15, 0.15, 0.45))
+"""Where the plate and its sensors may be, m, fg."""
+STATED = {'flux_noise_t': 2e-4, 'optical_position_m': 1e-3, 'optical_rotation_rad': 5e-3}
+"""Readings with what sensors differ by, and the errors of the nominal poses."""
 CURRENT_A = 35.0
 """Nominal current of the electromagnets, A, that fluxes are referred to."""
+
+
+def in_fg(points: Array) -> Array:
+    """Points (P, 3) of the data set's frame in fg, m: the magnets lie below, the sensors above."""
+    return np.asarray(points @ TURN.T + [0.0, 0.0, PLANE_M])
 
 
 def emitter_of(data: NavionData) -> Emitter:
     """Three coils, each where one dipole explains its field best."""
     coils = tuple(
         Coil(f'coil{k}', vector(place), 0.0, float(1 + k))
-        for k, place in enumerate(locate_magnets(data.coils))
+        for k, place in enumerate(in_fg(np.array(locate_magnets(data.coils))))
     )
     return Emitter(KIND, {'current_a': CURRENT_A}, coils)
 
@@ -50,12 +64,12 @@ def _axes(body: str, name: str, first: int, place: Array) -> list[SensorSpec]:
 def _write(
     path: Path, emitter: Emitter, sensors: Sequence[SensorSpec], flux: Array, place: Array
 ) -> None:
-    """Frames of one upright body, a second apart: flux (F, S, K), places (F, 3)."""
-    setup = Setup('fg', 1.0, emitter, tuple(sensors))
-    upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(place), 1))
+    """Frames of one body, a second apart: flux (F, S, K), places (F, 3) in the data's frame."""
+    setup = Setup('fg', 1.0, emitter, tuple(sensors), VOLUME, STATED)
+    upright = np.tile(Rotation.from_matrix(TURN).as_quat(), (len(place), 1))
     stamps = [SECOND_NS * (1 + frame) for frame in range(len(place))]
     body = sensors[0].body
-    write_frames(path, setup, stamps, flux.astype(complex), {body: (place, upright)})
+    write_frames(path, setup, stamps, flux.astype(complex), {body: (in_fg(place), upright)})
 
 
 def write_plate(data: NavionData, emitter: Emitter, path: Path) -> None:
