@@ -351,7 +351,10 @@ export default {
         const pill = document.createElement("span");
         pill.className = `pill ${LEVELS[level]}`;
         pill.textContent = state;
-        cells[1].append(pill);
+        const why = document.createElement("span");
+        why.className = "reason";
+        why.textContent = reason;
+        cells[1].append(pill, why);
         cells[1].parentNode.title = reason;
         cells[5].textContent = number(sigma, 2);
         cells[6].textContent = number(error, 2);
