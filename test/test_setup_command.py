@@ -5,6 +5,7 @@ import json
 import sys
 
 import pytest
+from conftest import REPO
 
 from anser_ros.cli.main import main
 from anser_ros.cli.setup_parts import GEOMETRY, coil_of, document_of, emitter_of, text_of
@@ -107,3 +108,14 @@ def test_what_is_asked_draws_every_kind_of_board():
                   'axis': [0, 0, 1]}  # fmt: skip
         _, setup = text_of(document_of(emitter, [sensor], 50.0, None, {}))
         assert abs(board_of(setup).moments()[0, 2]) > 0
+
+
+def test_a_folder_that_takes_no_file_is_found_before_the_work(capsys):
+    """Permissions allow root all; what matters is whether a file can be made."""
+    for command in (
+        ['setup', 'config/demo_setup.yaml', '--out', '/proc'],
+        ['calibrate', str(REPO / 'bags' / 'scan.mcap'), '--out', '/proc/model.yaml'],
+        ['import_poses', 'none.tsv', '--out', '/proc/session.mcap'],
+    ):
+        assert main(command) == 2
+        assert 'nothing can be written into /proc' in capsys.readouterr().err

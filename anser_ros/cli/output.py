@@ -3,6 +3,7 @@
 import json
 import os
 import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -85,8 +86,13 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ParameterError(f'no folder {folder}: {error.strerror}') from error
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise ParameterError(f'no permission to write into {folder}')
+    try:  # permissions alone do not tell: a file system may be full, or no place for files
+        with tempfile.TemporaryFile(dir=folder) as stream:
+            stream.write(b'x')
+            stream.flush()
+    except OSError as error:
+        words = os.strerror(error.errno or 0)
+        raise ParameterError(f'nothing can be written into {folder}: {words}') from error
 
 
 def say_written(*paths: Path) -> None:
