@@ -23,9 +23,10 @@ LEAST_DRIFT = 2e-4
 a millimetre."""
 CERTAIN = 5.0
 """The same in standard deviations of what noise makes of it."""
-COMMON = 0.9
-"""Share of the power of an emitter's changes that one factor must explain: of metal that passes it
-explains a half at most, as fields of metal have other directions at each sensor."""
+COMMON = 0.995
+"""Share of the power of an emitter's changes that one factor must explain. It explains all of a
+drift; of a large metal body that comes up from below it explains up to 97 %, so that less would
+take metal for a drift, and more would miss a drift beside a little of anything else."""
 
 
 def emitter_strength(reference: Measurements) -> ComplexArray:
