@@ -49,6 +49,7 @@ def test_the_chosen_references_are_all_that_a_session_has(metal):
         with_references(replace(metal, reference=None), [1])
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures('shared_tables')
 def test_without_enough_references_there_is_no_pose_near_metal(metal):
     model, clean = load_model(MODEL), load_session(REPO / 'bags' / 'factory.mcap')

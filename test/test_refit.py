@@ -13,7 +13,8 @@ from anser_ros.refit.baseline import ReadingWindow
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.settings import RefitSettings
 
-pytestmark = pytest.mark.usefixtures('shared_tables')
+# The refit that all share takes some five seconds to work out.
+pytestmark = [pytest.mark.usefixtures('shared_tables'), pytest.mark.long]
 
 
 @pytest.fixture(scope='module')

@@ -7,7 +7,8 @@ from refit_world import anser_world
 
 from anser_ros.refit.live_refit import LiveRefit
 
-pytestmark = pytest.mark.usefixtures('shared_tables')
+# The refit that all share takes some five seconds to work out.
+pytestmark = [pytest.mark.usefixtures('shared_tables'), pytest.mark.long]
 
 
 @pytest.fixture(scope='module')

@@ -219,6 +219,7 @@ def test_tangents_are_across():
     assert np.allclose(np.einsum('stj,suj->stu', pair, pair), np.eye(2))
 
 
+@pytest.mark.long
 def test_sessions_that_say_different_things_of_a_sensor_are_told(dirty):
     told, whole, _ = dirty
     halves = [told.frames(np.arange(0, 250)), told.frames(np.arange(250, 500))]

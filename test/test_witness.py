@@ -96,6 +96,7 @@ def alone(world):
     return followed(world, witnesses=False)[0]
 
 
+@pytest.mark.long
 def test_a_tool_tells_what_few_references_leave_open(world, alone):
     share, _ = followed(world, witnesses=True, off_m=2e-4)
     assert share < 0.6 * alone
