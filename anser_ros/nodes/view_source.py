@@ -260,7 +260,7 @@ class ViewSource:
         parts = [
             (told.level, f'{part.partition(": ")[2]}: {told.message}')
             for part, told in self._told.items()
-            if part.startswith(f'{name}: ')
+            if part.startswith(f'{name}: ') and view.silent_s(part) <= SILENT_S
         ]
         own = self._told[name]
         return [(own.level, own.message), *parts]
