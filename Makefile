@@ -9,7 +9,8 @@ READY_OLDEST = $(VENV_OLDEST)/.installed-oldest
 ENVIRONMENT = OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE=
 # Three processes run the tests, as test/conftest.py shares them out: on two cores one calculates
 # while two mostly wait for nodes. ARGS='-n 0' has one alone.
-WORKERS = -n 3 --dist loadgroup --no-loadscope-reorder
+COUNT = 3
+WORKERS = -n $(COUNT) --dist loadgroup --no-loadscope-reorder
 ARGS ?=
 # What the installation is made of: a new command or version installs anew.
 PACKAGING = setup.py package.xml anser_ros/cli/commands.py
@@ -67,6 +68,7 @@ test: lint
 	exit $$passed
 
 test-quick: QUICK = -m 'not processes and not long'
+test-quick: COUNT = 2
 test-quick: test
 
 test-oldest: $(READY_OLDEST)

@@ -38,6 +38,7 @@ def misfit(one, other):
     return np.sqrt(np.mean(np.sum((turn.apply(one) - other) ** 2, axis=1)))
 
 
+@pytest.mark.long
 def test_errors_fall_and_stamps_move_to_the_references_clock(bent):
     world, model = bent
     corrector = PoseCorrector(model)

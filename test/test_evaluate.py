@@ -106,6 +106,7 @@ def test_files_and_json_are_the_contracts(model, tmp_path, capsys):
     assert all(float(row['sigma_position_m']) > 0 for row in good)
 
 
+@pytest.mark.long
 def test_in_phase_alone_tracks_where_there_is_no_metal(model, tmp_path):
     arguments = ['evaluate', str(BAGS / 'moving.mcap'), '--model', str(model), '--in-phase']
     assert main([*arguments, '--out', str(tmp_path)]) == 0
@@ -113,6 +114,7 @@ def test_in_phase_alone_tracks_where_there_is_no_metal(model, tmp_path):
     assert all(row['position_rmse_m'] < 0.25e-3 for row in document['sensors'].values())
 
 
+@pytest.mark.long
 def test_the_nominal_model_tracks_worse_than_the_calibrated(tmp_path):
     arguments = ['evaluate', str(BAGS / 'moving.mcap'), '--model', 'nominal']
     assert main([*arguments, '--out', str(tmp_path)]) == 0

@@ -68,6 +68,7 @@ def test_sigma_that_is_too_small_shows(evaluation):
     plt.close('all')
 
 
+@pytest.mark.long
 def test_the_page_holds_all_figures(evaluation, tmp_path):
     document = to_document(evaluation)
     files = figures.write_figures(

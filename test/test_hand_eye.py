@@ -59,6 +59,7 @@ def shah(session):
     return frame, solution[:3], solution[3:]
 
 
+@pytest.mark.long
 def test_frames_and_clocks_are_found_and_their_sigmas_are_honest():
     scores = {'lever': [], 'mount': [], 'place': [], 'turn': [], 'offset': [], 'rate': []}
     for seed in SEEDS:
@@ -83,6 +84,7 @@ def test_frames_and_clocks_are_found_and_their_sigmas_are_honest():
     assert max(np.abs(np.mean(np.array(v), axis=0)).max() for v in scores.values()) < 1.5
 
 
+@pytest.mark.long
 def test_static_pairs_agree_with_a_closed_form():
     """Both see the same data, and are as near to the truth."""
     ours, theirs = [], []

@@ -60,6 +60,7 @@ def test_numbers_that_are_missing_are_null():
     assert measured.table([row]).row_count == 1
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not (SHARED / 'measured').is_dir(), reason='no shared measured data')
 def test_json_alone_on_stdout(capsys, tmp_path):
     code = measured_main(

@@ -58,6 +58,7 @@ class TestFrames:
             write_frames(path, setup, [10], flux)
 
 
+@pytest.mark.long
 class TestNavion:
     EMITTER = Emitter('electromagnet', {'current_a': 35.0}, COILS)
 

@@ -191,6 +191,7 @@ class TestServer:
         finally:
             server.close()
 
+    @pytest.mark.long
     def test_a_client_that_reads_nothing_holds_nobody_up(self):
         server = IgtlServer('127.0.0.1', 0, answer)
         try:

@@ -62,6 +62,7 @@ def test_the_same_coil_twice_tells_little_more(metals):
     assert (expected_errors(metals, (0, 4), K) < one).all()
 
 
+@pytest.mark.long
 def test_a_list_of_places_gives_a_table_and_a_picture(tmp_path, capsys):
     angle = np.linspace(0.0, 2.0 * np.pi, 7)[:-1]
     lines = ['x_m,y_m,z_m', *(f'{0.17 * np.cos(a)},{0.17 * np.sin(a)},0.05' for a in angle)]

@@ -21,6 +21,7 @@ def hand_eyes(found):
     return [record for record in found.records if record.name == 'hand_eye']
 
 
+@pytest.mark.long
 def test_a_clean_session_has_hand_eye_alone_and_knows_how_well():
     world = World(1)
     found = diagnose_poses(world.session())

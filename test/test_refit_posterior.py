@@ -192,6 +192,7 @@ def test_layers_stand_for_their_clouds_also_between_their_samples(world, parts):
         assert len(stand_in.positions) <= 200
 
 
+@pytest.mark.long
 def test_a_calibrated_layer_takes_the_change_itself(world, parts):
     excitation, region, _, _, _ = parts
     side = np.linspace(-1.3, 1.3, 12) * region.half

@@ -267,6 +267,7 @@ def test_a_map_of_mere_noise_is_not_used(rng):
     assert found.after_m == found.before_m
 
 
+@pytest.mark.long
 def test_the_error_reported_of_a_map_is_the_error_at_new_places(rng):
     """Whether a map is used is decided without the blocks that its error is reported of."""
     reported, fresh = [], []

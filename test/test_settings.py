@@ -172,6 +172,7 @@ class TestStating:
         assert stamp_sigma(stated) == 2e-3
 
 
+@pytest.mark.long
 class TestEffect:
     """Each value, set to another, changes what it should."""
 

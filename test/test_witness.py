@@ -102,6 +102,7 @@ def test_a_tool_tells_what_few_references_leave_open(world, alone):
     assert share < 0.6 * alone
 
 
+@pytest.mark.long
 def test_metal_that_has_left_is_forgotten(world):
     _, refit = followed(world, witnesses=True)
     rows, rng = [0, 4, 8, 12], np.random.default_rng(8)
