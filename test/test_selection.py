@@ -7,7 +7,7 @@ import pytest
 from calibration_world import NOISE_T, scene
 
 from anser_ros.calibration.blocks import FOLDS, fold_of_frames
-from anser_ros.calibration.calibrate import Options, calibrate
+from anser_ros.calibration.calibrate import Options, fit_scan, survey
 from anser_ros.calibration.error_map import FEWEST_POINTS, IDENTITY, learn_error_map
 from anser_ros.calibration.held_out import rms
 from anser_ros.calibration.layout_fit import fit_layout
@@ -22,6 +22,13 @@ from anser_ros.settings import Accuracy
 
 EMITTERS = ('a', 'b', 'c')
 TONES = (1000.0, 1100.0, 1200.0)
+
+
+def calibrate(measurements, names, generator, emitters, tones, options=None, nominal=None):
+    """Survey measurements and fit a model to them, as a session's calibration does."""
+    options = options or Options()
+    scan = survey(measurements, generator, options, nominal)
+    return fit_scan(scan, names, generator, emitters, tones, options, nominal)
 
 
 @pytest.fixture

@@ -59,50 +59,6 @@ class Options:
     estimate: tuple[str, ...] = ()
 
 
-def calibrate(
-    measurements: Sequence[Measurements],
-    names: Sequence[str],
-    generator: Generator,
-    emitters: tuple[str, ...],
-    frequencies_hz: tuple[float, ...],
-    options: Options | None = None,
-    nominal: FieldModel | None = None,
-    progress: Progress | None = None,
-    steady: Sequence[NDArray[np.bool_]] | None = None,
-) -> Calibration:
-    """Fit a field model to measurements.
-
-    Parameters
-    ----------
-    measurements : sequence of Measurements
-        One a body and session; their optical poses are the reference.
-    names : sequence of str
-        Name of the session of each.
-    generator : Generator
-        Places of the coils.
-    emitters : tuple of str, length K
-        Names of the emitters.
-    frequencies_hz : tuple of float, length K
-        Drive frequencies, Hz.
-    options : Options, optional
-        Uncertainties, and what not to choose.
-    nominal : FieldModel, optional
-        The drawn board: a prior of the fit, and compared with its result.
-    progress : callable, optional
-        Called with the name of the stage and its finished fraction.
-    steady : sequence of ndarray of bool, shape (F,), optional
-        Frames of each of the measurements in which the references saw nothing move.
-
-    Raises
-    ------
-    FitError
-        When the measurements cannot determine a model, or one field cannot explain all sessions.
-    """
-    options = options or Options()
-    scan = survey(measurements, generator, options, nominal, progress, steady)
-    return fit_scan(scan, names, generator, emitters, frequencies_hz, options, nominal, progress)
-
-
 def fit_scan(
     scan: Scan,
     names: Sequence[str],
@@ -113,7 +69,26 @@ def fit_scan(
     nominal: FieldModel | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Choose and fit a field model to a scan that was surveyed; arguments as of `calibrate`.
+    """Choose and fit a field model to a scan that was surveyed.
+
+    Parameters
+    ----------
+    scan : Scan
+        What `survey` made of the measurements.
+    names : sequence of str
+        Name of the session of each of the measurements.
+    generator : Generator
+        Places of the coils.
+    emitters : tuple of str, length K
+        Names of the emitters.
+    frequencies_hz : tuple of float, length K
+        Drive frequencies, Hz.
+    options : Options
+        Uncertainties, and what not to choose.
+    nominal : FieldModel, optional
+        The drawn board: a prior of the fit, and compared with its result.
+    progress : callable, optional
+        Called with the name of the stage and its finished fraction.
 
     Raises
     ------
@@ -167,7 +142,20 @@ def survey(
 ) -> Scan:
     """Return the measurements as sound sensors would have given them, and what was not.
 
-    Arguments as of `calibrate`.
+    Parameters
+    ----------
+    measurements : sequence of Measurements
+        One a body and session; their optical poses are the reference.
+    generator : Generator
+        Places of the coils.
+    options : Options
+        Uncertainties, and what is estimated of the sensors.
+    nominal : FieldModel, optional
+        The drawn board: a prior of the fit.
+    progress : callable, optional
+        Called with the name of the stage and its finished fraction.
+    steady : sequence of ndarray of bool, shape (F,), optional
+        Frames of each of the measurements in which the references saw nothing move.
 
     Raises
     ------

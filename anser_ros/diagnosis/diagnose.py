@@ -24,7 +24,7 @@ from anser_ros.diagnosis.outlying import clean_start, outlying_share, without_ou
 from anser_ros.diagnosis.prepare import test_blocks, train_blocks
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.diagnosis.refine import FINE, settled
-from anser_ros.diagnosis.residuals import raw_rms, rms
+from anser_ros.diagnosis.residuals import rms
 from anser_ros.diagnosis.search import Progress, Search, SearchSettings, search_effects
 from anser_ros.diagnosis.structure import StructureTest, noise_scale, noise_t, structure_tests
 from anser_ros.diagnosis.whiteness import whiteness
@@ -50,8 +50,6 @@ class Diagnosis:
     findings : tuple of Finding
     flux_rms_before_t, flux_rms_after_t, flux_rms_floor_t : float
         Held-out residuals with the pose jitter taken out, T a phasor component.
-    raw_rms_before_t, raw_rms_after_t : float
-        The same with the jitter in.
     unexplained : float
         Share of the power above the floor that remains.
     depends_on : tuple of str
@@ -69,8 +67,6 @@ class Diagnosis:
     flux_rms_before_t: float
     flux_rms_after_t: float
     flux_rms_floor_t: float
-    raw_rms_before_t: float
-    raw_rms_after_t: float
     unexplained: float
     depends_on: tuple[str, ...]
     tests_before: tuple[StructureTest, ...]
@@ -259,8 +255,6 @@ def conclude(
         flux_rms_before_t=rms(before),
         flux_rms_after_t=rms(after),
         flux_rms_floor_t=floor,
-        raw_rms_before_t=raw_rms(before),
-        raw_rms_after_t=raw_rms(after),
         unexplained=excess / possible if significant and possible > 0 else 0.0,
         depends_on=depends,
         tests_before=tuple(structure_tests(before)),

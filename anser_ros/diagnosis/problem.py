@@ -121,7 +121,7 @@ class State:
 
     @property
     def sum_of_squares(self) -> float:
-        """Of the whitened residuals."""
+        """Return the sum of squares of the whitened residuals."""
         return float(sum(np.sum(part.white**2) for part in self.parts))
 
     @property

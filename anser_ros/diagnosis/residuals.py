@@ -15,13 +15,3 @@ def rms(state: State) -> float:
     squares = sum(float(np.sum(part.white**2)) for part in tool_parts(state))
     count = sum(part.count for part in tool_parts(state))
     return float(np.sqrt(squares / max(count, 1))) * state.problem.spread.flux_t
-
-
-def raw_rms(state: State) -> float:
-    """Residual of the tools as it is, T a phasor component."""
-    squares, count = 0.0, 0
-    for part in tool_parts(state):
-        good = part.whitener.weight > 0
-        squares += float(np.sum(part.residual[good] ** 2))
-        count += int(good.sum())
-    return float(np.sqrt(squares / max(count, 1)))

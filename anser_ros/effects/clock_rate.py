@@ -56,7 +56,7 @@ class ClockRate(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """From offset and rate."""
+        """Return the term of an offset and a rate."""
         rate = 1e-6 * float(needed(record, 'rate_ppm'))
         return Term(self, {}, np.array([float(needed(record, 'offset_s')), rate]))
 

@@ -75,7 +75,7 @@ class CoilCrosstalk(Effect[Term]):
         return matrix
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
-        """One entry, or two."""
+        """Return the unit matrix with one entry more, or two."""
         return self._matrix(term, omega.size)[None]
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:

@@ -52,7 +52,7 @@ class CoilGain(Effect[Term]):
         return EffectRecord(self.name, {'coil': term.site['coil'], **figures}, sigmas)
 
     def term(self, record: EffectRecord) -> Term:
-        """From gain and phase."""
+        """Return the term of a gain and a phase."""
         return Term(self, {'coil': int(needed(record, 'coil'))}, theta_of(record))
 
 

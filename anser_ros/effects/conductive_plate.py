@@ -130,7 +130,7 @@ class ConductivePlate(Effect[Term]):
         return np.stack([unit, 1j * unit], axis=-1)
 
     def started(self, term: Term, solution: Array) -> Sequence[Term]:
-        """The sheet as probed."""
+        """Return the term of the sheet as it was probed."""
         return (term,)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:

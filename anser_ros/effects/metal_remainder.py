@@ -58,7 +58,7 @@ class Couplings:
 
     @property
     def count(self) -> int:
-        """Real, then imaginary parts."""
+        """Return the number of parameters: real, then imaginary parts."""
         return 2 * int(self.modes.shape[1])
 
     def unit(self, view: View) -> NDArray[np.inexact]:

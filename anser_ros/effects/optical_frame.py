@@ -36,7 +36,7 @@ class OpticalScale(Effect[Term]):
         return [Term(self, {}, np.zeros(4))] if apparatus.tools else []
 
     def prior(self, term: Term) -> Array:
-        """A percent, some millimetres."""
+        """Scales err by a percent, shifts are some millimetres."""
         return np.array([0.01, 5e-3, 5e-3, 5e-3])
 
     def amounts(self, term: Term) -> NDArray[np.int64]:

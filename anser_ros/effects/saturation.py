@@ -151,7 +151,7 @@ class Saturation(Effect[SaturationTerm]):
         return EffectRecord(self.name, parameters, {'full_scale_t': float(full_scale * relative)})
 
     def term(self, record: EffectRecord) -> SaturationTerm:
-        """From the full scale."""
+        """Return the term of a full scale."""
         full_scale = float(needed(record, 'full_scale_t'))
         site = {
             'channel': int(needed(record, 'channel')),

@@ -27,7 +27,7 @@ class SensorGain(Effect[Term]):
     remedy = Remedy.FLUX
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Every channel, references too."""
+        """Return a term for every channel, references too."""
         return [Term(self, {'channel': c}, np.zeros(2)) for c in apparatus.channels]
 
     def prior(self, term: Term) -> Array:
@@ -58,7 +58,7 @@ class SensorGain(Effect[Term]):
         return EffectRecord(self.name, {'channel': term.site['channel'], **figures}, sigmas)
 
     def term(self, record: EffectRecord) -> Term:
-        """From gain and phase."""
+        """Return the term of a gain and a phase."""
         return Term(self, {'channel': int(needed(record, 'channel'))}, theta_of(record))
 
 

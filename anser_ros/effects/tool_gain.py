@@ -61,7 +61,7 @@ class ToolGain(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """From gain and phase."""
+        """Return the term of a gain and a phase."""
         return Term(self, {'channels': tuple(needed(record, 'channels'))}, theta_of(record))
 
 

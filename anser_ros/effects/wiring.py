@@ -53,7 +53,7 @@ class SwappedChannels(Effect[Term]):
 
 
 class SwappedCoils(Effect[Term]):
-    """As `SwappedChannels`, of emitters."""
+    """Each emitter of ``coils`` is shown in the place of the one in ``read_as``."""
 
     name = 'swapped_coils'
     summary = 'emitters are plugged into each other'
@@ -90,7 +90,7 @@ class DeadChannel(Effect[Term]):
     family = Family.SEEN
 
     def silenced(self, term: Term) -> tuple[int, ...]:
-        """All of its channels."""
+        """Return all channels that the term names."""
         return term.channels
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:

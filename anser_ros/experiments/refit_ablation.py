@@ -30,7 +30,6 @@ farther astray."""
 COUNTS = (4, 8, 16, 32)
 """Numbers of reference coils that are compared; the demo's board has 32."""
 FROZEN, FREE, SHARED = 'frozen model', 'free dipoles', 'shared polarisability'
-METHODS = (FROZEN, FREE, SHARED)
 
 
 @dataclass(frozen=True)

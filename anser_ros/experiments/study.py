@@ -36,7 +36,6 @@ Errors = dict[str, SensorErrors]
 
 STATIC_NOISE_T = 30e-12
 """Flux noise of a static point, T rms a component, as the recordings have it; for the bound."""
-METHODS = ('drawing', 'article', 'ours')
 
 
 @dataclass

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from anser_ros.nodes.parameters import parameter
-from anser_ros.wire.port import DEFAULT_BAUD
+from anser_ros.wire.port import DEFAULT_BAUD, SILENCE_S
 from anser_ros.wire.protocols import PROTOCOLS
 
 
@@ -45,5 +45,5 @@ class AcquisitionParameters:
         True, 'whether the control unit is told to drive the tones of the setup document'
     )
     silence_s: float = parameter(
-        1.5, 'time without a byte that counts as a fault, s', minimum=0.1, maximum=60.0
+        SILENCE_S, 'time without a byte that counts as a fault, s', minimum=0.1, maximum=60.0
     )

@@ -21,7 +21,7 @@ from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.shared_names import optical_parameter, optical_topic
 from anser_ros.simulation.board_source import board_source
-from anser_ros.simulation.control_unit import ControlUnit, Piece
+from anser_ros.simulation.control_unit import BLOCK_SAMPLES, ControlUnit, Piece
 from anser_ros.simulation.effect_draw import NONE as NO_EFFECT
 from anser_ros.simulation.effect_draw import Drawn, draw
 from anser_ros.simulation.faults import (
@@ -65,14 +65,22 @@ class CuSimulatorParameters:
         minimum=0,
     )
     sample_rate_hz: float = parameter(
-        40e3, 'samples a second and channel', minimum=16e3, maximum=100e3
+        FrontEnd.sample_rate_hz, 'samples a second and channel', minimum=16e3, maximum=100e3
     )
-    block_samples: int = parameter(40, 'sampling instants a block', minimum=1, maximum=600)
+    block_samples: int = parameter(
+        BLOCK_SAMPLES, 'sampling instants a block', minimum=1, maximum=600
+    )
     noise_codes: float = parameter(
-        2.4, 'white noise before the converter, codes rms', minimum=0.0, maximum=1000.0
+        FrontEnd.noise_codes,
+        'white noise before the converter, codes rms',
+        minimum=0.0,
+        maximum=1000.0,
     )
     current_drift: float = parameter(
-        0.02, 'share by which the coil currents fall as they warm up', minimum=0.0, maximum=0.5
+        FrontEnd.current_drift,
+        'share by which the coil currents fall as they warm up',
+        minimum=0.0,
+        maximum=0.5,
     )
     metal: bool = parameter(True, 'whether a steel disc comes and goes')
     metal_radius_m: float = parameter(0.06, 'of the disc, m', minimum=0.005, maximum=0.3)

@@ -77,7 +77,7 @@ class PoseFit:
         return np.asarray(formal * scale[:, None] * scale[None, :])
 
     def covariance_of(self, index: int, whole: Array | None = None) -> Array:
-        """Of one term's parameters."""
+        """Return the covariance of one term's parameters."""
         sizes = np.cumsum([0] + [t.theta.size for t in self.terms])
         rows = slice(sizes[index], sizes[index + 1])
         return (self.covariance() if whole is None else whole)[rows, rows]

@@ -61,7 +61,7 @@ class Reading:
 
 
 AS_WRITTEN = Reading('')
-"""The poses as the contract has them: m, x y z w, body to fg."""
+"""The poses as `docs/interfaces.md` has them: m, x y z w, body to fg."""
 W_FIRST = (1, 2, 3, 0)
 """Where x, y, z and w stand in a quaternion that begins with w."""
 OTHER_READINGS = (

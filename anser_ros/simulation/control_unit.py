@@ -37,6 +37,8 @@ from anser_ros.wire.records import (
 
 TICK_HZ = 1e6
 """Rate of the device's timestamp counter, Hz."""
+BLOCK_SAMPLES = 40
+"""Sampling instants a block, unless a setting says another: 1 ms at the usual rate."""
 _COMMANDS = (Identify, Start, Stop, SetFrequencies)
 
 
@@ -86,7 +88,7 @@ class ControlUnit:
         calibration: ChannelCalibration,
         front_end: FrontEnd | None = None,
         *,
-        block_samples: int = 40,
+        block_samples: int = BLOCK_SAMPLES,
         effects: Sequence[RawEffect] = (),
         seed: int = 0,
         name: str = 'anser_ros simulated control unit',

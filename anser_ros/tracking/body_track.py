@@ -114,7 +114,7 @@ class _BodyFrame:
 
     @cached_property
     def inverse_sigma(self) -> Array:
-        """1/T, shape (2K,)."""
+        """Return the inverse of each sigma, 1/T, shape (2K,)."""
         return 1.0 / self.context.sigma
 
     def common(self, used: NDArray[np.int64], start: Start) -> Array:

@@ -27,6 +27,9 @@ GOODBYE_S = 0.1
 """Time, s, that the last messages get to leave before the process ends."""
 DEFAULT_BAUD = 12_000_000
 """Baud rate of the port; USB devices ignore it."""
+SILENCE_S = 1.5
+"""Time without a byte that counts as a fault, s, unless a setting says another: a unit says hello
+once a second."""
 _COMMANDS = 64
 """Commands that may wait to be written, and of which the time is remembered; they are answered
 within a second, and asked at most a few times a second."""
@@ -102,7 +105,7 @@ class ControlUnitPort:
         *,
         protocol: SerialProtocol = ANSER,
         baud: int = DEFAULT_BAUD,
-        silence_s: float = 1.5,
+        silence_s: float = SILENCE_S,
         queue_blocks: int = 2048,
         pause_s: float = 0.1,
         longest_pause_s: float = 2.0,

@@ -34,7 +34,7 @@ class PoseTimeOffset(PoseEffect):
         return [Term(self, {}, np.zeros(1)), *(own if len(own) > 1 else [])]
 
     def prior(self, term: Term) -> Array:
-        """Tenths of a second."""
+        """Offsets are some tenths of a second."""
         return np.full(1, 0.3)
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
@@ -42,7 +42,7 @@ class PoseTimeOffset(PoseEffect):
         return -view.velocity[:, :, None] if self.acts_on(term, view.sensor) else None
 
     def clock(self, term: Term, sensor: str, time: Array) -> Array:
-        """Stamps less the offset."""
+        """Return the stamps less the offset."""
         return time - term.theta[0] if self.acts_on(term, sensor) else time
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
@@ -71,7 +71,7 @@ class PoseClockRate(PoseEffect):
         return [Term(self, {'middle_s': 0.5 * setting.duration}, np.zeros(1))]
 
     def prior(self, term: Term) -> Array:
-        """Parts in a thousand."""
+        """Rates err by some parts in a thousand."""
         return np.full(1, 2.0)
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:

@@ -41,7 +41,7 @@ class TrackerLag(PoseEffect):
         return [Term(self, {}, np.array([tau])) for tau in TAUS_S]
 
     def prior(self, term: Term) -> Array:
-        """Tenths of a second."""
+        """Lags are some tenths of a second."""
         return np.full(1, 0.1)
 
     def filter(self, term: Term, path: OpticalPath) -> OpticalPath:
