@@ -209,6 +209,9 @@ class TestHummel:
             grid_points(shuffled, grid)
         with pytest.raises(ParameterError, match='--grid'):
             Grid.of(24, None, 0.05)
+        small = [point(p) for p in board(3, 4)]
+        with pytest.raises(FitError, match='--grid 3x4'):
+            grid_points(small, Grid.of(12, (4, 3), 0.05))
 
     def test_the_interval_holds_what_repetition_gives(self):
         grid, true, rng = Grid.of(12, None, 0.05), board(3, 4).reshape(3, 4, 3), rng_of(8)
@@ -383,6 +386,10 @@ class TestCommand:
         (tmp_path / 'truth.csv').write_text(f'x_mm,y_mm,z_mm\n{rows}\n')
         truth = ['--truth', str(tmp_path / 'truth.csv')]
         assert run_verb('accuracy', ['point-to-point', one, *truth]) == 0
+        (tmp_path / 'truth.csv').write_text(f'\ufeffx_mm,y_mm,z_mm\n{rows}\n', encoding='utf-8')
+        assert run_verb('accuracy', ['point-to-point', one, *truth]) == 0
+        (tmp_path / 'truth.csv').write_text('x_mm,y_mm,z_mm\n' + 'nan,0,0\n' * 12)
+        assert run_verb('accuracy', ['point-to-point', one, *truth]) == 2
         assert 'rigid_fit_m' in capsys.readouterr().out
 
     @pytest.mark.parametrize(

@@ -90,6 +90,7 @@ def test_a_list_of_places_gives_a_table_and_a_picture(tmp_path, capsys):
         (['--references', '2', '--metal', 'above'], '--metal'),
         (['--references', '2', '--error-mm', '-1'], '--error-mm'),
         (['--references', '2', '--from', 'plane=x'], 'height'),
+        (['--references', '2', '--from', 'plane=50'], 'heights are in m'),
         (['--references', '2', '--from', 'nowhere.csv'], 'nowhere.csv'),
     ],
 )

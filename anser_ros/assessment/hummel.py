@@ -121,6 +121,12 @@ def grid_points(points: Sequence[StillPoint], grid: Grid, order: str = 'rows') -
             f'neighbouring points are {1e3 * off[1]:.0f} mm off (rms), and with --order {better} '
             f'{1e3 * turned_off[1]:.1f} mm'
         )
+    lying = place.reshape(grid.columns, grid.rows, 3)
+    if _off(lying, grid)[1] < WRONG_ORDER * off[1] and off[1] > WRONG_ORDER * grid.spacing_m:
+        raise FitError(
+            f'neighbouring points are {1e3 * off[1]:.0f} mm off (rms), and with --grid '
+            f'{grid.columns}x{grid.rows} {1e3 * _off(lying, grid)[1]:.1f} mm'
+        )
     if off[0] > WRONG_ORDER * grid.spacing_m:
         raise FitError(
             f'neighbouring points are {1e3 * off[0]:.0f} mm off their '

@@ -186,7 +186,7 @@ def _options(args: argparse.Namespace) -> ProtocolOptions:
 
 def _truth(path: Path) -> Array:
     """Points of a CSV, m, shape (n, 3)."""
-    with path.open(encoding='utf-8', newline='') as stream:
+    with path.open(encoding='utf-8-sig', newline='') as stream:
         rows = list(csv.DictReader(stream))
     for unit, scale in (('m', 1.0), ('mm', 1e-3)):
         names = [f'{axis}_{unit}' for axis in 'xyz']
@@ -195,6 +195,8 @@ def _truth(path: Path) -> Array:
                 table = np.array([[float(row[name]) for name in names] for row in rows])
             except (TypeError, ValueError) as error:
                 raise ParameterError(f'{path}: needs numbers in {", ".join(names)}') from error
+            if not np.isfinite(table).all():
+                raise ParameterError(f'{path}: needs finite numbers in {", ".join(names)}')
             return scale * table
     raise ParameterError(f'{path}: needs rows with the columns x_m, y_m, z_m, or x_mm, y_mm, z_mm')
 

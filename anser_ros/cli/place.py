@@ -41,6 +41,8 @@ AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, -1, -1]]) / np.
 """Axes that a coil may have where nobody states them: three of a cluster, and two oblique ones."""
 LENGTH_M = 0.008
 """Length of a coil that is not stated, m."""
+FARTHEST = 10.0
+"""Height of a plane, in halves of the board, beyond which its coils hear nothing of it."""
 MOST_CANDIDATES = 400
 """Coils to choose from; more take minutes and gigabytes."""
 RANDOM_TRIES, SEED = 20, 1
@@ -181,6 +183,11 @@ def candidates_of(setup: Setup, origin: str, region: Region) -> SensorTable:
             height = float('nan')
         if not np.isfinite(height):
             raise ParameterError(f'--from {origin}: the height must be a number, m')
+        if abs(height) > FARTHEST * half:
+            raise ParameterError(
+                f'--from {origin}: a height of {height:g} m is too far from a board of '
+                f'{2e3 * half:.0f} mm; heights are in m'
+            )
         line = SPACING * half * np.arange(-3, 4)
         x, y = np.meshgrid(line + middle[0], line + middle[1], indexing='ij')
         places = np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)

@@ -69,7 +69,7 @@ def read_form(path: Path) -> dict[str, RawRows]:
     ParameterError
         When no form fits, or the file has no row.
     """
-    lines = path.read_text(encoding='utf-8', errors='replace').splitlines()
+    lines = path.read_text(encoding='utf-8-sig', errors='replace').splitlines()
     lines = [line for line in lines if line.strip() and not line.lstrip().startswith('#')]
     if not lines:
         raise ParameterError(f'{path}: no rows')

@@ -194,7 +194,9 @@ def compare_shares(
 
 def _names(first: dict[Key, float], second: dict[Key, float]) -> list[str]:
     if not first.keys() & second.keys():
-        raise ParameterError('the two have no frame in common: are they of the same session?')
+        raise ParameterError(
+            'the two have no frame in common: are they of the same session, and have both poses?'
+        )
     return list(dict.fromkeys(name for _, name in (*first, *second)))
 
 
