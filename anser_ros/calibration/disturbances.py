@@ -30,7 +30,9 @@ SEEN = 8.0
 """Power of the references' deviation in a stretch, in standard deviations beyond the noise's, from
 which on something moved."""
 EDGE = 3.0
-"""The same, beside a stretch that something moved in: it comes and goes gradually."""
+"""The same, beside a stretch that something moved in: it comes and goes gradually. Smaller spreads
+a disturbance over quiet stretches next to it; larger leaves its beginning and end in the data. Its
+choice is not recorded."""
 ROUNDS = 6
 """Rounds in which the quiet stretches are told from the others."""
 

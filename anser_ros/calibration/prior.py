@@ -25,12 +25,16 @@ second one along z). With three axes a point they are some 2000 equations for at
 dipoles; fewer would leave the field between the points free."""
 MARGIN = 0.3
 """How far beyond the measured volume the drawn field is followed, as a fraction of its half size,
-so that a model extrapolates as the drawing does."""
+so that a model extrapolates as the drawing does. Smaller leaves the field beyond the edge of a
+scan free; larger spends dipoles on places where nobody measures. Its choice is not recorded."""
 LEAST_HALF_SIZE_M = 0.02
-"""Half size of that volume at least, m, for measurements along a line or in a plane."""
+"""Half size of that volume at least, m, for measurements along a line or in a plane. Smaller gives
+a lattice so flat that it does not tell the field across it; larger follows the drawing far from
+what was measured. Its choice is not recorded."""
 LEAST_HEIGHT = 0.8
-"""Lowest point of that volume as a fraction of the lowest reading's height: farther down the field
-of the drawn coils changes too fast for a layer of dipoles."""
+"""Lowest point of that volume as a fraction of the lowest reading's height. Smaller asks for the
+field farther down, where that of the drawn coils changes too fast for a layer of dipoles; larger
+leaves it free just below the scan. Its choice is not recorded."""
 PROJECTION_DAMPING = 1e-6
 """Damping when a known field without noise is expressed by dipoles, as a fraction of the largest
 singular value. It only keeps nearly parallel columns from making huge moments."""

@@ -72,7 +72,9 @@ FREE_POSE = np.repeat([1.0 / 0.02**2, 1.0 / 0.1**2], 3)
 """Precision of a pose that is to follow the fluxes, 1/m^2 and 1/rad^2: a prior of 2 cm and 0.1 rad
 holds only what they do not tell."""
 FIELD_WIDTH = 0.3
-"""Prior width of the field's deviation from the drawing, relative to the flux, to begin with."""
+"""Prior width of the field's deviation from the drawing, relative to the flux, to begin with;
+later steps find their own. Smaller holds the first steps to a poor drawing; larger lets the field
+take up what is the sensors'. Its choice is not recorded."""
 LEAST_FIELD_WIDTH = 1e-3
 """Least such width: no board is made more exactly than that."""
 FIT_NOISE = 10.0

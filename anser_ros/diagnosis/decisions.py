@@ -46,7 +46,8 @@ REMNANT = 0.01
 """Further metal with less than this share of the strongest metal's gain is what the model of that
 one left."""
 MOST_METALS = 2
-"""Pieces of metal in force beside which no further metal is looked for."""
+"""Pieces of metal in force beside which no further metal is looked for. More let what the shapes
+of these leave pass for another piece; fewer leave a second piece to be taken for other effects."""
 MOST_DOUBTFUL = 2
 """With so many effects in force that are not the same in all parts of the data, something else is
 the cause, and further effects would only stand in for it: the search ends."""
@@ -54,17 +55,20 @@ PLAIN_TO_SEE = 5.0
 """An effect whose parameters stand so many times above what it must gain (by their covariance) is
 kept without the fit of all the others without it."""
 TOLD_APART = 0.05
-"""A candidate of whose power the fluctuations in force leave less than this share can't be told
-from them."""
+"""A candidate of whose power the fluctuations in force leave less than this share (0 to 1) can't
+be told from them. Smaller fits candidates that only noise decides on; larger hides effects behind
+a fluctuation."""
 
 # --- which candidates are fitted in full -------------------------------------------------------
 PROMISING = 0.5
 """Share of the best fitted gain that a candidate's probe must promise. The probe is linear and
 may promise too little, by less than this for the effects that there are."""
 OPEN_FINALISTS = 3
-"""Fluctuations that are fitted in full in each round."""
+"""Fluctuations that are fitted in full in each round. Fewer may pass over the right one, whose
+probe is only linear; each further one costs the time of a fit."""
 SITES_PER_EFFECT = 2
-"""Sites of one effect that are fitted in full in each round."""
+"""Sites (channels, coils, places) of one effect that are fitted in full in each round. With one, a
+wrong site whose probe happens to promise more shuts out the right one; more cost a fit each."""
 
 # --- which of several explanations is taken ----------------------------------------------------
 AS_GOOD, AS_GOOD_PER_PARAMETER = 10.0, 4.0
@@ -87,20 +91,25 @@ SOMETHING_LEFT = 1.02
 """Misfit over the noise's from which there is something to explain: a body is made richer only
 above it, and below it nothing that stays speaks against an effect."""
 MUCH_LEFT = 1.3
-"""The same for a first, coarse shape: the finer one follows once all effects are known."""
+"""The same for a first, coarse shape: the finer one follows once all effects are known. Smaller
+spends modes on what effects that are not found yet do; larger leaves so much of the metal that
+other effects stand in for it."""
 
 # --- whether metal moves or rests --------------------------------------------------------------
 FREER = 1.05
-"""Metal at the best place for each block of time must explain so much more than at one place, or
-it isn't tried as metal that moves."""
+"""Factor by which metal at the best place for each block of time must explain more than at one
+place, or it isn't tried as metal that moves. Smaller tries it for what noise gives so much
+freedom; larger overlooks metal that moves little."""
 LEAST_MORE = 100.0
 """Gain, in units of the misfit, that metal that moves must have over metal at rest, beside the
 shares above: its course and shape cost some dozens of parameters."""
 NO_RIVAL = 0.25
-"""Metal at rest that by itself explains less than this share of what moving metal explains is no
-rival to it."""
+"""Metal at rest that by itself explains less than this share (0 to 1) of what moving metal
+explains is no rival to it. Smaller spends fits on metal at rest that cannot win; larger lets
+moving metal be named without asking whether rest and one more effect would do."""
 BESIDE_REST = 3
-"""Effects that are tried beside metal at rest before metal is said to move."""
+"""Effects that are tried beside metal at rest before metal is said to move. Fewer let metal move
+for what rest and one more effect explain; each further one costs a full fit."""
 
 # --- whether an effect is confirmed and named --------------------------------------------------
 TIME_PARTS = 6
@@ -141,12 +150,15 @@ KNOWN_SIGMAS = 3.0
 chance alone does in one session of 700."""
 BESIDE_OUTLIERS = 0.3
 """Unexplained power over the floor's up to which frames that stand out are outliers: a model that
-is wrong by more makes some itself."""
+is wrong by more makes some itself. Larger names outliers that are another effect's; smaller leaves
+true ones unnamed beside a small unknown."""
 STRUCTURED, UNSTRUCTURED = 0.03, 0.1
-"""Unexplained power over the floor's from which it is reported: where it depends on something,
-and where no test finds on what."""
+"""Unexplained power over the floor's from which it is reported: where it depends on something, and
+where no test finds on what. Smaller reports a sound model's own error; larger keeps silent about
+what is there."""
 DEPENDENT = 0.05
-"""Unexplained power over the floor's from which it is said what it depends on."""
+"""Unexplained power over the floor's from which it is said what it depends on. Smaller gives names
+to dependences of next to nothing; larger leaves a remainder without the hint where to look."""
 
 
 def as_good(spared: int) -> float:

@@ -31,7 +31,8 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 FOLDS = 4
-"""Parts of the cross-validation over time blocks."""
+"""Parts of the cross-validation over time blocks: each fit uses three quarters of them. More cost
+a fit each, fewer leave less to fit on. Its choice is not recorded."""
 KNOTS = 9
 """Knots of a path to begin with: three seconds apart in half a minute of moving."""
 FINE_KNOTS = 17
@@ -44,19 +45,23 @@ SLOPE = 0.57
 """Share of a way that goes down, for ways to the side: metal that goes away does not come nearer
 to the tools above the board, and hardly ever goes level."""
 AROUND = 8
-"""Directions to the side."""
+"""Directions to the side in which a way is tried, one in 45 deg. Fewer may start too far from the
+true way for the fit to find it; time grows with their number. Its choice is not recorded."""
 FEW_FRAMES, SOME_FRAMES, MANY_FRAMES = 25, 60, 300
 """Frames of a tool, about, on which ways are compared, refined, and fitted at last."""
 BODY = Richness(90, (25,), SOMETHING_LEFT)
 """How finely the body is shaped, and the path divided beyond `FINE_KNOTS` where much is left."""
 STEPS = 6
-"""Steps of a fit."""
+"""Steps of a fit at most; fewer end before it has settled, and each further one costs as much time
+as the one before. Its choice is not recorded."""
 EXPLAINED = 0.1
 """Share of the power in unseen blocks, beyond the noise's, that may stay: with more, the body is
-no picture of this metal, and what it does at rest would be a guess."""
+no picture of this metal, and what it does at rest would be a guess. Smaller leaves metal in the
+field that is nearly understood. Its choice is not recorded."""
 KNOWN = 0.3
 """Standard deviation of what the metal does at rest, relative to that, from which on it is not
-taken off: it would be made worse as likely as better."""
+taken off: it would be made worse as likely as better. Larger takes off guesses; smaller leaves
+metal in the field that was known well enough. Its choice is not recorded."""
 
 
 @dataclass(frozen=True)

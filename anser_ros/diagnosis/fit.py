@@ -17,7 +17,9 @@ ATTEMPTS = 6
 """Dampings that are tried for a step that lowers the sum of squares; each is ten or a hundred
 times the one before, so the last steps are far too small to help."""
 SETTLED = 1e-5
-"""A step that lowers the sum of squares by less than this share ends the fit."""
+"""Share of the sum of squares by which a step must lower it for the fit to go on. Larger ends fits
+that still creep; smaller costs steps that change parameters by far less than their uncertainty.
+Its choice is not recorded."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,9 @@ from anser_ros.effects.term import Term
 Array = NDArray[np.float64]
 
 SCALES = np.geomspace(1e-3, 1.0, 7)
-"""Spreads that are tried first, over what the constant effect expects."""
+"""Spreads that are tried first, as multiples of what the constant effect expects: from a
+thousandth to all of it, a factor of 3.2 apart. Coarser or fewer leave expectation-maximisation,
+which starts at the best, farther to go; more cost time."""
 ROUNDS = 25
 """Rounds of expectation-maximisation. It starts at the best of seven spreads, so it has less than
 a factor of two to go."""

@@ -21,11 +21,15 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 VOLUME_ERROR = 1e-3
-"""Relative error that the fit allows the model in the volume."""
+"""Relative error that the fit allows the model in the volume. Smaller lets the sheet follow the
+model's own errors at the cost of the references; larger lets the references outvote the model. Its
+choice is not recorded."""
 LEAST_ERROR = 1e-5
 """Relative error that references are given at least, so that exact ones do not divide by zero."""
 DRAWING_ERROR = 0.05
-"""Prior spread of the sheet's moments about the drawn ones, as a share of their rms."""
+"""Prior spread of the sheet's moments about the drawn ones, as a share of their rms. Smaller holds
+the sheet to the drawing where the data contradict it; larger leaves free what they do not tell,
+where no sensor was. Its choice is not recorded."""
 
 
 @dataclass(frozen=True)

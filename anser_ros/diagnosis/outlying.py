@@ -23,8 +23,11 @@ or more passes less than once in 1e6. Of fewer values the ratio of so rare a noi
 RARE = 1e-6
 """Probability that noise alone makes so large a reading or frame."""
 JUMP_RATIO = 40.0
-"""The same for a frame whose pose's own directions are left in: the optical jitter along them is
-larger than the noise and differs from pose to pose, so only a glitch stands out so far."""
+"""Mean square over the neighbours' median from which a frame stands out whose pose's own
+directions are left in: the optical jitter along them is larger than the noise and differs from
+pose to pose, so only a glitch stands out so far. Smaller takes jitter for glitches, larger keeps
+glitches in the fit. No more is known of its choice than that thresholds of the diagnosis were
+chosen on seeds below 100 (`docs/log.md`)."""
 WHOLE = 0.5
 """Share of a frame's readings, and of frames that lost any, from which whole frames are out: more
 bad than good, so that what is left of the frame is not to be believed either."""

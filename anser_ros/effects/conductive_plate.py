@@ -31,7 +31,8 @@ STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])
 """Steps of the central differences, in theta's units: small beside the distances and beside a
 change of the resistance that shows."""
 TYPICAL_OHM = 3e-5
-"""A millimetre of aluminium."""
+"""Surface resistance, ohm, that a plate's fit starts from: about that of a millimetre of
+aluminium. It is only a start, from which the fit moves."""
 
 HEIGHT, RIM, OHM = 0.005, 0.03, 0.1
 """How well a sheet is known at best, whose true outline, thickness and bend nobody knows: its

@@ -27,7 +27,9 @@ FAR_M = 5e-4
 of the error that a pose may have beside three of its sigmas. A survey's 0.2 mm a sensor is a tenth
 of that among 32 of them."""
 FAR_SIGMAS = 5.0
-"""The same in standard deviations of that distance, for few sensors or a poor survey."""
+"""The same in standard deviations of that distance, for few sensors or a poor survey. Smaller
+refuses a sound model for what the survey's errors make; larger lets a board that lies elsewhere
+pass where sensors are few. Its choice is not recorded."""
 EXPLAINED = 1.0
 """Misfit of the typical reference, in what survey and manufacture allow, up to which the distance
 is believed: metal is no board that lies elsewhere, and is left to others to judge."""
@@ -45,7 +47,9 @@ ALIKE = 40.0
 PRIOR_M, PRIOR_RAD = 5e-3, 0.02
 """Standard deviations of how far a model lies aside before anything is known, m and rad."""
 ROUNDS = 12
-"""Rounds in which sensors that do not fit lose weight."""
+"""Rounds in which sensors that do not fit lose weight. Fewer leave a sensor that is off some say
+in where the board lies; more cost time and change nothing once weights have settled. Its choice is
+not recorded."""
 
 
 @dataclass(frozen=True)

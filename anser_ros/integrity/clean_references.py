@@ -24,14 +24,17 @@ STABLE_SHARE = 0.25
 another: what it is known by at all is worse than how it keeps. Smaller, and a warm amplifier is
 taken for metal; larger, and metal that moves poses by a tenth of a millimetre is not noticed."""
 CERTAIN = 4.0
-"""Changes below so many times their noise are none."""
+"""Changes below so many times their noise are none. Smaller takes noise for metal; larger misses
+metal that weak readings see. Its choice is not recorded."""
 FEWEST_SENSORS = 4
 """Sensors that have to be known: with fewer, the emitters' strengths explain what metal does."""
 SAME_PLACE_M = 1e-4
 """Farthest that a sensor may be from where it was at the calibration, m. A new survey tells of
 another place, where the old reading is worth nothing."""
 STEPS = 25
-"""Steps in which sensors that changed most lose their say in the emitters' strengths."""
+"""Steps in which sensors that changed most lose their say in the emitters' strengths. Fewer leave
+sensors beside metal some say; more change nothing once the weights have settled. Its choice is not
+recorded."""
 DRAWN_GATE = 3.0
 """Root mean square of all readings' differences from the drawn board, in units of what survey and
 manufacture allow, from which on there is metal. It is 1 where these are stated as they are.

@@ -17,7 +17,9 @@ POOR_M = 8e-3
 """Median misfit of hand-eye, m and tenths of rad together, from which other readings are tried:
 distorted trackers are off by less, and the inverse of a quaternion makes 25 mm and more."""
 BETTER = 0.5
-"""Share of the misfit as it stands below which another reading is the right one."""
+"""Share (0 to 1) of the misfit as it stands below which another reading is the right one. Larger
+re-reads a session that is only distorted; smaller refuses a right reading of a tracker that is
+poor besides. Its choice is not recorded."""
 FEW_POSES = 150  # poses of a sensor by which a reading is judged
 HOPELESS_M = 25e-3
 """Median misfit, m, with which no reading fits and a session is refused: its files do not belong

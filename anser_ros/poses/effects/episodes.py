@@ -20,7 +20,9 @@ TIMES = 9.0
 """Squared error over the median window's from which a window belongs to an episode: three times
 the error, which the range of places in a session hardly makes."""
 LONGEST = 0.4
-"""Share of the windows that episodes may be: what is there for longer is no episode."""
+"""Share (0 to 1) of the windows that episodes may be: what is there for longer is no episode.
+Larger takes half a session for the exception; smaller overlooks metal that stayed for a while. Its
+choice is not recorded."""
 ALIKE = 0.4  # share of a window's squared error that its mean must be; noise has a small one
 NEAR_M = 0.03
 """Distance within which a place outside the episode is the same place; metal changes over its own

@@ -15,7 +15,9 @@ from anser_ros.poses.sequence import PoseSequence, leaps
 Array = NDArray[np.float64]
 
 FEWEST_STALE = 0.02
-"""Share of poses of a moving body from which repeats are named; a hand stops now and then."""
+"""Share (0 to 1) of poses of a moving body from which repeats are named; a hand stops now and
+then. Smaller names these stops; larger leaves a tracker unnamed that seldom repeats itself. Its
+choice is not recorded."""
 MOVING_M = 5e-4
 """Way between two poses, m, from which a body moves: trackers tell a tenth of it."""
 NEAR = 3  # poses before and after by which motion is judged
