@@ -71,7 +71,7 @@ class Model:
 
     @property
     def frequencies_hz(self) -> tuple[float, ...]:
-        """Drive frequencies of the emitters, Hz."""
+        """Return the drive frequencies of the emitters, Hz."""
         return self.field.frequencies_hz
 
     @property

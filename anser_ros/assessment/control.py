@@ -137,5 +137,5 @@ def judged(
 
 
 def worst(verdicts: Mapping[str, Verdict]) -> str:
-    """The state of a session."""
+    """Return the worst state of the verdicts, which is the session's."""
     return max((v.state for v in verdicts.values()), key=STATES.index, default=PASS)

@@ -97,7 +97,7 @@ class Grid:
         return cls(*shape, spacing_m, name)
 
     def point(self, row: int, column: int) -> str:
-        """What a hole is called."""
+        """Return the label of a hole, as ``row/column``."""
         first = SMALL_LABEL if self.name == 'small' else 1
         return f'{row + first}/{column + first}'
 

@@ -51,7 +51,7 @@ class Span:
     end_s: float
 
     def holds(self, time: Array) -> Mask:
-        """Which times lie in it."""
+        """Return a mask of the times, s, that lie in the span."""
         return np.asarray((time >= self.start_s) & (time <= self.end_s))
 
 

@@ -107,7 +107,7 @@ class ErrorMap:
 
     @property
     def n_points(self) -> int:
-        """Points that it was learnt from."""
+        """Return the number of points that the map was learnt from."""
         return len(self.places)
 
     @property
@@ -122,7 +122,7 @@ class ErrorMap:
 
     @property
     def shape(self) -> Shape:
-        """The shape that was chosen."""
+        """Return the shape of correction that was chosen."""
         return self.correction.shape
 
     @property

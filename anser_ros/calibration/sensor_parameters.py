@@ -196,7 +196,7 @@ class SensorParameters:
         return self._size
 
     def rows(self, kind: str) -> NDArray[np.int64]:
-        """Indices of all parameters of a kind."""
+        """Return the indices of all parameters of a kind."""
         found = [np.arange(s.start, s.stop) for (own, _), s in self.slices.items() if own == kind]
         return np.concatenate(found) if found else np.zeros(0, dtype=np.int64)
 

@@ -307,7 +307,7 @@ class SensorSurveyor:
 
     @property
     def flux_rms(self) -> float:
-        """Typical flux of a phasor component, T."""
+        """Return the root mean square of a flux phasor's component, T."""
         power = [np.mean(np.abs(m.flux[m.usable]) ** 2) / 2.0 for m in self.measured]
         return float(np.sqrt(np.mean(power)))
 

@@ -57,5 +57,5 @@ class SurveyResult:
     contradictions: tuple[Contradiction, ...] = ()
 
     def survey(self, body: str) -> Survey:
-        """The survey of a body's sensors."""
+        """Return the survey of a body's sensors."""
         return self.parameters.survey(body, self.posterior.values)

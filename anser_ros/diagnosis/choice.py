@@ -1,4 +1,4 @@
-"""Which of several fitted explanations is taken."""
+"""Choose which of several fitted explanations is taken."""
 
 from collections.abc import Sequence
 

@@ -43,7 +43,7 @@ class Fit:
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """The terms with their parameters."""
+        """Return all terms with their fitted parameters."""
         return self.state.terms
 
     @property
@@ -53,7 +53,7 @@ class Fit:
 
     @property
     def newest(self) -> Term:
-        """The effect that was added last."""
+        """Return the term of the effect that was added last."""
         return self.effects[-1]
 
     def covariance_of(self, index: int) -> Array:

@@ -82,7 +82,7 @@ def _stands_out(values: Array, ratio: float) -> Mask:
 
 
 def without_outliers(problem: Problem, state: State) -> Problem:
-    """The problem with outlying readings left out."""
+    """Return the problem with outlying readings left out."""
     masks = find_outliers(state)
     good = tuple(g & ~bad for g, bad in zip(problem.good, masks, strict=True))
     return replace(problem, good=good)

@@ -102,7 +102,7 @@ class Part:
 
     @property
     def count(self) -> int:
-        """The number of values that count."""
+        """Return the number of values that have a weight."""
         return int(np.count_nonzero(self.whitener.weight))
 
 
@@ -116,7 +116,7 @@ class State:
 
     @property
     def white(self) -> Array:
-        """All whitened residuals in one vector."""
+        """Return all whitened residuals in one vector."""
         return np.concatenate([part.white.ravel() for part in self.parts])
 
     @property
@@ -131,7 +131,7 @@ class State:
 
     @property
     def count(self) -> int:
-        """The number of values that count."""
+        """Return the number of values that have a weight, over all parts."""
         return sum(part.count for part in self.parts)
 
     def design(self, term: Term, probe: bool = False) -> list[Array | None]:

@@ -106,7 +106,7 @@ def _turned(sums: BlockSums, known: int, root: Array) -> BlockSums:
 
 
 def thinned(state: State, blocks: NDArray[np.int64]) -> State:
-    """Some frames of every part."""
+    """Return the state with only some frames of every part."""
     parts_ = []
     for part in state.parts:
         rows = np.flatnonzero(np.isin(part.blocks, blocks))

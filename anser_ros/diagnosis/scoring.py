@@ -36,15 +36,15 @@ class BlockSums:
 
     @property
     def size(self) -> int:
-        """The number of columns."""
+        """Return the number of columns."""
         return int(self.right.shape[1])
 
     def part(self, rows: NDArray[np.int64]) -> 'BlockSums':
-        """The sums of some blocks, by index."""
+        """Return the sums of some blocks, chosen by index."""
         return BlockSums(self.normal[rows], self.right[rows], self.squares[rows])
 
     def columns(self, keep: NDArray[np.int64]) -> 'BlockSums':
-        """The sums of some columns, by index."""
+        """Return the sums of some columns, chosen by index."""
         normal = self.normal[:, keep[:, None], keep[None, :]]
         return BlockSums(normal, self.right[:, keep], self.squares)
 

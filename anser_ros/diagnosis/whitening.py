@@ -111,14 +111,14 @@ class Whitener:
         return Whitener(weight, basis, inner, penalty)
 
     def rows(self, frames: NDArray[np.int64]) -> 'Whitener':
-        """The whitener of some frames, by index."""
+        """Return the whitener of some frames, chosen by index."""
         basis = None if self.basis is None else self.basis[frames]
         return Whitener(
             self.weight[frames], basis, None if self.inner is None else self.inner[frames]
         )
 
     def first(self, count: int) -> 'Whitener':
-        """The whitener with the first directions only."""
+        """Return the whitener with only the first ``count`` directions."""
         if self.basis is None or count == self.basis.shape[2]:
             return self
         if count == 0:
@@ -127,7 +127,7 @@ class Whitener:
         return Whitener.of(self.weight, self.basis[..., :count] / weight[..., None], count)
 
     def __call__(self, values: Array) -> Array:
-        """Whiten (F, n) or (F, n, q)."""
+        """Return values of shape (F, n) or (F, n, q), whitened."""
         columns = values[..., None] if values.ndim == 2 else values
         out = np.empty(columns.shape)
 

@@ -33,7 +33,7 @@ DEAD = 0.02
 
 
 def wiring_faults(problem: Problem) -> list[Term]:
-    """The wiring faults of the tools."""
+    """Return terms for the wiring faults of the tools."""
     state = evaluate(problem, ())
     coils = _swapped_coils(state)
     if coils is not None:

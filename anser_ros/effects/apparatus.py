@@ -48,7 +48,7 @@ class Apparatus:
 
     @property
     def tool_channels(self) -> tuple[int, ...]:
-        """Channels of all tool sensors."""
+        """Return the channels of all tool sensors, in the tables' order."""
         return tuple(int(c) for table in self.tools for c in table.channel)
 
     @property

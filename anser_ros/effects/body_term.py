@@ -67,7 +67,7 @@ class BodyTerm(Term):
 
     @property
     def shapes(self) -> Shapes:
-        """The shapes that the body couples."""
+        """Return the shapes of the field that the body couples."""
         return BODIES[self.kind]()
 
     @property
@@ -82,12 +82,12 @@ class BodyTerm(Term):
 
     @property
     def course(self) -> Array:
-        """Parameters of the course."""
+        """Return the parameters that say where the body is."""
         return self.theta[: self.placed]
 
     @property
     def couplings(self) -> ComplexArray:
-        """Couplings of the whole body, shape (c,)."""
+        """Return the complex couplings of the whole body, shape (c,)."""
         parts = self.theta[self.placed :].reshape(2, -1)
         return np.asarray(self.modes @ (parts[0] + 1j * parts[1]))
 

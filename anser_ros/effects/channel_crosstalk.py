@@ -47,11 +47,11 @@ class ChannelCrosstalk(Effect[Term]):
         return [Term(self, {'channels': g}, np.zeros(len(g) * (len(g) - 1))) for g in groups]
 
     def prior(self, term: Term) -> Array:
-        """Leaks are some percent."""
+        """Return a prior spread of 0.1: leaks amount to some percent."""
         return np.full(term.theta.size, 0.1)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """The other channels' fluxes."""
+        """Return the other channels' fluxes, which leak into each channel."""
         rows = [view.row(c) for c in term.site['channels']]
         if all(row is None for row in rows):
             return None
@@ -102,7 +102,7 @@ class ChannelCrosstalk(Effect[Term]):
         return super().possible(replace(record, parameters={'matrix': leaks}))
 
     def term(self, record: EffectRecord) -> Term:
-        """The leaks from a record's matrix."""
+        """Read the leaks from a record's matrix, whose diagonal is scaled to one."""
         channels = tuple(int(c) for c in needed(record, 'channels'))
         matrix = np.asarray(needed(record, 'matrix'), dtype=np.float64)
         if matrix.shape != (len(channels), len(channels)):

@@ -28,7 +28,7 @@ class ClockRate(Effect[Term]):
     remedy = Remedy.OPTICAL
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """One clock for all bodies."""
+        """Return one candidate, as all bodies share the optical clock."""
         return [Term(self, {}, np.zeros(2))] if apparatus.tools else []
 
     def prior(self, term: Term) -> Array:
@@ -43,7 +43,7 @@ class ClockRate(Effect[Term]):
         return np.stack([rate, rate * view.time[:, None, None]], axis=-1)
 
     def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
-        """The track on the fluxes' clock."""
+        """Return the optical track with its stamps on the fluxes' clock."""
         return replace(track, time=track.time * (1 + term.theta[1]) + term.theta[0])
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:

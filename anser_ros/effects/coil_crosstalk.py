@@ -48,11 +48,11 @@ class CoilCrosstalk(Effect[Term]):
         return one_way + both
 
     def prior(self, term: Term) -> Array:
-        """Leaks are some percent."""
+        """Return a prior spread of 0.1: leaks amount to some percent."""
         return np.full(term.theta.size, 0.1)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """The source's flux in the other tone."""
+        """Return the source emitter's flux, placed in the other emitter's tone."""
         source, target = term.site['coils']
         own = np.einsum(
             'ab,fsb->fsa', np.linalg.inv(self._matrix(term, view.omega.size)), view.linear
@@ -79,7 +79,7 @@ class CoilCrosstalk(Effect[Term]):
         return self._matrix(term, omega.size)[None]
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Source, target and share."""
+        """Record the source, the target and the share that leaks, with its uncertainty."""
         sigma = sigmas(covariance)
         parameters = {'coils': list(term.site['coils']), 'eps': float(term.theta[0])}
         uncertainty = {'eps': float(sigma[0])}
@@ -91,7 +91,7 @@ class CoilCrosstalk(Effect[Term]):
         return EffectRecord(self.name, parameters, uncertainty)
 
     def term(self, record: EffectRecord) -> Term:
-        """From source, target and share."""
+        """Read the source, the target and the share that leaks from a record."""
         coils = tuple(int(c) for c in needed(record, 'coils'))
         eps = float(needed(record, 'eps'))
         if record.parameters.get('mutual'):

@@ -58,7 +58,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
     drifts = True
 
     def candidates(self, apparatus: Apparatus) -> Sequence[CoilDriftTerm]:
-        """A candidate for every emitter."""
+        """Return a candidate for every emitter."""
         start = np.array([0.0, np.log(0.5 * max(apparatus.duration, 1.0))])
         return [
             CoilDriftTerm(self, {'coil': k}, start, duration=max(apparatus.duration, 1.0))
@@ -89,7 +89,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
         return out
 
     def probe(self, term: CoilDriftTerm, view: View) -> ComplexArray | None:
-        """Curves of three time constants."""
+        """Return the flux of drifts with three different time constants."""
         own = self._own(term, view)
         out = view.columns(len(PROBED_SHARES))
         for i, share in enumerate(PROBED_SHARES):
@@ -126,7 +126,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
         return matrix
 
     def record(self, term: CoilDriftTerm, covariance: Array) -> EffectRecord:
-        """Amount and time constant."""
+        """Record the emitter, the amount of its drift and the time constant, s."""
         sigma, tau = sigmas(covariance), float(np.exp(term.theta[1]))
         return EffectRecord(
             self.name,
@@ -135,7 +135,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
         )
 
     def term(self, record: EffectRecord) -> CoilDriftTerm:
-        """From amount and time constant."""
+        """Read the emitter, the amount of its drift and the time constant, s, from a record."""
         theta = np.array([float(needed(record, 'amount')), np.log(float(needed(record, 'tau_s')))])
         return CoilDriftTerm(self, {'coil': int(needed(record, 'coil'))}, theta)
 

@@ -26,7 +26,7 @@ class CoilGain(Effect[Term]):
     remedy = Remedy.FLUX
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """A candidate for every emitter."""
+        """Return a candidate for every emitter."""
         return [Term(self, {'coil': k}, np.zeros(2)) for k in range(apparatus.emitters)]
 
     def prior(self, term: Term) -> Array:
@@ -34,14 +34,14 @@ class CoilGain(Effect[Term]):
         return np.full(2, 0.3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """The emitter's own flux."""
+        """Return the emitter's own flux, for the real and the imaginary part of its gain."""
         own = view.linear[:, :, term.site['coil']] / (1 + complex(*term.theta))
         out = view.columns(2)
         out[:, :, term.site['coil'], 0], out[:, :, term.site['coil'], 1] = own, 1j * own
         return out
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
-        """The emitter's gain on the diagonal."""
+        """Return a unit matrix with the emitter's complex gain on its diagonal."""
         matrix = unit_matrix(omega.size)
         matrix[term.site['coil'], term.site['coil']] = 1 + complex(*term.theta)
         return matrix[None]

@@ -29,11 +29,11 @@ class CoilMoved(Effect[Term]):
     gradient_error = GRADIENT_ERROR
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """A candidate for every emitter."""
+        """Return a candidate for every emitter."""
         return [Term(self, {'coil': k}, np.zeros(3)) for k in range(apparatus.emitters)]
 
     def prior(self, term: Term) -> Array:
-        """Shifts are some millimetres."""
+        """Return a prior spread of 3 mm: emitters shift by some millimetres."""
         return np.full(3, 3e-3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
@@ -50,7 +50,7 @@ class CoilMoved(Effect[Term]):
         return self._shifted(term, base)
 
     def light(self, term: Term, illumination: Dipoles) -> Dipoles:
-        """What metal sees has moved too."""
+        """Shift the emitter in the field that metal sees, too."""
         return illumination.joined(self._shifted(term, illumination))
 
     @staticmethod
@@ -64,7 +64,7 @@ class CoilMoved(Effect[Term]):
         )
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the shift."""
+        """Record the emitter and its shift, m."""
         return EffectRecord(
             self.name,
             {'coil': term.site['coil'], 'shift_m': term.theta.tolist()},
@@ -72,7 +72,7 @@ class CoilMoved(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """The term of a record's shift."""
+        """Read the emitter and its shift, m, from a record."""
         shift = np.asarray(needed(record, 'shift_m'), dtype=np.float64)
         return Term(self, {'coil': int(needed(record, 'coil'))}, shift)
 

@@ -1,4 +1,4 @@
-"""A metal sheet parallel to the board."""
+"""A metal sheet parallel to the board distorts the field by its eddy currents."""
 
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
@@ -86,7 +86,7 @@ class ConductivePlate(Effect[Term]):
         return np.array([0.1, 0.2, 0.1, 0.1, 3.0])
 
     def bounded(self, term: Term) -> Term:
-        """Edges and resistances that exist."""
+        """Keep the edge length and the sheet resistance within what exists."""
         theta = term.theta.copy()
         theta[1] = np.clip(theta[1], 0.02, 2.0)
         theta[4] = np.clip(theta[4], np.log(1e-7), 0.0)
@@ -115,7 +115,7 @@ class ConductivePlate(Effect[Term]):
         return view.along(added.flux(*view.flat))
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """Derivatives by central differences with `STEPS`."""
+        """Return the flux's derivatives, taken by central differences with `STEPS`."""
         if term.held:
             return view.columns(5)
         parts = [
@@ -135,7 +135,7 @@ class ConductivePlate(Effect[Term]):
         return (term,)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Height, size, centre and resistance."""
+        """Record height, edge length and centre of the sheet, m, and its resistance, ohm."""
         z, edge, x, y, log_ohm = (float(v) for v in term.theta)
         ohm, rim = float(np.exp(log_ohm)), RIM * edge
         least = [HEIGHT * edge, np.sqrt(2) * rim, rim / np.sqrt(2), rim / np.sqrt(2), OHM]
@@ -152,7 +152,7 @@ class ConductivePlate(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """From height, size, centre and resistance."""
+        """Read height, edge length, centre and sheet resistance from a record."""
         x, y = needed(record, 'centre_m')
         theta = np.array(
             [

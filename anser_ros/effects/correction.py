@@ -103,7 +103,7 @@ class Correction:
 
     @property
     def changes_flux(self) -> bool:
-        """Whether `flux` does anything."""
+        """Whether any term makes `flux` change the measured flux."""
         return bool(self._with(Remedy.FLUX))
 
     @property
@@ -113,7 +113,7 @@ class Correction:
 
     @property
     def corrected(self) -> tuple[str, ...]:
-        """What is undone, by name and site."""
+        """Return name and site of every effect that is undone, except those that drift."""
         return tuple(term.label for term in self.terms if not term.effect.drifts)
 
     def sensors(self, table: SensorTable | None = None) -> SensorTable:

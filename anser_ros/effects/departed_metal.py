@@ -26,7 +26,7 @@ class DepartedTerm(MovingTerm):
 
     @property
     def alone(self) -> MovingTerm:
-        """The metal itself, relative to none."""
+        """Return the moving metal itself, not relative to where it rests."""
         return MovingTerm(**{f.name: getattr(self, f.name) for f in fields(MovingTerm)})
 
     def resting(self, view: View) -> View:

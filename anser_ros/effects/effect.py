@@ -50,7 +50,7 @@ on the values that it changes is another effect's stand-in."""
 
 
 class Remedy(Enum):
-    """What is done about an effect live."""
+    """What is corrected while tracking, so that an effect does no harm."""
 
     FLUX = 'the measured flux is corrected'
     SENSORS = 'the sensor table is corrected'
@@ -238,7 +238,7 @@ class Effect(Generic[TermT]):
         return track
 
     def table(self, term: TermT, sensors: SensorTable) -> SensorTable:
-        """True sensors from the surveyed ones."""
+        """Return the sensors as they truly are, from the surveyed ones."""
         return sensors
 
     def light(self, term: TermT, illumination: Dipoles) -> Dipoles:
@@ -309,12 +309,12 @@ def needed(record: EffectRecord, key: str) -> Any:
 
 
 def sigmas(covariance: Array) -> Array:
-    """Standard deviations from a covariance."""
+    """Return the standard deviations that a covariance matrix holds."""
     return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
 
 
 def unit_matrix(size: int) -> ComplexArray:
-    """The identity as a complex matrix."""
+    """Return the identity of this size as a complex matrix."""
     return np.eye(size, dtype=complex)
 
 

@@ -41,7 +41,7 @@ class ExcessNoise(Effect[ExcessNoiseTerm]):
         return EffectRecord(self.name, parameters, {'factor': term.sigma})
 
     def term(self, record: EffectRecord) -> ExcessNoiseTerm:
-        """The factor from a record."""
+        """Read the factor by which the noise has grown from a record."""
         return ExcessNoiseTerm(self, factor=float(needed(record, 'factor')))
 
 

@@ -90,7 +90,7 @@ class Fluctuation(Effect[FluctuationTerm]):
         ]
 
     def opened(self, term: FluctuationTerm) -> FluctuationTerm:
-        """The term, whose spread is found."""
+        """Return the term itself, as its spread is found in a fit."""
         return term
 
     def complexity(self, term: FluctuationTerm) -> int:
@@ -117,7 +117,7 @@ class Fluctuation(Effect[FluctuationTerm]):
         return 0 if term.spread is None else term.frames * len(term.spread)
 
     def directions(self, term: FluctuationTerm, view: View) -> ComplexArray | None:
-        """The columns, a standard deviation long."""
+        """Return the columns, scaled to one standard deviation each, or None."""
         columns = term.columns(view)
         return None if columns is None or term.spread is None else columns * term.spread
 
@@ -186,7 +186,7 @@ class LooseSensorPosition(Fluctuation):
     of = SensorPosition()
 
     def candidates(self, apparatus: Apparatus) -> Sequence[FluctuationTerm]:
-        """A candidate for every cluster."""
+        """Return a candidate for every cluster of two channels or more."""
         return [term for term in super().candidates(apparatus) if len(term.site['channels']) > 1]
 
 

@@ -23,7 +23,7 @@ class LeverArm(Effect[Term]):
     remedy = Remedy.SENSORS
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """A candidate for every body."""
+        """Return a candidate for every body that has sensors."""
         return [
             Term(self, {'body': table.body[0]}, np.zeros(3))
             for table in apparatus.tools
@@ -31,7 +31,7 @@ class LeverArm(Effect[Term]):
         ]
 
     def prior(self, term: Term) -> Array:
-        """Offsets are some millimetres."""
+        """Return a prior spread of 5 mm: offsets are some millimetres."""
         return np.full(3, 5e-3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
@@ -41,7 +41,7 @@ class LeverArm(Effect[Term]):
         return np.asarray(np.einsum('fsik,fij->fskj', view.d_position, view.rotation))
 
     def table(self, term: Term, sensors: SensorTable) -> SensorTable:
-        """Sensors moved in their body."""
+        """Return the table with the body's sensors shifted by the offset, m."""
         rows = np.array([body == term.site['body'] for body in sensors.body])
         return sensors.with_geometry(
             position=sensors.position + rows[:, None] * term.theta[None, :]
@@ -56,7 +56,7 @@ class LeverArm(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """The term of a record's offset."""
+        """Read the body and its offset, m, from a record."""
         offset = np.asarray(needed(record, 'offset_m'), dtype=np.float64)
         return Term(self, {'body': str(needed(record, 'body'))}, offset)
 

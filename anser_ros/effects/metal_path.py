@@ -27,14 +27,14 @@ class MetalPath(Protocol):
 
     @property
     def count(self) -> int:
-        """The number of the path's parameters."""
+        """Return the number of the path's parameters."""
 
     @property
     def knots(self) -> tuple[float, ...]:
         """Times at which the place is free; none where the path is straight."""
 
     def centre(self, theta: Array, time: Array) -> Array:
-        """Centre at each time, (F, 3), m."""
+        """Return the body's centre at each time, shape (F, 3), m."""
 
     def rates(self, theta: Array, time: Array) -> Array:
         """Derivative of the centre by the parameters, (F, 3, count)."""
@@ -44,10 +44,10 @@ class MetalPath(Protocol):
         values, and the coordinate at each time."""
 
     def prior(self) -> Array:
-        """Standard deviation of each parameter, (count,)."""
+        """Return the prior standard deviation of each parameter, shape (count,)."""
 
     def bounded(self, theta: Array) -> Array:
-        """Parameters brought back into their domain."""
+        """Return the parameters brought back into their domain."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class StraightPath:
         return np.asarray(u + theta[8] * u * (1 - u) * (2 * u - 1))
 
     def centre(self, theta: Array, time: Array) -> Array:
-        """Centre at each time, (F, 3), m."""
+        """Return the body's centre at each time, shape (F, 3), m."""
         way = theta[3:6] - theta[:3]
         return np.asarray(theta[:3] + self.progress(theta, time)[:, None] * way)
 
@@ -86,7 +86,7 @@ class StraightPath:
         return out
 
     def nodes(self, theta: Array, time: Array) -> tuple[Array, Array, Array]:
-        """The share of the way made."""
+        """Return shares of the way, the places there, m, and the share made at each time."""
         way = theta[3:6] - theta[:3]
         share = np.linspace(0.0, 1.0, NODES)
         made = np.clip(self.progress(theta, time), 0.0, 1.0)
@@ -118,7 +118,7 @@ class FreePath:
 
     @property
     def count(self) -> int:
-        """Three parameters for each knot."""
+        """Return three parameters for each knot of the path."""
         return 3 * len(self.knots)
 
     def _weights(self, time: Array) -> Array:
@@ -128,7 +128,7 @@ class FreePath:
         return np.asarray(spline(np.clip(time, knots[0], knots[-1])))
 
     def centre(self, theta: Array, time: Array) -> Array:
-        """Centre at each time, (F, 3), m."""
+        """Return the body's centre at each time, shape (F, 3), m."""
         return np.asarray(self._weights(time) @ theta.reshape(-1, 3))
 
     def rates(self, theta: Array, time: Array) -> Array:
@@ -144,11 +144,11 @@ class FreePath:
         return times, self.centre(theta, times), np.clip(time, times[0], times[-1])
 
     def prior(self) -> Array:
-        """Places within decimetres of the start value."""
+        """Return a spread of 0.1 m: the path stays within decimetres of its start value."""
         return np.full(self.count, 0.1)
 
     def bounded(self, theta: Array) -> Array:
-        """A free path has no bounds."""
+        """Return the parameters unchanged, as a free path has no bounds."""
         return theta
 
     @staticmethod
@@ -171,7 +171,7 @@ def way_of(path: MetalPath, theta: Array, time: Array) -> tuple[Array, Array]:
 
 
 def moving_times(path: MetalPath, theta: Array, time: Array) -> tuple[float, float]:
-    """When the way begins and ends, s."""
+    """Return when the body begins and ends its way, s."""
     if not path.knots:
         return float(theta[6]), float(theta[7])
     fine, way = way_of(path, theta, time)

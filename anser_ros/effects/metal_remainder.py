@@ -30,13 +30,13 @@ class Leftover(Protocol):
 
     @property
     def count(self) -> int:
-        """Number of real parameters."""
+        """Return the number of its real parameters."""
 
     def columns(self, view: View) -> ComplexArray:
         """Flux of each parameter, (F, S, K, count)."""
 
     def sources(self, theta: Array, illumination: Dipoles, omega: Array) -> Dipoles:
-        """Dipoles of all of it."""
+        """Return the dipoles that stand for the whole leftover."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +69,12 @@ class Couplings:
         return shapes.mode_flux(ears, drive, self.modes, view.omega)
 
     def columns(self, view: View) -> ComplexArray:
-        """Flux of each parameter."""
+        """Return the flux that a unit of each parameter adds."""
         unit = self.unit(view)
         return np.concatenate([unit, 1j * unit], axis=-1)
 
     def sources(self, theta: Array, illumination: Dipoles, omega: Array) -> Dipoles:
-        """The dipoles of all modes together."""
+        """Return the dipoles that all modes make together."""
         parts = theta.reshape(2, -1)
         couplings = self.modes @ (parts[0] + 1j * parts[1])
         return self.shapes.sources(self.centre, couplings, illumination, omega)
@@ -96,7 +96,7 @@ class Lighting:
 
     @property
     def count(self) -> int:
-        """Strength and place of every emitter."""
+        """Return four parameters, a strength and a place, for every emitter."""
         return 4 * self.emitters
 
     def _answers(self, illumination: Dipoles, omega: Array) -> list[Dipoles]:
@@ -118,7 +118,7 @@ class Lighting:
         return out
 
     def columns(self, view: View) -> ComplexArray:
-        """Flux of each parameter."""
+        """Return the flux that a unit of each parameter adds."""
         out = view.columns(self.count)
         every = np.arange(self.emitters)
         for way, answer in enumerate(self._answers(view.illumination, view.omega)):
@@ -166,7 +166,7 @@ class MetalRemainder(Effect[RemainderTerm]):
         )  # fmt: skip
 
     def belongs(self, term: RemainderTerm, other: Term) -> bool:
-        """A leftover belongs to its metal."""
+        """Whether ``other`` is the metal that this leftover belongs to."""
         return term.parent == other.seat
 
     def columns(self, term: RemainderTerm, view: View) -> ComplexArray | None:

@@ -64,7 +64,7 @@ class MovingTerm(BodyTerm):
 
     @property
     def placed(self) -> int:
-        """Parameters of the path."""
+        """Return the number of the path's parameters, which come first in theta."""
         return self.path.count
 
     @property
@@ -166,7 +166,7 @@ class MovingMetal(Effect[MovingTerm]):
         return term
 
     def amounts(self, term: MovingTerm) -> NDArray[np.int64]:
-        """The amplitudes of the modes."""
+        """Return the indices of the modes' amplitudes."""
         return np.arange(term.placed, term.theta.size)
 
     def prior(self, term: MovingTerm) -> Array:
@@ -177,7 +177,7 @@ class MovingMetal(Effect[MovingTerm]):
         return np.concatenate([path, term.spread, term.spread])
 
     def bounded(self, term: MovingTerm) -> MovingTerm:
-        """The path in its domain."""
+        """Return the term with its path brought back into its domain."""
         course = term.path.bounded(term.course)
         return term.with_theta(np.concatenate([course, term.theta[term.placed :]]))
 
@@ -201,7 +201,7 @@ class MovingMetal(Effect[MovingTerm]):
         return out
 
     def moving_flux(self, term: MovingTerm, view: View) -> ComplexArray:
-        """What the body adds to a view."""
+        """Return the flux that the moving body adds to a view."""
         return term.flux(view, np.zeros(3))
 
     def record(self, term: MovingTerm, covariance: Array) -> EffectRecord:

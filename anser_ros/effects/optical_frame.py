@@ -32,7 +32,7 @@ class OpticalScale(Effect[Term]):
     remedy = Remedy.OPTICAL
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """One tracker for all bodies."""
+        """Return one candidate, as all bodies are seen by one tracker."""
         return [Term(self, {}, np.zeros(4))] if apparatus.tools else []
 
     def prior(self, term: Term) -> Array:
@@ -44,7 +44,7 @@ class OpticalScale(Effect[Term]):
         return np.array([0])
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """All sensors moved against the scale."""
+        """Return the flux that changes as all sensors move with scale and shift."""
         if view.is_reference:
             return None
         out = view.columns(4)
@@ -54,7 +54,7 @@ class OpticalScale(Effect[Term]):
         return out
 
     def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
-        """Positions at their true scale."""
+        """Return the optical track with positions at their true scale, m."""
         return replace(track, position=(track.position + term.theta[1:]) / (1 + term.theta[0]))
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
@@ -67,7 +67,7 @@ class OpticalScale(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """From scale and shift."""
+        """Read the scale and the shift, m, from a record."""
         shift = np.asarray(needed(record, 'shift_m'), dtype=np.float64)
         return Term(self, {}, np.array([float(needed(record, 'scale')) - 1, *shift]))
 
@@ -102,13 +102,13 @@ class RegistrationDrift(Effect[RegistrationDriftTerm]):
     remedy = Remedy.OPTICAL
 
     def candidates(self, apparatus: Apparatus) -> Sequence[RegistrationDriftTerm]:
-        """One tracker for all bodies."""
+        """Return one candidate, as all bodies are seen by one tracker."""
         duration = max(apparatus.duration, 1e-3)
         term = RegistrationDriftTerm(self, {}, np.zeros(6), duration=duration)
         return [term] if apparatus.tools else []
 
     def prior(self, term: RegistrationDriftTerm) -> Array:
-        """Shifts are some millimetres."""
+        """Return a prior spread of 5 mm: shifts are some millimetres."""
         return np.full(6, 5e-3)
 
     def amounts(self, term: RegistrationDriftTerm) -> NDArray[np.int64]:
@@ -125,7 +125,7 @@ class RegistrationDrift(Effect[RegistrationDriftTerm]):
         return out
 
     def optical(self, term: RegistrationDriftTerm, track: PoseTrack) -> PoseTrack:
-        """The track as it is in fg."""
+        """Return the optical track with the drift of its frame taken off, in fg."""
         share = (track.time / term.duration)[:, None]
         return replace(track, position=track.position - term.theta[:3] - share * term.theta[3:])
 
@@ -146,7 +146,7 @@ class RegistrationDrift(Effect[RegistrationDriftTerm]):
         )
 
     def term(self, record: EffectRecord) -> RegistrationDriftTerm:
-        """From translation and velocity."""
+        """Read the translation, m, and the velocity, m/s, from a record."""
         duration = float(needed(record, 'duration_s'))
         start = np.asarray(needed(record, 'translation_m'), dtype=np.float64)
         way = np.asarray(needed(record, 'velocity_m_per_s'), dtype=np.float64) * duration

@@ -1,4 +1,4 @@
-"""Frames that belong to no model."""
+"""Some frames are outliers, which no model of the field explains."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ class Outliers(Effect[OutliersTerm]):
         return EffectRecord(self.name, parameters, {'fraction': term.sigma})
 
     def term(self, record: EffectRecord) -> OutliersTerm:
-        """The share of frames from a record."""
+        """Read the share of outlying frames from a record."""
         return OutliersTerm(self, fraction=float(needed(record, 'fraction')))
 
 

@@ -25,15 +25,15 @@ class PhaseDelay(Effect[Term]):
     remedy = Remedy.FLUX
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """One delay for all channels."""
+        """Return one candidate, as one delay holds for all channels."""
         return [Term(self, {}, np.zeros(1))]
 
     def prior(self, term: Term) -> Array:
-        """Delays are some microseconds."""
+        """Return a prior spread of 5 us: delays are some microseconds."""
         return np.full(1, 5.0)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """Minus j w times the flux."""
+        """Return minus j omega times the flux, for a microsecond of delay."""
         return np.asarray((-1j * UNIT * view.omega * view.linear)[..., None])
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
@@ -41,7 +41,7 @@ class PhaseDelay(Effect[Term]):
         return np.diag(np.exp(-1j * omega * term.theta[0] * UNIT))[None]
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the delay."""
+        """Record the delay and its uncertainty, s."""
         return EffectRecord(
             self.name,
             {'delay_s': UNIT * float(term.theta[0])},
@@ -49,7 +49,7 @@ class PhaseDelay(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """The term of a record's delay."""
+        """Read the delay, s, from a record."""
         return Term(self, {}, np.array([float(needed(record, 'delay_s')) / UNIT]))
 
 

@@ -30,18 +30,18 @@ class Pickup(Effect[Term]):
     remedy = Remedy.FLUX
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Every channel of a tool."""
+        """Return a candidate for every channel of a tool."""
         return [self._at(c, apparatus) for c in apparatus.tool_channels]
 
     def _at(self, channel: int, apparatus: Apparatus) -> Term:
         return Term(self, {'channel': channel}, np.zeros(2 * apparatus.emitters))
 
     def prior(self, term: Term) -> Array:
-        """Phasors are some tens of nanotesla."""
+        """Return a prior spread of 30 nT: phasors are some tens of nanotesla."""
         return np.full(term.theta.size, 30.0)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """Ones, a column a part and emitter."""
+        """Return a constant column for either part of every emitter's phasor."""
         row = view.row(term.site['channel'])
         if row is None:
             return None
@@ -56,13 +56,13 @@ class Pickup(Effect[Term]):
         return np.asarray(parts[0] + 1j * parts[1])
 
     def offset(self, term: Term, channels: NDArray[np.int64], emitters: int) -> ComplexArray:
-        """The phasor in its row."""
+        """Return the flux offset of all channels, with the phasor, T, in its channel's row."""
         out = np.zeros((channels.size, emitters), dtype=complex)
         out[channels == term.site['channel']] = self._phasor(term)
         return out
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Phasors and their size."""
+        """Record the phasors of a channel and their root mean square, T."""
         phasor, sigma = self._phasor(term), sigmas(covariance).reshape(2, -1) * UNIT
         rms = float(np.sqrt(np.mean(np.abs(phasor) ** 2)))
         return EffectRecord(
@@ -76,7 +76,7 @@ class Pickup(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """The term of a record's phasors."""
+        """Read a channel and its phasors, T, from a record."""
         parts = np.asarray(needed(record, 'phasor_t'), dtype=np.float64)
         return Term(self, {'channel': int(needed(record, 'channel'))}, parts.T.ravel() / UNIT)
 
@@ -88,7 +88,7 @@ class ReferenceChanged(Pickup):
     summary = "a reference sensor's reading changed for good: it was moved, turned or picks up"
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """A candidate for every reference."""
+        """Return a candidate for every channel of a reference sensor."""
         return [
             self._at(c, apparatus) for c in apparatus.channels if c not in apparatus.tool_channels
         ]

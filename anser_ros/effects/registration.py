@@ -27,11 +27,11 @@ class Registration(Effect[Term]):
     remedy = Remedy.OPTICAL
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """One frame for all bodies."""
+        """Return one candidate, as all bodies share one optical frame."""
         return [Term(self, {}, np.zeros(6))] if apparatus.tools else []
 
     def prior(self, term: Term) -> Array:
-        """About a degree, some millimetres."""
+        """Return prior spreads of about a degree and of 5 mm."""
         return np.repeat([0.02, 5e-3], 3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
@@ -48,7 +48,7 @@ class Registration(Effect[Term]):
         return out
 
     def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
-        """The track as it is in fg."""
+        """Return the optical track as it is in fg."""
         back = Rotation.from_rotvec(term.theta[:3]).inv()
         return PoseTrack(
             track.time,
@@ -57,7 +57,7 @@ class Registration(Effect[Term]):
         )
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Rotation vector and translation."""
+        """Record the rotation vector, degrees, and the translation, m."""
         sigma = sigmas(covariance)
         return EffectRecord(
             self.name,
@@ -72,7 +72,7 @@ class Registration(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """From rotation and translation."""
+        """Read the rotation vector, degrees, and the translation, m, from a record."""
         turn = np.radians(np.asarray(needed(record, 'rotation_deg'), dtype=np.float64))
         shift = np.asarray(needed(record, 'translation_m'), dtype=np.float64)
         return Term(self, {}, np.concatenate([turn, shift]))

@@ -100,7 +100,7 @@ class Saturation(Effect[SaturationTerm]):
         ]
 
     def covers(self, term: SaturationTerm, candidate: Term) -> bool:
-        """A channel saturates along one curve only."""
+        """Whether the term is on the candidate's channel, which saturates along one curve only."""
         if candidate.effect is not self:
             return False
         return bool(candidate.site['channel'] == term.site['channel'])
@@ -128,7 +128,7 @@ class Saturation(Effect[SaturationTerm]):
     def compress(
         self, term: SaturationTerm, channels: NDArray[np.int64], flux: ComplexArray
     ) -> ComplexArray:
-        """The channel behind its amplifier."""
+        """Return the fluxes as the saturated channel's amplifier passes them on."""
         out, weights = flux.copy(), term.weights
         for row in np.flatnonzero(channels == term.site['channel']):
             seen = flux[:, row] * weights
@@ -151,7 +151,7 @@ class Saturation(Effect[SaturationTerm]):
         return EffectRecord(self.name, parameters, {'full_scale_t': float(full_scale * relative)})
 
     def term(self, record: EffectRecord) -> SaturationTerm:
-        """Return the term of a full scale."""
+        """Read the channel's full scale, T, from a record."""
         full_scale = float(needed(record, 'full_scale_t'))
         site = {
             'channel': int(needed(record, 'channel')),

@@ -68,7 +68,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
         return terms
 
     def prior(self, term: SensorAxisTerm) -> Array:
-        """Tilts are some degrees."""
+        """Return a prior spread of 0.1 rad: tilts are some degrees."""
         return np.full(term.theta.size, 0.1)
 
     def columns(self, term: SensorAxisTerm, view: View) -> ComplexArray | None:
@@ -97,7 +97,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
         return out
 
     def table(self, term: SensorAxisTerm, sensors: SensorTable) -> SensorTable:
-        """Sensors with their true axes."""
+        """Return the table with the sensors' true axes."""
         axis = sensors.axis.copy()
         if 'channel' in term.site:
             for row in np.flatnonzero(sensors.channel == term.site['channel']):
@@ -138,7 +138,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
         )
 
     def term(self, record: EffectRecord) -> SensorAxisTerm:
-        """From the true axis or the rotation."""
+        """Read a sensor's true axis, or the cluster's rotation, from a record."""
         if 'channels' in record.parameters:
             theta = np.radians(np.asarray(needed(record, 'rotation_deg'), dtype=np.float64))
             return SensorAxisTerm(self, {'channels': tuple(record.parameters['channels'])}, theta)

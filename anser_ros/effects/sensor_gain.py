@@ -46,7 +46,7 @@ class SensorGain(Effect[Term]):
         return out
 
     def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
-        """The channel's gain on the diagonal."""
+        """Return a unit matrix with the channel's complex gain on its diagonal."""
         matrix = unit_matrix(channels.size)
         for row in np.flatnonzero(channels == term.site['channel']):
             matrix[row, row] = 1 + term.theta[0] + 1j * term.theta[1]

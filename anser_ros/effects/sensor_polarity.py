@@ -21,16 +21,16 @@ class SensorPolarity(Effect[Term]):
     family = Family.SEEN
 
     def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
-        """The channels' signs on the diagonal."""
+        """Return a diagonal matrix with -1 for every reversed channel."""
         signs = np.where(np.isin(channels, term.site['channels']), -1.0, 1.0)
         return np.diag(signs).astype(complex)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the channels."""
+        """Record the channels that are reversed."""
         return EffectRecord(self.name, {'channels': list(term.site['channels'])})
 
     def term(self, record: EffectRecord) -> Term:
-        """The term of a record's channels."""
+        """Read the channels that are reversed from a record."""
         channels = tuple(int(c) for c in needed(record, 'channels'))
         return Term(self, {'channels': channels})
 

@@ -33,7 +33,7 @@ class SensorPosition(Effect[Term]):
         return [Term(self, {'channels': group}, np.zeros(3)) for group in groups]
 
     def prior(self, term: Term) -> Array:
-        """Offsets are some millimetres."""
+        """Return a prior spread of 5 mm: offsets are some millimetres."""
         return np.full(3, 5e-3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
@@ -46,7 +46,7 @@ class SensorPosition(Effect[Term]):
         return out
 
     def table(self, term: Term, sensors: SensorTable) -> SensorTable:
-        """The table with those sensors moved."""
+        """Return the table with those sensors shifted by the offset, m."""
         rows = np.isin(sensors.channel, term.site['channels'])
         return sensors.with_geometry(
             position=sensors.position + rows[:, None] * term.theta[None, :]
@@ -61,7 +61,7 @@ class SensorPosition(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """The term of a record's offset."""
+        """Read the channels and their offset, m, from a record."""
         offset = np.asarray(needed(record, 'offset_m'), dtype=np.float64)
         return Term(self, {'channels': tuple(needed(record, 'channels'))}, offset)
 

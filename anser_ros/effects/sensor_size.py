@@ -44,7 +44,7 @@ class SensorSize(Effect[SensorSizeTerm]):
     remedy = Remedy.SENSORS
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SensorSizeTerm]:
-        """All coils of a body together."""
+        """Return a candidate for all coils of each body that has sensors."""
         return [
             SensorSizeTerm(
                 self,
@@ -57,7 +57,7 @@ class SensorSize(Effect[SensorSizeTerm]):
         ]
 
     def prior(self, term: SensorSizeTerm) -> Array:
-        """Lengths of a few centimetres."""
+        """Return a prior spread that allows coil lengths of a few centimetres."""
         return np.full(1, 10.0)
 
     def columns(self, term: SensorSizeTerm, view: View) -> ComplexArray | None:
@@ -80,7 +80,7 @@ class SensorSize(Effect[SensorSizeTerm]):
         return term.with_theta(np.maximum(term.theta, smallest))
 
     def table(self, term: SensorSizeTerm, sensors: SensorTable) -> SensorTable:
-        """The table with longer coils."""
+        """Return the table with the coils at their fitted lengths, m."""
         length = sensors.length.copy()
         for row, channel in enumerate(sensors.channel.tolist()):
             if channel in term.surveyed:
@@ -104,7 +104,7 @@ class SensorSize(Effect[SensorSizeTerm]):
         )
 
     def term(self, record: EffectRecord) -> SensorSizeTerm:
-        """The term of a record's length."""
+        """Read the coils' length from a record."""
         channels = tuple(int(c) for c in needed(record, 'channels'))
         surveyed = record.parameters.get('surveyed_length_m') or [0.0] * len(channels)
         base = float(np.mean(np.square(surveyed)))

@@ -54,7 +54,7 @@ class SpreadTerm(Term):
 
     @property
     def values(self) -> Array:
-        """The values, a row a channel."""
+        """Return the parameters as a table with a row for each channel."""
         if self.groups:
             return self.theta.reshape(max(self.groups) + 1, -1)[list(self.groups)]
         return self.theta.reshape(len(self.members), -1)
@@ -104,7 +104,7 @@ class SensorSpread(Effect[SpreadTerm]):
         return np.array(self.offset_of_values or (0.0,) * width)
 
     def term(self, record: EffectRecord) -> SpreadTerm:
-        """From the channels and their values."""
+        """Read the channels and their values from a record."""
         channels = tuple(int(channel) for channel in needed(record, 'channels'))
         values = np.asarray(needed(record, 'values'), dtype=np.float64)
         width = self.width or (values.shape[1] if values.ndim == 2 else 2)
@@ -173,7 +173,7 @@ class SensorGainSpread(SensorSpread):
         return super().record(replace(term, spread=width), covariance)
 
     def channel_matrix(self, term: SpreadTerm, channels: NDArray[np.int64]) -> ComplexArray | None:
-        """The gains on the diagonal."""
+        """Return a diagonal matrix of the channels' complex gains."""
         parts = term.of(channels)
         return np.asarray(unit_matrix(channels.size) + np.diag(parts[:, 0] + 1j * parts[:, 1]))
 
@@ -205,7 +205,7 @@ class SensorAxisSpread(SensorSpread):
     offset_of_values = (0.0, 0.0)
 
     def table(self, term: SpreadTerm, sensors: SensorTable) -> SensorTable:
-        """Sensors with their true axes."""
+        """Return the table with the sensors' true axes."""
         return sensors.with_geometry(axis=tilted(sensors.axis, term.of(sensors.channel)))
 
 
@@ -220,7 +220,7 @@ class SensorPlaceSpread(SensorSpread):
     offset_of_values = (0.0, 0.0, 0.0)
 
     def table(self, term: SpreadTerm, sensors: SensorTable) -> SensorTable:
-        """Sensors where they truly are."""
+        """Return the table with the sensors at their true positions, m."""
         return sensors.with_geometry(position=sensors.position + term.of(sensors.channel))
 
 

@@ -95,7 +95,7 @@ class StaticMetal(Effect[Term]):
     inexact = np.inf
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """A grid of places."""
+        """Return a candidate at every place of a grid."""
         modes = 2 * ball_modes().shape[1]
         return [
             Term(
@@ -107,7 +107,7 @@ class StaticMetal(Effect[Term]):
         ]
 
     def amounts(self, term: Term) -> NDArray[np.int64]:
-        """The amplitudes of the modes."""
+        """Return the indices of the modes' amplitudes."""
         return np.arange(3, term.theta.size)
 
     def prior(self, term: Term) -> Array:
@@ -129,7 +129,7 @@ class StaticMetal(Effect[Term]):
         return multipoles().flux(*self._seen(centre, view), self._couplings(term), view.omega)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """By place (differences) and by polarisability (exact)."""
+        """Return derivatives by place (differences) and by polarisability (exact)."""
         centre, alpha = term.theta[:3], term.theta[3:]
         out = view.columns(term.theta.size)
         if np.any(alpha) and not term.held:
@@ -142,14 +142,14 @@ class StaticMetal(Effect[Term]):
         return out
 
     def probe(self, term: Term, view: View) -> ComplexArray | None:
-        """The two columns of an isotropic scatterer."""
+        """Return both columns, real and imaginary, of an isotropic scatterer."""
         points = term.theta[:3]
         field = view.illumination.field(points[None])[0] * (UNIT / MU_0)
         unit = view.along(Dipoles.vectors(points[None], field[None]).flux(*view.flat))
         return np.stack([unit, 1j * unit], axis=-1)
 
     def started(self, term: Term, solution: Array) -> Sequence[Term]:
-        """The scatterer at its place."""
+        """Start with the isotropic scatterer that the probe found at its place."""
         alpha = np.zeros((2, ball_modes().shape[1]))
         alpha[:, 0] = solution
         return (term.with_theta(np.concatenate([term.theta[:3], alpha.ravel()])),)
@@ -168,13 +168,13 @@ class StaticMetal(Effect[Term]):
     def sources(
         self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
-        """The dipoles that the emitters induce."""
+        """Return the dipoles that the emitters induce in the metal, or None without any."""
         if not np.any(term.theta[3:]):
             return None
         return multipoles().sources(term.theta[:3], self._couplings(term), illumination, omega)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """Place and whole polarisability."""
+        """Record the place, m, and the whole polarisability of the metal."""
         total = multipoles().polarisability(self._couplings(term))
         return EffectRecord(
             self.name,
@@ -187,7 +187,7 @@ class StaticMetal(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """From place and groups."""
+        """Read the place, m, and the polarisability by groups of modes from a record."""
         place = np.asarray(needed(record, 'position_m'), dtype=np.float64)
         alpha = np.asarray(needed(record, 'groups'), dtype=np.float64) / UNIT
         return Term(self, {'place': tuple(place.tolist())}, np.concatenate([place, alpha]))

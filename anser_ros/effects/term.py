@@ -49,7 +49,7 @@ class Term:
     held: Held | None = None
 
     def with_theta(self, theta: Array) -> Self:
-        """The same term with other parameters."""
+        """Return the same term with other parameters."""
         return replace(self, theta=np.asarray(theta, dtype=np.float64))
 
     def hold(self, covariance: Array | None = None) -> Self:
@@ -82,7 +82,7 @@ class Term:
 
     @property
     def label(self) -> str:
-        """Name and site in words."""
+        """Return the effect's name and its site in words."""
         parts = [f'{key} {_short(value)}' for key, value in self.site.items()]
         return f'{self.effect.name}{" (" + ", ".join(parts) + ")" if parts else ""}'
 

@@ -35,23 +35,23 @@ class TimeOffset(Effect[Term]):
     remedy = Remedy.OPTICAL
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """One offset for all bodies."""
+        """Return one candidate, as one offset holds for all bodies."""
         return [Term(self, {}, np.zeros(1))] if apparatus.tools else []
 
     def prior(self, term: Term) -> Array:
-        """A tenth of a second."""
+        """Return a prior spread of a tenth of a second."""
         return np.full(1, 0.1)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """Minus the flux's rate of change."""
+        """Return minus the flux's rate of change, or None for references."""
         return None if view.is_reference else -flux_rate(view)[..., None]
 
     def optical(self, term: Term, track: PoseTrack) -> PoseTrack:
-        """The track on the fluxes' clock."""
+        """Return the optical track with its stamps on the fluxes' clock."""
         return replace(track, time=track.time + term.theta[0])
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the offset."""
+        """Record the offset and its uncertainty, s."""
         return EffectRecord(
             self.name,
             {'offset_s': float(term.theta[0])},
@@ -59,7 +59,7 @@ class TimeOffset(Effect[Term]):
         )
 
     def term(self, record: EffectRecord) -> Term:
-        """The term of a record's offset."""
+        """Read the offset, s, from a record."""
         return Term(self, {}, np.array([float(needed(record, 'offset_s'))]))
 
 

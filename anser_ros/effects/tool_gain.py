@@ -27,7 +27,7 @@ class ToolGain(Effect[Term]):
     remedy = Remedy.FLUX
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Every body of two sensors or more."""
+        """Return a candidate for every body with two sensors or more."""
         return [
             Term(self, {'channels': tuple(int(c) for c in table.channel)}, np.zeros(2))
             for table in apparatus.tools

@@ -69,7 +69,7 @@ class View:
         return int(found[0]) if found.size else None
 
     def columns(self, count: int) -> ComplexArray:
-        """Zeros of shape (F, S, K, count)."""
+        """Return zeros of shape (F, S, K, count), to be filled with columns."""
         return np.zeros((*self.flux.shape, count), dtype=complex)
 
     def frames(self, rows: NDArray[np.int64]) -> 'View':

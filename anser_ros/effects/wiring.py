@@ -47,7 +47,7 @@ class SwappedChannels(Effect[Term]):
         return EffectRecord(self.name, {k: list(term.site[k]) for k in ('channels', 'read_as')})
 
     def term(self, record: EffectRecord) -> Term:
-        """The term of a record's channels."""
+        """Read the swapped channels from a record, and as which they are read."""
         site = {k: tuple(int(c) for c in needed(record, k)) for k in ('channels', 'read_as')}
         return Term(self, site)
 
@@ -62,7 +62,7 @@ class SwappedCoils(Effect[Term]):
     family = Family.SEEN
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
-        """The emitters' permutation as a matrix."""
+        """Return the emitters' permutation as a matrix."""
         matrix = unit_matrix(omega.size)
         for shown, true in zip(term.site['read_as'], term.site['coils'], strict=True):
             matrix[shown] = 0.0
@@ -74,7 +74,7 @@ class SwappedCoils(Effect[Term]):
         return EffectRecord(self.name, {k: list(term.site[k]) for k in ('coils', 'read_as')})
 
     def term(self, record: EffectRecord) -> Term:
-        """The term of a record's emitters."""
+        """Read the swapped emitters from a record, and as which they are read."""
         return Term(
             self, {k: tuple(int(c) for c in needed(record, k)) for k in ('coils', 'read_as')}
         )
@@ -94,11 +94,11 @@ class DeadChannel(Effect[Term]):
         return term.channels
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the channels."""
+        """Record the channels that are dead."""
         return EffectRecord(self.name, {'channels': list(term.site['channels'])})
 
     def term(self, record: EffectRecord) -> Term:
-        """The term of a record's channels."""
+        """Read the channels that are dead from a record."""
         return Term(self, {'channels': tuple(int(c) for c in needed(record, 'channels'))})
 
 

@@ -114,7 +114,7 @@ class Study:
 
     @cached_property
     def factory(self) -> Session:
-        """The recording of tool A without metal."""
+        """Return the recording of tool A without metal."""
         return self.recordings.load('factory_tool_a')
 
     @cached_property

@@ -39,7 +39,7 @@ class SensorErrors:
 
     @property
     def tracked_fraction(self) -> float:
-        """Fraction of the frames with a pose."""
+        """Return the fraction of the frames that have a pose."""
         return float(np.isfinite(self.distance).mean())
 
     def millimetres(self) -> dict[str, float]:

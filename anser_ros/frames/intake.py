@@ -63,7 +63,7 @@ class Frame:
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """Readings without a fault, shape (S,)."""
+        """Return a mask (S,) of the readings without a fault."""
         return np.asarray(self.codes == GOOD)
 
     @property

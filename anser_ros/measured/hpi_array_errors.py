@@ -63,7 +63,7 @@ class SharedError:
 def refit(
     array: SquidArray, coils: Sequence[CoilData], fits: Sequence[CoilFit], errors: ChipErrors
 ) -> tuple[CoilFit, ...]:
-    """All coils again from where they are."""
+    """Fit all coils again, starting from where they are."""
     return tuple(
         fit_coil(array, data, fit.places_m, errors, 4)
         for data, fit in zip(coils, fits, strict=True)
@@ -71,7 +71,7 @@ def refit(
 
 
 def likelihood(fits: Sequence[CoilFit]) -> float:
-    """Log likelihood of all coils."""
+    """Return the log likelihood of all coils together."""
     return float(sum(fit.log_likelihood for fit in fits))
 
 

@@ -54,7 +54,7 @@ class ChannelFindings:
     noise_ratio: Array
 
     def text(self, array: SquidArray) -> list[str]:
-        """Lines of the report."""
+        """Return the lines of the report."""
         names = np.array(array.names)
         inverted = names[self.inverted]
         endings = sorted({name[-1] for name in inverted})

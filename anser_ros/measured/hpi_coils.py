@@ -56,7 +56,7 @@ FREEDOM = 4.0
 
 @dataclass(frozen=True)
 class HpiData:
-    """What the file holds, SI units."""
+    """The data that the file holds, in SI units."""
 
     array: SquidArray
     stored: Array
@@ -351,7 +351,7 @@ def _channel_rows(analysis: HpiAnalysis) -> list[ReportRow]:
 
 
 def tables(analysis: HpiAnalysis) -> str:
-    """Wrong channels, candidates, places."""
+    """Return tables of wrong channels, candidates and places."""
     lines = [f'{NAME}: tones at {np.round(analysis.tones.frequencies_hz, 3)} Hz']
     lines += analysis.findings.text(analysis.data.array)
     lines.append('  dipoles of the lead (0, 1, ...): held-out loss, mean of six folds of channels')

@@ -120,7 +120,7 @@ def first_place(array: SquidArray, data: CoilData, starts: Array) -> Array:
 
 
 def plain_fit(array: SquidArray, data: CoilData, place: Array) -> Array:
-    """Prediction (S,) of the plain fit's dipole."""
+    """Return the readings (S,) that the plain fit's dipole predicts."""
     weight = np.where(data.used, 1.0, 0.0)
     for kind in (array.is_magnetometer, ~array.is_magnetometer):
         weight[kind] /= np.median(np.abs(data.signals[kind]))

@@ -20,7 +20,7 @@ def rigid_distance(fitted: Array, digitised: Array) -> Array:
 
 
 def rms(values: Array) -> float:
-    """Root of the mean square."""
+    """Return the root of the mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 

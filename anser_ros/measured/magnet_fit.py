@@ -62,7 +62,7 @@ class MagnetFit:
     search: CandidateSearch | None = None
 
     def predict(self, recording: Recording) -> Array:
-        """Readings (F, S, 3), T."""
+        """Return the predicted readings, shape (F, S, 3), T."""
         return predict(recording, self.source, self.moment, self.found)
 
 

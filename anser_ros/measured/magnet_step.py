@@ -61,7 +61,7 @@ class StepAnalysis:
 
 
 def analyse(folder: Path) -> StepAnalysis:
-    """Everything of the robot's file."""
+    """Analyse the robot's file in a folder."""
     parts, _ = read_poses(folder / 'step1.csv', 'M')
     return analyse_step(as_recording('step1', parts, np.zeros(3)), point_source())
 
@@ -96,7 +96,7 @@ def scatter_mm(model: MagnetFit) -> float:
 
 
 def rows(step: StepAnalysis) -> list[ReportRow]:
-    """Rows of the table."""
+    """Return the rows of the report's table."""
     noise = step.final.noise_t
     chosen = f'{", ".join(step.search.chosen)}: chosen and scored on blocks of poses left out'
     sigma = 2.0 * float(np.linalg.norm(step.final.sigma['registration'][:3]))
@@ -135,7 +135,7 @@ def rows(step: StepAnalysis) -> list[ReportRow]:
 
 
 def tables(step: StepAnalysis) -> str:
-    """Candidates and the sensors' places."""
+    """Return tables of the candidates and of the sensors' places."""
     lines = [search_text(NAME, step.search, 'of the noise')]
     lines.append(f'  noise {1e6 * step.final.noise_t:.2f} uT')
     for title, model in (('point dipole', step.naive), ('with the effects', step.final)):

@@ -75,7 +75,7 @@ class Fold:
 
 
 def others(data: PlateData, held: int) -> PlateData:
-    """The heights that a fold learns from."""
+    """Return the heights that a fold learns from."""
     return data.select([p for p in range(len(data.height_m)) if p != held])
 
 

@@ -89,7 +89,7 @@ class Sources:
 
     @property
     def magnets(self) -> Sources:
-        """The sources of the magnets without metal."""
+        """Return the sources of the magnets without those of the metal."""
         count = len(self.position_m) - self.n_metal
         return Sources(self.position_m[:count], self.moment_am2[:count])
 

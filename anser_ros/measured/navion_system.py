@@ -96,12 +96,12 @@ class NavionProblem:
 
     @property
     def reading(self) -> Array:
-        """Readings (S, K, P, 3), T."""
+        """Return the readings, shape (S, K, P, 3), T."""
         return self.data.field_t.transpose(2, 1, 0, 3)
 
     @property
     def n_moments(self) -> int:
-        """Moment components of one coil."""
+        """Return the number of moment components of one coil."""
         return 3 * (len(self.magnet_m) + len(self.metal_m))
 
 
@@ -132,13 +132,13 @@ class Estimate:
     weight: Array
 
     def sources(self, magnet_m: Array) -> Sources:
-        """Dipoles as they are now."""
+        """Return the dipoles as they are estimated now."""
         position = np.concatenate([magnet_m, self.metal])
         moment = self.moment.reshape(len(position), 3, self.moment.shape[1])
         return Sources(position, moment, len(self.metal))
 
     def errors(self) -> HallSensorErrors:
-        """Sensor errors as they are now."""
+        """Return the sensor errors as they are estimated now."""
         matrix = np.eye(3) + np.einsum('sa,aij->sij', self.sensor[:, :9], GENERATORS)
         return HallSensorErrors(matrix, self.sensor[:, 9:])
 

@@ -58,7 +58,7 @@ class SquidArray:
 
     @property
     def centres_m(self) -> Array:
-        """Middle of each channel, m, (S, 3)."""
+        """Return the middle of each channel, shape (S, 3), m."""
         used = (self.weights != 0.0)[:, :, None]
         return np.asarray(np.sum(self.points_m * used, axis=1) / used.sum(axis=1))
 

@@ -318,7 +318,7 @@ class Acquisition(AnserNode):
             self._port.end_stream()
 
     def status(self) -> Status:
-        """State of the port and the stream."""
+        """Return the state of the port and of the stream."""
         interval, self._interval = self._interval, Interval(time.monotonic())
         elapsed = max(self._interval.begin_s - interval.begin_s, 1e-3)
         values: dict[str, object] = {

@@ -260,11 +260,11 @@ class CuSimulator(AnserNode):
             publisher.publish(_pose(self._frame_id, now_ns, position, rotation))
 
     def on_parameters(self, old: Any, new: Any) -> None:
-        """Switch to another fault."""
+        """Switch to the fault that the new parameters name."""
         self._injector = FaultInjector(new.fault, new.fault_period_s, new.seed)
 
     def status(self) -> Status:
-        """State of the control unit."""
+        """Return the state of the simulated control unit."""
         state = 'streaming' if self._unit.streaming else 'idle, waits for a start'
         values: dict[str, object] = {'link': self.parameters.link, 'fault': self._injector.kind}
         if self.parameters.metal:

@@ -192,13 +192,13 @@ class IgtlServer:
 
     @property
     def n_clients(self) -> int:
-        """Number of connected clients."""
+        """Return the number of connected clients."""
         self._forget_the_gone()
         return len(self._clients)
 
     @property
     def dropped(self) -> int:
-        """Messages that slow clients have missed."""
+        """Return how many messages slow clients have missed."""
         with self._lock:
             return self._dropped_before + sum(client.dropped for client in self._clients)
 

@@ -158,13 +158,13 @@ class LiveView:
         return rows
 
     def sigma_m(self) -> Array:
-        """The poses' own uncertainty, m."""
+        """Return the poses' own uncertainty, m; NaN where no pose came lately."""
         trace: Array = np.trace(self._covariance, axis1=1, axis2=2)
         fresh = time.monotonic() - self._heard_s < FRESH_S
         return np.where(fresh, np.sqrt(trace), np.nan)
 
     def told_of(self, name: str) -> Told:
-        """What the tracker says of a target."""
+        """Return what the tracker says of a target."""
         return self.told.get(f'{self.namespace}/tracker: {name}', Told(1, 'waiting', {}))
 
     def figure(self, node: str, key: str) -> float:
@@ -173,7 +173,7 @@ class LiveView:
         return _number(told, key)
 
     def residual_t(self) -> Array:
-        """The fluxes' residual of every target, T."""
+        """Return the residual of every target's fluxes, T."""
         return np.array([_number(self.told_of(t.name), 'residual_t') for t in self.targets])
 
     def tracked(self) -> Array:
@@ -186,7 +186,7 @@ class LiveView:
         return np.divide(poses, frames, out=np.full(len(poses), np.nan), where=frames > 0)
 
     def reasons(self) -> list[str]:
-        """Why things are as they are."""
+        """Return the causes of what the statuses report."""
         return causes(self.told, self.namespace, self.setup.flux_rate_hz)
 
     def silent_s(self, name: str) -> float:

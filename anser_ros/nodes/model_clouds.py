@@ -113,7 +113,7 @@ class ModelWriter:
 
 
 def stamp_of(message: PointCloud2) -> int:
-    """Stamp of a message, ns."""
+    """Return the stamp of a message, ns."""
     return int(message.header.stamp.sec) * SECOND_NS + int(message.header.stamp.nanosec)
 
 

@@ -259,7 +259,7 @@ class Monitor(AnserNode):
         return '  '.join(parts)
 
     def status(self) -> Status:
-        """How many poses came."""
+        """Return how many poses came from each chain of nodes."""
         poses = {
             f'poses_{chain or "live"}': sum(len(t.stamp_s) for t in traces.of.values())
             for chain, traces in self._chains.items()

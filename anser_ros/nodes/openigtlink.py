@@ -76,7 +76,7 @@ class OpenIGTLink(AnserNode):
 
     @property
     def port(self) -> int:
-        """The TCP port in use."""
+        """Return the TCP port in use."""
         return self._server.port
 
     def status(self) -> Status:

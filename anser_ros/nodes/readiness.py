@@ -34,7 +34,7 @@ PATIENCE_S = 8.0
 
 
 def digest_of(setup_text: str) -> str:
-    """Eight hexadecimal digits that tell setups apart."""
+    """Return eight hexadecimal digits that tell setups apart."""
     return hashlib.blake2b(setup_text.encode(), digest_size=4).hexdigest()
 
 

@@ -19,5 +19,5 @@ def optical_parameter() -> Any:
 
 
 def optical_topic(namespace: str, body: str) -> str:
-    """The topic of a body's optical pose."""
+    """Return the topic of a body's optical pose."""
     return f'{namespace.rstrip("/")}/{topic_of(body)}/pose'

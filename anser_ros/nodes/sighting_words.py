@@ -13,7 +13,7 @@ MOST_TEXT = 60
 
 
 def words_of(seen: Sighting) -> str:
-    """One line for an operator."""
+    """Return what was seen as one line for an operator."""
     size = f'residual {1e12 * seen.flux_rms_t:.0f} pT, {seen.excess**0.5:.1f} x the expected one'
     if seen.findings:
         named = '; '.join(f'{title_of(record)}: {figures_of(record)}' for record in seen.findings)
@@ -34,7 +34,7 @@ def title_of(record: EffectRecord) -> str:
 
 
 def figures_of(record: EffectRecord) -> str:
-    """Parameters that fit into a line."""
+    """Return the parameters that are short enough for a line."""
     parts = [
         f'{key} {text}'
         for key, value in record.parameters.items()

@@ -89,7 +89,7 @@ def clock_troubles(stream: FluxStream) -> list[tuple[Level, str]]:
 
 
 def clock_values(stream: FluxStream) -> dict[str, object]:
-    """Figures of the clock."""
+    """Return state, lateness and uncertainty of the clock, s."""
     clock = stream.clock
     return {
         'clock': clock.state.value,
@@ -99,7 +99,7 @@ def clock_values(stream: FluxStream) -> dict[str, object]:
 
 
 def emitter_statuses(coils: Sequence[Coil], stream: FluxStream, frame: FluxFrame) -> list[Status]:
-    """Amplitude, noise and current of each emitter."""
+    """Return a status with amplitude, noise and current of each emitter."""
     window = frame.window
     statuses = []
     for k, coil in enumerate(coils):

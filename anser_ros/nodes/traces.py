@@ -60,7 +60,7 @@ class OpticalTrace:
             self.quaternion.append(turn)
 
     def forget(self, but: int) -> None:
-        """Keep the last poses alone."""
+        """Keep only the last ``but`` poses."""
         for values in (self.stamp_s, self.position, self.quaternion):
             del values[:-but]
 
@@ -139,7 +139,7 @@ class Traces:
         self._seen = dict.fromkeys(self.of, 0)
 
     def rows(self, optical: Mapping[str, OpticalTrace], elapsed_s: float) -> list[Row]:
-        """What came since the last call."""
+        """Return a row for each target about what came since the last call."""
         recent = {
             body: trace.track(max(0, len(trace.stamp_s) - 200)) for body, trace in optical.items()
         }

@@ -202,20 +202,20 @@ class ViewSource:
         ]
 
     def metal(self) -> list[list[float]]:
-        """Balls where metal seems to be."""
+        """Return balls where metal seems to be."""
         return self._balls
 
     def point(self) -> list[Any]:
-        """The newest point of the curves."""
+        """Return the newest point of the curves."""
         view = self.view
         return [] if view is None or not view.points else _point(view.points[-1])
 
     def marks(self) -> list[list[Any]]:
-        """Moments in the curves."""
+        """Return the marked moments, each with its time and words."""
         return [list(mark) for mark in self._marks]
 
     def status(self) -> dict[str, Any]:
-        """What header and lists say."""
+        """Return what the page's header and lists say."""
         view, space = self.view, self.namespace
         own, busy = self._processor.shares()
         status: dict[str, Any] = {

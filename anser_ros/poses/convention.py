@@ -61,7 +61,7 @@ class PoseReading:
         )  # fmt: skip
 
     def applied(self, session: PoseSession) -> PoseSession:
-        """The session with its numbers read so."""
+        """Return the session with its numbers read in this convention."""
         if self.stream == 'optical':
             assert session.reference is not None
             return replace(session, reference=self.of_sequence(session.reference))
@@ -70,7 +70,7 @@ class PoseReading:
         )
 
     def of_sequence(self, poses: PoseSequence) -> PoseSequence:
-        """The poses of one stream, read so."""
+        """Return the poses of one stream, read in this convention."""
         turn, place = poses.quaternion, poses.position * UNITS.get(self.unit, 1.0)
         if self.quaternion.startswith('wxyz'):
             turn = turn[:, [1, 2, 3, 0]]

@@ -200,7 +200,7 @@ class PoseSight:
 
 
 def effect_of(term: Term) -> PoseEffect:
-    """The effect of a term of poses."""
+    """Return the effect that a term of poses belongs to."""
     assert isinstance(term.effect, PoseEffect)
     return term.effect
 

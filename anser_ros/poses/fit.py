@@ -48,7 +48,7 @@ class PoseFit:
 
     @property
     def terms(self) -> tuple[Term, ...]:
-        """The terms with their parameters."""
+        """Return all terms with their fitted parameters."""
         return self.state.terms
 
     @property

@@ -89,7 +89,7 @@ class PoseProblem:
         )
 
     def in_blocks(self, wanted: Ints) -> 'PoseProblem':
-        """The poses in some blocks of time."""
+        """Return the problem with only the poses in some blocks of time."""
         return self.rows([np.isin(blocks, wanted) for blocks in self.blocks])
 
     def state(self, terms: Sequence[Term]) -> 'PoseState':
@@ -174,7 +174,7 @@ class PosePart:
 
     @property
     def used(self) -> Mask:
-        """Mask (n,) of the poses that count."""
+        """Return a mask (n,) of the poses that have a weight."""
         return self.weight > 0
 
 
@@ -193,7 +193,7 @@ class PoseState:
 
     @property
     def count(self) -> int:
-        """The number of values that count."""
+        """Return the number of values that have a weight, six a pose."""
         return int(6 * sum(np.count_nonzero(part.used) for part in self.parts))
 
     def rms(self, sensor: str | None = None) -> tuple[float, float]:

@@ -54,7 +54,7 @@ class PoseSequence:
 
     @property
     def size(self) -> int:
-        """The number of poses."""
+        """Return the number of poses."""
         return int(self.time.size)
 
     @property

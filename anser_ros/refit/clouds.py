@@ -56,7 +56,7 @@ class Region:
 
     @cached_property
     def volume(self) -> TrackedVolume:
-        """The volume in which tools are tracked."""
+        """Return the volume in which tools are tracked."""
         return self.stated or TrackedVolume.over_board(self.centre, self.half)
 
 

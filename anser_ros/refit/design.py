@@ -71,7 +71,7 @@ class Design:
 
     @property
     def error_m(self) -> float:
-        """Root mean square over the metals."""
+        """Return the root mean square of the errors over the metals, m."""
         return float(np.sqrt(np.mean(self.errors_m**2)))
 
 

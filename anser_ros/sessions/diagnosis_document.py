@@ -18,7 +18,7 @@ stand in the model file."""
 
 
 def to_document(result: SessionDiagnosis) -> dict[str, Any]:
-    """What was found as plain data."""
+    """Return what was found as plain data."""
     found = result.diagnosis
     return {
         'schema': SCHEMA,

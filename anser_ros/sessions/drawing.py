@@ -26,7 +26,7 @@ class Drawing:
 
     @staticmethod
     def of(setup: Setup) -> 'Drawing':
-        """The drawing of a setup's emitters."""
+        """Return the drawing of a setup's emitters."""
         try:
             return Drawing(board_of(setup))
         except SetupError:

@@ -31,7 +31,7 @@ class FrameReadings:
     flags: NDArray[np.int64]
 
     def in_phase(self) -> 'FrameReadings':
-        """The same without the fluxes' quadrature parts."""
+        """Return the readings without the fluxes' quadrature parts."""
         return replace(self, flux=self.flux.real.astype(complex))
 
 

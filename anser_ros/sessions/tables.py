@@ -64,7 +64,7 @@ class NumberTable:
         return np.asarray(found[index])
 
     def columns(self, references: Any, count: int, what: str) -> NDArray[Any]:
-        """Several columns, shape (N, count)."""
+        """Return several columns as an array of shape (N, count)."""
         if not isinstance(references, list) or len(references) != count:
             raise ParameterError(f'{self.path}: {what} needs a list of {count} columns')
         return np.stack([self.column(reference) for reference in references], axis=1)

@@ -252,7 +252,7 @@ class SampleClock:
 
     @property
     def state(self) -> ClockState:
-        """What is known of the stamps now."""
+        """Return what is known of the stamps now."""
         if not self._settled:
             return ClockState.SETTLING
         return ClockState.LATE if self._late_from_ns is not None else ClockState.GOOD

@@ -113,7 +113,7 @@ class RepetitionWatch:
 
     @property
     def columns(self) -> int:
-        """How many columns a sample has."""
+        """Return how many columns a sample has."""
         return self._history.shape[1]
 
     @property

@@ -126,7 +126,7 @@ class WindowCutter:
 
     @property
     def samples_wanted(self) -> int:
-        """Samples until the next window is complete."""
+        """Return how many samples the next window still lacks."""
         return self._until_next
 
     def push(self, sequence: int, timestamp_ticks: int, codes: NDArray[np.int16]) -> list[Window]:

@@ -111,12 +111,12 @@ class ControlUnit:
 
     @property
     def sample_rate_hz(self) -> float:
-        """Number of samples a second and channel."""
+        """Return the number of samples a second and channel."""
         return self._hello.sample_rate_hz
 
     @property
     def samples(self) -> int:
-        """Number of samples since power-up."""
+        """Return the number of samples since power-up."""
         return self._sample
 
     @property

@@ -70,7 +70,7 @@ class GridScan:
 
     @property
     def frames(self) -> int:
-        """Number of grid points of all layers."""
+        """Return the number of grid points of all layers."""
         return self.count**2 * len(self.heights_m)
 
     def __call__(self, time_s: float) -> Pose:

@@ -55,7 +55,7 @@ class BodyTrack:
     noise: NoiseScale = field(default_factory=NoiseScale)
 
     def forget(self) -> None:
-        """Drop the warm start."""
+        """Drop the last poses, so that the next solve starts cold."""
         self.good = self.before = None
         self.left_out = frozenset()
 
@@ -87,7 +87,7 @@ class BodyFit:
 
     @property
     def ratio(self) -> float:
-        """Chi-square over the degrees of freedom."""
+        """Return chi-square divided by the degrees of freedom."""
         return self.solution.chi2 / self.freedom
 
     def good(self, gate: float) -> bool:

@@ -120,7 +120,7 @@ class CoilTrack:
     error: PoseErrors | None = None
 
     def forget(self) -> None:
-        """Drop the warm start."""
+        """Drop the last poses, so that the next solve starts cold."""
         self.good = self.suspect = self.before = None
         self.failures = 0
 

@@ -118,7 +118,7 @@ class TrackerSettings:
 
     @property
     def box(self) -> TrackedVolume:
-        """Where tools may be."""
+        """Return the volume where tools may be."""
         return self.volume or TrackedVolume()
 
     def margin(self, ratio: float) -> float:

@@ -76,7 +76,7 @@ class RealField:
 
     @property
     def emitters(self) -> int:
-        """Number K of emitters."""
+        """Return the number K of emitters."""
         return int(self.moments.shape[1]) // 2
 
 

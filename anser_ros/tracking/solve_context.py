@@ -66,7 +66,7 @@ class Starts:
         return basis, basis @ field.moments
 
     def grid(self, field: RealField, sigma: Array) -> SeedGrid:
-        """Grid of starts in the field."""
+        """Return the grid of start poses in the field."""
         if self._made is None:
             flux = self.landmarks(field)[1]
             made = None if self._before is None else self._before._made
@@ -164,7 +164,7 @@ class SolveContext:
 
     @property
     def grid(self) -> SeedGrid:
-        """Grid of the cold start."""
+        """Return the grid of start poses for a cold start."""
         return self.starts.grid(self.field, self.sigma)
 
     @cached_property
@@ -207,7 +207,7 @@ class SolveContext:
 
 
 def model_digest(model: FieldModel) -> str:
-    """Eight hexadecimal digits that tell models apart."""
+    """Return eight hexadecimal digits that tell models apart."""
     digest = hashlib.blake2b(digest_size=4)
     for array in (model.positions, model.directions, model.moments):
         digest.update(np.ascontiguousarray(array).tobytes())

@@ -102,7 +102,7 @@ class SourceTrack:
     noise: NoiseScale | None = None
 
     def forget(self) -> None:
-        """Drop the warm start."""
+        """Drop the last pose, so that the next solve starts cold."""
         self.good = None
 
 
@@ -125,7 +125,7 @@ class SourceFrame:
 
     @cached_property
     def field(self) -> RealField:
-        """The field of those components."""
+        """Return the field of the live components only."""
         whole = self.context.field
         return RealField(
             whole.positions, whole.directions, np.ascontiguousarray(whole.moments[:, self.live])

@@ -127,7 +127,7 @@ class Tracker:
 
     @property
     def model(self) -> FieldModel | None:
-        """The field model in force."""
+        """Return the field model in force, or None."""
         return self._model
 
     @property
@@ -154,7 +154,7 @@ class Tracker:
 
     @property
     def bodies(self) -> tuple[str, ...]:
-        """Bodies that get a 6-DoF pose."""
+        """Return the bodies that get a 6-DoF pose."""
         return tuple(self._bodies)
 
     def with_model(self, model: FieldModel, model_id: str | None = None) -> 'Tracker':

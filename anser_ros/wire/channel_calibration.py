@@ -47,11 +47,11 @@ class ChannelCalibration:
     current_delay_s: float = 0.0
 
     def areas_m2(self, channels: Iterable[int]) -> NDArray[np.float64]:
-        """Effective area of each channel."""
+        """Return the effective area of each channel, m^2."""
         return np.array([self.channels.get(c, self.default).area_m2 for c in channels], float)
 
     def delays_s(self, channels: Iterable[int]) -> NDArray[np.float64]:
-        """Delay of each channel."""
+        """Return the delay of each channel, s."""
         return np.array([self.channels.get(c, self.default).delay_s for c in channels], float)
 
 

@@ -68,7 +68,7 @@ class Tracked:
 
 
 def crc64(data: bytes) -> int:
-    """The check sum of a body."""
+    """Return the check sum of a message's body."""
     value = 0
     for byte in data:
         value = _TABLE[(value >> 56) ^ byte] ^ ((value << 8) & _MASK)
@@ -169,7 +169,7 @@ def transform(
 
 
 def string(device: str, stamp_s: float, text: str) -> bytes:
-    """Pack a text of a device."""
+    """Pack a device's text into a STRING message."""
     words = text.encode('ascii', 'replace')
     return message('STRING', device, stamp_s, struct.pack('>HH', ASCII, len(words)) + words)
 

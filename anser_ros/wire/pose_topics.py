@@ -18,7 +18,7 @@ def tracked_topic(sensor: str) -> str:
 
 
 def optical_topic(body: str) -> str:
-    """Topic of a body's optical poses."""
+    """Return the topic of a body's optical poses."""
     return f'{OPTICAL}{topic_of(body)}{ENDING}'
 
 

@@ -110,7 +110,7 @@ class Hello:
     minor: int = 0
 
     def samples_size(self) -> int:
-        """Payload bytes of one block of samples."""
+        """Return the payload size of one block of samples, bytes."""
         return SAMPLES_HEAD.size + 2 * self.block_samples * len(self.channels)
 
 

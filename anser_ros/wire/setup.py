@@ -150,12 +150,12 @@ class Setup:
 
     @property
     def tool_sensors(self) -> tuple[SensorSpec, ...]:
-        """Sensors on bodies that move."""
+        """Return the sensors on bodies that move."""
         return tuple(s for s in self.sensors if s.body != FIELD_GENERATOR)
 
     @property
     def reference_sensors(self) -> tuple[SensorSpec, ...]:
-        """Sensors fixed in fg."""
+        """Return the sensors that are fixed in fg."""
         return tuple(s for s in self.sensors if s.body == FIELD_GENERATOR)
 
     @property

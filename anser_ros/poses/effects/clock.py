@@ -34,11 +34,11 @@ class PoseTimeOffset(PoseEffect):
         return [Term(self, {}, np.zeros(1)), *(own if len(own) > 1 else [])]
 
     def prior(self, term: Term) -> Array:
-        """Offsets are some tenths of a second."""
+        """Return a prior spread of 0.3 s: offsets are some tenths of a second."""
         return np.full(1, 0.3)
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
-        """Minus the velocity of the predicted pose."""
+        """Return minus the velocity of the predicted pose, or None for other sensors."""
         return -view.velocity[:, :, None] if self.acts_on(term, view.sensor) else None
 
     def clock(self, term: Term, sensor: str, time: Array) -> Array:
@@ -51,7 +51,7 @@ class PoseTimeOffset(PoseEffect):
         return EffectRecord(self.name, values, {'offset_s': float(sigmas(covariance)[0])})
 
     def term(self, record: EffectRecord) -> Term:
-        """The term of a recorded offset."""
+        """Read the offset, s, from a record."""
         site = {k: v for k, v in record.parameters.items() if k == 'sensor'}
         return Term(self, site, np.array([float(needed(record, 'offset_s'))]))
 
@@ -67,7 +67,7 @@ class PoseClockRate(PoseEffect):
     role = Role.CLOCK
 
     def sites(self, setting: PoseSetting) -> Sequence[Term]:
-        """One rate for all sensors."""
+        """Return one term, as one rate holds for all sensors."""
         return [Term(self, {'middle_s': 0.5 * setting.duration}, np.zeros(1))]
 
     def prior(self, term: Term) -> Array:
@@ -80,7 +80,7 @@ class PoseClockRate(PoseEffect):
         return -(view.velocity * apart[:, None])[:, :, None]
 
     def clock(self, term: Term, sensor: str, time: Array) -> Array:
-        """Stamps that gain no more."""
+        """Return the stamps, s, without what their clock gains."""
         return np.asarray(time - 1e-3 * term.theta[0] * (time - float(term.site['middle_s'])))
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
@@ -90,7 +90,7 @@ class PoseClockRate(PoseEffect):
         return EffectRecord(self.name, values, {'rate_ppm': sigma})
 
     def term(self, record: EffectRecord) -> Term:
-        """The term of a recorded rate."""
+        """Read the clock's rate, ppm, from a record."""
         rate = 1e-3 * float(needed(record, 'rate_ppm'))
         return Term(self, {'middle_s': float(needed(record, 'middle_s'))}, np.array([rate]))
 

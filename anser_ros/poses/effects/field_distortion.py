@@ -67,7 +67,7 @@ class FieldDistortion(PoseEffect):
         return Term(self, site, np.zeros(3 * count))
 
     def prior(self, term: Term) -> Array:
-        """Some millimetres at the rms distance."""
+        """Return a prior spread of 5 mm at the rms distance."""
         return np.full(term.theta.size, 5.0)
 
     def _basis(self, term: Term, position: Array) -> Array:
@@ -92,7 +92,7 @@ class FieldDistortion(PoseEffect):
     def corrected(
         self, term: Term, sensor: str, position: Array, rotation: Array
     ) -> tuple[Array, Array]:
-        """Positions with the map's shift."""
+        """Return positions with the map's shift added, m, and rotations as they are."""
         if not self.acts_on(term, sensor):
             return position, rotation
         return position + self.shift(term, position), rotation
@@ -113,7 +113,7 @@ class FieldDistortion(PoseEffect):
         )  # fmt: skip
 
     def term(self, record: EffectRecord) -> Term:
-        """The term of a recorded map."""
+        """Read the map's coefficients, mm, from a record."""
         keys = ('sensor', 'degree', 'lowest', 'centre_m', 'size_m')
         site = {k: record.parameters[k] for k in keys if k in record.parameters}
         return Term(self, site, np.asarray(needed(record, 'coefficients_mm'), dtype=np.float64))

@@ -34,12 +34,12 @@ class FrameTerm(Term):
 
     @property
     def rotation(self) -> Array:
-        """The rotation with theta's turn."""
+        """Return the start's rotation, turned by theta's rotation vector."""
         return np.asarray(Rotation.from_rotvec(self.theta[3:]).as_matrix() @ self.start)
 
     @property
     def translation(self) -> Array:
-        """The translation of the frame, m."""
+        """Return the translation of the frame, m."""
         return self.theta[:3]
 
     def rebased(self) -> Self:
@@ -57,7 +57,7 @@ class OpticalFrame(PoseEffect):
     summary = "the optical frame is not the tracker's"
 
     def prior(self, term: Term) -> Array:
-        """Nothing is known of it before."""
+        """Return a wide prior, as nothing is known of the frame before."""
         return np.full(6, FREE)
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
@@ -77,7 +77,7 @@ class Mount(PoseEffect):
     summary = 'where and how the sensor sits on the body'
 
     def prior(self, term: Term) -> Array:
-        """Nothing is known of it before."""
+        """Return a wide prior, as nothing is known of the mount before."""
         return np.full(6, FREE)
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:

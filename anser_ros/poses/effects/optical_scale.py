@@ -30,7 +30,7 @@ class PoseOpticalScale(PoseEffect):
         return [Term(self, {}, np.zeros(1))]
 
     def prior(self, term: Term) -> Array:
-        """A scale is off by some percents."""
+        """Return a prior spread of 3 %, as scales are off by some percent."""
         return np.full(1, 30.0)
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
@@ -40,17 +40,17 @@ class PoseOpticalScale(PoseEffect):
         return out
 
     def seen(self, term: Term, position: Array) -> Array:
-        """Positions at the tracker's scale."""
+        """Return the positions as the optical tracker scales them, m."""
         return position / (1 + 1e-3 * float(term.theta[0]))
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the scale."""
+        """Record the scale and its uncertainty."""
         sigma = 1e-3 * float(sigmas(covariance)[0])
         scale = 1 + 1e-3 * float(term.theta[0])
         return EffectRecord(self.name, {'scale': scale}, {'scale': sigma})
 
     def term(self, record: EffectRecord) -> Term:
-        """The term of a recorded scale."""
+        """Read the scale from a record."""
         return Term(self, {}, np.array([1e3 * (float(needed(record, 'scale')) - 1)]))
 
 

@@ -42,7 +42,7 @@ class StalePoses(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'fraction': '1', 'runs': '1'}
 
     def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
-        """Each stream in which poses come again."""
+        """Return a record for each stream in which poses come again."""
         found = []
         for poses in _streams(sight):
             moving = _moving(poses)
@@ -68,7 +68,7 @@ class MissingPoses(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'fraction': '1', 'spans': 's'}
 
     def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
-        """Each stream that lacks poses."""
+        """Return a record for each stream that lacks poses."""
         found = []
         for poses in _streams(sight):
             spans = _gaps(poses)
@@ -94,7 +94,7 @@ class PoseOutliers(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'fraction': '1'}
 
     def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
-        """One record for all sensors."""
+        """Return one record of the outlying poses of all sensors."""
         found = list(self._leaping(sight))
         out = np.concatenate([s.out for s in sight.sensors])
         used = np.concatenate([s.used for s in sight.sensors])

@@ -41,11 +41,11 @@ class TrackerLag(PoseEffect):
         return [Term(self, {}, np.array([tau])) for tau in TAUS_S]
 
     def prior(self, term: Term) -> Array:
-        """Lags are some tenths of a second."""
+        """Return a prior spread of 0.1 s: lags are some tenths of a second."""
         return np.full(1, 0.1)
 
     def filter(self, term: Term, path: OpticalPath) -> OpticalPath:
-        """The path behind the filter."""
+        """Return the optical path as it is behind the tracker's filter."""
         return path.filtered(float(term.theta[0]), TWO_SIDED in term.site)
 
     def rival(self, term: Term) -> Term:
@@ -53,12 +53,12 @@ class TrackerLag(PoseEffect):
         return Term(self, {TWO_SIDED: True}, term.theta)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the time constant."""
+        """Record the filter's time constant and its uncertainty, s."""
         sigma = float(sigmas(covariance)[0])
         return EffectRecord(self.name, {'tau_s': float(term.theta[0])}, {'tau_s': sigma})
 
     def term(self, record: EffectRecord) -> Term:
-        """The term of a recorded time constant."""
+        """Read the filter's time constant, s, from a record."""
         return Term(self, {}, np.array([float(needed(record, 'tau_s'))]))
 
 
