@@ -258,7 +258,8 @@ def test_a_node_that_is_still_starting_is_waited_for_longer(ros, tmp_path):
     began = time.monotonic()
     node = replay.Replay(str(make_session(tmp_path / 'a.mcap', 3)), rate=100.0, wait=0.5)
     assert spin_until(node, lambda: node.exit_code is not None)
-    assert 3.0 <= time.monotonic() - began < 8.0
+    # A poll of a busy machine may take a part of the wait that follows.
+    assert replay.STARTING_FACTOR * 0.5 <= time.monotonic() - began < 8.0
     assert node.exit_code == 0 and node.counters['no_listeners'] == 1
     node.close()
     node.destroy_node()
