@@ -70,31 +70,6 @@ def emitter_strength(reference: Measurements) -> ComplexArray:
         if common > COMMON * (power - chance):
             out[:, k] = CubicSpline(middle, gain)(reference.time)
     return out
-    flux = reference.flux[:, good]
-    noise = np.median(np.abs(np.diff(flux, axis=0)) ** 2, axis=0) / np.log(2.0) / 2.0
-    seen = np.flatnonzero(size)
-    means = np.array([flux[bins == b].mean(axis=0) for b in seen])
-    middle = np.array([reference.time[bins == b].mean() for b in seen])
-    for k in range(emitters):
-        steady = np.median(means[:, :, k].real, axis=0) + 1j * np.median(
-            means[:, :, k].imag, axis=0
-        )
-        weight = 1.0 / np.maximum(noise[:, k], 1e-30)
-        total = float((weight * np.abs(steady) ** 2).sum())
-        gain = (means[:, :, k] * (weight * steady.conj())).sum(axis=1) / max(total, 1e-300)
-        change = means[:, :, k] - steady
-        power = float((weight * np.abs(change) ** 2 * size[seen, None]).sum())
-        chance = float(change.size)
-        common = float((total * np.abs(gain - 1.0) ** 2 * size[seen]).sum())
-        drift = float(np.sqrt(np.mean(np.abs(gain - 1.0) ** 2)))
-        by_noise = np.sqrt(1.0 / max(total * float(np.mean(size[seen])), 1e-300))
-        if drift < max(LEAST_DRIFT, CERTAIN * by_noise):
-            continue
-        if common > COMMON * (power - chance):
-            out[:, k] = np.interp(reference.time, middle, gain.real) + 1j * np.interp(
-                reference.time, middle, gain.imag
-            )
-    return out
 
 
 def at_strength(measurements: Measurements, time: Array, strength: ComplexArray) -> Measurements:
@@ -108,12 +83,5 @@ def at_strength(measurements: Measurements, time: Array, strength: ComplexArray)
     strength : ndarray, shape (G, K), complex
         Of the emitters at these times, as of `emitter_strength`.
     """
-    now = np.stack(
-        [
-            np.interp(measurements.time, time, column.real)
-            + 1j * np.interp(measurements.time, time, column.imag)
-            for column in strength.T
-        ],
-        axis=1,
-    )
+    now = np.stack([np.interp(measurements.time, time, column) for column in strength.T], axis=1)
     return replace(measurements, flux=measurements.flux / now[:, None, :])

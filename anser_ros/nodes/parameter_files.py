@@ -17,6 +17,21 @@ LEAF = 'ros__parameters'
 WILDCARDS = ('*', '**')
 
 
+def _documents(arguments: Sequence[str]) -> Iterator[tuple[str, Any]]:
+    """Yield the path and content of each parameter file among a process's arguments.
+
+    What cannot be read or is no YAML is left out: rclpy refuses it.
+    """
+    for option, value in itertools.pairwise(arguments):
+        if option != OPTION:
+            continue
+        try:
+            document = read_yaml(Path(value).read_text(encoding='utf-8'))
+        except (OSError, ValueError, yaml.YAMLError):
+            continue
+        yield value, document
+
+
 def complaints(arguments: Sequence[str], node: str) -> list[str]:
     """Return one line for each parameter file without a section for a node.
 
@@ -31,13 +46,7 @@ def complaints(arguments: Sequence[str], node: str) -> list[str]:
         The node's name.
     """
     found = []
-    for option, value in itertools.pairwise(arguments):
-        if option != OPTION:
-            continue
-        try:
-            document = read_yaml(Path(value).read_text(encoding='utf-8'))
-        except (OSError, ValueError, yaml.YAMLError):
-            continue
+    for value, document in _documents(arguments):
         keys = [key for key, _ in _sections(document)]
         names = [key.rsplit('/', 1)[-1] for key in keys]
         if node in names or any(name in WILDCARDS for name in names):
@@ -50,13 +59,7 @@ def complaints(arguments: Sequence[str], node: str) -> list[str]:
 
 def names_for(arguments: Sequence[str], node: str) -> Iterator[str]:
     """Yield the names of the values that parameter files have in sections of just this node."""
-    for option, value in itertools.pairwise(arguments):
-        if option != OPTION:
-            continue
-        try:
-            document = read_yaml(Path(value).read_text(encoding='utf-8'))
-        except (OSError, ValueError, yaml.YAMLError):
-            continue
+    for _, document in _documents(arguments):
         for key, values in _sections(document):
             if key.rsplit('/', 1)[-1] == node and isinstance(values, dict):
                 yield from map(str, values)
