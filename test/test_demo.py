@@ -227,7 +227,7 @@ def test_ctrl_c_ends_the_demo_in_order_and_it_says_how_to_go_on(start, tmp_path,
     demo.wait_for('tracked', 60)
     begin = time.monotonic()
     assert demo.interrupt(signal.SIGINT) == 0, demo.output
-    assert time.monotonic() - begin < 2.0
+    assert time.monotonic() - begin < 3.0
     (folder,) = tmp_path.glob('demo_*_*')
     said = re.search(rf'bag: {folder}/bag \((\S+) s, (\d+) messages, complete\)', demo.output)
     assert said, demo.output
@@ -253,7 +253,7 @@ def test_ctrl_c_while_the_nodes_start(start, tmp_path, after_s):
     time.sleep(after_s)
     begin = time.monotonic()
     assert demo.interrupt(signal.SIGINT) == 0, demo.output
-    assert time.monotonic() - begin < 1.5
+    assert time.monotonic() - begin < 3.0
     summary = json.loads(demo.output)
     assert summary['interrupted']
     assert summary['bag'] is None or list(Path(summary['bag']).glob('*.mcap'))
