@@ -37,7 +37,7 @@ def test_the_names_in_the_recipes_are_those_of_the_code():
         'physics/board.py': ('KINDS',),
         'tracking/estimate.py': ('STATES', 'TrackerSettings'),
         'cli/measured.py': ('RECIPES',),
-        'tracking/coil_track.py': ('_judge',),
+        'tracking/solve_verdict.py': ('verdict',),
     }.items():
         code = (REPO / 'anser_ros' / path).read_text()
         for name in names:

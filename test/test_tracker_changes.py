@@ -11,7 +11,7 @@ from tracking_world import NOISE_T, fluxes, random_pose
 from anser_ros.errors import TrackingError
 from anser_ros.field.model import EffectRecord
 from anser_ros.tracking import estimate as states
-from anser_ros.tracking.estimate import NoiseScale, TrackerSettings
+from anser_ros.tracking.estimate import NO_GATE, NoiseScale, TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 
 
@@ -183,7 +183,15 @@ def test_sensors_and_settings_that_are_none_are_refused():
             TrackerSettings(**{name: 0.0})
     with pytest.raises(TrackingError, match='odds'):
         TrackerSettings(odds=0.5)
-    assert TrackerSettings(gate=math.inf).gate == math.inf, 'no gate at all'
+
+
+@pytest.mark.parametrize('gate', [NO_GATE, math.inf])
+def test_no_gate_is_the_same_however_it_is_said(gate):
+    """The node's largest gate refuses no more than the infinite one of a command line does."""
+    settings = TrackerSettings(gate=gate)
+    assert not settings.has_gate and settings.leniency(9.0) == 3.0
+    assert settings.margin(400.0) == -math.inf, 'the best of poses that all fit badly is taken'
+    assert TrackerSettings(gate=NO_GATE / 2).margin(400.0) > 0.0
 
 
 def test_hostile_fluxes_never_make_a_pose(rng):

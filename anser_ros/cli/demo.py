@@ -22,6 +22,7 @@ from anser_ros.cli.output import make_folder
 from anser_ros.cli.supervisor import Supervisor, tail
 from anser_ros.cli.warm_up import compile_kernels
 from anser_ros.errors import ParameterError
+from anser_ros.tracking.estimate import NO_GATE
 from anser_ros.wire.bag_metadata import told
 from anser_ros.wire.config_folder import config_path
 
@@ -36,7 +37,7 @@ METAL_RADIUS_M = 0.1
 """Radius of the steel disc, m: as large as the foot of a stand or the head of a C-arm."""
 # The frozen chain shows the poses of a tracker without residual gate. With one it would withhold
 # them near metal, and nobody would see the error that the refit avoids.
-NO_GATE = {'gate': 1e6, 'adaptive': False}
+FROZEN_TRACKER = {'gate': NO_GATE, 'adaptive': False}
 POLL_S = 0.05
 """Time from one look at the processes to the next, s."""
 DASHBOARD_PORT = 8642
@@ -245,7 +246,7 @@ def _commands(folder: Path, port: Path, args: argparse.Namespace) -> list[tuple[
             ),
         ),
         ('field_model_frozen', node_command('field_model', *apart, model_file=model)),
-        ('tracker_frozen', node_command('tracker', *apart, **NO_GATE)),
+        ('tracker_frozen', node_command('tracker', *apart, **FROZEN_TRACKER)),
         ('recorder', node_command('recorder', directory=folder, name='bag')),
         *(
             [('dashboard', node_command('dashboard', directory=folder, port=DASHBOARD_PORT))]

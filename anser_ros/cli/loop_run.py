@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from anser_ros.cli.demo import BOARD_SEED, NO_GATE, SAMPLE_RATE_HZ, SHARED_TOPICS
+from anser_ros.cli.demo import BOARD_SEED, FROZEN_TRACKER, SAMPLE_RATE_HZ, SHARED_TOPICS
 from anser_ros.cli.demo import node_command as node
 from anser_ros.cli.supervisor import Supervisor, tail
 from anser_ros.errors import AnserError, DiagnosisError, SetupError
@@ -166,7 +166,7 @@ def _commands(run: Run, port: Path) -> dict[str, list[str]]:
 
 def _beside(run: Run) -> dict[str, dict[str, object]]:
     """Return the namespaces and settings of the trackers with the uncorrected model."""
-    return {} if run.known is None else {BEFORE: {}, UNGATED: dict(NO_GATE)}
+    return {} if run.known is None else {BEFORE: {}, UNGATED: dict(FROZEN_TRACKER)}
 
 
 def _wait(supervisor: Supervisor, run: Run, missing: Callable[[], str]) -> None:

@@ -7,7 +7,7 @@ from anser_ros.errors import ParameterError
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.stated_parameters import stated
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.tracking.estimate import TrackerSettings
+from anser_ros.tracking.estimate import NO_GATE, TrackerSettings
 from anser_ros.wire.setup_tips import TipSpec, read_tips
 
 
@@ -47,7 +47,7 @@ class TrackerParameters:
         TrackerSettings.gate,
         'largest residual of a pose, in units of the expected one',
         minimum=1.0,
-        maximum=1e6,
+        maximum=NO_GATE,
         live=True,
     )
     max_sigma_m: float = parameter(

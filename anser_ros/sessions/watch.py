@@ -19,8 +19,9 @@ from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.sessions.diagnosis import problem_of, spread_of
 from anser_ros.sessions.prepared import PreparedSession, correct
-from anser_ros.sessions.session import NANO, Session
-from anser_ros.tracking.estimate import OK, TrackerSettings
+from anser_ros.sessions.session import Session
+from anser_ros.stamps import NANO
+from anser_ros.tracking.estimate import NO_GATE, OK, TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 
 Array = NDArray[np.float64]
@@ -219,7 +220,7 @@ def _shifted(measurements: Measurements, seconds: float) -> Measurements:
 
 def _posed_by_itself(tool: Measurements, model: FieldModel) -> Measurements:
     """A rigid tool with the poses that all its coils together give it."""
-    tracker = Tracker(model, tool.sensors, TrackerSettings(gate=np.inf, adaptive=False))
+    tracker = Tracker(model, tool.sensors, TrackerSettings(gate=NO_GATE, adaptive=False))
     count = tool.time.size
     position, rotation = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
     has_pose = np.zeros(count, dtype=bool)

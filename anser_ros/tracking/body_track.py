@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.frames.intake import NANO
+from anser_ros.stamps import NANO
 from anser_ros.tracking import estimate as states
 from anser_ros.tracking.body_descent import step_to_coils
 from anser_ros.tracking.coil_track import (
@@ -27,7 +27,8 @@ from anser_ros.tracking.rigid import (
 )
 from anser_ros.tracking.rotations import rotation_between, rotation_of_vector
 from anser_ros.tracking.solve_context import SolveContext
-from anser_ros.tracking.uncertainty import bounded_inverse, chi2_limit
+from anser_ros.tracking.solve_verdict import RARE, SAME_PLACE_M, variance_scale, verdict
+from anser_ros.tracking.uncertainty import bounded_inverse
 
 Array = NDArray[np.float64]
 Start = tuple[Array, Array]
@@ -35,9 +36,13 @@ Start = tuple[Array, Array]
 DISAGREES = 4.0
 """A coil is left out when its share of the misfit is so many times the mean of the others'."""
 
-RARE = 0.01
-"""Probability of a body's residual beyond which it counts as more than noise. It is smaller than
-that of a coil, for a body's many degrees of freedom make much of a small excess."""
+UNKNOWNS = 6
+"""Numbers that a body's pose has."""
+
+SAME_TURN = 0.1
+"""Two poses whose rotation matrices differ by no more (Frobenius norm: 0.1 is 4 deg) are one.
+Smaller, and one pose that two descents reached makes itself ambiguous; larger, and a second pose
+near by is not seen. How the value was chosen is not recorded."""
 
 LEFT_OUT_S = 1.0
 """How long a coil that disagreed stays out before it is tried again."""
@@ -163,7 +168,7 @@ def _solve(frame: _BodyFrame, used: NDArray[np.int64], start: Start) -> BodyFit:
         context.field, part, np.ascontiguousarray(frame.flux[used]), weights,
         frame.common(used, start), *start, context.low - part.reach, context.high + part.reach,
     )  # fmt: skip
-    return BodyFit(solution, used, max(weights.size - 6, 1))
+    return BodyFit(solution, used, max(weights.size - UNKNOWNS, 1))
 
 
 def _without_disagreeing(fit: BodyFit, frame: _BodyFrame, gate: float) -> BodyFit:
@@ -283,41 +288,34 @@ def _judge(
     settings: TrackerSettings,
 ) -> PoseEstimate:
     solution = fit.solution
-    scale = 1.0
-    if settings.adaptive:
-        usual = chi2_limit(fit.freedom, RARE) / fit.freedom
-        scale = track.noise.of_frame(
-            fit.ratio, usual, fit.freedom / 6, context.model_share, context.modes is not None
-        )
+    scale = variance_scale(
+        track.noise, solution.chi2, fit.freedom, UNKNOWNS, RARE, context, settings
+    )
     covariance = scale * bounded_inverse(solution.information)
     sigma = math.sqrt(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
-    centre = solution.position + solution.rotation @ coils.subset(fit.used).offsets.mean(axis=0)
     residual = float(np.sqrt(np.mean(solution.residual**2)))
-    state = states.OK
+    others = (
+        (rival.solution.chi2, 'another pose')
+        for rival in rivals
+        if rival.solution.converged and _apart(rival.solution, solution)
+    )
+    state, reason = verdict(
+        settings, solution.chi2, fit.freedom, residual,
+        solution.position + solution.rotation @ coils.subset(fit.used).offsets.mean(axis=0),
+        solution.converged, sigma, scale, rivals=others,
+    )  # fmt: skip
     left_out = len(coils.offsets) - len(fit.used)
-    reason = f'{left_out} of {len(coils.offsets)} coils left out' if left_out else ''
-    if not fit.ratio <= settings.gate**2:
-        state = states.RESIDUAL
-        reason = f'residual {residual:.3g} T is {math.sqrt(fit.ratio):.3g} times the expected one'
-    elif not settings.box.contains(centre):
-        state = states.OUTSIDE_VOLUME
-        reason = 'at ' + ', '.join(f'{1e3 * v:.1f}' for v in centre) + ' mm'
-    elif not solution.converged:
-        state, reason = states.AMBIGUOUS, 'the solve did not converge'
-    elif sigma > settings.max_sigma_m * settings.leniency(scale):
-        state, reason = states.AMBIGUOUS, f'position uncertain by {1e3 * sigma:.3g} mm'
-    else:
-        margin = settings.margin(fit.ratio)
-        for rival in rivals:
-            apart = np.linalg.norm(rival.solution.position - solution.position) > 2e-3
-            apart |= np.linalg.norm(rival.solution.rotation - solution.rotation) > 0.1
-            if (
-                apart
-                and rival.solution.converged
-                and (rival.solution.chi2 < solution.chi2 + margin)
-            ):
-                state, reason = states.AMBIGUOUS, 'another pose would explain the fluxes too'
+    if state == states.OK and left_out:
+        reason = f'{left_out} of {len(coils.offsets)} coils left out'
     return PoseEstimate(
         name, stamp_ns, state, solution.position, solution.rotation[:, 2].copy(),
         solution.rotation, covariance, sigma, residual, fit.ratio, context.model_id, reason,
     )  # fmt: skip
+
+
+def _apart(one: BodySolution, other: BodySolution) -> bool:
+    """Whether two solutions are different poses, not one that two descents ended at."""
+    return bool(
+        np.linalg.norm(one.position - other.position) > SAME_PLACE_M
+        or np.linalg.norm(one.rotation - other.rotation) > SAME_TURN
+    )

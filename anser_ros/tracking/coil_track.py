@@ -8,13 +8,14 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.frames.intake import NANO
+from anser_ros.stamps import NANO
 from anser_ros.tracking import estimate as states
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.seed import solve_cold
 from anser_ros.tracking.solve import CoilSolution, solve_coil, whitening_of
 from anser_ros.tracking.solve_context import SolveContext
-from anser_ros.tracking.uncertainty import chi2_limit, coil_covariance
+from anser_ros.tracking.solve_verdict import millimetres, variance_scale, verdict
+from anser_ros.tracking.uncertainty import coil_covariance
 
 Array = NDArray[np.float64]
 Start = tuple[Array, Array]
@@ -152,7 +153,7 @@ class _CoilFrame:
 
     @property
     def freedom(self) -> int:
-        return max(self.flux.size - 5, 1)
+        return max(self.flux.size - UNKNOWNS, 1)
 
     @property
     def limit(self) -> float:
@@ -285,10 +286,10 @@ def track_coil(
         return _finish(track, frame, solution, [], False)
     if track.suspect is not None and stamp_ns < track.retry_ns:
         solution = _descend(track, frame, track.suspect.position, track.suspect.axis)
-        verdict = _judge(track, frame, solution, [])
+        judged = _judge(track, frame, solution, [])
         change = solution.chi2 / max(track.suspect.chi2, 1e-300)
-        if verdict.state != states.OK and 1.0 / CHANGED < change < CHANGED:
-            return CoilResult(verdict, solution, False, track.error)
+        if judged.state != states.OK and 1.0 / CHANGED < change < CHANGED:
+            return CoilResult(judged, solution, False, track.error)
     solution, *rivals = _cold(track, frame)
     return _finish(track, frame, solution, rivals, True)
 
@@ -301,8 +302,8 @@ def _finish(
     cold: bool,
 ) -> CoilResult:
     """Judge a solution and remember it as good or suspect."""
-    verdict = _judge(track, frame, solution, rivals)
-    if verdict.state == states.OK:
+    judged = _judge(track, frame, solution, rivals)
+    if judged.state == states.OK:
         last = track.good
         moved = last is not None and math.dist(last.position, solution.position)
         track.before = None
@@ -310,12 +311,12 @@ def _finish(
             track.before = (track.good_ns, last.position, last.axis)
         track.good, track.good_ns = solution, frame.stamp_ns
         track.suspect, track.failures = None, 0
-        track.noise.add(verdict.chi2)
+        track.noise.add(judged.chi2)
     elif cold:
         wait_s = min(FIRST_RETRY_S * 2.0**track.failures, LAST_RETRY_S)
         track.suspect, track.failures = solution, track.failures + 1
         track.retry_ns = frame.stamp_ns + round(wait_s / NANO)
-    return CoilResult(verdict, solution, cold, track.error)
+    return CoilResult(judged, solution, cold, track.error)
 
 
 def _descend(track: CoilTrack, frame: _CoilFrame, position: Array, axis: Array) -> CoilSolution:
@@ -349,44 +350,27 @@ def _from_good(track: CoilTrack, frame: _CoilFrame) -> CoilSolution | None:
 def _judge(
     track: CoilTrack, frame: _CoilFrame, solution: CoilSolution, rivals: list[CoilSolution]
 ) -> PoseEstimate:
-    freedom, settings = frame.freedom, frame.settings
-    ratio = solution.chi2 / freedom
-    scale = 1.0
-    if settings.adaptive:
-        usual = chi2_limit(freedom, SELDOM) / freedom
-        context = frame.context
-        scale = track.noise.of_frame(
-            ratio, usual, freedom / 5, context.model_share, context.modes is not None
-        )
+    settings, context = frame.settings, frame.context
+    ratio = solution.chi2 / frame.freedom
+    scale = variance_scale(
+        track.noise, solution.chi2, frame.freedom, UNKNOWNS, SELDOM, context, settings
+    )
     covariance = scale * coil_covariance(
         solution.normal, solution.axis, settings.roll_variance / scale
     )
     sigma = math.sqrt(covariance[0, 0] + covariance[1, 1] + covariance[2, 2])
     residual = math.sqrt(float(solution.residual @ solution.residual) / solution.residual.size)
-    state, reason = states.OK, ''
-    if not solution.chi2 <= frame.limit:
-        state = states.RESIDUAL
-        reason = f'residual {residual:.3g} T is {math.sqrt(ratio):.3g} times the expected one'
-    elif not settings.box.contains(solution.position):
-        state, reason = states.OUTSIDE_VOLUME, f'at {_millimetres(solution.position)} mm'
-    elif not solution.converged:
-        state, reason = states.AMBIGUOUS, 'the solve did not converge'
-    elif sigma > settings.max_sigma_m * settings.leniency(scale):
-        state, reason = states.AMBIGUOUS, f'position uncertain by {1e3 * sigma:.3g} mm'
-    elif track.error and track.error.among_metal and math.isfinite(settings.gate):
-        state, reason = states.AMBIGUOUS, 'where there may be metal'
-    else:
-        margin = settings.margin(ratio)
-        for rival in rivals:
-            likely = rival.converged and rival.chi2 < solution.chi2 + margin
-            if likely and settings.box.contains(rival.position):
-                state = states.AMBIGUOUS
-                reason = f'{_millimetres(rival.position)} mm would explain the fluxes too'
+    others = (
+        (rival.chi2, f'{millimetres(rival.position)} mm')
+        for rival in rivals
+        if rival.converged and settings.box.contains(rival.position)
+    )
+    state, reason = verdict(
+        settings, solution.chi2, frame.freedom, residual, solution.position, solution.converged,
+        sigma, scale, in_metal=track.error is not None and track.error.among_metal,
+        rivals=others,
+    )  # fmt: skip
     return PoseEstimate(
         frame.name, frame.stamp_ns, state, solution.position, solution.axis, None, covariance,
-        sigma, residual, ratio, frame.context.model_id, reason,
+        sigma, residual, ratio, context.model_id, reason,
     )  # fmt: skip
-
-
-def _millimetres(position: Array) -> str:
-    return ', '.join(f'{1e3 * v:.1f}' for v in position)

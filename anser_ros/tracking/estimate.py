@@ -124,16 +124,16 @@ class TrackerSettings:
     def margin(self, ratio: float) -> float:
         """Chi-square by which a rival must be worse, at a residual power per freedom ``ratio``.
 
-        A misfit takes part in it as noise would; with an infinite gate the best of poses that all
-        fit badly is taken.
+        A misfit takes part in it as noise would; without a gate the best of poses that all fit
+        badly is taken.
         """
-        if math.isinf(self.gate) and ratio > USUAL_GATE**2:
+        if not self.has_gate and ratio > USUAL_GATE**2:
             return -math.inf
         return 2.0 * math.log(self.odds) * max(1.0, ratio)
 
     def leniency(self, scale: float) -> float:
-        """What ``max_sigma_m`` is multiplied by: an infinite gate forgives what misfit adds."""
-        return 1.0 if math.isfinite(self.gate) else math.sqrt(max(1.0, scale))
+        """What ``max_sigma_m`` is multiplied by: without a gate, what misfit adds is forgiven."""
+        return 1.0 if self.has_gate else math.sqrt(max(1.0, scale))
 
 
 @dataclass(frozen=True)

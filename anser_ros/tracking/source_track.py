@@ -15,13 +15,15 @@ from numpy.typing import NDArray
 
 from anser_ros.field.symmetry import SymmetryAxis
 from anser_ros.physics.dipole import field_basis
+from anser_ros.stamps import NANO
 from anser_ros.tracking import estimate as states
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.rigid import BodyCoils, BodySolution, common_factor, solve_body
 from anser_ros.tracking.rotations import nearest_rotation, rotation_of_vector
 from anser_ros.tracking.solve import RealField
 from anser_ros.tracking.solve_context import SolveContext
-from anser_ros.tracking.uncertainty import ROLL_VARIANCE, bounded_inverse, chi2_limit
+from anser_ros.tracking.solve_verdict import RARE, SAME_PLACE_M, variance_scale, verdict
+from anser_ros.tracking.uncertainty import ROLL_VARIANCE, bounded_inverse
 
 Array = NDArray[np.float64]
 Start = tuple[Array, Array]
@@ -33,8 +35,10 @@ NEAREST = 0.2
 """Places nearer to a sensor than this part of the least distance are no place of a source."""
 STARTS = 4
 """Places of the scan from which the pose is descended to."""
-RARE = 0.01
-"""Probability of a residual beyond which it counts as more than noise."""
+UNKNOWNS = 5
+"""Numbers that a source's place and axis have; the turn about its axis is open."""
+FEWEST_SENSORS = UNKNOWNS + 1
+"""Sensors that find a source and leave a residual to judge it by."""
 
 
 class SourceScan:
@@ -173,18 +177,20 @@ def track_source(
     The estimate's position (m), axis and covariance are in the body's frame.
     """
     used, settings, context = np.flatnonzero(usable), frame.settings, frame.context
-    if len(used) < 6:
-        reason = f'{len(used)} sensors usable, 6 needed to find the source and to judge it'
+    if len(used) < FEWEST_SENSORS:
+        reason = (
+            f'{len(used)} sensors usable, {FEWEST_SENSORS} needed to find and judge the source'
+        )
         return no_pose(frame.name, frame.stamp_ns, states.STALE, context.model_id, reason)
     if track.scan is None or track.coils is not frame.coils:
         near, far = _distances(frame)
         track.scan, track.coils = SourceScan(frame.coils, near, far), frame.coils
         track.noise = NoiseScale()
     found: list[BodySolution] = []
-    age = (frame.stamp_ns - track.good_ns) * 1e-9
+    age = (frame.stamp_ns - track.good_ns) * NANO
     if track.good is not None and age <= settings.warm_age_s:
         found = [frame.solved(used, frame.rolled(track.good.position, track.good.rotation))]
-    freedom = len(used) * int(frame.live.sum()) - 5
+    freedom = len(used) * int(frame.live.sum()) - UNKNOWNS
     if not found or not found[0].chi2 <= settings.gate**2 * freedom:
         found = [frame.solved(used, start) for start in frame.starts(track.scan, used)]
         found.sort(key=lambda solution: solution.chi2)
@@ -238,34 +244,23 @@ def _judged(
     solution, settings, context = found[0], frame.settings, frame.context
     assert track.noise is not None
     ratio = solution.chi2 / freedom
-    scale = 1.0
-    if settings.adaptive:
-        usual = chi2_limit(freedom, RARE) / freedom
-        scale = track.noise.of_frame(
-            ratio, usual, freedom / 5, context.model_share, context.modes is not None
-        )
+    scale = variance_scale(track.noise, solution.chi2, freedom, UNKNOWNS, RARE, context, settings)
     covariance = scale * _covariance(frame, solution)
     sigma = float(np.sqrt(np.trace(covariance[:3, :3])))
     residual = float(np.sqrt(np.mean(solution.residual**2)))
     place, axis = seen_from(frame.axis, solution.position, solution.rotation)
-    centre = solution.position + solution.rotation @ frame.coils.offsets.mean(axis=0)
-    state, reason = states.OK, ''
-    if not ratio <= settings.gate**2:
-        state = states.RESIDUAL
-        reason = f'residual {residual:.3g} T is {math.sqrt(ratio):.3g} times the expected one'
-    elif not settings.box.contains(centre):
-        state = states.OUTSIDE_VOLUME
-        reason = 'at ' + ', '.join(f'{1e3 * v:.1f}' for v in centre) + ' mm'
-    elif not solution.converged:
-        state, reason = states.AMBIGUOUS, 'the solve did not converge'
-    elif sigma > settings.max_sigma_m * settings.leniency(scale):
-        state, reason = states.AMBIGUOUS, f'place uncertain by {1e3 * sigma:.3g} mm'
-    else:
-        for rival in found[1:]:
-            other, _ = seen_from(frame.axis, rival.position, rival.rotation)
-            apart = float(np.linalg.norm(other - place)) > 2e-3
-            if apart and rival.converged and rival.chi2 < solution.chi2 + settings.margin(ratio):
-                state, reason = states.AMBIGUOUS, 'another place would explain the fluxes too'
+    others = (
+        (rival.chi2, 'another place')
+        for rival in found[1:]
+        if rival.converged
+        and math.dist(seen_from(frame.axis, rival.position, rival.rotation)[0], place)
+        > SAME_PLACE_M
+    )
+    state, reason = verdict(
+        settings, solution.chi2, freedom, residual,
+        solution.position + solution.rotation @ frame.coils.offsets.mean(axis=0),
+        solution.converged, sigma, scale, 'place', rivals=others,
+    )  # fmt: skip
     if state == states.OK:
         track.noise.add(ratio)
     blank = no_pose(frame.name, frame.stamp_ns, state, context.model_id, reason)

@@ -1,0 +1,132 @@
+"""The verdict on one pose solve, the same for a coil, a body and a source.
+
+A solve is judged by itself here: does its residual pass the gate, is the pose in the volume, did
+the descent end, is the pose certain enough, does no other pose explain the fluxes as well. What
+coils and frames say of each other is judged afterwards, in `anser_ros.tracking.judgement`.
+"""
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.tracking import estimate as states
+from anser_ros.tracking.estimate import NoiseScale, TrackerSettings
+from anser_ros.tracking.solve_context import SolveContext
+from anser_ros.tracking.uncertainty import chi2_limit
+
+Array = NDArray[np.float64]
+
+RARE = 0.01
+"""Probability of the residual of many sensors together beyond which it counts as more than noise.
+It is smaller than that of a single coil, for many degrees of freedom make much of a small
+excess."""
+
+SAME_PLACE_M = 2e-3
+"""Solutions no further apart, m, are one pose that several descents ended at. Smaller, and a pose
+makes itself ambiguous; larger, and a second pose near by is not seen. How the value was chosen is
+not recorded."""
+
+
+def variance_scale(
+    noise: NoiseScale,
+    chi2: float,
+    freedom: int,
+    unknowns: int,
+    seldom: float,
+    context: SolveContext,
+    settings: TrackerSettings,
+) -> float:
+    """Factor by which the variances of a pose are multiplied; 1 where the noise is not adapted.
+
+    Parameters
+    ----------
+    noise : NoiseScale
+        Of the coil or body that the pose is of.
+    chi2 : float
+        Whitened residual power of the solve.
+    freedom, unknowns : int
+        Degrees of freedom of the residual, and numbers that the pose has.
+    seldom : float
+        Probability of a residual beyond which it counts as more than noise.
+    context : SolveContext
+        What the pose was solved with.
+    settings : TrackerSettings
+        The tracker's.
+    """
+    if not settings.adaptive:
+        return 1.0
+    usual = chi2_limit(freedom, seldom) / freedom
+    return noise.of_frame(
+        chi2 / freedom, usual, freedom / unknowns, context.model_share, context.modes is not None
+    )
+
+
+def verdict(
+    settings: TrackerSettings,
+    chi2: float,
+    freedom: int,
+    residual_t: float,
+    place: Array,
+    converged: bool,
+    sigma_m: float,
+    scale: float,
+    what: str = 'position',
+    in_metal: bool = False,
+    rivals: Iterable[tuple[float, str]] = (),
+) -> tuple[str, str]:
+    """State of a solved pose, and the reason in words where it is not ``ok``.
+
+    Parameters
+    ----------
+    settings : TrackerSettings
+        Gate, volume, largest sigma and odds.
+    chi2 : float
+        Whitened residual power of the solve.
+    freedom : int
+        Degrees of freedom of the residual.
+    residual_t : float
+        Root mean square of the residual, T, for the reason.
+    place : ndarray, shape (3,)
+        What has to be in the volume: the coil, or the middle of the body's coils; m, frame fg.
+    converged : bool
+        Whether the descent has ended.
+    sigma_m : float
+        Square root of the trace of the position covariance, m.
+    scale : float
+        What variances were multiplied by, see `variance_scale`.
+    what : str
+        What is uncertain where ``sigma_m`` is too large.
+    in_metal : bool
+        Whether the pose lies where the model's field is none, among the dipoles that stand for
+        metal.
+    rivals : iterable of tuple of float and str
+        Other poses, the likeliest first: the chi-square of each, and its name in the reason. They
+        are looked at only where the pose is good by itself.
+    """
+    ratio = chi2 / freedom
+    if not ratio <= settings.gate**2:
+        times = math.sqrt(ratio)
+        return (
+            states.RESIDUAL,
+            f'residual {residual_t:.3g} T is {times:.3g} times the expected one',
+        )
+    if not settings.box.contains(place):
+        return states.OUTSIDE_VOLUME, f'at {millimetres(place)} mm'
+    if not converged:
+        return states.AMBIGUOUS, 'the solve did not converge'
+    if sigma_m > settings.max_sigma_m * settings.leniency(scale):
+        return states.AMBIGUOUS, f'{what} uncertain by {1e3 * sigma_m:.3g} mm'
+    if in_metal and settings.has_gate:
+        return states.AMBIGUOUS, 'where there may be metal'
+    margin = settings.margin(ratio)
+    for other_chi2, words in rivals:
+        if other_chi2 < chi2 + margin:
+            return states.AMBIGUOUS, f'{words} would explain the fluxes too'
+    return states.OK, ''
+
+
+def millimetres(place: Array) -> str:
+    """Coordinates of a place given in m, written in mm."""
+    return ', '.join(f'{1e3 * v:.1f}' for v in place)
