@@ -41,7 +41,8 @@ def call(bench, kind, name, **request):
 
 
 def test_the_nominal_model_is_served_latched_with_its_uncertainty(server):
-    from anser_ros.nodes.model_clouds import read_dipoles, read_error, stamp_of
+    from anser_ros.nodes.model_clouds import read_dipoles, read_error
+    from anser_ros.stamps import stamp_of
 
     server.say_setup()
     server.spin_until(lambda: server.models and server.errors)
@@ -60,8 +61,8 @@ def test_the_nominal_model_is_served_latched_with_its_uncertainty(server):
 def test_services_of_the_field_model(server, tmp_path):
     from std_srvs.srv import SetBool, Trigger
 
-    from anser_ros.nodes.model_clouds import stamp_of
     from anser_ros.sessions.session import sensor_table
+    from anser_ros.stamps import stamp_of
 
     assert not call(server, Trigger, 'reset').success, 'there is no model yet'
     assert not call(server, Trigger, 'save').success

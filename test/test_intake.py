@@ -8,10 +8,10 @@ import pytest
 from anser_ros.errors import LayoutError
 from anser_ros.frames.faults import FAULTS, value_codes
 from anser_ros.frames.intake import BACK, FORWARD, Intake
+from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.points import DROPPED, SATURATED, STALE
 
 CHANNELS = np.array([5, 3, 8, 1, 7, 2, 9, 4])
-SECOND_NS = 1_000_000_000
 
 
 def kinds_of(frame):

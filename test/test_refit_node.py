@@ -13,9 +13,9 @@ from refit_world import anser_world, metal_block
 from anser_ros.errors import FitError, FrameError, ModelFileError, ParameterError
 from anser_ros.integrity.withheld import OTHER_MODEL, code_of
 from anser_ros.nodes.diagnostics import Level
-from anser_ros.nodes.model_clouds import stamp_of
 from anser_ros.refit.result import Metal
 from anser_ros.sessions.model_file import load_model
+from anser_ros.stamps import stamp_of
 
 pytestmark = pytest.mark.usefixtures('shared_tables')
 

@@ -15,6 +15,7 @@ from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.session import empty_session, load_session
 from anser_ros.sessions.sliding_window import LIVE, SlidingWindow
 from anser_ros.sessions.watch import OPTICAL, RIGID, Watch
+from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.bag import read_bag
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
@@ -22,7 +23,6 @@ from anser_ros.wire.points import FluxPoints, encode_flux
 MODEL = REPO / 'config' / 'demo_model.yaml'
 MOVING, FACTORY = (REPO / 'bags' / f'{name}.mcap' for name in ('moving', 'factory'))
 CHANNEL, GAIN = 4, 0.97
-SECOND_NS = 1_000_000_000
 
 
 def points(stream, row, gain=1.0):

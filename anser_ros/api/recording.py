@@ -10,14 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from anser_ros.api.setup import SetupSource, load_setup
 from anser_ros.errors import ParameterError
+from anser_ros.stamps import NANO
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup, dump_setup, topic_of
 
 Array = NDArray[np.float64]
 
-NANO = 1e-9
-"""Seconds in a nanosecond."""
 QUATERNION_TOLERANCE = 1e-3
 """How far the length of a quaternion may be from 1. A larger error is no rounding but a mistake,
 such as angles in the place of a quaternion; whoever reads the bag refuses 1e-2."""

@@ -12,7 +12,8 @@ from anser_ros.api.model import Model
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.evaluation_document import to_document
 from anser_ros.sessions.pose_errors import PoseSeries
-from anser_ros.sessions.session import NANO, Session
+from anser_ros.sessions.session import Session
+from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import TrackerSettings
 
 Array = NDArray[np.float64]

@@ -14,8 +14,9 @@ from anser_ros.poses.importing import import_poses
 from anser_ros.poses.recording import read_pose_session
 from anser_ros.poses.sequence import PoseSequence, PoseSession, sequence_of
 from anser_ros.sessions.evaluation import track_session
-from anser_ros.sessions.session import NANO, load_session
+from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for
+from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import OK
 from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages
 from anser_ros.wire.pose_topics import ENDING, OPTICAL

@@ -21,9 +21,10 @@ from anser_ros.effects.correction import Correction
 from anser_ros.errors import DiagnosisError, ParameterError
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.recorded_health import first_warnings, kept_share, overload
-from anser_ros.sessions.session import NANO, load_session
+from anser_ros.sessions.session import load_session
 from anser_ros.settings import Accuracy
 from anser_ros.simulation.effect_draw import CATALOGUE, NONE, RANDOM
+from anser_ros.stamps import NANO
 
 ALL = 'all'
 CLEAN_S = 6.0

@@ -19,6 +19,7 @@ from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import fill_frame
 from anser_ros.kernel_cache import KernelCache, folder_of
+from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.config_folder import config_path, read_config
 from anser_ros.wire.setup import parse_setup
 
@@ -26,8 +27,6 @@ POLL_S = 0.2
 """Time from one look at the processes to the next, s: how late their end is noticed."""
 SAY_S = 5.0
 """Time from one line about the progress to the next, s."""
-SECOND_NS = 1_000_000_000
-"""Nanoseconds in a second."""
 PACKAGE = 'anser_ros.'
 
 

@@ -18,8 +18,9 @@ from anser_ros.refit.free import FreeDipoles
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.sessions.baseline import baseline_flux
 from anser_ros.sessions.drawing import Drawing
-from anser_ros.sessions.session import NANO, Session
+from anser_ros.sessions.session import Session
 from anser_ros.settings import Accuracy
+from anser_ros.stamps import NANO
 from anser_ros.tracking.solve import RealField, solve_coil, whitening_of
 
 Array = NDArray[np.float64]

@@ -17,6 +17,7 @@ from anser_ros.errors import AnserError, LayoutError
 from anser_ros.frames import faults
 from anser_ros.frames.faults import FAULTS, GOOD
 from anser_ros.physics.sensor import LARGEST_FLUX_T
+from anser_ros.stamps import NANO
 from anser_ros.wire.points import DROPPED, SATURATED, STALE
 
 Integers = NDArray[np.int64]
@@ -24,8 +25,6 @@ ComplexArray = NDArray[np.complex128]
 Count = Callable[[str, int], None]
 """Takes a counter's name and by how much it rises."""
 
-NANO = 1e-9
-"""Seconds in a nanosecond."""
 JUMP_S = 1.0
 """A stamp that is further ahead of the last one than this is a jump forward, s: as old as a good
 pose may be to start the tracker's next one from. Smaller, and every short pause is called a jump;

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from anser_ros.field.model import FieldModel
-from anser_ros.frames.intake import NANO
 from anser_ros.integrity.withheld import REFERENCES_LOST, Withheld
 from anser_ros.physics.volume import TrackedVolume
+from anser_ros.stamps import NANO
 
 SPEED_S = 0.3
 """Time over which the last speed of the metal is taken, s. Shorter, and the noise of the refit is

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from anser_ros.frames.intake import NANO
+from anser_ros.stamps import NANO
 
 STREAM_GAP_S = 0.5
 """Frames further apart than this, s, are single points and no stream. Smaller, and a stream with

@@ -16,7 +16,8 @@ import numba
 import numpy as np
 
 from anser_ros.frames.faults import STUCK_CODE
-from anser_ros.frames.intake import BACK, NANO, Frame
+from anser_ros.frames.intake import BACK, Frame
+from anser_ros.stamps import NANO
 
 LEAST_NOISE = 0.1
 """The noise of a reading is at least so many times the stated one. Larger, and a lab that states

@@ -8,8 +8,8 @@ wrong by as much as the gate lets through.
 import math
 from collections import deque
 
-from anser_ros.frames.intake import NANO
 from anser_ros.integrity.continuity import STREAM_GAP_S
+from anser_ros.stamps import NANO
 
 RECORD_S = 2.0
 """How far back readings count, s. Smaller, and metal that passes makes the model doubtful; larger,

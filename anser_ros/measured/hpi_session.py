@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from anser_ros.measured.hpi_channels import examine
 from anser_ros.measured.hpi_coils import HpiData, load
 from anser_ros.measured.hpi_demodulation import demodulate, find_tones
-from anser_ros.measured.session_file import SECOND_NS, vector, write_frames
+from anser_ros.measured.session_file import vector, write_frames
+from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.setup import FIELD_GENERATOR, Coil, Emitter, SensorSpec, Setup
 
 KIND = 'head_coil'

@@ -22,7 +22,8 @@ from anser_ros.errors import FitError
 from anser_ros.measured import ReportRow
 from anser_ros.measured.magnet_model import Recording
 from anser_ros.measured.recipe import Recipe, figure, ran
-from anser_ros.measured.session_file import SECOND_NS, vector, write_frames
+from anser_ros.measured.session_file import vector, write_frames
+from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
 Array = NDArray[np.float64]

@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.measured.navion_data import NavionData, load
 from anser_ros.measured.navion_sources import locate_magnets
-from anser_ros.measured.session_file import SECOND_NS, vector, write_frames
+from anser_ros.measured.session_file import vector, write_frames
+from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 
 Array = NDArray[np.float64]

@@ -12,9 +12,6 @@ from anser_ros.wire.setup import SensorSpec, Setup, Vector, dump_setup
 
 Array = NDArray[np.float64]
 
-SECOND_NS = 1_000_000_000
-"""Nanoseconds in a second."""
-
 
 def vector(values: Array) -> Vector:
     """Three plain numbers, as a setup document has them."""

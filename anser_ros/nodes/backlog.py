@@ -9,8 +9,8 @@ from collections import deque
 from statistics import median
 from typing import Any
 
-NANO = 1e-9
-"""Seconds in a nanosecond."""
+from anser_ros.stamps import NANO
+
 LATE_WINDOWS = 3.0
 """Age of a message, in the spacing of messages, from which it may be late. Smaller, and the jitter
 of a loaded machine looks like a backlog; larger, and poses are that many windows old."""

@@ -4,6 +4,7 @@ import array
 
 from sensor_msgs.msg import PointCloud2, PointField
 
+from anser_ros.stamps import set_stamp
 from anser_ros.wire.points import FluxPoints, encode_flux
 
 
@@ -32,7 +33,7 @@ class FluxCloud:
             ]
         message = PointCloud2()
         message.header.frame_id = self._frame_id
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+        set_stamp(message.header.stamp, stamp_ns)
         message.height, message.width = 1, len(points.channel)
         message.fields = self._fields
         message.point_step, message.row_step = step, len(data)

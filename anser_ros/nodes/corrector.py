@@ -11,10 +11,10 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 
 from anser_ros.errors import ParameterError
 from anser_ros.nodes import qos
-from anser_ros.nodes.model_clouds import SECOND_NS
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.poses.corrector import OK, OUTSIDE, PoseCorrector
+from anser_ros.stamps import set_stamp, stamp_of
 from anser_ros.wire.model_file import read_document
 from anser_ros.wire.setup import topic_of
 
@@ -76,7 +76,7 @@ class Corrector(AnserNode):
 
     def _on_pose(self, sensor: str, message: PoseStamped) -> None:
         place, turn = message.pose.position, message.pose.orientation
-        stamp = message.header.stamp.sec * SECOND_NS + message.header.stamp.nanosec
+        stamp = stamp_of(message)
         pose = self._corrector.correct(
             sensor,
             stamp,
@@ -91,7 +91,7 @@ class Corrector(AnserNode):
         plain, full = PoseStamped(), PoseWithCovarianceStamped()
         for one, out in ((plain, plain.pose), (full, full.pose.pose)):
             one.header.frame_id = self.parameters.frame_id
-            one.header.stamp.sec, one.header.stamp.nanosec = divmod(pose.stamp_ns, SECOND_NS)
+            set_stamp(one.header.stamp, pose.stamp_ns)
             out.position.x, out.position.y, out.position.z = pose.position.tolist()
             q = out.orientation
             q.x, q.y, q.z, q.w = pose.quaternion.tolist()

@@ -38,6 +38,7 @@ from anser_ros.simulation.motion import Approach, tool_paths
 from anser_ros.simulation.pseudo_port import PseudoPort
 from anser_ros.simulation.sampling import FrontEnd
 from anser_ros.simulation.world import World
+from anser_ros.stamps import set_stamp
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import Setup, parse_setup
@@ -314,7 +315,7 @@ def _metal(table: CuSimulatorParameters, begin_s: Callable[[], float]) -> list[M
 def _pose(frame_id: str, stamp_ns: int, position: np.ndarray, rotation: np.ndarray) -> PoseStamped:
     message = PoseStamped()
     message.header.frame_id = frame_id
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
+    set_stamp(message.header.stamp, stamp_ns)
     place, turn = message.pose.position, message.pose.orientation
     place.x, place.y, place.z = (float(v) for v in position)
     turn.x, turn.y, turn.z, turn.w = (float(v) for v in Rotation.from_matrix(rotation).as_quat())

@@ -9,8 +9,8 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from anser_ros.nodes import qos
-from anser_ros.nodes.model_clouds import SECOND_NS
 from anser_ros.refit.result import Metal, RefitResult
+from anser_ros.stamps import set_stamp
 
 SHOWN = 0.15
 """Sources whose density is at least this part of the strongest one's are shown."""
@@ -56,7 +56,7 @@ def centroid_message(metal: Metal, frame_id: str, stamp_ns: int) -> PointStamped
     """Return where the metal's middle is, as far as the emitters reach it."""
     message = PointStamped()
     message.header.frame_id = frame_id
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, SECOND_NS)
+    set_stamp(message.header.stamp, stamp_ns)
     message.point = _point(metal.centroid)
     return message
 
@@ -100,7 +100,7 @@ def metal_markers(metal: Metal | None, frame_id: str, stamp_ns: int) -> MarkerAr
 def _marker(frame_id: str, stamp_ns: int, number: int) -> Marker:
     marker = Marker(ns='metal', id=number, action=Marker.ADD)
     marker.header.frame_id = frame_id
-    marker.header.stamp.sec, marker.header.stamp.nanosec = divmod(stamp_ns, SECOND_NS)
+    set_stamp(marker.header.stamp, stamp_ns)
     marker.pose = Pose()
     marker.pose.orientation.w = 1.0
     return marker

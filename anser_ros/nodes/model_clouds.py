@@ -9,6 +9,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from anser_ros.effects.correction import is_undone
 from anser_ros.errors import LayoutError
 from anser_ros.field.model import FieldModel
+from anser_ros.stamps import set_stamp
 from anser_ros.wire.model_error import ModelError, decode_model_error, encode_model_error
 from anser_ros.wire.points import (
     DipolePoints,
@@ -16,9 +17,6 @@ from anser_ros.wire.points import (
     decode_field_model,
     encode_field_model,
 )
-
-SECOND_NS = 1_000_000_000
-"""Nanoseconds in a second."""
 
 
 class CloudMaker:
@@ -43,7 +41,7 @@ class CloudMaker:
             ]
         message = PointCloud2()
         message.header.frame_id = frame_id
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, SECOND_NS)
+        set_stamp(message.header.stamp, stamp_ns)
         message.height, message.width = 1, len(data) // step
         message.fields = self._fields[key]
         message.point_step, message.row_step = step, len(data)
@@ -73,7 +71,7 @@ class ModelWriter:
         if self._told is not None and self._told[0] is model:
             message = self._told[1]
             message.header.frame_id = frame_id
-            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, SECOND_NS)
+            set_stamp(message.header.stamp, stamp_ns)
             return message
         points = DipolePoints(model.positions, model.directions, model.moments)
         message = self._maker.message(encode_field_model(points), frame_id, stamp_ns)
@@ -110,11 +108,6 @@ class ModelWriter:
             modes = np.zeros((0, *model.moments.shape), dtype=complex)
         error = ModelError(float(model.flux_error_t), modes, follows, withheld, *self._origin)
         return self._maker.message(encode_model_error(error), frame_id, stamp_ns)
-
-
-def stamp_of(message: PointCloud2) -> int:
-    """Return the stamp of a message, ns."""
-    return int(message.header.stamp.sec) * SECOND_NS + int(message.header.stamp.nanosec)
 
 
 def layout_of(message: PointCloud2) -> list[PointFieldTuple]:

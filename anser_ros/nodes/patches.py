@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import FrameError
 from anser_ros.field.model import FieldModel
-from anser_ros.nodes.model_clouds import stamp_of
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.patches import PatchCoils
@@ -20,6 +19,7 @@ from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.volume import stated_volume
 from anser_ros.settings import RefitSettings
+from anser_ros.stamps import stamp_of
 from anser_ros.tracking.rotations import rotation_of_quaternion
 from anser_ros.wire.setup import Setup
 

@@ -9,13 +9,13 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import qos_profile_sensor_data
 
+from anser_ros.stamps import SECOND_NS
+
 NAME = 'anser_pose_look'
 SLICE_S = 0.1
 """Longest time that one message is waited for, s."""
 FIRST_S = 10.0
 """Least time, s, that the first pose is waited for: a graph takes seconds to be discovered."""
-SECOND_NS = 1_000_000_000
-"""Nanoseconds in a second."""
 
 
 def main(topic: str, seconds: float) -> None:

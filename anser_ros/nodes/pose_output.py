@@ -10,7 +10,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformS
 
 from anser_ros.nodes import qos
 from anser_ros.nodes.diagnostics import Level, Status
-from anser_ros.nodes.model_clouds import SECOND_NS
+from anser_ros.stamps import SECOND_NS
 from anser_ros.tracking.estimate import OK, STALE, PoseEstimate
 from anser_ros.tracking.rotations import quaternion_of_axis, quaternion_of_rotation
 from anser_ros.wire.setup import topic_of

@@ -18,6 +18,7 @@ from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.recording_log import TopicLog, report
 from anser_ros.nodes.shared_names import optical_parameter
+from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.bag_metadata import qos_profile, write_metadata
 from anser_ros.wire.bag_writer import BagWriter
 
@@ -268,7 +269,7 @@ def _stamp_ns(data: bytes) -> int | None:
         return None
     order = '<' if data[1] & 1 else '>'
     sec, nanosec = struct.unpack_from(f'{order}iI', data, 4)
-    return int(sec) * 1_000_000_000 + int(nanosec)
+    return int(sec) * SECOND_NS + int(nanosec)
 
 
 def _ros_distro() -> str:

@@ -23,6 +23,7 @@ from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.readiness import Readiness
 from anser_ros.nodes.shared_names import OPTICAL, optical_parameter
+from anser_ros.stamps import set_stamp
 from anser_ros.wire.bag import RawMessage, Salvage, iter_messages
 from anser_ros.wire.yaml_text import read_yaml
 
@@ -285,7 +286,7 @@ class Replay(AnserNode):
 
     def _publish_clock(self, stamp_ns: int) -> None:
         tick = Clock()
-        tick.clock.sec, tick.clock.nanosec = divmod(stamp_ns, 1_000_000_000)
+        set_stamp(tick.clock, stamp_ns)
         self._ticks.publish(tick)
 
     def _finish(self) -> None:

@@ -23,7 +23,6 @@ from anser_ros.nodes.diagnostics import Trouble
 from anser_ros.nodes.flux_reader import read_frame
 from anser_ros.nodes.handover import HandedFlux
 from anser_ros.nodes.incoming import opened
-from anser_ros.nodes.model_clouds import SECOND_NS, stamp_of
 from anser_ros.nodes.model_in_force import ModelInForce
 from anser_ros.nodes.model_intake import GivenModel, ModelIntake
 from anser_ros.nodes.node import AnserNode, Level, Status, main
@@ -36,6 +35,7 @@ from anser_ros.nodes.tracker_parameters import TrackerParameters, settings_of, t
 from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.starting_model import check_emitters, model_of
 from anser_ros.sessions.tracker_settings import settings_for
+from anser_ros.stamps import SECOND_NS, stamp_of
 from anser_ros.tracking.estimate import OK, USUAL_GATE
 from anser_ros.tracking.tip import Tip
 from anser_ros.tracking.tracker import Tracker

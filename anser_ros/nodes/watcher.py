@@ -17,7 +17,6 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.integrity.withheld import TWO_SOURCES
 from anser_ros.nodes import qos
 from anser_ros.nodes.flux_reader import read_flux
-from anser_ros.nodes.model_clouds import SECOND_NS
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.one_source import OneSource, said_of
 from anser_ros.nodes.parameters import parameter
@@ -29,6 +28,7 @@ from anser_ros.sessions.session import Session, empty_session, load_session
 from anser_ros.sessions.sliding_window import LIVE, SlidingWindow
 from anser_ros.sessions.starting_model import NOMINAL, model_for
 from anser_ros.sessions.watch import Sighting, Watch
+from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.setup import parse_setup
 
 POLL_S = 0.2

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import BagError
 from anser_ros.poses.sequence import PoseSequence, PoseSession, sequence_of
-from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages, stamp_ns
+from anser_ros.stamps import NANO, stamp_of
+from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.pose_topics import (
     ENDING,
@@ -21,8 +22,6 @@ from anser_ros.wire.pose_topics import (
 )
 
 Array = NDArray[np.float64]
-
-NANO = 1e-9  # s in a nanosecond
 
 
 def read_pose_session(
@@ -54,7 +53,7 @@ def read_pose_session(
         if raw.type_name == POSE_TYPE:
             message = decoder.decode(raw)
             p, q = message.pose.position, message.pose.orientation
-            stamps.setdefault(raw.topic, []).append(stamp_ns(message))
+            stamps.setdefault(raw.topic, []).append(stamp_of(message))
             rows.setdefault(raw.topic, []).append((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
     chosen = tracked or {
         topic[len(TRACKED) : -len(ENDING)]: topic

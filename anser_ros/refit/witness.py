@@ -30,6 +30,7 @@ from anser_ros.refit.reduced import ReducedPrior
 from anser_ros.refit.tables import RefitTables
 from anser_ros.refit.tool_readings import CoilErrors, ToolReading, linearised
 from anser_ros.settings import ToolSettings
+from anser_ros.stamps import NANO
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -50,8 +51,6 @@ SPARSE = 30
 """Every so many of a layer's samples stand for the volume before a tool was seen."""
 _AROUND = np.array([[0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 """A coil's own place and the corners of a tetrahedron around it, in units of `NEAR_M`."""
-NANO = 1e-9
-"""Seconds in a nanosecond."""
 
 
 @dataclass

@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.sessions.recorded_poses import published_poses
+from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.recorded import PoseStream, RecordedFluxes
 
 CSV, TUM, MAT = 'csv', 'tum', 'mat'
 FORMATS = (CSV, TUM, MAT)
 """Forms of files; TUM, which `evo` reads, has poses only."""
 POSE_COLUMNS = ('stamp_ns', 'x_m', 'y_m', 'z_m', 'qx', 'qy', 'qz', 'qw')
-NS = 1_000_000_000
-"""Nanoseconds in a second."""
 
 
 def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> dict[str, int]:
@@ -74,7 +73,7 @@ def _write_poses(path: Path, poses: PoseStream, form: str) -> None:
         if form == TUM:
             for stamp, row in zip(poses.stamp_ns.tolist(), rows, strict=True):
                 words = ' '.join(f'{value:.9g}' for value in row)
-                stream.write(f'{stamp // NS}.{stamp % NS:09d} {words}\n')
+                stream.write(f'{stamp // SECOND_NS}.{stamp % SECOND_NS:09d} {words}\n')
             return
         writer = csv.writer(stream)
         writer.writerow(POSE_COLUMNS)

@@ -18,8 +18,9 @@ from anser_ros.sessions.baseline import Baseline
 from anser_ros.sessions.frames import FrameReadings, SessionFrame
 from anser_ros.sessions.patches import PatchFollower
 from anser_ros.sessions.prepared import PreparedSession
-from anser_ros.sessions.session import NANO, tracking_noise
+from anser_ros.sessions.session import tracking_noise
 from anser_ros.sessions.volume import stated_volume
+from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import OK, PoseEstimate
 
 

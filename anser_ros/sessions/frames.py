@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.measurements import Measurements
-from anser_ros.sessions.session import NANO, Session
+from anser_ros.sessions.session import Session
+from anser_ros.stamps import NANO
 
 ComplexArray = NDArray[np.complex128]
 

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from anser_ros.errors import BagError
 from anser_ros.field.measurements import Measurements
 from anser_ros.sessions.prepared import PreparedSession, with_truth
-from anser_ros.sessions.session import NANO, Session
+from anser_ros.sessions.session import Session
+from anser_ros.stamps import NANO, stamp_of
 from anser_ros.wire.recorded import PoseStream
 from anser_ros.wire.setup import topic_of
 
@@ -40,7 +41,7 @@ class LiveErrors:
 def published_poses(path: str | os.PathLike[str], topics: Sequence[str]) -> dict[str, PoseStream]:
     """What each PoseStamped topic of a bag carries."""
     # Nodes that read no bag run where the packages that read bags are not installed.
-    from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages, stamp_ns
+    from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages
 
     rows: dict[str, list[tuple[float, ...]]] = {topic: [] for topic in topics}
     stamps: dict[str, list[int]] = {topic: [] for topic in topics}
@@ -49,7 +50,7 @@ def published_poses(path: str | os.PathLike[str], topics: Sequence[str]) -> dict
         if raw.topic in rows and raw.type_name == POSE_TYPE:
             message = decoder.decode(raw)
             place, turn = message.pose.position, message.pose.orientation
-            stamps[raw.topic].append(stamp_ns(message))
+            stamps[raw.topic].append(stamp_of(message))
             rows[raw.topic].append((place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w))
     found = {}
     for topic, values in rows.items():

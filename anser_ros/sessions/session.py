@@ -13,12 +13,11 @@ from anser_ros.frames.faults import GOOD, value_codes
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.sessions.plausibility import plausible_tools
+from anser_ros.stamps import NANO
 from anser_ros.wire.points import STALE
 from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
 
-NANO = 1e-9
-"""Seconds in a nanosecond."""
 MOST_NOISE_T = 1e-3
 """Noise, T, from which on a setup's statement is taken for a mistake and not used. The emitters
 make microtesla at most, so that nothing could be tracked in so much noise."""

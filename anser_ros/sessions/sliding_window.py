@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.sessions.session import NANO, Session, session_of
+from anser_ros.sessions.session import Session, session_of
+from anser_ros.stamps import NANO
 from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes
 from anser_ros.wire.setup import Setup

@@ -13,13 +13,12 @@ from scipy.spatial.transform import Rotation
 from anser_ros.settings import Accuracy
 from anser_ros.simulation.motion import Pose
 from anser_ros.simulation.world import World
+from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, dump_setup
 
 Array = NDArray[np.float64]
-SECOND_NS = 1_000_000_000
-"""Nanoseconds in a second."""
 START_NS = 1_700_000_000 * SECOND_NS
 """First stamp of every recording, ns since 1970: a fixed date in 2023, so that the same seed makes
 the same bag."""

@@ -22,6 +22,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap_ros2.decoder import DecoderFactory
 
 from anser_ros.errors import BagError, LayoutError, SetupError
+from anser_ros.stamps import stamp_of
 from anser_ros.wire.points import STALE, FluxPoints, decode_flux
 from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes
 from anser_ros.wire.setup import parse_setup
@@ -222,12 +223,6 @@ class MessageDecoder:
             ) from error
 
 
-def stamp_ns(message: Any) -> int:
-    """Return the header stamp of a decoded message, ns."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-
-
 class _Collector:
     """Gathers what a session needs from the messages of a bag."""
 
@@ -258,7 +253,7 @@ class _Collector:
         points = decode_flux(
             fields, cloud.point_step, width, bytes(cloud.data), cloud.is_bigendian
         )
-        stamp = stamp_ns(cloud)
+        stamp = stamp_of(cloud)
         if stamp == 0:
             raise LayoutError('stamp zero')
         self.flux[raw.topic.split('/')[-2]].append((stamp, points))
@@ -272,7 +267,7 @@ class _Collector:
             raise LayoutError('a pose with values not finite or a quaternion not of unit length')
         # A board that shares its graph with others has a namespace of its own before it.
         body = raw.topic.partition(OPTICAL)[2].removesuffix('/pose')
-        self.poses.setdefault(body, []).append((stamp_ns(message), values))
+        self.poses.setdefault(body, []).append((stamp_of(message), values))
 
     def flux_stream(self, which: str) -> RecordedFluxes | None:
         frames: dict[int, FluxPoints] = {}

@@ -16,11 +16,10 @@ import struct
 from collections.abc import Sequence
 
 from anser_ros.errors import LayoutError
+from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.points import PointFieldTuple
 
 HEADER = b'\x00\x01\x00\x00'
-NS = 1_000_000_000
-"""Nanoseconds in a second."""
 
 _TIME = """
 ================================================================================
@@ -95,8 +94,8 @@ class _Bytes:
         self.body += encoded
 
     def header(self, stamp_ns: int, frame_id: str) -> None:
-        self.add('i', stamp_ns // NS)
-        self.add('I', stamp_ns % NS)
+        self.add('i', stamp_ns // SECOND_NS)
+        self.add('I', stamp_ns % SECOND_NS)
         self.text(frame_id)
 
     def done(self) -> bytes:
