@@ -12,11 +12,12 @@ from scipy.interpolate import CubicSpline
 
 from anser_ros.calibration.disturbances import stretches
 from anser_ros.field.measurements import Measurements
+from anser_ros.settings import RefitSettings
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-FEWEST_SENSORS = 4
+FEWEST_SENSORS = RefitSettings.min_references
 """References that have to be read throughout: with fewer, metal may look like a strength."""
 LEAST_DRIFT = 2e-4
 """Change of a strength (rms, relative) from which on it is one; it moves a pose by a hundredth of

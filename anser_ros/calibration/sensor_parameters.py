@@ -51,9 +51,6 @@ between lever arm and field: an example with 0.02 rad was off by 1.3 mm."""
 BY_RULE = 1e-9
 """Standard deviation, relative or m, of what a rule sets: far below any spread, and above what
 rounding makes of it."""
-VELOCITY_STEP_S = 0.02
-"""Half the time, s, over which a body's velocity is taken: much shorter multiplies the optical
-jitter, much longer smooths away how a hand accelerates."""
 
 
 @dataclass(frozen=True)
@@ -136,19 +133,10 @@ def velocity_of(measurements: Measurements) -> Array:
 
     It is zero without a track, from which it is taken.
     """
-    out, track = np.zeros((len(measurements.time), 6)), measurements.track
-    if track is None or track.time.size < 2:
-        return out
-    low = np.clip(measurements.time - VELOCITY_STEP_S, track.time[0], track.time[-1])
-    high = np.clip(measurements.time + VELOCITY_STEP_S, track.time[0], track.time[-1])
-    before, turned, _ = track.at(low, np.inf)
-    after, turned_on, _ = track.at(high, np.inf)
-    turn = turned_on @ turned.transpose(0, 2, 1)
-    span = np.maximum(high - low, 1e-9)[:, None]
-    out[:, :3] = (after - before) / span
-    parts = [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0]]
-    out[:, 3:] = 0.5 * np.stack([*parts, turn[:, 1, 0] - turn[:, 0, 1]], axis=1) / span
-    return out
+    track = measurements.track
+    if track is None:
+        return np.zeros((len(measurements.time), 6))
+    return track.velocity(measurements.time)
 
 
 class SensorParameters:

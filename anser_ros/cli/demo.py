@@ -27,7 +27,7 @@ from anser_ros.wire.bag_metadata import told
 from anser_ros.wire.config_folder import config_path
 
 PATIENCE_S = 180.0
-"""Time that the monitor waits for the first pose, s; kernels may have to be compiled meanwhile."""
+"""Longest wait for all nodes and the first pose, s; kernels may have to be compiled meanwhile."""
 # The board of the bags in bags/, from which config/demo_model.yaml is calibrated:
 # anser calibrate bags/scan.mcap --out config/demo_model.yaml
 BOARD_SEED = 1

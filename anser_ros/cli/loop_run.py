@@ -7,7 +7,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from anser_ros.cli.demo import BOARD_SEED, FROZEN_TRACKER, SAMPLE_RATE_HZ, SHARED_TOPICS
+from anser_ros.cli.demo import (
+    BOARD_SEED,
+    FROZEN_TRACKER,
+    PATIENCE_S,
+    SAMPLE_RATE_HZ,
+    SHARED_TOPICS,
+)
 from anser_ros.cli.demo import node_command as node
 from anser_ros.cli.supervisor import Supervisor, tail
 from anser_ros.errors import AnserError, DiagnosisError, SetupError
@@ -17,8 +23,6 @@ from anser_ros.wire.bag import read_bag
 from anser_ros.wire.config_folder import config_path, read_config
 from anser_ros.wire.setup import dump_setup, parse_setup
 
-PATIENCE_S = 180.0
-"""Time to wait for all nodes and for the first flux, s; kernels may be compiled meanwhile."""
 POLL_S = 0.2
 """Time from one look at the processes to the next, s."""
 RATE_HZ = 25.0

@@ -12,7 +12,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.decisions import SOMETHING_LEFT
+from anser_ros.diagnosis.decisions import FOLDS, SOMETHING_LEFT
 from anser_ros.diagnosis.fit import Fit, Fitter
 from anser_ros.diagnosis.moving_start import course_of
 from anser_ros.diagnosis.outlying import without_outliers
@@ -30,9 +30,6 @@ from anser_ros.metal.body import COMPACT, SPACINGS, body_sizes
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-FOLDS = 4
-"""Parts of the cross-validation over time blocks: each fit uses three quarters of them. More cost
-a fit each, fewer leave less to fit on. Its choice is not recorded."""
 KNOTS = 9
 """Knots of a path to begin with: three seconds apart in half a minute of moving."""
 FINE_KNOTS = 17

@@ -104,7 +104,7 @@ def fit_terms(
     problem: Problem,
     terms: Sequence[Term],
     block_numbers: NDArray[np.int64],
-    iterations: int = 8,
+    iterations: int,
 ) -> Fit:
     """Fit all parameters of all terms together.
 

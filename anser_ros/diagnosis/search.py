@@ -50,7 +50,7 @@ class SearchSettings:
         Most steps of a fit; most settle in fewer.
     """
 
-    folds: int = 4
+    folds: int = decisions.FOLDS
     most_effects: int = 6
     finalists: int = 7
     least_gain: float = decisions.LEAST_GAIN

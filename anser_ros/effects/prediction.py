@@ -16,10 +16,6 @@ from anser_ros.physics.pose_track import PoseTrack
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-VELOCITY_STEP_S = 0.02
-"""Half the time (s) over which the body's velocity is taken: much shorter would multiply the
-optical jitter, much longer would smooth away how a hand accelerates."""
-
 
 @dataclass(frozen=True)
 class Fields:
@@ -121,21 +117,7 @@ def _poses(body: Measurements, terms: Sequence[Term]) -> tuple[Array, Array, Arr
     track = true_track(body.track, terms)
     inside = np.clip(body.time, track.time[0], track.time[-1])
     position, rotation, _ = track.at(inside, np.inf)
-    low = np.clip(inside - VELOCITY_STEP_S, track.time[0], track.time[-1])
-    high = np.clip(inside + VELOCITY_STEP_S, track.time[0], track.time[-1])
-    before, turned_before, _ = track.at(low, np.inf)
-    after, turned_after, _ = track.at(high, np.inf)
-    span = np.maximum(high - low, 1e-9)[:, None]
-    turn = turned_after @ turned_before.transpose(0, 2, 1)
-    spin = 0.5 * np.stack(
-        [
-            turn[:, 2, 1] - turn[:, 1, 2],
-            turn[:, 0, 2] - turn[:, 2, 0],
-            turn[:, 1, 0] - turn[:, 0, 1],
-        ],
-        axis=1,
-    )
-    return position, rotation, np.concatenate([after - before, spin], axis=1) / span
+    return position, rotation, track.velocity(inside)
 
 
 def lit(terms: Sequence[Term], illumination: Dipoles) -> Dipoles:

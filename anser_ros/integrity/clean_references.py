@@ -14,7 +14,7 @@ from anser_ros.field.reference_readings import ReferenceReadings
 from anser_ros.integrity.drawn_readings import DrawnReadings, FieldAt
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.tangent import tangents
-from anser_ros.settings import Accuracy
+from anser_ros.settings import Accuracy, RefitSettings
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -26,7 +26,7 @@ taken for metal; larger, and metal that moves poses by a tenth of a millimetre i
 CERTAIN = 4.0
 """Changes below so many times their noise are none. Smaller takes noise for metal; larger misses
 metal that weak readings see. Its choice is not recorded."""
-FEWEST_SENSORS = 4
+FEWEST_SENSORS = RefitSettings.min_references
 """Sensors that have to be known: with fewer, the emitters' strengths explain what metal does."""
 SAME_PLACE_M = 1e-4
 """Farthest that a sensor may be from where it was at the calibration, m. A new survey tells of

@@ -15,6 +15,7 @@ from anser_ros.nodes import qos
 from anser_ros.nodes.igtl_server import IgtlServer
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
+from anser_ros.nodes.tracker_parameters import TrackerParameters
 from anser_ros.wire import igtl
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 from anser_ros.wire.setup_tips import tip_name
@@ -32,7 +33,10 @@ class OpenIGTLinkParameters:
     host: str = parameter('127.0.0.1', 'address to listen on; 0.0.0.0 lets other machines in')
     port: int = parameter(18944, 'TCP port, 0 for a free one', minimum=0, maximum=65535)
     stale_after_s: float = parameter(
-        0.3, 'a sensor without a pose for so long is reported, s', minimum=0.02, live=True
+        TrackerParameters.stale_after_s,
+        'a sensor without a pose for so long is reported, s',
+        minimum=0.02,
+        live=True,
     )
     version: int = parameter(
         1,

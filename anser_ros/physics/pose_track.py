@@ -12,6 +12,10 @@ LONGEST_GAP_S = 0.25
 that is silent for longer did not see the tool, whose motion meanwhile is not known; a hand moves
 by centimetres in that time."""
 
+VELOCITY_STEP_S = 0.02
+"""Half the time, s, over which a velocity is taken: much shorter multiplies the jitter of the
+poses, much longer smooths away how a hand accelerates."""
+
 
 @dataclass(frozen=True)
 class PoseTrack:
@@ -74,3 +78,29 @@ class PoseTrack:
                 slerp = Slerp(self.time, Rotation.from_quat(self.quaternion))
                 rotation[valid] = slerp(inside).as_matrix()
         return position, rotation, valid
+
+    def velocity(self, time: Array) -> Array:
+        """Velocity (m/s) and angular velocity (rad/s) at some times, frame fg, shape (F, 6).
+
+        Each is the mean over `VELOCITY_STEP_S` before and after, as far as the track goes.
+
+        Parameters
+        ----------
+        time : ndarray, shape (F,)
+            Times on the clock of the track, s.
+        """
+        low = np.clip(time - VELOCITY_STEP_S, self.time[0], self.time[-1])
+        high = np.clip(time + VELOCITY_STEP_S, self.time[0], self.time[-1])
+        before, turned_before, _ = self.at(low, np.inf)
+        after, turned_after, _ = self.at(high, np.inf)
+        span = np.maximum(high - low, 1e-9)[:, None]
+        turn = turned_after @ turned_before.transpose(0, 2, 1)
+        spin = 0.5 * np.stack(
+            [
+                turn[:, 2, 1] - turn[:, 1, 2],
+                turn[:, 0, 2] - turn[:, 2, 0],
+                turn[:, 1, 0] - turn[:, 0, 1],
+            ],
+            axis=1,
+        )
+        return np.concatenate([after - before, spin], axis=1) / span
