@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eigh
 
 from anser_ros.refit.evidence import STRENGTHS, FrameEvidence
 from anser_ros.refit.kernels import fill_evidence, fill_precision, fill_products
@@ -137,7 +136,8 @@ class Bank:
 
     def _decomposed(self, prior: CloudPrior) -> tuple[Array, Array]:
         block = prior.covariance[np.ix_(self.rows, self.rows)]
-        values, vectors = eigh(self.whitening.T @ block @ self.whitening, driver='evd')
+        # numpy's releases the interpreter's lock, scipy's would stop the frames for 10 ms and more.
+        values, vectors = np.linalg.eigh(self.whitening.T @ block @ self.whitening)
         return np.maximum(values, 0.0), self.whitening @ vectors
 
     def vacate(self, hypothesis: int) -> None:
