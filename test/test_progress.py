@@ -18,6 +18,22 @@ def test_lines_come_now_and_then_with_the_share_and_the_time_that_is_left(monkey
     ]  # fmt: skip
 
 
+def test_no_time_is_told_that_loading_and_compiling_would_make(monkeypatch, capsys):
+    """The first frame of a session takes as long as the kernels need to be there."""
+    now_s = [100.0]
+    monkeypatch.setattr(progress.time, 'monotonic', lambda: now_s[0])
+    with progress_of('evaluating') as tell:
+        now_s[0] += 25.0
+        for frame in range(1, 201):
+            tell('tracking', frame / 200)
+            now_s[0] += 0.1
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == 'evaluating: tracking, 0%'
+    left = [float(line.split('about ')[1].split(' s')[0]) for line in said[1:]]
+    assert len(left) > 2
+    assert all(abs(had + 5.0 * rank - left[0]) < 1.5 for rank, had in enumerate(left))
+
+
 def test_a_short_command_says_nothing(capsys):
     with progress_of('evaluating') as tell:
         tell('tracking', 0.5)

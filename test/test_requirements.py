@@ -12,7 +12,7 @@ from conftest import REPO
 
 from anser_ros.cli import main as cli
 from anser_ros.cli import missing
-from anser_ros.cli.commands import NODES
+from anser_ros.cli.commands import NODES, OFFLINE
 
 OPTIONAL = {'tf2_msgs', 'launch', 'launch_ros'}
 """ROS packages that no wheel brings: where they are missing, what needs them is left out."""
@@ -109,7 +109,7 @@ def test_what_rosdep_does_not_know_is_asked_for_where_it_is_needed(monkeypatch, 
     assert said == 'anser evaluate: mcap is not installed: pip install mcap\n'
 
 
-# Imports the nodes as where only rosdep's packages are.
+# Imports modules as where some packages are not.
 WITHOUT = """
 import importlib, sys
 class Missing:
@@ -117,18 +117,32 @@ class Missing:
         if name.split('.')[0] in sys.argv[1].split(','):
             raise ModuleNotFoundError(name, name=name)
 sys.meta_path.insert(0, Missing())
-for node in sys.argv[2:]:
-    importlib.import_module(f'anser_ros.nodes.{node}')
+for module in sys.argv[2:]:
+    importlib.import_module(module)
 """
+
+
+def import_without(packages, modules):
+    """Import modules in a process that finds some packages nowhere."""
+    command = [sys.executable, '-c', WITHOUT, ','.join(packages), *modules]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=REPO)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.processes
 def test_all_other_nodes_start_without_it():
     names = [name for name in NODES if name not in missing.NEEDED]
     assert {'acquisition', 'field_model', 'tracker', 'watcher', 'monitor'} <= set(names)
-    command = [sys.executable, '-c', WITHOUT, ','.join(missing.PYPI), *names]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=REPO)
-    assert done.returncode == 0, done.stderr
+    import_without(missing.PYPI, [f'anser_ros.nodes.{name}' for name in names])
+
+
+@pytest.mark.processes
+def test_what_a_single_step_needs_is_not_needed_to_read_the_help():
+    """A command is imported for its help; bags' own packages nearly every command needs."""
+    bags = ('mcap', 'mcap_ros2', 'zstandard')
+    few = [name for name in missing.PYPI if name not in bags]
+    assert {'allantools', 'dask', 'distributed'} <= set(few)
+    import_without(few, [f'anser_ros.cli.{name}' for name in OFFLINE])
 
 
 @pytest.mark.parametrize('kind', ['newest', 'oldest'])

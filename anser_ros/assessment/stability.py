@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import allantools
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
@@ -146,6 +145,8 @@ def _longest_even(time: Array) -> tuple[int, int]:
 
 def allan_deviation(values: Array, rate_hz: float) -> AllanCurve:
     """Overlapping Allan deviation of evenly spaced values, m, at octaves of averaging time."""
+    import allantools  # no other assessment needs it
+
     tau, deviation, _, terms = allantools.oadev(
         values - values.mean(), rate=rate_hz, data_type='freq', taus='octave'
     )

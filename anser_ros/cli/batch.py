@@ -11,10 +11,7 @@ import importlib
 import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
-
-import dask
-from distributed import Client, KilledWorker, LocalCluster, as_completed
+from typing import TYPE_CHECKING, Any
 
 from anser_ros.cli.commands import OFFLINE
 from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, ONE_THREAD, attempt
@@ -24,6 +21,9 @@ from anser_ros.cli.session_runs import SessionRun, finish, perform, runs_of
 from anser_ros.cli.summary import COMMANDS, Outcome, row_of, write_summary
 from anser_ros.errors import ParameterError
 from anser_ros.parallel import cores
+
+if TYPE_CHECKING:  # Dask is loaded where it is used: the help is there without it
+    from distributed import Client
 
 CONNECT_S = 10.0
 """How long a scheduler is waited for, s."""
@@ -89,8 +89,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 @contextlib.contextmanager
-def _client(args: argparse.Namespace, sessions: int) -> Iterator[tuple[Client, int]]:
+def _client(args: argparse.Namespace, sessions: int) -> Iterator[tuple['Client', int]]:
     """A client of the scheduler, and the threads among which a session may share its work."""
+    import dask
+    from distributed import Client, LocalCluster
+
     if args.scheduler is not None:
         try:
             client = Client(args.scheduler, timeout=CONNECT_S)
@@ -114,8 +117,10 @@ def _client(args: argparse.Namespace, sessions: int) -> Iterator[tuple[Client, i
         yield client, max(1, cores() // workers)
 
 
-def _outcomes(client: Client, runs: Sequence[SessionRun], threads: int) -> Iterator[Outcome]:
+def _outcomes(client: 'Client', runs: Sequence[SessionRun], threads: int) -> Iterator[Outcome]:
     """What became of each run, as they end."""
+    from distributed import as_completed
+
     futures = client.map(perform, runs, threads=threads, pure=False)
     of = dict(zip(futures, runs, strict=True))
     for future in as_completed(futures):
@@ -127,6 +132,8 @@ def _outcomes(client: Client, runs: Sequence[SessionRun], threads: int) -> Itera
 
 def _lost(run: SessionRun, error: Any, code: int, words: str) -> Outcome:
     """A session that no worker could bring to an end."""
+    from distributed import KilledWorker
+
     if isinstance(error, KilledWorker):
         line = 'every worker that took it died, as for want of memory'
         return Outcome(run.name, run.session, EXIT_BAD_INPUT, {}, line)

@@ -29,7 +29,7 @@ from anser_ros.sessions.pose_table import (
     write_poses,
     write_sources,
 )
-from anser_ros.sessions.session import load_session
+from anser_ros.sessions.session import Session, load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.tracking.estimate import TrackerSettings
 
@@ -171,8 +171,23 @@ def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result
     shown: list[Any] = [_table(document)]
     if 'refit' in document:
         shown.append(_refit_line(document['refit']))
-    notes = (*snapshot_notes(args.model, model), *loss_notes(args.session, session.lost))
+    notes = (
+        *snapshot_notes(args.model, model), *loss_notes(args.session, session.lost),
+        *(_few_notes(session) if args.refit and not args.patch else ()),
+    )  # fmt: skip
     return Result(document, notes, tuple(shown), tuple(written))
+
+
+def _few_notes(session: Session) -> tuple[str, ...]:
+    """Say why a refit gives no pose, where it has fewer references than it takes."""
+    count = 0 if session.reference is None else len(session.reference.sensors)
+    need = session.setup.refit.min_references
+    if count >= need:
+        return ()
+    return (
+        f'a refit with {count} reference sensors gives no pose, as min_references is {need}; '
+        f'evaluate without --refit, or --set min_references={max(count, 1)}',
+    )
 
 
 def _refit_line(refit: dict[str, dict[str, int]]) -> str:

@@ -6,10 +6,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 SAY_S = 5.0
 """Time from one line to the next, s: enough to see that it goes on, few enough for a log."""
+LEAST_SHARE, LEAST_S = 0.1, 1.0
+"""Finished share of a stage, and time that its later half took, s, from which on the time that is
+left is told. Before, it would be that of loading and compiling, which do not come again."""
 
 
 @contextmanager
@@ -26,17 +29,19 @@ def progress_of(command: str) -> Iterator[Callable[[str, float], None]]:
         yield _Lines(command).tell
         return
     columns = (
-        TextColumn('{task.description}'), BarColumn(), TaskProgressColumn(), TimeRemainingColumn(),
+        TextColumn('{task.description}'), BarColumn(), TaskProgressColumn(),
+        TextColumn('{task.fields[left]}'),
     )  # fmt: skip
     with Progress(*columns, console=console) as bar:
-        task, stage = bar.add_task(command, total=1.0), command
+        task, stage = bar.add_task(command, total=1.0, left=''), command
+        remaining = _Remaining()
 
         def tell(name: str, share: float) -> None:
             nonlocal stage
             if name != stage:
                 stage = name
                 bar.reset(task, description=name)
-            bar.update(task, completed=share)
+            bar.update(task, completed=share, left=remaining.words(name, share))
 
         yield tell
 
@@ -59,24 +64,42 @@ def stages_of(command: str) -> Iterator[Callable[[str], None]]:
     yield tell
 
 
+class _Remaining:
+    """How long a stage will take, by the pace of the later half of what is finished."""
+
+    def __init__(self) -> None:
+        self._stage = ''
+        self._past: list[tuple[float, float]] = []
+
+    def words(self, stage: str, share: float) -> str:
+        """Take in how far a stage is; the time that is left, empty while it is not known well."""
+        now_s = time.monotonic()
+        if stage != self._stage:
+            self._stage, self._past = stage, []
+        if not self._past or share > self._past[-1][0]:
+            self._past.append((share, now_s))
+        done, since_s = next(one for one in reversed(self._past) if self._is_early(one, share))
+        took_s = now_s - since_s
+        if share < LEAST_SHARE or took_s < LEAST_S or share <= done:
+            return ''
+        return f'about {took_s * (1.0 - share) / (share - done):.0f} s left'
+
+    def _is_early(self, one: tuple[float, float], share: float) -> bool:
+        return one[0] <= 0.5 * share or one is self._past[0]
+
+
 class _Lines:
     """Says a line on stderr every few seconds; a short command says nothing."""
 
     def __init__(self, command: str) -> None:
-        self._command, self._stage = command, ''
-        self._begin_s = self._said_s = self._last_s = time.monotonic()
+        self._command, self._remaining = command, _Remaining()
+        self._said_s = time.monotonic()
 
     def tell(self, stage: str, share: float) -> None:
         """Take in how far a stage is, and say it where it is time to."""
-        now_s = time.monotonic()
-        if stage != self._stage:
-            self._stage, self._begin_s = stage, self._last_s
-        self._last_s = now_s
+        now_s, left = time.monotonic(), self._remaining.words(stage, share)
         if now_s - self._said_s < SAY_S:
             return
         self._said_s = now_s
-        line = f'{self._command}: {stage}, {share:.0%}'
-        if share > 0.0:
-            left_s = (now_s - self._begin_s) * (1.0 - share) / share
-            line += f', about {left_s:.0f} s left'
-        print(line, file=sys.stderr, flush=True)
+        words = ', '.join(filter(None, (f'{stage}, {share:.0%}', left)))
+        print(f'{self._command}: {words}', file=sys.stderr, flush=True)
