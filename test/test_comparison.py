@@ -65,12 +65,33 @@ def test_frames_that_only_one_has_are_counted_and_not_compared():
     assert found.rmse_a == found.rmse_b and found.verdict == 'neither'
 
 
-def test_few_stretches_give_no_interval_and_no_common_frame_is_refused():
+def test_few_stretches_give_no_interval_and_other_sessions_are_refused():
     short = errors(1.0, frames=25 * (FEWEST_BLOCKS - 1))
     found = compare_errors(short, short, np.random.default_rng(1))['a']
     assert np.isnan(found.low) and found.verdict == 'neither'
-    with pytest.raises(ParameterError, match='no frame in common'):
-        compare_errors(short, {(1, 'a'): 1.0}, np.random.default_rng(1))
+    with pytest.raises(ParameterError, match='of the same session'):
+        compare_shares(short, {(1, 'a'): 1.0}, np.random.default_rng(1))
+
+
+def test_a_side_without_a_pose_is_told_and_not_refused(tmp_path, capsys):
+    some, folders = errors(1.0), []
+    for name, state in (('one', OK), ('none', 'residual')):
+        (tmp_path / name).mkdir()
+        folders.append(str(tmp_path / name))
+        evaluation = evaluation_of(some, state)
+        write_errors(tmp_path / name / ERRORS_FILE, evaluation)
+        write_poses(tmp_path / name / POSES_FILE, evaluation)
+        write_body_poses(tmp_path / name / BODIES_FILE, evaluation)
+    found = compare_errors(some, {}, np.random.default_rng(1))['a']
+    assert (found.n, found.only_a, found.only_b) == (0, FRAMES, 0)
+    assert found.verdict == 'neither'
+    assert main(['compare', *folders, '--out', str(tmp_path / 'out')]) == 0
+    out = capsys.readouterr().out
+    assert 'position error: nothing to compare of 1' in out
+    assert 'frames with a pose: first better for 1 of 1' in out
+    assert f'0 poses with an error both have, {FRAMES - 1} only the first, 0 only the sec' in out
+    document = json.loads((tmp_path / 'out' / 'comparison.json').read_text())
+    assert document['position']['a']['rmse_b'] is None
 
 
 def test_the_share_of_frames_with_a_pose_has_a_verdict_of_its_own():
@@ -88,16 +109,18 @@ def test_the_share_of_frames_with_a_pose_has_a_verdict_of_its_own():
     assert called <= 6, 'of 40, two are expected'
 
 
-def evaluation_of(found):
+def evaluation_of(found, state=OK):
     estimates = tuple(
         SimpleNamespace(
-            stamp_ns=stamp, state=OK if rank % 50 else 'residual', position=np.zeros(3),
+            stamp_ns=stamp, state=state if rank % 50 else 'residual', position=np.zeros(3),
             axis=np.zeros(3), sigma_position_m=1e-4, residual_t=1e-9,
         )
         for rank, (stamp, _) in enumerate(found)
     )  # fmt: skip
     sizes = np.array(list(found.values()))
     sizes[5] = np.nan
+    if state != OK:
+        sizes[:] = np.nan
     return Evaluation({'a': PoseSeries('a', estimates, sizes, 2 * sizes)}, {}, 1e-3)
 
 

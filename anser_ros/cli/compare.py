@@ -75,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
         Console().print(_errors(found[kind], f'{kind} error, RMSE, {unit}', scale))
     Console().print(_shares(shares))
     print(verdict(everything))
+    print(alone(found['position']))
     if args.out is not None:
         say_written(args.out / 'comparison.json', args.out / 'comparison.png')
     return 0
@@ -94,15 +95,24 @@ def verdict(found: Mapping[str, Mapping[str, Compared | ComparedShares]]) -> str
     for kind, all_of in found.items():
         count = Counter(one.verdict for one in all_of.values())
         said = [f'{WORDS[key]} better for {count[key]}' for key in 'ab' if count[key]]
-        parts.append(f'{words[kind]}: {", ".join(said) or "no difference"} of {len(all_of)}')
+        none = 'no difference' if any(one.n for one in all_of.values()) else 'nothing to compare'
+        parts.append(f'{words[kind]}: {", ".join(said) or none} of {len(all_of)}')
     return '; '.join(parts) + '. Errors are those of frames in which both have a pose.'
+
+
+def alone(found: Mapping[str, Compared]) -> str:
+    """Say how many errors only one of the two has, as the other gave no pose there."""
+    counts = [sum(getattr(one, side) for one in found.values()) for side in ('only_a', 'only_b')]
+    said = [f'{count} only the {WORDS[key]}' for key, count in zip('ab', counts, strict=True)]
+    pairs = sum(one.n for one in found.values())
+    return f'{pairs} poses with an error both have, {", ".join(said)} has.'
 
 
 def _errors(found: Mapping[str, Compared], title: str, scale: float) -> Table:
     """One table of at most 80 columns."""
     table = Table('name', 'pairs', 'first', 'second', 'difference, 95 %', 'better', title=title)
     for name, one in found.items():
-        cells = [f'{scale * value:.4f}' for value in (one.rmse_a, one.rmse_b)]
+        cells = [_cell(scale * value, 4) for value in (one.rmse_a, one.rmse_b)]
         table.add_row(name, str(one.n), *cells, _interval(one, scale, 4), WORDS[one.verdict])
     return table
 
@@ -111,9 +121,13 @@ def _shares(found: Mapping[str, ComparedShares]) -> Table:
     heads = 'name', 'frames', 'first', 'second', 'difference, 95 %', 'better'
     table = Table(*heads, title='frames with a pose, %')
     for name, one in found.items():
-        cells = [f'{100 * value:.2f}' for value in (one.share_a, one.share_b)]
+        cells = [_cell(100 * value, 2) for value in (one.share_a, one.share_b)]
         table.add_row(name, str(one.n), *cells, _interval(one, 100.0, 2), WORDS[one.verdict])
     return table
+
+
+def _cell(value: float, digits: int) -> str:
+    return '-' if np.isnan(value) else f'{value:.{digits}f}'
 
 
 def _interval(one: Compared | ComparedShares, scale: float, digits: int) -> str:
@@ -140,6 +154,11 @@ def draw(
     ]
     drawn.append((shares, 100.0, 'frames with a pose, second - first, %'))
     for panel, (all_of, scale, label) in zip(panels, drawn, strict=True):
+        if not any(one.n for one in all_of.values()):
+            panel.text(0.5, 0.5, 'no frame in which\nboth have a pose', ha='center',
+                       va='center', transform=panel.transAxes)  # fmt: skip
+            panel.set(xticks=[], xlabel=label)
+            continue
         for name, one in all_of.items():
             row, pair = names.index(name), asdict(one)
             first, second = (

@@ -165,10 +165,7 @@ def compare_errors(
 ) -> dict[str, Compared]:
     """Compare two evaluations by name; errors of one kind by stamp and name.
 
-    Raises
-    ------
-    ParameterError
-        When no frame is in both.
+    A name without a frame in which both have an error has no pairs, and counts what one has alone.
     """
     return {name: _compare(first, second, name, rng) for name in _names(first, second)}
 
@@ -183,6 +180,8 @@ def compare_shares(
     ParameterError
         When no frame is in both.
     """
+    if not first.keys() & second.keys():
+        raise ParameterError('the two have no frame in common: are they of the same session?')
     found = {}
     for name in _names(first, second):
         stamps, pairs = _paired(first, second, name)
@@ -193,10 +192,6 @@ def compare_shares(
 
 
 def _names(first: dict[Key, float], second: dict[Key, float]) -> list[str]:
-    if not first.keys() & second.keys():
-        raise ParameterError(
-            'the two have no frame in common: are they of the same session, and have both poses?'
-        )
     return list(dict.fromkeys(name for _, name in (*first, *second)))
 
 
