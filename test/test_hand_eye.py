@@ -176,6 +176,31 @@ def test_the_command_takes_a_bag_or_files(tmp_path, capsys):
     assert 'about a bag' in capsys.readouterr().err
 
 
+def test_millimetres_under_heads_of_metres_are_said_or_refused(tmp_path, capsys):
+    session = World(4200, sensors=1, duration=12.0).session()
+    streams = {'em': session.sensors['sensor_0'], 'optical': session.reference}
+    for name, poses in streams.items():
+        for ending, scale in (('m', 1.0), ('mm', 1e3)):
+            rows = np.c_[poses.time + 5.0, scale * poses.position, poses.quaternion]
+            np.savetxt(tmp_path / f'{name}_{ending}.tum', rows, fmt='%.9f')
+
+    def told(em, optical):
+        files = [str(tmp_path / f'em_{em}.tum'), '--reference']
+        code = run_verb('handeye', [*files, str(tmp_path / f'optical_{optical}.tum'), '--json'])
+        out, said = capsys.readouterr()
+        return code, out, said
+
+    code, plain, said = told('m', 'm')
+    assert code == 0 and said == ''
+    code, out, said = told('mm', 'm')
+    assert code == 0 and 'positions in mm, as they extend' in said and 'times as far' in said
+    for key in ('registration_matrix', 'registration_translation_m'):
+        np.testing.assert_allclose(json.loads(out)[key], json.loads(plain)[key], atol=1e-6)
+    for em in ('m', 'mm'):
+        code, _, said = told(em, 'mm')
+        assert code == 2 and 'the reference: positions span' in said and 'millimetres?' in said
+
+
 @pytest.mark.long
 def test_fluxes_are_tracked_with_a_model(capsys):
     model = str(REPO / 'config' / 'demo_model.yaml')

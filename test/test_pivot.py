@@ -2,6 +2,7 @@
 
 import json
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -212,6 +213,23 @@ def test_the_command_writes_the_tip_and_refuses_in_a_line(tmp_path, capsys):
     assert run_verb('pivot', []) == 2
     assert run_verb('pivot', [recording, '--setup', str(setup), '--body', 'pen']) == 2
     assert 'no such body' in capsys.readouterr().err
+
+
+def test_positions_in_millimetres_are_named_and_what_is_no_pose_is_counted(tmp_path, capsys):
+    poses, tip, _ = pivoting(9)
+    wrong = write_tum(tmp_path / 'mm.tum', replace(poses, position=1e3 * poses.position))
+    assert run_verb('pivot', [wrong]) == 2
+    said = capsys.readouterr().err.strip().splitlines()[-1]
+    assert 'positions span' in said and said.endswith('millimetres?')
+    gone = np.arange(poses.size) % 5 == 0
+    some = np.where(gone[:, None], np.nan, poses.position)
+    recording = write_tum(tmp_path / 'gaps.tum', replace(poses, position=some))
+    assert run_verb('pivot', [recording, '--json']) == 0
+    out, said = capsys.readouterr()
+    assert f'{gone.sum()} of {poses.size} poses of tool are none' in said
+    document = json.loads(out)
+    assert (document['n_missing'], document['n']) == (gone.sum(), poses.size - gone.sum())
+    assert np.linalg.norm(np.array(document['tip_m']) - tip) < 3e-4
 
 
 def test_a_file_of_tips_that_is_not_there_is_the_callers_fault(tmp_path):

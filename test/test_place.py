@@ -82,6 +82,19 @@ def test_a_list_of_places_gives_a_table_and_a_picture(tmp_path, capsys):
     assert (tmp_path / 'out' / 'places.png').stat().st_size > 5000
 
 
+@pytest.mark.parametrize(('scale', 'said'), [(1e3, ': millimetres?'), (3e4, ' within 1.')])
+def test_coils_that_hear_nothing_are_refused(scale, said, tmp_path, capsys):
+    places = tmp_path / 'places.csv'
+    rows = ('0.1,0.1,0.05', '-0.1,0.1,0.05', '0.1,-0.1,0.05')
+    far = (','.join(str(scale * float(value)) for value in row.split(',')) for row in rows)
+    places.write_text('\n'.join(['x_m,y_m,z_m', *far]) + '\n')
+    command = ['place', 'demo_setup.yaml', '--references', '2', '--from', str(places)]
+    assert main([*command, '--out', str(tmp_path / 'out')]) == 2
+    words = capsys.readouterr().err
+    assert 'coils lie up to' in words and said in words
+    assert not (tmp_path / 'out').exists()
+
+
 @pytest.mark.parametrize(
     ('more', 'said'),
     [
@@ -90,7 +103,7 @@ def test_a_list_of_places_gives_a_table_and_a_picture(tmp_path, capsys):
         (['--references', '2', '--metal', 'above'], '--metal'),
         (['--references', '2', '--error-mm', '-1'], '--error-mm'),
         (['--references', '2', '--from', 'plane=x'], 'height'),
-        (['--references', '2', '--from', 'plane=50'], 'heights are in m'),
+        (['--references', '2', '--from', 'plane=50'], 'are in m'),
         (['--references', '2', '--from', 'nowhere.csv'], 'nowhere.csv'),
     ],
 )

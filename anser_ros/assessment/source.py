@@ -14,6 +14,7 @@ from anser_ros.poses.importing import import_poses
 from anser_ros.poses.recording import read_pose_session
 from anser_ros.poses.sequence import PoseSequence, PoseSession, sequence_of
 from anser_ros.sessions.evaluation import track_session
+from anser_ros.sessions.plausibility import check_positions
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.stamps import NANO
@@ -89,7 +90,9 @@ def read_poses(
     ------
     BagError
         When a recording has no such poses, or several and none is named.
-    ParameterError, PlausibilityError
+    PlausibilityError
+        When the positions cannot be in metres, and as `import_poses` and `track_session`.
+    ParameterError
         As `import_poses` and `track_session`.
     """
     source = Path(path)
@@ -104,6 +107,7 @@ def read_poses(
         name = wanted.body or (sensor if len(session.sensors) > 1 else TOOL)
         poses = replace(session.sensors[sensor], name=name)
         found = AssessedPoses(name, poses, replace(session, sensors={name: poses}))
+    check_positions(f'{path}: {found.name}', found.poses.position)
     return found if wanted.tip is None else _carried(found, wanted.tip)
 
 

@@ -24,6 +24,7 @@ from anser_ros.cli.output import make_folder, say_written
 from anser_ros.cli.pose_source import add_source_options, source_of
 from anser_ros.cli.progress import progress_of
 from anser_ros.errors import ParameterError
+from anser_ros.poses.sequence import missing_words
 
 SEED = 1
 """Seed of the resamples, so that the same recordings give the same intervals."""
@@ -102,6 +103,8 @@ def run(args: argparse.Namespace) -> int:
             recordings.append(read_poses(path, wanted))
         progress(args.protocol, 0.5)
         found = assess(args.protocol, recordings, options, np.random.default_rng(SEED))
+    missing = tuple(filter(None, (missing_words(one.poses) for one in recordings)))
+    found = replace(found, notes=(*found.notes, *missing))
     if found.start_ns < NO_DATE_NS:  # a device's own counter: the file tells when
         found = replace(found, start_ns=args.recordings[0].stat().st_mtime_ns)
     verdicts: dict[str, Verdict] = {}

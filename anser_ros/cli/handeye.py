@@ -3,6 +3,7 @@
 import argparse
 import html
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +25,12 @@ from anser_ros.cli.pose_session import add_topic_options, load_poses
 from anser_ros.cli.progress import progress_of
 from anser_ros.errors import ParameterError
 from anser_ros.field.plain_data import plain
+from anser_ros.poses.convention import reading_words
 from anser_ros.poses.document import finite
 from anser_ros.poses.forms import ORDERS, UNITS
 from anser_ros.poses.hand_eye_fit import HandEye, fit_hand_eye, matrix_of, turn_of
 from anser_ros.poses.importing import STAMPS, import_poses
-from anser_ros.poses.sequence import PoseSession
+from anser_ros.poses.sequence import PoseSequence, PoseSession, missing_words
 
 SCHEMA = 'anser_handeye/1'
 BAGS = ('.mcap', '.db3', '.bag')
@@ -92,8 +94,12 @@ def run(args: argparse.Namespace) -> int:
         }
         for name, content in files.items():
             (args.out / name).write_text(content, encoding='utf-8')
-    if session.lost:
-        Console(stderr=True).print(f'{session.path}: {session.lost}', highlight=False)
+    notes = [session.lost] if session.lost else []
+    if found.convention is not None:
+        notes.append(reading_words(found.convention))
+    notes += filter(None, map(missing_words, _streams(session)))
+    for note in notes:
+        print(f'anser handeye: {session.path}: {note}', file=sys.stderr)
     if args.json:
         print(text)
         return 0
@@ -104,6 +110,10 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         say_written(*(args.out / name for name in files))
     return 0
+
+
+def _streams(session: PoseSession) -> list[PoseSequence]:
+    return [*session.sensors.values(), *filter(None, [session.reference])]
 
 
 def _session(args: argparse.Namespace) -> PoseSession:

@@ -3,6 +3,7 @@
 import argparse
 import html
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from anser_ros.cli.output import make_folder, say_written
 from anser_ros.cli.pose_source import add_source_options, live_poses, source_of
 from anser_ros.cli.progress import progress_of
 from anser_ros.errors import FitError, ParameterError, SetupError
+from anser_ros.poses.sequence import missing_words
 from anser_ros.wire.setup import parse_setup, topic_of
 from anser_ros.wire.setup_tips import SCHEMA, UPPER, TipSpec, dump_tips, with_tips
 
@@ -86,15 +88,18 @@ def run(args: argparse.Namespace) -> int:
             found = read_poses(
                 args.recording, source_of(args), lambda share: progress('tracking', share)
             )
-        body = _body(args, found, text)
+        body, missing = _body(args, found, text), missing_words(found.poses)
         progress('fitting', 0.5)
         limits = PivotLimits(1e-3 * args.max_sigma_mm, 1e-3 * args.max_rms_mm)
         try:
             fit = fit_pivot(found.poses, np.random.default_rng(SEED), limits)
         except FitError as error:
-            raise FitError(f'{found.session.path}: {found.name}: {error}') from error
+            words = '; '.join(filter(None, (str(error), missing)))
+            raise FitError(f'{found.session.path}: {found.name}: {words}') from error
     document = to_document(fit, found, body)
     written = _write(args, text, body, fit, document)
+    if missing:
+        print(f'anser pivot: {found.session.path}: {missing}', file=sys.stderr)
     if args.json:
         print(json.dumps(document, indent=1))
         return 0
@@ -143,6 +148,7 @@ def to_document(fit: PivotFit, found: AssessedPoses, body: str) -> dict[str, Any
         'pivot_point_sigma_m': np.sqrt(np.diag(fit.point_covariance)).tolist(),
         'rms_m': fit.rms_m,
         'n': int(fit.time.size),
+        'n_missing': int(found.poses.missing.size),
         'n_agree': int(fit.agrees.sum()),
         'tilt_rms_deg': fit.tilt_deg.tolist(),
     }

@@ -22,6 +22,7 @@ from anser_ros.refit.design import Design, StatedMetal, choose, family, random_d
 from anser_ros.refit.excitation import Excitation, region_of
 from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.session import sensor_table
+from anser_ros.sessions.units import LENGTH_UNITS, unit_words
 from anser_ros.sessions.volume import stated_volume
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import FIELD_GENERATOR, Setup, parse_setup
@@ -42,7 +43,7 @@ AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, -1, -1]]) / np.
 LENGTH_M = 0.008
 """Length of a coil that is not stated, m."""
 FARTHEST = 10.0
-"""Height of a plane, in halves of the board, beyond which its coils hear nothing of it."""
+"""Distance of a coil, in halves of the board, beyond which it hears nothing of it."""
 MOST_CANDIDATES = 400
 """Coils to choose from; more take minutes and gigabytes."""
 RANDOM_TRIES, SEED = 20, 1
@@ -166,7 +167,7 @@ def candidates_of(setup: Setup, origin: str, region: Region) -> SensorTable:
         table = sensor_table(setup.reference_sensors)
         if not len(table):
             raise ParameterError('the setup has no reference sensors; say --from frame or plane=Z')
-        return _bounded(table, origin)
+        return _bounded(table, origin, region)
     half, middle = region.half, region.centre
     if origin == 'frame':
         angle = 2.0 * np.pi * np.arange(FRAME_PLACES) / FRAME_PLACES
@@ -175,7 +176,7 @@ def candidates_of(setup: Setup, origin: str, region: Region) -> SensorTable:
         places = np.concatenate(
             [np.column_stack([rim + middle, np.full(len(rim), z * half)]) for z in FRAME_HEIGHTS]
         )
-        return _bounded(_every_axis(places), origin)
+        return _bounded(_every_axis(places), origin, region)
     if origin.startswith('plane='):
         try:
             height = float(origin.removeprefix('plane='))
@@ -183,19 +184,23 @@ def candidates_of(setup: Setup, origin: str, region: Region) -> SensorTable:
             height = float('nan')
         if not np.isfinite(height):
             raise ParameterError(f'--from {origin}: the height must be a number, m')
-        if abs(height) > FARTHEST * half:
-            raise ParameterError(
-                f'--from {origin}: a height of {height:g} m is too far from a board of '
-                f'{2e3 * half:.0f} mm; heights are in m'
-            )
         line = SPACING * half * np.arange(-3, 4)
         x, y = np.meshgrid(line + middle[0], line + middle[1], indexing='ij')
         places = np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)
-        return _bounded(_every_axis(places), origin)
-    return _bounded(_read(Path(origin)), origin)
+        return _bounded(_every_axis(places), origin, region)
+    return _bounded(_read(Path(origin)), origin, region)
 
 
-def _bounded(table: SensorTable, origin: str) -> SensorTable:
+def _bounded(table: SensorTable, origin: str, region: Region) -> SensorTable:
+    """The coils, if they are not too many and none is too far from the board to hear it."""
+    away = np.linalg.norm(table.position - np.array([*region.centre, 0.0]), axis=1)
+    if away.max() > FARTHEST * region.half:
+        unit = unit_words(float(np.median(away)) / region.half, LENGTH_UNITS)
+        raise ParameterError(
+            f'--from {origin}: coils lie up to {away.max():.3g} m from a board of '
+            f'{2e3 * region.half:.0f} mm, and hear it within {FARTHEST * region.half:.2g} m'
+            + (f': {unit}?' if unit else '; places are in m')
+        )
     if len(table) > MOST_CANDIDATES:
         raise ParameterError(
             f'--from {origin}: {len(table)} coils to choose from, {MOST_CANDIDATES} at most'

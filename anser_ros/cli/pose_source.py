@@ -12,6 +12,7 @@ import numpy as np
 from anser_ros.assessment.source import AssessedPoses, PoseSource
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.poses.sequence import PoseSession, sequence_of
+from anser_ros.sessions.plausibility import check_positions
 from anser_ros.wire.setup_tips import read_tips
 
 PATIENCE_S = 20.0
@@ -71,6 +72,8 @@ def live_poses(
         When the time is none that can be waited.
     BagError
         When there is no ROS, or no pose on the topic.
+    PlausibilityError
+        When the positions cannot be in metres.
     """
     if not 0.0 < seconds <= LONGEST_LOOK_S:
         raise ParameterError(f'--seconds must be in (0, {LONGEST_LOOK_S:g}], got {seconds:g}')
@@ -96,5 +99,6 @@ def live_poses(
     table = np.array([row[1:] for row in rows])
     name = topic.removesuffix('/pose').lstrip('/')
     poses = sequence_of(name, (stamps - stamps[0]) * 1e-9, table[:, :3], table[:, 3:])
+    check_positions(topic, poses.position)
     session = PoseSession(topic, int(stamps[0]), {name: poses}, None)
     return AssessedPoses(name, poses, session)

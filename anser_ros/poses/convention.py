@@ -10,6 +10,7 @@ from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.sequence import PoseSequence, PoseSession
 from anser_ros.poses.start import coarse_offset, first_cost, first_fit, pose_problem
+from anser_ros.sessions.plausibility import check_positions
 
 Array = NDArray[np.float64]
 
@@ -47,8 +48,16 @@ class PoseReading:
         """Whether the numbers are what they say."""
         return (self.quaternion, self.handedness, self.unit) == ('xyzw', 'right', 'm')
 
-    def record(self, before: float, after: float) -> EffectRecord:
-        """The reading as an effect, with the misfits (m) without and with it."""
+    def record(self, before: float, after: float, ratio: float) -> EffectRecord:
+        """The reading as an effect.
+
+        Parameters
+        ----------
+        before, after : float
+            Misfits, m, without and with it.
+        ratio : float
+            Extent of the tracked positions over that of the optical ones, as both are written.
+        """
         return EffectRecord(
             'frame_convention',
             {
@@ -56,7 +65,7 @@ class PoseReading:
                 'handedness': self.handedness, 'unit': self.unit,
             },
             {},
-            {'misfit_as_written_m': before, 'misfit_so_read_m': after,
+            {'misfit_as_written_m': before, 'misfit_so_read_m': after, 'extent_ratio': ratio,
              'summary': 'the stream means something else than it says'},
         )  # fmt: skip
 
@@ -88,28 +97,53 @@ def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None
     Raises
     ------
     PlausibilityError
-        When hand-eye fits in no reading.
+        When hand-eye fits in no reading, or the reference itself is in another unit.
     DiagnosisError
         When there are too few poses.
     """
     if session.reference is None:
         return session, None
-    unit = _unit(session)
+    check_positions(f'{session.path}: the reference', session.reference.position)
+    ratio = _extent_ratio(session)
+    unit = _unit(ratio)
     plain = PoseReading(unit=unit)
     cost = _cost(plain.applied(session))
     if cost < POOR_M:
-        return plain.applied(session), None if plain.is_plain else plain.record(np.inf, cost)
+        record = None if plain.is_plain else plain.record(np.inf, cost, ratio)
+        return plain.applied(session), record
     trials = [(_cost(reading.applied(session)), reading) for reading in _readings(unit)]
     best, reading = min(trials, key=lambda pair: pair[0])
     if best < BETTER * cost:
-        return reading.applied(session), reading.record(cost, best)
+        return reading.applied(session), reading.record(cost, best, ratio)
     if cost > HOPELESS_M:
         raise PlausibilityError(
             f'{session.path}: tracked and optical poses do not belong together: hand-eye is off '
             f'by {1e3 * cost:.0f} mm in the median, and by {1e3 * best:.0f} mm when quaternions '
             f'are read in another order or sense'
         )
-    return plain.applied(session), None if plain.is_plain else plain.record(np.inf, cost)
+    return plain.applied(session), None if plain.is_plain else plain.record(np.inf, cost, ratio)
+
+
+def reading_words(record: EffectRecord) -> str:
+    """How a stream was read where it means something else than it says, with the evidence."""
+    read, told = record.parameters, record.evidence
+    said = []
+    if read['unit'] != 'm':
+        said.append(
+            f'positions in {read["unit"]}, as they extend {told["extent_ratio"]:.3g} times as '
+            "far as the reference's"
+        )
+    if read['quaternion'] != 'xyzw':
+        said.append(f'quaternions as {read["quaternion"].replace("_", ", ")}')
+    if read['handedness'] != 'right':
+        said.append('left-handed')
+    before = told['misfit_as_written_m']
+    if np.isfinite(before):
+        said.append(
+            f'hand-eye is off by {1e3 * told["misfit_so_read_m"]:.1f} mm so, '
+            f'and by {1e3 * before:.0f} mm as written'
+        )
+    return f'the {read["stream"]} poses are read otherwise than they say: {"; ".join(said)}'
 
 
 def _readings(unit: str) -> Iterator[PoseReading]:
@@ -129,14 +163,18 @@ def _cost(session: PoseSession) -> float:
     return first_cost(first_fit(problem, coarse_offset(problem), False))
 
 
-def _unit(session: PoseSession) -> str:
-    """The unit of the tracked positions by their extent against the optical ones."""
+def _extent_ratio(session: PoseSession) -> float:
+    """Extent of the tracked positions over that of the optical ones at the same times."""
     problem = pose_problem(session)
     ratios = []
     for poses in problem.sensors:
         place, _, _, known = problem.path.at(poses.time)
         ratios.append(_extent(poses.position[known]) / max(_extent(place[known]), 1e-9))
-    ratio = float(np.median(ratios))
+    return float(np.median(ratios))
+
+
+def _unit(ratio: float) -> str:
+    """The unit that such a ratio of extents means."""
     if SAME_SCALE[0] < ratio < SAME_SCALE[1]:
         return 'm'
     for unit, size in UNITS.items():

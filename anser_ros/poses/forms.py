@@ -33,6 +33,8 @@ HOST_TIMES = ('NetworkTime', 'Time')
 """Keys of the host's counter at receipt, ns."""
 LEAST_COUNTED = 8
 """Numbers that a line of TUM's form has: the time, a position, a quaternion."""
+TUM = re.compile(r'\s*[-+.\deE]+([\s,]+([-+.\deE]+|[-+]?nan|[-+]?inf)){7}', re.IGNORECASE)
+"""A line of TUM's form; values that are no numbers stand where there was no pose."""
 PORT_COLUMNS = 13
 """Columns of a port in a ToolTracker file: name, frame, face, state, pose, error, markers."""
 _KEY = re.compile(r'(\w+):\s*((?:[^\s:]+(?:\s+|$)(?!:))*?)(?=\s*\w+:|\s*$)')
@@ -77,7 +79,7 @@ def read_form(path: Path) -> dict[str, RawRows]:
         rows = _tool_tracker(lines)
     elif 'Position:' in lines[0]:
         rows = _keyed(lines, path)
-    elif re.match(r'\s*[-+.\deE]+([\s,]+[-+.\deE]+){7}', lines[0]):
+    elif TUM.match(lines[0]):
         rows = _tum(lines, path)
     else:
         rows = _table(lines, path)

@@ -85,6 +85,14 @@ class PoseSequence:
         return PoseTrack(fresh.time[first], fresh.position[first], fresh.quaternion[first])
 
 
+def missing_words(poses: PoseSequence) -> str:
+    """How many poses of a stream are none, in words; empty where all are."""
+    if not poses.missing.size:
+        return ''
+    count = poses.size + poses.missing.size
+    return f'{poses.missing.size} of {count} poses of {poses.name} are none (no numbers), left out'
+
+
 @dataclass(frozen=True)
 class PoseSession:
     """One recording of a tracker that gives poses, with an optical reference.

@@ -34,7 +34,9 @@ tool at rest by a few hundredths."""
 MOST_FROZEN = 0.5
 """Share of the time that optical poses may be frozen; what is left of more is no reference."""
 WIDEST_POINTS_M = 10.0
-"""Largest extent of the points of an error map, m: a tracked volume is below a metre."""
+"""Largest extent of a tracker's positions, m: a tracked volume is below 1, a room below 10."""
+USUAL_EXTENT_M = 0.3
+"""Usual extent of a tracker's positions, m, by which a unit is told."""
 
 
 def plausible_tools(
@@ -102,11 +104,43 @@ def check_points(tracked: Array, true: Array) -> None:
     least = min(extents.values())
     unit = unit_words(extents[widest] / least, LENGTH_UNITS) if least > 0.0 else ''
     if unit or extents[widest] > WIDEST_POINTS_M:
-        unit = unit or unit_words(extents[widest] / 0.3, LENGTH_UNITS) or 'another unit than m'
+        unit = unit or _unit_of(extents[widest])
         raise PlausibilityError(
             f'tracked positions span {extents["tracked"]:.3g} m, '
             f'true ones {extents["true"]:.3g} m: {unit}?'
         )
+
+
+def check_positions(what: str, places: Array) -> None:
+    """Check that the positions of a tracker can be in metres.
+
+    Parameters
+    ----------
+    what : str
+        Whose they are, for the message.
+    places : ndarray, shape (n, 3)
+        m, in the tracker's frame.
+
+    Raises
+    ------
+    PlausibilityError
+        When most of them extend over more than a room, or lie where a unit explains it.
+    """
+    if not len(places):
+        return
+    low, high = np.percentile(places, (5, 95), axis=0)
+    span = float(np.linalg.norm(high - low))
+    away = float(np.median(np.linalg.norm(places, axis=1)))
+    strange = away > WIDEST_POINTS_M and unit_words(away / USUAL_EXTENT_M, LENGTH_UNITS)
+    if span > WIDEST_POINTS_M or strange:
+        raise PlausibilityError(
+            f'{what}: positions span {span:.3g} m and lie {away:.3g} m from the origin: '
+            f'{_unit_of(span if span > WIDEST_POINTS_M else away)}?'
+        )
+
+
+def _unit_of(extent: float) -> str:
+    return unit_words(extent / USUAL_EXTENT_M, LENGTH_UNITS) or 'another unit than m'
 
 
 def _check_refused(path: str, tool: Measurements, refused: Mapping[str, int]) -> list[str]:
