@@ -5,24 +5,35 @@ setup of your own as argument the policy is of its sensors and bodies: `.ci/writ
 SETUP.yaml`.
 """
 
+import contextlib
+import importlib
 import os
 import sys
 import tempfile
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import yaml
+
+from anser_ros.cli.commands import COMPOSED
+from anser_ros.cli.commands import NODES as ALL_NODES
+from anser_ros.poses.document import MODEL_SCHEMA
 
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 POLICY = Path(__file__).resolve().parents[1] / 'config' / 'sros2_policy.xml'
-NODES = ('acquisition', 'field_model', 'tracker', 'openigtlink', 'recorder', 'watcher', 'monitor')
-"""Nodes of an installation; simulation and replay belong on no graph that is secured."""
-SETTLES_S = 20.0
+SIMULATED = ('cu_simulator', 'replay')
+"""What belongs on no graph that is secured; all other nodes of the package have an enclave."""
+NODES = tuple(node for node in ALL_NODES if node not in SIMULATED)
+SETTLES_S = 60.0
 """Longest time, s, for all topics of a setup to appear."""
 KINDS = (
     ('topics', 'publish', 'topic', 'get_publisher_names_and_types_by_node'),
     ('topics', 'subscribe', 'topic', 'get_subscriber_names_and_types_by_node'),
     ('services', 'reply', 'service', 'get_service_names_and_types_by_node'),
+    ('services', 'request', 'service', 'get_client_names_and_types_by_node'),
 )
 """Groups of a profile: tags, verb, and the question that fills it."""
 
@@ -30,28 +41,49 @@ KINDS = (
 def policy(setup_file: str = 'demo_setup.yaml') -> str:
     """Return the policy of a setup; rclpy must be initialised."""
     graph = _graph(setup_file)
+    enclaves = {node: _profiles_of(node, graph) for node in NODES}
+    for process in COMPOSED:
+        chain = importlib.import_module(f'anser_ros.nodes.{process}').CHAIN
+        enclaves[process] = [name for node in chain for name in enclaves[node.NAME]]
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         '<!-- Written by .ci/write_policy.py; docs/security.md says how it is used. -->',
         '<policy version="0.2.0">',
         '  <enclaves>',
     ]
-    for node in NODES:
-        lines += [f'    <enclave path="/anser/{node}">', '      <profiles>']
-        lines += [f'        <profile ns="/anser" node="{node}">']
-        for tag, verb, item, _ in KINDS:
-            names = graph[node, verb]
-            if names:
-                lines.append(f'          <{tag} {verb}="ALLOW">')
-                lines += [f'            <{item}>{name}</{item}>' for name in names]
-                lines.append(f'          </{tag}>')
-        lines += ['        </profile>', '      </profiles>', '    </enclave>']
+    for enclave, profiles in enclaves.items():
+        lines += [f'    <enclave path="/anser/{enclave}">', '      <profiles>']
+        for node in profiles:
+            lines += [f'        <profile ns="/anser" node="{node}">']
+            for tag, verb, item, _ in KINDS:
+                names = graph[node, verb]
+                if names:
+                    lines.append(f'          <{tag} {verb}="ALLOW">')
+                    lines += [f'            <{item}>{name}</{item}>' for name in names]
+                    lines.append(f'          </{tag}>')
+            lines.append('        </profile>')
+        lines += ['      </profiles>', '    </enclave>']
     return '\n'.join([*lines, '  </enclaves>', '</policy>', ''])
 
 
-def _graph(setup_file: str) -> dict[tuple[str, str], list[str]]:
-    import importlib
+def _profiles_of(node: str, graph: Mapping[tuple[str, str], list[str]]) -> list[str]:
+    """A node of the package, and what it polls topics with."""
+    from anser_ros.nodes.polled import STREAMS
 
+    return sorted({name for name, _ in graph if name.removesuffix(STREAMS) == node})
+
+
+def _pose_model(bodies: Sequence[str]) -> str:
+    """A model for `corrector` that changes nothing, of sensors named as the bodies are."""
+    support = {'low_m': [-1.0] * 3, 'high_m': [1.0] * 3}
+    effects = [{'name': 'hand_eye', 'parameters': {'sensor': body}} for body in bodies]
+    return yaml.safe_dump({
+        'schema': MODEL_SCHEMA, 'support': support, 'effects': effects,
+        'held_out_position_rmse_m': 1e-3, 'held_out_orientation_rmse_rad': 1e-3,
+    })  # fmt: skip
+
+
+def _graph(setup_file: str) -> dict[tuple[str, str], list[str]]:
     import rclpy
     from geometry_msgs.msg import PoseStamped
     from rclpy.executors import SingleThreadedExecutor
@@ -73,10 +105,14 @@ def _graph(setup_file: str) -> dict[tuple[str, str], list[str]]:
     executor.add_node(peer)
     made: list[Any] = []
     with tempfile.TemporaryDirectory() as folder:
+        pose_model = Path(folder) / 'model.yaml'
+        pose_model.write_text(_pose_model(bodies), encoding='utf-8')
         given = {
             'acquisition': {'device': '/nowhere', 'setup_file': setup_file},
             'openigtlink': {'port': 0},
             'recorder': {'directory': folder},
+            'corrector': {'model': str(pose_model)},
+            'dashboard': {'directory': folder, 'port': 0},
         }
         for name in NODES:
             module = importlib.import_module(f'anser_ros.nodes.{name}')
@@ -90,7 +126,8 @@ def _graph(setup_file: str) -> dict[tuple[str, str], list[str]]:
         setup.publish(String(data=text))
         found, since = _asked(peer), time.monotonic()
         end = since + SETTLES_S
-        while time.monotonic() < min(end, since + 3.0):  # until nothing new has come for a while
+        # Until poses are recorded and shown, and nothing new has come for a while.
+        while time.monotonic() < end and (time.monotonic() < since + 3.0 or not _settled(found)):
             executor.spin_once(timeout_sec=0.1)
             now = _asked(peer)
             if now != found:
@@ -101,9 +138,15 @@ def _graph(setup_file: str) -> dict[tuple[str, str], list[str]]:
     return found
 
 
+def _settled(found: Mapping[tuple[str, str], list[str]]) -> bool:
+    heard = {name for (_, verb), names in found.items() if verb == 'subscribe' for name in names}
+    poses = {name for name in found.get(('tracker', 'publish'), []) if '/pose' in name}
+    return bool(poses) and poses <= heard
+
+
 def _asked(peer: Any) -> dict[tuple[str, str], list[str]]:
     found = {}
-    for node in NODES:
+    for node in sorted(set(peer.get_node_names()) - {peer.get_name()}):
         for _, verb, _, question in KINDS:
             try:
                 names = {name for name, _ in getattr(peer, question)(node, '/anser')}
@@ -119,10 +162,12 @@ def main() -> int:
 
     rclpy.init()
     try:
+        with contextlib.redirect_stdout(sys.stderr):  # the nodes have their say there
+            text = policy(*sys.argv[1:2])
         if len(sys.argv) > 1:
-            print(policy(sys.argv[1]), end='')
+            print(text, end='')
         else:
-            POLICY.write_text(policy(), encoding='utf-8')
+            POLICY.write_text(text, encoding='utf-8')
     finally:
         rclpy.try_shutdown()
     return 0

@@ -130,8 +130,9 @@ def refusal(capsys, *arguments):
     assert calibrate(*arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == ''
-    assert len(captured.err.strip().split('\n')) == 1
-    return captured.err
+    # On a slow machine lines about the progress come before it.
+    (line,) = [x for x in captured.err.splitlines() if not x.startswith('calibrating: ')]
+    return line
 
 
 def test_without_poses(factory, tmp_path, capsys):
