@@ -91,6 +91,15 @@ def test_no_effect_is_a_special_case_outside_its_room(paths):
     assert not found, f'let the effect declare it (anser_ros/effects/effect.py): {found}'
 
 
+@by_room([path for path in FILES if path.relative_to(PACKAGE).parts[0] != 'poses'])
+def test_what_a_site_holds_is_known_to_the_effects_alone(paths):
+    """Others ask a term for its channels, seat or label."""
+    for path in paths:
+        nodes = ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+        lines = [n.lineno for n in nodes if isinstance(n, ast.Attribute) and n.attr == 'site']
+        assert not lines, f'{path}: {lines}'
+
+
 def test_no_site_hides_state_behind_an_underscore():
     """What a term needs to know beside its site is a field of a class of its own."""
     for room in ('effects', 'diagnosis'):
