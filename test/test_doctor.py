@@ -1,7 +1,9 @@
 """`anser doctor` finds what is not there, and names a remedy for it."""
 
+import errno
 import json
 import os
+from unittest import mock
 
 import pytest
 
@@ -28,27 +30,84 @@ def test_ports_that_are_missing_or_closed(tmp_path, monkeypatch):
     pattern = (str(tmp_path / 'tty*'),)
     (none,) = doctor.ports(None, pattern)
     assert none.state == doctor.NOTE and 'simulate' in none.remedy
-    (tmp_path / 'ttyACM0').touch()
+    main_end, port = os.openpty()
+    (tmp_path / 'ttyACM0').symlink_to(os.ttyname(port))
     (tmp_path / 'ttyACM1').touch()
     closed = str(tmp_path / 'ttyACM1')
     monkeypatch.setattr(doctor.os, 'access', lambda name, _mode: name != closed)
     first, second = doctor.ports(None, pattern)
     assert (first.state, second.state) == (doctor.GOOD, doctor.BAD)
-    assert 'dialout' in second.remedy
+    assert 'usermod -aG' in second.remedy
     assert doctor.ports(str(tmp_path / 'ttyX'))[0].state == doctor.BAD
+    for name in ('/dev/null', str(tmp_path / 'ttyACM2')):
+        (tmp_path / 'ttyACM2').touch()
+        (other,) = doctor.ports(name)
+        assert (other.state, other.found) == (doctor.BAD, 'is no serial port') and other.remedy
+    for code, state in ((errno.EBUSY, doctor.NOTE), (errno.EIO, doctor.BAD)):
+        failure = OSError(code, os.strerror(code))
+        monkeypatch.setattr(doctor.os, 'open', mock.Mock(side_effect=failure))
+        (other,) = doctor.ports(os.ttyname(port))
+        assert other.state == state and other.remedy
+    os.close(main_end)
+    os.close(port)
 
 
 @pytest.mark.processes
 @pytest.mark.parametrize(
-    ('said', 'state'), [('yes', doctor.GOOD), ('no', doctor.NOTE), ('', doctor.NOTE)]
-)
-def test_the_clock(tmp_path, monkeypatch, said, state):
+    ('said', 'kernel', 'state'),
+    [
+        ('yes', None, doctor.GOOD), ('no', None, doctor.NOTE), ('', None, doctor.NOTE),
+        ('', True, doctor.GOOD), ('', False, doctor.NOTE), ('yes', False, doctor.GOOD),
+    ],
+)  # fmt: skip
+def test_the_clock(tmp_path, monkeypatch, said, kernel, state):
     tool = tmp_path / 'timedatectl'
     tool.write_text(f'#!/bin/sh\necho {said}\n')
     tool.chmod(0o755)
     monkeypatch.setenv('PATH', f'{tmp_path}:{os.environ["PATH"]}')
-    assert doctor.clock()[0].state == state
-    assert doctor.clock('no_such_tool')[0].state == doctor.NOTE
+    monkeypatch.setattr(doctor, 'kernel_clock', lambda: kernel)
+    (found,) = doctor.clock()
+    assert found.state == state
+    assert bool(found.remedy) == (said == 'no' or (kernel is False and not said))
+    (alone,) = doctor.clock('no_such_tool')
+    assert (alone.state == doctor.GOOD) == (kernel is True)
+
+
+def test_the_kernel_has_a_word_of_its_clock():
+    assert doctor.kernel_clock() in (True, False)
+
+
+@pytest.mark.parametrize(
+    ('text', 'state'),
+    [('0', None), ('101', None), ('150', doctor.NOTE), ('233', doctor.BAD), ('-1', doctor.BAD),
+     ('one', doctor.BAD)],
+)  # fmt: skip
+def test_a_domain_that_does_not_work_is_named(monkeypatch, text, state):
+    monkeypatch.setenv('ROS_DOMAIN_ID', text)
+    found = doctor.domain()
+    assert [one.state for one in found] == ([] if state is None else [state])
+    assert all(one.remedy for one in found)
+    if state == doctor.BAD:
+        assert doctor.graph(0.1) == [], 'it is said once'
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(
+    ('broken', 'remedy'),
+    [
+        ({'RMW_IMPLEMENTATION': 'rmw_nobody'}, 'unset RMW_IMPLEMENTATION'),
+        ({'PYTHONPATH': 'here'}, 'source /opt/ros'),
+    ],
+)
+def test_a_ros_that_does_not_start_has_a_remedy(tmp_path, monkeypatch, domain, broken, remedy):
+    (tmp_path / 'here').mkdir()
+    (tmp_path / 'here' / 'rclpy.py').write_text('raise ImportError("no rclpy")\n')
+    monkeypatch.chdir(tmp_path)
+    for name, value in broken.items():
+        monkeypatch.setenv(name, value)
+    (found,) = doctor.graph(0.1)
+    assert found.state == doctor.BAD and remedy in found.remedy
+    assert not found.found.startswith('[')
 
 
 def test_a_full_disk(tmp_path):

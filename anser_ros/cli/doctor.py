@@ -1,9 +1,13 @@
 """Look at the installation and the machine, and name a remedy for each problem."""
 
 import argparse
+import ctypes
+import errno
 import glob
+import grp
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -39,6 +43,12 @@ PATIENCE_S = 20.0
 LEAST_FREE_BYTES = 2 * 2**30
 """Free disk space below which a recording is at risk, bytes: an hour of the usual fluxes."""
 PORTS = ('/dev/ttyACM*', '/dev/ttyUSB*')
+SAFE_DOMAINS, DOMAINS = range(102), range(233)
+"""Values of ROS_DOMAIN_ID whose ports nobody else is given, and all that DDS has ports for."""
+UNSET = 5
+"""What adjtimex returns where nobody keeps the kernel's clock right (TIME_ERROR)."""
+TIMEX_BYTES = 512
+"""Room for the kernel's record of its clock, bytes: more than any of its versions takes."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +86,8 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps({'schema': SCHEMA, 'problems': len(problems), 'findings': listed}))
     else:
         Console().print(_table(findings))
-        print(f'{len(problems)} problems' if problems else 'nothing is wrong')
+        several = '' if len(problems) == 1 else 's'
+        print(f'{len(problems)} problem{several}' if problems else 'nothing is wrong')
     return 2 if problems else 0
 
 
@@ -90,6 +101,7 @@ def looks(
     yield 'ports', lambda: ports(device)
     yield 'clock', clock
     yield 'disk', lambda: disk(Path.cwd())
+    yield 'the domain', domain
     yield 'the graph', lambda: graph(seconds)
 
 
@@ -148,30 +160,65 @@ def ports(device: str | None, patterns: tuple[str, ...] = PORTS) -> list[Observa
     if not names:
         words = f'none of {", ".join(patterns)}'
         return [Observation('port', NOTE, words, 'plug the control unit in, or simulate:=true')]
-    found = []
-    for name in names:
-        if not os.path.exists(name):
-            found.append(Observation(name, BAD, 'not there', 'plug it in; see dmesg for its name'))
-        elif not os.access(name, os.R_OK | os.W_OK):
-            remedy = 'sudo usermod -aG dialout $USER, and log in anew'
-            found.append(Observation(name, BAD, 'may not be read and written', remedy))
-        else:
-            found.append(Observation(name, GOOD, 'may be opened'))
-    return found
+    return [_port(name) for name in names]
+
+
+def _port(name: str) -> Observation:
+    """One port; it is opened for a moment, as only so it shows whether it is one."""
+    if not os.path.exists(name):
+        return Observation(name, BAD, 'not there', 'plug it in; see dmesg for its name')
+    if not os.access(name, os.R_OK | os.W_OK):
+        remedy = f'sudo usermod -aG {_group(name)} $USER, and log in anew'
+        return Observation(name, BAD, 'may not be read and written', remedy)
+    try:
+        handle = os.open(name, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    except OSError as error:
+        if error.errno == errno.EBUSY:
+            words = 'another program has it to itself'
+            return Observation(name, NOTE, words, f'fine if that is acquisition: fuser {name}')
+        words = f'cannot be opened: {error.strerror}'
+        return Observation(name, BAD, words, 'unplug it and plug it in; see dmesg')
+    try:
+        if os.isatty(handle):
+            return Observation(name, GOOD, 'may be opened')
+    finally:
+        os.close(handle)
+    return Observation(name, BAD, 'is no serial port', 'see dmesg for the name of the port')
+
+
+def _group(name: str) -> str:
+    """The group that may use a port."""
+    try:
+        group = grp.getgrgid(os.stat(name).st_gid).gr_name
+    except (KeyError, OSError):
+        return 'dialout'
+    return 'dialout' if group == 'root' else group
 
 
 def clock(tool: str = 'timedatectl') -> list[Observation]:
     """The system's clock: whether somebody keeps it right, as poses of two machines need it."""
-    if shutil.which(tool) is None:
-        return [Observation('clock', NOTE, f'unknown, as there is no {tool}')]
-    command = [tool, 'show', '-p', 'NTPSynchronized', '--value']
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.stdout.strip() == 'yes':
+    said = ''
+    if shutil.which(tool) is not None:
+        command = [tool, 'show', '-p', 'NTPSynchronized', '--value']
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        said = done.stdout.strip()
+    kept = {'yes': True, 'no': False}.get(said)
+    kept = kernel_clock() if kept is None else kept
+    if kept is None:
+        return [Observation('clock', NOTE, 'unknown, as nobody tells')]
+    if kept:
         return [Observation('clock', GOOD, 'synchronised')]
-    if done.stdout.strip() == 'no':
-        remedy = 'install chrony, or timedatectl set-ntp true'
-        return [Observation('clock', NOTE, 'not synchronised with other machines', remedy)]
-    return [Observation('clock', NOTE, f'unknown, as {tool} does not tell')]
+    remedy = 'install chrony, or timedatectl set-ntp true'
+    return [Observation('clock', NOTE, 'not synchronised with other machines', remedy)]
+
+
+def kernel_clock() -> bool | None:
+    """Whether somebody keeps the kernel's clock right; None where it has no word of that."""
+    try:
+        state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX_BYTES))
+    except (OSError, AttributeError):
+        return None
+    return None if state < 0 else state != UNSET
 
 
 def disk(folder: Path, least: int = LEAST_FREE_BYTES) -> list[Observation]:
@@ -183,8 +230,23 @@ def disk(folder: Path, least: int = LEAST_FREE_BYTES) -> list[Observation]:
     return [Observation('disk', GOOD, words)]
 
 
+def domain() -> list[Observation]:
+    """Which of the graphs of the network is ours: whether its number is one that works."""
+    text = os.environ.get('ROS_DOMAIN_ID', '0')
+    number = int(text) if re.fullmatch('[0-9]{1,9}', text) else -1
+    if number in SAFE_DOMAINS:
+        return []
+    remedy = f'export ROS_DOMAIN_ID=N, with N from 0 to {SAFE_DOMAINS[-1]}'
+    if number in DOMAINS:
+        words = f'{text}: Linux gives its ports to other programs too'
+        return [Observation('ROS_DOMAIN_ID', NOTE, words, remedy)]
+    return [Observation('ROS_DOMAIN_ID', BAD, f'{text!r} is no domain', remedy)]
+
+
 def graph(seconds: float) -> list[Observation]:
     """The ROS graph: the middleware, which nodes are there, and what they complain of."""
+    if any(one.state == BAD for one in domain()):
+        return []
     code = f'from anser_ros.nodes.graph_look import main; main({seconds!r})'
     try:
         done = subprocess.run(
@@ -195,11 +257,19 @@ def graph(seconds: float) -> list[Observation]:
         remedy = 'look at RMW_IMPLEMENTATION and the network'
         return [Observation('ROS', BAD, 'the middleware does not answer', remedy)]
     if done.returncode:
-        last = (done.stderr.strip().splitlines() or ['no reason'])[-1]
-        remedy = 'source /opt/ros/jazzy/setup.bash, or use the environment that `make` makes'
-        return [Observation('ROS', BAD, last, remedy)]
+        last = (done.stderr.strip().splitlines() or [f'ends with {done.returncode}'])[-1]
+        last = re.sub(r'^(\[[^]]*\] *)+: *', '', last)  # a log's level, time and name
+        return [Observation('ROS', BAD, last, _ros_remedy(last))]
     told = json.loads(done.stdout.strip().splitlines()[-1])
     return graph_findings(told)
+
+
+def _ros_remedy(last: str) -> str:
+    """What to do where ROS does not start, by the last line that it said."""
+    if 'rmw' in last.lower():
+        chosen = os.environ.get('RMW_IMPLEMENTATION', '').replace('_', '-')
+        return f'unset RMW_IMPLEMENTATION, or sudo apt install ros-jazzy-{chosen}'
+    return 'source /opt/ros/jazzy/setup.bash, or use the environment that `make` makes'
 
 
 def graph_findings(told: dict[str, Any]) -> list[Observation]:
@@ -209,7 +279,7 @@ def graph_findings(told: dict[str, Any]) -> list[Observation]:
     words = f'{told["middleware"]}, domain {domain}, discovery {reach}'
     found = [Observation('ROS', GOOD, words)]
     for name in told['twice']:
-        remedy = 'end one of them, or give it a namespace of its own'
+        remedy = 'end one, or give it a namespace or ROS_DOMAIN_ID of its own'
         found.append(Observation(name, BAD, 'runs more than once', remedy))
     ours = [name for name in told['nodes'] if name.rsplit('/', 1)[-1] in NODES]
     words = f'{len(told["nodes"])} nodes, {len(ours)} of them ours, {told["topics"]} topics'

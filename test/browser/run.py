@@ -2,8 +2,9 @@
 
 A control unit with one effect in its raw samples, the chain, a recorder and the live view run as
 processes; a headless Chromium opens the page, records, diagnoses, loads the corrected model and
-undoes it. What the page says before and after is printed beside what was put in, with the rate of
-the page's poses and the processor time of the live view's process.
+undoes it. With --calibrate it sets a baseline and fits a new model to the recording instead. What
+the page says before and after is printed beside what was put in, with the rate of the page's poses
+and the processor time of the live view's process.
 """
 
 import argparse
@@ -65,7 +66,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument('--metal', action='store_true', help='a steel disc comes and goes')
     parser.add_argument('--watch', action='store_true', help='the watcher runs too')
     parser.add_argument('--look', action='store_true', help='only look; nothing is clicked')
-    parser.add_argument('--calibrate', action='store_true', help='also calibrate by a click')
+    parser.add_argument(
+        '--calibrate', action='store_true', help='set a baseline, and calibrate, not diagnose'
+    )
     parser.add_argument('--pictures', type=Path, metavar='DIR', help='folder for pictures')
     parser.add_argument(
         '--processor', type=float, default=0.0, metavar='S', help='measure its load for so long'
@@ -147,15 +150,16 @@ class Trial:
 
     def _loop(self, args: argparse.Namespace) -> dict[str, Any]:
         page, found = self.page, {}
+        if args.calibrate:
+            self._click('Set baseline')
+            said = page.locator('.words').filter(has_text='baseline')
+            found['baseline'] = said.inner_text()
         self._click('Record')
         page.wait_for_timeout(1e3 * args.record)
         self._click('Stop')
-        if args.calibrate:
-            self._command('Calibrate')
-            found['calibrated'] = page.locator('.verdict').inner_text()
         began_s = time.monotonic()
-        self._command('Diagnose')
-        found['diagnosis_s'] = round(time.monotonic() - began_s, 1)
+        self._command('Calibrate' if args.calibrate else 'Diagnose')
+        found['command_s'] = round(time.monotonic() - began_s, 1)
         found['verdict'] = page.locator('.verdict').inner_text()
         with page.expect_popup() as opened:
             self._click('Report')
