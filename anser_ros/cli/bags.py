@@ -2,11 +2,14 @@
 
 import argparse
 import contextlib
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from anser_ros.cli.output import make_folder
+from anser_ros.cli.progress import progress_of
 from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.manufacture import manufactured
 from anser_ros.simulation.metal import steel_disc
@@ -16,6 +19,7 @@ from anser_ros.simulation.world import World
 from anser_ros.wire.bag import bag_file
 from anser_ros.wire.setup import parse_setup
 
+SCHEMA = 'anser_bags/1'
 RATE_HZ = 25.0
 """Rate of the fluxes of moving tools, Hz: half of the demo's, which keeps the bags small."""
 OPTICAL_RATE_HZ = 60.0
@@ -38,12 +42,16 @@ and 0.4 mrad each."""
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = 'example: anser bags --out bags/'
-    parser.add_argument('--setup', type=Path, default=Path('config/demo_setup.yaml'))
+    parser.add_argument(
+        '--setup', type=Path, default=Path('config/demo_setup.yaml'),
+        help='setup document (%(default)s)',
+    )  # fmt: skip
     parser.add_argument(
         '--out', type=Path, default=Path('bags'), metavar='DIR',
         help='folder for the bags, made if missing (%(default)s)',
     )  # fmt: skip
-    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--seed', type=int, default=1, help='of board and noise (%(default)s)')
+    parser.add_argument('--json', action='store_true', help='print what was written as JSON')
 
 
 def run(args: argparse.Namespace) -> int:
@@ -62,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     paths = dict.fromkeys(setup.bodies, path)
     visit = steel_disc(Approach(near_m=(0.05, -0.03, -0.06), start_s=2.0, travel_s=3.0))
     static, live = Errors(flux_noise_t=STATIC_NOISE_T), Errors()
-    for name, world, count, rate, optical_rate, errors in (
+    sessions = (
         ('factory', scanned, scan.frames, 1.0, None, static),
         ('moving', World(setup, source, paths=paths), frames, RATE_HZ, OPTICAL_RATE_HZ, live),
         (
@@ -74,13 +82,23 @@ def run(args: argparse.Namespace) -> int:
             live,
         ),
         ('scan', scanned_tall, tall.frames, 1.0, None, SCAN_ERRORS),
-    ):
-        path = args.out / f'{name}.mcap'
-        with contextlib.suppress(FileNotFoundError):
-            path.unlink()
-        record(
-            str(path), world, frames=count, rate_hz=rate, optical_rate_hz=optical_rate,
-            errors=errors, rng=rng,
-        )  # fmt: skip
-        print(f'{bag_file(path)}: {count} frames, {path.stat().st_size / 1e6:.2f} MB, simulated')
+    )
+    written: list[dict[str, Any]] = []
+    with progress_of('recording') as progress:
+        for number, (name, world, count, rate, optical_rate, errors) in enumerate(sessions):
+            progress('recording', number / len(sessions))
+            file = args.out / f'{name}.mcap'
+            with contextlib.suppress(FileNotFoundError):
+                file.unlink()
+            record(
+                str(file), world, frames=count, rate_hz=rate, optical_rate_hz=optical_rate,
+                errors=errors, rng=rng,
+            )  # fmt: skip
+            size = file.stat().st_size
+            written.append({'file': str(bag_file(file)), 'frames': count, 'bytes': size})
+    if args.json:
+        print(json.dumps({'schema': SCHEMA, 'bags': written}, indent=1))
+        return 0
+    for one in written:
+        print(f'{one["file"]}: {one["frames"]} frames, {one["bytes"] / 1e6:.2f} MB, simulated')
     return 0

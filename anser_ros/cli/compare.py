@@ -17,6 +17,7 @@ matplotlib.use('Agg')
 import matplotlib.pyplot as plt
 
 from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.progress import stages_of
 from anser_ros.sessions.comparison import (
     Compared,
     ComparedShares,
@@ -53,8 +54,9 @@ def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
     if args.out is not None:
         make_folder(args.out)
-    with Console(stderr=True).status('resampling'):
+    with stages_of('comparing') as tell:
         one, two = read_errors(args.first), read_errors(args.second)
+        tell('resampling')
         rng = np.random.default_rng(SEED)
         found = {kind: compare_errors(one[kind], two[kind], rng) for kind, _, _ in KINDS}
         shares = compare_shares(read_states(args.first), read_states(args.second), rng)

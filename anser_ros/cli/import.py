@@ -5,9 +5,8 @@ import json
 import sys
 from pathlib import Path
 
-from rich.console import Console
-
 from anser_ros.cli.output import check_new_file, say_written
+from anser_ros.cli.progress import stages_of
 from anser_ros.errors import ParameterError
 from anser_ros.sessions.bag_import import import_bag, parse_remaps
 from anser_ros.sessions.table_import import import_tables
@@ -52,7 +51,8 @@ def run(args: argparse.Namespace) -> int:
     if is_document and (args.remap or args.setup is not None):
         raise ParameterError('--remap and --setup are for bags; the document tells its setup')
     lost, left_out = '', {}
-    with Console(stderr=True).status(f'reading {args.source}'):
+    with stages_of('importing') as tell:
+        tell(f'reading {args.source}')
         if is_document:
             counts = import_tables(args.source, args.out).messages
         else:

@@ -1,14 +1,18 @@
 """Turn files of tracked and optical poses, in the forms that trackers write, into a bag."""
 
 import argparse
+import json
 from pathlib import Path
 
 from anser_ros.cli.output import check_new_file, say_written
+from anser_ros.cli.progress import stages_of
 from anser_ros.errors import ParameterError
 from anser_ros.poses.forms import ORDERS, UNITS
 from anser_ros.poses.importing import STAMPS, import_poses
 from anser_ros.poses.recording import write_pose_session
 from anser_ros.wire.setup_values import read_name
+
+SCHEMA = 'anser_import_poses/1'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='FOUND=NEW',
         help='another name for a sensor than that of its file or port; may be repeated',
     )
+    parser.add_argument('--json', action='store_true', help='print what was written as JSON')
 
 
 def parse_name(text: str) -> tuple[str, str]:
@@ -61,20 +66,31 @@ def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
     names = [parse_name(text) for text in args.name]
     check_new_file(args.out)
-    session = import_poses(
-        args.tracked,
-        args.reference,
-        stamps=args.stamps,
-        unit=args.unit,
-        quaternion=args.quaternion,
-        names=dict(names),
-    )
-    write_pose_session(args.out, session)
-    sequences = [*session.sensors.values(), *filter(None, [session.reference])]
-    for poses in sequences:
+    with stages_of('reading') as tell:
+        session = import_poses(
+            args.tracked,
+            args.reference,
+            stamps=args.stamps,
+            unit=args.unit,
+            quaternion=args.quaternion,
+            names=dict(names),
+        )
+        tell(f'writing {args.out}')
+        write_pose_session(args.out, session)
+    rows = {
+        poses.name: {
+            'poses': poses.size, 'missing': poses.missing.size, 'out_of_order': poses.unordered,
+        }
+        for poses in (*session.sensors.values(), *filter(None, [session.reference]))
+    }  # fmt: skip
+    if args.json:
+        document = {'schema': SCHEMA, 'file': str(args.out), 'sequences': rows}
+        print(json.dumps(document, indent=1))
+        return 0
+    for name, one in rows.items():
         print(
-            f'{poses.name}: {poses.size} poses, {poses.missing.size} missing, '
-            f'{poses.unordered} out of order'
+            f'{name}: {one["poses"]} poses, {one["missing"]} missing, '
+            f'{one["out_of_order"]} out of order'
         )
     say_written(args.out)
     return 0

@@ -3,6 +3,7 @@
 import argparse
 import csv
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from rich.table import Table
 
 from anser_ros.cli.output import make_folder, say_written
 from anser_ros.cli.place_figure import write_figure
+from anser_ros.cli.progress import progress_of
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.physics.sensor import SensorTable
@@ -100,7 +102,10 @@ def run(args: argparse.Namespace) -> int:
     if not (np.isfinite(args.error_mm) and args.error_mm > 0.0):
         raise ParameterError(f'--error-mm must be positive, got {args.error_mm}')
     setup = parse_setup(read_config(args.setup)).with_stated(stated_values(args))
-    proposal = propose(setup, args.references, args.origin, kinds, 1e-3 * args.error_mm)
+    with progress_of('placing') as progress:
+        proposal = propose(
+            setup, args.references, args.origin, kinds, 1e-3 * args.error_mm, progress
+        )
     make_folder(args.out)
     document = to_document(proposal, args.origin)
     text = json.dumps(document, indent=1)
@@ -117,7 +122,10 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def propose(setup: Setup, count: int, origin: str, kinds: list[str], error_m: float) -> Proposal:
+def propose(
+    setup: Setup, count: int, origin: str, kinds: list[str], error_m: float,
+    progress: Callable[[str, float], None] = lambda *_: None,
+) -> Proposal:  # fmt: skip
     """Choose reference coils of a setup.
 
     Parameters
@@ -131,6 +139,8 @@ def propose(setup: Setup, count: int, origin: str, kinds: list[str], error_m: fl
         Of `KINDS`.
     error_m : float
         Error of poses that each metal makes while nobody corrects it, m.
+    progress : callable
+        Is told the stage and the finished share of all.
 
     Raises
     ------
@@ -151,12 +161,15 @@ def propose(setup: Setup, count: int, origin: str, kinds: list[str], error_m: fl
         )
     k = len(setup.emitter_names)
     excitation = Excitation('board', np.ones(k), np.ones(k, dtype=complex), field)
+    progress('metals', 0.0)
     metals = family(
         candidates, excitation, region, setup.frequencies_hz, setup.refit, kinds, error_m
     )
+    progress('places', 0.4)
     designs = choose(metals, count, k)
     rng = np.random.default_rng(SEED)
     counts = sorted({2**i for i in range(10) if 2**i < count} | {count})
+    progress('places by chance', 0.8)
     drawn = {n: random_designs(metals, n, k, RANDOM_TRIES, rng) for n in counts}
     return Proposal(candidates, region, metals, designs, drawn)
 

@@ -6,6 +6,7 @@ installer, it can be done before: as the user who will run the nodes.
 
 import argparse
 import contextlib
+import json
 import subprocess
 import sys
 import time
@@ -23,6 +24,7 @@ from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.config_folder import config_path, read_config
 from anser_ros.wire.setup import parse_setup
 
+SCHEMA = 'anser_warm_up/1'
 POLL_S = 0.2
 """Time from one look at the processes to the next, s: how late their end is noticed."""
 SAY_S = 5.0
@@ -31,11 +33,12 @@ PACKAGE = 'anser_ros.'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the command line, which has no options."""
+    """Declare the command's arguments."""
     parser.epilog = 'example: anser warm_up'
+    parser.add_argument('--json', action='store_true', help='print the number of kernels as JSON')
 
 
-def run(_args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Compile what is not there yet, and say how far that is.
 
     Raises
@@ -43,8 +46,13 @@ def run(_args: argparse.Namespace) -> int:
     ParameterError
         When a kernel can't be compiled.
     """
-    compile_kernels(lambda text: print(text, flush=True))
-    print('all kernels are compiled')
+    stream = sys.stderr if args.json else sys.stdout
+    compile_kernels(lambda text: print(text, file=stream, flush=True))
+    if args.json:
+        count = KernelCache(folder_of(fill_frame)).total
+        print(json.dumps({'schema': SCHEMA, 'kernels': count}))
+    else:
+        print('all kernels are compiled')
     return 0
 
 

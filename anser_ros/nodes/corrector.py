@@ -35,6 +35,7 @@ class Corrector(AnserNode):
     """Takes ``/tracked/<sensor>/pose``, gives ``corrected/<sensor>/pose`` with covariance."""
 
     NAME = 'corrector'
+    EXAMPLE = '--ros-args -p model:=result/model.yaml -p tracked:=/tracked'
     PARAMETERS = CorrectorParameters
 
     def __init__(self, **options: Any) -> None:

@@ -120,6 +120,7 @@ class CuSimulator(AnserNode):
     """Runs the control unit in a thread in real time, and publishes ``/optical/<body>/pose``."""
 
     NAME = 'cu_simulator'
+    EXAMPLE = '--ros-args -p link:=/tmp/anser_cu -p metal:=false'
     PARAMETERS = CuSimulatorParameters
     HAS_KERNELS = True
 

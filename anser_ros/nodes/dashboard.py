@@ -44,6 +44,7 @@ class Dashboard(AnserNode):
     """
 
     NAME = 'dashboard'
+    EXAMPLE = '--ros-args -p directory:=recordings -p port:=8642'
     PARAMETERS = DashboardParameters
 
     def __init__(self, **options: Any) -> None:

@@ -48,6 +48,7 @@ class FieldModelNode(AnserNode):
     """Publishes ``field_model``, and answers ``field_model/reset`` and its like."""
 
     NAME = 'field_model'
+    EXAMPLE = '--ros-args -p model_file:=model.yaml -p baseline_file:=clean.mcap'
     PARAMETERS = FieldModelParameters
     HAS_KERNELS = True
     WORKS_ASIDE = True  # its first answer takes seconds

@@ -60,6 +60,7 @@ class Monitor(AnserNode):
     """Shows state, pose, sigma, true error, rate and latency of every sensor and body."""
 
     NAME = 'monitor'
+    EXAMPLE = '--ros-args -p duration_s:=30.0'
     PARAMETERS = MonitorParameters
 
     def __init__(self, **options: Any) -> None:

@@ -4,6 +4,7 @@ A node is a class with a name and a parameter table::
 
     class Tracker(AnserNode):
         NAME = 'tracker'
+        EXAMPLE = '--ros-args -p model_file:=model.yaml'
         PARAMETERS = TrackerParameters
 
         def __init__(self, **options):
@@ -79,6 +80,8 @@ class AnserNode(Node):
     """
 
     NAME: ClassVar[str]
+    EXAMPLE: ClassVar[str] = ''
+    """What may stand behind the name on a command line, for its help."""
     PARAMETERS: ClassVar[type] = NoParameters
     HAS_KERNELS: ClassVar[bool] = False
     """Whether the node calculates with compiled kernels, and waits until all are there."""

@@ -58,6 +58,7 @@ class OpenIGTLink(AnserNode):
     """
 
     NAME = 'openigtlink'
+    EXAMPLE = "--ros-args -p host:=0.0.0.0 -p body_name:='{body}ToTracker'"
     PARAMETERS = OpenIGTLinkParameters
 
     def __init__(self, **options: Any) -> None:

@@ -120,10 +120,14 @@ def _parse(
         table = '\n'.join(f'{node}:\n{table}' for node, table in tables)
     else:
         table = tables[0][1]
+    example = classes[0].EXAMPLE
+    if prefix:
+        example = example.replace('-p ', f'-p {classes[0].NAME}:')
     parser = OneLineParser(
         prog=f'anser {name}',
         description=summary,
-        epilog=f'parameters (--ros-args -p {prefix}NAME:=VALUE, or --params-file):\n{table}',
+        epilog=f'example: anser {name} {example}\n\n'
+        f'parameters (--ros-args -p {prefix}NAME:=VALUE, or --params-file):\n{table}',
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     for node in classes:

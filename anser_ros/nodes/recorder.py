@@ -61,6 +61,7 @@ class Recorder(AnserNode):
     """Subscribes to the topics of docs/interfaces.md as they appear and writes their raw bytes."""
 
     NAME = 'recorder'
+    EXAMPLE = '--ros-args -p directory:=recordings -p name:=scan'
     PARAMETERS = RecorderParameters
 
     def __init__(self, **options: Any) -> None:

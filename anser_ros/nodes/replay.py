@@ -84,6 +84,7 @@ class Replay(AnserNode):
     """
 
     NAME = 'replay'
+    EXAMPLE = 'bags/moving.mcap --rate 0.5'
     PARAMETERS = ReplayParameters
 
     @classmethod
