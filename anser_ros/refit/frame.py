@@ -1,5 +1,7 @@
 """Readings of references beside their baselines, with a reason for each unusable one."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -57,3 +59,33 @@ def _least_power(baseline: ComplexArray) -> NDArray[np.float64]:
     """Return the power (S,), T^2, below which a coil is silent, with NaN without a baseline."""
     power = np.asarray((np.abs(baseline) ** 2).sum(axis=1), dtype=np.float64)
     return np.where(np.isfinite(power), QUIET**2 * power, np.nan)
+
+
+class NoiseUnits:
+    """Changes of readings in units of the nominal noise, in phase with what drives the metal.
+
+    Parameters
+    ----------
+    baseline : ndarray, shape (S, K), complex
+        Readings without the metal, T; NaN for a coil that has none.
+    phase : ndarray, shape (K,), complex
+        Unit phasors of what drives the metal.
+    noise_t : float
+        Nominal noise of a phasor component, T.
+
+    Attributes
+    ----------
+    size : float
+        Root mean square of a component of the baseline, in the same units.
+    """
+
+    def __init__(self, baseline: ComplexArray, phase: ComplexArray, noise_t: float) -> None:
+        self._scale = phase.conj() / noise_t
+        known = baseline[np.isfinite(baseline)]
+        power = float((np.abs(known) ** 2).mean()) if known.size else 0.0
+        self.size = math.sqrt(0.5 * power) / noise_t
+
+    def of(self, change: ComplexArray) -> NDArray[np.float64]:
+        """Return changes (S, K), T, as real and imaginary parts, shape (S, K, 2)."""
+        scaled = change * self._scale
+        return scaled.view(np.float64).reshape(*scaled.shape, 2)

@@ -9,6 +9,7 @@ figures, and what was tried and left.
 import math
 from collections.abc import Callable, Sequence
 from copy import copy
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,12 +24,13 @@ from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit import health
 from anser_ros.refit.agreement import distance_of, evidence_without, left_out
 from anser_ros.refit.assembly import Assembly
-from anser_ros.refit.baseline import checked_baseline
-from anser_ros.refit.beside import begin_beside
+from anser_ros.refit.banks import Banks
+from anser_ros.refit.baseline import checked_baseline, checked_noise
+from anser_ros.refit.belief import Belief
 from anser_ros.refit.change import Average, NoiseLevel
 from anser_ros.refit.evidence import FrameEvidence
 from anser_ros.refit.excitation import FieldFunction
-from anser_ros.refit.frame import BaselineCheck
+from anser_ros.refit.frame import BaselineCheck, NoiseUnits
 from anser_ros.refit.health import ReferenceHealth, ReferenceWatch
 from anser_ros.refit.jumps import NOTICED, SUDDEN, Courses, jumped
 from anser_ros.refit.posterior import Bank
@@ -49,10 +51,6 @@ from anser_ros.settings import RefitSettings
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-MOST_BANKS = 4
-"""Banks of hypotheses, one for each set of usable coils, that are kept; the oldest is dropped."""
-NOTHING = 0.99
-"""Probability of no change from which on the calibrated model is in force."""
 DRIFT_SIGMAS = 5.0
 """Standard deviations from which on a coil's drift counts as certain."""
 POOR = 4.0
@@ -100,7 +98,7 @@ class LiveRefit:
         self.references = references
         self.settings = settings or RefitSettings()
         self.baseline = checked_baseline(model, references, baseline)
-        self._row_noise = _checked_noise(noise, len(references), len(model.emitters))
+        self._row_noise = checked_noise(noise, len(references), len(model.emitters))
         self._tables = build_tables(model, references, self.settings, drawing, volume)
         self._witness: Witness | None = None
         self._prepare()
@@ -116,23 +114,12 @@ class LiveRefit:
 
     def _prepare(self) -> None:
         """Compute what depends on the baseline and the references' places."""
-        model, references, baseline = self.model, self.references, self.baseline
-        k = len(model.emitters)
-        turned = self.baseline * self._tables.excitation.phase.conj()
-        scale = self.settings.emitter_drift / self.settings.accuracy.flux_noise_t
-        self._drift = np.zeros((baseline.size, k))
-        for emitter in range(k):
-            self._drift[emitter::k, emitter] = np.nan_to_num(turned[:, emitter].real) * scale
-        self._to_noise_units = (
-            self._tables.excitation.phase.conj() / self.settings.accuracy.flux_noise_t
-        )
-        known = self.baseline[np.isfinite(self.baseline)]
-        power = float((np.abs(known) ** 2).mean()) if known.size else 0.0
-        self._size = math.sqrt(0.5 * power) / self.settings.accuracy.flux_noise_t
-        self._banks: dict[bytes, tuple[Bank, BodySlots]] = {}
-        self._intake = Intake(references.channel, error=FitError)
+        phase, noise_t = self._tables.excitation.phase, self.settings.accuracy.flux_noise_t
+        self._units = NoiseUnits(self.baseline, phase, noise_t)
+        self._banks = Banks(self._tables, self.baseline, self.settings, self._row_noise)
+        self._intake = Intake(self.references.channel, error=FitError)
         self._baseline_check = BaselineCheck(self.baseline)
-        self._assembly = Assembly(model)
+        self._assembly = Assembly(self.model)
 
     @property
     def excitation_source(self) -> str:
@@ -147,9 +134,8 @@ class LiveRefit:
         self._watch = ReferenceWatch(len(self.references), settings.hold_frames)
         self._freshness = Freshness()
         self._courses = Courses(*self.baseline.shape)
-        self._weights = _fresh_weights(1 + len(self._tables.priors) + SLOTS)
-        for _, slots in self._banks.values():
-            slots.clear()
+        self._belief = Belief(1 + len(self._tables.priors) + SLOTS, settings.persistence)
+        self._banks.forget()
         self._assembly.forget()
         if self._witness is not None:
             self._witness.forget()
@@ -173,9 +159,10 @@ class LiveRefit:
         other = copy(self)
         other.references = references
         other.baseline = checked_baseline(self.model, references, baseline)
-        other._row_noise = _checked_noise(noise, len(references), len(self.model.emitters))
+        other._row_noise = checked_noise(noise, len(references), len(self.model.emitters))
         other._tables = self._tables.moved(references, self.settings)
         other._prepare()
+        other._belief = copy(self._belief)
         other._average = Average(self.settings.average_frames)
         return other
 
@@ -201,10 +188,6 @@ class LiveRefit:
             Flag bits; a flagged reading is not used.
         baseline : ndarray, shape (S, K), complex, optional
             The baseline at this moment, in the order of the references, where some of them move.
-
-        Returns
-        -------
-        RefitResult
 
         Raises
         ------
@@ -250,8 +233,7 @@ class LiveRefit:
         if used is not ordered:
             mean = np.where(np.isfinite(mean), mean, ordered)
         noise = level / math.sqrt(frames)
-        change = (mean - self.baseline) * self._to_noise_units
-        values = change.view(np.float64).reshape(*change.shape, 2)
+        values = self._units.of(mean - self.baseline)
         bank, seen = self._judged(stamp_ns, values, noise)
         if np.count_nonzero(self._in_use()) < self.settings.min_references:
             return self._too_few(stamp_ns, level)
@@ -262,9 +244,8 @@ class LiveRefit:
     def _look_for_jumps(self, stamp_ns: int, change: ComplexArray, level: float) -> None:
         """Leave out coils whose change (S, K) has just jumped by itself."""
         jumps = self._courses.follow(stamp_ns, change)
-        off = jumps.off * self._to_noise_units / jumps.spread[:, None]
-        parts = off.view(np.float64).reshape(*off.shape, 2)
-        power = (parts**2).mean(axis=(1, 2)) / (level * self._row_noise[:: off.shape[1]]) ** 2
+        parts = self._units.of(jumps.off) / jumps.spread[:, None, None]
+        power = (parts**2).mean(axis=(1, 2)) / (level * self._row_noise[:: parts.shape[1]]) ** 2
         loud = power > NOTICED
         if not loud.any():
             return
@@ -277,7 +258,7 @@ class LiveRefit:
             return
         bank, _ = self._bank()
         seen = bank.evaluate(parts[coils].reshape(-1, 2), level)
-        largest = SUDDEN * jumps.since_s * self._size
+        largest = SUDDEN * jumps.since_s * self._units.size
         found = coils[jumped(bank, seen, parts[coils], self.settings.emitter_drift, largest)]
         for coil in found.tolist():
             self._watch.exclude(coil)
@@ -289,21 +270,8 @@ class LiveRefit:
         return np.asarray(~self._watch.excluded)
 
     def _bank(self) -> tuple[Bank, BodySlots]:
-        """Return the hypotheses for the coils in use, computed anew only when these change."""
-        key = self._watch.excluded.tobytes()
-        if key not in self._banks:
-            k = len(self.model.emitters)
-            coils = np.flatnonzero(self._in_use())
-            rows = (coils[:, None] * k + np.arange(k)).ravel()
-            if len(self._banks) >= MOST_BANKS:
-                del self._banks[next(iter(self._banks))]
-            tables = self._tables
-            bank = Bank(
-                tables.priors, rows, self._drift, self._row_noise, SLOTS, len(tables.bodies)
-            )
-            self._banks[key] = (bank, BodySlots(bank, self._tables))
-            begin_beside(bank.make_ready)
-        return self._banks[key]
+        """Return the hypotheses for the coils in use."""
+        return self._banks.of(self._in_use())
 
     def _judged(self, stamp_ns: int, values: Array, noise: float) -> tuple[Bank, FrameEvidence]:
         """Evaluate the hypotheses, leaving out coils that are at fault, the worst first."""
@@ -342,17 +310,13 @@ class LiveRefit:
             self._watch.agreed(int(coil), distance < health.AGREES * 2 * k)
 
     def _result(self, stamp_ns: int, bank: Bank, seen: FrameEvidence, level: float) -> RefitResult:
-        prior = self.settings.persistence * self._weights
-        prior += (1.0 - self.settings.persistence) / len(prior)
-        log_weight = np.log(prior) + seen.log_evidence
-        weights = np.exp(log_weight - log_weight.max())
-        self._weights = weights = weights / weights.sum()
+        self._belief.update(seen.log_evidence)
+        weights, moving = self._belief.weights, self._belief.something
         best = int(weights.argmax())
         typical = health.typical(self._distance) / (2 * bank.width)
         mean, variance = bank.drifts(seen, best)
         drift = self.settings.emitter_drift * (mean @ np.array([1.0, 1.0j]))
         sure = (np.abs(mean) > DRIFT_SIGMAS * np.sqrt(np.maximum(variance, 1e-30))).any(axis=1)
-        moving = weights[0] < NOTHING
         if not moving:
             drift[~sure] = 0.0
         model, state, reason = self.model, FROZEN, ''
@@ -377,21 +341,12 @@ class LiveRefit:
         elif moving and typical > POOR:
             state = POOR_FIT
             reason = f'readings are {np.sqrt(typical):.1f} times as far off as they should be'
+        known = dict(zip(bank.names, weights.tolist(), strict=True))
+        metal = (lambda: locate_metal(bank, seen, weights, unit)) if moving else None
         return self._finish(
-            RefitResult(
-                stamp_ns,
-                model,
-                state,
-                model is not self._last_model,
-                self._healths(),
-                float(np.log(max(1.0 - weights[0], 1e-300)) - np.log(max(weights[0], 1e-300))),
-                dict(zip(bank.names, weights.tolist(), strict=True)),
-                level * self.settings.accuracy.flux_noise_t,
-                drift,
-                reason,
-                (lambda: locate_metal(bank, seen, weights, unit)) if moving else None,
-            )
-        )
+            stamp_ns, model, state, reason, level, log_odds=self._belief.log_odds, weights=known,
+            drift=drift, find=metal,
+        )  # fmt: skip
 
     def heed_tools(self, flux_noise_t: float) -> None:
         """From now on let `witnessed` have a say; the noise is of the tools' components, T."""
@@ -404,47 +359,36 @@ class LiveRefit:
         """
         if self._witness is None:
             return
-        if self._weights[0] >= NOTHING:
+        if not self._belief.something:
             self._witness.learn(readings)
             return
         bank, _ = self._bank()
-        told = self._witness.update(readings)
-        if not told:
-            return
-        gain = np.full(len(self._weights), -np.inf)
-        for h, name in enumerate(bank.names):
-            if name in told:
-                gain[h] = told[name]
-        weights = self._weights * np.exp(gain - gain.max())
-        if weights.sum() > 0.0:
-            self._weights = weights / weights.sum()
+        self._belief.heed(bank.names, self._witness.update(readings))
 
-    def _finish(self, result: RefitResult) -> RefitResult:
-        self._last_model = result.model
-        return result
+    def _finish(
+        self, stamp_ns: int, model: FieldModel, state: str, reason: str, level: float, **more: Any
+    ) -> RefitResult:
+        changed, self._last_model = model is not self._last_model, model
+        noise_t = level * self.settings.accuracy.flux_noise_t
+        return RefitResult(
+            stamp_ns, model, state, changed, self._healths(), noise_t=noise_t, reason=reason,
+            **more,
+        )  # fmt: skip
 
     def _too_few(self, stamp_ns: int, level: float) -> RefitResult:
         """Return to the calibrated model, which is no answer: nobody knows where metal is."""
-        self._weights = _fresh_weights(len(self._weights))
+        self._belief.forget()
         self._average.forget()
         if self._witness is not None:
             self._witness.forget()
         count = int(self._in_use().sum())
         need = self.settings.min_references
         self._distance = self._residual = np.empty(0)
+        state = REFERENCES_DOUBTFUL if self._watch.is_outvoted else FEW_REFERENCES
+        reason = f'{count} usable references, {need} are needed'
+        drift = np.zeros(len(self.model.emitters), dtype=complex)
         return self._finish(
-            RefitResult(
-                stamp_ns,
-                self.model,
-                REFERENCES_DOUBTFUL if self._watch.is_outvoted else FEW_REFERENCES,
-                self.model is not self._last_model,
-                self._healths(),
-                0.0,
-                {},
-                level * self.settings.accuracy.flux_noise_t,
-                np.zeros(len(self.model.emitters), dtype=complex),
-                f'{count} usable references, {need} are needed',
-            )
+            stamp_ns, self.model, state, reason, level, log_odds=0.0, weights={}, drift=drift
         )
 
     def _healths(self) -> Callable[[], tuple[ReferenceHealth, ...]]:
@@ -453,17 +397,3 @@ class LiveRefit:
         reason = self._watch.reason.copy()
         names, noise_t = self.references.name, self.settings.accuracy.flux_noise_t
         return lambda: health.judge_references(names, reason, used, distance, residual, noise_t)
-
-
-def _checked_noise(noise: Array | None, count: int, width: int) -> Array:
-    """Return the noise of every reading, (S K,), from that of every coil."""
-    given = np.ones(count) if noise is None else np.asarray(noise, dtype=np.float64)
-    if given.shape != (count,) or not (given >= 1.0).all() or not np.isfinite(given).all():
-        raise FitError(f'refit: noise must be {count} finite numbers of at least 1, got {given}')
-    return np.repeat(given, width)
-
-
-def _fresh_weights(count: int) -> Array:
-    weights = np.zeros(count)
-    weights[0] = 1.0
-    return weights

@@ -136,7 +136,7 @@ class Bank:
 
     def _decomposed(self, prior: CloudPrior) -> tuple[Array, Array]:
         block = prior.covariance[np.ix_(self.rows, self.rows)]
-        # numpy's releases the interpreter's lock, scipy's would stop the frames for 10 ms and more.
+        # numpy's releases the interpreter's lock, scipy's would stop the frames for 10 ms or more.
         values, vectors = np.linalg.eigh(self.whitening.T @ block @ self.whitening)
         return np.maximum(values, 0.0), self.whitening @ vectors
 
