@@ -180,13 +180,13 @@ def test_phases_of_the_emitters_are_turned_back():
 @pytest.mark.long
 def test_a_drawing_of_another_board_is_not_believed():
     world, other = anser_world(), three_coil_world()
-    assert world.refit().excitation_source == 'board'
+    assert world.refit()._tables.excitation.source == 'board'
 
     def shuffled(points):
         return world.board.field(points)[:, ::-1]
 
     refit = LiveRefit(world.model, world.references, world.baseline, drawing=shuffled)
-    assert refit.excitation_source == 'model'
+    assert refit._tables.excitation.source == 'model'
     result = run(refit, world, world.metal(HEAD))
     before, after, _, _ = errors(world, result.model, HEAD)
     assert after < 0.3 * before

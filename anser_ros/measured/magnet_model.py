@@ -91,23 +91,6 @@ def point_source() -> Source:
     return Source(np.zeros((1, 3)), np.ones(1))
 
 
-def cylinder(radius_m: float, half_length_m: float) -> Source:
-    """A uniformly magnetised cylinder: Gauss nodes over its volume.
-
-    Three nodes along the axis, two radii (in the square of the radius), six angles: exact up to
-    the fifth order of the size over the distance.
-    """
-    height, along = np.polynomial.legendre.leggauss(3)
-    square, across = np.polynomial.legendre.leggauss(2)
-    angle = 2.0 * np.pi * np.arange(6) / 6.0
-    z, rho, phi = np.meshgrid(
-        half_length_m * height, radius_m * np.sqrt(0.5 * (square + 1.0)), angle, indexing='ij'
-    )
-    weights = np.broadcast_to(along[:, None, None] * across[None, :, None] / 24.0, z.shape)
-    nodes = np.stack([rho * np.cos(phi), rho * np.sin(phi), z], axis=-1).reshape(-1, 3)
-    return Source(nodes, np.ascontiguousarray(weights).ravel())
-
-
 @dataclass(frozen=True)
 class EffectSpec:
     """Parameters of one effect.

@@ -25,8 +25,6 @@ class WallClock:
     ----------
     sets : int
         How often the system's clock was set.
-    step_s : float
-        By how much it was set last, s.
     """
 
     def __init__(
@@ -37,7 +35,6 @@ class WallClock:
         self._wall_ns, self._monotonic_ns = wall_ns, monotonic_ns
         self._offset_ns: int | None = None
         self.sets = 0
-        self.step_s = 0.0
 
     def offset_ns(self) -> int:
         """Return the system's time minus the monotonic time now, ns."""
@@ -52,6 +49,5 @@ class WallClock:
                 break
         if self._offset_ns is not None and abs(offset_ns - self._offset_ns) > _STEP_NS:
             self.sets += 1
-            self.step_s = (offset_ns - self._offset_ns) / 1e9
         self._offset_ns = offset_ns
         return offset_ns

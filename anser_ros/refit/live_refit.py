@@ -121,11 +121,6 @@ class LiveRefit:
         self._baseline_check = BaselineCheck(self.baseline)
         self._assembly = Assembly(self.model)
 
-    @property
-    def excitation_source(self) -> str:
-        """Name of what drives the metal: ``board`` for the drawing, ``model`` for the model."""
-        return self._tables.excitation.source
-
     def reset(self) -> None:
         """Forget all frames, so that the calibrated model is in force again."""
         settings = self.settings

@@ -26,7 +26,7 @@ from anser_ros.tracking.tracker import Tracker
 
 Array = NDArray[np.float64]
 
-OPTICAL, RIGID, REFERENCES = 'optical poses', 'rigidity of the tools', 'references alone'
+OPTICAL, RIGID = 'optical poses', 'rigidity of the tools'
 LIGHT = SearchSettings(most_effects=1, finalists=4, iterations=6)
 """A search that names the strongest effect alone, so that a look takes seconds. What that effect
 leaves is reported, and finding its cause is left to the whole diagnosis."""

@@ -132,11 +132,6 @@ class Tracker:
         return self._model
 
     @property
-    def last_stamp_ns(self) -> int:
-        """Stamp of the last frame, ns; 0 before there was one."""
-        return self._intake.last_ns
-
-    @property
     def dead_emitters(self) -> tuple[str, ...]:
         """Emitters that no sensor heard in the last frame while others were heard."""
         return self._intake.dead

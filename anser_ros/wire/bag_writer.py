@@ -7,6 +7,7 @@ leaves a bag with an index, a file without a name keeps the space for it.
 
 import contextlib
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -60,7 +61,26 @@ class _Segments:
         self._waiting.clear()
 
 
-class BagWriter:
+class _Closing(ABC):
+    """Is closed at the end of a ``with`` block."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Write what is left and close the file."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class BagWriter(_Closing):
     """One MCAP file being written.
 
     Parameters
@@ -194,19 +214,8 @@ class BagWriter:
             os.close(self._reserve)
             self._reserve = None
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
-
-class SessionWriter:
+class SessionWriter(_Closing):
     """Writes a session without ROS: setup, fluxes and poses, log time = stamp.
 
     Parameters
@@ -262,17 +271,6 @@ class SessionWriter:
     def close(self) -> None:
         """Write the index and close the file."""
         self._bag.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _channel(self, topic: str, type_name: str, latched: bool = False) -> int:
         if topic not in self._channels:
