@@ -39,3 +39,4 @@ def test_a_setting_is_followed_and_counted_and_a_drift_is_not():
     clocks.wall_offset_ns -= 2_000_000_000
     assert abs(clock.offset_ns() - clocks.wall_offset_ns) < 1000
     clock.offset_ns()
+    assert clock.sets == 1
