@@ -10,7 +10,13 @@ from scipy.spatial.transform import Rotation
 from anser_ros.assessment.control import ALERT, FAIL, NOTE, PASS, judged
 from anser_ros.assessment.dynamic import assess_motion
 from anser_ros.assessment.f2554 import point_to_point, single_point, standing_alone
-from anser_ros.assessment.hummel import Grid, distance_errors, grid_points, rotation_errors
+from anser_ros.assessment.hummel import (
+    Grid,
+    distance_errors,
+    grid_points,
+    lines_alike,
+    rotation_errors,
+)
 from anser_ros.assessment.metal import metal_shifts
 from anser_ros.assessment.stillness import StillPoint, still_points
 from anser_ros.cli.main import run_verb
@@ -144,6 +150,32 @@ class TestHummel:
             found = distance_errors(noisy, grid, rng)['5 cm distance errors'].summary['Mean']
             hits.append(found.low < np.mean(many) < found.high)
         assert 0.83 < np.mean(hits) <= 1.0
+
+    def test_a_distorted_field_makes_intervals_wide_enough(self):
+        """Lines beside each other err alike then: drawing them again one by one is too sure."""
+        grid, true = Grid.of(90, None, 0.05), board(9, 10)
+        away = np.linalg.norm(true[:, None] - true[None], axis=2)
+        root = 1e-3 * np.linalg.cholesky(np.exp(-50 * away**2) + 1e-9 * np.eye(90))
+
+        def boards(seeds):
+            for seed in seeds:
+                smooth, noise = rng_of(seed).normal(size=(2, 90, 3))
+                yield (true + root @ smooth + 3e-4 * noise).reshape(9, 10, 3)
+
+        def sizes(place):
+            return np.abs(np.linalg.norm(place[:, 3:] - place[:, :-3], axis=2) - 0.15) * 1e3
+
+        mean = np.mean([sizes(place).mean() for place in boards(range(8000, 8400))])
+        hits, alike = [], []
+        for place in boards(range(8400, 8425)):
+            alike.append(lines_alike(place, grid))
+            found = distance_errors(place, grid, rng_of(1))['15 cm distance errors']
+            hits.append(found.summary['Mean'].low < mean < found.summary['Mean'].high)
+        assert all(alike) and np.mean(hits) > 0.88
+        quiet = true.reshape(9, 10, 3) + rng_of(3).normal(0, 3e-4, (9, 10, 3))
+        assert not lines_alike(quiet, grid)
+        narrow = distance_errors(quiet, grid, rng_of(1))['15 cm distance errors'].summary['Mean']
+        assert narrow.high - narrow.low < 0.5 * narrow.value
 
     def test_turns_of_the_ring(self):
         angles = np.cumsum([0.0, 11.25, 11.75, 10.25])

@@ -64,7 +64,7 @@ def single_point(
         )
     size = 1e3 * np.linalg.norm(place - place.mean(axis=0), axis=1)
     group = grouped('mm', [f'Reading at {t:.2f} s' for t in time], size,
-                    blocks_of_time(time, BLOCKS), rng)  # fmt: skip
+                    [blocks_of_time(time, BLOCKS)], rng)  # fmt: skip
     return group, {'span_m': IntervalEstimate(_span(place))}
 
 

@@ -5,7 +5,7 @@ bootstrap), and of distances between points the points (vertex bootstrap of Snij
 Connections 22, 1999).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,6 +106,21 @@ def summarised(values: Array, weights: Array, clusters: int) -> dict[str, Interv
             low = max(low, 0.0)
         found[name] = IntervalEstimate(value, float(min(low, value)), float(max(high, value)))
     return found
+
+
+def widest(found: Sequence[dict[str, IntervalEstimate]]) -> dict[str, IntervalEstimate]:
+    """The same figures from several ways of drawing again, each with the ends farthest out."""
+    widened = {}
+    for name, first in found[0].items():
+        low = np.array([one[name].low for one in found])
+        high = np.array([one[name].high for one in found])
+        known = np.isfinite(low)
+        if known.any():
+            first = IntervalEstimate(
+                first.value, float(low[known].min()), float(high[known].max())
+            )
+        widened[name] = first
+    return widened
 
 
 def _statistics(ordered: Array, weights: Array) -> Mapping[str, Array]:

@@ -17,6 +17,7 @@ from anser_ros.assessment.hummel import (
     Grid,
     distance_errors,
     grid_points,
+    lines_alike,
     matching_error,
     rotation_errors,
 )
@@ -208,9 +209,14 @@ def _grid(
         'grid_matching_fre_m': IntervalEstimate(matching_error(place, grid)),
         'point_jitter_rms_m': _jitter(points),
     }
-    return replace(
-        empty, estimates=estimates, groups=distance_errors(place, grid, rng), points=tuple(points)
-    )
+    notes: tuple[str, ...] = ()
+    if lines_alike(place, grid):
+        notes = (
+            'neighbouring lines of holes seem to err alike, as in a distorted field: intervals '
+            'come from thirds of the board, and are wide',
+        )
+    groups = distance_errors(place, grid, rng)
+    return replace(empty, estimates=estimates, groups=groups, points=tuple(points), notes=notes)
 
 
 def _jitter(points: Sequence[StillPoint]) -> IntervalEstimate:
