@@ -71,3 +71,25 @@ def test_the_drawing_and_a_model_with_metal_are_not_asked(recorded):
     aside = replace(model, positions=model.positions + [0.0, 0.003, 0.0])
     with pytest.raises(FitError, match=r'lies 3\.\d mm \(.* along x, y, z\)'):
         board_place_of(aside, sensors, setup).check(session.reference.flux[0])
+
+
+def test_poses_wait_for_references_that_are_announced_and_not_for_others(recorded, monkeypatch):
+    from types import SimpleNamespace
+
+    from anser_ros.nodes import place_watch
+    from anser_ros.nodes.place_watch import PlaceWatch
+
+    session, model = recorded
+    sensors, announced = session.reference.sensors, [0]
+    watch = PlaceWatch.of(model, sensors, session.setup, lambda: announced[0])
+    assert watch.awaits, 'whoever sends references may not be known yet'
+    monkeypatch.setattr(place_watch, 'DISCOVERY_S', 0.0)
+    assert not watch.awaits
+    announced[0] = 1
+    assert watch.awaits
+    frame = SimpleNamespace(readings=session.reference.flux[0])
+    window = SimpleNamespace(full=False)
+    assert watch.look(frame, window) and not watch.awaits and not watch.misplaced
+    assert not watch.look(frame, window), 'it is said once'
+    bare = PlaceWatch.of(model, sensors.select(np.zeros(0, int)), session.setup, lambda: 1)
+    assert not bare.awaits and not PlaceWatch().awaits

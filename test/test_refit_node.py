@@ -11,7 +11,7 @@ from refit_rig import HEAD, PATCH_COILS, STEP_NS, Rig, setup_text
 from refit_world import anser_world, metal_block
 
 from anser_ros.errors import FitError, FrameError, ModelFileError, ParameterError
-from anser_ros.integrity.withheld import OTHER_MODEL, code_of
+from anser_ros.integrity.withheld import OTHER_MODEL, REFERENCES_LOST, code_of
 from anser_ros.nodes.diagnostics import Level
 from anser_ros.refit.result import Metal
 from anser_ros.sessions.model_file import load_model
@@ -223,6 +223,8 @@ def test_a_model_beside_its_board_gives_no_poses_until_the_references_agree(make
     aside = rig.world.model.flux(there, table.axis, table.length)
     here = rig.world.model.flux(table.position, table.axis, table.length)
     rig.node._on_setup(String(data=setup_text(rig.world)))
+    assert rig.node.status().message == f'{REFERENCES_LOST}: none heard yet'
+    assert codes == [], 'the model was withheld from the beginning'
     rig.say(aside - here)
     state = rig.node.status()
     assert state.level == Level.ERROR

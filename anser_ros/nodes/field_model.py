@@ -3,7 +3,6 @@
 ``field_model`` carries the dipoles, ``field_model_error`` their uncertainty with the same stamp.
 """
 
-import math
 import sys
 import time
 from pathlib import Path
@@ -27,7 +26,7 @@ from anser_ros.nodes.metal_view import MetalView
 from anser_ros.nodes.model_output import ModelOutput
 from anser_ros.nodes.moving_coils import MovingCoils
 from anser_ros.nodes.node import AnserNode, Level, Status, main
-from anser_ros.nodes.one_source import OneSource, said_of
+from anser_ros.nodes.one_source import LOOK_S, OneSource, said_of
 from anser_ros.nodes.patches import start_refit
 from anser_ros.nodes.place_watch import PlaceWatch
 from anser_ros.nodes.stated_parameters import stated_by
@@ -36,7 +35,7 @@ from anser_ros.refit.baseline import ReadingWindow, check_enough
 from anser_ros.refit.change import Pace
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.result import RefitResult
-from anser_ros.sessions.baseline import board_place_of, clean_flux, clean_mean
+from anser_ros.sessions.baseline import clean_flux, clean_mean
 from anser_ros.sessions.model_file import SNAPSHOT, as_saved, is_snapshot, save_model
 from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session, sensor_table
@@ -69,6 +68,7 @@ class FieldModelNode(AnserNode):
         self._result: RefitResult | None = None
         self._baseline: NDArray[np.complex128] | None = None
         self._frozen = self._unfit = False
+        self._told: tuple[bool, ...] = ()
         self._place = PlaceWatch()
         self._trouble = Trouble()
         self._frames: Intake | None = None
@@ -78,19 +78,18 @@ class FieldModelNode(AnserNode):
         self._pace = Pace(table.refit_rate_hz)
         self._output = ModelOutput(self)
         self._metal = MetalView(self)
-        self._sources = [
-            OneSource(
-                self, String, 'setup', self._on_setup, qos.LATCHED, lasting=lambda text: text.data
-            ),
-            OneSource(self, PointCloud2, 'reference/flux', self._on_flux, qos.STREAM),
-        ]
+        setups = OneSource(
+            self, String, 'setup', self._on_setup, qos.LATCHED, lasting=lambda text: text.data
+        )
+        self._fluxes = OneSource(self, PointCloud2, 'reference/flux', self._on_flux, qos.STREAM)
         topics = parse_patches(table.patches)
         self._moving = MovingCoils(self, topics, lambda: self._frame_id, self._refuse)
-        self._sources += self._moving.sources
+        self._sources = [setups, self._fluxes, *self._moving.sources]
         self.create_service(Trigger, 'field_model/reset', self._on_reset)
         self.create_service(Trigger, 'field_model/save', self._on_save)
         self.create_service(SetBool, 'field_model/freeze', self._on_freeze)
         self.create_service(Trigger, 'field_model/set_baseline', self._on_set_baseline)
+        self.create_timer(LOOK_S, self._tell_changes, clock=self.steady_clock)
         if self._file_model is not None:
             self._base = self._file_model
             self._output.name_origin(self._file_model)
@@ -111,31 +110,26 @@ class FieldModelNode(AnserNode):
             self._refuse('setups_refused', error)
             if isinstance(error, ModelFileError) and self._model is not None:
                 self._unfit = True
-                self._serve(self._model, self.get_clock().now().nanoseconds)
+                self._tell_changes()
             return
-        self._setup_text, self._setup = message.data, setup
+        self._setup_text, self._setup, table = message.data, setup, self.parameters
         self._trouble.forget()
         self._refit = self._result = self._baseline = None
         self._references = sensor_table(setup.reference_sensors)
         self._frames = Intake(self._references.channel, self.count)
-        self._window = ReadingWindow(
-            self._references, len(base.emitters), self.parameters.baseline_s
-        )
-        self._place = PlaceWatch(board_place_of(base, self._references, setup))
+        self._window = ReadingWindow(self._references, len(base.emitters), table.baseline_s)
         self._output.name_origin(base)
-        told, self._unfit, self._base = not self._unfit, False, base
-        if base is not self._model or not told:
+        self._unfit, self._base = False, base
+        self._place = PlaceWatch.of(base, self._references, setup, self._fluxes.publishers)
+        if base is not self._model:
             self._serve(base, self.get_clock().now().nanoseconds)
+        self._tell_changes()
         if self._baseline_bag is not None and len(self._references):
             try:
                 self._follow(clean_flux(self._baseline_bag, self._references, base))
             except AnserError as error:
                 self._refuse_baseline(error)
-        elif (
-            len(self._references)
-            and self.parameters.refit
-            and not self.parameters.baseline_at_start
-        ):
+        elif len(self._references) and table.refit and not table.baseline_at_start:
             self.get_logger().warning(refit_status.no_baseline(self.get_namespace()))
 
     def _on_flux(self, message: PointCloud2) -> None:
@@ -153,8 +147,8 @@ class FieldModelNode(AnserNode):
             for kind, many in frame.kinds.items():
                 self.count(f'readings_{kind}', many)
             window.add(frame)
-            if self._place.look(frame, window) and self._model is not None:
-                self._serve(self._model, self.get_clock().now().nanoseconds)
+            if self._place.look(frame, window) and not self._follows and self._model is not None:
+                self._serve(self._model, stamp_ns)
             if self._refit is None and self.parameters.baseline_at_start and window.full:
                 self._begin(window, setup)
             if self._refit is not None and self._follows:
@@ -204,6 +198,12 @@ class FieldModelNode(AnserNode):
         """Whether every frame of the references is answered by a model of its own."""
         return self._refit is not None and self.parameters.refit and not self._frozen
 
+    @property
+    def _state(self) -> tuple[bool, ...]:
+        """What receivers are told beside the model; of it the first two are in the message."""
+        awaits = self._setup is None or self._place.awaits
+        return self._follows, awaits, self._unfit, self._is_uncalibrated
+
     # The model and its baseline -----------------------------------------------------------
 
     def _serve(self, model: FieldModel, stamp_ns: int, withheld: str = '') -> None:
@@ -212,12 +212,16 @@ class FieldModelNode(AnserNode):
         The model of a frame of readings has their stamp, which may be of another day. ``withheld``
         is the state for which trackers are to give no pose, or not for long.
         """
+        self._told = follows, awaits, *_ = self._state
         if self._unfit or self._place.misplaced:
             withheld = why.OTHER_MODEL
+        elif awaits:
+            withheld = why.REFERENCES_LOST
         elif not withheld and self._is_uncalibrated:
             withheld = why.UNCALIBRATED
         self._stamp_ns = stamp_ns if stamp_ns != self._stamp_ns else stamp_ns + 1
-        self._output.publish(model, self._frame_id, self._stamp_ns, self._follows, withheld)
+        # A model that is about to be judged lets trackers wait for the verdict on their frame.
+        self._output.publish(model, self._frame_id, self._stamp_ns, follows or awaits, withheld)
         if model is not self._model:
             self.count('models')
         self._model = model
@@ -240,10 +244,11 @@ class FieldModelNode(AnserNode):
         self._no_baseline = str(error)
         self._refuse('baselines_refused', error)
 
-    def _tell_following(self) -> None:
-        """Let receivers know, when it has changed, whether frames are answered from now on."""
-        if self._model is not None and not self._output.has_told(self._follows):
-            self._serve(self._model, self.get_clock().now().nanoseconds)
+    def _tell_changes(self) -> None:
+        """Let receivers know of another state than the one that they were told."""
+        if self._model is not None and self._told != self._state:
+            withheld = self._withheld if self._follows else ''
+            self._serve(self._model, self.get_clock().now().nanoseconds, withheld)
 
     def _follow(self, baseline: NDArray[np.complex128]) -> None:
         """Refit from now on to what differs from a baseline, shape (S, K), T."""
@@ -254,7 +259,7 @@ class FieldModelNode(AnserNode):
         )
         self._baseline = baseline
         self._result, self._heard_s, self._no_baseline = None, time.monotonic(), ''
-        self._tell_following()
+        self._tell_changes()
         self.count('baselines')
 
     def _exchange(self, file_model: FieldModel | None) -> None:
@@ -273,13 +278,15 @@ class FieldModelNode(AnserNode):
         self._file_model, self._base = file_model, base
         if base is None:
             return
-        is_seen = setup is not None and references is not None
-        self._place = PlaceWatch(board_place_of(base, references, setup) if is_seen else None)
+        self._place = PlaceWatch.of(base, references, setup, self._fluxes.publishers)
         self._refit, self._moving.patches = started or (None, None)
         self._result, self._unfit, self._heard_s = None, False, time.monotonic()
         self._trouble.forget()
         self._output.name_origin(base)
-        # As after a reset: it is no answer of the references.
+        self._serve_start(base)
+
+    def _serve_start(self, base: FieldModel) -> None:
+        """Serve a model that is no answer of the references: trackers wait for the next one."""
         state = why.REFERENCES_LOST if self._follows else ''
         self._serve(base, self.get_clock().now().nanoseconds, state)
 
@@ -291,9 +298,7 @@ class FieldModelNode(AnserNode):
         if self._refit is not None:
             self._refit.reset()
         self._result = None
-        # It is no answer of the references: trackers wait for the next one.
-        state = why.REFERENCES_LOST if self._follows else ''
-        self._serve(self._base, self.get_clock().now().nanoseconds, state)
+        self._serve_start(self._base)
         response.success, response.message = True, 'the model is the one from the start'
         return response
 
@@ -308,7 +313,7 @@ class FieldModelNode(AnserNode):
 
     def _on_freeze(self, request: Any, response: Any) -> Any:
         self._frozen = bool(request.data)
-        self._tell_following()
+        self._tell_changes()
         response.success = True
         response.message = 'the model stays as it is' if self._frozen else 'the model may change'
         return response
@@ -338,9 +343,7 @@ class FieldModelNode(AnserNode):
         if old.model_file != new.model_file:
             self._exchange(model_of(new.model_file))
         self._pace.rate_hz = new.refit_rate_hz
-        self._tell_following()
-        if self._model is not None and old.allow_uncalibrated != new.allow_uncalibrated:
-            self._serve(self._model, self._stamp_ns, self._withheld)
+        self._tell_changes()
 
     def status(self) -> Status:
         """Return which model is in force, where it comes from, and what the refit does."""
@@ -355,13 +358,10 @@ class FieldModelNode(AnserNode):
             return Status('', Level.ERROR, f'{why.OTHER_MODEL}: {self._place.misplaced}', values)
         if model is None:
             return Status('', Level.WARN, self._trouble.last or 'no setup yet', values)
-        values |= {
-            'fingerprint': '' if self._base is None else self._base.fingerprint,
-            **refit_status.model_values(model, self.parameters.model_file),
-            'stamp_ns': self._stamp_ns,
-            'freeze': self._frozen,
-            'refit_time_s': self._refit_s,
-        }
+        values['fingerprint'] = '' if self._base is None else self._base.fingerprint
+        values |= refit_status.model_values(model, self.parameters.model_file)
+        values |= {'stamp_ns': self._stamp_ns, 'freeze': self._frozen}
+        values['refit_time_s'] = self._refit_s
         activity = self._activity(values)
         if self._is_uncalibrated:
             activity = f'{why.UNCALIBRATED}: calibrate, or set allow_uncalibrated; {activity}'
@@ -372,19 +372,16 @@ class FieldModelNode(AnserNode):
         trouble = self._trouble.recent(time.monotonic())
         if trouble:
             return Status('', Level.WARN, f'{activity}; lately: {trouble}', values)
-        silent_s = time.monotonic() - self._heard_s
-        if self._follows and silent_s > self._longest_s:
+        if self._place.awaits:
+            return Status('', Level.WARN, f'{why.REFERENCES_LOST}: none heard yet', values)
+        silent_s, setup = time.monotonic() - self._heard_s, self._setup
+        if setup is not None and self._follows and silent_s > setup.refit.references_age_s:
             said = f'{why.REFERENCES_LOST}: no reference fluxes for {silent_s:.1f} s'
             return Status('', Level.ERROR, said, values)
         is_troubled = values.get('refit_state') in refit_status.TROUBLED
         is_troubled |= bool(self._no_baseline and self.parameters.refit)
         level = Level.WARN if is_troubled or self._is_uncalibrated else Level.OK
         return Status('', level, activity, values)
-
-    @property
-    def _longest_s(self) -> float:
-        setup = self._setup
-        return math.inf if setup is None else setup.refit.references_age_s
 
     def _activity(self, values: dict[str, object]) -> str:
         if self._frozen or self._refit is None or not self.parameters.refit:

@@ -90,10 +90,6 @@ class ModelWriter:
         self._uncertainty = now
         return self.error(model, frame_id, stamp_ns, follows, withheld)
 
-    def has_told(self, follows: bool) -> bool:
-        """Return whether receivers know, if anything, whether the model follows the references."""
-        return self._uncertainty is None or self._uncertainty[3] == follows
-
     def error(
         self,
         model: FieldModel,

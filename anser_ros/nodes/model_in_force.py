@@ -9,7 +9,7 @@ from anser_ros.nodes.model_intake import GivenModel
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.wire.setup import Setup
 
-REASONS = {REFERENCES_LOST: 'too few references'}
+REASONS = {REFERENCES_LOST: 'no references heard yet, or too few'}
 """What is said of a state that the server names, where it needs words."""
 OTHER_CLOCK_NS = 5_000_000_000
 """A model whose stamp is that far ahead of the frames' has it from another clock: the host's,

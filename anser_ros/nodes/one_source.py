@@ -79,6 +79,10 @@ class OneSource:
             self.subscription = self._subscribed()
         return said
 
+    def publishers(self) -> int:
+        """How many publishers the graph knows, idle ones included."""
+        return self._count(time.monotonic())
+
     def hears(self, info: Mapping[str, Any], lasting: Hashable = None) -> bool:
         """Take a message's information; return whether the message may be believed."""
         now_s, number = time.monotonic(), info.get(NUMBER)
