@@ -103,7 +103,9 @@ class Accuracy:
 
     @property
     def pose_jitter(self) -> NDArray[np.float64]:
-        """Jitter of an optical pose along (m) and about (rad) the three axes, shape (6,)."""
+        """Return the jitter of an optical pose along (m) and about (rad) the three axes, shape
+        (6,).
+        """
         return np.repeat([self.optical_position_m, self.optical_rotation_rad], 3)
 
 
@@ -225,7 +227,7 @@ VALUES = {name: item for section in SECTIONS.values() for name, item in section.
 
 
 def settings_from(stated: Mapping[str, Any]) -> RefitSettings:
-    """The settings with some values stated, and the default of every other.
+    """Return the settings with some values stated, and the default of every other.
 
     Parameters
     ----------

@@ -168,7 +168,9 @@ def _independent(values: Array, power: int) -> float:
 
 
 def deviation_interval(value: float, freedoms: float) -> IntervalEstimate:
-    """A standard deviation with the interval of chi-square with so many degrees of freedom."""
+    """Return a standard deviation with the interval of chi-square with so many degrees of
+    freedom.
+    """
     low, high = stats.chi2.ppf([0.5 + LEVEL / 2, 0.5 - LEVEL / 2], freedoms)
     return IntervalEstimate(
         value, value * np.sqrt(freedoms / low), value * np.sqrt(freedoms / high)

@@ -94,7 +94,7 @@ class PivotFit:
 
     @property
     def sigma(self) -> Array:
-        """Standard deviations of the tip, m, shape (3,)."""
+        """Return the standard deviations of the tip, m, shape (3,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 

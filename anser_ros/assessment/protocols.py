@@ -157,7 +157,7 @@ def assess(
 
 
 def points_of(recordings: Sequence[AssessedPoses], rule: PauseRule) -> list[StillPoint]:
-    """The points of recordings: the pauses of one, or one of each where there are several.
+    """Return the points of recordings: the pauses of one, or one of each where there are several.
 
     Raises
     ------

@@ -144,7 +144,9 @@ def _longest_even(time: Array) -> tuple[int, int]:
 
 
 def allan_deviation(values: Array, rate_hz: float) -> AllanCurve:
-    """Overlapping Allan deviation of evenly spaced values, m, at octaves of averaging time."""
+    """Return the overlapping Allan deviation of evenly spaced values, m, at octaves of averaging
+    time.
+    """
     import allantools  # no other assessment needs it
 
     tau, deviation, _, terms = allantools.oadev(

@@ -57,7 +57,7 @@ class FieldModes:
 
     @staticmethod
     def of(measurements: Sequence[Measurements], sites: DipoleSites) -> 'FieldModes':
-        """The modes of dipoles over the usable readings of measurements at their poses."""
+        """Return the modes of dipoles over the usable readings of measurements at their poses."""
         gram, count = np.zeros((len(sites), len(sites))), 0.0
         for m in measurements:
             for block in frame_blocks(len(m.time), len(m.sensors)):

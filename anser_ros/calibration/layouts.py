@@ -35,7 +35,7 @@ class Generator:
 
     @property
     def half_extent(self) -> Array:
-        """Half sizes in x and y of the rectangle around all coils, shape (2,), m."""
+        """Return half sizes in x and y of the rectangle around all coils, shape (2,), m."""
         low, high = self._bounds()
         return np.asarray(np.maximum(high - low, 1e-3) / 2.0)
 

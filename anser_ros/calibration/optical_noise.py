@@ -37,12 +37,12 @@ class OpticalNoise:
 
     @property
     def jitter(self) -> Array:
-        """Along (m) and about (rad) the three axes, shape (6,)."""
+        """Return the jitter of a pose along (m) and about (rad) the three axes, shape (6,)."""
         return np.repeat([self.position_m, self.rotation_rad], 3)
 
     @property
     def relative_uncertainty(self) -> float:
-        """Relative standard deviation of both figures: three components a pose."""
+        """Return the relative standard deviation of both figures: three components a pose."""
         return float(1.0 / np.sqrt(max(6.0 * self.poses, 1.0)))
 
 

@@ -82,7 +82,7 @@ class Posterior:
 
 
 def solve(likelihood: Likelihood, width: Array, root: Array | None = None) -> Posterior:
-    """The parameters for given prior widths, or a root (Q, Q) of the prior covariance."""
+    """Return the parameters for given prior widths, or a root (Q, Q) of the prior covariance."""
     root = np.diag(width) if root is None else root
     inner = np.eye(width.size) + root.T @ likelihood.information @ root
     # In units of the widths, a parameter that is held fixed does no harm.

@@ -24,7 +24,7 @@ without noise and is far below the tens of picotesla of real electronics."""
 
 
 def pose_precision(accuracy: Accuracy) -> Array:
-    """Inverse variances of the six pose parameters, shape (6,), 1/m^2 and 1/rad^2.
+    """Return the inverse variances of the six pose parameters, shape (6,), 1/m^2 and 1/rad^2.
 
     A jitter of zero counts as 1e-12, so that the pose stays fixed.
     """

@@ -234,7 +234,9 @@ class SensorParameters:
         return out, common
 
     def of(self, kind: str, body: str, values: Array) -> Array | None:
-        """A kind's parameters of a body, a row a sensor for a population; None where fixed."""
+        """Return a kind's parameters of a body, a row a sensor for a population; None where
+        fixed.
+        """
         if (kind, body) not in self.slices:
             return None
         part = values[self.slices[kind, body]]

@@ -23,7 +23,7 @@ SHOWN = (
 def to_document(
     found: Assessment, state: str, verdicts: Mapping[str, Verdict], sessions: int
 ) -> dict[str, Any]:
-    """The assessment as plain data; null where there is no number."""
+    """Return the assessment as plain data; null where there is no number."""
     document: dict[str, Any] = {
         'schema': SCHEMA, 'protocol': found.protocol, 'body': found.body,
         'recordings': list(found.recordings), 'start_ns': found.start_ns,

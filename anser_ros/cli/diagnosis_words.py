@@ -91,7 +91,7 @@ def _size(value: Any) -> int:
 
 
 def value_text(value: Any) -> str:
-    """A parameter's value as text with four digits."""
+    """Return a parameter's value as text with four digits."""
     if isinstance(value, list):
         return '[' + ', '.join(value_text(item) for item in value) + ']'
     return f'{value:.4g}' if isinstance(value, float) else str(value)

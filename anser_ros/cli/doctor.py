@@ -115,7 +115,7 @@ def _table(findings: list[Observation]) -> Table:
 
 
 def python() -> list[Observation]:
-    """The interpreter: whether it is one that is tested."""
+    """Check the interpreter: whether it is one that is tested."""
     own, words = sys.version_info[:2], sys.version.split()[0]
     tested = ' and '.join('.'.join(map(str, one)) for one in TESTED)
     if own in TESTED:
@@ -141,7 +141,7 @@ def packages(has: Callable[[str], Any] = find_spec) -> list[Observation]:
 
 
 def kernels() -> list[Observation]:
-    """The compiled kernels: whether the first start has to wait for them."""
+    """Check the compiled kernels: whether the first start has to wait for them."""
     # Late, as numba may be what is missing.
     if not find_spec('numba'):
         return []
@@ -156,7 +156,7 @@ def kernels() -> list[Observation]:
 
 
 def ports(device: str | None, patterns: tuple[str, ...] = PORTS) -> list[Observation]:
-    """The serial ports: whether there is one, and may be opened."""
+    """Check the serial ports: whether there is one, and may be opened."""
     names = [device] if device else sorted(n for p in patterns for n in glob.glob(p))
     if not names:
         words = f'none of {", ".join(patterns)}'
@@ -197,7 +197,9 @@ def _group(name: str) -> str:
 
 
 def clock(tool: str = 'timedatectl') -> list[Observation]:
-    """The system's clock: whether somebody keeps it right, as poses of two machines need it."""
+    """Check the system's clock: whether somebody keeps it right, as poses of two machines
+    need it.
+    """
     said = ''
     if shutil.which(tool) is not None:
         command = [tool, 'show', '-p', 'NTPSynchronized', '--value']
@@ -223,7 +225,7 @@ def kernel_clock() -> bool | None:
 
 
 def disk(folder: Path, least: int = LEAST_FREE_BYTES) -> list[Observation]:
-    """The disk under a folder: whether a recording has room."""
+    """Check the disk under a folder: whether a recording has room."""
     free = shutil.disk_usage(folder).free
     words = f'{free / 2**30:.1f} GB free in {folder}'
     if free < least:
@@ -245,7 +247,7 @@ def domain() -> list[Observation]:
 
 
 def graph(seconds: float) -> list[Observation]:
-    """The ROS graph: the middleware, which nodes are there, and what they complain of."""
+    """Check the ROS graph: the middleware, which nodes are there, and what they complain of."""
     if any(one.state == BAD for one in domain()):
         return []
     code = f'from anser_ros.nodes.graph_look import main; main({seconds!r})'

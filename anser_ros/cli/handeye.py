@@ -135,7 +135,7 @@ def _session(args: argparse.Namespace) -> PoseSession:
 
 
 def to_document(found: HandEye) -> dict[str, Any]:
-    """The result as plain data; null where the recording does not tell."""
+    """Return the result as plain data; null where the recording does not tell."""
     vector, quaternion = turn_of(found.rotation)
     offset, rate = (pair or (None, None) for pair in (found.offset_s, found.rate_ppm))
     document: dict[str, Any] = {
@@ -229,7 +229,7 @@ def _table(document: dict[str, Any]) -> Table:
 
 
 def render(found: HandEye, document: dict[str, Any]) -> str:
-    """The page: frames, clocks, what is open, and what is left over time."""
+    """Return the page as HTML: frames, clocks, what is open, and what is left over time."""
     columns = [
         (scale, document[f'registration_{key}'])
         for scale, key in (

@@ -136,7 +136,7 @@ def _body(args: argparse.Namespace, found: AssessedPoses, text: str) -> str:
 
 
 def to_document(fit: PivotFit, found: AssessedPoses, body: str) -> dict[str, Any]:
-    """The result as plain data."""
+    """Return the result as plain data."""
     return {
         'schema': DOCUMENT,
         'recording': found.session.path,
@@ -206,7 +206,7 @@ def _table(fit: PivotFit) -> Table:
 
 
 def render(fit: PivotFit, document: dict[str, Any]) -> str:
-    """The page: the tip, and how far each pose puts it from the point that it rested on."""
+    """Return the page as HTML: the tip, and how far each pose puts it from where it rested."""
     figure, axes = plt.subplots(figsize=(9, 3), layout='constrained')
     for mask, colour, label in ((fit.agrees, 'C0', 'agrees'), (~fit.agrees, 'C3', 'left out')):
         axes.plot(fit.time[mask], 1e3 * fit.distance[mask], '.', ms=3, color=colour, label=label)

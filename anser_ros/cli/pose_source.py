@@ -64,7 +64,8 @@ def source_of(args: argparse.Namespace) -> PoseSource:
 def live_poses(
     topic: str, seconds: float, progress: Callable[[str, float], None]
 ) -> AssessedPoses:
-    """Poses of a topic of the running graph, received for some seconds from the first one on.
+    """Return poses of a topic of the running graph, received for some seconds from the first one
+    on.
 
     Raises
     ------

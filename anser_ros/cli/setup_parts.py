@@ -71,12 +71,14 @@ def numbers_of(text: str, counts: Sequence[int], what: str) -> list[float]:
 
 
 def metres(values: Sequence[float]) -> list[float]:
-    """Lengths in mm as lengths in m, without the rounding of the division in the document."""
+    """Return lengths in mm as lengths in m, without the rounding of the division in the
+    document.
+    """
     return [round(1e-3 * value, 9) for value in values]
 
 
 def emitter_of(kind: str, geometry: Mapping[str, float], coils: list[Document]) -> Document:
-    """The section of a board; its values are checked with the whole document."""
+    """Return the section of a board; its values are checked with the whole document."""
     if kind not in GEOMETRY:
         raise ParameterError(f'no board {kind}; there are: {", ".join([ANSER, *GEOMETRY])}')
     values = {k: int(v) if k in WHOLE and v == int(v) else v for k, v in geometry.items()}
@@ -84,7 +86,7 @@ def emitter_of(kind: str, geometry: Mapping[str, float], coils: list[Document]) 
 
 
 def anser_emitter() -> Document:
-    """The section of the Anser v1 board."""
+    """Return the section of the Anser v1 board."""
     emitter: Document = read_yaml(read_config(ANSER_FILE))['emitter']
     return emitter
 
@@ -121,7 +123,9 @@ def sensor_of(text: str, body: str = '') -> Document:
 
 
 def axis_of(text: str, what: str) -> list[float]:
-    """A direction: x, -z and the like, or three numbers of any length, blanks between them."""
+    """Return a direction: x, -z and the like, or three numbers of any length, blanks
+    between them.
+    """
     if text.lower() in DIRECTIONS:
         return DIRECTIONS[text.lower()]
     if len(text.split()) != 3:
@@ -164,7 +168,7 @@ def document_of(
     volume_mm: Sequence[float] | None,
     stated: Mapping[str, float],
 ) -> Document:
-    """The whole document as plain data."""
+    """Return the whole document as plain data."""
     document: Document = {
         'schema': SCHEMA, 'frame_id': FIELD_GENERATOR, 'flux_rate_hz': rate_hz, 'flux_unit': 'T',
         'emitter': emitter, 'sensors': sensors,

@@ -20,7 +20,9 @@ def add_stated_values(parser: argparse.ArgumentParser, *sections: str) -> None:
 
 
 def stated_values(args: argparse.Namespace) -> dict[str, float]:
-    """The values that the command line states; raises `ParameterError` as `parse_entries`."""
+    """Return the values that the command line states; raises `ParameterError` as
+    `parse_entries`.
+    """
     return parse_entries(args.stated)
 
 

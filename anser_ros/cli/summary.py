@@ -153,7 +153,7 @@ COMMANDS: dict[str, tuple[tuple[Column, ...], Callable[[Mapping[str, Any]], Row]
 
 
 def row_of(command: str, outcome: Outcome) -> Row:
-    """A session as plain data, in SI units; None where a session has no such figure."""
+    """Return a session as plain data, in SI units; None where a session has no such figure."""
     columns, figures, _ = COMMANDS[command]
     found = figures(outcome.document) if outcome.document else {}
     return {
@@ -177,7 +177,9 @@ def write_summary(folder: Path, command: str, rows: Sequence[Row]) -> tuple[Path
 
 
 def table_of(command: str, rows: Sequence[Row]) -> Table:
-    """The rows for a terminal of 80 columns: names, the most important figures, or why not."""
+    """Return the rows for a terminal of 80 columns: names, the most important figures, or
+    why not.
+    """
     columns = [column for column in COMMANDS[command][0] if column.is_short]
     table = Table('session', *(column.heading for column in columns))
     failed = [row for row in rows if row['status'] != 'ok']

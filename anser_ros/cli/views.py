@@ -74,15 +74,15 @@ class Topics:
         return f'{self._prefix}{setup.frame_id}'
 
     def own(self, name: str) -> str:
-        """A topic of the nodes."""
+        """Return the name of a topic of the nodes."""
         return f'/{self.namespace}/{name}'
 
     def pose(self, name: str, ending: str = 'pose') -> str:
-        """The pose of a coil or a body."""
+        """Return the name of the topic of a coil's or body's pose."""
         return self.own(f'{topic_of(name)}/{ending}')
 
     def optical(self, body: str) -> str:
-        """The optical pose of a body."""
+        """Return the name of the topic of a body's optical pose."""
         return f'{self._optical}/{topic_of(body)}/pose'
 
 
@@ -101,7 +101,7 @@ def _cells(setup: Setup) -> int:
 
 
 def rviz_view(setup: Setup, topics: Topics) -> dict[str, Any]:
-    """The whole configuration of RViz as plain data."""
+    """Return the whole configuration of RViz as plain data."""
     view: dict[str, Any] = yaml.safe_load(read_config(RVIZ))
     manager = view['Visualization Manager']
     manager['Displays'] = list(_displays(manager['Displays'], setup, topics))
@@ -145,7 +145,7 @@ def _display(known: dict[str, Any], name: str, topic: str, shown: bool = True) -
 
 
 def foxglove_view(setup: Setup, topics: Topics) -> dict[str, Any]:
-    """The whole layout of Foxglove as plain data."""
+    """Return the whole layout of Foxglove as plain data."""
     view: dict[str, Any] = json.loads(read_config(FOXGLOVE))
     panels = view['configById']
     scene = panels['3D!tool']

@@ -57,7 +57,7 @@ class Fit:
         return self.effects[-1]
 
     def covariance_of(self, index: int) -> Array:
-        """Covariance of one term; where it is held, what it had when it was free."""
+        """Return the covariance of one term; where it is held, what it had when it was free."""
         held = self.terms[index].held
         if held is not None and held.covariance is not None:
             return held.covariance

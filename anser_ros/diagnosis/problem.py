@@ -82,7 +82,9 @@ class Problem:
         )
 
     def in_blocks(self, wanted: NDArray[np.int64], step: int = 1) -> 'Problem':
-        """Every ``step``-th frame of some blocks; bins of those blocks."""
+        """Return the problem of every ``step``-th frame of some blocks, with the bins of those
+        blocks.
+        """
         keep = []
         for blocks in self.blocks:
             rows = np.flatnonzero(np.isin(blocks, wanted))

@@ -11,7 +11,7 @@ def tool_parts(state: State) -> list[Part]:
 
 
 def rms(state: State) -> float:
-    """Residual of the tools with the jitter taken out, T a phasor component."""
+    """Return the residual of the tools with the jitter taken out, T a phasor component."""
     squares = sum(float(np.sum(part.white**2)) for part in tool_parts(state))
     count = sum(part.count for part in tool_parts(state))
     return float(np.sqrt(squares / max(count, 1))) * state.problem.spread.flux_t

@@ -40,7 +40,7 @@ def rich_modes(
     folds: int,
     most: int,
 ) -> tuple[float, Array] | None:
-    """Combinations of couplings, of the size that predicts held-out blocks best.
+    """Return combinations of couplings, of the size that predicts held-out blocks best.
 
     Parameters
     ----------

@@ -110,7 +110,7 @@ def _estimate(normal: Array, right: Array, prior: Array) -> Array:
 
 
 def spans(blocks: NDArray[np.int64], wanted: NDArray[np.int64]) -> list[slice]:
-    """Rows of each wanted block; frames are in the order of time, so a block is one run."""
+    """Return rows of each wanted block; frames are in the order of time, so a block is one run."""
     starts = np.searchsorted(blocks, wanted, side='left')
     ends = np.searchsorted(blocks, wanted, side='right')
     return [slice(int(a), int(b)) for a, b in zip(starts, ends, strict=True)]
@@ -142,7 +142,7 @@ def block_sums(state: State, columns: Columns, block_numbers: NDArray[np.int64])
 
 
 def joined(groups: Sequence[Columns]) -> list[Array | None]:
-    """Columns of several groups side by side; zeros where a group has none."""
+    """Return columns of several groups side by side; zeros where a group has none."""
     out: list[Array | None] = []
     for pieces in zip(*groups, strict=True):
         known = [p for p in pieces if p is not None]
@@ -200,7 +200,9 @@ class Scorer:
         self.held_out = self.sums.held_out(self.prior, folds) + state.penalty
 
     def score(self, term: 'Term') -> Score | None:
-        """Worth of a candidate; None when it touches no value, or is at a dipole's own place."""
+        """Return the worth of a candidate; None when it touches no value, or is at a dipole's own
+        place.
+        """
         probe = self.state.design(term, probe=True)
         width = _width(probe)
         if width == 0:

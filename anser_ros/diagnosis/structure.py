@@ -81,12 +81,15 @@ def _noise(parts: list[Part]) -> float:
 
 
 def noise_scale(state: State) -> float:
-    """Standard deviation of the white part of the tools' residuals, over the expected one."""
+    """Return the standard deviation of the white part of the tools' residuals, over the expected
+    one.
+    """
     return float(np.sqrt(_noise(_tools(state))))
 
 
 def noise_t(state: State) -> float:
-    """Noise of a phasor component, T: the white part, without the pose's own directions.
+    """Return the noise of a phasor component, T: the white part, without the pose's own
+    directions.
 
     Along those six directions of a frame the residual is as large as the jitter's prior allows,
     whatever the noise; they are taken off the count.

@@ -60,13 +60,15 @@ class Spread:
 
 
 def parts(values: ComplexArray) -> Array:
-    """Real, then imaginary parts of values (F, S, K, ...), flattened to (F, 2 S K, ...)."""
+    """Return real, then imaginary parts of values (F, S, K, ...), flattened to (F, 2 S K, ...)."""
     flat = values.reshape(values.shape[0], values.shape[1] * values.shape[2], *values.shape[3:])
     return np.concatenate([flat.real, flat.imag], axis=1)
 
 
 def pose_jacobian(view: View) -> Array:
-    """Derivative of the flux parts by the body's pose, (F, 2 S K, 6): m, rad about fg's axes."""
+    """Return the derivative of the flux parts by the body's pose, (F, 2 S K, 6): m, rad about fg's
+    axes.
+    """
     columns = np.concatenate([view.d_position, view.d_turn], axis=2)
     return parts(np.moveaxis(columns, 2, -1))
 
@@ -94,7 +96,9 @@ class Whitener:
 
     @staticmethod
     def of(weight: Array, directions: Array, known: int = 0) -> 'Whitener':
-        """From weights (F, n) and directions (F, n, m), the first ``known`` of them the pose's."""
+        """Make it from weights (F, n) and directions (F, n, m), the first ``known`` of them the
+        pose's.
+        """
         basis = directions * weight[..., None]
         gram = basis.transpose(0, 2, 1) @ basis
         values, vectors = np.linalg.eigh(gram)

@@ -53,7 +53,7 @@ class Apparatus:
 
     @property
     def channels(self) -> tuple[int, ...]:
-        """Channels of all sensors, those of the tools first."""
+        """Return channels of all sensors, those of the tools first."""
         extra = () if self.references is None else self.references.channel
         return self.tool_channels + tuple(int(c) for c in extra)
 

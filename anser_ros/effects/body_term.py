@@ -77,7 +77,7 @@ class BodyTerm(Term):
 
     @property
     def knots(self) -> int:
-        """Knots of a free course; 0 where the course has few parameters of its own kind."""
+        """Return knots of a free course; 0 where the course has few parameters of its own kind."""
         return 0
 
     @property
@@ -92,7 +92,7 @@ class BodyTerm(Term):
         return np.asarray(self.modes @ (parts[0] + 1j * parts[1]))
 
     def unit(self, view: View) -> NDArray[np.inexact]:
-        """Flux of each mode of unit amplitude in a view, (F, S, K, m), T."""
+        """Return the flux of each mode of unit amplitude in a view, (F, S, K, m), T."""
         raise NotImplementedError
 
     def with_body(self, kind: str, modes: Array, spread: Array) -> Self:
@@ -101,7 +101,9 @@ class BodyTerm(Term):
         return replace(self, kind=kind, modes=modes, spread=spread, theta=theta)
 
     def shaped(self, kind: str, modes: Array, richness: Richness) -> Self:
-        """The same course, a body of modes of unit prior size; a compact one has a ball's too."""
+        """Return the same course, a body of modes of unit prior size; a compact one has a ball's
+        too.
+        """
         spread = np.ones(modes.shape[1])
         if kind == COMPACT:
             ball = ball_modes()
@@ -110,7 +112,7 @@ class BodyTerm(Term):
         return replace(self.with_body(kind, modes, spread), richness=richness)
 
     def freer(self, knots: int) -> Self | None:
-        """The same body on a freer course near this one; None where there is none."""
+        """Return the same body on a freer course near this one; None where there is none."""
         return None
 
     def restarted(self) -> Self | None:

@@ -39,7 +39,7 @@ class ChannelCrosstalk(Effect[Term]):
     remedy = Remedy.FLUX
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Clusters as a whole, and pairs of channels of different clusters."""
+        """Try clusters as a whole, and pairs of channels of different clusters."""
         groups = [g for g in apparatus.clusters() if len(g) <= 4]
         inside = {pair for g in groups if len(g) > 2 for pair in combinations(sorted(g), 2)}
         pairs = [p for p in combinations(sorted(apparatus.tool_channels), 2) if p not in inside]
@@ -74,7 +74,7 @@ class ChannelCrosstalk(Effect[Term]):
         return matrix
 
     def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
-        """The cluster's block; a channel that is not there leaks nothing."""
+        """Mix the cluster's channels; one that is not there leaks nothing."""
         matrix, block = unit_matrix(channels.size), self._matrix(term)
         place = {int(c): row for row, c in enumerate(channels)}
         for i, to in enumerate(term.site['channels']):

@@ -32,7 +32,7 @@ class ClockRate(Effect[Term]):
         return [Term(self, {}, np.zeros(2))] if apparatus.tools else []
 
     def prior(self, term: Term) -> Array:
-        """A tenth of a second, a few thousand parts per million."""
+        """Expect a tenth of a second, and a few thousand parts per million."""
         return np.array([0.1, 3e-3])
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:

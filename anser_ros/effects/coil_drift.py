@@ -66,7 +66,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
         ]
 
     def amounts(self, term: CoilDriftTerm) -> NDArray[np.int64]:
-        """The amount alone: a drift of nothing has any time constant."""
+        """Return the amount's index alone: a drift of nothing has any time constant."""
         return np.array([0])
 
     def prior(self, term: CoilDriftTerm) -> Array:
@@ -79,7 +79,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
         return np.asarray(view.linear[:, :, coil] / factor[:, None])
 
     def columns(self, term: CoilDriftTerm, view: View) -> ComplexArray | None:
-        """The emitter's flux times the derivatives of the curve."""
+        """Return the emitter's flux times the derivatives of the curve."""
         amount, log_tau = term.theta
         tau = float(np.exp(log_tau))
         own, late = self._own(term, view), np.maximum(view.time, 0.0) / tau
@@ -113,12 +113,12 @@ class CoilDrift(Effect[CoilDriftTerm]):
         return (term.with_theta(best[1] if best else term.theta),)
 
     def bounded(self, term: CoilDriftTerm) -> CoilDriftTerm:
-        """Time constants from half a second to a quarter of an hour."""
+        """Keep the time constant between half a second and a quarter of an hour."""
         amount, log_tau = term.theta
         return term.with_theta(np.array([amount, np.clip(log_tau, np.log(0.3), np.log(1500.0))]))
 
     def emitter_matrix(self, term: CoilDriftTerm, time: Array, omega: Array) -> ComplexArray:
-        """The emitter's factor at each time, on the diagonal."""
+        """Return the emitter's factor at each time, on the diagonal."""
         amount, log_tau = term.theta
         matrix = np.repeat(unit_matrix(omega.size)[None], time.size, axis=0)
         coil = term.site['coil']

@@ -60,7 +60,7 @@ class ConductivePlate(Effect[Term]):
     inexact = np.inf
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Heights below the board and above the volume, two sizes."""
+        """Try heights below the board and above the volume, in two sizes."""
         size = float(np.max(apparatus.board[1, :2] - apparatus.board[0, :2]))
         middle = apparatus.board.mean(axis=0)
         below = apparatus.board[0, 2] - size * np.array([0.08, 0.16, 0.26, 0.4, 0.6])
@@ -76,11 +76,13 @@ class ConductivePlate(Effect[Term]):
         ]
 
     def amounts(self, term: Term) -> NDArray[np.int64]:
-        """The edge: a sheet without size is none."""
+        """Return the edge's index: a sheet without size is none."""
         return np.array([1])
 
     def prior(self, term: Term) -> Array:
-        """Heights and places near the board, resistances over decades; a held sheet stays."""
+        """Expect heights and places near the board, resistances over decades; a held sheet
+        stays.
+        """
         if term.held:
             return np.full(5, FROZEN)
         return np.array([0.1, 0.2, 0.1, 0.1, 3.0])
@@ -104,7 +106,7 @@ class ConductivePlate(Effect[Term]):
     def sources(
         self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
-        """The loops of the sheet; none where no amount has been set yet."""
+        """Return the loops of the sheet; none where no amount has been set yet."""
         z, edge, x, y, log_ohm = term.theta
         centre, edges = np.array([x, y, z]), np.array([edge, edge])
         return sheet_sources(centre, edges, float(np.exp(log_ohm)), MESH, illumination, omega)
@@ -126,7 +128,7 @@ class ConductivePlate(Effect[Term]):
         return np.stack(parts, axis=-1)
 
     def probe(self, term: Term, view: View) -> ComplexArray | None:
-        """A sheet of this height and size, any strength and phase."""
+        """Return the columns of a sheet of this height and size, of any strength and phase."""
         unit = self._flux(term.theta, view)
         return np.stack([unit, 1j * unit], axis=-1)
 

@@ -38,7 +38,7 @@ class DepartedTerm(MovingTerm):
         return self.alone.flux(view, shift) - self.alone.flux(self.resting(view), shift)
 
     def unit(self, view: View) -> NDArray[np.inexact]:
-        """The same of each mode of unit amplitude, (F, S, K, m)."""
+        """Return the flux of each mode of unit amplitude, (F, S, K, m)."""
         return np.asarray(self.alone.unit(view) - self.alone.unit(self.resting(view)))
 
     def rest_flux(self, view: View) -> ComplexArray:
@@ -46,7 +46,7 @@ class DepartedTerm(MovingTerm):
         return self.alone.flux(self.resting(view), np.zeros(3))
 
     def rest_columns(self, view: View) -> ComplexArray:
-        """Its derivatives by the parameters, (F, S, K, q)."""
+        """Return the derivative by the parameters of the flux of metal at rest, (F, S, K, q)."""
         columns = MovingMetal().columns(self.alone.free(), self.resting(view))
         return np.zeros((*view.flux.shape, 0), complex) if columns is None else columns
 
@@ -66,7 +66,7 @@ class DepartedMetal(MovingMetal):
     def starting(
         self, path: MetalPath, course: Array, duration: float, alpha: Array
     ) -> DepartedTerm:
-        """A simple body on a path; arguments as of `MovingMetal.starting`."""
+        """Return a simple body on a path; arguments as of `MovingMetal.starting`."""
         plain = super().starting(path, course, duration, alpha)
         parts = {f.name: getattr(plain, f.name) for f in fields(MovingTerm)}
         return DepartedTerm(**parts, rest_s=self.rest_s)

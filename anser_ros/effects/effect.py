@@ -149,7 +149,7 @@ class Effect(Generic[TermT]):
         return np.ones(term.theta.size)
 
     def columns(self, term: TermT, view: View) -> ComplexArray | None:
-        """Derivative of the view's flux by the parameters, (F, S, K, q), or None."""
+        """Return the derivative of the view's flux by the parameters, (F, S, K, q), or None."""
         return None
 
     def amounts(self, term: TermT) -> NDArray[np.int64]:
@@ -186,7 +186,7 @@ class Effect(Generic[TermT]):
         return ()
 
     def bounded(self, term: TermT) -> TermT:
-        """The term with its parameters brought back into their domain."""
+        """Return the term with its parameters brought back into their domain."""
         return term
 
     # --- comparison --------------------------------------------------------------------------
@@ -256,11 +256,13 @@ class Effect(Generic[TermT]):
         return np.zeros_like(view.flux)
 
     def emitter_matrix(self, term: TermT, time: Array, omega: Array) -> ComplexArray | None:
-        """Mixing of the emitters' tones, shape (F or 1, K, K): row the tone that is read."""
+        """Return the mixing of the emitters' tones, shape (F or 1, K, K): row the tone that is
+        read.
+        """
         return None
 
     def channel_matrix(self, term: TermT, channels: NDArray[np.int64]) -> ComplexArray | None:
-        """Mixing of the channels, shape (S, S): row the channel that is read."""
+        """Return the mixing of the channels, shape (S, S): row the channel that is read."""
         return None
 
     def gain_changes(self, term: TermT, sensors: SensorTable) -> Array | None:
@@ -281,7 +283,7 @@ class Effect(Generic[TermT]):
 
     # --- records -----------------------------------------------------------------------------
     def record(self, term: TermT, covariance: Array) -> EffectRecord:
-        """The term in the record's parameters; ``covariance`` (q, q) belongs to theta."""
+        """Return the term in the record's parameters; ``covariance`` (q, q) belongs to theta."""
         raise NotImplementedError
 
     def term(self, record: EffectRecord) -> TermT:
@@ -301,7 +303,7 @@ class Effect(Generic[TermT]):
 
 
 def needed(record: EffectRecord, key: str) -> Any:
-    """A record's parameter; raises `ModelFileError` when it is missing."""
+    """Return a record's parameter; raises `ModelFileError` when it is missing."""
     try:
         return record.parameters[key]
     except KeyError:

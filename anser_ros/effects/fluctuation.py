@@ -81,7 +81,7 @@ class Fluctuation(Effect[FluctuationTerm]):
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'rms': (0.0, 1.0)}
 
     def candidates(self, apparatus: Apparatus) -> Sequence[FluctuationTerm]:
-        """Every site of the constant effect on emitters and tools."""
+        """Try every site of the constant effect on emitters and tools."""
         ours = apparatus.tool_channels
         return [
             FluctuationTerm(self, term.site, constant=term)
@@ -113,7 +113,7 @@ class Fluctuation(Effect[FluctuationTerm]):
         return any(term.site[k] == other.site.get(k) for k in about)
 
     def freedom(self, term: FluctuationTerm) -> int:
-        """One value for each column in each frame."""
+        """Count one value for each column in each frame."""
         return 0 if term.spread is None else term.frames * len(term.spread)
 
     def directions(self, term: FluctuationTerm, view: View) -> ComplexArray | None:

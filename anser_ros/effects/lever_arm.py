@@ -35,7 +35,7 @@ class LeverArm(Effect[Term]):
         return np.full(3, 5e-3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """Derivative by the centres, along the body's axes."""
+        """Return the derivative by the centres, along the body's axes."""
         if view.is_reference or view.sensors.body[0] != term.site['body']:
             return None
         return np.asarray(np.einsum('fsik,fij->fskj', view.d_position, view.rotation))

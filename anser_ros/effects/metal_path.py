@@ -72,7 +72,7 @@ class StraightPath:
         return np.asarray(theta[:3] + self.progress(theta, time)[:, None] * way)
 
     def rates(self, theta: Array, time: Array) -> Array:
-        """Derivative of the centre by the parameters, (F, 3, 9)."""
+        """Return the derivative of the centre by the parameters, (F, 3, 9)."""
         span = max(float(theta[7] - theta[6]), SHORTEST)
         u = np.clip((time - theta[6]) / span, 0.0, 1.0)
         going = ((u > 0) & (u < 1)).astype(np.float64)
@@ -93,7 +93,7 @@ class StraightPath:
         return share, theta[:3] + share[:, None] * way, made
 
     def prior(self) -> Array:
-        """Places within decimetres, times within tens of seconds, any ease."""
+        """Expect places within decimetres, times within tens of seconds, and any ease."""
         return np.concatenate([np.full(6, 0.1), np.full(2, 10.0), [0.5]])
 
     def bounded(self, theta: Array) -> Array:
@@ -153,7 +153,7 @@ class FreePath:
 
     @staticmethod
     def through(knots: Array, time: Array, centres: Array) -> tuple['FreePath', Array]:
-        """The path nearest to a course (F, 3) at ascending times, and its parameters."""
+        """Return the path nearest to a course (F, 3) at ascending times, and its parameters."""
         path = FreePath(tuple(float(k) for k in knots))
         weights = path._weights(time)
         bend = 1e-3 * np.diff(np.eye(len(knots)), 2, axis=0)
@@ -163,7 +163,7 @@ class FreePath:
 
 
 def way_of(path: MetalPath, theta: Array, time: Array) -> tuple[Array, Array]:
-    """Fine times over those given, and the way made since the first, (T,) each, s and m."""
+    """Return fine times over those given, and the way made since the first, (T,) each, s and m."""
     count = max(3, int((time.max() - time.min()) / FINE_STEP_S) + 1)
     fine = np.linspace(time.min(), time.max(), count)
     steps = np.linalg.norm(np.diff(path.centre(theta, fine), axis=0), axis=1)

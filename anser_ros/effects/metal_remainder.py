@@ -62,7 +62,7 @@ class Couplings:
         return 2 * int(self.modes.shape[1])
 
     def unit(self, view: View) -> NDArray[np.inexact]:
-        """Flux of each mode, (F, S, K, m)."""
+        """Return the flux of each mode, (F, S, K, m)."""
         shapes = self.shapes
         ears = shapes.heard(self.centre, view.centres, view.axes, view.sensors.length)
         drive = shapes.driven(view.illumination.field(self.centre + shapes.offsets))
@@ -127,7 +127,7 @@ class Lighting:
         return out
 
     def sources(self, theta: Array, illumination: Dipoles, omega: Array) -> Dipoles:
-        """The dipoles of all errors of the light together."""
+        """Return the dipoles of all errors of the light together."""
         shares = theta.reshape(4, self.emitters)
         out = Dipoles.none(self.emitters)
         for share, answer in zip(shares, self._answers(illumination, omega), strict=True):
@@ -182,7 +182,7 @@ class MetalRemainder(Effect[RemainderTerm]):
         return term.leftover.sources(term.theta, illumination, omega)
 
     def record(self, term: RemainderTerm, covariance: Array) -> EffectRecord:
-        """Size only; the parent's record names the metal."""
+        """Record the size only; the parent's record names the metal."""
         rms = float(np.sqrt(np.mean(term.theta**2)))
         return EffectRecord(self.name, {'of': term.site['of'], 'rms': rms})
 

@@ -69,7 +69,7 @@ class MovingTerm(BodyTerm):
 
     @property
     def knots(self) -> int:
-        """Knots of a free path; 0 for a straight one."""
+        """Return knots of a free path; 0 for a straight one."""
         return len(self.path.knots)
 
     def centres(self, time: Array) -> Array:
@@ -93,11 +93,11 @@ class MovingTerm(BodyTerm):
         return self.shapes.flux(*self._seen(view, shift), self.couplings, view.omega)
 
     def unit(self, view: View) -> NDArray[np.inexact]:
-        """Flux of each mode of unit amplitude, (F, S, K, m)."""
+        """Return the flux of each mode of unit amplitude, (F, S, K, m)."""
         return self.shapes.mode_flux(*self._seen(view, np.zeros(3)), self.modes, view.omega)
 
     def freer(self, knots: int) -> Self | None:
-        """The same body on a free path with so many knots; None where it has as many."""
+        """Return the same body on a free path with so many knots; None where it has as many."""
         if self.knots >= knots:
             return None
         time = np.linspace(0.0, self.duration, 6 * knots)
@@ -132,7 +132,9 @@ class MovingMetal(Effect[MovingTerm]):
     def along(
         self, time: Array, course: Array, solution: Array, apparatus: Apparatus
     ) -> Sequence[MovingTerm]:
-        """A straight and a free path along the best places; ``solution`` is re, im of alpha."""
+        """Return a straight and a free path along the best places; ``solution`` is re, im of
+        alpha.
+        """
         duration, few = apparatus.duration, max(2, len(course) // 8)
         start, end = course[:few].mean(0), course[-few:].mean(0)
         path, knots = FreePath.through(np.linspace(0.0, duration, KNOTS), time, course)
@@ -147,7 +149,7 @@ class MovingMetal(Effect[MovingTerm]):
     def starting(
         self, path: MetalPath, course: Array, duration: float, alpha: Array
     ) -> MovingTerm:
-        """A simple body on a path with parameters ``course``; alpha: re, im in 1e-4 m^3."""
+        """Return a simple body on a path with parameters ``course``; alpha: re, im in 1e-4 m^3."""
         modes = ball_modes()
         amplitudes = np.zeros((2, modes.shape[1]))
         amplitudes[:, 0] = alpha
@@ -182,7 +184,7 @@ class MovingMetal(Effect[MovingTerm]):
         return term.with_theta(np.concatenate([course, term.theta[term.placed :]]))
 
     def columns(self, term: MovingTerm, view: View) -> ComplexArray | None:
-        """Derivatives by the path (differences, chained) and by the amplitudes (exact)."""
+        """Return derivatives by the path (differences, chained) and by the amplitudes (exact)."""
         unit = term.unit(view)
         out = view.columns(term.theta.size)
         groups = unit.shape[-1]
@@ -242,7 +244,7 @@ class MovingMetal(Effect[MovingTerm]):
         )
 
     def term(self, record: EffectRecord) -> MovingTerm:
-        """From path and couplings; every coupling is a mode of its own."""
+        """Make the term from path and couplings; every coupling is a mode of its own."""
         knots = tuple(float(k) for k in needed(record, 'knots_s'))
         course = np.asarray(needed(record, 'course'), dtype=np.float64)
         couplings = np.asarray(needed(record, 'couplings_m3'), dtype=np.float64) / UNIT

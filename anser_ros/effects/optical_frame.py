@@ -112,7 +112,7 @@ class RegistrationDrift(Effect[RegistrationDriftTerm]):
         return np.full(6, 5e-3)
 
     def amounts(self, term: RegistrationDriftTerm) -> NDArray[np.int64]:
-        """The growth alone: a constant shift is a registration's."""
+        """Return the growth's index alone: a constant shift is a registration's."""
         return np.arange(3, 6)
 
     def columns(self, term: RegistrationDriftTerm, view: View) -> ComplexArray | None:

@@ -35,7 +35,9 @@ class Registration(Effect[Term]):
         return np.repeat([0.02, 5e-3], 3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """All sensors turned about fg's origin and moved, the other way round."""
+        """Return the derivative by a turn about fg's origin and a shift, which all sensors make
+        the other way round.
+        """
         if view.is_reference:
             return None
         back = Rotation.from_rotvec(term.theta[:3]).as_matrix().T

@@ -38,7 +38,7 @@ def third_order(flux: ComplexArray) -> ComplexArray:
 
 
 def compressed(flux: ComplexArray, per_full_scale_squared: float, shape: str) -> ComplexArray:
-    """Amplitudes (..., K) behind the amplifier, averaged over the phases of the tones.
+    """Return amplitudes (..., K) behind the amplifier, averaged over the phases of the tones.
 
     The third order is exact; what lies above it is an average over a fixed lattice of phases.
     """
@@ -84,7 +84,7 @@ class Saturation(Effect[SaturationTerm]):
     inexact = 0.2  # the curve, and tones that mix into each other's place
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SaturationTerm]:
-        """Every channel of a tool; references don't see signals of different size."""
+        """Try every channel of a tool; references don't see signals of different size."""
         weights = {
             FLUX: np.ones(apparatus.emitters),
             VOLTAGE: apparatus.omega / apparatus.omega.mean(),
@@ -106,7 +106,7 @@ class Saturation(Effect[SaturationTerm]):
         return bool(candidate.site['channel'] == term.site['channel'])
 
     def prior(self, term: SaturationTerm) -> Array:
-        """Full scales down to the size of the signals."""
+        """Expect full scales down to the size of the signals."""
         return np.full(1, 3.0)
 
     def columns(self, term: SaturationTerm, view: View) -> ComplexArray | None:

@@ -52,7 +52,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
     remedy = Remedy.SENSORS
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SensorAxisTerm]:
-        """Every single tool sensor, and every cluster as a whole."""
+        """Try every single tool sensor, and every cluster as a whole."""
         axes = {
             int(c): tuple(float(v) for v in a)
             for table in apparatus.tools
@@ -114,7 +114,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
         return np.asarray(axis / np.linalg.norm(axis))
 
     def record(self, term: SensorAxisTerm, covariance: Array) -> EffectRecord:
-        """Tilt and true axis, or the cluster's rotation."""
+        """Record tilt and true axis, or the cluster's rotation."""
         if 'channel' not in term.site:
             return EffectRecord(
                 self.name,

@@ -37,7 +37,7 @@ class SensorPosition(Effect[Term]):
         return np.full(3, 5e-3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """Derivative by the centres of those sensors, along the body's axes."""
+        """Return the derivative by the centres of those sensors, along the body's axes."""
         rows = np.isin(view.sensors.channel, term.site['channels'])
         if view.is_reference or not rows.any():
             return None

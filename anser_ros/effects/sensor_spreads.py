@@ -60,7 +60,7 @@ class SpreadTerm(Term):
         return self.theta.reshape(len(self.members), -1)
 
     def of(self, channels: NDArray[np.generic]) -> Array:
-        """The values of listed channels, a row each; zero for one that is no member."""
+        """Return the values of listed channels, a row each; zero for one that is no member."""
         out = np.zeros((len(channels), self.values.shape[1]))
         place = {channel: row for row, channel in enumerate(self.members)}
         for row, channel in enumerate(np.asarray(channels, dtype=np.int64).tolist()):
@@ -168,7 +168,7 @@ class SensorGainSpread(SensorSpread):
         return out if found else None
 
     def record(self, term: SpreadTerm, covariance: Array) -> EffectRecord:
-        """As any population's; the spread is that of the gains that were found."""
+        """Record it as any population; the spread is that of the gains that were found."""
         width = float(np.std(term.theta[0::2])) if term.groups else term.spread
         return super().record(replace(term, spread=width), covariance)
 

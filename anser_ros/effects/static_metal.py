@@ -111,7 +111,7 @@ class StaticMetal(Effect[Term]):
         return np.arange(3, term.theta.size)
 
     def prior(self, term: Term) -> Array:
-        """Places within decimetres, a few litres of metal at most; held metal stays."""
+        """Expect places within decimetres, a few litres of metal at most; held metal stays."""
         place = FROZEN if term.held else 0.1
         return np.concatenate([np.full(3, place), np.full(term.theta.size - 3, 10.0)])
 

@@ -53,11 +53,11 @@ class Term:
         return replace(self, theta=np.asarray(theta, dtype=np.float64))
 
     def hold(self, covariance: Array | None = None) -> Self:
-        """The same term, held; ``covariance`` is kept for its record."""
+        """Return the same term, held; ``covariance`` is kept for its record."""
         return replace(self, held=Held(covariance))
 
     def free(self) -> Self:
-        """The same term with all parameters free again."""
+        """Return the same term with all parameters free again."""
         return replace(self, held=None)
 
     def belongs_to(self, other: 'Term') -> bool:

@@ -15,7 +15,7 @@ from anser_ros.physics.pose_track import PoseTrack
 
 
 def flux_rate(view: View) -> ComplexArray:
-    """Time derivative of the flux by the body's motion, (F, S, K), T/s."""
+    """Return the time derivative of the flux by the body's motion, (F, S, K), T/s."""
     lever = view.centres - view.position[:, None, :]
     moving = view.velocity[:, None, :3] + np.cross(view.velocity[:, None, 3:], lever)
     turning = np.cross(view.velocity[:, None, 3:], view.axes)

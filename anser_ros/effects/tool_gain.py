@@ -49,7 +49,7 @@ class ToolGain(Effect[Term]):
         return out
 
     def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
-        """The gain of the tool's channels on the diagonal."""
+        """Return the gain of the tool's channels on the diagonal."""
         own = np.isin(channels, term.site['channels'])
         return np.diag(np.where(own, 1 + complex(*term.theta), 1.0))
 

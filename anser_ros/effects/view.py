@@ -73,7 +73,7 @@ class View:
         return np.zeros((*self.flux.shape, count), dtype=complex)
 
     def frames(self, rows: NDArray[np.int64]) -> 'View':
-        """The view of some frames, named by index."""
+        """Return the view of some frames, named by index."""
         each = (
             'time', 'position', 'rotation', 'velocity', 'centres', 'axes', 'linear', 'flux',
             'd_position', 'd_axis', 'd_turn',
@@ -81,11 +81,11 @@ class View:
         return replace(self, **{name: getattr(self, name)[rows] for name in each})
 
     def along(self, field_flux: ComplexArray) -> ComplexArray:
-        """Fluxes of flattened sensors, shape (F S, K), in the shape (F, S, K)."""
+        """Return fluxes of flattened sensors, shape (F S, K), in the shape (F, S, K)."""
         return field_flux.reshape(self.flux.shape)
 
     @property
     def flat(self) -> tuple[Array, Array, Array]:
-        """Centres, axes (F S, 3) and lengths (F S,) of every sensor in every frame."""
+        """Return centres, axes (F S, 3) and lengths (F S,) of every sensor in every frame."""
         lengths = np.tile(self.sensors.length, self.time.size)
         return self.centres.reshape(-1, 3), self.axes.reshape(-1, 3), lengths

@@ -32,7 +32,7 @@ class SwappedChannels(Effect[Term]):
     family = Family.SEEN
 
     def channel_matrix(self, term: Term, channels: NDArray[np.int64]) -> ComplexArray:
-        """A permutation; channels of which one is missing stay as they are."""
+        """Return a permutation; channels of which one is missing stay as they are."""
         row = {int(c): i for i, c in enumerate(channels)}
         matrix = unit_matrix(channels.size)
         if not all(c in row for c in term.site['channels']):

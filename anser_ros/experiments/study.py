@@ -119,7 +119,7 @@ class Study:
 
     @cached_property
     def factory_calibration(self) -> Calibration:
-        """This package's model of the board without metal."""
+        """Return this package's model of the board without metal."""
         return self._ours('factory_tool_a', self.factory)
 
     @cached_property

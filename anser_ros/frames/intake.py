@@ -67,7 +67,7 @@ class Frame:
 
     @property
     def readings(self) -> ComplexArray:
-        """Fluxes without a fault, shape (S, K), T; NaN in place of the others."""
+        """Return fluxes without a fault, shape (S, K), T; NaN in place of the others."""
         return np.where(self.usable[:, None], self.flux, np.nan)
 
     @property

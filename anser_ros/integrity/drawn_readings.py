@@ -43,7 +43,7 @@ class DrawnReadings:
 
     @staticmethod
     def of(field: FieldAt, points: Array, axes: Array, lengths: Array) -> 'DrawnReadings':
-        """Readings of sensors of some lengths (S,), m, by Gauss' two points."""
+        """Return readings of sensors of some lengths (S,), m, by Gauss' two points."""
         ends = lengths[:, None] / np.sqrt(12.0) * axes
 
         def mean(places: Array) -> Array:

@@ -23,7 +23,9 @@ PITCH_M = 31.75e-3
 
 
 def places() -> Array:
-    """The places of the board, shape (41, 3), m: 5 x 5 row by row, then 4 x 4 between them."""
+    """Return the places of the board, shape (41, 3), m: 5 x 5 row by row, then 4 x 4
+    between them.
+    """
     outer, inner = np.arange(-2.0, 3.0), np.arange(4) - 1.5
     grid = [(x, y, 0.0) for line in (outer, inner) for y in line for x in line]
     return np.asarray(PITCH_M * np.array(grid))
@@ -59,7 +61,7 @@ def analyse(folder: Path) -> dict[str, ErrorMap]:
 
 
 def rows(analysis: dict[str, ErrorMap]) -> list[ReportRow]:
-    """In-plane errors before and after; a map that the blocks do not confirm is none."""
+    """Return in-plane errors before and after; a map that the blocks do not confirm is none."""
     out = []
     for name, found in analysis.items():
         before, after = 1e3 * found.before_m, 1e3 * found.after_m

@@ -109,7 +109,9 @@ def weigh(
     errors: ChipErrors,
     name: str,
 ) -> SharedError:
-    """Likelihood of one shared error: a parabola through three values, then at its top."""
+    """Return the likelihood of one shared error: a parabola through three values, then at
+    its top.
+    """
     here, step = likelihood(refit(array, coils, fits, errors)), STEPS[name]
     ends = [
         likelihood(refit(array.changed({name: sign * step}), coils, fits, errors))

@@ -153,7 +153,7 @@ def fold_of(array: SquidArray) -> NDArray[np.int64]:
 
 
 def predict_left_out(data: CoilData, fit: CoilFit) -> Array:
-    """Channels that took no part: the sources' field, and what their chip's others tell."""
+    """Return channels that took no part: the sources' field, and what their chip's others tell."""
     left = np.where(data.used, data.signals - fit.predicted, 0.0)
     return fit.predicted + fit.white.explained(left)
 
@@ -187,7 +187,7 @@ def student_loss(left: Array) -> float:
 
 
 def expected_power(array: SquidArray, data: CoilData, fit: CoilFit) -> Array:
-    """One yardstick for all predictions: variance (S,) by noise and chip errors."""
+    """Return one yardstick for all predictions: variance (S,) by noise and chip errors."""
     spread = array.chip_columns(fit.places_m[0], fit.moments[0])
     return np.asarray(
         data.noise**2
@@ -247,7 +247,9 @@ def analyse(folder: Path) -> HpiAnalysis:
 
 
 def relative_error(analysis: HpiAnalysis, predicted: Array, kind: NDArray[np.bool_]) -> float:
-    """Root of the summed squared error over the summed squared signal, %, channels of a kind."""
+    """Return the root of the summed squared error over the summed squared signal, %, channels of a
+    kind.
+    """
     keep = kind & ~analysis.findings.noisy
     signals = analysis.findings.signals[:, keep]
     return 100.0 * float(np.linalg.norm(predicted[:, keep] - signals) / np.linalg.norm(signals))

@@ -130,7 +130,8 @@ def plain_fit(array: SquidArray, data: CoilData, place: Array) -> Array:
 
 
 def student_weight(white: SquidWhitener, left: Array) -> Array:
-    """Weight of each chip, (C,): chips beside a stretch of lead that is not modelled count less.
+    """Return the weight of each chip, (C,): chips beside a stretch of lead that is not modelled
+    count less.
 
     Student's t of the chip's three residuals together, `FREEDOM` degrees of freedom.
     Source: K. Lange et al., J. Am. Stat. Assoc. 84 (1989) 881.

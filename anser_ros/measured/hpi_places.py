@@ -32,13 +32,13 @@ def order_of(places_m: Array, digitised_m: Array) -> list[int]:
 
 
 def distance_mm(places_m: Array, digitised_m: Array) -> float:
-    """Rms distance to the digitised places after rigid alignment, mm."""
+    """Return the rms distance to the digitised places after rigid alignment, mm."""
     order = order_of(places_m, digitised_m)
     return 1e3 * rms(rigid_distance(places_m[order], digitised_m))
 
 
 def outward(places_m: Array, moments: Array) -> Array:
-    """Axes of the coils, away from the middle of the head."""
+    """Return axes of the coils, away from the middle of the head."""
     axes = moments / np.linalg.norm(moments, axis=1, keepdims=True)
     away = places_m - places_m.mean(axis=0) + np.array([0.0, 0.0, 0.05])
     return np.asarray(axes * np.sign(np.sum(axes * away, axis=1))[:, None])

@@ -81,7 +81,8 @@ def whiteners(
     noise_t: float,
     jitter: Jitter,
 ) -> Array:
-    """Per frame, the inverse Cholesky factor of a reading's covariance, shape (F, 3S, 3S).
+    """Return the inverse Cholesky factor of a reading's covariance in each frame, shape (F, 3S,
+    3S).
 
     Noise is independent; the pose's jitter moves all readings of a frame together.
     """
@@ -167,7 +168,7 @@ def _noise(
 
 
 def blocks_of(frames: int, count: int) -> NDArray[np.int64]:
-    """Block of each frame: runs of neighbours, so that no held-out pose has a twin."""
+    """Return the block of each frame: runs of neighbours, so that no held-out pose has a twin."""
     return np.arange(frames) * count // frames
 
 

@@ -61,11 +61,11 @@ class Recording:
         return replace(self, **parts)
 
     def with_pose(self, magnet_m: Array, magnet_rotation: Array) -> 'Recording':
-        """The same sensors and fields, another pose of the magnet."""
+        """Return the same sensors and fields, another pose of the magnet."""
         return replace(self, magnet_m=magnet_m, magnet_rotation=magnet_rotation)
 
     def velocity(self) -> Array:
-        """Stated velocity of the magnet, m/s, shape (F, 3)."""
+        """Return the stated velocity of the magnet, m/s, shape (F, 3)."""
         if len(self.stamp_s) < 3 or not np.all(np.diff(self.stamp_s) > 0.0):
             return np.zeros_like(self.magnet_m)
         return np.asarray(np.gradient(self.magnet_m, self.stamp_s, axis=0))

@@ -51,7 +51,7 @@ learnt on the first file, the second one tracked."""
 
 
 def read_table(path: Path) -> tuple[list[str], Array]:
-    """Header and numbers of a CSV file; text columns become nan.
+    """Return the header and numbers of a CSV file; text columns become nan.
 
     Raises
     ------
@@ -75,7 +75,8 @@ def read_table(path: Path) -> tuple[list[str], Array]:
 
 
 def read_poses(path: Path, magnet: str) -> tuple[dict[str, Array], int]:
-    """Columns of a file of 16 sensors a pose, as (F, 16, 3) arrays; `magnet` is their prefix.
+    """Return columns of a file of 16 sensors a pose, as (F, 16, 3) arrays; `magnet` is their
+    prefix.
 
     Raises
     ------
@@ -105,7 +106,9 @@ def read_poses(path: Path, magnet: str) -> tuple[dict[str, Array], int]:
 
 
 def as_recording(name: str, parts: dict[str, Array], background_t: Array) -> Recording:
-    """SI units, matrices for rotation vectors, ambient field removed."""
+    """Return a table as a recording: SI units, matrices for rotation vectors, ambient field
+    removed.
+    """
     turn = Rotation.from_rotvec(parts['turn'].reshape(-1, 3)).as_matrix()
     frames = len(parts['field'])
     stamp = parts['stamp'].mean(axis=1) if 'stamp' in parts else np.arange(frames, dtype=float)
@@ -138,7 +141,7 @@ def file_names(folder: Path) -> list[str]:
 
 
 def patch_in_fg(recording: Recording) -> tuple[Array, Array]:
-    """Pose of the patch in the frame fg: rotations (F, 3, 3), positions (F, 3) in m.
+    """Return the pose of the patch in the frame fg: rotations (F, 3, 3), positions (F, 3) in m.
 
     The patch's own frame has its origin at the middle of the sensors and the optical axes.
     """
@@ -148,7 +151,9 @@ def patch_in_fg(recording: Recording) -> tuple[Array, Array]:
 
 
 def setup_of(recording: Recording) -> Setup:
-    """One emitter, three channels a sensor, as the first frame states them."""
+    """Return a setup of one emitter, and three channels a sensor, as the first frame states
+    them.
+    """
     place = recording.sensor_m[0] - recording.sensor_m[0].mean(axis=0)
     turn = recording.sensor_rotation[0]
     sensors = tuple(
@@ -178,7 +183,7 @@ def write_session(recording: Recording, path: Path) -> None:
 
 
 def write_sessions(folder: Path, into: Path) -> list[Path]:
-    """Every file of poses as a session; the files written."""
+    """Write every file of poses as a session; return the files written."""
     into.mkdir(parents=True, exist_ok=True)
     out = []
     for name in file_names(folder):
@@ -209,7 +214,7 @@ def commands(bags: list[Path], out: Path) -> list[list[str]]:
 
 
 def rows(bags: list[Path], out: Path) -> list[ReportRow]:
-    """Before and after, on files that took no part."""
+    """Return the errors before and after, on files that took no part."""
     made = []
     for bag, other in itertools.permutations(bags, 2):
         learnt, tracked = (path.stem.removeprefix('magnet_') for path in (bag, other))

@@ -36,7 +36,7 @@ OWN_POSE = 'as above, but pose and bend of the height left out from half its sen
 
 
 def rows(analysis: NavionAnalysis, folder: Path) -> list[ReportRow]:
-    """Before and after, on heights that took no part."""
+    """Return the errors before and after, on heights that took no part."""
     return [
         *_field_rows(analysis),
         *_state_rows(analysis),

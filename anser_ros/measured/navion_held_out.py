@@ -80,7 +80,9 @@ def others(data: PlateData, held: int) -> PlateData:
 
 
 def prediction_error(data: PlateData, held: int, fit: PlateFit) -> Array:
-    """Predicted minus measured coil fields (K, S, 3), T, of a height that took no part."""
+    """Return the predicted minus measured coil fields (K, S, 3), T, of a height that took
+    no part.
+    """
     height = float(data.height_m[held])
     predicted = predict_plane(data.grid_m, height, fit.sources, fit.errors, None)
     return np.asarray(predicted - data.field_t[held])
@@ -168,13 +170,13 @@ def add_metal(data: PlateData, cloud: Array, fit: PlateFit) -> PlateFit:
 
 
 def metal_places(fit: PlateFit) -> Array:
-    """Places (J, 3), m, of a fit's metal objects."""
+    """Return places (J, 3), m, of a fit's metal objects."""
     sources = fit.sources
     return sources.position_m[len(sources.position_m) - sources.n_metal :]
 
 
 def metal_text(fit: PlateFit) -> str:
-    """The objects' places in mm, for a person."""
+    """Return the objects' places in mm, for a person."""
     return '; '.join('({:.0f}, {:.0f}, {:.0f}) mm'.format(*(1e3 * p)) for p in metal_places(fit))
 
 

@@ -82,7 +82,7 @@ class Sources:
     n_metal: int = 0
 
     def field(self, points: Array) -> Array:
-        """Field of each coil's full current at `points` (P, 3): shape (P, 3, K), T."""
+        """Return the field of each coil's full current at `points` (P, 3): shape (P, 3, K), T."""
         basis = vector_basis(points, self.position_m)
         flat = self.moment_am2.reshape(-1, self.moment_am2.shape[2])
         return np.asarray(np.einsum('pim,mk->pik', basis, flat))
@@ -94,7 +94,9 @@ class Sources:
         return Sources(self.position_m[:count], self.moment_am2[:count])
 
     def gradient(self, points: Array, only: slice = slice(None)) -> Array:
-        """Gradient ``dB_i / dx_j`` of each coil: shape (P, 3, 3, K), T/m; `only` picks dipoles."""
+        """Return the gradient ``dB_i / dx_j`` of each coil: shape (P, 3, 3, K), T/m; `only` picks
+        dipoles.
+        """
         place, direction = vector_dipoles(self.position_m[only])
         moment = self.moment_am2[only].reshape(-1, self.moment_am2.shape[2]).astype(complex)
         parts = [
@@ -105,12 +107,16 @@ class Sources:
 
 
 def vector_dipoles(positions: Array) -> tuple[Array, Array]:
-    """Three unit dipoles along x, y and z at every position: places and directions (3N, 3)."""
+    """Return three unit dipoles along x, y and z at every position: places and directions
+    (3N, 3).
+    """
     return np.repeat(positions, 3, axis=0), np.tile(np.eye(3), (len(positions), 1))
 
 
 def vector_basis(points: Array, positions: Array) -> Array:
-    """Field at `points` (P, 3) per component of each dipole's moment: (P, 3, 3N), T/(A m^2)."""
+    """Return the field at `points` (P, 3) per component of each dipole's moment: (P, 3, 3N), T/(A
+    m^2).
+    """
     return field_basis(points, *vector_dipoles(positions)).transpose(0, 2, 1)
 
 
@@ -144,7 +150,7 @@ class Plate:
         return 6 + int(self.lift.shape[1])
 
     def place(self, height_m: float, state: Array, shift_m: Array) -> tuple[Array, Array]:
-        """Positions (S, 3) and rotations (S, 3, 3) of the sensors at one height."""
+        """Return positions (S, 3) and rotations (S, 3, 3) of the sensors at one height."""
         whole = rotation_matrices(state[None, 3:6])[0]
         local = self.grid_m + shift_m - self.centre
         local[:, 2] += self.lift @ state[6:]

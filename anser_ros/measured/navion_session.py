@@ -41,7 +41,9 @@ CURRENT_A = 35.0
 
 
 def in_fg(points: Array) -> Array:
-    """Points (P, 3) of the data set's frame in fg, m: the magnets lie below, the sensors above."""
+    """Return points (P, 3) of the data set's frame in fg, m: the magnets lie below, the sensors
+    above.
+    """
     return np.asarray(points @ TURN.T + [0.0, 0.0, PLANE_M])
 
 

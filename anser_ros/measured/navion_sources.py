@@ -49,7 +49,7 @@ def locate_magnets(data: PlateData) -> Array:
 
 
 def magnet_cloud(magnets_m: Array, radius_m: float = CLOUD_RADIUS) -> Array:
-    """Thirteen dipole places a magnet: its centre and the corners of a cuboctahedron."""
+    """Return thirteen dipole places a magnet: its centre and the corners of a cuboctahedron."""
     pairs = [(0, 1), (0, 2), (1, 2)]
     corners = [np.zeros(3)]
     for i, j in pairs:
@@ -62,7 +62,9 @@ def magnet_cloud(magnets_m: Array, radius_m: float = CLOUD_RADIUS) -> Array:
 
 
 def outside_points(data: PlateData, step_m: float, margin: float, reach: float) -> Array:
-    """Grid points (n, 3) around the measured volume, at least `margin` away from its box."""
+    """Return grid points (n, 3) around the measured volume, at least `margin` away from its
+    box.
+    """
     points = _nominal_points(data).reshape(-1, 3)
     low, high = points.min(axis=0), points.max(axis=0)
     axes = [

@@ -40,7 +40,7 @@ def split_states(reading_t: Array, sign: Array) -> Array:
 
 
 def join_states(terms_t: Array, sign: Array) -> Array:
-    """Readings (8, ...) of the eight states from their terms (8, ...)."""
+    """Return readings (8, ...) of the eight states from their terms (8, ...)."""
     return np.asarray(np.tensordot(_design(sign), terms_t, axes=1))
 
 
@@ -101,7 +101,9 @@ def predict_memory(data: PlateData, fit: PlateFit, memory: Memory) -> Array:
 
 
 def sensor_frames(data: PlateData, fit: PlateFit, states: Array) -> tuple[Array, Array]:
-    """Positions (P, S, 3) and sensing matrices (P, S, 3, 3) of the sensors at some heights."""
+    """Return positions (P, S, 3) and sensing matrices (P, S, 3, 3) of the sensors at some
+    heights.
+    """
     plate = Plate(data.grid_m)
     placed = [
         plate.place(height, state, fit.errors.shift_m)

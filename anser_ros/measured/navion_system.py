@@ -248,7 +248,7 @@ class System:
         return out.reshape(self.n_sensors, -1, n_columns)
 
     def dipole_columns(self, positions: Array) -> Array:
-        """Readings per component of each dipole's moment: shape (S, P, 3, 3N)."""
+        """Return readings per component of each dipole's moment: shape (S, P, 3, 3N)."""
         basis = vector_basis(self.position.reshape(-1, 3), positions)
         basis = basis.reshape(*self.position.shape[:2], 3, -1)
         return np.asarray((self.sensing @ basis).transpose(1, 0, 2, 3))
@@ -284,7 +284,7 @@ class System:
         self.normal = self.white.T @ self.white + problem.prior
 
     def solve(self) -> Solution:
-        """Shared unknowns by generalised least squares, then each sensor's given those."""
+        """Return shared unknowns by generalised least squares, then each sensor's given those."""
         shared = np.linalg.solve(self.normal, self.white.T @ self.white_target)
         rest = self.target - self.shared @ shared
         spread = self.own * self.now.width
@@ -296,7 +296,7 @@ class System:
         return Solution(shared, sensor, np.maximum(variance, 0.0), residual)
 
     def residual(self, solution: Solution) -> Array:
-        """Residual (S, K, P, 3), T, of the linearised model."""
+        """Return the residual (S, K, P, 3), T, of the linearised model."""
         return solution.residual.reshape(self.problem.reading.shape)
 
     def log_evidence(self, solution: Solution) -> float:

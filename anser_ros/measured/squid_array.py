@@ -147,12 +147,12 @@ class SquidWhitener:
         return out
 
     def weighted(self, weight: Array) -> 'SquidWhitener':
-        """The same with each chip's covariance divided by its weight (C,)."""
+        """Return the same with each chip's covariance divided by its weight (C,)."""
         root = np.sqrt(weight)[:, None, None]
         return replace(self, factors=self.factors * root, shared=self.shared / root**2)
 
     def apply(self, values: Array) -> Array:
-        """Whitened values of channels, (S,) or (S, n), chip by chip."""
+        """Return whitened values of channels, (S,) or (S, n), chip by chip."""
         own = values.reshape(len(values), -1)[self.chips]
         white = np.einsum('cij,cjn->cin', self.factors, own)
         return np.asarray(white.reshape(-1, *values.shape[1:]))
@@ -166,7 +166,7 @@ def whitener(
     errors: ChipErrors,
     used: NDArray[np.bool_],
 ) -> SquidWhitener:
-    """Covariance of each chip's channels: noise, gain, place and tilt."""
+    """Return the covariance of each chip's channels: noise, gain, place and tilt."""
     chips = array.chips
     variance = noise**2 + (errors.gain * predicted) ** 2
     own = columns[chips]

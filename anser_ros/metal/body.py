@@ -84,7 +84,7 @@ def multipoles() -> Shapes:
 
 
 def body_spread(radius: float, odd: float) -> Array:
-    """Prior size of each coupling in a body of a radius (m), shape (`Shapes.size`,).
+    """Return the prior size of each coupling in a body of a radius (m), shape (`Shapes.size`,).
 
     Couplings that a symmetric body lacks have the share ``odd`` of it.
     """
@@ -118,8 +118,9 @@ def centre_sigma(polarisability: NDArray[np.complexfloating]) -> float:
 
 @cache
 def ball_modes() -> Array:
-    """Couplings (`Shapes.size`, 7) of a simple body: a unit polarisability, its five traceless
-    tensors, and the quadrupoles of a ball."""
+    """Return couplings (`Shapes.size`, 7) of a simple body: a unit polarisability, its five
+    traceless tensors, and the quadrupoles of a ball.
+    """
     shapes = multipoles()
     where = {(i, j): n for n, (i, j) in enumerate(zip(shapes.first, shapes.second, strict=True))}
     modes = np.zeros((shapes.size, 7))
@@ -135,7 +136,9 @@ def ball_modes() -> Array:
 
 @cache
 def lattice(spacing: float) -> Shapes:
-    """An extended body: pieces that each answer to the field along x, y and z where they are."""
+    """Return an extended body: pieces that each answer to the field along x, y and z where they
+    are.
+    """
     lateral, upright = (np.arange(6) - 2.5) * spacing, (np.arange(2) - 0.5) * spacing
     offsets = np.array([(a, b, c) for a in lateral for b in lateral for c in upright])
     functionals = np.eye(3 * len(offsets)).reshape(-1, len(offsets), 3)

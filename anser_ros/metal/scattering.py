@@ -60,11 +60,13 @@ class Shapes:
 
     @property
     def size(self) -> int:
-        """Couplings in all: the pairs', then what the sloped ones gain with log f."""
+        """Return how many couplings there are: the pairs', then what the sloped ones gain with log
+        f.
+        """
         return int(self.first.size + self.sloped.size)
 
     def driven(self, field: ComplexArray) -> ComplexArray:
-        """Amplitudes (..., K, M) from the fields (..., n, 3, K) at the points."""
+        """Return amplitudes (..., K, M) from the fields (..., n, 3, K) at the points."""
         shape = (*field.shape[:-3], -1, field.shape[-1])
         if self.local:
             return np.asarray(np.swapaxes(field.reshape(shape), -1, -2))
@@ -72,7 +74,7 @@ class Shapes:
         return np.asarray(np.swapaxes(flat @ field.reshape(shape), -1, -2))
 
     def heard(self, centre: Array, centres: Array, axes: Array, lengths: Array) -> Array:
-        """Amplitudes of unit dipoles in the sensors' places, T / (A m^2).
+        """Return amplitudes of unit dipoles in the sensors' places, T / (A m^2).
 
         Parameters
         ----------
@@ -99,7 +101,7 @@ class Shapes:
     def mode_flux(
         self, ears: Array, drive: ComplexArray, modes: Array, omega: Array
     ) -> NDArray[np.inexact]:
-        """Flux (..., S, K, m) of modes (`size`, m) of unit amplitude.
+        """Return the flux (..., S, K, m) of modes (`size`, m) of unit amplitude.
 
         ``ears`` has the shape (..., S, M), ``drive`` (..., K, M), ``omega`` (K,).
         """
@@ -150,20 +152,20 @@ class Shapes:
         return out * (UNIT / MU_0)
 
     def matrix(self, couplings: ComplexArray) -> ComplexArray:
-        """T (M, M) from the couplings of the pairs (P,)."""
+        """Return T (M, M) from the couplings of the pairs (P,)."""
         out = np.zeros((len(self.functionals),) * 2, dtype=complex)
         out[self.first, self.second] = couplings
         return np.where(np.eye(len(out), dtype=bool), out, (out + out.T) / np.sqrt(2))
 
     def polarisability(self, couplings: ComplexArray) -> ComplexArray:
-        """Moment in a uniform field over that field / mu0, shape (3, 3), m^3."""
+        """Return the moment in a uniform field over that field / mu0, shape (3, 3), m^3."""
         uniform = self.functionals.sum(axis=1)
         return np.asarray(uniform.T @ self.matrix(couplings[: self.first.size]) @ uniform * UNIT)
 
     def flux(
         self, ears: Array, drive: ComplexArray, couplings: ComplexArray, omega: Array
     ) -> ComplexArray:
-        """Flux (..., S, K) of metal with these couplings."""
+        """Return the flux (..., S, K) of metal with these couplings."""
         return np.asarray(ears @ np.swapaxes(self.answer(drive, couplings, omega), -1, -2))
 
     def sources(
@@ -182,7 +184,7 @@ def tilt(omega: Array) -> Array:
 
 
 def dipole_coupling(points: Array, centres: Array, axes: Array) -> Array:
-    """Flux of unit moments along x, y, z at points (..., n, 3) in sensors, T / (A m^2).
+    """Return the flux of unit moments along x, y, z at points (..., n, 3) in sensors, T / (A m^2).
 
     Sensors (..., S, 3) are taken as points; the result has the shape (..., S, n, 3).
     """

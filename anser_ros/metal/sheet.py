@@ -79,7 +79,7 @@ def _modes(count: int) -> tuple[Array, Array]:
 def sheet_sources(
     centre: Array, edges: Array, sheet_ohm: float, count: int, illumination: Dipoles, omega: Array
 ) -> Dipoles:
-    """Loops of a sheet parallel to the board, as dipoles along z.
+    """Return loops of a sheet parallel to the board, as dipoles along z.
 
     Parameters
     ----------
@@ -126,7 +126,9 @@ def _unit_shapes() -> tuple[Shapes, Array]:
 
 
 def sheet_shapes(edge: float) -> Shapes:
-    """Shapes of the field through a square sheet, its edge (m) a little wider than the sheet."""
+    """Return shapes of the field through a square sheet, its edge (m) a little wider than the
+    sheet.
+    """
     shapes, _ = _unit_shapes()
     size = WIDER * edge
     return replace(shapes, offsets=size * shapes.offsets, functionals=size * shapes.functionals)

@@ -385,7 +385,7 @@ class Acquisition(AnserNode):
         return Level.OK, 'streaming'
 
     def part_statuses(self) -> list[Status]:
-        """Amplitude, noise and current of each emitter; state and noise of each sensor."""
+        """Return the state of each emitter (amplitude, noise, current) and of each sensor."""
         stream, frame = self._stream, self._frame
         if stream is None or frame is None or len(frame.flags) != len(stream.sensors):
             return []

@@ -14,7 +14,7 @@ from anser_ros.wire.points import FluxPoints, decode_flux
 
 
 def read_flux(message: PointCloud2) -> tuple[int, FluxPoints]:
-    """Stamp (ns) and points of a flux message.
+    """Return the stamp (ns) and points of a flux message.
 
     Raises
     ------

@@ -107,7 +107,7 @@ class ModelWriter:
 
 
 def layout_of(message: PointCloud2) -> list[PointFieldTuple]:
-    """The fields of a cloud as plain tuples."""
+    """Return the fields of a cloud as plain tuples."""
     return [(f.name, f.offset, f.datatype, f.count) for f in message.fields]
 
 

@@ -163,5 +163,5 @@ def transform_publisher(node: Any) -> Any:
 
 
 def transform_message(topics: list[PoseTopic]) -> Any:
-    """One /tf message with the transforms of these topics."""
+    """Return one /tf message with the transforms of these topics."""
     return TFMessage(transforms=[topic.transform for topic in topics])

@@ -12,7 +12,7 @@ from anser_ros.settings import VALUES, settings_from
 
 
 def stated(name: str) -> Any:
-    """The field of a parameter table for a value of `VALUES`; see `parameter`."""
+    """Return the field of a parameter table for a value of `VALUES`; see `parameter`."""
     item = VALUES[name]
     meaning, high = item.metadata['meaning'], item.metadata['high']
     text = f'{meaning}; 0 for that of the setup document, or {item.default:.4g} without one'

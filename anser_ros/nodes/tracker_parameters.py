@@ -90,7 +90,7 @@ class TrackerParameters:
 
 
 def settings_of(table: TrackerParameters) -> TrackerSettings:
-    """Settings of the core.
+    """Return settings of the core.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def settings_of(table: TrackerParameters) -> TrackerSettings:
 
 
 def tips_of_file(path: str) -> dict[str, TipSpec]:
-    """Tips of a file by body; none where no file is named.
+    """Return tips of a file by body; none where no file is named.
 
     Raises
     ------

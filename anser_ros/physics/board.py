@@ -58,7 +58,7 @@ class Board:
 
     @property
     def paths(self) -> tuple[Array, ...]:
-        """Corners of every coil's path, each of shape (M, 3), m, frame fg."""
+        """Return corners of every coil's path, each of shape (M, 3), m, frame fg."""
         pairs = zip(self.rotations, self.centres, strict=True)
         return tuple(self.shape @ turn.T + centre for turn, centre in pairs)
 

@@ -80,7 +80,8 @@ class PoseTrack:
         return position, rotation, valid
 
     def velocity(self, time: Array) -> Array:
-        """Velocity (m/s) and angular velocity (rad/s) at some times, frame fg, shape (F, 6).
+        """Return the velocity (m/s) and angular velocity (rad/s) at some times, frame fg, shape
+        (F, 6).
 
         Each is the mean over `VELOCITY_STEP_S` before and after, as far as the track goes.
 

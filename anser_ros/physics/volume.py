@@ -82,12 +82,12 @@ class TrackedVolume:
 
     @property
     def middle(self) -> Array:
-        """The x and y of the middle of the box, m, shape (2,)."""
+        """Return the x and y of the middle of the box, m, shape (2,)."""
         return np.array([(a + b) / 2.0 for a, b in zip(self.low[:2], self.high[:2], strict=True)])
 
     @property
     def reach(self) -> Array:
-        """Half of the box's sides along x and y, m, shape (2,)."""
+        """Return half of the box's sides along x and y, m, shape (2,)."""
         return np.array([(b - a) / 2.0 for a, b in zip(self.low[:2], self.high[:2], strict=True)])
 
     @property

@@ -49,7 +49,7 @@ class PoseReading:
         return (self.quaternion, self.handedness, self.unit) == ('xyzw', 'right', 'm')
 
     def record(self, before: float, after: float, ratio: float) -> EffectRecord:
-        """The reading as an effect.
+        """Return the reading as an effect.
 
         Parameters
         ----------

@@ -281,7 +281,8 @@ def lever_blur(part: PosePart, jitter_rad: float) -> Array:
 
 
 def turn_jitter(reference: PoseSequence) -> float:
-    """Jitter of a reference's orientation, rad a coordinate, from its quietest stretches.
+    """Return the jitter of a reference's orientation, rad a coordinate, from its quietest
+    stretches.
 
     The squared second difference of noise has six times its variance a coordinate; the lowest
     quarter of that with three coordinates is at 1.21.
@@ -301,7 +302,9 @@ def hand_eye_record(
     frame_spread: Array | None,
     blurred: Array,
 ) -> EffectRecord:
-    """OpticalFrame, lever arm and mount of a sensor; None where the motion does not tell."""
+    """Return optical frame, lever arm and mount of a sensor; None where the motion does not
+    tell.
+    """
 
     def degrees(matrix: Array) -> list[float]:
         turn = np.rad2deg(Rotation.from_matrix(matrix).as_rotvec())

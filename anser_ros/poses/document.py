@@ -14,7 +14,7 @@ MODEL_SCHEMA = 'anser_pose_model/1'
 
 
 def to_document(found: PoseDiagnosis) -> dict[str, Any]:
-    """The diagnosis as plain data; figures of fluxes are null."""
+    """Return the diagnosis as plain data; figures of fluxes are null."""
     before, after = found.before, found.after
     document: dict[str, Any] = {
         'schema': SCHEMA,

@@ -106,7 +106,8 @@ class PoseEffect(Effect[Term]):
         return ()
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
-        """Derivative of predicted less measured pose by the parameters, shape (n, 6, q).
+        """Return the derivative of predicted less measured pose by the parameters, shape (n, 6,
+        q).
 
         Rows are m and rad along the axes of the tracker's frame; None where it does nothing.
         """

@@ -112,7 +112,8 @@ class HandEye:
 
 
 def as_pairs(session: PoseSession) -> PoseSession:
-    """The n-th pose of every sensor beside the n-th of the reference, whatever their stamps.
+    """Return the n-th pose of every sensor beside the n-th of the reference, whatever their
+    stamps.
 
     Raises
     ------
@@ -285,13 +286,15 @@ def _open_lever(name: str, lever: Array, turn: Array) -> list[str]:
 
 
 def matrix_of(rotation: Array, translation: Array) -> Array:
-    """A rotation and a translation as one matrix, shape (4, 4); NaN where either is unknown."""
+    """Return a rotation and a translation as one matrix, shape (4, 4); NaN where either is
+    unknown.
+    """
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation, translation
     return matrix
 
 
 def turn_of(rotation: Array) -> tuple[list[float], list[float]]:
-    """A rotation matrix as a rotation vector, degrees, and a quaternion x y z w."""
+    """Return a rotation matrix as a rotation vector, degrees, and a quaternion x y z w."""
     turn = Rotation.from_matrix(rotation)
     return np.rad2deg(turn.as_rotvec()).tolist(), turn.as_quat().tolist()

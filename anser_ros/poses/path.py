@@ -45,7 +45,7 @@ class OpticalPath:
 
     @classmethod
     def through(cls, track: PoseTrack, is_at_rest: bool = False) -> 'OpticalPath':
-        """The path through a track's poses.
+        """Return the path through a track's poses.
 
         Raises
         ------
@@ -71,7 +71,8 @@ class OpticalPath:
         return cls(time, gap, is_at_rest, CubicHermiteSpline(time, values, slopes))
 
     def at(self, time: Array) -> tuple[Array, Array, Array, Mask]:
-        """Positions (n, 3), rotations (n, 3, 3), velocities (n, 6) in the optical frame, validity.
+        """Return positions (n, 3), rotations (n, 3, 3), velocities (n, 6) in the optical frame,
+        validity.
 
         What is not valid is at the nearest pose, at rest.
         """

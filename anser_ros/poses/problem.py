@@ -206,7 +206,7 @@ class PoseState:
         return float(np.sqrt(squares[:3].sum())), float(np.sqrt(squares[3:].sum()))
 
     def sums(self, terms: Sequence[Term] | None = None, in_space: bool = False) -> BlockSums:
-        """Normal equations of the terms' parameters, block by block."""
+        """Return normal equations of the terms' parameters, block by block."""
         wanted = self.terms if terms is None else tuple(terms)
         sizes = [term.theta.size for term in wanted]
         edges = np.concatenate([[0], np.cumsum(sizes)]).astype(int)

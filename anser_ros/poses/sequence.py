@@ -59,7 +59,7 @@ class PoseSequence:
 
     @property
     def rotation(self) -> Array:
-        """Rotation matrices, shape (n, 3, 3), from the sensor's frame to the tracker's."""
+        """Return rotation matrices, shape (n, 3, 3), from the sensor's frame to the tracker's."""
         return np.asarray(Rotation.from_quat(self.quaternion).as_matrix()).reshape(-1, 3, 3)
 
     def rows(self, keep: NDArray[np.generic]) -> 'PoseSequence':
@@ -119,7 +119,8 @@ class PoseSession:
 
 
 def leaps(poses: PoseSequence) -> Mask:
-    """Mask (n,) of single poses, or a few, that leap away from those before and after them.
+    """Return the mask (n,) of single poses, or a few, that leap away from those before and after
+    them.
 
     A marker seen in its other solution does: it is far off between two poses that agree.
     """

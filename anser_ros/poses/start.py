@@ -203,7 +203,7 @@ def frames_from_places(tracked: Array, optical: Array) -> Array:
 
 
 def frames_from_turns(tracked: Array, optical: Array) -> Array:
-    """The rotation (3, 3) from the optical frame to the tracker's, from quaternions alone.
+    """Return the rotation (3, 3) from the optical frame to the tracker's, from quaternions alone.
 
     ``q_tracked = q_frame q_optical q_mount`` is a rotation of four dimensions, which is found as
     any rotation is from pairs; it splits into the two factors.

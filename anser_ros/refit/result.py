@@ -138,7 +138,7 @@ class RefitResult:
 
     @cached_property
     def references(self) -> tuple[ReferenceHealth, ...]:
-        """Health of every reference, computed when first asked for."""
+        """Return the health of every reference, computed when first asked for."""
         return self.judge()
 
     @property
@@ -148,5 +148,5 @@ class RefitResult:
 
     @cached_property
     def metal(self) -> Metal | None:
-        """The sources found, computed when first asked for; None without a change."""
+        """Return the sources found, computed when first asked for; None without a change."""
         return self.find() if self.find is not None else None

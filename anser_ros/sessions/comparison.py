@@ -77,7 +77,9 @@ class Compared(Difference):
 
     @property
     def verdict(self) -> str:
-        """Which errs less: ``a``, ``b``, or ``neither``, where the interval has room for both."""
+        """Return which errs less: ``a``, ``b``, or ``neither``, where the interval has room for
+        both.
+        """
         return {1: 'a', 0: 'neither', -1: 'b'}[self.sign]
 
 

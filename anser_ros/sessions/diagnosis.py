@@ -107,7 +107,7 @@ def diagnose_session(
 
 
 def problem_of(corrected: PreparedSession, spread: Spread | None = None) -> Problem:
-    """The diagnosis problem of a session.
+    """Return the diagnosis problem of a session.
 
     Parameters
     ----------

@@ -34,7 +34,9 @@ class Drawing:
 
     @property
     def field(self) -> FieldFunction | None:
-        """Field at the nominal currents: points (P, 3) in m, frame fg, to (P, K, 3) in T."""
+        """Return the field at the nominal currents: points (P, 3) in m, frame fg, to (P, K, 3) in
+        T.
+        """
         return None if self.board is None else self.board.field
 
     @cached_property

@@ -10,7 +10,7 @@ SCHEMA = 'anser_evaluation/1'
 
 
 def to_document(evaluation: Evaluation) -> dict[str, Any]:
-    """The figures of every sensor and body as plain data.
+    """Return the figures of every sensor and body as plain data.
 
     Where the model followed the references, the number of frames in each state of the refit, and
     in how many each reference sensor was left out, are there too.

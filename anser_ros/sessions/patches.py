@@ -20,7 +20,7 @@ ComplexArray = NDArray[np.complex128]
 
 
 def parse_patches(entries: Sequence[str]) -> dict[str, str]:
-    """Topic of every patch's body from entries ``body=topic``.
+    """Return the topic of every patch's body from entries ``body=topic``.
 
     Raises
     ------

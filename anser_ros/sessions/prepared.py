@@ -62,11 +62,13 @@ class PreparedSession:
         return self.session.sensors
 
     def with_session(self, session: Session) -> 'PreparedSession':
-        """The same for a part of the session, or for another recording of the same setup."""
+        """Return the same for a part of the session, or for another recording of the same
+        setup.
+        """
         return replace(self, session=session, recorded_drift=is_recorded(self.model, session))
 
     def with_model(self, model: FieldModel) -> 'PreparedSession':
-        """The same with another model.
+        """Return the same with another model.
 
         Raises
         ------

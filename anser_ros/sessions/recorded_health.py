@@ -45,7 +45,7 @@ def last_words(path: str | os.PathLike[str]) -> dict[str, Mapping[str, str]]:
 
 
 def first_warnings(path: str | os.PathLike[str], part_of: str) -> dict[str, int]:
-    """When each part of a node first warned.
+    """Return when each part of a node first warned.
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ def published_poses(path: str | os.PathLike[str], topics: Sequence[str]) -> dict
 
 
 def live_errors(prepared: PreparedSession, namespace: str) -> dict[str, LiveErrors]:
-    """Errors of everything that the tracker of a namespace published, by sensor and body.
+    """Return errors of everything that the tracker of a namespace published, by sensor and body.
 
     Parameters
     ----------

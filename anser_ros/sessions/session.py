@@ -55,7 +55,7 @@ class Session:
 
     @property
     def sensors(self) -> SensorTable:
-        """All tool sensors, one body after the other."""
+        """Return all tool sensors, one body after the other."""
         return sensor_table(()).joined(*(tool.sensors for tool in self.tools))
 
     def with_stated(self, stated: Mapping[str, float]) -> 'Session':
@@ -99,7 +99,8 @@ def tracking_noise(setup: Setup) -> float:
 
 
 def stamp_sigma(setup: Setup) -> float:
-    """Error of the fluxes' stamps, s: what is stated, else what the acquisition measured.
+    """Return the error of the fluxes' stamps, s: what is stated, else what the acquisition
+    measured.
 
     Where the setup tells neither, it is the default of `anser_ros.settings.Accuracy`.
     """

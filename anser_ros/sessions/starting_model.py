@@ -24,7 +24,9 @@ NOMINAL = 'nominal'
 
 
 def board_of(setup: Setup) -> Board:
-    """The emitter's geometry; raises `SetupError` when its kind is unknown or a key is missing."""
+    """Return the emitter's geometry; raises `SetupError` when its kind is unknown or a key is
+    missing.
+    """
     emitter = setup.emitter
     return build_board(
         emitter.kind,

@@ -40,7 +40,7 @@ class NumberTable:
         return self.arrays[name]
 
     def column(self, reference: Any) -> NDArray[Any]:
-        """One column, shape (N,), such as ``time``, ``flux[3]`` or ``flux[0, 3]``.
+        """Return one column, shape (N,), such as ``time``, ``flux[3]`` or ``flux[0, 3]``.
 
         Raises
         ------

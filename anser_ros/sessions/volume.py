@@ -8,7 +8,7 @@ from anser_ros.wire.setup import Setup
 
 
 def stated_volume(setup: Setup) -> TrackedVolume | None:
-    """The volume that the setup document states; None where it leaves it to the board."""
+    """Return the volume that the setup document states; None where it leaves it to the board."""
     return None if setup.volume is None else TrackedVolume(*setup.volume)
 
 

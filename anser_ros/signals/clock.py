@@ -264,7 +264,9 @@ class SampleClock:
 
     @property
     def sigma_s(self) -> float:
-        """Standard deviation of a confirmed stamp, s; infinite while the line is not settled."""
+        """Return the standard deviation of a confirmed stamp, s; infinite while the line is not
+        settled.
+        """
         if not self._settled:
             return math.inf
         return math.hypot(_FLOOR_S, min(self.lateness_s, LARGEST_LATENESS_S))

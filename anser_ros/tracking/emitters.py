@@ -30,7 +30,9 @@ def without_dead(
     living: NDArray[np.bool_],
     previous: ReducedScene | None = None,
 ) -> ReducedScene:
-    """The context of the living emitters; what has not changed since ``previous`` is kept."""
+    """Return the context of the living emitters; what has not changed since ``previous`` is
+    kept.
+    """
     same = previous is not None and bool((previous.living == living).all())
     if same and previous is not None and previous.whole is context:
         return previous

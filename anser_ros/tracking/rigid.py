@@ -48,11 +48,13 @@ class BodyCoils:
 
     @cached_property
     def reach(self) -> float:
-        """Largest distance of a coil from the tool's origin, m."""
+        """Return the largest distance of a coil from the tool's origin, m."""
         return float(np.linalg.norm(self.offsets, axis=1).max())
 
     def subset(self, keep: NDArray[np.generic]) -> 'BodyCoils':
-        """The coils of a mask or of ascending indices; all of them are these coils themselves."""
+        """Return the coils of a mask or of ascending indices; all of them are these coils
+        themselves.
+        """
         if len(self.offsets[keep]) == len(self.offsets):
             return self
         return BodyCoils(
@@ -102,7 +104,7 @@ class BodySolution:
 
 
 def common_factor(modes: Array, inverse_sigma: Array) -> Array:
-    """Factor E with ``(I + D^T D)^-1 = I - E^T E`` for whitened modes D.
+    """Return the factor E with ``(I + D^T D)^-1 = I - E^T E`` for whitened modes D.
 
     Parameters
     ----------

@@ -9,7 +9,9 @@ Array = NDArray[np.float64]
 
 
 def rotation_of_vector(vector: NDArray[np.generic]) -> Array:
-    """Matrix, shape (3, 3), of a rotation vector, shape (3,), rad (Rodrigues' formula)."""
+    """Return the matrix, shape (3, 3), of a rotation vector, shape (3,), rad (Rodrigues'
+    formula).
+    """
     v = np.asarray(vector, dtype=np.float64)
     angle = math.sqrt(float(v @ v))
     cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
@@ -50,7 +52,9 @@ def quaternion_of_axis(axis: NDArray[np.generic]) -> tuple[float, float, float, 
 
 
 def quaternion_of_rotation(matrix: NDArray[np.generic]) -> tuple[float, float, float, float]:
-    """Unit quaternion (x, y, z, w), w >= 0, of a rotation matrix (Shepperd's method)."""
+    """Return the unit quaternion (x, y, z, w), w >= 0, of a rotation matrix (Shepperd's
+    method).
+    """
     m = np.asarray(matrix, dtype=np.float64)
     trace = float(np.trace(m))
     squares = [1.0 + 2.0 * float(m[i, i]) - trace for i in range(3)] + [1.0 + trace]
@@ -77,7 +81,7 @@ def quaternion_of_rotation(matrix: NDArray[np.generic]) -> tuple[float, float, f
 
 
 def rotation_of_quaternion(quaternion: NDArray[np.generic]) -> Array:
-    """Matrix, shape (3, 3), of a quaternion (x, y, z, w) of any length but zero."""
+    """Return the matrix, shape (3, 3), of a quaternion (x, y, z, w) of any length but zero."""
     q = np.asarray(quaternion, dtype=np.float64)
     x, y, z, w = q / math.sqrt(float(q @ q))
     return np.array(
@@ -90,7 +94,9 @@ def rotation_of_quaternion(quaternion: NDArray[np.generic]) -> Array:
 
 
 def nearest_rotation(matrix: NDArray[np.generic]) -> Array:
-    """Proper rotation nearest to a matrix (Kabsch): ``U diag(1, 1, det) V^T`` of its SVD."""
+    """Return the proper rotation nearest to a matrix (Kabsch): ``U diag(1, 1, det) V^T`` of its
+    SVD.
+    """
     u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
     sign = 1.0 if np.linalg.det(u @ vt) > 0 else -1.0
     return np.asarray(u @ np.diag([1.0, 1.0, sign]) @ vt)

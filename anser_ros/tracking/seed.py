@@ -143,7 +143,7 @@ def _pick(points, cost, axes, apart, count):  # type: ignore[no-untyped-def]
 
 
 def grid_points(volume: TrackedVolume, spacing_m: float) -> Array:
-    """Points of a grid that covers a volume, shape (G, 3), m.
+    """Return points of a grid that covers a volume, shape (G, 3), m.
 
     The field changes over a length that grows with the height, so does the spacing: ``spacing_m``
     holds at 0.1 m height and grows in proportion above it.
@@ -212,7 +212,7 @@ def build_grid(
 
 
 def scan(grid: SeedGrid, flux: Array, count: int) -> tuple[NDArray[np.int64], Array, Array]:
-    """Cheapest distinct grid points.
+    """Return the cheapest distinct grid points.
 
     Parameters
     ----------
@@ -292,7 +292,7 @@ def solve_cold(
     candidates: int = 6,
     thorough: bool = True,
 ) -> list[CoilSolution]:
-    """Every distinct pose that the best grid points lead to, least chi-square first.
+    """Return every distinct pose that the best grid points lead to, least chi-square first.
 
     Parameters
     ----------

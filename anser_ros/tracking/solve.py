@@ -71,7 +71,7 @@ class RealField:
 
     @cached_property
     def columns(self) -> Array:
-        """Coordinates of the positions and of the directions in rows, shape (6, N)."""
+        """Return coordinates of the positions and of the directions in rows, shape (6, N)."""
         return np.ascontiguousarray(np.concatenate([self.positions, self.directions], axis=1).T)
 
     @property

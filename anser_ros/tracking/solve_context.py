@@ -46,7 +46,7 @@ class Starts:
         self._made: tuple[SeedGrid, Array] | None = None
 
     def following(self) -> 'Starts':
-        """For the next model: with the last grid that was made."""
+        """Make the context for the next model, with the last grid that was made."""
         before = self._before if self._made is None else self
         return Starts(self._volume, self._spacing_m, before)
 
@@ -55,7 +55,9 @@ class Starts:
         return Starts(self._volume, self._spacing_m)
 
     def landmarks(self, field: RealField) -> tuple[Array, Array]:
-        """Coupling (P, N) of the dipoles with a few points of the volume; field there, (P, 2K)."""
+        """Return the coupling (P, N) of the dipoles with a few points of the volume; field there,
+        (P, 2K).
+        """
         sides = [
             np.linspace(a + 0.15 * (b - a), b - 0.15 * (b - a), 3)
             for a, b in zip(self._volume.low, self._volume.high, strict=True)
@@ -130,7 +132,7 @@ class ErrorModes:
         return cls(given, rows, moments, source_spacing(positions[rows], floor_m))
 
     def of_components(self, kept: NDArray[np.bool_]) -> 'ErrorModes':
-        """The modes' part in some of the 2K flux components."""
+        """Return the modes' part in some of the 2K flux components."""
         parts = self.moments.reshape(len(self.rows), -1, kept.size)[:, :, kept]
         return replace(self, moments=np.ascontiguousarray(parts.reshape(len(self.rows), -1)))
 
@@ -180,7 +182,7 @@ class SolveContext:
 
     @cached_property
     def relative_error(self) -> float:
-        """Typical model error by ``modes`` over the field's strength."""
+        """Return the typical model error by ``modes`` over the field's strength."""
         if self.modes is None:
             return 0.0
         basis, flux = self.starts.landmarks(self.field)

@@ -145,7 +145,7 @@ class SourceFrame:
         return solve_body(self.field, part, flux, weights, common, *start, low, high)
 
     def starts(self, scan: SourceScan, used: NDArray[np.int64]) -> list[Start]:
-        """Poses of the body for the scan's best places."""
+        """Return poses of the body for the scan's best places."""
         column = int(np.argmax((self.flux[used] ** 2).sum(axis=0)))
         whole = self.context.field
         moment = whole.moments[:, column] @ whole.directions

@@ -30,7 +30,7 @@ class Tip:
     covariance: Array
 
     def of_body(self, body: PoseEstimate) -> PoseEstimate:
-        """The tip's pose with its body's state; none where the body has none.
+        """Return the tip's pose with its body's state; none where the body has none.
 
         The tip moves with the body's position and by a turn times the arm. To first order, with
         the arm ``a`` in fg, ``d_tip = d_body - [a]x d_turn + R d_arm``, and turns are the body's.

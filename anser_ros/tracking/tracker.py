@@ -154,7 +154,7 @@ class Tracker:
         return tuple(self._bodies)
 
     def with_model(self, model: FieldModel, model_id: str | None = None) -> 'Tracker':
-        """The same tracker with another field model; warm starts and counters go on.
+        """Return the same tracker with another field model; warm starts and counters go on.
 
         Raises
         ------
@@ -175,7 +175,7 @@ class Tracker:
         return other
 
     def with_settings(self, settings: TrackerSettings) -> 'Tracker':
-        """The same tracker with other settings; warm starts and counters go on."""
+        """Return the same tracker with other settings; warm starts and counters go on."""
         other = Tracker.__new__(Tracker)
         other.__dict__.update(self.__dict__)
         other.settings = settings

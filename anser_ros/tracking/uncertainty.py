@@ -24,7 +24,7 @@ UNKNOWN_VARIANCE = 1.0
 
 
 def chi2_limit(degrees_of_freedom: int, probability: float) -> float:
-    """Chi-square that noise alone exceeds with the given probability."""
+    """Return chi-square that noise alone exceeds with the given probability."""
     return float(chdtri(max(degrees_of_freedom, 1), probability))
 
 

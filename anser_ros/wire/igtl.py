@@ -76,7 +76,7 @@ def crc64(data: bytes) -> int:
 
 
 def read_header(data: bytes) -> Header | None:
-    """The header in the first `HEADER_BYTES` bytes; None where they are none."""
+    """Return the header in the first `HEADER_BYTES` bytes; None where they are none."""
     version, kind, device, _, _, size, _ = _HEADER.unpack(data[:HEADER_BYTES])
     if version not in _VERSIONS or not kind.strip(b'\0').isascii():
         return None
@@ -85,7 +85,9 @@ def read_header(data: bytes) -> Header | None:
 
 
 def resolution_s(header: Header, body: bytes) -> float:
-    """Time between two TDATA that a client asked for, s; 0 for as often as there is something."""
+    """Return the time between two TDATA that a client asked for, s; 0 for as often as there is
+    something.
+    """
     content = body[12:] if header.version > 1 else body  # behind the extended header
     if len(content) < 4:
         return 0.0

@@ -23,5 +23,5 @@ def optical_topic(body: str) -> str:
 
 
 def pose_setup(sensors: Iterable[str], body: str) -> str:
-    """The setup document of a session of poses, as text."""
+    """Return the setup document of a session of poses, as text."""
     return f'schema: {SCHEMA}\nsensors: [{", ".join(sensors)}]\nbody: {body}\n'

@@ -131,7 +131,7 @@ class Setup:
 
     @cached_property
     def identity(self) -> Identity:
-        """Fingerprints of the board, and of the sensors on each body."""
+        """Return fingerprints of the board, and of the sensors on each body."""
         emitter = self.emitter
         coils = [[c.name, c.centre_m, c.rotation_deg, c.frequency_hz] for c in emitter.coils]
         sensors = sorted(self.sensors, key=lambda sensor: sensor.channel)

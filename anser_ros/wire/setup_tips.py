@@ -33,7 +33,7 @@ class TipSpec:
 
     @property
     def covariance(self) -> NDArray[np.float64]:
-        """The covariance as a matrix, shape (3, 3), m^2, body's frame."""
+        """Return the covariance as a matrix, shape (3, 3), m^2, body's frame."""
         matrix = np.zeros((3, 3))
         for (i, j), value in zip(UPPER, self.covariance_m2, strict=True):
             matrix[i, j] = matrix[j, i] = value
@@ -41,7 +41,7 @@ class TipSpec:
 
 
 def parse_tips(item: Any) -> dict[str, TipSpec]:
-    """The tips of a mapping from bodies to places.
+    """Return the tips of a mapping from bodies to places.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def tip_name(body: str) -> str:
 
 
 def read_tips(text: str) -> dict[str, TipSpec]:
-    """The tips of a setup document's text, or of a file of tips alone.
+    """Return the tips of a setup document's text, or of a file of tips alone.
 
     Raises
     ------

@@ -29,7 +29,7 @@ class PoseTimeOffset(PoseEffect):
     role = Role.CLOCK
 
     def sites(self, setting: PoseSetting) -> Sequence[Term]:
-        """One offset for all sensors, and one a sensor."""
+        """Try one offset for all sensors, and one a sensor."""
         own = [Term(self, {'sensor': s}, np.zeros(1)) for s in setting.sensors]
         return [Term(self, {}, np.zeros(1)), *(own if len(own) > 1 else [])]
 
@@ -75,7 +75,7 @@ class PoseClockRate(PoseEffect):
         return np.full(1, 2.0)
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
-        """Minus the velocity, the more the farther from the session's middle."""
+        """Return minus the velocity, the more the farther from the session's middle."""
         apart = 1e-3 * (view.time - float(term.site['middle_s']))
         return -(view.velocity * apart[:, None])[:, :, None]
 

@@ -21,7 +21,9 @@ UNIT_M = 1e-3
 
 
 def monomials(position: Array, centre: Array, size: float, degree: int, lowest: int = 1) -> Array:
-    """Products of coordinates of positions (n, 3) about a centre, degrees ``lowest`` and up."""
+    """Return products of coordinates of positions (n, 3) about a centre, degrees ``lowest`` and
+    up.
+    """
     scaled = (position - centre) / size
     columns = [
         np.prod(scaled[:, list(chosen)], axis=1)
@@ -43,12 +45,12 @@ class FieldDistortion(PoseEffect):
     role = Role.MAP
 
     def sites(self, setting: PoseSetting) -> Sequence[Term]:
-        """Each degree, for all sensors together and for each alone."""
+        """Try each degree, for all sensors together and for each alone."""
         alone = setting.sensors if len(setting.sensors) > 1 else ()
         return [self.at(setting, degree, s) for degree in KINDS for s in (None, *alone)]
 
     def at(self, setting: PoseSetting, degree: int, sensor: str | None) -> Term:
-        """The effect of a degree on one sensor, or on all."""
+        """Return the effect of a degree on one sensor, or on all."""
         site = {} if sensor is None else {'sensor': sensor}
         place = {'degree': degree, 'centre_m': setting.centre.tolist(), 'size_m': setting.size}
         count = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, degree).shape[1]

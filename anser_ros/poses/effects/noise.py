@@ -27,7 +27,7 @@ FEWEST = 60  # differences of neighbours that a power law is fitted to
 
 
 def jitter(sensing: Sensing) -> tuple[Array, Array]:
-    """Squared noise (m^2, a coordinate) and distance (m) of poses beside near neighbours.
+    """Return squared noise (m^2, a coordinate) and distance (m) of poses beside near neighbours.
 
     Second differences of the residual across the velocity, so that neither a slow course nor an
     error of the stamps is in it.
@@ -49,7 +49,8 @@ def jitter(sensing: Sensing) -> tuple[Array, Array]:
 
 
 def power_law(square: Array, distance: Array) -> tuple[float, float, float]:
-    """Exponent of the noise by distance above a floor, its sigma, and the likelihood's gain.
+    """Return the exponent of the noise by distance above a floor, its sigma, and the likelihood's
+    gain.
 
     A squared deviation across the velocity has two degrees of freedom, so it is distributed
     exponentially about the variance.

@@ -26,7 +26,7 @@ class PoseOpticalScale(PoseEffect):
     role = Role.SCALE
 
     def sites(self, setting: PoseSetting) -> Sequence[Term]:
-        """One reference for all sensors; its scale about the middle of what it saw."""
+        """Try one reference for all sensors, scaled about the middle of what it saw."""
         return [Term(self, {}, np.zeros(1))]
 
     def prior(self, term: Term) -> Array:

@@ -49,7 +49,7 @@ class TrackerLag(PoseEffect):
         return path.filtered(float(term.theta[0]), TWO_SIDED in term.site)
 
     def rival(self, term: Term) -> Term:
-        """The same smoothing without a sense of time."""
+        """Return the same smoothing without a sense of time."""
         return Term(self, {TWO_SIDED: True}, term.theta)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
