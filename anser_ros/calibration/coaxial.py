@@ -27,7 +27,8 @@ SPREAD = 0.2
 a fraction s it makes the first multipole that is left out smaller than what is kept by s squared;
 much smaller fractions make columns that only differ by rounding."""
 FIRST_SPACING_M = 1e-3
-"""Distance of the dipoles before any data are seen, m."""
+"""Distance of the dipoles before any data are seen, m. Any value far below the distance of the
+sensors gives the same first fit."""
 ENDED = 1e-10
 """Relative change of the sum of squares at which the search has ended."""
 

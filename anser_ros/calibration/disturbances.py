@@ -19,22 +19,28 @@ BIN_FRAMES = 4
 """Frames of a stretch at least."""
 GLITCH = 6.0
 """Deviation of a pose from where the fluxes put it, in robust standard deviations, from which on
-it is left out. A Gaussian jitter is that far off once in a billion."""
+it is left out. A Gaussian jitter is that far off once in a billion. Smaller leaves out poses that
+only jitter; larger lets reflections into the fit."""
 LEFT_OVER = 25.0
 """Power that no pose explains, in a stretch against the median stretch and against where the tool
 was near the same place, from which on something moved. What a field's model misses at the edge of
-a scan is a few times the noise, in power; what moves there leaves it also a millimetre away."""
+a scan is a few times the noise, in power; what moves there leaves it also a millimetre away.
+Smaller takes the edge of a scan for metal; larger fits a field to metal that moved."""
 SHORTEST_S = 2.0
-"""Time, s, for which a tool must see that something moves: a glimpse is no path."""
+"""Time, s, for which a tool must see that something moves: a glimpse is no path. Shorter takes
+single bad stretches for metal; longer misses what passes quickly. How the value was chosen is not
+recorded."""
 SEEN = 8.0
 """Power of the references' deviation in a stretch, in standard deviations beyond the noise's, from
-which on something moved."""
+which on something moved. Smaller takes slow drifts for metal; larger misses small metal far away.
+How the value was chosen is not recorded."""
 EDGE = 3.0
 """The same, beside a stretch that something moved in: it comes and goes gradually. Smaller spreads
 a disturbance over quiet stretches next to it; larger leaves its beginning and end in the data. Its
 choice is not recorded."""
 ROUNDS = 6
-"""Rounds in which the quiet stretches are told from the others."""
+"""Rounds in which the quiet stretches are told from the others. Fewer may end before the stretches
+have settled; more cost a fit each."""
 
 
 @dataclass(frozen=True)

@@ -31,21 +31,28 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 KNOTS = 9
-"""Knots of a path to begin with: three seconds apart in half a minute of moving."""
+"""Knots of a path to begin with: three seconds apart in half a minute of moving. Fewer cannot
+follow a way that stops; more start the fit with parameters that few frames determine. How the
+value was chosen is not recorded."""
 FINE_KNOTS = 17
 """Knots at last. A spline of few pieces cannot rest at its ends, where what is asked is told: with
 nine the metal at rest was half again too strong, with 17 and with 25 right."""
 WAYS = (0.12, 0.24)
 """Lengths of the ways that are tried, m: the shorter about a hand's way, twice it, and between
-them the fit finds its way."""
+them the fit finds its way. Only shorter ones, and metal that crosses the volume is not found; only
+longer ones, and a start lies too far from a small movement. How the value was chosen is not
+recorded."""
 SLOPE = 0.57
 """Share of a way that goes down, for ways to the side: metal that goes away does not come nearer
-to the tools above the board, and hardly ever goes level."""
+to the tools above the board, and hardly ever goes level. Smaller, and starts are level; larger,
+and metal that is drawn aside is looked for below. How the value was chosen is not recorded."""
 AROUND = 8
 """Directions to the side in which a way is tried, one in 45 deg. Fewer may start too far from the
 true way for the fit to find it; time grows with their number. Its choice is not recorded."""
 FEW_FRAMES, SOME_FRAMES, MANY_FRAMES = 25, 60, 300
-"""Frames of a tool, about, on which ways are compared, refined, and fitted at last."""
+"""Frames of a tool, about, on which ways are compared, refined, and fitted at last. Fewer are
+faster and noisier; more cost time in proportion and tell little, as neighbouring frames are alike.
+How the value was chosen is not recorded."""
 BODY = Richness(90, (25,), SOMETHING_LEFT)
 """How finely the body is shaped, and the path divided beyond `FINE_KNOTS` where much is left."""
 STEPS = 6

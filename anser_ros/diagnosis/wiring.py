@@ -20,7 +20,8 @@ of its choice than that thresholds of the diagnosis were chosen on seeds below 1
 (`docs/log.md`)."""
 TURNED_ROUND = 0.3
 """A gain within this of -1 is a polarity: as far as a gain is expected from one (the prior of
-`sensor_gain`)."""
+`sensor_gain`). Smaller misses a turned sensor whose gain is off as well; larger takes a weak
+sensor with a turned phase for one."""
 ALIKE, BETTER = 0.95, 0.1
 """Correlation (0 to 1) with another's prediction, and share of the power that its own leaves which
 the other's may leave, from which a plug is in its socket. A looser pair takes neighbours that read
@@ -29,7 +30,9 @@ of the choice than that thresholds of the diagnosis were chosen on seeds below 1
 (`docs/log.md`)."""
 DEAD = 0.02
 """Share of the expected reading below which a channel hears nothing: a fifth of the leak that
-`channel_crosstalk` expects, so that one that still hears its neighbours is not called dead."""
+`channel_crosstalk` expects, so that one that still hears its neighbours is not called dead.
+Smaller, and a dead channel that hears its neighbours is taken for a weak one; larger, and a weak
+one is given up."""
 
 
 def wiring_faults(problem: Problem) -> list[Term]:

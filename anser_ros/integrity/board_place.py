@@ -25,27 +25,40 @@ ComplexArray = NDArray[np.complex128]
 FAR_M = 5e-4
 """Distance between the model's board and the references' from which on the model is refused: half
 of the error that a pose may have beside three of its sigmas. A survey's 0.2 mm a sensor is a tenth
-of that among 32 of them."""
+of that among 32 of them. Smaller refuses models for errors of the survey; larger lets poses be
+wrong by as much, all alike."""
 FAR_SIGMAS = 5.0
 """The same in standard deviations of that distance, for few sensors or a poor survey. Smaller
 refuses a sound model for what the survey's errors make; larger lets a board that lies elsewhere
 pass where sensors are few. Its choice is not recorded."""
 EXPLAINED = 1.0
 """Misfit of the typical reference, in what survey and manufacture allow, up to which the distance
-is believed: metal is no board that lies elsewhere, and is left to others to judge."""
+is believed: metal is no board that lies elsewhere, and is left to others to judge. Smaller leaves
+a board that lies aside to the other judges when its survey is a little worse than stated; larger
+takes metal for a board that lies aside. How the value was chosen is not recorded."""
 MODEL_SHARE = 2e-3
-"""Error of a calibrated model's field relative to itself, in the middle of the volume."""
+"""Error of a calibrated model's field relative to itself, in the middle of the volume. Smaller
+takes the model's error for a shift; larger hides small shifts. How the
+value was chosen is not recorded."""
 DRAWN_SHARE = 2e-3
 """Error of a drawn field with its coils moved, relative to itself: tracks are not where they are
-drawn either."""
+drawn either. Smaller and larger do as they do for `MODEL_SHARE`. How the value was chosen is not
+recorded."""
 INNER = 0.5
-"""Part of the volume, from its middle, in which the model is asked: scans reach that far."""
+"""Part of the volume, from its middle, in which the model is asked: scans reach that far. Smaller
+asks where all is alike; larger, where the model was never measured. How the value was chosen is
+not recorded."""
 SIDE = 4
-"""Points along a side of that part; three readings each."""
+"""Points along a side of that part; three readings each. Fewer leave one bad place much weight;
+more tell the same again and cost time. How the value was chosen is not recorded."""
 ALIKE = 40.0
-"""So many of these readings count: neighbouring points tell the same."""
+"""So many of these readings count: neighbouring points tell the same. Smaller lets the readings of
+references decide alone; larger makes the model too sure of itself. How the value was chosen is not
+recorded."""
 PRIOR_M, PRIOR_RAD = 5e-3, 0.02
-"""Standard deviations of how far a model lies aside before anything is known, m and rad."""
+"""Standard deviations of how far a model lies aside before anything is known, m and rad. Smaller
+pulls the distance towards nothing; larger lets noise find one where few references are read. How
+the value was chosen is not recorded."""
 ROUNDS = 12
 """Rounds in which sensors that do not fit lose weight. Fewer leave a sensor that is off some say
 in where the board lies; more cost time and change nothing once weights have settled. Its choice is

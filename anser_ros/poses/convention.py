@@ -24,7 +24,9 @@ poor besides. Its choice is not recorded."""
 FEW_POSES = 150  # poses of a sensor by which a reading is judged
 HOPELESS_M = 25e-3
 """Median misfit, m, with which no reading fits and a session is refused: its files do not belong
-together, or mean something that is not known here."""
+together, or mean something that is not known here. Smaller refuses sessions with much distortion;
+larger takes files that do not belong together for bad ones. How the value was chosen is not
+recorded."""
 UNITS = {
     'mm': 1e-3, 'cm': 1e-2, 'inch': 0.0254, 'km': 1e3,
     'inch taken for mm': 25.4, 'mm taken for inch': 1 / 25.4,

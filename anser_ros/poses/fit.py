@@ -17,15 +17,20 @@ Array = NDArray[np.float64]
 
 HEAVY = 4.0
 """Degrees of freedom of Student's distribution by which poses are weighted in a robust fit: the
-usual compromise between the mean (infinite) and a distribution without one (1)."""
+usual compromise between the mean (infinite) and a distribution without one (1). Smaller gives far
+poses less weight and costs precision where the errors are normal; larger lets a few bad poses move
+the frames."""
 STANDS_OUT, FAR_OUT = 7.0, 25.0
 """Distances of a pose from its prediction, in robust spreads of a coordinate, from which it stands
 out: where few do, and where many do. Three normal coordinates reach the first once in 1e10; what
 many poses share is something to explain, and only what no distortion makes is left out of it."""
 FEW = 0.03
-"""Share of a sensor's poses up to which those that stand out are few."""
+"""Share of a sensor's poses up to which those that stand out are few. Smaller takes a handful of
+reflections for something to explain; larger takes an effect of a few seconds for outliers. How the
+value was chosen is not recorded."""
 FOLDS = 5
-"""Parts of the cross-validation over blocks."""
+"""Parts of the cross-validation over blocks. Fewer leave less to fit on; each more costs a fit.
+How the value was chosen is not recorded."""
 SMALLEST_NOISE = (1e-6, 1e-6)  # m and rad; what is exact would have an infinite weight
 LARGEST_STAMP_S = 0.1
 """Spread of stamps, s, beyond which a time makes no pose of a hand's motion."""

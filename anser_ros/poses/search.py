@@ -23,13 +23,17 @@ Array = NDArray[np.float64]
 
 LEAST_SHARE = 0.015
 """Share of the sum of squares that an effect must explain on blocks that it has not seen. Errors
-of trackers are alike over seconds and centimetres, and any smooth course takes a trace of them."""
+of trackers are alike over seconds and centimetres, and any smooth course takes a trace of them.
+Smaller names traces of smooth errors; larger misses effects that matter to a tenth of the
+error."""
 POSES_A_PARAMETER = 12  # poses that a parameter needs: neighbours in time are hardly new
 MAP_SHARE = 0.35
 """The same of a map, and what it must explain beyond a few numbers: a fifth of the error. A map
-follows whatever is smooth in the places that were visited."""
+follows whatever is smooth in the places that were visited. Smaller lets a map take what is another
+effect; larger leaves distortions unnamed."""
 SMOOTH_STEPS = 2.0
-"""Intervals of the reference up to which a filter may only smooth its noise."""
+"""Intervals of the reference up to which a filter may only smooth its noise. Fewer call smoothing
+a lag; more take a lag for smoothing. How the value was chosen is not recorded."""
 MOST_EFFECTS = 6  # effects in force after which the search ends: more would be stand-ins
 FULL_FITS = 3  # candidates that are fitted in full in each round
 NOISE_ROUNDS = 3  # times that noise and what stands out are told apart

@@ -17,13 +17,16 @@ FARTHEST = 1e6
 """Coordinate, m, from which on it is a device's marker for no pose and no position: no tracker
 sees a thousand kilometres, NDI's marker is 3.7e28."""
 NO_TURN = 0.1
-"""Norm of a quaternion below which it is a marker for no pose; a rounded one has a norm near 1."""
+"""Norm of a quaternion below which it is a marker for no pose; a rounded one has a norm near 1.
+Smaller takes a marker of rounded zeros for a turn; larger, a quaternion of another scale for a
+marker."""
 LEAP_M, LEAP_RAD, LEAP_TIMES = 0.01, 0.25, 3.0
 """How far a pose is from the line between its neighbours if it leaps: m, rad, and in distances of
 these from each other. A hand that shakes turns back within 5 mm at 20 poses a second."""
 LONGEST_LEAP = 3  # rounds; each takes out one pose of a run, or two from its ends
 NOT_UNIT = 0.05
-"""How far the norm of a quaternion may be from one: four digits are given by the coarsest form."""
+"""How far the norm of a quaternion may be from one: four digits are given by the coarsest form.
+Smaller refuses rounded files; larger takes other numbers for quaternions."""
 
 
 @dataclass(frozen=True)

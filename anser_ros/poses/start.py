@@ -20,7 +20,9 @@ from anser_ros.poses.sequence import PoseSequence, PoseSession, leaps
 Array = NDArray[np.float64]
 
 BLOCKS = 25
-"""Blocks of time of one recording: five folds of five, each long against a hand's motion."""
+"""Blocks of time of one recording: five folds of five, each long against a hand's motion. Fewer
+hold out much at a time; more are shorter than the time over which errors are alike. How the value
+was chosen is not recorded."""
 PAUSE_S = 2.0
 """Pause, s, that parts static recordings; where there are several, each is a block."""
 AT_REST_M, POSES_AT_REST = 2e-3, 4
@@ -32,12 +34,15 @@ FEWEST_POSES = 8
 many again have to judge it."""
 MOST_POSES = 900
 """Poses of a sensor that are fitted at most, evenly over the session. More tell no more of errors
-that are alike for seconds, and a session of four sensors has to be done within seconds."""
+that are alike for seconds, and a session of four sensors has to be done within seconds. Fewer make
+effects uncertain; more cost time."""
 COARSE_S, COARSE_STEP_S = 1.5, 0.05
 """Range and step of the first look for a time offset, s."""
 COARSE_POSES = 300  # poses of that first look
 CLEARLY = 0.8
-"""Share of the misfit at no offset below which a coarse offset is taken."""
+"""Share of the misfit at no offset below which a coarse offset is taken. Smaller starts at no
+offset although there is one; larger starts at an offset that noise has made. How the value was
+chosen is not recorded."""
 START_NOISE = PoseNoise(2e-3, 0.02)  # m, rad: of the first fit, which then finds its own
 HELD_OUT = 5
 """Every fifth block takes no part in choosing or fitting."""

@@ -14,11 +14,14 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 WINDOWS = 40
-"""Windows of time that a session is cut into: an episode of a twentieth is seen in two."""
+"""Windows of time that a session is cut into: an episode of a twentieth is seen in two. Fewer miss
+short episodes; more leave too few poses in a window to judge it. How the value was chosen is not
+recorded."""
 FEWEST_POSES = 4  # poses that a window needs to be judged
 TIMES = 9.0
 """Squared error over the median window's from which a window belongs to an episode: three times
-the error, which the range of places in a session hardly makes."""
+the error, which the range of places in a session hardly makes. Smaller takes the far side of the
+volume for an episode; larger misses those that bend poses little."""
 LONGEST = 0.4
 """Share (0 to 1) of the windows that episodes may be: what is there for longer is no episode.
 Larger takes half a session for the exception; smaller overlooks metal that stayed for a while. Its
@@ -26,7 +29,8 @@ choice is not recorded."""
 ALIKE = 0.4  # share of a window's squared error that its mean must be; noise has a small one
 NEAR_M = 0.03
 """Distance within which a place outside the episode is the same place; metal changes over its own
-size, centimetres."""
+size, centimetres. Smaller finds no pose to compare with; larger compares places where a constant
+distortion differs."""
 SEEN_AGAIN = 0.5  # share of the episode's places that must have been visited outside it
 LOOSE, FAST = 0.5, 0.25
 """Share of a sensor's squared error that shifts in the body's frame explain if its mount is loose,

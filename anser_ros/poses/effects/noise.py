@@ -14,7 +14,8 @@ Array = NDArray[np.float64]
 
 NOISIER = 2.0
 """Factor over the other sensors' median noise from which a sensor's is named; sensors of one kind
-at one place differ by a half."""
+at one place differ by a half. Smaller names a sensor for its place; larger misses one that is
+worn."""
 NEAR_S, NEAR_STEPS = 0.3, 3.0
 """Poses that are nearer in time, s or usual intervals, differ by noise and not by place."""
 WIDEST = 1.3

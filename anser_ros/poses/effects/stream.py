@@ -19,7 +19,9 @@ FEWEST_STALE = 0.02
 then. Smaller names these stops; larger leaves a tracker unnamed that seldom repeats itself. Its
 choice is not recorded."""
 MOVING_M = 5e-4
-"""Way between two poses, m, from which a body moves: trackers tell a tenth of it."""
+"""Way between two poses, m, from which a body moves: trackers tell a tenth of it. Smaller takes
+jitter for motion, so that a tracker at rest seems to repeat poses; larger sees no motion in slow
+hands."""
 NEAR = 3  # poses before and after by which motion is judged
 FEWEST_MISSING = 0.005  # share of poses, or of the time, from which missing ones are named
 FEWEST_MARKED, FEWEST_MARKED_SHARE = 5, 1e-3
@@ -31,7 +33,8 @@ PAUSE_S, MANY_PAUSES = 2.0, 4
 FEWEST_POSES = 3  # outliers that must be there at least
 FAR = 14.0
 """Distance of the median outlier in spreads of a coordinate from which it is one: errors of real
-trackers have tails of half that."""
+trackers have tails of half that. Smaller names the tails of usual errors; larger misses
+reflections near by."""
 
 
 class StalePoses(PoseEffect):
