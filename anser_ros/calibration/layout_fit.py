@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.calibration.coaxial import fit_coaxial
+from anser_ros.calibration.coil_places import CoilPlacer
 from anser_ros.calibration.dipole_sites import DipoleSites
 from anser_ros.calibration.factors import ComplexArray
 from anser_ros.calibration.layouts import Generator, Layout, place
@@ -85,6 +86,8 @@ def placed(
     layout: Layout, generator: Generator, drawn: DrawnBoard | None
 ) -> tuple[DipoleSites, ComplexArray | None]:
     """Return a layout's dipoles, and the moments towards which the damping pulls."""
+    if layout.kind == 'drawing' and drawn is not None:
+        return CoilPlacer(drawn.nominal).sites, drawn.nominal.moments * drawn.gains
     dipoles = place(layout, generator)
     return dipoles, prior_of(layout, dipoles, drawn)
 
@@ -102,8 +105,9 @@ def optimise_positions(
     dipoles: DipoleSites,
     prior: ComplexArray | None,
     layout: Layout,
-) -> DipoleSites:
-    """Return dipoles moved to where they explain the measurements best.
+    drawn: DrawnBoard | None,
+) -> tuple[DipoleSites, ComplexArray | None]:
+    """Return dipoles moved to where they explain the measurements best, and their prior there.
 
     Parameters
     ----------
@@ -116,15 +120,22 @@ def optimise_positions(
     prior : ndarray, shape (N, K), complex, or None
         Moments towards which the damping pulls, A m^2.
     layout : Layout
-        Of the dipoles: those on an axis stay on it, all others move each by itself.
+        Of the dipoles: those on an axis stay on it, those of a drawn coil move together, and all
+        others each by itself.
+    drawn : DrawnBoard or None
+        The drawn board.
     """
     rows = sum(m.flux.shape[0] * m.flux.shape[1] for m in corrected)
     step = max(1, -(-rows // MOST_MOVING_ROWS))
     thin = [m.frames(np.arange(0, len(m.time), step)) for m in corrected]
     shares = [w[::step] for w in weights]
+    if layout.kind == 'drawing' and drawn is not None:
+        return CoilPlacer(drawn.nominal).fit(thin, shares)
     if layout.kind == 'coaxial':
-        return fit_coaxial(thin, shares, dipoles, layout.count)
-    return PositionFitter(thin, shares, dipoles, MOVING_DAMPING, prior).fit().dipoles
+        moved = fit_coaxial(thin, shares, dipoles, layout.count)
+    else:
+        moved = PositionFitter(thin, shares, dipoles, MOVING_DAMPING, prior).fit().dipoles
+    return moved, prior_of(layout, moved, drawn)
 
 
 def fit_layout(
@@ -165,10 +176,9 @@ def fit_layout(
         layer = place(rich_layout(measurements, generator), generator)
         rich = MomentFitter(measurements, layer, RICH_DAMPING, accuracy)
         reference = rich.fit(3, exact=False)
-        dipoles = optimise_positions(
-            reference.measurements, reference.weights, dipoles, prior, layout
+        dipoles, prior = optimise_positions(
+            reference.measurements, reference.weights, dipoles, prior, layout, drawn
         )
-        prior = prior_of(layout, dipoles, drawn)
     fitter = MomentFitter(measurements, dipoles, damping, accuracy, prior)
     fit = fitter.fit(alternations, progress, exact)
     if not layout.local:

@@ -165,8 +165,7 @@ class LayoutScorer:
             chi, count = np.zeros(len(dampings)), 0.0
             sites, moments_prior = dipoles, prior
             if layout.moved:
-                sites = self._moved_without(fold, dipoles, prior, layout)
-                moments_prior = prior_of(layout, sites, drawn)
+                sites, moments_prior = self._moved_without(fold, dipoles, prior, layout, drawn)
             matrices, grams = same or self._tables(sites)
             start = None if moments_prior is None else as_real(moments_prior) / self.noise_t
             total = sum(gram for other, gram in grams.items() if other != fold)
@@ -192,8 +191,13 @@ class LayoutScorer:
         return matrices, dict(zip(folds, grams, strict=True))
 
     def _moved_without(
-        self, fold: int, dipoles: DipoleSites, prior: ComplexArray | None, layout: Layout
-    ) -> DipoleSites:
+        self,
+        fold: int,
+        dipoles: DipoleSites,
+        prior: ComplexArray | None,
+        layout: Layout,
+        drawn: DrawnBoard | None,
+    ) -> tuple[DipoleSites, ComplexArray | None]:
         kept = [body.folds != fold for body in self._bodies]
         return optimise_positions(
             [body.corrected.frames(k) for body, k in zip(self._bodies, kept, strict=True)],
@@ -201,6 +205,7 @@ class LayoutScorer:
             dipoles,
             prior,
             layout,
+            drawn,
         )
 
     @property

@@ -58,11 +58,11 @@ class Layout:
 
     Attributes
     ----------
-    kind : {'layer', 'layer_xyz', 'coils', 'coaxial'}
+    kind : {'layer', 'layer_xyz', 'coils', 'coaxial', 'drawing'}
         A layer of z-dipoles, a layer of dipoles with three free components, z-dipoles on the
-        coils, or dipoles along an axis of its own for each coil.
+        coils, dipoles along an axis of its own for each coil, or those of the drawn coils.
     count : int
-        Number of dipoles along a side of the layer, of each coil, or along each axis.
+        Number of dipoles along a side of the layer, of each coil, along each axis, or in all.
     extension : float
         Size of the layer as a multiple of the field generator's.
     depth_m : float
@@ -90,6 +90,8 @@ class Layout:
         drawn += ', in overlapping regions' if self.local else ''
         if self.kind == 'coaxial':
             return f'{self.count} on an axis of its own for every emitter, place and axis free'
+        if self.kind == 'drawing':
+            return f'{self.count} of the drawn coils, each coil placed where it fits, pulled to it'
         if self.kind == 'coils':
             return f'{self.count}x{self.count} z-dipoles on every coil{drawn}'
         parts = 'z-dipoles' if self.kind == 'layer' else 'three-component dipoles'

@@ -52,6 +52,7 @@ class DrawnBoard:
     """
 
     def __init__(self, nominal: FieldModel, measurements: Sequence[Measurements]) -> None:
+        self.nominal = nominal
         self.points, self.axes = volume_lattice(measurements)
         self.gains = emitter_gains(nominal, measurements)
         self.flux = nominal.flux(self.points, self.axes) * self.gains

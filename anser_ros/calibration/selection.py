@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.calibration.layout_fit import lowest_height, rich_layout
+from anser_ros.calibration.coil_places import CoilPlacer
+from anser_ros.calibration.layout_fit import lowest_height, placed, rich_layout
 from anser_ros.calibration.layout_score import LayoutCandidate, LayoutScorer
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.moments import MomentFit
@@ -167,7 +168,7 @@ class _Search:
 
     def score(self, layout: Layout) -> LayoutCandidate:
         if layout not in self.tried:
-            dipoles = place(layout, self.generator)
+            dipoles, _ = placed(layout, self.generator, self.drawn)
             self.tried[layout] = self.scorer.score(layout, dipoles, self.drawn)
             if self.progress is not None:
                 # How many layouts will be tried is not known: the bar slows down towards its end.
@@ -197,7 +198,7 @@ class _Search:
         return [o for o in others if len(place(o, self.generator)) <= MOST_DIPOLES]
 
     def other_finalists(self, best: LayoutCandidate, rows: int) -> list[LayoutCandidate]:
-        """Return the best moved dipoles and a local model, where the readings suffice for them."""
+        """Return moved dipoles, coils and a local model, where the readings suffice for them."""
         found = []
         moving = [replace(layout, prior=self.prior, moved=True) for layout in MOVING]
         moving = [m for m in moving if MOVING_READINGS * len(place(m, self.generator)) <= rows]
@@ -206,6 +207,12 @@ class _Search:
         if self.drawn is None:
             # A few dipoles more cost a tracker nothing: the best of them, not the leanest.
             found.append(min(map(self.score, COAXIAL), key=lambda c: c.score))
+        else:
+            coils = CoilPlacer(self.drawn.nominal)
+            if coils.possible and len(coils.sites) <= MOST_DIPOLES:
+                found.append(
+                    self.score(Layout('drawing', len(coils.sites), 1.0, 0.0, self.prior, True))
+                )
         if rows >= LOCAL_READINGS * LOCAL_COUNT**2:
             depth = max(best.layout.depth_m, 0.0)
             common = self.score(Layout('layer', LOCAL_COUNT, EXTENSIONS[1], depth, self.prior))
