@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibration_world import NOISE_T, scene
+from calibration_world import scene
 from scipy.spatial.transform import Rotation
 
 from anser_ros.calibration.blocks import fold_of_frames
