@@ -16,6 +16,7 @@ from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.sensor_parameters import EXTRA_KINDS, KINDS
 from anser_ros.cli.calibration_figure import draw_choice, draw_populations
 from anser_ros.cli.output import Result, check_file, loss_notes, make_folder, say
+from anser_ros.cli.populations import population_table
 from anser_ros.cli.progress import progress_of
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.errors import FitError, ParameterError
@@ -24,7 +25,7 @@ from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.session import load_session
 
 LONG = ('values', 'uncertainty', 'axes')
-"""Parameters of a population that are tables: the report's picture and document have them."""
+"""Parameters of a population that are tables, which are shown by themselves."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -140,7 +141,7 @@ def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result
             *document['unobservable'],
             *document['contradictions'],
         ),
-        (_table(calibration, document),),
+        (_table(calibration, document), *_populations(calibration)),
         (args.out, *(() if args.report is None else (args.report,))),
     )
 
@@ -175,6 +176,17 @@ def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
         found = {k: v for k, v in effect.parameters.items() if k not in LONG}
         table.add_row(effect.name, ', '.join(f'{k} {_short(v)}' for k, v in found.items()))
     return table
+
+
+def _populations(calibration: Calibration) -> tuple[Table, ...]:
+    """The table of how the sensors differ, where the scan says that they do."""
+    head, rows = population_table(calibration.scan.corrections)
+    if not rows:
+        return ()
+    table = Table(*head, title='populations')
+    for row in rows:
+        table.add_row(*row)
+    return (table,)
 
 
 def _short(value: Any) -> str:

@@ -3,12 +3,12 @@
 from pathlib import Path
 
 import matplotlib
-import numpy as np
 
 matplotlib.use('Agg')
 from matplotlib import pyplot as plt
 
 from anser_ros.calibration.result import Calibration
+from anser_ros.cli.populations import population_figure
 
 
 def draw_choice(calibration: Calibration, path: Path) -> None:
@@ -39,26 +39,8 @@ def draw_choice(calibration: Calibration, path: Path) -> None:
 
 
 def draw_populations(calibration: Calibration, path: Path) -> None:
-    """Draw each channel's values with their uncertainty, and the population's width behind them.
-
-    Nothing is drawn where the scan contains no population.
-    """
-    found = [e for e in calibration.scan.corrections if 'values' in e.parameters]
-    if not found:
-        return
-    figure, panels = plt.subplots(1, len(found), figsize=(4 * len(found), 3.5), squeeze=False)
-    for panel, effect in zip(panels[0], found, strict=True):
-        values = np.array(effect.parameters['values'], dtype=np.float64)
-        values = values - np.median(values, axis=0).round()
-        sigma = np.array(effect.parameters['uncertainty'], dtype=np.float64)
-        places, spread = np.arange(len(values)), float(effect.parameters['spread'])
-        panel.axhspan(-spread, spread, color='0.9')
-        for part in range(values.shape[1]):
-            at = places + 0.15 * (part - (values.shape[1] - 1) / 2.0)
-            panel.errorbar(at, values[:, part], sigma[:, part], fmt='.', capsize=2)
-        panel.set_xticks(places, [str(c) for c in effect.parameters['channels']])
-        panel.set(title=f'{effect.name}: {spread:.3g}', xlabel='channel')
-        panel.grid(alpha=0.3)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110, metadata={'Software': None})
-    plt.close(figure)
+    """Draw how the sensors differ; nothing is drawn where the scan contains no population."""
+    figure = population_figure(calibration.scan.corrections)
+    if figure is not None:
+        figure.savefig(path, dpi=110, metadata={'Software': None})
+        plt.close(figure)

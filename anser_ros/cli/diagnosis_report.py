@@ -7,6 +7,7 @@ from typing import Any
 from anser_ros.cli.diagnosis_figures import bars, course, image, maps, strongest, time_line
 from anser_ros.cli.diagnosis_words import paths, short_ones, value_text, verdict
 from anser_ros.cli.html_page import page, table
+from anser_ros.cli.populations import population_figure, population_table
 from anser_ros.diagnosis.search import Candidate
 from anser_ros.sessions.diagnosis import SessionDiagnosis
 
@@ -37,6 +38,7 @@ def render(result: SessionDiagnosis, document: dict[str, Any], *, session: str, 
         '<h2>Effects</h2>',
         _effects(document),
         *_paths(document, result),
+        *_populations(result),
         '<h2>Residuals over time</h2><p>In the pictures 1 is what noise alone would give.</p>',
         image(time_line(found.before, found.after)),
         '<h2>Residuals over the volume</h2>',
@@ -114,6 +116,17 @@ def _paths(document: dict[str, Any], result: SessionDiagnosis) -> Iterator[str]:
                 f'<details><summary>{len(rows)} points</summary>'
                 f'{table(list(columns), rows)}</details>'
             )
+
+
+def _populations(result: SessionDiagnosis) -> Iterator[str]:
+    """How the sensors differ, as the model corrects it: those that it had, and those found."""
+    records = result.diagnosis.model.effects
+    figure = population_figure(records)
+    if figure is not None:
+        yield '<h2>What every sensor has</h2><p>Its own error, one standard deviation behind it, '
+        yield 'as the corrected model undoes it; the grey band is the width of the population.</p>'
+        yield image(figure)
+        yield table(*population_table(records))
 
 
 def _structure(result: SessionDiagnosis) -> str:

@@ -107,6 +107,8 @@ class Effect(Generic[TermT]):
         One clause for the report.
     units : mapping
         Unit of each parameter of the record.
+    parts : tuple of str
+        What the values of each channel are, of an effect that every channel has in its own size.
     plausible : mapping
         Range that a parameter of the record may reasonably have.
     remedy : Remedy
@@ -130,6 +132,7 @@ class Effect(Generic[TermT]):
     name: ClassVar[str] = ''
     summary: ClassVar[str] = ''
     units: ClassVar[Mapping[str, str]] = {}
+    parts: ClassVar[tuple[str, ...]] = ()
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {}
     remedy: ClassVar[Remedy] = Remedy.NONE
     family: ClassVar[Family] = Family.STEADY

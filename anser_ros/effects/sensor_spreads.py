@@ -128,6 +128,7 @@ class SensorGainSpread(SensorSpread):
     units: ClassVar[Mapping[str, str]] = {'spread': '1', 'channels': '1', 'values': '1'}
     remedy = Remedy.FLUX
     width = 2
+    parts: ClassVar[tuple[str, ...]] = ('in phase', 'quadrature')
     offset_of_values = (1.0, 0.0)
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SpreadTerm]:
@@ -202,6 +203,7 @@ class SensorAxisSpread(SensorSpread):
     units: ClassVar[Mapping[str, str]] = {'spread': 'rad', 'channels': '1', 'values': 'rad'}
     remedy = Remedy.SENSORS
     width = 2
+    parts: ClassVar[tuple[str, ...]] = ('first tangent', 'second tangent')
     offset_of_values = (0.0, 0.0)
 
     def table(self, term: SpreadTerm, sensors: SensorTable) -> SensorTable:
@@ -217,6 +219,7 @@ class SensorPlaceSpread(SensorSpread):
     units: ClassVar[Mapping[str, str]] = {'spread': 'm', 'channels': '1', 'values': 'm'}
     remedy = Remedy.SENSORS
     width = 3
+    parts: ClassVar[tuple[str, ...]] = ('x', 'y', 'z')
     offset_of_values = (0.0, 0.0, 0.0)
 
     def table(self, term: SpreadTerm, sensors: SensorTable) -> SensorTable:

@@ -1,0 +1,94 @@
+"""Populations of sensors' errors, as a table and a picture of each channel's values."""
+
+from collections.abc import Sequence
+
+import matplotlib
+
+matplotlib.use('Agg')
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from anser_ros.effects.registry import effect_named
+from anser_ros.field.model import EffectRecord
+
+Array = NDArray[np.float64]
+
+SHOWN = {'1': (100.0, '%'), 'rad': (1e3, 'mrad'), 'm': (1e3, 'mm'), 'T': (1e9, 'nT')}
+"""Factor and unit in which values of each SI unit are shown."""
+MOST_PARTS = 3
+"""Values of a channel that a table has columns for; of more, their root mean square is shown."""
+
+
+def populations(records: Sequence[EffectRecord]) -> list[EffectRecord]:
+    """Return the records that hold a value and its uncertainty for every channel."""
+    return [r for r in records if {'channels', 'values', 'uncertainty'} <= r.parameters.keys()]
+
+
+def population_table(
+    records: Sequence[EffectRecord],
+) -> tuple[list[str], list[list[str]]]:
+    """Return the head and the rows, one a channel, of the table of all populations.
+
+    Of gains, the difference from one is shown.
+    """
+    found = populations(records)
+    channels = sorted({int(c) for record in found for c in record.parameters['channels']})
+    head, columns = ['channel'], [[str(channel) for channel in channels]]
+    for record in found:
+        names, unit, values, sigma = _shown(record)
+        rows = {int(c): i for i, c in enumerate(record.parameters['channels'])}
+        for part, name in enumerate(names):
+            head.append(f'{record.name}{f" {name}" if name else ""}, {unit}')
+            columns.append(
+                [
+                    f'{values[rows[c], part]:.4f} ± {sigma[rows[c], part]:.4f}'
+                    if c in rows
+                    else ''
+                    for c in channels
+                ]
+            )
+    return head, [list(row) for row in zip(*columns, strict=True)]
+
+
+def population_figure(records: Sequence[EffectRecord]) -> Figure | None:
+    """Draw each channel's values with one sigma, and the population's width behind them.
+
+    Returns None where no record is a population.
+    """
+    found = populations(records)
+    if not found:
+        return None
+    width = 4 * len(found)
+    figure, panels = plt.subplots(
+        1, len(found), figsize=(width, 3.5), squeeze=False, layout='constrained'
+    )
+    for panel, record in zip(panels[0], found, strict=True):
+        names, unit, values, sigma = _shown(record)
+        factor = SHOWN[effect_named(record.name).units['values']][0]
+        spread = factor * float(record.parameters['spread'])
+        panel.axhspan(-spread, spread, color='0.9', label='spread')
+        places = np.arange(len(values))
+        for part, name in enumerate(names):
+            at = places + 0.15 * (part - (len(names) - 1) / 2.0)
+            panel.errorbar(at, values[:, part], sigma[:, part], fmt='.', capsize=2, label=name)
+        panel.set_xticks(places, [str(c) for c in record.parameters['channels']])
+        panel.set(title=f'{record.name}: {spread:.3g} {unit}', xlabel='channel', ylabel=unit)
+        panel.grid(alpha=0.3)
+        panel.legend(fontsize=7)
+    return figure
+
+
+def _shown(record: EffectRecord) -> tuple[tuple[str, ...], str, Array, Array]:
+    """Return names and unit of what is shown, and values and sigma (C, P) in that unit."""
+    effect = effect_named(record.name)
+    factor, unit = SHOWN[effect.units['values']]
+    values = np.array(record.parameters['values'], dtype=np.float64)
+    # What all sound channels have, one for a gain, is no error.
+    values = factor * (values - np.median(values, axis=0).round())
+    sigma = factor * np.array(record.parameters['uncertainty'], dtype=np.float64)
+    if values.shape[1] <= MOST_PARTS:
+        return effect.parts or ('',) * values.shape[1], unit, values, sigma
+    mean = [np.sqrt(np.mean(part**2, axis=1, keepdims=True)) for part in (values, sigma)]
+    return ('rms',), unit, mean[0], mean[1]
