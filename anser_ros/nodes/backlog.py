@@ -7,7 +7,6 @@ catch up: it loses nothing.
 
 from collections import deque
 from statistics import median
-from typing import Any
 
 from anser_ros.stamps import NANO
 
@@ -61,17 +60,3 @@ class Backlog:
             return False
         share = work_s / max(spacing_s, 1e-9)
         return share >= 1.0 or age_s * share / (1.0 - share) > CATCH_UP_S
-
-
-def take_waiting(subscription: Any) -> list[Any]:
-    """Messages, as bytes and with their information, that wait in a queue, oldest first.
-
-    They leave the queue so.
-    """
-    taken = []
-    with subscription.handle:
-        while True:
-            item = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-            if item is None:
-                return taken
-            taken.append((item[0], item[1]))

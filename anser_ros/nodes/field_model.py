@@ -25,6 +25,7 @@ from anser_ros.nodes.flux_reader import read_frame
 from anser_ros.nodes.metal_view import MetalView
 from anser_ros.nodes.model_output import ModelOutput
 from anser_ros.nodes.moving_coils import MovingCoils
+from anser_ros.nodes.newest_frame import NewestSource
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.one_source import LOOK_S, OneSource, said_of
 from anser_ros.nodes.patches import start_refit
@@ -81,7 +82,7 @@ class FieldModelNode(AnserNode):
         setups = OneSource(
             self, String, 'setup', self._on_setup, qos.LATCHED, lasting=lambda text: text.data
         )
-        self._fluxes = OneSource(self, PointCloud2, 'reference/flux', self._on_flux, qos.STREAM)
+        self._fluxes = NewestSource(self, 'reference/flux', self._on_flux)
         topics = parse_patches(table.patches)
         self._moving = MovingCoils(self, topics, lambda: self._frame_id, self._refuse)
         self._sources = [setups, self._fluxes, *self._moving.sources]

@@ -18,13 +18,13 @@ from anser_ros.integrity.ageing import Standing
 from anser_ros.integrity.withheld import TWO_SOURCES, Withheld
 from anser_ros.nodes import qos
 from anser_ros.nodes.answered_frames import AnsweredFrames
-from anser_ros.nodes.backlog import Backlog, take_waiting
+from anser_ros.nodes.backlog import Backlog
 from anser_ros.nodes.diagnostics import Trouble
 from anser_ros.nodes.flux_reader import read_frame
 from anser_ros.nodes.handover import HandedFlux
-from anser_ros.nodes.incoming import opened
 from anser_ros.nodes.model_in_force import ModelInForce
 from anser_ros.nodes.model_intake import GivenModel, ModelIntake
+from anser_ros.nodes.newest_frame import newest_of
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.one_source import OneSource, said_of
 from anser_ros.nodes.overload import Load
@@ -35,7 +35,7 @@ from anser_ros.nodes.tracker_parameters import TrackerParameters, settings_of, t
 from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.starting_model import check_emitters, model_of
 from anser_ros.sessions.tracker_settings import settings_for
-from anser_ros.stamps import SECOND_NS, stamp_of
+from anser_ros.stamps import SECOND_NS
 from anser_ros.tracking.estimate import OK, USUAL_GATE
 from anser_ros.tracking.tip import Tip
 from anser_ros.tracking.tracker import Tracker
@@ -53,9 +53,6 @@ the parameter ``model_wait_s``, which it makes inexact by as much."""
 WIDE_GATE = 2.0 * USUAL_GATE
 """A gate that is wider than this is warned of. Smaller, and who has a rough model is warned for
 nothing; larger, and a gate that was opened for a trial stays open unseen."""
-LIVE_WITHIN_S = 60.0
-"""Fluxes whose stamps are further from the host's clock, s, are a recording's. Larger than any
-clock's error between two hosts that work together, smaller than the age of any recording."""
 
 
 class TrackerNode(AnserNode):
@@ -203,20 +200,9 @@ class TrackerNode(AnserNode):
         if isinstance(message, HandedFlux):
             self._take_frame(self._read(message), 0.0)
             return
-        received_ns = info.get('received_timestamp') or info.get('source_timestamp') or 0
-        now_ns, stamp_ns = time.time_ns(), stamp_of(message)
-        self._backlog.arrived(received_ns, stamp_ns)
-        # Nobody steers by a recording that is played: it is worked off whole.
-        live = abs(now_ns - stamp_ns) < LIVE_WITHIN_S * SECOND_NS
-        if live and received_ns and self._backlog.is_hopeless((now_ns - received_ns) / SECOND_NS):
-            waiting = take_waiting(self._fluxes.subscription)
-            believed = [self._fluxes.hears(about) for _, about in waiting]
-            if not all(believed):
-                return
-            if waiting:
-                self.count('frames_skipped', len(waiting))
-                message = opened(waiting[-1][0], PointCloud2)
-        self._take_frame(self._read(message), self.parameters.model_wait_s)
+        newest = newest_of(message, info, self._backlog, self._fluxes, self.count)
+        if newest is not None:
+            self._take_frame(self._read(newest), self.parameters.model_wait_s)
 
     def _take_frame(self, frame: tuple[int, FluxPoints] | None, wait_s: float) -> None:
         """Track a frame when its model is there, or after so long."""
