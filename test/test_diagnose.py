@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from anser_ros.cli.diagnosis_words import MOST_CHARACTERS, verdict
 from anser_ros.cli.main import main
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.bag import read_bag
@@ -43,7 +44,9 @@ def with_gain(path: Path) -> Path:
 
 def run(bag: Path, out: Path, model: Path = MODEL, *more: str) -> dict:
     assert main(['diagnose', str(bag), '--model', str(model), '--out', str(out), *more]) == 0
-    return json.loads((out / 'diagnosis.json').read_text())
+    document = json.loads((out / 'diagnosis.json').read_text())
+    assert len(verdict(document)) < MOST_CHARACTERS
+    return document
 
 
 @pytest.mark.long

@@ -15,7 +15,9 @@ import matplotlib
 matplotlib.use('Agg')
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from anser_ros.cli.html_page import page
@@ -73,6 +75,7 @@ def over_time(evaluation: Evaluation) -> Figure:
         lost = time[~series.ok]
         lower.plot(lost, np.full(lost.size, rank), '|', color=colour)
     upper.set(ylabel='position error, mm', yscale='log')
+    _spell_out(upper.yaxis)
     lower.set(xlabel='time, s', ylabel='no pose', ylim=(-0.8, len(found) - 0.2))
     lower.set_yticks([])
     upper.grid(alpha=0.3)
@@ -155,12 +158,21 @@ def against_sigma(evaluation: Evaluation, jitter_m: float = 0.0) -> Figure:
         left.plot(line, line, '-', color='0.3', label='error = sigma')
         left.plot(line, 3 * line, '--', color='0.3', label='error = 3 sigma')
         left.set(xscale='log', yscale='log')
+        for axis in (left.xaxis, left.yaxis):
+            _spell_out(axis)
     left.set(xlabel='sigma, with the optical jitter, mm', ylabel='position error, mm')
     right.set(xlabel='multiple of sigma', ylabel='share of the errors within', ylim=(0, 1.02))
     for panel in (left, right):
         panel.grid(alpha=0.3)
     _below(figure, left)
     return figure
+
+
+def _spell_out(axis: Axis) -> None:
+    """Label a logarithmic axis with numbers at 1, 2 and 5 of each power, which have room."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FormatStrFormatter('%g'))
+    axis.set_minor_formatter(NullFormatter())
 
 
 FIGURES = {

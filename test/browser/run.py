@@ -152,7 +152,7 @@ class Trial:
         page, found = self.page, {}
         if args.calibrate:
             self._click('Set baseline')
-            said = page.locator('.words').filter(has_text='baseline')
+            said = page.locator('.words').filter(has_text=re.compile(r'\w')).first
             found['baseline'] = said.inner_text()
         self._click('Record')
         page.wait_for_timeout(1e3 * args.record)
@@ -177,6 +177,8 @@ class Trial:
         found['after_undo'] = page.locator('.bar .pill').inner_text()
         live = found['tables']['live, last 10 s']
         found['closed'] = _fell(live['tracked frames, %'][::-1]) or _fell(live['error, mm rms'])
+        if args.calibrate:
+            found['closed'] &= found['baseline'].startswith('baseline of')
         return found
 
     def _click(self, name: str) -> None:
