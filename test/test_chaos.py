@@ -95,9 +95,21 @@ def test_what_a_busy_machine_hides_is_no_pass():
     good = Row('g', 'n', 'what', 'said', 0.1, 400, 0, None, None, 0.5)
     assert good.verdict(1.0) == 'ok'
     assert replace(good, skipped=900).verdict(1.0) == 'BUSY'
+    assert replace(good, skipped=900, back_s=None).verdict(1.0) == 'BUSY'
     assert replace(good, skipped=900, wrong=1).verdict(1.0) == 'FAILED'
     for change in ({'back_s': None}, {'back_s': 1.5}, {'wrong': 1}, {'crashed': ('node',)}):
         assert replace(good, **change).verdict(1.0) == 'FAILED'
+
+
+def test_rows_are_read_as_they_were_written(tmp_path):
+    from table import Row, load, save
+
+    rows = [
+        Row('g', 'n', 'what', 'said', None, 4, 1, 0.01, 1e-4, None, ('node: end',), 3, ('a', 'b')),
+        Row('g', 'm', 'what', '', 0.1, 400, 0, None, None, 0.5),
+    ]
+    save(tmp_path / 'chaos.json', rows)
+    assert load(tmp_path / 'chaos.json') == rows
 
 
 def test_growth_is_a_trend_and_no_step():

@@ -8,10 +8,8 @@ ends, and poses that are not back a second after the fault has gone.
 """
 
 import argparse
-import dataclasses
 import fcntl
 import itertools
-import json
 import os
 import sys
 import tempfile
@@ -28,7 +26,7 @@ from faults_line import CLOCK, REFERENCES, SERIAL
 from faults_models import MODELS
 from faults_processes import PROCESSES
 from rig import RATE_HZ, Rig
-from table import ALLOWED_S, Row, line, write_docs
+from table import ALLOWED_S, Row, line, load, save, write_docs
 from witness import WINDOW_S, is_wrong
 
 DOCUMENT = Path(__file__).resolve().parents[2] / 'docs' / 'faults.md'
@@ -123,7 +121,7 @@ def tried(chain: Chain, faults: Sequence[Fault], seed: int, lasts_s: float | Non
     group = next((g for g, all_ in GROUPS.items() if faults[0] in all_), 'together')
     return Row(
         group,
-        '+'.join(fault.name for fault in faults),
+        _name(faults),
         ' and '.join(fault.what for fault in faults),
         heard[0] if heard else '',
         told[0].arrival_s - begin if told else None,
@@ -162,7 +160,7 @@ def minimised(chain: Chain, faults: Sequence[Fault], seed: int, lasts_s: float |
 
 
 def _command(faults: Sequence[Fault], seed: int, lasts_s: float | None) -> str:
-    names = '+'.join(fault.name for fault in faults)
+    names = _name(faults)
     duration = '' if lasts_s is None else f' --duration {lasts_s:g}'
     return f"make chaos ARGS='--only {names} --seed {seed}{duration}'"
 
@@ -227,6 +225,10 @@ def main() -> int:
     parser.add_argument('--random', type=int, default=0, metavar='N', help='so many combinations')
     parser.add_argument('--write-docs', action='store_true', help='write docs/faults.md anew')
     parser.add_argument('--out', type=Path, default=Path('chaos.json'), help='file with all rows')
+    parser.add_argument(
+        '--again', type=Path, metavar='FILE',
+        help='repeat what the run of a chaos.json could not judge, and keep the rest of its rows',
+    )  # fmt: skip
     parser.add_argument('--list', action='store_true', help='name all faults and end')
     args = parser.parse_args()
     trials, commands = chosen(args)
@@ -241,24 +243,26 @@ def main() -> int:
     # Faults of one world share a chain.
     trials.sort(key=lambda faults: max(fault.world == 'metal' for fault in faults))
     number, lock = domain()
-    rows: list[Row] = []
+    found: dict[str, Row] = {}
+    if args.again:
+        found = {row.name: row for row in load(args.again)}
+        open_ = {row.name for row in found.values() if not row.is_judged}
+        trials = [faults for faults in trials if _name(faults) in open_]
+        commands = []
     with tempfile.TemporaryDirectory(prefix='anser_chaos_') as folder:
         chain = Chain(Path(folder), number)
         try:
             for command in commands:
-                rows.append(commanded(chain, command))
-                print(line(rows[-1]), flush=True)
+                _note(commanded(chain, command), found, args.out)
             for faults in trials:
-                rows.append(_tried_surely(chain, faults, args))
-                print(line(rows[-1]), flush=True)
-                if len(faults) > 1 and args.random and rows[-1].failed(ALLOWED_S):
+                row = _tried_surely(chain, faults, args)
+                _note(row, found, args.out)
+                if len(faults) > 1 and args.random and row.failed(ALLOWED_S):
                     print('  ' + minimised(chain, faults, args.seed, args.duration), flush=True)
         finally:
             chain.end()
             os.close(lock)
-            args.out.write_text(
-                json.dumps([dataclasses.asdict(row) for row in rows], indent=1) + '\n'
-            )
+    rows = list(found.values())
     failed = [row for row in rows if row.failed(ALLOWED_S)]
     poses, wrong = sum(row.poses for row in rows), sum(row.wrong for row in rows)
     print(f'{len(rows)} faults, {len(failed)} failed; {wrong} of {poses} poses wrong and ok')
@@ -272,13 +276,24 @@ def main() -> int:
     return 1 if failed or busy else 0
 
 
+def _name(faults: Sequence[Fault]) -> str:
+    return '+'.join(fault.name for fault in faults)
+
+
+def _note(row: Row, found: dict[str, Row], out: Path) -> None:
+    """Keep a row, and all of them in the file: a trial that is ended has its rows."""
+    found[row.name] = row
+    save(out, found.values())
+    print(line(row), flush=True)
+
+
 def _tried_surely(chain: Chain, faults: Sequence[Fault], args: argparse.Namespace) -> Row:
     """Try faults; a chain that does not come up is a failure of the fault, not of the trial."""
     try:
         return tried(chain, faults, args.seed, args.duration)
     except (RuntimeError, OSError) as error:
         chain.end()
-        names = '+'.join(fault.name for fault in faults)
+        names = _name(faults)
         return Row('together', names, names, '', None, 0, 0, None, None, None, (str(error),))
 
 

@@ -1,7 +1,8 @@
 """The rows of the trial, as a line for whoever watches and as a table of the documents."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
 
@@ -59,7 +60,7 @@ class Row:
 
     def failed(self, allowed_s: float) -> bool:
         """Return whether this must not be; how soon poses are back says nothing if it is busy."""
-        late = self.back_s is None or (self.is_judged and self.back_s > allowed_s)
+        late = self.is_judged and (self.back_s is None or self.back_s > allowed_s)
         return bool(self.wrong or self.crashed or late)
 
     def verdict(self, allowed_s: float) -> str:
@@ -92,6 +93,17 @@ def line(row: Row) -> str:
         *row.crashed,
     ]
     return ' | '.join(parts)
+
+
+def save(path: Path, rows: Iterable[Row]) -> None:
+    """Write rows to a file, from which `load` reads them."""
+    path.write_text(json.dumps([asdict(row) for row in rows], indent=1) + '\n', encoding='utf-8')
+
+
+def load(path: Path) -> list[Row]:
+    """Return the rows of a file."""
+    rows = [Row(**row) for row in json.loads(path.read_text(encoding='utf-8'))]
+    return [replace(row, crashed=tuple(row.crashed), heard=tuple(row.heard)) for row in rows]
 
 
 def write_docs(path: Path, rows: Sequence[Row], seed: int, rate_hz: float) -> None:
