@@ -7,7 +7,7 @@ import numpy as np
 from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.watch import Sighting
 
-SITES = ('channel', 'channels', 'coil', 'coils', 'body')
+SITES = ('channel', 'channels', 'coil', 'coils', 'body', 'sensor', 'stream')
 MOST_TEXT = 60
 """Characters of a figure beyond which it is left to the values: a line is read at a glance."""
 
@@ -23,6 +23,19 @@ def words_of(seen: Sighting) -> str:
     cause = seen.remark or 'no effect that is known explains it'
     depends = f', it depends on {", ".join(seen.depends_on)}' if seen.depends_on else ''
     return f'{size}; {cause}{depends}'
+
+
+def values_of(seen: Sighting) -> dict[str, object]:
+    """Return the figures of what was seen, by name."""
+    return {
+        'compared_with': seen.truth,
+        'frames_compared': seen.frames,
+        'flux_rms_t': seen.flux_rms_t,
+        'excess': seen.excess,
+        'excess_left': seen.excess_left,
+        'findings': ', '.join(title_of(record) for record in seen.findings),
+        'depends_on': ', '.join(seen.depends_on),
+    }
 
 
 def title_of(record: EffectRecord) -> str:

@@ -1,4 +1,4 @@
-"""Watches live for what the field model lacks, and names it in /diagnostics."""
+"""Watches live for what a field model or a tracker of poses lacks; names it in /diagnostics."""
 
 import queue
 import sys
@@ -20,9 +20,13 @@ from anser_ros.nodes.flux_reader import read_flux
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.one_source import OneSource, said_of
 from anser_ros.nodes.parameters import parameter
+from anser_ros.nodes.pose_streams import PoseStreams, pose_values, pose_words
 from anser_ros.nodes.shared_names import optical_parameter, optical_topic
-from anser_ros.nodes.sighting_words import figures_of, plain_text, title_of, words_of
+from anser_ros.nodes.sighting_words import figures_of, plain_text, title_of, values_of, words_of
 from anser_ros.nodes.stated_parameters import stated, stated_by
+from anser_ros.poses.live_look import PoseSighting, PoseWatch
+from anser_ros.poses.live_window import PoseWindow
+from anser_ros.poses.sequence import PoseSession
 from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.session import Session, empty_session, load_session
 from anser_ros.sessions.sliding_window import LIVE, SlidingWindow
@@ -49,6 +53,12 @@ class WatcherParameters:
         live=True,
     )
     optical: str = optical_parameter()
+    tracked_poses: tuple[str, ...] = parameter(
+        (), 'topics of tracked poses (PoseStamped); with these it watches a tracker of poses alone'
+    )
+    reference_pose: str = parameter(
+        '', 'with tracked_poses: topic of the reference; none to judge the sensors by each other'
+    )
     baseline_file: str = parameter(
         '', 'distortion-free recording of the same board; without one the references have no say'
     )
@@ -72,14 +82,15 @@ class WatcherParameters:
 class Task:
     """One look: at what, and with whom."""
 
-    watch: Watch
-    session: Session
+    watch: Watch | PoseWatch
+    session: Session | PoseSession
     first_ns: int
 
 
 class Watcher(AnserNode):
     """Subscribes to fluxes and optical poses, and publishes ``/diagnostics`` alone.
 
+    Where topics of tracked poses are named, it takes these and a reference's, and no fluxes.
     The diagnosis runs in a thread of its own; after each look it rests until its share of the
     processor is kept.
     """
@@ -95,9 +106,9 @@ class Watcher(AnserNode):
         self._stated = stated_by(table)
         self._baseline_bag = load_session(table.baseline_file) if table.baseline_file else None
         self._setup_text = self._offered = ''
-        self._window: SlidingWindow | None = None
-        self._watch: Watch | None = None
-        self._sighting: Sighting | None = None
+        self._window: SlidingWindow | PoseWindow | None = None
+        self._watch: Watch | PoseWatch | None = None
+        self._sighting: Sighting | PoseSighting | None = None
         self._trouble = ''
         self._known: dict[str, EffectRecord] = {}
         self._pose_subscriptions: dict[str, Any] = {}
@@ -106,13 +117,22 @@ class Watcher(AnserNode):
         self._look_s = 0.0
         self._busy = False
         self._tasks: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
-        self._sources = [
-            OneSource(
-                self, String, 'setup', self._on_setup, qos.LATCHED, lasting=lambda text: text.data
-            ),
-            OneSource(self, PointCloud2, 'tool/flux', self._on_tool, qos.STREAM),
-            OneSource(self, PointCloud2, 'reference/flux', self._on_reference, qos.STREAM),
-        ]
+        self._poses: PoseStreams | None = None
+        if table.tracked_poses:
+            self._poses = PoseStreams(
+                self, table.tracked_poses, table.reference_pose, table.window_s
+            )
+            self._window, self._watch = self._poses.window, PoseWatch()
+            self._sources = self._poses.sources
+        else:
+            self._sources = [
+                OneSource(
+                    self, String, 'setup', self._on_setup, qos.LATCHED,
+                    lasting=lambda text: text.data,
+                ),
+                OneSource(self, PointCloud2, 'tool/flux', self._on_tool, qos.STREAM),
+                OneSource(self, PointCloud2, 'reference/flux', self._on_reference, qos.STREAM),
+            ]  # fmt: skip
         self.create_timer(POLL_S, self._begin_look, clock=self.steady_clock)
         work = self._guard(self._take_look)
         self._thread = threading.Thread(target=self._work, args=(work,), daemon=True)
@@ -162,7 +182,7 @@ class Watcher(AnserNode):
 
     def _taker(self, body: str) -> Callable[[PoseStamped], None]:
         def take(message: PoseStamped) -> None:
-            if self._window is not None:
+            if isinstance(self._window, SlidingWindow):
                 p, q = message.pose.position, message.pose.orientation
                 stamp = message.header.stamp
                 pose = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
@@ -171,11 +191,11 @@ class Watcher(AnserNode):
         return take
 
     def _on_tool(self, message: PointCloud2) -> None:
-        if self._window is not None:
+        if isinstance(self._window, SlidingWindow):
             self._take(message, self._window.take_tool)
 
     def _on_reference(self, message: PointCloud2) -> None:
-        if self._window is not None:
+        if isinstance(self._window, SlidingWindow):
             self._take(message, self._window.take_reference)
 
     def _take(self, message: PointCloud2, take: Callable[..., None]) -> None:
@@ -200,7 +220,7 @@ class Watcher(AnserNode):
             return
         if window.span_s < FILLED * self.parameters.window_s or self._is_silent(now_s):
             return
-        session = window.session()
+        session = window.session() if self._poses is None else self._poses.session()
         if session is not None:
             self._busy = True
             self._next_s = now_s + self.parameters.period_s
@@ -218,7 +238,7 @@ class Watcher(AnserNode):
     def _take_look(self, task: Task) -> None:
         self.count('looks')
         try:
-            sighting = task.watch.look(task.session, task.first_ns)
+            sighting = _look(task)
         except AnserError as error:
             self._refuse('looks_refused', error)
             self._sighting = None
@@ -235,7 +255,8 @@ class Watcher(AnserNode):
     # What is told -------------------------------------------------------------------------
 
     def _is_silent(self, now_s: float) -> bool:
-        return now_s - self._heard_s > SILENCE_S
+        heard_s = self._heard_s if self._poses is None else self._poses.heard_s
+        return now_s - heard_s > SILENCE_S
 
     def status(self) -> Status:
         """Return what is there, in one line, with its figures."""
@@ -248,20 +269,17 @@ class Watcher(AnserNode):
             return Status('', Level.WARN, self._trouble or 'no setup yet', values)
         values |= {'searches': self._watch.searches, 'restarts': window.restarts}
         if self._is_silent(time.monotonic()):
-            return Status('', Level.WARN, 'no fluxes', values)
+            what = 'fluxes' if self._poses is None else 'poses'
+            return Status('', Level.WARN, f'no {what}', values)
+        quiet = () if self._poses is None else self._poses.quiet_topics()
+        if quiet:
+            return Status('', Level.WARN, f'no poses on {", ".join(quiet)}', values)
         if seen is None:
             state = self._trouble or f'gathers, {window.span_s:.0f} s so far'
             return Status('', Level.OK, state, values)
-        values |= {
-            'compared_with': seen.truth,
-            'frames_compared': seen.frames,
-            'flux_rms_t': seen.flux_rms_t,
-            'excess': seen.excess,
-            'excess_left': seen.excess_left,
-            'findings': ', '.join(title_of(record) for record in seen.findings),
-            'depends_on': ', '.join(seen.depends_on),
-        }
-        return Status('', Level.OK if seen.is_clear else Level.WARN, words_of(seen), values)
+        values |= pose_values(seen) if isinstance(seen, PoseSighting) else values_of(seen)
+        words = pose_words(seen) if isinstance(seen, PoseSighting) else words_of(seen)
+        return Status('', Level.OK if seen.is_clear else Level.WARN, words, values)
 
     def part_statuses(self) -> list[Status]:
         """Return a line for everything that was found since the setup came."""
@@ -280,6 +298,15 @@ class Watcher(AnserNode):
             else:
                 statuses.append(Status(title, Level.OK, 'gone'))
         return statuses
+
+
+def _look(task: Task) -> Sighting | PoseSighting:
+    """Look at a window as its kind of watch does."""
+    if isinstance(task.watch, PoseWatch):
+        assert isinstance(task.session, PoseSession)
+        return task.watch.look(task.session, task.first_ns)
+    assert isinstance(task.session, Session)
+    return task.watch.look(task.session, task.first_ns)
 
 
 if __name__ == '__main__':

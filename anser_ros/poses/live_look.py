@@ -1,0 +1,291 @@
+"""What the last seconds of running trackers of poses show: the diagnosis, and what has changed.
+
+A diagnosis of a recording takes the two frames as they are. Live they are known from earlier, so
+that a camera that was pushed, or a sensor that came loose, is told from what was there before.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from anser_ros.effects.term import Term
+from anser_ros.errors import DiagnosisError
+from anser_ros.field.model import EffectRecord
+from anser_ros.poses.diagnosis import PoseDiagnosis, diagnose_poses
+from anser_ros.poses.effects.episodes import LooseMount
+from anser_ros.poses.effects.hand_eye import FrameTerm, Mount, OpticalFrame
+from anser_ros.poses.effects.noise import PoseExcessNoise, RangeNoise
+from anser_ros.poses.effects.stamps import QuantisedStamps, ReceiptJitter
+from anser_ros.poses.effects.stream import StalePoses
+from anser_ros.poses.live_window import REFERENCE
+from anser_ros.poses.problem import PoseProblem, PoseState
+from anser_ros.poses.sequence import PoseSequence, PoseSession
+from anser_ros.poses.start import pose_problem
+
+Array = NDArray[np.float64]
+
+FROZEN_S = 1.0
+"""Time, s, for which a stream gives the same pose while another moves, to be frozen; a slow
+tracker repeats itself for some tenths."""
+MOVED_M = 0.01  # way of another stream in that time, m: far more than any tracker's jitter
+FEWEST_S = 4.0
+"""Time, s, that must be left before a stream froze for a diagnosis of the rest."""
+CHANGED, CHANGED_M = 2.5, 1.5e-3
+"""Factor of the median misfit over the one that was there when the frames were learnt, and its
+growth (m), from which something has changed."""
+EXPLAINED = 0.4
+"""Share of the misfit that may be left when one frame is fitted anew for that one to have
+changed."""
+STEPS = 12  # Gauss-Newton steps for one frame; a turn of 30 deg takes six
+NOISIER = 2.0
+"""Factor of the jitter over the one that was there first from which it is told: that of trackers
+grows by half over their volume."""
+FEWEST_POSES = 20  # poses of the later half of a window by which a change is judged
+
+
+@dataclass(frozen=True)
+class PoseSighting:
+    """What one look at the last seconds found.
+
+    Attributes
+    ----------
+    findings : tuple of EffectRecord
+        What is wrong; empty when all is well or nothing that is known explains it.
+    poses : int
+        Tracked poses that were looked at.
+    before_m, after_m, jitter_m : float
+        Held-out error with hand-eye alone and with the findings, and what jitter makes; NaN where
+        the poses were judged by the frames of earlier.
+    misfit_m : float
+        Median distance from where the frames of earlier have the poses; NaN before there are any.
+    unexplained : float
+        Share of the squared error above the jitter that nothing explains.
+    depends_on : tuple of str
+        What that depends on.
+    remark : str
+        Why nothing is named although something is there.
+    """
+
+    findings: tuple[EffectRecord, ...]
+    poses: int
+    before_m: float = float('nan')
+    after_m: float = float('nan')
+    jitter_m: float = float('nan')
+    misfit_m: float = float('nan')
+    unexplained: float = 0.0
+    depends_on: tuple[str, ...] = ()
+    remark: str = ''
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether there is nothing to be said."""
+        return not self.findings and not self.remark
+
+
+@dataclass(frozen=True)
+class _Known:
+    """The frames and effects of the first look that told them all."""
+
+    terms: tuple[Term, ...]
+    misfit: dict[str, float]
+    jitter_m: float
+
+
+class PoseWatch:
+    """A watch looks at one window after the other, and remembers the frames it learnt first.
+
+    Attributes
+    ----------
+    searches : int
+        How often effects were searched for.
+    """
+
+    def __init__(self) -> None:
+        self._known: _Known | None = None
+        self.searches = 0
+
+    def look(self, session: PoseSession, first_ns: int) -> PoseSighting:
+        """Look at a window whose stamps count from its own beginning.
+
+        Raises
+        ------
+        DiagnosisError
+            When there are too few poses to say anything.
+        PlausibilityError
+            When tracked and optical poses fit in no reading.
+        """
+        poses = sum(one.size for one in session.sensors.values())
+        frozen, since = frozen_streams(session)
+        if frozen:
+            start = min(float(p.time[0]) for p in _streams(session).values() if p.size)
+            if since - start < FEWEST_S:
+                return PoseSighting(frozen, poses)
+            session = _until(session, since)
+        misfit, changed, remark = self._changes(session)
+        if changed or remark:
+            return PoseSighting((*frozen, *changed), poses, misfit_m=misfit, remark=remark)
+        self.searches += 1
+        found = diagnose_poses(session)
+        told = [record for record in found.records if record.name != 'hand_eye']
+        told += self._noisier(found, told)
+        if self._known is None and not frozen:
+            self._known = _learnt(session, found)
+        # Noise that is not quite alike among neighbours is no reason for a warning of its own.
+        depends = found.depends_on if not told else ()
+        words = f'something depends on {", ".join(depends)}' if depends else ''
+        return PoseSighting(
+            (*frozen, *told), poses, found.before.position_m, found.after.position_m,
+            found.floor_m, misfit, found.unexplained, found.depends_on, words,
+        )  # fmt: skip
+
+    def _changes(self, session: PoseSession) -> tuple[float, tuple[EffectRecord, ...], str]:
+        """Median misfit by the known frames (m), the frame that has changed, or why none."""
+        known = self._known
+        if known is None or session.reference is None:
+            return float('nan'), (), ''
+        problem = _later_half(pose_problem(session))
+        terms = [t for t in known.terms if 'sensor' not in t.site or _has(problem, t)]
+        state = problem.state(terms)
+        misfit = _misfits(state)
+        if not misfit or not set(misfit) <= set(known.misfit):
+            return float('nan'), (), ''
+        off = [
+            name for name, size in misfit.items()
+            if size > max(CHANGED * known.misfit[name], known.misfit[name] + CHANGED_M)
+        ]  # fmt: skip
+        worst = max(misfit.values())
+        if not off:
+            return worst, (), ''
+        trials = []
+        for index, term in enumerate(terms):
+            # The reference's frame is every sensor's, a mount is its own.
+            is_frame = isinstance(term.effect, OpticalFrame) and len(off) == len(misfit)
+            is_mount = isinstance(term.effect, Mount) and off == [term.site['sensor']]
+            if is_frame or is_mount:
+                moved = _fitted_alone(problem, terms, index)
+                left = max(_misfits(problem.state(moved)).values())
+                trials.append((left, index, moved))
+        left, index, moved = min(trials, key=lambda t: t[0], default=(np.inf, 0, terms))
+        limit = max(EXPLAINED * worst, CHANGED * max(known.misfit.values()))
+        if left > limit:
+            return worst, (), (
+                f'{", ".join(off)}: poses are {1e3 * worst:.1f} mm from where the frames of '
+                'earlier have them, and no single frame explains it yet'
+            )  # fmt: skip
+        return worst, (_change(terms[index], moved[index], state, worst, left),), ''
+
+    def _noisier(
+        self, found: PoseDiagnosis, told: Sequence[EffectRecord]
+    ) -> Sequence[EffectRecord]:
+        """More jitter than at first, unless something that is named makes it."""
+        makers = ReceiptJitter, QuantisedStamps, PoseExcessNoise, RangeNoise
+        if self._known is None or {m.name for m in makers} & {r.name for r in told}:
+            return ()
+        factor = found.floor_m / max(self._known.jitter_m, 1e-9)
+        if factor < NOISIER:
+            return ()
+        return [EffectRecord(PoseExcessNoise.name, {'factor': factor}, {'factor': 0.1 * factor})]
+
+
+def frozen_streams(session: PoseSession) -> tuple[tuple[EffectRecord, ...], float]:
+    """Streams that give one pose over and over while another moves, and since when (s)."""
+    streams, found, since = _streams(session), [], np.inf
+    for name, poses in streams.items():
+        fresh = np.flatnonzero(~poses.repeated)
+        if not poses.size:
+            continue
+        begin, end = float(poses.time[fresh[-1]]), float(poses.time[-1])
+        if end - begin < FROZEN_S:
+            continue
+        ways = [
+            float(np.linalg.norm(np.ptp(other.position[other.time > begin], axis=0)))
+            for key, other in streams.items()
+            if key != name and np.count_nonzero(other.time > begin) > 1
+        ]
+        if max(ways, default=0.0) > MOVED_M:
+            again = poses.size - int(fresh[-1]) - 1
+            values = {'stream': name, 'fraction': again / poses.size, 'runs': 1,
+                      'since_s': begin}  # fmt: skip
+            found.append(EffectRecord(StalePoses.name, values, {}))
+            since = min(since, begin)
+    return tuple(found), float(since)
+
+
+def _streams(session: PoseSession) -> dict[str, PoseSequence]:
+    reference = session.reference
+    return {**session.sensors, **({} if reference is None else {REFERENCE: reference})}
+
+
+def _until(session: PoseSession, end: float) -> PoseSession:
+    streams = {name: poses.rows(poses.time < end) for name, poses in _streams(session).items()}
+    reference = streams.pop(REFERENCE, None)
+    return replace(session, sensors=streams, reference=reference)
+
+
+def _later_half(problem: PoseProblem) -> PoseProblem:
+    """Return the later half of a window, which a change in its first half has left behind."""
+    first = min(float(p.time[0]) for p in problem.sensors)
+    last = max(float(p.time[-1]) for p in problem.sensors)
+    return problem.rows([p.time > 0.5 * (first + last) for p in problem.sensors])
+
+
+def _has(problem: PoseProblem, term: Term) -> bool:
+    return str(term.site['sensor']) in {poses.name for poses in problem.sensors}
+
+
+def _misfits(state: PoseState) -> dict[str, float]:
+    """Median distance (m) of each sensor that has poses enough."""
+    found = {}
+    for part in state.parts:
+        far = np.linalg.norm(part.residual[part.used, :3], axis=1)
+        if far.size >= FEWEST_POSES:
+            found[part.view.sensor] = float(np.median(far))
+    return found
+
+
+def _learnt(session: PoseSession, found: PoseDiagnosis) -> _Known | None:
+    """What later windows are judged by; None where the motion does not tell the frames."""
+    eyes = [record for record in found.records if record.name == 'hand_eye']
+    if session.reference is None or not all(e.evidence.get('observable') for e in eyes):
+        return None
+    misfit = _misfits(pose_problem(session).state(found.fit.terms))
+    return _Known(found.fit.terms, misfit, found.floor_m) if misfit else None
+
+
+def _fitted_alone(problem: PoseProblem, terms: Sequence[Term], index: int) -> list[Term]:
+    """The terms with one of them fitted to the poses, all others as they are."""
+    trial = list(terms)
+    prior = trial[index].effect.prior(trial[index])
+    for _ in range(STEPS):
+        sums = problem.state(trial).sums([trial[index]])
+        moved = trial[index].with_theta(trial[index].theta + sums.step(prior, 0.0))
+        trial[index] = moved.rebased() if isinstance(moved, FrameTerm) else moved
+    return trial
+
+
+def _change(
+    before: Term, after: Term, state: PoseState, worst: float, left: float
+) -> EffectRecord:
+    """The change of a frame as an effect, with the misfits (m) without and with it."""
+    if not isinstance(before, FrameTerm) or not isinstance(after, FrameTerm):
+        raise DiagnosisError(f'{before.label}: no frame')
+    turn = Rotation.from_matrix(after.rotation @ before.rotation.T).as_rotvec(degrees=True)
+    evidence = {'misfit_before_m': worst, 'misfit_after_m': left}
+    if isinstance(before.effect, Mount):
+        values = {
+            'sensor': before.site['sensor'],
+            'rms_m': float(np.linalg.norm(after.translation - before.translation)),
+            'rms_deg': float(np.linalg.norm(turn)),
+        }
+        summary = 'the sensor sits elsewhere on the body than when the watch began'
+        return EffectRecord(LooseMount.name, values, {}, {**evidence, 'summary': summary})
+    # Where the poses are: a turn about the far origin of a camera moves that by decimetres.
+    middle = np.concatenate([p.view.optical[p.used] for p in state.parts]).mean(axis=0)
+    moved = after.rotation @ middle + after.translation
+    moved -= before.rotation @ middle + before.translation
+    values = {'rotation_deg': turn.tolist(), 'translation_m': moved.tolist()}
+    summary = 'tracker and reference have moved against each other since the watch began'
+    return EffectRecord(OpticalFrame.name, values, {}, {**evidence, 'summary': summary})
