@@ -122,14 +122,15 @@ def tool(length=0.0):
     return SensorTable(np.arange(6), names, ('tool',) * 6, place, axes, np.full(6, length))
 
 
-def scene(rng, side=9, jitter=1.0, sensors=None, noise=NOISE_T, height=0.14):
-    """Three emitters, each seven dipoles around its centre, complex moments."""
-    around = rng.uniform(-0.03, 0.03, (3, 7, 3)) * [1, 1, 0.1]
-    positions = (CENTRES[:, None] + around).reshape(-1, 3)
-    directions = rng.normal(size=(21, 3)) * 0.2 + [0, 0, 1]
+def scene(rng, side=9, jitter=1.0, sensors=None, noise=NOISE_T, height=0.14, centres=CENTRES):
+    """Emitters, three by default, each seven dipoles around its centre, complex moments."""
+    emitters = len(centres)
+    around = rng.uniform(-0.03, 0.03, (emitters, 7, 3)) * [1, 1, 0.1]
+    positions = (centres[:, None] + around).reshape(-1, 3)
+    directions = rng.normal(size=(7 * emitters, 3)) * 0.2 + [0, 0, 1]
     directions /= np.linalg.norm(directions, axis=1)[:, None]
-    moments = np.zeros((21, 3), dtype=complex)
-    for k in range(3):
+    moments = np.zeros((7 * emitters, emitters), dtype=complex)
+    for k in range(emitters):
         moments[7 * k : 7 * k + 7, k] = rng.uniform(0.005, 0.01, 7) * (1.0 + 0.05j)
     dipoles = DipoleSites(positions, directions)
     table = tool() if sensors is None else sensors
@@ -141,7 +142,7 @@ def scene(rng, side=9, jitter=1.0, sensors=None, noise=NOISE_T, height=0.14):
     points, axes = table.placed(position, rotation)
     lengths = np.tile(table.length, len(position))
     basis = flux_basis(points.reshape(-1, 3), axes.reshape(-1, 3), lengths, positions, directions)
-    flux = (basis @ moments).reshape(len(position), len(table), 3)
+    flux = (basis @ moments).reshape(len(position), len(table), emitters)
     flux = flux + noise * (rng.normal(size=flux.shape) + 1j * rng.normal(size=flux.shape))
     seen = position + jitter * JITTER_M * rng.normal(size=position.shape)
     turn = Rotation.from_rotvec(jitter * JITTER_RAD * rng.normal(size=position.shape)).as_matrix()
@@ -157,5 +158,5 @@ def scene(rng, side=9, jitter=1.0, sensors=None, noise=NOISE_T, height=0.14):
         rotation=turn @ rotation,
         has_pose=np.ones(count, dtype=bool),
     )
-    generator = Generator(CENTRES, np.zeros(3), 0.07)
+    generator = Generator(centres, np.zeros(emitters), 0.07)
     return Scene(measurements, position, rotation, dipoles, moments, generator)
