@@ -82,6 +82,26 @@ def test_no_pose_stays_none_and_a_pose_costs_little(bent):
     assert min(spent_s) < 3e-4
 
 
+def test_a_shrunk_space_is_stretched_about_its_own_point_with_its_variance(bent):
+    parameters = {
+        'degree': 0, 'kind': 'scale', 'sensor': 'sensor_0', 'centre_m': [0.05, 0.02, -0.3],
+        'size_m': 0.05, 'coefficients_mm': [1.5, 0.1, -0.2, 0.3],
+    }  # fmt: skip
+    sigma = {'coefficients_mm': [0.3, 0.1, 0.1, 0.1]}
+    record = {'name': 'field_distortion', 'parameters': parameters, 'uncertainty': sigma}
+    effects = [e for e in bent[1]['effects'] if e['name'] == 'hand_eye']
+    plain, full = (
+        PoseCorrector({**bent[1], 'effects': [*effects, *more]}) for more in ([], [record])
+    )
+    q, place = np.array([0, 0, 0, 1.0]), np.array([0.08, 0.0, -0.28])
+    before, after = (one.correct('sensor_0', 1, place, q) for one in (plain, full))
+    away = place - parameters['centre_m']
+    moved = 1.5e-3 * away / 0.05 + [1e-4, -2e-4, 3e-4]
+    np.testing.assert_allclose(after.position - before.position, moved, atol=1e-12)
+    variance = np.mean((0.3e-3 * away / 0.05) ** 2) + 1e-8
+    assert after.covariance[0, 0] - before.covariance[0, 0] == pytest.approx(variance, rel=1e-9)
+
+
 def test_what_is_no_model_of_poses_is_refused(bent):
     with pytest.raises(ModelFileError, match='anser_pose_model/1'):
         PoseCorrector({'schema': 'anser_model/1'})

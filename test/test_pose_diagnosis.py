@@ -66,6 +66,11 @@ def bent(world):
     world.bend = bend
 
 
+def shrunk(world):
+    middle = np.array([0.05, 0.02, -0.3])
+    world.bend = lambda sensor, place: middle + 0.97 * (place - middle) if sensor == 1 else place
+
+
 def far_noise(world):
     world.spread = lambda s, p: (np.linalg.norm(p, axis=1) / 0.3) ** 4
 
@@ -123,6 +128,7 @@ CASES = [
     (stale, {'stale_poses': ('fraction', 0.25, 0.05)}),
     (lossy, {'missing_poses': ('fraction', 0.03, 0.005)}),
     (bent, {'field_distortion': ('degree', 2, 0.1)}),
+    (shrunk, {'field_distortion': ('degree', 0, 0.1)}),
     (mirrored, {'outliers': ('fraction', 0.02, 0.005)}),
     (swapped, {'swapped_sensors': ('fraction', 0.1, 0.01)}),
 ]

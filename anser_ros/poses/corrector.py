@@ -12,7 +12,7 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.poses.convention import PoseReading
 from anser_ros.poses.document import MODEL_SCHEMA
 from anser_ros.poses.effects.clock import PoseTimeOffset
-from anser_ros.poses.effects.field_distortion import UNIT_M, FieldDistortion, monomials
+from anser_ros.poses.effects.field_distortion import FieldDistortion
 from anser_ros.poses.point_model import SMOOTH, smooth_map
 from anser_ros.poses.sequence import FARTHEST, NO_TURN, PoseSequence
 
@@ -84,7 +84,11 @@ class PoseCorrector:
         bend = FieldDistortion()
         maps = [r for r in records if r.name == bend.name]
         self._smooth = [smooth_map(r) for r in maps if r.parameters.get('kind') == SMOOTH]
-        self._maps = [(bend.term(r), r) for r in maps if r.parameters.get('kind') != SMOOTH]
+        self._maps = [
+            (bend.term(r), np.asarray(r.uncertainty.get('coefficients_mm', 0.0), dtype=np.float64))
+            for r in maps
+            if r.parameters.get('kind') != SMOOTH
+        ]
         self._bend = bend
         self._reading = PoseReading()
         for record in records:
@@ -123,27 +127,14 @@ class PoseCorrector:
         away = float(np.sqrt(outside @ outside))
         inside = np.clip(place, self._low, self._high)
         variance = self._sigma**2 + (GROWTH * away) ** 2
-        for term, record in self._maps:
+        for term, sigma in self._maps:
             if self._bend.acts_on(term, sensor):
                 # Outside it is held at the border: a polynomial knows nothing beyond it.
-                variance += self._map_variance(record, inside)
-                place = place + self._bend.shift(term, inside[None])[0]
+                shift, spread = self._bend.shift_and_variance(term, inside[None], sigma)
+                variance += float(spread[0])
+                place = place + shift[0]
         for added in self._smooth:
             place = place + added(inside[None])[0]
         covariance = np.diag(np.repeat([variance, self._turn**2], 3))
         state = OK if away == 0.0 else OUTSIDE
         return CorrectedPose(state, stamp_ns - round(1e9 * late), place, turn, covariance)
-
-    @staticmethod
-    def _map_variance(record: EffectRecord, place: Array) -> float:
-        """Variance that the map's coefficients give a coordinate of a place, m^2."""
-        told = record.uncertainty.get('coefficients_mm')
-        if told is None:
-            return 0.0
-        p = record.parameters
-        basis = monomials(
-            place[None], np.asarray(p['centre_m']), float(p['size_m']), int(p['degree']),
-            int(p.get('lowest', 1)),
-        )[0]  # fmt: skip
-        spread = np.asarray(told, dtype=np.float64).reshape(-1, 3)
-        return float(UNIT_M**2 * np.mean((basis**2) @ spread**2))

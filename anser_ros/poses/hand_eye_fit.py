@@ -19,7 +19,7 @@ from anser_ros.poses.diagnosis import (
     LEAST_KNOWN_M,
     LEAST_KNOWN_RAD,
     hand_eye_record,
-    lever_blur,
+    lever_is_told,
     turn_jitter,
 )
 from anser_ros.poses.effects.clock import PoseClockRate, PoseTimeOffset
@@ -225,7 +225,7 @@ def _told(
         name = str(term.site['sensor'])
         part = next(p for p in fit.state.parts if p.view.sensor == name)
         record = hand_eye_record(
-            term, spreads[index], frame, spreads[base], lever_blur(part, shaking)
+            term, spreads[index], frame, spreads[base], lever_is_told(part, shaking)
         )
         lever = [np.nan if v is None else float(v) for v in record.parameters['lever_arm_m']]
         sigma = np.sqrt(np.maximum(np.diag(spreads[index]), 0.0))

@@ -11,26 +11,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN, PER_PARAMETER
+from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN
 from anser_ros.effects.term import Term
 from anser_ros.poses.effect import Role, effect_of, is_of
 from anser_ros.poses.effects.hand_eye import FrameTerm
 from anser_ros.poses.fit import FOLDS, LARGEST_STAMP_S, PoseFit, fit_poses, noise_of, standing_out
+from anser_ros.poses.prices import LEAST_SHARE, is_scale, price
 from anser_ros.poses.problem import PoseNoise, PosePart
 from anser_ros.poses.registry import pose_effects
 
 Array = NDArray[np.float64]
 
-LEAST_SHARE = 0.015
-"""Share of the sum of squares that an effect must explain on blocks that it has not seen. Errors
-of trackers are alike over seconds and centimetres, and any smooth course takes a trace of them.
-Smaller names traces of smooth errors; larger misses effects that matter to a tenth of the
-error."""
-POSES_A_PARAMETER = 12  # poses that a parameter needs: neighbours in time are hardly new
-MAP_SHARE = 0.35
-"""The same of a map, and what it must explain beyond a few numbers: a fifth of the error. A map
-follows whatever is smooth in the places that were visited. Smaller lets a map take what is another
-effect; larger leaves distortions unnamed."""
+POSES_A_PARAMETER = 6
+"""Poses that a parameter needs: neighbours in time are hardly new. More leave metal unnamed on a
+hundred poses that a slow tracker gives in a minute; blocks judge what fewer would do."""
 SMOOTH_STEPS = 2.0
 """Intervals of the reference up to which a filter may only smooth its noise. Fewer call smoothing
 a lag; more take a lag for smoothing. How the value was chosen is not recorded."""
@@ -132,17 +126,6 @@ def effects_of(fit: PoseFit) -> list[Term]:
     return [term for term in fit.terms if not isinstance(term, FrameTerm)]
 
 
-def price(term: Term, total: float, fit: PoseFit) -> float:
-    """Gain, in units of the misfit, that a term must have beside a sum of squares ``total``."""
-    misfit, parts = fit.misfit, fit.state.parts
-    if 'sensor' in term.site:  # of one sensor only its own errors can be explained
-        squares = {p.view.sensor: float(np.sum(p.white**2)) for p in parts}
-        total *= squares[str(term.site['sensor'])] / max(sum(squares.values()), 1e-300)
-    parameters = max(term.complexity, 1)
-    share = MAP_SHARE if is_of(term, Role.MAP) else LEAST_SHARE
-    return max(LEAST_GAIN + PER_PARAMETER * parameters, share * total / misfit)
-
-
 def _best_addition(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | None:
     """The fit with the candidate that is worth most, or None; a lag is looked for at the end."""
     setting = fit.state.problem.setting
@@ -159,7 +142,8 @@ def _best_addition(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | No
                 promising.append((gain - AS_GOOD_PER_PARAMETER * term.complexity, term))
     promising.sort(key=lambda pair: -pair[0])
     # Of each effect the best is tried, so that many shapes of one do not crowd out the others.
-    chosen = list({t.effect.name: t for _, t in reversed(promising)}.values())
+    kinds = {(t.effect.name, is_scale(t)): t for _, t in reversed(promising)}
+    chosen = list(kinds.values())
     accepted: list[tuple[float, PoseFit]] = []
     for term in [*chosen, *(t for _, t in promising[:FULL_FITS] if t not in chosen)]:
         found = _accepted(fit, term, refused)
@@ -262,7 +246,17 @@ def _with_lag(
         if _gain(fit, trial, term) > need:
             refused.append((term.label, 'a smoother reference explains as much'))
         return None, left
+    if not _all_gain(best, trial):
+        refused.append((term.label, 'not all sensors of the tracker show it'))
+        return None, left
     return trial, left
+
+
+def _all_gain(before: PoseFit, after: PoseFit) -> bool:
+    """Whether an effect of the tracker itself takes off errors of each of its sensors."""
+    pairs = zip(before.state.parts, after.state.parts, strict=True)
+    gains = [float(np.sum(old.white**2) - np.sum(new.white**2)) for old, new in pairs]
+    return min(gains) > LEAST_GAIN * after.misfit
 
 
 def _probe(fit: PoseFit, term: Term) -> float:
@@ -310,7 +304,11 @@ def _one_scale(fit: PoseFit) -> bool:
             **{key: getattr(problem, key)[i : i + 1]
                for key in ('sensors', 'blocks', 'places', 'weight', 'noise')},
         )  # fmt: skip
-        terms = [t for t in fit.terms if str(t.site.get('sensor', poses.name)) == poses.name]
+        # A map of its own would take up what differs.
+        terms = [
+            t for t in fit.terms
+            if effect_of(t).acts_on(t, poses.name) and not is_of(t, Role.MAP)
+        ]  # fmt: skip
         one = fit_poses(alone, terms)
         index = next(k for k, t in enumerate(one.terms) if is_of(t, Role.SCALE))
         scale = 1e-3 * float(one.terms[index].theta[0])
@@ -343,7 +341,7 @@ def _settled(
     while True:
         evidence: list[PoseEvidence | None] = []
         weakest: tuple[float, Term, PoseFit] | None = None
-        for term in fit.terms:
+        for index, term in enumerate(fit.terms):
             if isinstance(term, FrameTerm):
                 evidence.append(None)
                 continue
@@ -354,8 +352,12 @@ def _settled(
             gain = _gain(without, fit, term)
             left = without.held_out()
             need = price(term, left, without)
-            if gain < need and (weakest is None or gain / need < weakest[0]):
-                weakest = gain / need, term, without
+            # Beside others the parameters may have become what no instrument has.
+            covariance = fit.covariance_of(index)
+            is_possible = term.effect.possible(term.effect.record(term, covariance))
+            share = gain / need if is_possible else min(gain / need, 0.0)
+            if share < 1 and (weakest is None or share < weakest[0]):
+                weakest = share, term, without
             evidence.append(
                 PoseEvidence(
                     gain, gain * fit.misfit / left, without.state.rms()[0], fit.state.rms()[0]

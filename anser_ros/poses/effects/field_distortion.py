@@ -1,6 +1,7 @@
 """The tracker's map of space is bent: a smooth function of the tracked place, for a sensor."""
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from itertools import combinations_with_replacement
 from typing import ClassVar
 
@@ -14,8 +15,9 @@ from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView, Role
 
 Array = NDArray[np.float64]
 
-KINDS = {1: 'linear', 2: 'quadratic', 3: 'cubic'}
-"""Degrees of the polynomials of position that are tried."""
+KINDS = {0: 'scale', 1: 'linear', 2: 'quadratic', 3: 'cubic'}
+"""Degrees of the polynomials of position that are tried; of degree zero is a space that shrinks or
+grows alike in all directions about a point of its own, which four numbers tell."""
 UNIT_M = 1e-3
 """Unit of theta, m: a coefficient is what it moves a pose at the rms distance from the middle."""
 
@@ -25,12 +27,14 @@ def monomials(position: Array, centre: Array, size: float, degree: int, lowest: 
     up.
     """
     scaled = (position - centre) / size
-    columns = [
-        np.prod(scaled[:, list(chosen)], axis=1)
-        for order in range(lowest, degree + 1)
-        for chosen in combinations_with_replacement(range(3), order)
-    ]
-    return np.stack(columns, axis=1)
+    columns = [np.prod(scaled[:, _factors(order)], axis=2) for order in range(lowest, degree + 1)]
+    return np.concatenate(columns, axis=1)
+
+
+@cache
+def _factors(order: int) -> NDArray[np.int64]:
+    """Coordinates that are multiplied for each monomial of an order, shape (m, order)."""
+    return np.array(list(combinations_with_replacement(range(3), order)), dtype=np.int64)
 
 
 class FieldDistortion(PoseEffect):
@@ -47,12 +51,20 @@ class FieldDistortion(PoseEffect):
     def sites(self, setting: PoseSetting) -> Sequence[Term]:
         """Try each degree, for all sensors together and for each alone."""
         alone = setting.sensors if len(setting.sensors) > 1 else ()
-        return [self.at(setting, degree, s) for degree in KINDS for s in (None, *alone)]
+        # One scale of all sensors is the reference's as well as the tracker's.
+        return [
+            self.at(setting, degree, s)
+            for degree in KINDS
+            for s in (None, *alone)
+            if degree > 0 or s is not None
+        ]
 
     def at(self, setting: PoseSetting, degree: int, sensor: str | None) -> Term:
         """Return the effect of a degree on one sensor, or on all."""
         site = {} if sensor is None else {'sensor': sensor}
         place = {'degree': degree, 'centre_m': setting.centre.tolist(), 'size_m': setting.size}
+        if degree == 0:
+            return Term(self, {**site, **place}, np.zeros(4))
         count = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, degree).shape[1]
         return Term(self, {**site, **place}, np.zeros(3 * count))
 
@@ -72,24 +84,40 @@ class FieldDistortion(PoseEffect):
         """Return a prior spread of 5 mm at the rms distance."""
         return np.full(term.theta.size, 5.0)
 
-    def _basis(self, term: Term, position: Array) -> Array:
+    def _derivative(self, term: Term, position: Array) -> Array:
+        """What each parameter moves positions (n, 3) by, shape (n, 3, q), m."""
         centre, size = np.asarray(term.site['centre_m']), float(term.site['size_m'])
         degree, lowest = int(term.site['degree']), int(term.site.get('lowest', 1))
-        return monomials(position, centre, size, degree, lowest)
+        if degree == 0:
+            away = ((position - centre) / size)[:, :, None]
+            shift = np.broadcast_to(np.eye(3), (len(position), 3, 3))
+            return UNIT_M * np.concatenate([away, shift], axis=2)
+        basis = monomials(position, centre, size, degree, lowest)
+        out = np.zeros((len(position), 3, term.theta.size))
+        for axis in range(3):
+            out[:, axis, axis::3] = UNIT_M * basis
+        return out
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
         """Minus what it adds to the tracked positions."""
         if not self.acts_on(term, view.sensor):
             return None
-        basis = self._basis(term, view.measured)
         out = np.zeros((view.time.size, 6, term.theta.size))
-        for axis in range(3):
-            out[:, axis, axis::3] = -UNIT_M * basis
+        out[:, :3] = -self._derivative(term, view.measured)
         return out
 
     def shift(self, term: Term, position: Array) -> Array:
         """What is added to tracked positions (n, 3), m."""
-        return UNIT_M * self._basis(term, position) @ term.theta.reshape(-1, 3)
+        return self._derivative(term, position) @ term.theta
+
+    def shift_and_variance(self, term: Term, position: Array, sigma: Array) -> tuple[Array, Array]:
+        """What is added to tracked positions (n, 3), m, and its variance (n,) a coordinate, m^2.
+
+        The parameters' standard deviations ``sigma``, mm, are taken for independent.
+        """
+        moved = self._derivative(term, position)
+        spread = np.broadcast_to(sigma, term.theta.shape)
+        return moved @ term.theta, np.asarray(np.mean(moved**2 @ spread**2, axis=1))
 
     def corrected(
         self, term: Term, sensor: str, position: Array, rotation: Array
@@ -102,13 +130,17 @@ class FieldDistortion(PoseEffect):
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """The record has the map, and how far it moves poses at their rms distance."""
         degree = int(term.site['degree'])
-        rms = UNIT_M * float(np.linalg.norm(term.theta)) / np.sqrt(3)
+        # A scale's first number moves all three coordinates, as its shift does together.
+        rms = UNIT_M * float(np.linalg.norm(term.theta)) / (np.sqrt(3) if degree else 1.0)
+        strain = (rms if degree else UNIT_M * abs(float(term.theta[0]))) / float(
+            term.site['size_m']
+        )
         spread = UNIT_M * float(np.sqrt(np.mean(sigmas(covariance) ** 2)))
         return EffectRecord(
             self.name,
             {
                 **term.site, 'kind': KINDS[degree], 'rms_m': rms,
-                'strain': rms / float(term.site['size_m']),
+                'strain': strain,
                 'coefficients_mm': term.theta.tolist(),
             },
             {'rms_m': spread, 'coefficients_mm': sigmas(covariance).tolist()},

@@ -22,6 +22,9 @@ FINEST_S = 2e-3  # finest step of stamps, s, that a poll would have
 STEP_SHARE = (0.15, 0.7)
 """Error over the step that rounding to a step makes: 0.29 if even, more if a poll is late."""
 ON_STEP = 0.95  # share of the stamps that lie on a grid for it to be one
+RATE_SHARE = 0.9
+"""Share of the intervals that are one step from which the step is the tracker's own rate, with
+some poses lost, and no poll's: another clock falls into step for less."""
 
 
 def stamp_step(time: Array) -> float:
@@ -46,7 +49,8 @@ def stamp_step(time: Array) -> float:
         step = float(np.sum(steps * counts) / np.sum(counts**2))
         off = np.abs(steps - np.round(steps / step) * step)
         if np.mean(off < 0.02 * step + 2e-6) > ON_STEP:
-            return step
+            is_rate = np.mean(np.round(np.diff(time) / step) == 1) > RATE_SHARE
+            return 0.0 if is_rate else step
     return 0.0
 
 

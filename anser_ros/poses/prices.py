@@ -1,0 +1,54 @@
+"""What an effect on poses must explain on blocks that it has not seen, to be named."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from anser_ros.diagnosis.decisions import LEAST_GAIN, PER_PARAMETER
+from anser_ros.effects.term import Term
+from anser_ros.poses.effect import Role, effect_of, is_of
+from anser_ros.poses.fit import PoseFit
+from anser_ros.poses.problem import PosePart
+
+LEAST_SHARE = 0.015
+"""Share of the sum of squares that an effect must explain on blocks that it has not seen. Errors
+of trackers are alike over seconds and centimetres, and any smooth course takes a trace of them.
+Smaller names traces of smooth errors; larger misses effects that matter to a tenth of the
+error."""
+MAP_SHARE, LARGE_SHARE = 0.55, 0.3
+"""Share of the squared error of positions that a map must explain, since it follows whatever is
+smooth in the places that were visited: most of it, or less where it moves poses by `LARGE_M`.
+Smaller lets a map take what is another effect; larger leaves distortions unnamed. Both were chosen
+on recordings with and without metal."""
+LARGE_M = 1.5e-3
+"""Error, m, that no tracker has of itself: data sheets say 0.5 to 1.4 mm. What a map takes off is
+larger then, and something is there that bends the field."""
+SCALE_SHARE, SCALE_M = 0.1, 0.8e-3
+"""The same of a scale of one sensor alone, which is few numbers and follows hardly anything: this
+share, or more where that is less than `SCALE_M`."""
+
+
+def price(term: Term, total: float, fit: PoseFit) -> float:
+    """Gain, in units of the misfit, that a term must have beside a sum of squares ``total``."""
+    misfit, share = fit.misfit, LEAST_SHARE
+    # Only the errors of its own sensor, and of positions where it is a map, can be explained.
+    rows = slice(3) if is_of(term, Role.MAP) else slice(6)
+    parts = [p for p in fit.state.parts if effect_of(term).acts_on(term, p.view.sensor)]
+    own = float(sum(np.sum(p.white[:, rows] ** 2) for p in parts))
+    if is_of(term, Role.MAP):
+        share = _map_share(term, parts)
+    total *= own / max(fit.state.sum_of_squares, 1e-300)
+    return max(LEAST_GAIN + PER_PARAMETER * max(term.complexity, 1), share * total / misfit)
+
+
+def _map_share(term: Term, parts: Sequence[PosePart]) -> float:
+    """Share of the squared error of its sensors' positions that a map must explain."""
+    squares = [np.sum(p.residual[p.used, :3] ** 2, axis=1) for p in parts]
+    error = float(np.mean(np.concatenate(squares)))
+    least, size = (SCALE_SHARE, SCALE_M) if is_scale(term) else (LARGE_SHARE, LARGE_M)
+    return float(np.clip(size**2 / max(error, 1e-18), least, MAP_SHARE))
+
+
+def is_scale(term: Term) -> bool:
+    """Whether a map is that of one sensor's scale."""
+    return is_of(term, Role.MAP) and int(term.site['degree']) == 0
