@@ -36,7 +36,7 @@ class Open:
 
 
 def opened(state: State, term: Term) -> Open | None:
-    """Each frame's own normal equations along a fluctuation's columns; None for other effects."""
+    """Return each frame's normal equations along a fluctuation's columns; None for others."""
     free, normal, right = term.effect.opened(term), [], []
     if free is None:
         return None
@@ -94,7 +94,7 @@ def respread(problem: Problem, terms: Sequence[Term]) -> tuple[Term, ...]:
 
 
 def left_over(state: State, term: Term) -> float:
-    """Share of a candidate's power that the fluctuations in force leave it; one without any."""
+    """Return the share of a candidate's power that the fluctuations in force leave it, or 1."""
     if not any(t.effect.family is Family.FLUCTUATION for t in state.terms):
         return 1.0
     now, before = 0.0, 0.0

@@ -47,7 +47,7 @@ class SwappedChannels(Effect[Term]):
         return EffectRecord(self.name, {k: list(term.site[k]) for k in ('channels', 'read_as')})
 
     def term(self, record: EffectRecord) -> Term:
-        """Read the swapped channels from a record, and as which they are read."""
+        """Read from a record which channels are swapped, and with which."""
         site = {k: tuple(int(c) for c in needed(record, k)) for k in ('channels', 'read_as')}
         return Term(self, site)
 

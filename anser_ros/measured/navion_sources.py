@@ -77,7 +77,7 @@ def outside_points(data: PlateData, step_m: float, margin: float, reach: float) 
 
 
 def scan_for_metal(data: PlateData, fit: PlateFit, metal_am2: float) -> tuple[Array, float]:
-    """Place (3,), m, where one more dipole gains most log evidence, and that gain.
+    """Return the place (3,), m, where one more dipole gains most log evidence, and that gain.
 
     Parameters
     ----------

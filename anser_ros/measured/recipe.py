@@ -33,7 +33,7 @@ class Recipe:
 
 
 def ran(folder: Path, name: str) -> dict[str, Any]:
-    """Return the document of a name that a command wrote into its folder."""
+    """Return the JSON document of this name that a command wrote into its folder."""
     document: dict[str, Any] = json.loads((folder / name).read_text(encoding='utf-8'))
     return document
 

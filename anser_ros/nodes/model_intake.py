@@ -105,7 +105,7 @@ class ModelIntake:
         return self._joined(stamp_ns, data, points)
 
     def take_error(self, message: PointCloud2) -> GivenModel | None:
-        """Keep an uncertainty; return the newest model anew where it belongs to that.
+        """Keep an uncertainty; return the newest model with it where it is of that model.
 
         Raises
         ------

@@ -62,7 +62,7 @@ class PoseFit:
         return self.state.sum_of_squares / max(self.state.count, 1)
 
     def held_out(self, in_space: bool = False) -> float:
-        """Cross-validated sum of squares over blocks of time, or of space."""
+        """Return the cross-validated sum of squares over blocks of time, or of space."""
         sums = self.state.sums(in_space=True) if in_space else self.sums
         return sums.held_out(self.prior, FOLDS)
 

@@ -128,7 +128,7 @@ def error_whitening(
     modes: Array,
     sigma: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """What the model's error does to coils, and what makes their residuals of unit covariance.
+    """Return the model's error at coils, and the factors that make their residuals white.
 
     Parameters
     ----------

@@ -101,7 +101,7 @@ def _cross(vectors: Array) -> Array:
 
 
 def frame_term(effect: Any, site: dict[str, Any], place: Array, turn: Array) -> FrameTerm:
-    """A frame at a place (m) with a rotation matrix."""
+    """Return the term of a frame at a place (m) with a rotation matrix."""
     return FrameTerm(effect, site, np.array([*place, 0, 0, 0]), start=turn)
 
 
