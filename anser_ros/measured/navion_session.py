@@ -89,7 +89,7 @@ def write_plate(data: NavionData, emitter: Emitter, path: Path) -> None:
 
 
 def write_sensor(data: NavionData, emitter: Emitter, path: Path) -> None:
-    """Write a session in which one sensor stands for all; raises `BagError` when the file exists."""
+    """Write a session in which one sensor stands for all; raises `BagError` where the file is."""
     heights, grid = data.coils.height_m, data.coils.grid_m
     flux = data.coils.field_t.transpose(0, 2, 3, 1).reshape(heights.size * len(grid), 3, -1)
     places = (grid[None] + heights[:, None, None] * np.array([0.0, 0.0, 1.0])).reshape(-1, 3)
