@@ -3,7 +3,7 @@
 import argparse
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.sensor_parameters import EXTRA_KINDS, KINDS
 from anser_ros.cli.calibration_figure import draw_choice, draw_populations
 from anser_ros.cli.output import Result, check_file, loss_notes, make_folder, say
-from anser_ros.cli.populations import population_table
+from anser_ros.cli.populations import population_table, populations
 from anser_ros.cli.progress import progress_of
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.errors import FitError, ParameterError
@@ -178,15 +178,14 @@ def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
     return table
 
 
-def _populations(calibration: Calibration) -> tuple[Table, ...]:
-    """The table of how the sensors differ, where the scan says that they do."""
-    head, rows = population_table(calibration.scan.corrections)
-    if not rows:
-        return ()
-    table = Table(*head, title='populations')
-    for row in rows:
-        table.add_row(*row)
-    return (table,)
+def _populations(calibration: Calibration) -> Iterator[Table]:
+    """A table of each kind in which the sensors differ, as far as the scan says that they do."""
+    for record in populations(calibration.scan.corrections):
+        head, rows = population_table([record])
+        table = Table(*(name.removeprefix(f'{record.name} ') for name in head), title=record.name)
+        for row in rows:
+            table.add_row(*row)
+        yield table
 
 
 def _short(value: Any) -> str:
