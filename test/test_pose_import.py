@@ -197,3 +197,11 @@ def test_sensors_have_the_names_that_they_are_given(tmp_path, capsys):
         command = ['--name', name, '--out', str(tmp_path / 'other.mcap')]
         assert run_verb('import_poses', [str(path), *command]) == 2
         assert said in capsys.readouterr().err
+
+
+def test_axes_in_different_units_are_refused(tmp_path):
+    table = write(
+        tmp_path / 'a.csv', 'stamp_ns,x_m,y_mm,z_m,qx,qy,qz,qw', '1000000000,1,2,3,0,0,0,1'
+    )
+    with pytest.raises(ParameterError, match='columns'):
+        import_poses([table])

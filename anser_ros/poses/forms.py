@@ -160,7 +160,7 @@ def _table(lines: Sequence[str], path: Path) -> dict[str, RawRows]:
     """CSV: ``stamp_ns`` or ``time_s``, positions with their unit, quaternions, ``sensor``."""
     reader = csv.DictReader(lines)
     names = reader.fieldnames or []
-    unit = next((u for u in UNITS if f'x_{u}' in names), None)
+    unit = next((u for u in UNITS if {f'{axis}_{u}' for axis in 'xyz'} <= set(names)), None)
     clock = next((c for c in ('stamp_ns', 'time_s') if c in names), None)
     turn = ('qx', 'qy', 'qz', 'qw')
     if unit is None or clock is None or not set(turn) <= set(names):
