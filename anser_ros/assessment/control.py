@@ -76,7 +76,7 @@ class Verdict:
     state : str
         One of `STATES`.
     words : str
-        Why; empty where it passes.
+        Why, or that there are no limits yet; empty where it passes by limits.
     limits : ControlLimits or None
         None while there are too few sessions.
     tolerance : float or None

@@ -148,7 +148,7 @@ def _say(found: Assessment, document: dict[str, Any], state: str, sessions: int)
         words = ', '.join(
             f'{name}: {one["words"]}'
             for name, one in document['qa']['figures'].items()
-            if one['state'] != 'pass'
+            if one['words']
         )
         console.print(
             f'[{COLORS[state]}]{state}[/], beside {sessions} earlier sessions'

@@ -26,7 +26,10 @@ def render(found: Assessment, document: dict[str, Any]) -> str:
         f'<p class="note">{html.escape(PROTOCOLS[found.protocol])}; '
         f'<code>{html.escape(files)}</code></p>',
         _verdict(document),
-        table(('figure', 'value', '95 % interval', 'state'), figure_rows(found, document)),
+        table(
+            ('figure', 'value', '95 % interval', 'state')[: 4 if 'qa' in document else 3],
+            [row[: 4 if 'qa' in document else 3] for row in figure_rows(found, document)],
+        ),
         *(f'<p class="note">{html.escape(words)}</p>' for words in found.notes),
     ]
     if found.allan:
@@ -60,7 +63,7 @@ def _verdict(document: dict[str, Any]) -> str:
     words = '; '.join(
         f'{name}: {one["state"]}, {one["words"]}'
         for name, one in qa['figures'].items()
-        if one['state'] != 'pass'
+        if one['words']
     )
     text = f'{qa["state"]}, beside {qa["earlier_sessions"]} earlier sessions. {words}'
     return f'<p class="verdict">{html.escape(text)}</p>'
@@ -130,8 +133,9 @@ def _points(found: Assessment) -> Figure:
         panel.plot(place[:, a], place[:, b], 'o-', ms=4, lw=0.5)
         for number in range(0, len(place), max(1, len(place) // 20)):
             panel.annotate(str(number + 1), place[number, [a, b]], fontsize=7)
-        panel.set(xlabel=f'{"xyz"[a]}, mm', ylabel=f'{"xyz"[b]}, mm', aspect='equal')
+        panel.set(xlabel=f'{"xyz"[a]}, mm', ylabel=f'{"xyz"[b]}, mm')
         panel.grid(alpha=0.3)
+    panels[0].set_aspect('equal')  # the heights of a board, which is flat, would be a line
     return figure
 
 

@@ -75,7 +75,7 @@ def over_time(evaluation: Evaluation) -> Figure:
         lost = time[~series.ok]
         lower.plot(lost, np.full(lost.size, rank), '|', color=colour)
     upper.set(ylabel='position error, mm', yscale='log')
-    _spell_out(upper.yaxis)
+    spell_out(upper.yaxis)
     lower.set(xlabel='time, s', ylabel='no pose', ylim=(-0.8, len(found) - 0.2))
     lower.set_yticks([])
     upper.grid(alpha=0.3)
@@ -159,7 +159,7 @@ def against_sigma(evaluation: Evaluation, jitter_m: float = 0.0) -> Figure:
         left.plot(line, 3 * line, '--', color='0.3', label='error = 3 sigma')
         left.set(xscale='log', yscale='log')
         for axis in (left.xaxis, left.yaxis):
-            _spell_out(axis)
+            spell_out(axis)
     left.set(xlabel='sigma, with the optical jitter, mm', ylabel='position error, mm')
     right.set(xlabel='multiple of sigma', ylabel='share of the errors within', ylim=(0, 1.02))
     for panel in (left, right):
@@ -168,7 +168,7 @@ def against_sigma(evaluation: Evaluation, jitter_m: float = 0.0) -> Figure:
     return figure
 
 
-def _spell_out(axis: Axis) -> None:
+def spell_out(axis: Axis) -> None:
     """Label a logarithmic axis with numbers at 1, 2 and 5 of each power, which have room."""
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(FormatStrFormatter('%g'))

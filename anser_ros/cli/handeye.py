@@ -246,7 +246,9 @@ def render(found: HandEye, document: dict[str, Any]) -> str:
     return page('Hand-eye', [
         '<h1>Hand-eye calibration</h1>'
         f'<p class="note"><code>{html.escape(found.session.path)}</code></p>'
-        f'<p class="verdict">{html.escape(clocks)}</p>',
+        f'<p class="verdict">{html.escape(clocks)}</p>'
+        + (f'<p class="note">{html.escape(reading_words(found.convention))}</p>'
+           if found.convention is not None else ''),
         '<h2>Sensors on the body</h2>', table(HEAD, _rows(document)),
         "<h2>From the optical frame to the tracker's</h2>",
         table(('axis', 'translation, mm', '1 sigma', 'rotation vector, deg', '1 sigma'), rows),

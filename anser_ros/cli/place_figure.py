@@ -24,6 +24,8 @@ def write_figure(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    from anser_ros.cli.evaluation_figures import spell_out
+
     figure = Figure(figsize=(13.0, 4.2), layout='constrained')
     FigureCanvasAgg(figure)
     chosen = list(designs[-1].coils)
@@ -46,6 +48,7 @@ def write_figure(
         else:
             axes.plot(middle + half * np.array([-1, 1]), [0, 0], color='tab:brown', label='board')
         axes.set_aspect('equal', 'datalim')
+        axes.locator_params(axis='x', nbins=5)
         axes.set_title(words)
         axes.set_xlabel('x / m')
         axes.set_ylabel(f'{"xyz"[up]} / m')
@@ -61,6 +64,7 @@ def write_figure(
                   label='random places, best to worst')  # fmt: skip
     axes.set_xscale('log', base=2)
     axes.set_yscale('log')
+    spell_out(axes.yaxis)
     axes.set_xticks(numbers, [str(n) for n in numbers])
     axes.set_xlabel('reference coils')
     axes.set_ylabel('expected position error / mm')
