@@ -25,6 +25,7 @@ from anser_ros.nodes.causes import Told
 from anser_ros.nodes.chain_client import ChainClient, ChainError
 from anser_ros.nodes.dashboard import DashboardParameters
 from anser_ros.nodes.live_view import LiveView, read_pose
+from anser_ros.nodes.traces import latency_of
 from anser_ros.web import loop as loop_module
 from anser_ros.web.folder import RESULTS, RecordingFolder
 from anser_ros.web.guard import COOKIE, MOST_PAGES, Guard
@@ -306,6 +307,11 @@ def test_poses_are_read_from_their_bytes(frame):
     assert values.tolist() == [0, 3, 0, 0, 0, 0, 1]
     with pytest.raises(ValueError, match='no pose'):
         read_pose(bytes(serialize_message(message))[:-8])
+
+
+def test_a_replayed_pose_has_no_latency():
+    assert latency_of(1.75e9, 1.75e9 - 0.02) == pytest.approx(0.02, abs=1e-6)
+    assert math.isnan(latency_of(1.75e9, 1e9))
 
 
 def test_the_view_has_place_ellipsoid_error_and_residual(monkeypatch):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.nodes.causes import Told, causes
-from anser_ros.nodes.traces import LONGEST_GAP_S, OpticalTrace, targets_of
+from anser_ros.nodes.traces import LONGEST_GAP_S, OpticalTrace, latency_of, targets_of
 from anser_ros.wire.setup import Setup
 
 Array = NDArray[np.float64]
@@ -122,7 +122,7 @@ class LiveView:
         self._covariance[number] = values[POSE:].reshape(6, 6)[:3, :3]
         self._heard_s[number] = time.monotonic()
         if sent_ns:
-            self._latency_s.append(1e-9 * sent_ns - stamp_s)
+            self._latency_s.append(latency_of(1e-9 * sent_ns, stamp_s))
         self._recent.append((number, stamp_s, values[:3]))
 
     def take_optical(self, body: str, received: Iterable[tuple[bytes, Mapping[str, int]]]) -> None:

@@ -21,7 +21,7 @@ from anser_ros.nodes.causes import Told, causes
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.shared_names import optical_parameter, optical_topic
-from anser_ros.nodes.traces import OpticalTrace, Row, Traces, targets_of
+from anser_ros.nodes.traces import OpticalTrace, Row, Traces, latency_of, targets_of
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
 LINE_PERIOD_S = 1.0
@@ -131,7 +131,7 @@ class Monitor(AnserNode):
         trace.position.append((pose.position.x, pose.position.y, pose.position.z))
         trace.axis.append(_z_axis(q))
         trace.sigma_m.append(float(np.sqrt(variance[0] + variance[7] + variance[14])))
-        trace.latency_s.append(now_s - stamp_s)
+        trace.latency_s.append(latency_of(now_s, stamp_s))
 
     def _on_optical(self, trace: OpticalTrace, message: PoseStamped) -> None:
         stamp_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
