@@ -172,8 +172,10 @@ class Trial:
         page, found = self.page, {}
         if args.calibrate:
             self._click('Set baseline')
-            said = page.locator('.words').filter(has_text=re.compile(r'\w')).first
-            found['baseline'] = said.inner_text()
+            said = page.locator('.words').filter(
+                has_text=re.compile(r'\w'), has_not_text='in force'
+            )
+            found['baseline'] = said.first.inner_text()
         self._click('Record')
         page.wait_for_timeout(1e3 * args.record)
         self._click('Stop')
