@@ -13,7 +13,7 @@ from anser_ros.calibration import sensor_survey
 from anser_ros.calibration.coaxial import coaxial, fit_coaxial
 from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows
 from anser_ros.calibration.layouts import Generator, Layout, place
-from anser_ros.calibration.requirements import check_measurements
+from anser_ros.calibration.requirements import check_kept, check_measurements
 from anser_ros.calibration.sensor_survey import SensorSurveyor
 from anser_ros.calibration.survey_records import corrections, tellings
 from anser_ros.diagnosis import outlying
@@ -166,6 +166,17 @@ class TestFewPoses:
             check_measurements([measured.frames(slice(2))], 36, field_alone=True)
         with pytest.raises(FitError, match=r'at least 10 frames .* got 4$'):
             check_measurements([recorded(one, rng, 4)], 36, field_alone=True)
+
+    def test_frames_that_the_survey_left_out_are_counted_where_too_few_are_left(self):
+        rng = np.random.default_rng(6)
+        measured = recorded(array_of_sensors(rng), rng, 40)
+        none = measured.frames(slice(0))
+        check_kept([measured, measured], [measured, none], 36)
+        few = measured.frames(slice(4))
+        with pytest.raises(FitError, match=r'^36 of 40 frames were left out.* frames .* got 4$'):
+            check_kept([measured], [few], 36)
+        with pytest.raises(FitError, match=r'^40 of 40 frames were left out.* got 0'):
+            check_kept([measured], [none], 36)
 
 
 class TestPickup:

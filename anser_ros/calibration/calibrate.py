@@ -14,7 +14,7 @@ from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.prior import DrawnBoard
 from anser_ros.calibration.readings import with_pose
-from anser_ros.calibration.requirements import check_agreement, check_measurements
+from anser_ros.calibration.requirements import check_agreement, check_kept, check_measurements
 from anser_ros.calibration.result import Calibration, Scan, provenance, residuals
 from anser_ros.calibration.selection import (
     COUNTS,
@@ -171,6 +171,7 @@ def survey(
     )
     result = surveyor.fit()
     sound = [m.frames(kept) for m, kept in zip(measurements, result.kept, strict=True)]
+    check_kept(measurements, sound, needed)
     root = np.sqrt(result.optical.interpolated)
     accuracy = replace(
         options.accuracy,

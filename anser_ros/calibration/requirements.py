@@ -82,6 +82,35 @@ def check_measurements(
     return readings
 
 
+def check_kept(
+    measurements: Sequence[Measurements], kept: Sequence[Measurements], needed: int
+) -> None:
+    """Check that the frames that a survey kept still determine a field model.
+
+    Parameters
+    ----------
+    measurements, kept : sequence of Measurements
+        Tool measurements, one a body and session, before and after frames were left out.
+    needed : int
+        Number of readings an emitter that the dipoles need.
+
+    Raises
+    ------
+    FitError
+        When too little is left; the message has how many frames were left out, and why.
+    """
+    try:
+        check_measurements([m for m in kept if len(m.time)], needed)
+    except FitError as error:
+        before, after = (
+            sum(int(m.usable.any(axis=1).sum()) for m in those) for those in (measurements, kept)
+        )
+        raise FitError(
+            f'{before - after} of {before} frames were left out, as their poses are not where '
+            f'the fluxes are or something moved; of the rest: {error}'
+        ) from error
+
+
 def _check_thickness(measurements: Sequence[Measurements]) -> None:
     points = np.concatenate([m.placed()[0][m.usable] for m in measurements])
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
