@@ -8,6 +8,12 @@ NANO = 1e-9
 SECOND_NS = 1_000_000_000
 """Nanoseconds in a second."""
 
+JUMP_NS = SECOND_NS
+"""A stamp further than this from the last one, ns, is not late or lost but a jump: backwards a
+replay that begins again or a clock that was set, forwards a clock that was set or a silence. It is
+as old as a good pose may be to start the tracker's next one from. Smaller, and every short pause
+is called a jump; larger, and a clock that was set passes unnoticed."""
+
 
 def stamp_of(message: Any) -> int:
     """Return the header stamp of a message, whoever decoded it, ns."""

@@ -241,6 +241,34 @@ def test_over_dds_a_finding_is_raised_and_cleared(ros, start, moving, tmp_path):
     assert watcher.interrupt() == 0
 
 
+def test_fluxes_of_another_frame_are_counted_and_not_looked_at(ros, moving):
+    from rclpy.parameter import Parameter
+    from std_msgs.msg import String
+
+    from anser_ros.nodes.clouds import FluxCloud
+    from anser_ros.nodes.watcher import Watcher
+
+    node = Watcher(parameter_overrides=[Parameter('model_file', value=str(MODEL))])
+    try:
+        node._on_setup(String(data=moving.setup_text))
+        for frame_id in ('world', moving.setup.frame_id):
+            for stream, take in (
+                (moving.tool, node._on_tool),
+                (moving.reference, node._on_reference),
+            ):
+                cloud = FluxCloud(frame_id)
+                take(cloud.message(points(stream, 0), int(stream.stamp_ns[0])))
+            if frame_id == 'world':
+                assert node._window.session() is None
+                assert node.counters['fluxes_other_frame_id'] == 2
+                assert "fluxes in the frame 'world'" in node._trouble
+        assert node.counters['frames'] == node.counters['fluxes_refused'] == 2
+        assert node._window.session() is not None
+    finally:
+        node.close()
+        node.destroy_node()
+
+
 @pytest.mark.timeout(300)
 def test_over_dds_on_a_session_that_this_package_did_not_make(ros, start, shared, effects_model):
     folder = shared / 'sessions' / 'effects'

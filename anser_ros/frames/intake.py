@@ -17,7 +17,7 @@ from anser_ros.errors import AnserError, LayoutError
 from anser_ros.frames import faults
 from anser_ros.frames.faults import FAULTS, GOOD
 from anser_ros.physics.sensor import LARGEST_FLUX_T
-from anser_ros.stamps import NANO
+from anser_ros.stamps import JUMP_NS, NANO
 from anser_ros.wire.points import DROPPED, SATURATED, STALE
 
 Integers = NDArray[np.int64]
@@ -25,10 +25,6 @@ ComplexArray = NDArray[np.complex128]
 Count = Callable[[str, int], None]
 """Takes a counter's name and by how much it rises."""
 
-JUMP_S = 1.0
-"""A stamp that is further ahead of the last one than this is a jump forward, s: as old as a good
-pose may be to start the tracker's next one from. Smaller, and every short pause is called a jump;
-larger, and a clock that was set passes unnoticed."""
 BACK, FORWARD = -1, 1
 """Values of `Frame.jump`."""
 
@@ -131,7 +127,7 @@ class Intake:
         flux: NDArray[np.generic],
         flags: NDArray[np.generic] | None = None,
         emitters: tuple[str, ...] | None = None,
-        jump_s: float = JUMP_S,
+        jump_s: float = JUMP_NS * NANO,
     ) -> Frame | None:
         """Judge a frame as the next one of a stream.
 

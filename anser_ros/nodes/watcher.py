@@ -16,7 +16,7 @@ from anser_ros.errors import AnserError
 from anser_ros.field.model import EffectRecord
 from anser_ros.integrity.withheld import TWO_SOURCES
 from anser_ros.nodes import qos
-from anser_ros.nodes.flux_reader import read_flux
+from anser_ros.nodes.flux_reader import read_frame
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.one_source import OneSource, said_of
 from anser_ros.nodes.parameters import parameter
@@ -192,15 +192,17 @@ class Watcher(AnserNode):
 
     def _on_tool(self, message: PointCloud2) -> None:
         if isinstance(self._window, SlidingWindow):
-            self._take(message, self._window.take_tool)
+            self._take(message, self._window, self._window.take_tool)
 
     def _on_reference(self, message: PointCloud2) -> None:
         if isinstance(self._window, SlidingWindow):
-            self._take(message, self._window.take_reference)
+            self._take(message, self._window, self._window.take_reference)
 
-    def _take(self, message: PointCloud2, take: Callable[..., None]) -> None:
+    def _take(
+        self, message: PointCloud2, window: SlidingWindow, take: Callable[..., None]
+    ) -> None:
         try:
-            take(*read_flux(message))
+            take(*read_frame(message, window.setup.frame_id, self.count))
         except AnserError as error:
             self._refuse('fluxes_refused', error)
             return

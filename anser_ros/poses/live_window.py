@@ -6,14 +6,12 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from anser_ros.poses.sequence import PoseSequence, PoseSession, sequence_of
-from anser_ros.stamps import NANO
+from anser_ros.stamps import JUMP_NS, NANO
 
 LIVE = 'live'
 """What stands in place of a path in the sessions of running trackers."""
 REFERENCE = 'optical'
 """Name of the reference among the streams."""
-RESTART_NS = 1_000_000_000
-"""Stamps that run back by more, ns, are a replay that begins again or a clock that was set."""
 MOST_POSES = 6000
 """Poses of a stream that are kept at most: a minute of 100 Hz."""
 
@@ -45,7 +43,7 @@ class PoseWindow:
     def take(self, name: str, stamp_ns: int, pose: Sequence[float]) -> None:
         """Keep a pose (x y z in m, quaternion x y z w) of a stream; NaN where it has none."""
         rows = self._rows[name]
-        if rows and stamp_ns < rows[-1][0] - RESTART_NS:
+        if rows and stamp_ns < rows[-1][0] - JUMP_NS:
             self.restarts, self.first_ns = self.restarts + 1, 0
             for one in self._rows.values():
                 one.clear()

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.sessions.session import Session, session_of
-from anser_ros.stamps import NANO
+from anser_ros.stamps import JUMP_NS, NANO
 from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes
 from anser_ros.wire.setup import Setup
@@ -17,9 +17,6 @@ LIVE = 'live'
 """What stands in place of a path in the sessions of a running system."""
 MARGIN_NS = 1_000_000_000
 """How much longer than fluxes poses are kept, ns, because their clock may be ahead."""
-RESTART_NS = 1_000_000_000
-"""Stamps that run back by more, ns, are a replay that begins again or a clock that was set; by
-less, a message that came late."""
 
 
 @dataclass
@@ -50,6 +47,7 @@ class SlidingWindow:
 
     Attributes
     ----------
+    setup : Setup
     first_ns : int
         Stamp of the first reading of all; 0 before.
     restarts : int
@@ -57,7 +55,7 @@ class SlidingWindow:
     """
 
     def __init__(self, setup: Setup, length_s: float, frames: int) -> None:
-        self._setup = setup
+        self.setup = setup
         self._length_ns = round(length_s / NANO)
         self._step_ns = self._length_ns // frames
         self.first_ns, self.restarts = 0, 0
@@ -79,7 +77,7 @@ class SlidingWindow:
             return
         rows = self._poses.setdefault(body, deque())
         if rows and stamp_ns <= rows[-1][0]:
-            if stamp_ns > rows[-1][0] - RESTART_NS:
+            if stamp_ns > rows[-1][0] - JUMP_NS:
                 return  # late or twice
             rows.clear()
         rows.append((stamp_ns, tuple(values.tolist())))
@@ -90,7 +88,7 @@ class SlidingWindow:
     def _take(self, fluxes: _Fluxes, stamp_ns: int, points: FluxPoints) -> None:
         channel = np.asarray(points.channel, dtype=np.int64)
         rows = fluxes.rows
-        if rows and stamp_ns < rows[-1][0] - RESTART_NS:
+        if rows and stamp_ns < rows[-1][0] - JUMP_NS:
             self._forget()
         elif rows and stamp_ns < rows[-1][0] + self._step_ns:
             return
@@ -131,4 +129,4 @@ class SlidingWindow:
             values = np.array([pose for _, pose in rows])
             stamps = np.array([stamp for stamp, _ in rows])
             optical[body] = PoseStream(stamps, values[:, :3], values[:, 3:])
-        return session_of(Bag(LIVE, self._setup, '', tool, reference, optical))
+        return session_of(Bag(LIVE, self.setup, '', tool, reference, optical))
