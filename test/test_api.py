@@ -2,6 +2,7 @@
 
 import doctest
 import importlib
+import re
 import subprocess
 import sys
 
@@ -66,8 +67,10 @@ def test_examples_of_the_docstrings(workshop, name):
 
 def test_every_public_name_is_there_and_documented():
     assert set(anser_ros.__all__) == set(anser_ros._HOMES) <= set(dir(anser_ros))
-    for name in anser_ros.__all__:
-        assert getattr(anser_ros, name).__doc__
+    page = (REPO / 'docs' / 'api.md').read_text(encoding='utf-8')
+    told = re.findall(r'^\.\. auto(?:function|class):: (\w+)$', page, re.MULTILINE)
+    assert sorted(told) == sorted(anser_ros.__all__)
+    assert all(getattr(anser_ros, name).__doc__ for name in anser_ros.__all__)
     with pytest.raises(AttributeError, match='no attribute'):
         _ = anser_ros.nonsense
 

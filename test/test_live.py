@@ -11,6 +11,7 @@ from conftest import spin_until
 
 from anser_ros.errors import ParameterError
 from anser_ros.nodes.handover import Aside, HandedFlux, Handover, Taking
+from anser_ros.nodes.parameter_files import names_for
 from anser_ros.wire.points import FluxPoints, as_sent, decode_flux, encode_flux
 
 
@@ -121,7 +122,9 @@ def test_handed_fluxes_are_those_that_are_published():
 
 
 def test_parameters_of_one_node_are_given_to_it_alone():
-    process = pytest.importorskip('anser_ros.nodes.process')
+    pytest.importorskip('rclpy')
+    from anser_ros.nodes import process
+
     tracker, server = (
         type('T', (), {'NAME': name, 'PARAMETERS': make_dataclass('P', [(known, float, 0.0)])})
         for name, known in (('tracker', 'gate'), ('field_model', 'refit'))
@@ -144,7 +147,6 @@ def test_parameters_of_one_node_are_given_to_it_alone():
 
 
 def test_a_file_tells_which_values_it_has_for_one_node(tmp_path):
-    names_for = pytest.importorskip('anser_ros.nodes.parameter_files').names_for
     file = tmp_path / 'p.yaml'
     file.write_text(
         '/**:\n  ros__parameters: {common: 1}\n'
@@ -239,7 +241,9 @@ def test_what_several_nodes_cannot_be_given_is_one_line(start, words, said):
 @pytest.mark.parametrize('is_noticed', [True, False])
 def test_who_is_given_up_says_good_bye_to_devices_first(monkeypatch, is_noticed):
     """A process too busy to notice Ctrl-C ends all the same; the unit must not stream on."""
-    process = pytest.importorskip('anser_ros.nodes.process')
+    pytest.importorskip('rclpy')
+    from anser_ros.nodes import process
+
     done = []
 
     def fail():

@@ -290,8 +290,9 @@ class TestGraph:
 
 
 def test_the_executor_is_the_one_told_of_events_where_rclpy_has_it(monkeypatch):
-    process = pytest.importorskip('anser_ros.nodes.process')
     experimental = pytest.importorskip('rclpy.experimental')
+    from anser_ros.nodes import process
+
     monkeypatch.setattr(experimental, 'EventsExecutor', lambda: 'events')
     assert process.make_executor() == 'events'
     monkeypatch.setitem(sys.modules, 'rclpy.experimental', None)

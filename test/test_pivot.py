@@ -179,7 +179,9 @@ class TestDocument:
 
 
 def test_slicer_gets_the_tip_as_a_body():
-    igtl = pytest.importorskip('anser_ros.nodes.openigtlink')
+    pytest.importorskip('rclpy')
+    from anser_ros.nodes import openigtlink as igtl
+
     setup = parse_setup(DEMO).with_tips({'tool_a': TestDocument.SPEC})
     table = igtl.OpenIGTLinkParameters(coils=False)
     assert set(igtl.devices_of(setup, table)) == {'tool_a', 'tool_a/tip'}
@@ -233,7 +235,9 @@ def test_positions_in_millimetres_are_named_and_what_is_no_pose_is_counted(tmp_p
 
 
 def test_a_file_of_tips_that_is_not_there_is_the_callers_fault(tmp_path):
-    tracker = pytest.importorskip('anser_ros.nodes.tracker')
+    pytest.importorskip('rclpy')
+    from anser_ros.nodes import tracker
+
     with pytest.raises(ParameterError, match='tips_file'):
         tracker.tips_of_file(str(tmp_path / 'none.yaml'))
     assert tracker.tips_of_file('') == {}
