@@ -6,6 +6,7 @@ import json
 import math
 import socket
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,14 +26,17 @@ from anser_ros.nodes.causes import Told
 from anser_ros.nodes.chain_client import ChainClient, ChainError
 from anser_ros.nodes.dashboard import DashboardParameters
 from anser_ros.nodes.live_view import LiveView, read_pose
+from anser_ros.nodes.polled import polling_node
 from anser_ros.nodes.traces import latency_of
+from anser_ros.nodes.view_source import ViewSource
+from anser_ros.sessions.volume import pose_volume
 from anser_ros.web import loop as loop_module
 from anser_ros.web.folder import RESULTS, RecordingFolder
 from anser_ros.web.guard import COOKIE, MOST_PAGES, Guard
 from anser_ros.web.job import Job
 from anser_ros.web.loop import CorrectionLoop
 from anser_ros.web.server import LEAST_TOKEN, PageServer, token_for
-from anser_ros.wire.setup import parse_setup
+from anser_ros.wire.setup import dump_setup, parse_setup
 
 TOKEN = 'a-token-of-enough-letters'
 
@@ -57,6 +61,20 @@ def asked(guard, path='/', kind='http', query='', **headers):
 
 async def inner(_scope, _receive, send):
     await send('passed')
+
+
+@pytest.mark.parametrize('stated', [None, ((-0.1, -0.12, 0.06), (0.1, 0.1, 0.3))])
+def test_the_drawn_volume_is_that_in_which_poses_are_accepted(ros, stated):
+    node = polling_node('view', '/anser')
+    try:
+        source = ViewSource(node, 'optical', pytest.fail, lambda _: False)
+        setup = replace(parse_setup(ten_sensors()), volume=stated)
+        source.setup_text = dump_setup(setup)
+        source.look()
+        volume = pose_volume(setup)
+        assert source.world()['volume_m'] == [list(volume.low), list(volume.high)]
+    finally:
+        node.destroy_node()
 
 
 @pytest.mark.parametrize('kind', ['http', 'websocket'])

@@ -167,13 +167,16 @@ class ViewSource:
         coils, side = view.setup.emitter.coils, view.setup.emitter.geometry.get('side_m', COIL_M)
         side = float(side) if isinstance(side, int | float) else COIL_M
         reach = [max(abs(c.centre_m[axis]) for c in coils) + 0.75 * side for axis in (0, 1)]
-        low, high = view.setup.volume or ((-reach[0], -reach[1], 0.0), (*reach, 2 * max(reach)))
+        # Numba, which it needs, is half of the start of a node that has none; a page comes later.
+        from anser_ros.sessions.volume import pose_volume
+
+        volume = pose_volume(view.setup)
         return {
             'board_m': reach,
             'reach_m': max(reach),
             'coils': [[*c.centre_m, math.radians(c.rotation_deg), side] for c in coils],
             'references': [[*s.position_m, *s.axis] for s in view.setup.reference_sensors],
-            'volume_m': [list(low), list(high)],
+            'volume_m': [list(volume.low), list(volume.high)],
             'targets': [
                 {'name': t.name, 'is_body': n >= len(view.setup.tool_sensors)}
                 for n, t in enumerate(view.targets)

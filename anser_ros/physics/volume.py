@@ -31,6 +31,9 @@ same box."""
 class TrackedVolume:
     """A box, m, frame fg; the default is the tracker's box over an Anser board.
 
+    It is what `over_board` and `with_fringe` make of the demo's board (`test/test_setup.py`), for
+    setups whose board nobody can draw.
+
     Attributes
     ----------
     low, high : tuple of three float
