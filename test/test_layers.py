@@ -4,6 +4,7 @@ Every file's syntax tree is walked, imports inside functions included.
 """
 
 import ast
+import re
 from pathlib import Path
 
 from conftest import by_room
@@ -100,6 +101,25 @@ def test_imports_of_ours_point_inwards(paths):
             if is_ours and parts[1] != layer and parts[1] not in allowed:
                 faults.append(f'{place(path)} imports {name}')
     assert not faults, '\n'.join(faults)
+
+
+def test_the_page_has_the_same_table_and_every_file():
+    """What a newcomer reads about the rooms is what is enforced."""
+    page = (PACKAGE.parent / 'docs' / 'architecture.md').read_text(encoding='utf-8')
+    page = page[page.index('## Where code lives') :]
+    core = re.search(r'\*The core\* is (.*?)\.\n', page, re.DOTALL)
+    assert set(re.findall(r'`(\w+)`', core[1])) == CORE
+    told = {}
+    for rooms, may in re.findall(r'^\| (`.*?) \| (.*?) \|', page.split('### Inside')[0], re.M):
+        names = set(re.findall(r'`(\w+)`', may)) | (CORE if 'the core' in may else set())
+        told |= dict.fromkeys(re.findall(r'`(\w+)`', rooms), names)
+    for room, names in told.items():
+        assert names - {room} == ALLOWED[room] - {room}, room
+    assert {*told, '__init__.py'} == set(ALLOWED)
+    beside = {path.name for path in PACKAGE.glob('*.py')} - {'__init__.py'}
+    assert set(re.findall(r'`(\w+\.py)`', page.split('### Inside')[0])) >= beside
+    parts = set(re.findall(r'`(\w+)`', page.split('### Inside')[1]))
+    assert {path.stem for path in (PACKAGE / 'nodes').glob('[!_]*.py')} <= parts
 
 
 @by_room(FILES)
