@@ -30,6 +30,20 @@ ALLOWED = {
     'calibration/survey_records.py': 'writes records as `docs/interfaces.md` names them, from '
     'below the effects: a scan finds what is wrong with itself by its own fit',
 }
+GENERAL = {
+    'apparatus', 'body_term', 'correction', 'effect', 'prediction', 'registry', 'term', 'view',
+}  # fmt: skip
+"""Modules in the room of effects that are about no single one; others may import these."""
+MAY_IMPORT = {
+    'diagnosis/wiring.py': {'sensor_polarity', 'wiring'},
+    'diagnosis/noise.py': {'excess_noise', 'outliers'},
+    'diagnosis/remainder.py': {'metal_remainder'},
+    'diagnosis/departure.py': {'departed_metal', 'metal_path'},
+}
+"""Modules of single effects that a file may import, as it makes their terms without the search:
+wiring, noise and outliers are seen directly, and have no parameter whose fit could propose them;
+the remainder is fitted beside metal at rest, whichever effect that is; departed metal is asked for
+by a calibration alone, from a way that no search starts from."""
 FILES = sorted(
     path
     for path in PACKAGE.rglob('*.py')
@@ -77,6 +91,19 @@ def special_cases(text):
             yield f'{node.lineno}: case {_named(node.cls)}'
 
 
+def imports_of_effects(text):
+    """Yield the module in the room of effects that an import names."""
+    for node in ast.walk(ast.parse(text)):
+        names = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names = [f'{node.module}.{alias.name}' for alias in node.names]
+        for name in names:
+            if name.startswith(f'{package.__name__}.'):
+                yield name.split('.')[2]
+
+
 def _named(node):
     if isinstance(node, ast.Attribute):
         return node.attr
@@ -89,6 +116,16 @@ def test_no_effect_is_a_special_case_outside_its_room(paths):
         f'{path}: {case}' for path in paths for case in special_cases(path.read_text('utf-8'))
     ]
     assert not found, f'let the effect declare it (anser_ros/effects/effect.py): {found}'
+
+
+def test_no_module_of_a_single_effect_is_imported_outside_its_room():
+    found = {}
+    for path in PACKAGE.rglob('*.py'):
+        place = path.relative_to(PACKAGE).as_posix()
+        if not place.startswith('effects/'):
+            single = set(imports_of_effects(path.read_text('utf-8'))) - GENERAL
+            found |= {place: single} if single else {}
+    assert found == MAY_IMPORT
 
 
 @by_room([path for path in FILES if path.relative_to(PACKAGE).parts[0] != 'poses'])
@@ -122,6 +159,25 @@ def test_no_site_hides_state_behind_an_underscore():
 )
 def test_the_walk_sees_special_cases(text):
     assert list(special_cases(text))
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        'from anser_ros.effects.coil_moved import COIL_MOVED',
+        'from anser_ros.effects import coil_moved',
+        'import anser_ros.effects.coil_moved as moved',
+        'def f():\n    from anser_ros.effects.coil_moved import CoilMoved',
+    ],
+)
+def test_the_walk_sees_imports_of_effects(text):
+    assert list(imports_of_effects(text)) == ['coil_moved']
+
+
+def test_general_modules_hold_no_effect():
+    for name in GENERAL:
+        module = importlib.import_module(f'{package.__name__}.{name}')
+        assert not hasattr(module, 'EFFECTS'), name
 
 
 def test_the_walk_sees_nothing_else():

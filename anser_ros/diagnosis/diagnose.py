@@ -30,7 +30,6 @@ from anser_ros.diagnosis.structure import StructureTest, noise_scale, noise_t, s
 from anser_ros.diagnosis.whiteness import whiteness
 from anser_ros.diagnosis.wiring import wiring_faults
 from anser_ros.effects.effect import Family
-from anser_ros.effects.outliers import known_share
 from anser_ros.effects.term import Term
 from anser_ros.field.model import FieldModel
 
@@ -241,8 +240,7 @@ def conclude(
         for i, term in enumerate(fit.terms)
         if term.effect.family is not Family.REMAINDER
     ]
-    known = known_share(model.effects)
-    findings += outlier_findings(whole, cleaned, after, excess / floor**2, known)
+    findings += outlier_findings(whole, cleaned, after, excess / floor**2, model.effects)
     if not significant:
         findings += noise_findings(whole, after)
     records = [finding.record for finding in findings]

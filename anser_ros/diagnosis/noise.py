@@ -1,5 +1,7 @@
 """Frames that belong to no model, and noise that has grown: what is seen once all is explained."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from anser_ros.diagnosis.decisions import BESIDE_OUTLIERS, FEWEST_OUTLIERS, KNOWN_SIGMAS, NOISIER
@@ -10,11 +12,16 @@ from anser_ros.diagnosis.residuals import rms, tool_parts
 from anser_ros.diagnosis.structure import noise_t
 from anser_ros.effects.effect import Family
 from anser_ros.effects.excess_noise import excess_noise_of
-from anser_ros.effects.outliers import outliers_of
+from anser_ros.effects.outliers import known_share, outliers_of
+from anser_ros.field.model import EffectRecord
 
 
 def outlier_findings(
-    whole: Problem, cleaned: Problem, after: State, excess: float, known: float = 0.0
+    whole: Problem,
+    cleaned: Problem,
+    after: State,
+    excess: float,
+    known: Sequence[EffectRecord] = (),
 ) -> list[Finding]:
     """Outliers or a loose contact, where frames stand out and nothing else makes them.
 
@@ -26,16 +33,17 @@ def outlier_findings(
         The held-out part with all effects.
     excess : float
         Power that is not explained, over the floor's.
-    known : float
-        Share of frames that stand out as the model's own scan had them: what the optical tracker
-        always does is no effect of a session.
+    known : sequence of EffectRecord
+        The model's. The share of frames that stood out in its own scan is what the optical tracker
+        always does, and no effect of a session.
     """
     share, channels = outlying_share(whole, cleaned)
     # A fluctuation is taken for normal: frames far out along it are its own tails.
     own_tails = any(term.effect.family is Family.FLUCTUATION for term in after.terms)
     alone = excess < BESIDE_OUTLIERS and not own_tails
     frames = sum(tool.time.size for tool in whole.tools)
-    usual = known + KNOWN_SIGMAS * float(np.sqrt(known / max(frames, 1)))
+    always = known_share(known)
+    usual = always + KNOWN_SIGMAS * float(np.sqrt(always / max(frames, 1)))
     if share <= FEWEST_OUTLIERS + usual or not (channels or alone):
         return []
     sigma = float(np.sqrt(share / max(frames, 1)))
