@@ -18,7 +18,7 @@ of a fluctuation, and the spread by noise for `as_good`, named the few cases tha
 and none better (`docs/log.md`).
 
 Unless a number says otherwise, it was chosen by hand on injected effects with seeds below 100
-(`test/injection.py`); cases of later seeds that led to a rule are named in `docs/diagnosis.md`.
+(`test/injection.py`); cases of later seeds that led to a rule are named in `docs/log.md`.
 """
 
 # --- whether an effect is accepted -------------------------------------------------------------
