@@ -97,6 +97,13 @@ sensors:
 class TestInterfacesPage:
     """What the code promises is on the page, and what the page lists exists."""
 
+    def test_every_schema_has_a_row(self):
+        schema = re.compile(r'anser_[a-z_]+/\d+')
+        files = (REPO / 'anser_ros').rglob('*.py')
+        written = {name for file in files for name in schema.findall(file.read_text('utf-8'))}
+        rows = re.findall(r'^\| `anser_.*', page('interfaces'), re.MULTILINE)
+        assert written == set(schema.findall('\n'.join(rows)))
+
     def test_the_flux_layout(self):
         text = page('interfaces')
         fields, step = flux_fields(8)
