@@ -14,6 +14,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 from anser_ros.cli.commands import NODES
 from anser_ros.nodes.parameter_files import checked
 from anser_ros.wire.config_folder import config_path
+from anser_ros.wire.tcp_ports import LIVE_VIEW, OPENIGTLINK
 
 PACKAGE = 'anser_ros'
 DEVICE = '/dev/ttyACM0'
@@ -37,10 +38,10 @@ ARGUMENTS = {
     'directory': ('recordings', 'folder of the bags'),
     'watch': ('false', 'whether effects that the model lacks are reported in /diagnostics'),
     'dashboard': ('false', 'whether the live view is served to a browser on this machine'),
-    'dashboard_port': ('8642', 'TCP port of the live view'),
+    'dashboard_port': (str(LIVE_VIEW), 'TCP port of the live view'),
     'openigtlink': ('false', 'whether poses are served to 3D Slicer'),
     'igtl_host': ('127.0.0.1', 'address that OpenIGTLink is served on; 0.0.0.0 for all'),
-    'igtl_port': ('18944', 'TCP port of OpenIGTLink'),
+    'igtl_port': (str(OPENIGTLINK), 'TCP port of OpenIGTLink'),
     'rviz_config': ('anser.rviz', 'view of anser views: a path, or a file of the package'),
     'rviz': ('false', 'whether RViz is started'),
 }

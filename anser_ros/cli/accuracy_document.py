@@ -10,12 +10,13 @@ from anser_ros.assessment.control import Verdict
 from anser_ros.assessment.hummel import ErrorGroup
 from anser_ros.assessment.intervals import IntervalEstimate, mitk_statistics
 from anser_ros.assessment.protocols import Assessment
+from anser_ros.physics.constants import DEGREES
 from anser_ros.poses.document import finite
 
 SCHEMA = 'anser_accuracy/1'
 SHOWN = (
-    ('_m_per_h', 1e3, 'mm/h'), ('_rad_per_h', 57.29578, 'deg/h'), ('_m_s', 1e3, 'mm/s'),
-    ('_m', 1e3, 'mm'), ('_rad', 57.29578, 'deg'), ('_s', 1e3, 'ms'),
+    ('_m_per_h', 1e3, 'mm/h'), ('_rad_per_h', DEGREES, 'deg/h'), ('_m_s', 1e3, 'mm/s'),
+    ('_m', 1e3, 'mm'), ('_rad', DEGREES, 'deg'), ('_s', 1e3, 'ms'),
 )  # fmt: skip
 """Endings of figures' names, with the factor to the unit that is shown."""
 

@@ -14,7 +14,7 @@ from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.manufacture import manufactured
 from anser_ros.simulation.metal import steel_disc
 from anser_ros.simulation.motion import Approach, Lissajous
-from anser_ros.simulation.recording import Errors, GridScan, record
+from anser_ros.simulation.recording import STATIC_NOISE_T, Errors, GridScan, record
 from anser_ros.simulation.world import World
 from anser_ros.wire.bag import bag_file
 from anser_ros.wire.setup import parse_setup
@@ -27,8 +27,6 @@ OPTICAL_RATE_HZ = 60.0
 of `RATE_HZ`, so that poses have to be interpolated."""
 SECONDS = 8.0
 """Duration of the recordings of moving tools, s: enough for metal to approach and leave."""
-STATIC_NOISE_T = 30e-12
-"""Flux noise of a tool at rest, T a component: half of a single window's by averaging."""
 SCAN_HEIGHTS_M = (0.12, 0.18)
 """Heights of the scan's two layers, m. With them the three clusters of the tool cover 0.09 to 0.21
 m, the heights that the demo's tool reaches."""

@@ -20,6 +20,7 @@ from anser_ros.cli.populations import population_table, populations
 from anser_ros.cli.progress import progress_of
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.errors import FitError, ParameterError
+from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.calibration import calibrate_sessions, check_same_board
 from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.session import load_session
@@ -166,9 +167,7 @@ def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
         ('noise, T a component', f'{calibration.fit.noise_t:.3g}'),
     )
     if optical := document['optical_noise']:
-        told = (
-            f'{1e3 * optical["position_m"]:.3f} mm, {57.29578 * optical["rotation_rad"]:.4f} deg'
-        )
+        told = f'{1e3 * optical["position_m"]:.3f} mm, {DEGREES * optical["rotation_rad"]:.4f} deg'
         rows += (('optical jitter a component, at most', told),)
     for name, value in rows:
         table.add_row(name, value)

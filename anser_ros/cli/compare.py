@@ -18,6 +18,7 @@ import matplotlib.pyplot as plt
 
 from anser_ros.cli.output import make_folder, say_written
 from anser_ros.cli.progress import stages_of
+from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.comparison import (
     Compared,
     ComparedShares,
@@ -30,7 +31,7 @@ from anser_ros.sessions.comparison import (
 SCHEMA = 'anser_comparison/1'
 SEED = 1
 """Seed of the resamples, so that the same folders give the same intervals."""
-KINDS = (('position', 1e3, 'mm'), ('orientation', 57.29578, 'deg'))
+KINDS = (('position', 1e3, 'mm'), ('orientation', DEGREES, 'deg'))
 """What is compared, with the factor to the unit that is shown."""
 
 

@@ -25,6 +25,7 @@ from anser_ros.errors import ParameterError
 from anser_ros.tracking.estimate import NO_GATE
 from anser_ros.wire.bag_metadata import told
 from anser_ros.wire.config_folder import config_path
+from anser_ros.wire.tcp_ports import LIVE_VIEW
 
 PATIENCE_S = 180.0
 """Longest wait for all nodes and the first pose, s; kernels may have to be compiled meanwhile."""
@@ -40,8 +41,6 @@ METAL_RADIUS_M = 0.1
 FROZEN_TRACKER = {'gate': NO_GATE, 'adaptive': False}
 POLL_S = 0.05
 """Time from one look at the processes to the next, s."""
-DASHBOARD_PORT = 8642
-"""Of the live view on this machine, as its parameter has it by default."""
 # The file that the monitor writes.
 DATA = 'demo.npz'
 SHARED_TOPICS = ('setup', 'tool/flux', 'reference/flux')
@@ -114,7 +113,7 @@ def _run_in(folder: Path, args: argparse.Namespace, stopped: list[int]) -> int:
             for name, command in _commands(folder, ports / 'cu', args):
                 supervisor.start(name, command)
             if args.dashboard:
-                _say(f'live view: http://127.0.0.1:{DASHBOARD_PORT}/', args)
+                _say(f'live view: http://127.0.0.1:{LIVE_VIEW}/', args)
             monitor = supervisor.start(
                 'monitor', _monitor(folder / DATA, args), on_terminal=not args.json
             )
@@ -249,7 +248,7 @@ def _commands(folder: Path, port: Path, args: argparse.Namespace) -> list[tuple[
         ('tracker_frozen', node_command('tracker', *apart, **FROZEN_TRACKER)),
         ('recorder', node_command('recorder', directory=folder, name='bag')),
         *(
-            [('dashboard', node_command('dashboard', directory=folder, port=DASHBOARD_PORT))]
+            [('dashboard', node_command('dashboard', directory=folder, port=LIVE_VIEW))]
             if args.dashboard
             else []
         ),

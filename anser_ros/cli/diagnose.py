@@ -14,6 +14,7 @@ from anser_ros.cli.output import Result, loss_notes, make_folder, say, snapshot_
 from anser_ros.cli.pose_session import add_pose_options, diagnose_pose_session, need_model
 from anser_ros.cli.progress import stages_of
 from anser_ros.cli.stated_values import add_resurveyed, add_stated_values, stated_values
+from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.diagnosis import diagnose_session
 from anser_ros.sessions.diagnosis_document import to_document
 from anser_ros.sessions.model_file import save_model
@@ -87,7 +88,7 @@ def _table(document: dict[str, Any]) -> Table:
     for label, key, unit, scale in (
         ('flux residual, pT', 'flux_rms', 't', 1e12),
         ('position RMSE, mm', 'position_rmse', 'm', 1e3),
-        ('orientation RMSE, deg', 'orientation_rmse', 'rad', 57.29578),
+        ('orientation RMSE, deg', 'orientation_rmse', 'rad', DEGREES),
     ):
         cells = [held[f'{key}_{when}_{unit}'] for when in ('before', 'after')]
         table.add_row(label, *('-' if c is None else f'{scale * c:.4g}' for c in cells))

@@ -9,6 +9,7 @@ from anser_ros.cli.diagnosis_words import paths, short_ones, value_text, verdict
 from anser_ros.cli.html_page import page, table
 from anser_ros.cli.populations import population_figure, population_table
 from anser_ros.diagnosis.search import Candidate
+from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.diagnosis import SessionDiagnosis
 
 MOST_CANDIDATES = 40
@@ -60,7 +61,7 @@ def _held_out(document: dict[str, Any]) -> str:
     for label, key, unit, scale in (
         ('flux residual, pT rms', 'flux_rms', 't', 1e12),
         ('position RMSE of the coils, mm', 'position_rmse', 'm', 1e3),
-        ('orientation RMSE of the coils, deg', 'orientation_rmse', 'rad', 57.29578),
+        ('orientation RMSE of the coils, deg', 'orientation_rmse', 'rad', DEGREES),
     ):
         pair = [held[f'{key}_{when}_{unit}'] for when in ('before', 'after')]
         rows.append([label, *('-' if v is None else f'{scale * v:.4g}' for v in pair)])

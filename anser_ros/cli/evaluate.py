@@ -15,6 +15,7 @@ from anser_ros.cli.progress import progress_of
 from anser_ros.cli.session_runs import finish, perform, runs_of
 from anser_ros.cli.stated_values import add_resurveyed, add_stated_values, stated_values
 from anser_ros.errors import ParameterError
+from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.chosen_references import parse_references, with_references
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.evaluation_document import to_document
@@ -206,8 +207,8 @@ def _table(document: dict[str, Any]) -> Table:
                 for key, scale in (
                     ('position_rmse_m', 1e3),
                     ('position_prc95_m', 1e3),
-                    ('orientation_rmse_rad', 57.29578),
-                    ('orientation_prc95_rad', 57.29578),
+                    ('orientation_rmse_rad', DEGREES),
+                    ('orientation_prc95_rad', DEGREES),
                 )
             ]
             shown = f'source seen from {name}' if group == 'sources' else name

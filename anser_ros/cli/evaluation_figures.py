@@ -21,6 +21,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from anser_ros.cli.html_page import page
+from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.evaluation import Evaluation
 from anser_ros.sessions.pose_errors import PoseSeries
 
@@ -114,7 +115,7 @@ def by_coil(evaluation: Evaluation) -> Figure:
     )
     for panel, scale, unit, errors in (
         (panels[0], 1e3, 'position error, mm', [s.position_error for s in found.values()]),
-        (panels[1], 57.29578, 'orientation error, deg',
+        (panels[1], DEGREES, 'orientation error, deg',
          [s.orientation_error for s in found.values()]),
     ):  # fmt: skip
         for row, error in enumerate(errors, start=1):
@@ -233,7 +234,7 @@ def _table(document: Mapping[str, Any]) -> str:
             cells = [html.escape(name), str(row['n']), f'{row["tracked_fraction"]:.1%}']
             for key, scale in (
                 ('position_rmse_m', 1e3), ('position_prc95_m', 1e3),
-                ('orientation_rmse_rad', 57.29578), ('orientation_prc95_rad', 57.29578),
+                ('orientation_rmse_rad', DEGREES), ('orientation_prc95_rad', DEGREES),
             ):  # fmt: skip
                 cells.append('-' if row[key] is None else f'{scale * row[key]:.3f}')
             rows += '</tr><tr>' + ''.join(f'<td>{cell}</td>' for cell in cells)

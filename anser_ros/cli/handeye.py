@@ -25,6 +25,7 @@ from anser_ros.cli.pose_session import add_topic_options, load_poses
 from anser_ros.cli.progress import progress_of
 from anser_ros.errors import ParameterError
 from anser_ros.field.plain_data import plain
+from anser_ros.physics.constants import DEGREES
 from anser_ros.poses.convention import reading_words
 from anser_ros.poses.document import finite
 from anser_ros.poses.forms import ORDERS, UNITS
@@ -209,7 +210,7 @@ def _rows(document: dict[str, Any]) -> list[list[str]]:
             name, triple(one['lever_arm_m'], 1e3), triple(one['lever_arm_sigma_m'], 1e3),
             triple(one['mount_rotation_deg'], 1.0), triple(one['mount_rotation_sigma_deg'], 1.0),
             single(one['position_rmse_m'], 1e3), single(one['heldout_position_rmse_m'], 1e3),
-            single(one['heldout_orientation_rmse_rad'], 57.29578),
+            single(one['heldout_orientation_rmse_rad'], DEGREES),
         ]
         for name, one in document['sensors'].items()
     ]  # fmt: skip

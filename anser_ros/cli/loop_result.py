@@ -9,6 +9,7 @@ from rich.table import Table
 
 from anser_ros.cli.loop_run import AFTER, BEFORE, UNGATED
 from anser_ros.field.model import FieldModel
+from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.recorded_poses import LiveErrors, live_errors
 from anser_ros.sessions.session import Session
@@ -126,7 +127,7 @@ def table(rounds: list[dict[str, Any]], console: Console) -> None:
             'machine too busy' if hidden else one['verdict'],
             '\n'.join(_parameter(key, value) for key, value in one['parameters'].items()),
             *(_number(live[n]['position_rmse_m'], 1e3, hidden) for n in TRACKERS),
-            *(_number(live[n]['orientation_rmse_rad'], 57.29578, hidden) for n in TRACKERS[1:]),
+            *(_number(live[n]['orientation_rmse_rad'], DEGREES, hidden) for n in TRACKERS[1:]),
             *(f'{100 * live[n]["published_share"]:.1f} %' for n in TRACKERS[1:]),
             f'{100 * one["unexplained"]["fraction"]:.2g} %',
         )

@@ -11,11 +11,12 @@ from typing import Any
 from rich.table import Table
 
 from anser_ros.cli.html_page import page
+from anser_ros.physics.constants import DEGREES
 
 SCHEMA = 'anser_summary/1'
 """Name of the layout of what ``--json`` prints."""
 FILES = ('summary.csv', 'summary.html')
-MM, DEG, PT, PERCENT = 1e3, 57.29578, 1e12, 1e2
+MM, DEG, PT, PERCENT = 1e3, DEGREES, 1e12, 1e2
 """Factors from SI to the units of the table: mm a metre, degrees a radian, pT a tesla, percent."""
 
 Row = dict[str, Any]

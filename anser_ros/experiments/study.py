@@ -30,12 +30,10 @@ from anser_ros.experiments.tracking_errors import SensorErrors, track
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.constants import MU_0
 from anser_ros.sessions.session import Session
+from anser_ros.simulation.recording import STATIC_NOISE_T
 
 Array = NDArray[np.float64]
 Errors = dict[str, SensorErrors]
-
-STATIC_NOISE_T = 30e-12
-"""Flux noise of a static point, T rms a component, as the recordings have it; for the bound."""
 
 
 @dataclass

@@ -15,6 +15,7 @@ from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.polled import polling_node
 from anser_ros.nodes.shared_names import optical_parameter
 from anser_ros.nodes.view_source import ViewSource
+from anser_ros.wire.tcp_ports import LIVE_VIEW
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class DashboardParameters:
         '127.0.0.1', 'address that the page is served on; any but this machine needs a token'
     )
     port: int = parameter(
-        8642, 'TCP port of the page; 0 for any that is free', minimum=0, maximum=65535
+        LIVE_VIEW, 'TCP port of the page; 0 for any that is free', minimum=0, maximum=65535
     )
     token_file: str = parameter(
         '', 'file with the token that browsers have to know; empty: a new one, printed at the '
@@ -44,7 +45,7 @@ class Dashboard(AnserNode):
     """
 
     NAME = 'dashboard'
-    EXAMPLE = '--ros-args -p directory:=recordings -p port:=8642'
+    EXAMPLE = f'--ros-args -p directory:=recordings -p port:={LIVE_VIEW}'
     PARAMETERS = DashboardParameters
 
     def __init__(self, **options: Any) -> None:

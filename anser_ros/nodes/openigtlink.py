@@ -16,14 +16,14 @@ from anser_ros.nodes.igtl_server import IgtlServer
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.tracker_parameters import TrackerParameters
+from anser_ros.tracking.estimate import OK, STALE
 from anser_ros.wire import igtl
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 from anser_ros.wire.setup_tips import tip_name
+from anser_ros.wire.tcp_ports import OPENIGTLINK
 
 WATCH_PERIOD_S = 0.05
 """How often sensors are looked at that have fallen silent, s."""
-OK = 'ok'
-SILENT = 'stale'
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class OpenIGTLinkParameters:
     """Parameters of the OpenIGTLink server."""
 
     host: str = parameter('127.0.0.1', 'address to listen on; 0.0.0.0 lets other machines in')
-    port: int = parameter(18944, 'TCP port, 0 for a free one', minimum=0, maximum=65535)
+    port: int = parameter(OPENIGTLINK, 'TCP port, 0 for a free one', minimum=0, maximum=65535)
     stale_after_s: float = parameter(
         TrackerParameters.stale_after_s,
         'a sensor without a pose for so long is reported, s',
@@ -176,7 +176,7 @@ class OpenIGTLink(AnserNode):
         for status in message.status:
             node, _, part = status.name.partition(': ')
             if node.endswith('/tracker') and part in self._states and self._is_silent(part):
-                self._set_state(part, status.message if status.message != OK else SILENT)
+                self._set_state(part, status.message if status.message != OK else STALE)
 
     def _is_silent(self, name: str) -> bool:
         last_s = self._last_pose_s.get(name, -math.inf)
@@ -185,7 +185,7 @@ class OpenIGTLink(AnserNode):
     def _watch(self) -> None:
         for name, state in self._states.items():
             if state == OK and self._is_silent(name):
-                self._set_state(name, SILENT)
+                self._set_state(name, STALE)
         before, self._n_clients = self._n_clients, self._server.n_clients
         if self._n_clients > before:  # whoever is new must know what has no pose
             for name, state in self._states.items():

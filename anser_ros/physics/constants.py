@@ -1,4 +1,4 @@
-"""Constants of nature that the field computations share, in SI units."""
+"""Constants of nature that the field computations share, in SI units, and the size of a radian."""
 
 import math
 
@@ -7,3 +7,6 @@ MU_0 = 4e-7 * math.pi
 
 DIPOLE_CONSTANT = MU_0 / (4 * math.pi)
 """mu_0 / (4 pi), T m / A."""
+
+DEGREES = 180.0 / math.pi
+"""Degrees in a radian, the factor from SI to what tables and figures show."""

@@ -4,11 +4,10 @@ from typing import Any
 
 import numpy as np
 
+from anser_ros.diagnosis.schema import SCHEMA
 from anser_ros.field.plain_data import plain
 from anser_ros.poses.diagnosis import PoseDiagnosis
 
-SCHEMA = 'anser_diagnosis/1'
-"""Name of the document's layout, which is that of a diagnosis of fluxes."""
 MODEL_SCHEMA = 'anser_pose_model/1'
 """Name of the layout of a model of poses."""
 

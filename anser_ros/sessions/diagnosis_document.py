@@ -3,11 +3,10 @@
 from typing import Any
 
 from anser_ros.diagnosis.finding import Finding
+from anser_ros.diagnosis.schema import SCHEMA
 from anser_ros.field.plain_data import plain
 from anser_ros.sessions.diagnosis import SessionDiagnosis
 
-SCHEMA = 'anser_diagnosis/1'
-"""Name of the document's layout, which stands in every such document."""
 DEPENDENCIES = (
     'time', 'position', 'orientation', 'speed', 'emitter', 'channel', 'amplitude', 'frequency',
 )  # fmt: skip

@@ -24,6 +24,8 @@ START_NS = 1_700_000_000 * SECOND_NS
 the same bag."""
 OPTICAL_MARGIN_S = 0.2
 """Time by which the optical poses begin before the fluxes and end after them, s."""
+STATIC_NOISE_T = 30e-12
+"""Flux noise of a tool at rest, T rms a component: half of a single window's by averaging."""
 
 
 @dataclass(frozen=True)

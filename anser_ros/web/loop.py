@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 from anser_ros.cli.diagnosis_words import verdict
 from anser_ros.errors import AnserError, ParameterError
+from anser_ros.physics.constants import DEGREES
 from anser_ros.web.folder import RecordingFolder
 from anser_ros.web.job import Job
 
@@ -300,7 +301,7 @@ def _read_diagnosis(document: dict[str, Any]) -> tuple[str, tuple[tuple[str, str
     for label, key, unit, scale, digits in (
         ('residual, pT', 'flux_rms', 't', 1e12, 0),
         ('position error, mm', 'position_rmse', 'm', 1e3, 2),
-        ('orientation error, deg', 'orientation_rmse', 'rad', 57.29578, 2),
+        ('orientation error, deg', 'orientation_rmse', 'rad', DEGREES, 2),
     ):
         pair = [
             _text(_scaled(held[f'{key}_{when}_{unit}'], scale), digits)
