@@ -21,6 +21,7 @@ from anser_ros.assessment.intervals import (
 )
 from anser_ros.assessment.stillness import StillPoint
 from anser_ros.errors import FitError, ParameterError
+from anser_ros.physics.angles import axis_angles
 
 Array = NDArray[np.float64]
 
@@ -293,8 +294,7 @@ def rotation_errors(
         angles = (turns[:-1].inv() * turns[1:]).magnitude()
     else:
         vectors = turns.apply(axis / np.linalg.norm(axis))
-        cross = np.linalg.norm(np.cross(vectors[:-1], vectors[1:]), axis=1)
-        angles = np.arctan2(cross, np.sum(vectors[:-1] * vectors[1:], axis=1))
+        angles = axis_angles(vectors[:-1], vectors[1:])
     signed = np.rad2deg(angles) - step_deg
     if float(np.median(np.abs(signed))) > WRONG_ORDER * step_deg:
         raise FitError(

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from anser_ros.experiments.article import STATISTICS
 from anser_ros.field.model import FieldModel
+from anser_ros.physics.angles import axis_angles
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.session import Session
 
@@ -78,8 +79,7 @@ def track(session: Session, model: FieldModel, in_phase: bool = False) -> dict[s
             tracked = np.array([estimate.position for estimate in series.estimates])
             found = np.array([estimate.axis for estimate in series.estimates])
             distance = np.linalg.norm(tracked - centres[:, column], axis=1)
-            sine = np.linalg.norm(np.cross(found, axes[:, column]), axis=1)
-            angle = np.arctan2(sine, (found * axes[:, column]).sum(axis=1))
+            angle = axis_angles(found, axes[:, column])
             token = name.rsplit('/', 1)[-1].upper()
             out[token] = SensorErrors(tracked, centres[:, column], distance, angle)
     return out

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.physics.angles import axis_angles
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.wire.setup import Setup
 
@@ -112,12 +113,7 @@ class PoseTrace:
         true_position = position + rotation @ np.array(self.target.position_m)
         true_axis = rotation @ np.array(self.target.axis)
         away = np.linalg.norm(np.array(self.position[since:]) - true_position, axis=1)
-        axes = np.array(self.axis[since:])
-        angle = np.arctan2(
-            np.linalg.norm(np.cross(axes, true_axis), axis=1),
-            np.einsum('ni,ni->n', axes, true_axis),
-        )
-        return away, angle
+        return away, axis_angles(np.array(self.axis[since:]), true_axis)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.physics.angles import axis_angles, rotation_angles
 from anser_ros.tracking.estimate import OK, PoseEstimate
 
 Array = NDArray[np.float64]
@@ -58,8 +59,7 @@ def sensor_series(
     for i, estimate in enumerate(estimates):
         if estimate.state == OK:
             distance[i] = np.linalg.norm(estimate.position - centres[i])
-            cross = np.linalg.norm(np.cross(estimate.axis, axes[i]))
-            angle[i] = np.arctan2(cross, float(np.dot(estimate.axis, axes[i])))
+            angle[i] = axis_angles(estimate.axis, axes[i])
     return PoseSeries(name, tuple(estimates), distance, angle)
 
 
@@ -83,11 +83,7 @@ def body_series(
     for i, estimate in enumerate(estimates):
         if estimate.state == OK and estimate.rotation is not None:
             distance[i] = np.linalg.norm(estimate.position - position[i])
-            turn = estimate.rotation.T @ rotation[i]
-            sine = 0.5 * np.linalg.norm(
-                [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
-            )
-            angle[i] = np.arctan2(sine, 0.5 * (np.trace(turn) - 1.0))
+            angle[i] = rotation_angles(estimate.rotation.T @ rotation[i])
     return PoseSeries(name, tuple(estimates), distance, angle)
 
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import BagError
 from anser_ros.field.measurements import Measurements
+from anser_ros.physics.angles import axis_angles, rotation_angles
 from anser_ros.sessions.prepared import PreparedSession, with_truth
 from anser_ros.sessions.session import Session
 from anser_ros.stamps import NANO, stamp_of
@@ -106,11 +107,10 @@ def _compared(
         return LiveErrors(np.zeros(0), np.zeros(0), frames)
     if column is None:
         truth = position[valid]
-        turn = Rotation.from_matrix(rotation[valid].transpose(0, 2, 1) @ turned).magnitude()
+        turn = rotation_angles(rotation[valid].transpose(0, 2, 1) @ turned)
     else:
         centres, axes = tool.sensors.placed(position[valid], rotation[valid])
         truth = centres[:, column]
-        cross = np.linalg.norm(np.cross(turned[:, :, 2], axes[:, column]), axis=1)
-        turn = np.arctan2(cross, np.sum(turned[:, :, 2] * axes[:, column], axis=1))
+        turn = axis_angles(turned[:, :, 2], axes[:, column])
     distance = np.linalg.norm(poses.position[valid] - truth, axis=1)
-    return LiveErrors(distance, np.asarray(turn), frames)
+    return LiveErrors(distance, turn, frames)
