@@ -5,6 +5,7 @@ Every file's syntax tree is walked, imports inside functions included.
 
 import ast
 import re
+import tomllib
 from pathlib import Path
 
 from conftest import by_room
@@ -120,6 +121,14 @@ def test_the_page_has_the_same_table_and_every_file():
     assert set(re.findall(r'`(\w+\.py)`', page.split('### Inside')[0])) >= beside
     parts = set(re.findall(r'`(\w+)`', page.split('### Inside')[1]))
     assert {path.stem for path in (PACKAGE / 'nodes').glob('[!_]*.py')} <= parts
+
+
+def test_types_are_strict_in_the_core():
+    """As CONTRIBUTING.md says: all that lies below `simulation`, and what the core offers."""
+    settings = tomllib.loads((PACKAGE.parent / 'pyproject.toml').read_text(encoding='utf-8'))
+    mypy = settings['tool']['mypy']
+    assert mypy['strict']
+    assert set(mypy['files']) >= {'anser_ros/*.py', *(f'anser_ros/{room}' for room in CORE)}
 
 
 @by_room(FILES)
