@@ -44,6 +44,8 @@ def single_point(
     ----------
     poses : PoseSequence
         Of the tip, while it stays at one location.
+    rng : Generator
+        Draws the intervals.
 
     Raises
     ------
@@ -83,8 +85,11 @@ def point_to_point(
     Parameters
     ----------
     points : sequence of StillPoint
+        As they were touched.
     true : ndarray, shape (n, 3)
         Their places on the phantom, m, in any frame, in the same order.
+    rng : Generator
+        Draws the intervals.
 
     Raises
     ------

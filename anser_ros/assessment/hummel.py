@@ -168,7 +168,11 @@ def distance_errors(place: Array, grid: Grid, rng: np.random.Generator) -> dict[
     Parameters
     ----------
     place : ndarray, shape (rows, columns, 3)
-        m.
+        Measured places of the holes, m.
+    grid : Grid
+        The true layout.
+    rng : Generator
+        Draws the intervals.
     """
     found, alike = {}, lines_alike(place, grid)
     for name, step in STEPS:
@@ -193,7 +197,9 @@ def lines_alike(place: Array, grid: Grid) -> bool:
     Parameters
     ----------
     place : ndarray, shape (rows, columns, 3)
-        m.
+        Measured places of the holes, m.
+    grid : Grid
+        The true layout.
     """
     for _, step in STEPS:
         products, squares = [], []
@@ -281,6 +287,8 @@ def rotation_errors(
     axis : ndarray, shape (3,), or None
         Direction of the sensor whose turn counts (MITK's rotation vector, for sensors without
         roll); None: the whole turn.
+    rng : Generator
+        Draws the intervals.
 
     Raises
     ------

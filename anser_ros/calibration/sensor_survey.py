@@ -124,6 +124,8 @@ class SensorSurveyor:
         The drawn board.
     progress : callable, optional
         Called with the name of the stage and its finished fraction.
+    steady : sequence of ndarray of bool, optional
+        Frames of each of the measurements in which the references saw nothing move; else all.
     """
 
     def __init__(

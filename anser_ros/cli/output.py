@@ -48,7 +48,7 @@ class Result:
     notes : tuple of str
         What users have to know of the session or the model, a line each.
     shown : tuple
-        Tables and texts for who reads the terminal.
+        Tables and texts for the reader of the terminal.
     written : tuple of Path
         The files to look at.
     """

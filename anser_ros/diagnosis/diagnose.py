@@ -56,10 +56,12 @@ class Diagnosis:
     model : FieldModel
         With the effects.
     search : Search
-    refused : tuple of Term
+    refused : tuple of (Term, Confirmation)
         Effects that explained something but were not confirmed.
     before, after : State
         The held-out part.
+    terms : tuple of Term
+        All that was fitted last, also what is no finding.
     """
 
     findings: tuple[Finding, ...]

@@ -42,7 +42,7 @@ noise away that are to be judged; larger lets a single outlier make noise look h
 
 @dataclass(frozen=True)
 class Whiteness:
-    """The largest of each kind of structure that is no noise's; zero where it can't be told."""
+    """The strongest structure of each kind that noise does not make; zero where none is told."""
 
     memory: float
     shared: float

@@ -45,7 +45,7 @@ def drifts(record: EffectRecord) -> bool:
 
 
 def is_undone(record: EffectRecord) -> bool:
-    """Whether who tracks with a model has to undo a record's effect: the dipoles do not hold it.
+    """Return whether tracking has to undo a record's effect, as the dipoles do not hold it.
 
     Raises
     ------

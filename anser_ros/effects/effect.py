@@ -158,7 +158,7 @@ class Effect(Generic[TermT]):
         return None
 
     def amounts(self, term: TermT) -> NDArray[np.int64]:
-        """Parameters, by index, that all being zero means that there is no effect."""
+        """Return the indices of the parameters that are all zero when there is no effect."""
         return np.arange(term.theta.size)
 
     def probe(self, term: TermT, view: View) -> ComplexArray | None:

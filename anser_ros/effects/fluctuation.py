@@ -94,7 +94,7 @@ class Fluctuation(Effect[FluctuationTerm]):
         return term
 
     def complexity(self, term: FluctuationTerm) -> int:
-        """As many as `OPEN`, whatever the number of its columns."""
+        """Return `OPEN`, whatever the number of its columns."""
         return OPEN
 
     def covers(self, term: FluctuationTerm, candidate: Term) -> bool:

@@ -160,7 +160,7 @@ class MovingMetal(Effect[MovingTerm]):
         )  # fmt: skip
 
     def complexity(self, term: MovingTerm) -> int:
-        """At least what it will have once it is shaped."""
+        """Return at least the number of parameters that it will have once it is shaped."""
         return max(int(term.theta.size), SHAPED)
 
     def body(self, term: MovingTerm) -> MovingTerm:

@@ -132,7 +132,7 @@ class SensorGainSpread(SensorSpread):
     offset_of_values = (1.0, 0.0)
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SpreadTerm]:
-        """All sensors of a body that has many, those at one place with a gain in common."""
+        """Return a term of each body with many sensors; those at one place share a gain."""
         out = []
         for table in apparatus.tools:
             places = clusters_of(table)

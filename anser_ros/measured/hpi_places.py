@@ -25,7 +25,7 @@ def rms(values: Array) -> float:
 
 
 def order_of(places_m: Array, digitised_m: Array) -> list[int]:
-    """Which fitted coil each digitised point is; with coils far apart only one order fits."""
+    """Return which fitted coil each digitised point is; far apart, only one order fits."""
     orders = itertools.permutations(range(len(digitised_m)))
     best = min(orders, key=lambda o: rms(rigid_distance(places_m[list(o)], digitised_m)))
     return list(best)

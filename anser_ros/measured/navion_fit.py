@@ -60,6 +60,8 @@ class PlateFit:
         Laplace approximation; comparable between fits to the same readings.
     effects : frozenset of str
     residual_t : ndarray, shape (P, K, S, 3)
+    whitened : Whitened
+        The last step's equations.
     """
 
     sources: Sources

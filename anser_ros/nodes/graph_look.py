@@ -1,4 +1,4 @@
-"""A short look at the graph, for who may not load ROS: what is there, printed as one JSON line."""
+"""Print what is on the graph as one JSON line, for programs that may not load ROS."""
 
 import json
 import sys

@@ -77,6 +77,8 @@ class AnserNode(Node):
         What nodes of the same process give each other directly.
     beside : sequence of type, optional
         The other nodes of the process: values that are given to all of them may be meant for one.
+    **options : object
+        As `rclpy.node.Node` takes them.
     """
 
     NAME: ClassVar[str]

@@ -1,4 +1,4 @@
-"""Poses of a topic of the graph for some seconds, a JSON line each, for who may not load ROS."""
+"""Print the poses of a topic for some seconds, a JSON line each, for programs without ROS."""
 
 import json
 import sys

@@ -19,6 +19,8 @@ class TopicLog:
 
     Attributes
     ----------
+    n_publishers : int
+        How many nodes publish it.
     lost : int
         Messages that the publisher numbered and that never came; known while there is only one.
     gaps : int

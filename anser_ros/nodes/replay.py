@@ -74,6 +74,8 @@ class Replay(AnserNode):
         played too.
     wait : float
         Longest time to wait until all who take the fluxes, or poses made of them, are ready, s.
+    **options : object
+        As `AnserNode` takes them.
 
     Raises
     ------

@@ -32,6 +32,12 @@ def signal_troubles(
 
     Parameters
     ----------
+    coils : sequence of Coil
+        The emitters, in the order of the setup document.
+    stream : FluxStream
+        Of the connection.
+    frame : FluxFrame or None
+        The newest one.
     flags : ndarray, shape (S,), or None
         Flag bits that the sensors had since the last look. Lost samples are not told here: the
         counters of the line say where they were lost.

@@ -90,6 +90,7 @@ class PoseTrace:
 
     Attributes
     ----------
+    target : what is tracked
     stamp_s, sigma_m, latency_s : a value a pose; latency from the middle of the window
     position, axis : three values a pose
     """
@@ -122,6 +123,7 @@ class Row:
 
     Attributes
     ----------
+    name : of the target
     position_m : NaN when nothing came lately
     error_m, latency_s, sigma_m : medians of the poses of the interval, NaN without any
     rate_hz : poses a second of the interval

@@ -55,6 +55,8 @@ class PoseView:
         Stamps of the tracked poses, s.
     measured : ndarray, shape (n, 3)
         Tracked positions as they were reported, m, tracker's frame.
+    measured_rotation : ndarray, shape (n, 3, 3)
+        The rotations that were reported with them.
     optical, turn : ndarray, shapes (n, 3) and (n, 3, 3)
         The body in the optical frame at these times: place (m) and rotation.
     frame : ndarray, shape (3, 3)
@@ -132,19 +134,19 @@ class PoseEffect(Effect[Term]):
         return position, rotation
 
     def observed(self, sight: 'PoseSight') -> Sequence[EffectRecord]:
-        """What is seen of the effect without a fit; nothing where it has parameters to fit."""
+        """Return what is seen of the effect without a fit; nothing where parameters are fitted."""
         return ()
 
     def bent(self, term: Term) -> Term:
-        """Of a map: without its linear part, which something else has."""
+        """Return a map without its linear part, which something else has."""
         return term
 
     def whole(self, term: Term) -> Term:
-        """Of a map: with its linear part, on all sensors, with parameters of zero."""
+        """Return a map with its linear part, on all sensors, with parameters of zero."""
         return term
 
     def rival(self, term: Term) -> Term:
-        """Of a filter: the same smoothing without a delay, what a noisy reference asks for."""
+        """Return a filter's smoothing without its delay: what a noisy reference asks for."""
         return term
 
     def acts_on(self, term: Term, sensor: str) -> bool:

@@ -148,6 +148,8 @@ def fit_hand_eye(
         With a reference.
     pairs : bool
         Whether the poses are static pairs (`as_pairs`), which tell nothing of clocks.
+    progress : callable, optional
+        Called with the name of the stage and its finished fraction.
 
     Raises
     ------
@@ -268,7 +270,7 @@ def _middle(terms: tuple[Term, ...]) -> float:
 
 
 def _open_lever(name: str, lever: Array, turn: Array) -> list[str]:
-    """In words, which components of a lever arm are open, and what motion would tell them."""
+    """Say which components of a lever arm are open, and what motion would tell them."""
     if not np.isnan(lever).any():
         return []
     middle = turn.mean(axis=0)

@@ -51,6 +51,10 @@ def evidence_without(
 
     Parameters
     ----------
+    bank : Bank
+        Of the coils in use.
+    seen : FrameEvidence
+        What they say of the frame.
     coils : ndarray of int, shape (Q,)
         Numbers of the coils among those in use.
 
@@ -92,6 +96,12 @@ def distance_of(
 
     Parameters
     ----------
+    bank : Bank
+        Of the coils in use.
+    seen : FrameEvidence
+        What they say of the frame.
+    hypothesis : int
+        Number of the hypothesis that predicts.
     rows : ndarray of int, shape (K,)
         Rows of the priors' covariance.
     readings : ndarray, shape (K, 2)

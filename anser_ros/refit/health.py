@@ -152,6 +152,10 @@ class ReferenceWatch:
         Reference coils S.
     hold_frames : int
         Frames for which a coil must be readable and agree before it is used again.
+    excluded : ndarray of bool, shape (S,)
+        Which are not used.
+    reason : list of str, length S
+        Why, in a word; of the others that they are in order.
     """
 
     count: int
