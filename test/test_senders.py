@@ -68,7 +68,16 @@ def test_a_single_sender_may_say_otherwise():
     assert sources.take(2, 1, 50.0, 'b')
     assert sources.take(3, 1, 51.0)
     assert sources.take(4, 1, 51.02, 'c')
-    assert sources.take(1, 1, 59.0, 'd'), 'its successor, once it has gone'
+    assert sources.take(1, 1, 59.0, 'c'), 'its successor, who says the same'
+
+
+def test_who_says_otherwise_is_no_successor_before_it_is_asked_anew():
+    sources = Senders('setup')
+    assert sources.take(1, 1, 0.0, 'a')
+    assert not sources.take(1, 1, 60.0, 'b'), 'a graph may not know the second publisher yet'
+    assert sources.look(1, 60.5) == 'two publishers of setup'
+    sources.forget()
+    assert sources.take(1, 1, 61.0, 'b')
 
 
 def test_without_numbers_the_graph_decides():

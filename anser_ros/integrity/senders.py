@@ -69,7 +69,7 @@ class Senders:
             self._drop_silent(now_s)
             run = self._run_of(number, publishers)
             if run is None:
-                if publishers <= 1 and len(self._runs) == 1 and self._is_silent(now_s):
+                if publishers <= 1 and len(self._runs) == 1 and self._is_ended(lasting, now_s):
                     self._runs.clear()  # it has gone, and this is its successor
                 self._runs.append(_Run(number, now_s, lasting))
             else:
@@ -99,8 +99,16 @@ class Senders:
             run for run in self._runs if now_s - run.heard_s < SILENT_S or run.lasting is not None
         ]
 
-    def _is_silent(self, now_s: float) -> bool:
-        return all(now_s - run.heard_s >= SILENT_S for run in self._runs)
+    def _is_ended(self, lasting: Hashable, now_s: float) -> bool:
+        """Whether silence tells that a sender has gone, to whom another one may succeed.
+
+        It does not where what was said holds on: a graph of one publisher may not know the second
+        one yet, whose message says something else.
+        """
+        (run,) = self._runs
+        if run.lasting is not None:
+            return run.lasting == lasting
+        return now_s - run.heard_s >= SILENT_S
 
     def _run_of(self, number: int, publishers: int) -> _Run | None:
         """Return the run that a message continues; None for the first of another."""

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 LOOK_S = 0.1
 """How often the graph is asked at most, s, while messages go on as before: it takes 15 us.
 Smaller costs more; larger, and who only begins to publish is noticed later."""
+SETTLED_S = 0.3
+"""Time, s, after a message was refused in which the graph has to go on knowing one publisher
+before it is asked again what holds. Smaller, and a second publisher is believed whose message came
+before the graph knew it, which takes about 0.1 s; larger, and a successor is believed later."""
 NO_INFORMATION: Mapping[str, Any] = MappingProxyType({})
 """What is known of a message that was handed over within the process: its sender is ours, and a
 second one is known to the graph alone."""
@@ -62,7 +66,7 @@ class OneSource:
         self._arguments = message_type, profile
         self._sources = Senders(topic)
         self._publishers, self._looked_s = 0, 0.0
-        self._refused = False
+        self._refused_s: float | None = None
         self.subscription = self._subscribed()
 
     @property
@@ -71,9 +75,11 @@ class OneSource:
         now_s = time.monotonic()
         said = self._sources.look(self._count(now_s), now_s)
         latched = self._arguments[1].durability == DurabilityPolicy.TRANSIENT_LOCAL
-        if latched and self._refused and self._publishers <= 1:
+        if self._publishers > 1 and self._refused_s is not None:
+            self._refused_s = now_s
+        if latched and self._refused_s is not None and now_s - self._refused_s > SETTLED_S:
             # Who is left says again what holds.
-            self._refused = False
+            self._refused_s = None
             self._sources.forget()
             self._node.destroy_subscription(self.subscription)
             self.subscription = self._subscribed()
@@ -90,7 +96,7 @@ class OneSource:
             self._looked_s = 0.0  # the graph as it is at this moment is needed
         is_good = self._sources.take(number, self._count(now_s), now_s, lasting)
         if not is_good:
-            self._refused = True
+            self._refused_s = now_s
             self._node.warn('messages_of_two_sources', self._sources.said)
         return is_good
 
