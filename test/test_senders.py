@@ -71,10 +71,12 @@ def test_a_single_sender_may_say_otherwise():
     assert sources.take(1, 1, 59.0, 'c'), 'its successor, who says the same'
 
 
-def test_who_says_otherwise_is_no_successor_before_it_is_asked_anew():
-    sources = Senders('setup')
+@pytest.mark.parametrize('number', [1, 2, 3, 9])
+def test_who_says_otherwise_is_no_successor_before_it_is_asked_anew(number):
+    sources = Senders('setup', is_constant=True)
     assert sources.take(1, 1, 0.0, 'a')
-    assert not sources.take(1, 1, 60.0, 'b'), 'a graph may not know the second publisher yet'
+    assert sources.take(2, 1, 0.0, 'a')
+    assert not sources.take(number, 1, 60.0, 'b'), 'a graph may not know the second publisher yet'
     assert sources.look(1, 60.5) == 'two publishers of setup'
     sources.forget()
     assert sources.take(1, 1, 61.0, 'b')

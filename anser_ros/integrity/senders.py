@@ -27,14 +27,22 @@ class _Run:
 class Senders:
     """Tells the senders of one topic apart.
 
+    Parameters
+    ----------
+    topic : str
+        As it is called in `said`.
+    is_constant : bool
+        Whether what a sender says never changes: who says otherwise is another one, whatever
+        number the message has.
+
     Attributes
     ----------
     said : str
         Why the topic can't be believed now; empty while it has one sender.
     """
 
-    def __init__(self, topic: str) -> None:
-        self._topic = topic
+    def __init__(self, topic: str, is_constant: bool = False) -> None:
+        self._topic, self._is_constant = topic, is_constant
         self._runs: list[_Run] = []
         self._is_numbered = True
         self.said = ''
@@ -68,6 +76,8 @@ class Senders:
         if number is not None:
             self._drop_silent(now_s)
             run = self._run_of(number, publishers)
+            if run is not None and self._is_constant and run.lasting != lasting:
+                run = None
             if run is None:
                 if publishers <= 1 and len(self._runs) == 1 and self._is_ended(lasting, now_s):
                     self._runs.clear()  # it has gone, and this is its successor

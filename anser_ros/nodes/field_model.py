@@ -80,7 +80,13 @@ class FieldModelNode(AnserNode):
         self._output = ModelOutput(self)
         self._metal = MetalView(self)
         setups = OneSource(
-            self, String, 'setup', self._on_setup, qos.LATCHED, lasting=lambda text: text.data
+            self,
+            String,
+            'setup',
+            self._on_setup,
+            qos.LATCHED,
+            lasting=lambda text: text.data,
+            is_constant=True,
         )
         self._fluxes = NewestSource(self, 'reference/flux', self._on_flux)
         topics = parse_patches(table.patches)

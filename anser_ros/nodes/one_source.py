@@ -39,6 +39,8 @@ class OneSource:
         Takes messages that are not believed.
     lasting : callable, optional
         Returns what a message says if that holds until its sender says otherwise, else None.
+    is_constant : bool
+        Whether what lasts never changes, so that who says otherwise is another sender.
     informed : bool
         Whether callbacks take the message's information too.
 
@@ -57,6 +59,7 @@ class OneSource:
         profile: QoSProfile,
         doubted: Callable[..., None] | None = None,
         lasting: Callable[[Any], Hashable] | None = None,
+        is_constant: bool = False,
         informed: bool = False,
     ) -> None:
         self._node, self._topic = node, topic
@@ -64,7 +67,7 @@ class OneSource:
         self._callback, self._doubted, self._lasting = callback, doubted, lasting
         self._informed = informed
         self._arguments = message_type, profile
-        self._sources = Senders(topic)
+        self._sources = Senders(topic, is_constant)
         self._publishers, self._looked_s = 0, 0.0
         self._refused_s: float | None = None
         self.subscription = self._subscribed()

@@ -91,7 +91,13 @@ class TrackerNode(AnserNode):
         self._transforms = transform_publisher(self) if table.publish_tf else None
         warm_up()
         setups = OneSource(
-            self, String, 'setup', self._on_setup, qos.LATCHED, lasting=lambda text: text.data
+            self,
+            String,
+            'setup',
+            self._on_setup,
+            qos.LATCHED,
+            lasting=lambda text: text.data,
+            is_constant=True,
         )
         # The executor takes topics in this order, so a model finds its uncertainty there.
         self.create_subscription(

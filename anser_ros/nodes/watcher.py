@@ -128,7 +128,7 @@ class Watcher(AnserNode):
             self._sources = [
                 OneSource(
                     self, String, 'setup', self._on_setup, qos.LATCHED,
-                    lasting=lambda text: text.data,
+                    lasting=lambda text: text.data, is_constant=True,
                 ),
                 OneSource(self, PointCloud2, 'tool/flux', self._on_tool, qos.STREAM),
                 OneSource(self, PointCloud2, 'reference/flux', self._on_reference, qos.STREAM),

@@ -22,6 +22,10 @@ WINDOW_S = 0.4
 """Length of the window, s, in which poses must come again for a chain to count as recovered: ten
 frames, of which half must have a pose."""
 
+TRUTH_GAP_S = 0.25
+"""True poses further apart, s, tell nothing of the time between: the unit was started anew, and
+its truth was heard later than its samples. Between closer ones a line is followed."""
+
 
 @dataclass(frozen=True)
 class SeenPose:
@@ -164,7 +168,11 @@ class Witness:
         return found
 
     def errors(self, since_s: float, until_s: float) -> list[tuple[SeenPose, float]]:
-        """Return the poses that came in a time with their errors, m; infinite without a truth."""
+        """Return the poses that came in a time with their errors, m; infinite without a truth.
+
+        Those of a time in which the unit's truth was not heard, as after its restart, are not
+        among them.
+        """
         chosen = [pose for pose in self.poses if since_s <= pose.arrival_s < until_s]
         tracks = {body: _Track(rows) for body, rows in self._truth.items() if len(rows) > 1}
         specs = {spec.name: spec for spec in self.setup.tool_sensors}
@@ -172,6 +180,8 @@ class Witness:
         for pose in chosen:
             spec = specs.get(pose.name)
             track = tracks.get(spec.body if spec is not None else pose.name)
+            if track is not None and track.lacks(pose.stamp_s):
+                continue
             local = np.zeros(3) if spec is None else np.array(spec.position_m)
             truth = None if track is None else track.at(pose.stamp_s, local)
             error = np.inf if truth is None else float(np.linalg.norm(pose.place - truth))
@@ -186,6 +196,12 @@ class _Track:
         table = sorted(rows)
         self._time = [row[0] for row in table]
         self._rows = np.array(table)
+
+    def lacks(self, time_s: float) -> bool:
+        """Return whether a time is in a gap between true poses."""
+        right = bisect.bisect_left(self._time, time_s)
+        inside = 0 < right < len(self._time)
+        return inside and self._time[right] - self._time[right - 1] > TRUTH_GAP_S
 
     def at(self, time_s: float, local: np.ndarray) -> np.ndarray | None:
         """Return where a point of the body (m) was at a time."""
