@@ -18,7 +18,7 @@ from anser_ros.errors import AnserError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
 from anser_ros.integrity import withheld as why
-from anser_ros.nodes import qos, refit_status
+from anser_ros.nodes import refit_status
 from anser_ros.nodes.diagnostics import Trouble
 from anser_ros.nodes.field_model_parameters import FieldModelParameters
 from anser_ros.nodes.flux_reader import read_frame
@@ -27,7 +27,7 @@ from anser_ros.nodes.model_output import ModelOutput
 from anser_ros.nodes.moving_coils import MovingCoils
 from anser_ros.nodes.newest_frame import NewestSource
 from anser_ros.nodes.node import AnserNode, Level, Status, main
-from anser_ros.nodes.one_source import LOOK_S, OneSource, said_of
+from anser_ros.nodes.one_source import LOOK_S, said_of, setup_source
 from anser_ros.nodes.patches import start_refit
 from anser_ros.nodes.place_watch import PlaceWatch
 from anser_ros.nodes.stated_parameters import stated_by
@@ -79,15 +79,7 @@ class FieldModelNode(AnserNode):
         self._pace = Pace(table.refit_rate_hz)
         self._output = ModelOutput(self)
         self._metal = MetalView(self)
-        setups = OneSource(
-            self,
-            String,
-            'setup',
-            self._on_setup,
-            qos.LATCHED,
-            lasting=lambda text: text.data,
-            is_constant=True,
-        )
+        setups = setup_source(self, self._on_setup)
         self._fluxes = NewestSource(self, 'reference/flux', self._on_flux)
         topics = parse_patches(table.patches)
         self._moving = MovingCoils(self, topics, lambda: self._frame_id, self._refuse)

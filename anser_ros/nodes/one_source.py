@@ -6,8 +6,10 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import String
 
 from anser_ros.integrity.senders import Senders
+from anser_ros.nodes import qos
 
 if TYPE_CHECKING:
     from anser_ros.nodes.node import AnserNode
@@ -123,6 +125,14 @@ class OneSource:
         if now_s - self._looked_s > LOOK_S:
             self._publishers, self._looked_s = self._node.count_publishers(self._name), now_s
         return self._publishers
+
+
+def setup_source(node: 'AnserNode', callback: Callable[[Any], None]) -> OneSource:
+    """Subscribe to the setup document, whose text is one sender's for good."""
+    return OneSource(
+        node, String, 'setup', callback, qos.LATCHED, lasting=lambda text: text.data,
+        is_constant=True,
+    )  # fmt: skip
 
 
 def said_of(sources: list[OneSource]) -> str:

@@ -26,7 +26,7 @@ from anser_ros.nodes.model_in_force import ModelInForce
 from anser_ros.nodes.model_intake import GivenModel, ModelIntake
 from anser_ros.nodes.newest_frame import newest_of
 from anser_ros.nodes.node import AnserNode, Level, Status, main
-from anser_ros.nodes.one_source import OneSource, said_of
+from anser_ros.nodes.one_source import OneSource, said_of, setup_source
 from anser_ros.nodes.overload import Load
 from anser_ros.nodes.pose_output import PoseTopic, transform_message, transform_publisher
 from anser_ros.nodes.readiness import digest_of
@@ -90,15 +90,7 @@ class TrackerNode(AnserNode):
         self._model_age_ns = 0
         self._transforms = transform_publisher(self) if table.publish_tf else None
         warm_up()
-        setups = OneSource(
-            self,
-            String,
-            'setup',
-            self._on_setup,
-            qos.LATCHED,
-            lasting=lambda text: text.data,
-            is_constant=True,
-        )
+        setups = setup_source(self, self._on_setup)
         # The executor takes topics in this order, so a model finds its uncertainty there.
         self.create_subscription(
             PointCloud2, 'field_model_error', self._on_error, qos.MODEL_ERRORS

@@ -18,7 +18,7 @@ from anser_ros.integrity.withheld import TWO_SOURCES
 from anser_ros.nodes import qos
 from anser_ros.nodes.flux_reader import read_frame
 from anser_ros.nodes.node import AnserNode, Level, Status, main
-from anser_ros.nodes.one_source import OneSource, said_of
+from anser_ros.nodes.one_source import OneSource, said_of, setup_source
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.pose_streams import PoseStreams, pose_values, pose_words
 from anser_ros.nodes.shared_names import optical_parameter, optical_topic
@@ -126,10 +126,7 @@ class Watcher(AnserNode):
             self._sources = self._poses.sources
         else:
             self._sources = [
-                OneSource(
-                    self, String, 'setup', self._on_setup, qos.LATCHED,
-                    lasting=lambda text: text.data, is_constant=True,
-                ),
+                setup_source(self, self._on_setup),
                 OneSource(self, PointCloud2, 'tool/flux', self._on_tool, qos.STREAM),
                 OneSource(self, PointCloud2, 'reference/flux', self._on_reference, qos.STREAM),
             ]  # fmt: skip
