@@ -1,6 +1,7 @@
 """The rows of the trial, as a line for whoever watches and as a table of the documents."""
 
 import json
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import groupby
@@ -11,6 +12,8 @@ ALLOWED_S = 1.0
 """Time within which poses have to be back after a fault has gone, s."""
 WORDS = 90
 """Characters of a state's words that the table shows."""
+FOLDER = re.compile(r'/tmp/[^/\s]+/')
+"""Temporary folders, which say nothing to who reads the table."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,8 @@ def write_docs(path: Path, rows: Sequence[Row], seed: int, rate_hz: float) -> No
             '|---|---|---|---|---|',
         ]
         for row in some:
-            said = row.said.replace('|', '/').replace('<', '&lt;')[:WORDS] or 'nothing'
+            said = FOLDER.sub('', row.said).replace('|', '/').replace('<', '&lt;')
+            said = said[:WORDS] or 'nothing'
             wrong = f'{row.wrong} of {row.poses}' if row.is_judged else 'machine too busy'
             wrong += f', {_worst(row)}' if row.wrong else ''
             out.append(
