@@ -15,6 +15,11 @@ as old as a good pose may be to start the tracker's next one from. Smaller, and 
 is called a jump; larger, and a clock that was set passes unnoticed."""
 
 
+LIVE_WITHIN_S = 60.0
+"""A stamp further than this from the host's clock, s, is a recording's. Larger than any clock's
+error between two hosts that work together, smaller than the age of any recording."""
+
+
 def stamp_of(message: Any) -> int:
     """Return the header stamp of a message, whoever decoded it, ns."""
     stamp = message.header.stamp
@@ -24,3 +29,8 @@ def stamp_of(message: Any) -> int:
 def set_stamp(stamp: Any, stamp_ns: int) -> None:
     """Write a stamp, ns, into a message's ``builtin_interfaces/Time``."""
     stamp.sec, stamp.nanosec = divmod(stamp_ns, SECOND_NS)
+
+
+def is_live(stamp_ns: int, now_ns: int) -> bool:
+    """Return whether a stamp, ns, is of now by the host's clock, and not a recording's."""
+    return abs(now_ns - stamp_ns) < LIVE_WITHIN_S * SECOND_NS

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import DiagnosisError, ParameterError
 from anser_ros.poses.live_look import PoseWatch, frozen_streams
-from anser_ros.poses.live_window import REFERENCE, PoseWindow
+from anser_ros.poses.live_window import PoseWindow
+from anser_ros.poses.sequence import REFERENCE
 
 SECOND_NS = 1_000_000_000
 LENGTH_S = 12.0
@@ -18,10 +19,9 @@ LENGTH_S = 12.0
 
 def rows_of(session):
     """Every pose of a session as (stamp_ns, stream, pose), in the order of the stamps."""
-    streams = {**session.sensors, REFERENCE: session.reference}
     rows = [
         (session.start_ns + round(t * 1e9), name, (*place, *turn))
-        for name, poses in streams.items()
+        for name, poses in session.streams.items()
         for t, place, turn in zip(poses.time, poses.position, poses.quaternion, strict=True)
     ]
     return sorted(rows, key=lambda row: row[0])

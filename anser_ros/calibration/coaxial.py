@@ -16,6 +16,7 @@ from scipy.optimize import least_squares
 
 from anser_ros.calibration.dipole_sites import DipoleSites
 from anser_ros.calibration.factors import as_real
+from anser_ros.calibration.readings import weighted_readings
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.tangent import tilted
@@ -69,10 +70,8 @@ def fit_coaxial(
     """
     middle = (count - 1) // 2
     centres, axes = start.positions[middle::count], start.directions[middle::count]
-    rows = [_rows(m, w) for m, w in zip(corrected, weights, strict=True)]
-    points, normals, lengths, root, flux = (
-        np.concatenate([part[i] for part in rows]) for i in range(5)
-    )
+    (points, normals, lengths, measured), root = weighted_readings(corrected, weights)
+    flux = as_real(measured)
     found = []
     for k, (centre, axis) in enumerate(zip(centres, axes, strict=True)):
         near = float(np.linalg.norm(points - centre, axis=1).min())
@@ -122,14 +121,3 @@ def _best_vector(rows: tuple[Array, Array, Array, Array, Array], centre: Array) 
     basis = flux_basis(points, normals, lengths, where, np.eye(3)) * root[:, None]
     moments = np.linalg.lstsq(basis, flux * root[:, None], rcond=1e-12)[0]
     return np.asarray(moments[:, int(np.argmax((moments**2).sum(axis=0)))])
-
-
-def _rows(measurements: Measurements, weights: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Points, axes, lengths, root weights and fluxes (P, 2K) of the readings that have weight."""
-    points, axes = measurements.placed()
-    used = weights > 0.0
-    lengths = np.broadcast_to(measurements.sensors.length, used.shape)[used]
-    return (
-        points[used], axes[used], np.ascontiguousarray(lengths), np.sqrt(weights[used]),
-        as_real(measurements.flux[used]),
-    )  # fmt: skip

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.calibration.dipole_sites import DipoleSites
 from anser_ros.calibration.factors import ComplexArray
+from anser_ros.calibration.readings import weighted_readings
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_basis
@@ -73,7 +74,7 @@ class CoilPlacer:
         moments : ndarray, shape (N, K), complex
             Their moments, A m^2.
         """
-        points, axes, lengths, root, flux = _readings(corrected, weights)
+        (points, axes, lengths, flux), root = weighted_readings(corrected, weights)
         positions, directions = self.nominal.positions.copy(), self.nominal.directions.copy()
         moments = np.zeros_like(self.nominal.moments)
         for k, rows in enumerate(self.rows):
@@ -125,17 +126,3 @@ def _coil_fit(field: Callable[[Array], ComplexArray], flux: ComplexArray) -> tup
             break
     assert best is not None
     return best[1], best[2]
-
-
-def _readings(
-    corrected: Sequence[Measurements], weights: Sequence[Array]
-) -> tuple[Array, Array, Array, Array, ComplexArray]:
-    """Return points, axes, lengths, root weights and fluxes of the readings that have weight."""
-    parts = []
-    for m, weight in zip(corrected, weights, strict=True):
-        points, axes = m.placed()
-        used = weight > 0.0
-        lengths = np.broadcast_to(m.sensors.length, used.shape)[used]
-        parts.append((points[used], axes[used], lengths, np.sqrt(weight[used]), m.flux[used]))
-    points, axes, lengths, root, flux = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return points, axes, lengths, root, flux

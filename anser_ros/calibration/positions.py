@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from anser_ros.calibration.dipole_sites import DipoleSites
 from anser_ros.calibration.factors import ComplexArray, as_complex, as_real
-from anser_ros.calibration.readings import BLOCK_ROWS, frame_blocks
+from anser_ros.calibration.readings import BLOCK_ROWS, frame_blocks, weighted_readings
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import GAUSS_OFFSET, fill_field_and_gradient, flux_basis
 
@@ -226,10 +226,6 @@ class PositionFitter:
 
 
 def _rows(measurements: Measurements, weights: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Return points, axes, lengths, root weights and fluxes (P, 2K) of the weighted readings."""
-    points, axes = measurements.placed()
-    used = weights > 0.0
-    lengths = np.broadcast_to(measurements.sensors.length, used.shape)[used]
-    root = np.sqrt(weights[used])
-    flux = as_real(measurements.flux[used]) * root[:, None]
-    return points[used], axes[used], np.ascontiguousarray(lengths), root, flux
+    """Return points, axes, lengths, root weights and weighted real fluxes (P, 2K)."""
+    (points, axes, lengths, flux), root = weighted_readings([measurements], [weights])
+    return points, axes, lengths, root, as_real(flux) * root[:, None]

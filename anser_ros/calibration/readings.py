@@ -54,6 +54,35 @@ def usable_readings(measurements: Sequence[Measurements]) -> Iterator[Readings]:
                 yield Readings(points[used], axes[used], lengths, part.flux[used])
 
 
+def weighted_readings(
+    measurements: Sequence[Measurements], weights: Sequence[Array]
+) -> tuple[Readings, Array]:
+    """Return the P readings that have weight, at their poses, and the roots of their weights.
+
+    Parameters
+    ----------
+    measurements : sequence of Measurements
+        F frames of S sensors each.
+    weights : sequence of ndarray, shape (F, S)
+        Weights of the readings.
+
+    Returns
+    -------
+    readings : Readings
+        The readings whose weight is above zero.
+    root : ndarray, shape (P,)
+        Square roots of their weights.
+    """
+    parts, roots = [], []
+    for m, weight in zip(measurements, weights, strict=True):
+        points, axes = m.placed()
+        used = weight > 0.0
+        lengths = np.broadcast_to(m.sensors.length, used.shape)[used]
+        parts.append((points[used], axes[used], lengths, m.flux[used]))
+        roots.append(np.sqrt(weight[used]))
+    return Readings(*map(np.concatenate, zip(*parts, strict=True))), np.concatenate(roots)
+
+
 def usable_weights(measurements: Measurements) -> Array:
     """Return weights of the readings, shape (F, S): 1 where a reading is usable, else 0."""
     return np.asarray(measurements.usable, dtype=np.float64)

@@ -62,7 +62,7 @@ def check_measurements(
                 f'{m.body}: a calibration needs at least {FEWEST_FRAMES} frames with a pose, '
                 f'got 0 of {len(m.time)} (is /optical/{m.body}/pose recorded?)'
             )
-    frames = sum(int(m.usable.any(axis=1).sum()) for m in measurements)
+    frames = _usable_frames(measurements)
     many = all(len(m.sensors) >= MANY_SENSORS for m in measurements)
     fewest = FEWEST_POSES if many and field_alone else FEWEST_FRAMES
     if frames < fewest:
@@ -102,13 +102,15 @@ def check_kept(
     try:
         check_measurements([m for m in kept if len(m.time)], needed)
     except FitError as error:
-        before, after = (
-            sum(int(m.usable.any(axis=1).sum()) for m in those) for those in (measurements, kept)
-        )
+        before, after = _usable_frames(measurements), _usable_frames(kept)
         raise FitError(
             f'{before - after} of {before} frames were left out, as their poses are not where '
             f'the fluxes are or something moved; of the rest: {error}'
         ) from error
+
+
+def _usable_frames(measurements: Sequence[Measurements]) -> int:
+    return sum(int(m.usable.any(axis=1).sum()) for m in measurements)
 
 
 def _check_thickness(measurements: Sequence[Measurements]) -> None:

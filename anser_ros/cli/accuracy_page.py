@@ -21,15 +21,13 @@ MOST_ROWS = 500  # rows of a table of single errors; all are in accuracy.json
 def render(found: Assessment, document: dict[str, Any]) -> str:
     """Return the page of an assessment as HTML."""
     files = ', '.join(found.recordings[:3]) + (' ...' if len(found.recordings) > 3 else '')
+    heads = ('figure', 'value', '95 % interval', *(['state'] if 'qa' in document else []))
     sections = [
         f'<h1>Accuracy of {html.escape(found.body)}: {found.protocol}</h1>'
         f'<p class="note">{html.escape(PROTOCOLS[found.protocol])}; '
         f'<code>{html.escape(files)}</code></p>',
         _verdict(document),
-        table(
-            ('figure', 'value', '95 % interval', 'state')[: 4 if 'qa' in document else 3],
-            [row[: 4 if 'qa' in document else 3] for row in figure_rows(found, document)],
-        ),
+        table(heads, [row[: len(heads)] for row in figure_rows(found, document)]),
         *(f'<p class="note">{html.escape(words)}</p>' for words in found.notes),
     ]
     if found.allan:

@@ -31,7 +31,7 @@ from anser_ros.poses.document import finite
 from anser_ros.poses.forms import ORDERS, UNITS
 from anser_ros.poses.hand_eye_fit import HandEye, fit_hand_eye, matrix_of, turn_of
 from anser_ros.poses.importing import STAMPS, import_poses
-from anser_ros.poses.sequence import PoseSequence, PoseSession, missing_words
+from anser_ros.poses.sequence import PoseSession, missing_words
 
 SCHEMA = 'anser_handeye/1'
 BAGS = ('.mcap', '.db3', '.bag')
@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
     notes = [session.lost] if session.lost else []
     if found.convention is not None:
         notes.append(reading_words(found.convention))
-    notes += filter(None, map(missing_words, _streams(session)))
+    notes += filter(None, map(missing_words, session.streams.values()))
     for note in notes:
         print(f'anser handeye: {session.path}: {note}', file=sys.stderr)
     if args.json:
@@ -111,10 +111,6 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         say_written(*(args.out / name for name in files))
     return 0
-
-
-def _streams(session: PoseSession) -> list[PoseSequence]:
-    return [*session.sensors.values(), *filter(None, [session.reference])]
 
 
 def _session(args: argparse.Namespace) -> PoseSession:

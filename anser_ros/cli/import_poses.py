@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
         poses.name: {
             'poses': poses.size, 'missing': poses.missing.size, 'out_of_order': poses.unordered,
         }
-        for poses in (*session.sensors.values(), *filter(None, [session.reference]))
+        for poses in session.streams.values()
     }  # fmt: skip
     if args.json:
         document = {'schema': SCHEMA, 'file': str(args.out), 'sequences': rows}

@@ -11,14 +11,10 @@ from anser_ros.nodes.backlog import Backlog
 from anser_ros.nodes.handover import HandedFlux
 from anser_ros.nodes.incoming import opened
 from anser_ros.nodes.one_source import OneSource
-from anser_ros.stamps import SECOND_NS, stamp_of
+from anser_ros.stamps import SECOND_NS, is_live, stamp_of
 
 if TYPE_CHECKING:
     from anser_ros.nodes.node import AnserNode
-
-LIVE_WITHIN_S = 60.0
-"""Fluxes whose stamps are further from the host's clock, s, are a recording's. Larger than any
-clock's error between two hosts that work together, smaller than the age of any recording."""
 
 
 class NewestSource(OneSource):
@@ -77,7 +73,7 @@ def newest_of(
     now_ns, stamp_ns = time.time_ns(), stamp_of(message)
     backlog.arrived(received_ns, stamp_ns)
     # Nobody steers by a recording that is played: it is worked off whole.
-    live = abs(now_ns - stamp_ns) < LIVE_WITHIN_S * SECOND_NS
+    live = is_live(stamp_ns, now_ns)
     if not (live and received_ns and backlog.is_hopeless((now_ns - received_ns) / SECOND_NS)):
         return message
     waiting = take_waiting(source.subscription)

@@ -10,7 +10,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformS
 
 from anser_ros.nodes import qos
 from anser_ros.nodes.diagnostics import Level, Status
-from anser_ros.stamps import SECOND_NS
+from anser_ros.stamps import SECOND_NS, is_live
 from anser_ros.tracking.estimate import OK, STALE, PoseEstimate
 from anser_ros.tracking.rotations import quaternion_of_axis, quaternion_of_rotation
 from anser_ros.wire.setup import topic_of
@@ -19,9 +19,6 @@ try:
     from tf2_msgs.msg import TFMessage
 except ImportError:  # the wheels don't have it
     TFMessage = None
-
-LONGEST_LATENCY_S = 10.0
-"""Age of a frame, s, beyond which its stamp is of another clock and tells no latency."""
 
 
 @dataclass
@@ -84,10 +81,8 @@ class PoseTopic:
         if estimate.state == OK:
             self._publish(estimate)
             self.tally.poses += 1
-            latency_s = (now_ns - estimate.stamp_ns) / SECOND_NS
-            # A recorded bag's stamps are of another day.
-            if 0.0 <= latency_s < LONGEST_LATENCY_S:
-                self.tally.latency_s = latency_s
+            if is_live(estimate.stamp_ns, now_ns) and estimate.stamp_ns <= now_ns:
+                self.tally.latency_s = (now_ns - estimate.stamp_ns) / SECOND_NS
         return changed
 
     def _publish(self, estimate: PoseEstimate) -> None:

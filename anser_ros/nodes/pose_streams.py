@@ -10,10 +10,10 @@ from geometry_msgs.msg import PoseStamped
 from anser_ros.errors import ParameterError
 from anser_ros.nodes import qos
 from anser_ros.nodes.one_source import OneSource
-from anser_ros.nodes.sighting_words import figures_of, title_of
+from anser_ros.nodes.sighting_words import findings_words, titles_of
 from anser_ros.poses.live_look import PoseSighting
-from anser_ros.poses.live_window import REFERENCE, PoseWindow
-from anser_ros.poses.sequence import PoseSession
+from anser_ros.poses.live_window import PoseWindow
+from anser_ros.poses.sequence import REFERENCE, PoseSession
 from anser_ros.stamps import stamp_of
 from anser_ros.wire.pose_topics import ENDING, TRACKED
 
@@ -92,9 +92,8 @@ def pose_words(seen: PoseSighting) -> str:
     """Return what was seen of poses as one line for an operator."""
     size = '' if np.isnan(seen.after_m) else f'error {1e3 * seen.after_m:.2f} mm'
     if seen.findings:
-        named = '; '.join(f'{title_of(record)}: {figures_of(record)}' for record in seen.findings)
-        with_them = f'; {size} with it corrected' if size else ''
-        return named + with_them + (f'; {seen.remark}' if seen.remark else '')
+        with_them = f'{size} with it corrected' if size else ''
+        return '; '.join(filter(None, [findings_words(seen.findings), with_them, seen.remark]))
     if seen.remark:
         return '; '.join(filter(None, [seen.remark, size]))
     return f'all is well; {size}'
@@ -109,6 +108,6 @@ def pose_values(seen: PoseSighting) -> dict[str, object]:
         'position_floor_m': seen.jitter_m,
         'misfit_of_known_frames_m': seen.misfit_m,
         'unexplained': seen.unexplained,
-        'findings': ', '.join(title_of(record) for record in seen.findings),
+        'findings': titles_of(seen.findings),
         'depends_on': ', '.join(seen.depends_on),
     }

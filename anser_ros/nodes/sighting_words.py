@@ -1,5 +1,6 @@
 """A sighting in words, for an operator who reads /diagnostics."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,8 @@ def words_of(seen: Sighting) -> str:
     """Return what was seen as one line for an operator."""
     size = f'residual {1e12 * seen.flux_rms_t:.0f} pT, {seen.excess**0.5:.1f} x the expected one'
     if seen.findings:
-        named = '; '.join(f'{title_of(record)}: {figures_of(record)}' for record in seen.findings)
-        return f'{named}; {size}, {seen.excess_left**0.5:.1f} x with it corrected'
+        left = f'{seen.excess_left**0.5:.1f} x with it corrected'
+        return f'{findings_words(seen.findings)}; {size}, {left}'
     if seen.is_clear:
         return f'all as the model says; {size}'
     cause = seen.remark or 'no effect that is known explains it'
@@ -33,9 +34,19 @@ def values_of(seen: Sighting) -> dict[str, object]:
         'flux_rms_t': seen.flux_rms_t,
         'excess': seen.excess,
         'excess_left': seen.excess_left,
-        'findings': ', '.join(title_of(record) for record in seen.findings),
+        'findings': titles_of(seen.findings),
         'depends_on': ', '.join(seen.depends_on),
     }
+
+
+def findings_words(findings: Sequence[EffectRecord]) -> str:
+    """Return every effect with its site and its parameters, for a line."""
+    return '; '.join(f'{title_of(record)}: {figures_of(record)}' for record in findings)
+
+
+def titles_of(findings: Sequence[EffectRecord]) -> str:
+    """Return the names and sites of effects, separated by commas."""
+    return ', '.join(title_of(record) for record in findings)
 
 
 def title_of(record: EffectRecord) -> str:

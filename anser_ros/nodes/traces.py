@@ -10,19 +10,18 @@ from numpy.typing import NDArray
 
 from anser_ros.physics.angles import axis_angles
 from anser_ros.physics.pose_track import PoseTrack
+from anser_ros.stamps import LIVE_WITHIN_S
 from anser_ros.wire.setup import Setup
 
 Array = NDArray[np.float64]
 LONGEST_GAP_S = 0.1
 """Gap between optical poses, s, over which none is interpolated to compare with."""
-LONGEST_LATENCY_S = 60.0
-"""Age of a pose as it comes, s, beyond which its stamp is of another time: of a replayed bag."""
 
 
 def latency_of(now_s: float, stamp_s: float) -> float:
     """How old a pose is as it comes, s; NaN where its stamp is not of now."""
     age_s = now_s - stamp_s
-    return age_s if abs(age_s) < LONGEST_LATENCY_S else float('nan')
+    return age_s if abs(age_s) < LIVE_WITHIN_S else float('nan')
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
-from anser_ros.poses.sequence import PoseSequence, PoseSession
+from anser_ros.poses.sequence import REFERENCE, PoseSequence, PoseSession
 from anser_ros.poses.start import coarse_offset, first_cost, first_fit, pose_problem
 from anser_ros.sessions.plausibility import check_positions
 
@@ -73,7 +73,7 @@ class PoseReading:
 
     def applied(self, session: PoseSession) -> PoseSession:
         """Return the session with its numbers read in this convention."""
-        if self.stream == 'optical':
+        if self.stream == REFERENCE:
             assert session.reference is not None
             return replace(session, reference=self.of_sequence(session.reference))
         return replace(
@@ -149,7 +149,7 @@ def reading_words(record: EffectRecord) -> str:
 
 
 def _readings(unit: str) -> Iterator[PoseReading]:
-    for stream in ('tracked', 'optical'):
+    for stream in ('tracked', REFERENCE):
         for quaternion in ('xyzw', 'wxyz', 'conjugate', 'wxyz_conjugate'):
             for handedness in ('right', 'left'):
                 found = PoseReading(stream, quaternion, handedness, unit)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError
+from anser_ros.poses.sequence import REFERENCE
 
 Array = NDArray[np.float64]
 
@@ -123,7 +124,7 @@ def _keyed(lines: Iterable[str], path: Path) -> dict[str, RawRows]:
         parts = {key: text.split() for key, text in _KEY.findall(line)}
         if len(parts.get('Position', ())) != 3 or len(parts.get('Orientation', ())) != 4:
             continue
-        label = f'sensor_{parts["SensorID"][0]}' if 'SensorID' in parts else 'optical'
+        label = f'sensor_{parts["SensorID"][0]}' if 'SensorID' in parts else REFERENCE
         # Ascension's driver is the one that tells a quality and the time of the day.
         form = 'wxyz_inverse' if 'Quality' in parts else 'xyzw'
         one = rows.setdefault(label, RawRows(form=form))

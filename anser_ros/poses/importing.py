@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError
 from anser_ros.poses.forms import ORDERS, UNITS, RawRows, read_form
-from anser_ros.poses.sequence import PoseSequence, PoseSession, sequence_of
+from anser_ros.poses.sequence import REFERENCE, PoseSequence, PoseSession, sequence_of
 
 Array = NDArray[np.float64]
 
@@ -71,7 +71,7 @@ def import_poses(
     for number, path in enumerate(tracked):
         groups = _named(read_form(path), None, unit, quaternion)
         if reference:
-            groups |= _named(read_form(reference[number]), 'optical', None, None)
+            groups |= _named(read_form(reference[number]), REFERENCE, None, None)
         times = {label: _times(rows, stamps) for label, (rows, _, _) in groups.items()}
         for label, (time, _) in times.items():
             if not np.isfinite(time).any():
@@ -89,19 +89,19 @@ def import_poses(
 def _renamed(
     pieces: Sequence[tuple[str, Array, Array, Array]], names: Mapping[str, str]
 ) -> list[tuple[str, Array, Array, Array]]:
-    found = list(dict.fromkeys(piece[0] for piece in pieces if piece[0] != 'optical'))
+    found = list(dict.fromkeys(piece[0] for piece in pieces if piece[0] != REFERENCE))
     unknown = sorted(set(names) - set(found))
     if unknown:
         raise ParameterError(f'no sensor {", ".join(unknown)}; there are: {", ".join(found)}')
     called = [names.get(name, name) for name in found]
-    if len(set(called)) < len(called) or 'optical' in called:
+    if len(set(called)) < len(called) or REFERENCE in called:
         raise ParameterError(f'sensors must differ in name, and from optical: {", ".join(called)}')
     return [(names.get(piece[0], piece[0]), *piece[1:]) for piece in pieces]
 
 
 def _begin(label: str, times: Mapping[str, tuple[Array, bool]]) -> float:
     """Where a device's own time begins: two devices that count for themselves start together."""
-    same = [t for key, (t, _) in times.items() if (key == 'optical') == (label == 'optical')]
+    same = [t for key, (t, _) in times.items() if (key == REFERENCE) == (label == REFERENCE)]
     return min(float(np.nanmin(t)) for t in same)
 
 
@@ -151,7 +151,7 @@ def _session(path: str, pieces: Sequence[tuple[str, Array, Array, Array]]) -> Po
         known = np.isfinite(time)
         sequences[label] = sequence_of(label, time[known] - start, position[known], turn[known])
     # A file of optical poses alone is somebody's tracker too.
-    reference = sequences.pop('optical', None) if len(sequences) > 1 else None
+    reference = sequences.pop(REFERENCE, None) if len(sequences) > 1 else None
     if not any(poses.size for poses in sequences.values()):
         raise ParameterError(f'{path}: not one whole pose with a time')
     # A bag's stamp of zero means none.

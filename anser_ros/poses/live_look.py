@@ -20,9 +20,8 @@ from anser_ros.poses.effects.hand_eye import FrameTerm, Mount, OpticalFrame
 from anser_ros.poses.effects.noise import PoseExcessNoise, RangeNoise
 from anser_ros.poses.effects.stamps import QuantisedStamps, ReceiptJitter
 from anser_ros.poses.effects.stream import StalePoses
-from anser_ros.poses.live_window import REFERENCE
 from anser_ros.poses.problem import PoseProblem, PoseState
-from anser_ros.poses.sequence import PoseSequence, PoseSession
+from anser_ros.poses.sequence import REFERENCE, PoseSession
 from anser_ros.poses.start import pose_problem
 
 Array = NDArray[np.float64]
@@ -120,7 +119,7 @@ class PoseWatch:
         poses = sum(one.size for one in session.sensors.values())
         frozen, since = frozen_streams(session)
         if frozen:
-            start = min(float(p.time[0]) for p in _streams(session).values() if p.size)
+            start = min(float(p.time[0]) for p in session.streams.values() if p.size)
             if since - start < FEWEST_S:
                 return PoseSighting(frozen, poses)
             session = _until(session, since)
@@ -192,7 +191,7 @@ class PoseWatch:
 
 def frozen_streams(session: PoseSession) -> tuple[tuple[EffectRecord, ...], float]:
     """Streams that give one pose over and over while another moves, and since when (s)."""
-    streams, found, since = _streams(session), [], np.inf
+    streams, found, since = session.streams, [], np.inf
     for name, poses in streams.items():
         fresh = np.flatnonzero(~poses.repeated)
         if not poses.size:
@@ -214,13 +213,8 @@ def frozen_streams(session: PoseSession) -> tuple[tuple[EffectRecord, ...], floa
     return tuple(found), float(since)
 
 
-def _streams(session: PoseSession) -> dict[str, PoseSequence]:
-    reference = session.reference
-    return {**session.sensors, **({} if reference is None else {REFERENCE: reference})}
-
-
 def _until(session: PoseSession, end: float) -> PoseSession:
-    streams = {name: poses.rows(poses.time < end) for name, poses in _streams(session).items()}
+    streams = {name: poses.rows(poses.time < end) for name, poses in session.streams.items()}
     reference = streams.pop(REFERENCE, None)
     return replace(session, sensors=streams, reference=reference)
 

@@ -5,13 +5,11 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from anser_ros.poses.sequence import PoseSequence, PoseSession, sequence_of
+from anser_ros.poses.sequence import REFERENCE, PoseSequence, PoseSession, sequence_of
 from anser_ros.stamps import JUMP_NS, NANO
 
 LIVE = 'live'
 """What stands in place of a path in the sessions of running trackers."""
-REFERENCE = 'optical'
-"""Name of the reference among the streams."""
 MOST_POSES = 6000
 """Poses of a stream that are kept at most: a minute of 100 Hz."""
 

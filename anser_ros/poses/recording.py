@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import BagError
-from anser_ros.poses.sequence import PoseSequence, PoseSession, sequence_of
+from anser_ros.poses.sequence import REFERENCE, PoseSequence, PoseSession, sequence_of
 from anser_ros.stamps import NANO, stamp_of
 from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages
 from anser_ros.wire.bag_writer import SessionWriter
@@ -78,7 +78,7 @@ def read_pose_session(
         name,
         start,
         {label: sequence(label, topic) for label, topic in chosen.items()},
-        sequence('optical', reference) if reference else None,
+        sequence(REFERENCE, reference) if reference else None,
         salvage.lost,
     )
 

@@ -13,6 +13,8 @@ from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+REFERENCE = 'optical'
+"""Name of the reference among a session's streams."""
 FARTHEST = 1e6
 """Coordinate, m, from which on it is a device's marker for no pose and no position: no tracker
 sees a thousand kilometres, NDI's marker is 3.7e28."""
@@ -119,6 +121,12 @@ class PoseSession:
     sensors: Mapping[str, PoseSequence]
     reference: PoseSequence | None
     lost: str = ''
+
+    @property
+    def streams(self) -> dict[str, PoseSequence]:
+        """All sequences by name: the sensors, and the reference, if any, as `REFERENCE`."""
+        reference = self.reference
+        return {**self.sensors, **({} if reference is None else {REFERENCE: reference})}
 
 
 def leaps(poses: PoseSequence) -> Mask:
