@@ -42,6 +42,9 @@ takes the machine waits for the tests that run, and at the beginning these are f
 PLAYED = ('test_replay', 'test_main_job', 'test_refit_live', 'test_watcher')
 """Files of chains of nodes that a recording feeds, about half the time of all chains; the first
 one's tests are short."""
+READS_SOURCES = ('test_docstrings', 'test_effect_names', 'test_layers')
+"""Files that walk the syntax trees of all sources; parsed once, they walk them in a third of the
+time."""
 
 
 # What was started since the last test ended; Python tells of each at the moment of its start.
@@ -176,9 +179,10 @@ def _takes_machine(item: pytest.Item) -> bool:
 
 
 def _room(item: pytest.Item) -> str:
-    """Return the file, or what all files have that share the tables of a refit."""
+    """Return the file, or what all files have that share a refit's tables or sources' trees."""
     shares = 'shared_tables' in getattr(item, 'fixturenames', ())
-    return 'shared_tables' if shares else item.path.stem
+    stem = item.path.stem
+    return 'shared_tables' if shares else 'source_trees' if stem in READS_SOURCES else stem
 
 
 def _has_processes(item: pytest.Item) -> bool:

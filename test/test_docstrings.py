@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 from conftest import by_room
+from source_trees import nodes_of
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 
@@ -33,7 +34,7 @@ def pairs(node):
 
 @by_room(sorted(PACKAGE.rglob('*.py')))
 def test_sections_list_what_is_there(paths):
-    walked = [(path, node) for path in paths for node in ast.walk(ast.parse(path.read_text()))]
+    walked = [(path, node) for path in paths for node in nodes_of(path)]
     nodes = [(p, n) for p, n in walked if isinstance(n, (ast.FunctionDef, ast.ClassDef))]
     found = [(p.name, n.name, listed, real) for p, n in nodes for listed, real in pairs(n)]
     assert not [fault for fault in found if fault[2] != fault[3]]

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from conftest import by_room
+from source_trees import nodes_of
 
 import anser_ros.effects as package
 import anser_ros.poses.effects as pose_package
@@ -74,9 +75,9 @@ CLASSES = members(Effect) | members(Term)
 CLASSES |= (members(Effect, pose_package) | members(Term, pose_package)) - NO_EFFECTS
 
 
-def special_cases(text):
+def special_cases(nodes):
     """Yield the line and text of each effect's name, and each test for an effect's class."""
-    for node in ast.walk(ast.parse(text)):
+    for node in nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value in NAMES:
             yield f'{node.lineno}: {node.value!r}'
         elif isinstance(node, ast.Call) and _named(node.func) in ('isinstance', 'issubclass'):
@@ -91,9 +92,9 @@ def special_cases(text):
             yield f'{node.lineno}: case {_named(node.cls)}'
 
 
-def imports_of_effects(text):
+def imports_of_effects(nodes):
     """Yield the module in the room of effects that an import names."""
-    for node in ast.walk(ast.parse(text)):
+    for node in nodes:
         names = []
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
@@ -112,9 +113,7 @@ def _named(node):
 
 @by_room(FILES)
 def test_no_effect_is_a_special_case_outside_its_room(paths):
-    found = [
-        f'{path}: {case}' for path in paths for case in special_cases(path.read_text('utf-8'))
-    ]
+    found = [f'{path}: {case}' for path in paths for case in special_cases(nodes_of(path))]
     assert not found, f'let the effect declare it (anser_ros/effects/effect.py): {found}'
 
 
@@ -123,7 +122,7 @@ def test_no_module_of_a_single_effect_is_imported_outside_its_room():
     for path in PACKAGE.rglob('*.py'):
         place = path.relative_to(PACKAGE).as_posix()
         if not place.startswith('effects/'):
-            single = set(imports_of_effects(path.read_text('utf-8'))) - GENERAL
+            single = set(imports_of_effects(nodes_of(path))) - GENERAL
             found |= {place: single} if single else {}
     assert found == MAY_IMPORT
 
@@ -132,7 +131,7 @@ def test_no_module_of_a_single_effect_is_imported_outside_its_room():
 def test_what_a_site_holds_is_known_to_the_effects_alone(paths):
     """Others ask a term for its channels, seat or label."""
     for path in paths:
-        nodes = ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+        nodes = nodes_of(path)
         lines = [n.lineno for n in nodes if isinstance(n, ast.Attribute) and n.attr == 'site']
         assert not lines, f'{path}: {lines}'
 
@@ -141,7 +140,7 @@ def test_no_site_hides_state_behind_an_underscore():
     """What a term needs to know beside its site is a field of a class of its own."""
     for room in ('effects', 'diagnosis'):
         for path in (PACKAGE / room).rglob('*.py'):
-            for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            for node in nodes_of(path):
                 if isinstance(node, ast.Constant) and isinstance(node.value, str):
                     assert not re.fullmatch('_[a-z]+', node.value), f'{path}:{node.lineno}'
 
@@ -158,7 +157,7 @@ def test_no_site_hides_state_behind_an_underscore():
     ],
 )
 def test_the_walk_sees_special_cases(text):
-    assert list(special_cases(text))
+    assert list(special_cases(ast.walk(ast.parse(text))))
 
 
 @pytest.mark.parametrize(
@@ -171,7 +170,7 @@ def test_the_walk_sees_special_cases(text):
     ],
 )
 def test_the_walk_sees_imports_of_effects(text):
-    assert list(imports_of_effects(text)) == ['coil_moved']
+    assert list(imports_of_effects(ast.walk(ast.parse(text)))) == ['coil_moved']
 
 
 def test_general_modules_hold_no_effect():
@@ -184,10 +183,10 @@ def test_the_walk_sees_nothing_else():
     assert len(NAMES) > 30
     assert FILES
     text = '"""An outliers\' pickup."""\nisinstance(x, Measurements)\ntype(x) is int\ny = "metal"'
-    assert not list(special_cases(text))
+    assert not list(special_cases(ast.walk(ast.parse(text))))
 
 
 def test_every_exception_is_needed():
     for place in ALLOWED:
         files = [PACKAGE / place] if place.endswith('.py') else (PACKAGE / place).rglob('*.py')
-        assert any(list(special_cases(f.read_text(encoding='utf-8'))) for f in files), place
+        assert any(list(special_cases(nodes_of(f))) for f in files), place

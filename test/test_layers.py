@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 from conftest import by_room
+from source_trees import nodes_of, tree_of
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 FILES = sorted(PACKAGE.rglob('*.py'))
@@ -72,7 +73,7 @@ def place(path):
 def imports(path):
     """Yield the full names that a file imports."""
     module = ('anser_ros', *path.relative_to(PACKAGE).with_suffix('').parts)
-    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+    for node in nodes_of(path):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -160,7 +161,7 @@ def test_broad_excepts_are_the_outermost():
     """`except Exception` that swallows stands only where a callback, a thread or all ends."""
     allowed = {'cli/main.py', 'nodes/node.py', 'nodes/process.py', 'nodes/replay.py'}
     for path in FILES:
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+        for node in nodes_of(path):
             if not isinstance(node, ast.ExceptHandler) or isinstance(node.body[-1], ast.Raise):
                 continue
             kind = ast.unparse(node.type) if node.type else 'BaseException'
@@ -172,7 +173,7 @@ def test_no_class_name_stands_twice():
     """One name is one concept: a class is found by its name alone."""
     places = {}
     for path in FILES:
-        for node in ast.parse(path.read_text(encoding='utf-8')).body:
+        for node in tree_of(path).body:
             if isinstance(node, ast.ClassDef):
                 places.setdefault(node.name, []).append(place(path))
     twice = {name: found for name, found in places.items() if len(found) > 1}
