@@ -151,6 +151,7 @@ class TestHummel:
             hits.append(found.low < np.mean(many) < found.high)
         assert 0.83 < np.mean(hits) <= 1.0
 
+    @pytest.mark.long
     def test_a_distorted_field_makes_intervals_wide_enough(self):
         """Lines beside each other err alike then: drawing them again one by one is too sure."""
         grid, true = Grid.of(90, None, 0.05), board(9, 10)

@@ -203,9 +203,10 @@ def test_bad_usage_is_one_clear_line(words, capsys, tmp_path):
 
 
 def told_in(bag, begin):
-    """Frames of the tools (s) in a bag from begin on, as far as its nodes have counted, and what.
+    """Return the frames and the poses of the tools (s) in a bag, its end, and what was counted.
 
-    Nodes count once a second, so what came after the last count of either node does not take part.
+    Frames are those from begin on, as far as the nodes have counted: they do once a second, so
+    what came after the last count of either node does not take part.
     """
     stamps, told, decoder = {'tool/flux': [], 'tool_a/pose': []}, {}, MessageDecoder()
     for raw in iter_messages(bag, Salvage()):
@@ -228,7 +229,8 @@ def told_in(bag, begin):
         first = next((values for at, values in reversed(of) if at < begin), {})
         return sum(int(of[-1][1].get(key, 0)) - int(first.get(key, 0)) for key in keys)
 
-    return {one for one, _ in stamps['tool/flux'] if begin <= one <= end}, end, count
+    frames = {one for one, _ in stamps['tool/flux'] if begin <= one <= end}
+    return frames, {one for one, _ in stamps['tool_a/pose']}, end, count
 
 
 @pytest.mark.realtime
@@ -241,16 +243,17 @@ def test_demo_runs_and_reports(start, tmp_path):
     stamps = [set(np.round(results[f'stamp_0_{i}'], 4)) for i in range(len(results['names']))]
     tracked = set().union(*stamps)
     begin = min(tracked)
-    frames, end, count = told_in(summary['bag'], begin)
+    frames, recorded, end, count = told_in(summary['bag'], begin)
     # 50 Hz on a machine of its own. Where it stalls, windows are missing: each of them is
-    # counted by the acquisition, and each frame without a pose by the tracker. A tenth may be lost
-    # by who listens: poses and diagnostics are sent with best effort, and nobody counts that.
-    unheard = round(0.1 * len(frames))
+    # counted by the acquisition, and each frame without a pose by the tracker. All is sent with
+    # best effort: monitor and recorder may miss a pose each, and the tracker a frame that the
+    # recorder has. Nobody counts that; it was up to 9 frames beside other work.
+    unheard = max(10, round(0.1 * len(frames)))
     lost = count('acquisition', 'windows_withheld', 'windows_lost', 'windows_skipped')
     assert round((end - begin) * 50) + 1 - len(frames) <= lost + unheard
     refused = [f'frames_{state}' for state in STATES if state != OK]
     refused = count('tracker', 'frames_skipped') + count('tracker: tool_a', *refused)
-    assert len(frames - tracked) <= refused + unheard
+    assert len(frames - tracked - recorded) <= refused + unheard
     assert min(len(of_one) for of_one in stamps) > 0.95 * len(tracked)
     assert len(stamps) == 10
     assert live['position_rmse_m'] < 0.3e-3

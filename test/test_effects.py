@@ -86,6 +86,7 @@ def test_an_effect_nobody_wrote_is_refused():
         effect_named('gremlin')
 
 
+@pytest.mark.long
 def test_derivatives_agree_with_differences(scenery):
     _, problem = scenery
     tool, fields = problem.tools[0], problem.fields

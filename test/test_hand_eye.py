@@ -166,6 +166,7 @@ def test_a_body_that_moves_too_shortly_has_no_rate():
     assert any(words.startswith('the rate of the clocks') for words in found.undetermined)
 
 
+@pytest.mark.long
 def test_the_command_takes_a_bag_or_files(tmp_path, capsys):
     world = World(4200, sensors=2, duration=12.0)
     session = world.session()

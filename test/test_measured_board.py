@@ -26,6 +26,7 @@ def test_broken_lists_are_one_line(tmp_path):
         anser_board.load(tmp_path)
 
 
+@pytest.mark.long
 def test_a_bent_run_gains_and_a_scattered_one_does_not(tmp_path):
     rng, there = np.random.default_rng(11), anser_board.places()
     turn = Rotation.from_rotvec([0.4, -1.0, 0.3])
@@ -41,6 +42,7 @@ def test_a_bent_run_gains_and_a_scattered_one_does_not(tmp_path):
     assert 'across the board, not corrected' in anser_board.tables(analysis)
 
 
+@pytest.mark.long
 @needs_data
 def test_of_the_measured_runs_one_has_an_error_to_map():
     found = {

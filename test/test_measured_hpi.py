@@ -79,6 +79,7 @@ def coil_data(array, seed=0, extra=0.0):
 
 
 class TestTones:
+    @pytest.mark.long
     def test_close_tones_are_found_and_separated(self):
         rng = np.random.default_rng(1)
         rate, count = 600.6, 600
@@ -175,6 +176,7 @@ class TestPlaces:
         assert np.linalg.norm(fit.places_m[0] - COIL) < 3.0 * fit.sigma_m
         np.testing.assert_allclose(fit.moments[0], MOMENT, rtol=0.02, atol=1e-10)
 
+    @pytest.mark.long
     def test_stray_field_of_a_lead_is_found(self):
         array = helmet()
         lead = np.array([-0.03, -0.05, 0.02])

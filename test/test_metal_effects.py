@@ -30,6 +30,7 @@ def scenery():
     return made, made.problem()
 
 
+@pytest.mark.long
 def test_a_large_perfect_sheet_is_a_mirror():
     source = Dipoles(
         np.array([[0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.0]]), np.array([[1.0 + 0j]])

@@ -45,6 +45,7 @@ def fitted(poses, **limits):
     return fit_pivot(poses, np.random.default_rng(1), PivotLimits(**limits))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(('wrong', 'noise_rad'), [(0.0, 2e-3), (0.3, 8e-3)])
 def test_the_tip_is_found_and_its_sigma_is_honest(wrong, noise_rad):
     scores = []
@@ -59,6 +60,7 @@ def test_the_tip_is_found_and_its_sigma_is_honest(wrong, noise_rad):
     assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.3
 
 
+@pytest.mark.long
 def test_noise_of_the_rotations_does_not_shorten_the_arm():
     """Turns known with an error make every plain fit too short; the mean of many tells."""
     along = []
