@@ -1,14 +1,16 @@
 """When the setup document is told anew what the stream measures of itself."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 
-from anser_ros.nodes.measured_accuracy import MeasuredAccuracy
+from anser_ros.integrity.senders import Senders
+from anser_ros.nodes.measured_accuracy import MeasuredAccuracy, without_measured
 from anser_ros.sessions.session import measured_noise, stamp_sigma
 from anser_ros.settings import Accuracy
 from anser_ros.wire.config_folder import read_config
-from anser_ros.wire.setup import parse_setup
+from anser_ros.wire.setup import dump_setup, parse_setup
 
 SETUP = parse_setup(read_config('demo_setup.yaml'))
 FRAME = SimpleNamespace(window=SimpleNamespace(sigma=np.array([7e-11, np.nan, 8.12e-11, 9e-11])))
@@ -37,3 +39,18 @@ def test_stamps_that_are_worse_or_better_are_told_at_most_every_ten_seconds():
     assert stamp_sigma(accuracy.stated_in(SETUP, 50.0)) == 0.2e-3
     wild = told(accuracy, lambda t: 1e-2 if t % 20 > 10 else 1e-4, 60.0, 120.0)
     assert (np.diff(wild) >= 10.0).all()
+
+
+def test_a_setup_told_anew_is_still_its_sender_s_and_another_board_is_not():
+    accuracy = MeasuredAccuracy()
+    texts = [dump_setup(SETUP)]
+    for sigma_s in (0.4e-3, 2e-3):
+        assert told(accuracy, lambda t, sigma_s=sigma_s: sigma_s, 11.0, 100.0 * len(texts))
+        texts.append(dump_setup(accuracy.stated_in(SETUP, 49.9)))
+    assert len(set(texts)) == 3
+    sources = Senders('setup', is_constant=True)
+    for number, text in enumerate(texts, 1):
+        assert sources.take(number, 1, 10.0 * number, without_measured(text))
+    sensors = (*SETUP.sensors[:-1], replace(SETUP.sensors[-1], length_m=0.02))
+    other = dump_setup(replace(SETUP, sensors=sensors))
+    assert not sources.take(4, 1, 40.0, without_measured(other))

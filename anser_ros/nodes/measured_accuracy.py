@@ -13,11 +13,22 @@ FLUX_NOISE = 'flux_noise_t'
 """Key of the setup document: what the fluxes' components scatter by, T."""
 STAMP_SIGMA = 'stamp_sigma_s'
 """Key of the setup document: what the stamps are uncertain by, s."""
+FLUX_RATE = 'flux_rate_hz'
+"""Key of the setup document: the fluxes' rate, which is the stream's own once there is one, Hz."""
 EARLIEST_S = 10.0
 """Least time, s, from one setup document to the next for the sake of the stamps: trackers begin
 anew with it, and a host's load changes within seconds."""
 _FACTOR = 2.0
 """Ratio by which the stamps' uncertainty must differ from what was told to be told anew."""
+
+
+def without_measured(text: str) -> str:
+    """Return a setup document's text without what acquisition tells anew while it runs.
+
+    What is left never changes: board, coils and sensors.
+    """
+    keys = tuple(f'{key}:' for key in (FLUX_NOISE, STAMP_SIGMA, FLUX_RATE))
+    return '\n'.join(line for line in text.split('\n') if not line.startswith(keys))
 
 
 class MeasuredAccuracy:

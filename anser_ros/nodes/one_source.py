@@ -10,6 +10,7 @@ from std_msgs.msg import String
 
 from anser_ros.integrity.senders import Senders
 from anser_ros.nodes import qos
+from anser_ros.nodes.measured_accuracy import without_measured
 
 if TYPE_CHECKING:
     from anser_ros.nodes.node import AnserNode
@@ -128,10 +129,10 @@ class OneSource:
 
 
 def setup_source(node: 'AnserNode', callback: Callable[[Any], None]) -> OneSource:
-    """Subscribe to the setup document, whose text is one sender's for good."""
+    """Subscribe to the setup document, which is one sender's for good but for what it measures."""
     return OneSource(
-        node, String, 'setup', callback, qos.LATCHED, lasting=lambda text: text.data,
-        is_constant=True,
+        node, String, 'setup', callback, qos.LATCHED,
+        lasting=lambda text: without_measured(text.data), is_constant=True,
     )  # fmt: skip
 
 
