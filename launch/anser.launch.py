@@ -5,7 +5,7 @@ ros2 launch anser_ros anser.launch.py simulate:=true baseline:=clean.mcap openig
 """
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, GroupAction, OpaqueFunction
+from launch.actions import DeclareLaunchArgument, GroupAction, OpaqueFunction, Shutdown
 from launch.conditions import IfCondition, UnlessCondition
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node, PushRosNamespace
@@ -17,6 +17,8 @@ from anser_ros.wire.config_folder import config_path
 from anser_ros.wire.tcp_ports import LIVE_VIEW, OPENIGTLINK
 
 PACKAGE = 'anser_ros'
+# Exit code of a node that refuses its arguments or parameters, which it does before it starts.
+REFUSED = 2
 DEVICE = '/dev/ttyACM0'
 # Anybody may make a link there; one for each namespace, so that two boards can be simulated.
 SIMULATED = '/tmp/anser_cu_{namespace}'
@@ -63,6 +65,13 @@ def find_files(context):
         given['device'] = simulated if is_simulated else DEVICE
 
 
+def end_all_if_refused(event, context):
+    """End the launch where a process refused its parameters, for without it the chain is none."""
+    if event.returncode != REFUSED:
+        return None
+    return [Shutdown(reason=f'{event.process_name} refuses what it was given, see its line')]
+
+
 def process(name, condition=None, **parameters):
     """Return a process with the common parameter file, and values that override it.
 
@@ -77,6 +86,7 @@ def process(name, condition=None, **parameters):
         output='screen',
         emulate_tty=True,
         sigterm_timeout='5',
+        on_exit=end_all_if_refused,
     )
 
 

@@ -19,11 +19,16 @@ MODULES = (
 
 
 @pytest.fixture
-def launched(monkeypatch, tmp_path):
-    """Return what the launch file makes of the given arguments."""
+def namespace(monkeypatch):
+    """Return the launch file's names."""
     for module in MODULES:
         monkeypatch.setitem(sys.modules, module, MagicMock())
-    namespace = runpy.run_path(str(REPO / 'launch' / 'anser.launch.py'))
+    return runpy.run_path(str(REPO / 'launch' / 'anser.launch.py'))
+
+
+@pytest.fixture
+def launched(namespace, monkeypatch, tmp_path):
+    """Return what the launch file makes of the given arguments."""
     monkeypatch.chdir(tmp_path)
 
     def find(**given):
@@ -51,6 +56,16 @@ def test_a_parameter_file_is_taken_from_here_or_from_the_package(launched, tmp_p
     for name in ('bad.yaml', 'nowhere.yaml'):
         with pytest.raises(AnserError):
             launched(params=name)
+
+
+def test_a_node_that_refuses_its_parameters_ends_the_launch(namespace):
+    def ended(code):
+        event = SimpleNamespace(process_name='tracker-4', returncode=code)
+        return namespace['end_all_if_refused'](event, None)
+
+    assert ended(0) is None and ended(1) is None
+    (action,) = ended(2)
+    assert action is sys.modules['launch.actions'].Shutdown.return_value
 
 
 @pytest.mark.parametrize(
