@@ -28,7 +28,7 @@ ARGUMENTS = {
     'device': ('', f"the control unit's port; {DEVICE} or, simulated, {SIMULATED} by default"),
     'setup': ('demo_setup.yaml', 'setup document: a path, or a file of the package'),
     'channels': ('demo_channels.yaml', 'channel calibration: a path, or a file of the package'),
-    'model': ('nominal', 'model file of calibrate, or nominal'),
+    'model': ('nominal', 'model: a path, or a file of the package; or nominal'),
     'allow_uncalibrated': ('', 'whether the nominal model gives poses; true where simulated'),
     'baseline': ('', 'distortion-free recording of the board; empty: call set_baseline'),
     'board_seed': ('0', "the simulated unit's board: 0 as drawn, 1 that of demo_model.yaml"),
@@ -50,13 +50,15 @@ ARGUMENTS = {
 
 
 def find_files(context):
-    """Put the paths of parameter file and port in place of what was given for them.
+    """Put the paths of parameter file, model and port in place of what was given for them.
 
     A parameter file that is none, or names a node that there is not, ends the launch with a line.
     """
     given = context.launch_configurations
     given['rviz_config'] = str(config_path(given['rviz_config']))
     given['params'] = checked(given['params'], list(NODES))
+    if given['model'] != 'nominal':
+        given['model'] = str(config_path(given['model']))
     # As IfCondition reads it.
     is_simulated = given['simulate'].lower() in ('true', '1')
     given['allow_uncalibrated'] = given['allow_uncalibrated'] or str(is_simulated).lower()

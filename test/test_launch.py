@@ -47,15 +47,18 @@ def test_a_simulated_unit_has_a_port_that_anybody_may_make(launched):
     assert launched(simulate='true', device='mine')['device'] == 'mine'
 
 
-def test_a_parameter_file_is_taken_from_here_or_from_the_package(launched, tmp_path):
+def test_a_parameter_file_and_a_model_are_taken_from_here_or_from_the_package(launched, tmp_path):
     assert launched()['params'] == str(REPO / 'config' / 'anser.yaml')
     assert launched()['rviz_config'] == str(REPO / 'config' / 'anser.rviz')
+    assert launched()['model'] == 'nominal'
+    model = launched(model='demo_model.yaml')['model']
+    assert model == str(REPO / 'config' / 'demo_model.yaml')
     (tmp_path / 'mine.yaml').write_text('/**/tracker:\n  ros__parameters: {gate: 3.0}\n')
     assert launched(params='mine.yaml')['params'] == 'mine.yaml'
     (tmp_path / 'bad.yaml').write_text('/**/trakcer:\n  ros__parameters: {gate: 3.0}\n')
-    for name in ('bad.yaml', 'nowhere.yaml'):
+    for given in ({'params': 'bad.yaml'}, {'params': 'nowhere.yaml'}, {'model': 'nowhere.yaml'}):
         with pytest.raises(AnserError):
-            launched(params=name)
+            launched(**given)
 
 
 def test_a_node_that_refuses_its_parameters_ends_the_launch(namespace):
