@@ -1,1 +1,1 @@
-"""The field model, the dipoles that it consists of, and the measurements that it explains."""
+"""Holds the field model, the dipoles that it consists of, and the measurements it explains."""

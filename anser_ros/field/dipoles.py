@@ -1,4 +1,4 @@
-"""Sets of magnetic dipoles with one moment for each emitter, from which fields are summed."""
+"""Sums the fields of sets of magnetic dipoles that have one moment for each emitter."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Dipoles:
-    """A set of N dipoles with one moment for each of K emitters.
+    """Holds a set of N dipoles with one moment for each of K emitters.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Measured fluxes of the sensors on one body with the poses that another instrument gave it."""
+"""Holds measured fluxes of the sensors on a body, with the poses that another tracker gave it."""
 
 from dataclasses import dataclass, replace
 
@@ -14,7 +14,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Measurements:
-    """F frames of the S sensors on one body, with a flux for each of K emitters.
+    """Holds F frames of the S sensors on one body, with a flux for each of K emitters.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Measurements:
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """Mask (F, S) of the values that have a pose and are valid."""
+        """Return the mask (F, S) of the values that have a pose and are valid."""
         return np.asarray(self.valid & self.has_pose[:, None])
 
     def frames(self, rows: NDArray[np.generic] | slice) -> 'Measurements':

@@ -1,4 +1,4 @@
-"""The field model that all rooms share, virtual dipoles with moments for each emitter."""
+"""Defines the field model that all rooms share: virtual dipoles with moments for each emitter."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -26,7 +26,7 @@ SCHEMA = 'anser_model/1'
 
 @dataclass(frozen=True)
 class EffectRecord:
-    """One effect that a model corrects.
+    """Records one effect that a model corrects.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class EffectRecord:
 
 @dataclass(frozen=True)
 class FieldModel:
-    """Virtual dipoles that represent the field generator and all that distorts its field.
+    """Represents the field generator and all that distorts its field by virtual dipoles.
 
     Attributes
     ----------
@@ -113,7 +113,7 @@ class FieldModel:
 
     @cached_property
     def fingerprint(self) -> str:
-        """The model's short name, of all that poses follow from."""
+        """Return the model's short name, made of all that poses follow from."""
         return fingerprint_of(
             [
                 self.positions, self.directions, self.moments, self.emitters, self.frequencies_hz,

@@ -1,4 +1,5 @@
-"""The nominal field model, which expresses the Biot-Savart field of a drawn board by dipoles.
+"""Makes the nominal field model, which expresses the Biot-Savart field of a drawn board by
+dipoles.
 
 A flat coil has the field of a magnetised sheet over its area. A few vertical dipoles on that area
 represent the sheet, as the nodes of a quadrature represent an integral; two horizontal dipoles in
@@ -42,7 +43,7 @@ so that what a model misses is never larger than what the drawing does."""
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Standard deviations of the differences between a manufactured board and its drawing.
+    """Holds standard deviations of the differences between a manufactured board and its drawing.
 
     The defaults are assumptions, not measurements. Larger ones make reported uncertainties larger
     and let references change the model more.

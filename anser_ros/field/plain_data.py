@@ -1,4 +1,4 @@
-"""Values as text files can hold them: numbers, strings, lists and mappings, no arrays."""
+"""Turns values into what text files can hold: numbers, strings, lists and mappings, no arrays."""
 
 from typing import Any
 
@@ -6,7 +6,8 @@ import numpy as np
 
 
 def plain(value: Any) -> Any:
-    """The value with arrays and tuples as lists, numpy's numbers as Python's, keys as strings.
+    """Return the value with arrays and tuples as lists, numpy's numbers as Python's, keys as
+    strings.
 
     A complex number becomes the list of its real and imaginary part, because neither JSON nor
     YAML knows complex numbers.

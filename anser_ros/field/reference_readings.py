@@ -1,4 +1,4 @@
-"""What reference sensors read when a model was calibrated, without metal: kept in its file."""
+"""Keeps in a model's file what reference sensors read without metal when it was calibrated."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +14,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class ReferenceReadings:
-    """Mean readings of the reference sensors while nothing distorted the field.
+    """Holds mean readings of the reference sensors while nothing distorted the field.
 
     Attributes
     ----------

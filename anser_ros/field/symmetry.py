@@ -1,4 +1,4 @@
-"""The axis about which a field model may be turned without a change of its field."""
+"""Finds the axis about which a field model may be turned without a change of its field."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ a metre, up to which a dipole is on it: far below what anybody can measure."""
 
 @dataclass(frozen=True)
 class SymmetryAxis:
-    """An axis of rotation of a field.
+    """Describes an axis of rotation that leaves a field as it is.
 
     Attributes
     ----------

@@ -1,1 +1,1 @@
-"""One intake of flux frames: what order, flags and values say about a frame is judged here."""
+"""Takes flux frames in: what order, flags and values say about a frame is judged here, once."""

@@ -1,4 +1,4 @@
-"""Why a reading must not be used: every fault with its name, its state and its reason.
+"""Lists why a reading must not be used: every fault with its name, its state and its reason.
 
 A reading is what one sensor hears of all emitters in one frame. Its first fault in the order of
 `FAULTS` counts. The flag bits are those of `wire.points`.
@@ -13,7 +13,7 @@ from anser_ros.physics.sensor import LARGEST_FLUX_T
 
 
 class Fault(NamedTuple):
-    """One kind of fault.
+    """Describes one kind of fault by its name, state and reason.
 
     Attributes
     ----------

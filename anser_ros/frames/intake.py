@@ -1,4 +1,5 @@
-"""Frames of fluxes in a table's order, judged once: order of the stamps, flags, values, emitters.
+"""Judges frames of fluxes once and in a table's order: order of the stamps, flags, values,
+emitters.
 
 The tracker, the refit and the nodes before them share this component, so that the same fault has
 the same name and counter everywhere, and a frame that has been judged is not judged again.
@@ -31,7 +32,7 @@ BACK, FORWARD = -1, 1
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame of fluxes as a table of sensors has them.
+    """Holds one frame of fluxes as a table of sensors has them.
 
     Attributes
     ----------
@@ -68,7 +69,7 @@ class Frame:
 
     @property
     def kinds(self) -> Counter[str]:
-        """How many readings have which kind of fault."""
+        """Return how many readings have which kind of fault."""
         found = (FAULTS[code] for code in self.codes.tolist())
         return Counter(fault.kind for fault in found if fault is not None)
 

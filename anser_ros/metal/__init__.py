@@ -1,1 +1,1 @@
-"""How metal answers to the emitters: bodies and sheets as operators between shapes of field."""
+"""Models how metal answers to the emitters: bodies and sheets as operators on shapes of field."""

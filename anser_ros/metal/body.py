@@ -1,4 +1,5 @@
-"""A piece of metal seen from outside: what it makes of multipoles, or of pieces on a lattice.
+"""Models a piece of metal seen from outside: what it makes of multipoles, or of pieces on a
+lattice.
 
 Near a body's centre a field is a sum of gradients of solid harmonics; those are the shapes that
 count (`anser_ros.metal.scattering`). The leading block of T (orders 1, 1) is the polarisability,
@@ -67,7 +68,7 @@ def _orders() -> NDArray[np.int64]:
 
 @cache
 def multipoles() -> Shapes:
-    """All orders up to `HIGHEST`; the first three shapes are the mean field along x, y, z."""
+    """Return all orders up to `HIGHEST`; the first three shapes are the mean field on x, y, z."""
     functionals: list[Array] = [SPHERE_WEIGHTS[:, None] * np.eye(3)[i] for i in range(3)]
     root = np.sqrt(SPHERE_WEIGHTS)[None, :, None]
     for order in range(2, HIGHEST + 1):
@@ -97,14 +98,14 @@ def body_spread(radius: float, odd: float) -> Array:
 
 @cache
 def body_sizes(kind: str) -> tuple[Array, ...]:
-    """Prior sizes, each of shape (`Shapes.size`,), of the couplings of a kind of body to try."""
+    """Return prior sizes, shape (`Shapes.size`,) each, of couplings to try of a kind of body."""
     if kind == COMPACT:
         return tuple(body_spread(radius, ODD) for radius in RADII)
     return tuple(np.full(BODIES[kind]().size, size) for size in PIECES)
 
 
 def centre_sigma(polarisability: NDArray[np.complexfloating]) -> float:
-    """How well the centre of a body of unknown shape is known at best, m.
+    """Return how well the centre of a body of unknown shape is known at best, m.
 
     Parameters
     ----------

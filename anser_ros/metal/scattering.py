@@ -1,4 +1,4 @@
-"""What metal makes of a field: a symmetric operator between a few shapes of field.
+"""Models what metal makes of a field: a symmetric operator between a few shapes of field.
 
 Points about a piece of metal carry functionals that take the amplitudes of some shapes out of a
 field. Emitter k's field has the amplitudes ``b_k``; whatever the metal is made of, it answers with
@@ -33,7 +33,7 @@ UNIT = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """Shapes of a field about a centre, and the pairs of them that metal couples.
+    """Holds shapes of a field about a centre, and the pairs of them that metal couples.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Shapes:
 
     @property
     def local(self) -> bool:
-        """Whether the shapes are the field's components at the points, each answering alone."""
+        """Return whether the shapes are field components at points, each answering alone."""
         return len(self.functionals) == 3 * len(self.offsets)
 
     @property
@@ -140,7 +140,7 @@ class Shapes:
         return out.reshape(shapes, -1)
 
     def answer(self, drive: ComplexArray, couplings: ComplexArray, omega: Array) -> ComplexArray:
-        """Amplitudes (..., K, M) that metal with these couplings makes of a drive (..., K, M)."""
+        """Return the amplitudes (..., K, M) that these couplings make of a drive (..., K, M)."""
         if self.local:
             return drive * (couplings * (UNIT / MU_0))
         count = self.first.size
@@ -171,14 +171,14 @@ class Shapes:
     def sources(
         self, centre: Array, couplings: ComplexArray, illumination: Dipoles, omega: Array
     ) -> Dipoles:
-        """Dipoles about a centre (m) that stand for metal with these couplings."""
+        """Return the dipoles about a centre (m) that stand for metal with these couplings."""
         points = centre + self.offsets
         made = self.answer(self.driven(illumination.field(points)), couplings, omega)
         return Dipoles.vectors(points, np.einsum('mni,km->nik', self.functionals, made))
 
 
 def tilt(omega: Array) -> Array:
-    """Logarithm of each emitter's frequency, less the mean of all, shape (K,)."""
+    """Return the logarithm of each emitter's frequency, less the mean of all, shape (K,)."""
     logs = np.log(omega)
     return np.asarray(logs - logs.mean())
 

@@ -1,4 +1,4 @@
-"""Eddy currents of a thin square sheet, on a mesh of square loops.
+"""Computes eddy currents of a thin square sheet, on a mesh of square loops.
 
 Loop i of a mesh of edge h obeys ``sum_j (R_ij + j w M_ij) I_j = -j w Phi_i``: M from Neumann's
 formula for parallel filaments at the mean distance of the strips that they stand for (Grover,
@@ -57,7 +57,7 @@ def _parallel(ahead: Array, aside: Array) -> Array:
 
 @cache
 def unit_mesh(count: int) -> tuple[Array, Array]:
-    """Inductance (H at an edge of 1 m) and resistance (at 1 ohm a square) of a count^2 mesh."""
+    """Return inductance (H at a 1 m edge) and resistance (at 1 ohm a square) of a count^2 mesh."""
     i, j = np.meshgrid(np.arange(count * 1.0), np.arange(count * 1.0), indexing='ij')
     table = np.zeros((count, count))
     for a, b in ((i, j), (j, i)):
@@ -135,7 +135,8 @@ def sheet_shapes(edge: float) -> Shapes:
 
 
 def sheet_spread(edge: float, share: float) -> Array:
-    """Prior size of each coupling, as a share of a perfect conductor's, shape (`Shapes.size`,).
+    """Return each coupling's prior size as a share of a perfect conductor's, shape
+    (`Shapes.size`,).
 
     A perfectly conducting sheet answers a normal field of wave number k with the stream function
     ``2 / (mu0 k)`` times it.
@@ -146,5 +147,5 @@ def sheet_spread(edge: float, share: float) -> Array:
 
 
 def sheet_sizes(edge: float) -> tuple[Array, ...]:
-    """Prior sizes of the couplings of a sheet to try, each of shape (`Shapes.size`,)."""
+    """Return prior sizes of the couplings of a sheet to try, each of shape (`Shapes.size`,)."""
     return tuple(sheet_spread(edge, share) for share in SHEET_SHARES)

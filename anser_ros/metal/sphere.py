@@ -1,4 +1,4 @@
-"""The magnetic polarisability of a conducting permeable sphere in an alternating field.
+"""Computes the magnetic polarisability of a conducting permeable sphere in an alternating field.
 
 Time convention exp(+j w t): a conductor's induced moment opposes the field, and lags by at most a
 quarter period.

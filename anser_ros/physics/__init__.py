@@ -1,1 +1,1 @@
-"""Physics of current paths, magnetic dipoles and pick-up coils; it imports no other room."""
+"""Holds the physics of current paths, dipoles and pick-up coils; it imports no other room."""

@@ -1,4 +1,4 @@
-"""Angles between axes and of rotations, rad: by arctangent, exact for small ones too."""
+"""Computes angles between axes and of rotations, rad, by arctangent: small ones are exact too."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""This module turns the geometry of an emitter board into closed current paths.
+"""Turns the geometry of an emitter board into closed current paths.
 
 The number of coils, their kind and their places are data. A *kind* is a function that draws one
 coil around its own centre; a new kind of board needs one more function in `KINDS`.
@@ -30,7 +30,7 @@ _DIRECTIONS = ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0), (1.0, 0.0))
 
 @dataclass(frozen=True)
 class Board:
-    """A board of K emitter coils that all have the same shape.
+    """Describes a board of K emitter coils that all have the same shape.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Constants of nature that the field computations share, in SI units, and the size of a radian."""
+"""Holds constants of nature for field computations, in SI units, and the size of a radian."""
 
 import math
 

@@ -1,4 +1,5 @@
-"""Field and gradient of magnetic dipoles, and the flux density that a pick-up coil senses.
+"""Computes field and gradient of magnetic dipoles, and the flux density that a pick-up coil
+senses.
 
 The field of a dipole m at the offset d is the article's equation (1),
 ``B = mu0/(4 pi) (3 (m . d) d / |d|^5 - m / |d|^3)``; its gradient follows by differentiation and

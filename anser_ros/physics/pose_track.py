@@ -1,4 +1,4 @@
-"""Poses of one body over time, as another tracker with its own clock and rate reports them."""
+"""Holds poses of one body over time, as a tracker with its own clock and rate reports them."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ poses, much longer smooths away how a hand accelerates."""
 
 @dataclass(frozen=True)
 class PoseTrack:
-    """A sequence of M poses of one body in ascending order of time.
+    """Holds a sequence of M poses of one body in ascending order of time.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The table of pick-up coils: their channels, bodies, positions, axes and lengths."""
+"""Holds the table of pick-up coils: their channels, bodies, positions, axes and lengths."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ share a centre within winding tolerances of some 0.1 mm, separate sensors are ce
 
 @dataclass(frozen=True)
 class SensorTable:
-    """A table of S pick-up coils with one row each.
+    """Holds a table of S pick-up coils with one row each.
 
     Attributes
     ----------

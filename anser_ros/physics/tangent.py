@@ -1,4 +1,4 @@
-"""The plane across a direction: two unit vectors in it."""
+"""Spans the plane across a direction by two unit vectors."""
 
 import numba
 import numpy as np

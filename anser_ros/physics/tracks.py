@@ -1,4 +1,5 @@
-"""Field of straight current-carrying tracks by the Biot-Savart law with the textbook sign.
+"""Computes the field of straight current-carrying tracks by the textbook's Biot-Savart law and
+sign.
 
 A segment from A to B with the current I flowing from A to B makes, at the offsets ``a = P - A``
 and ``b = P - B``, ``B = mu0 I/(4 pi) (a x b) (|a| + |b|) / (|a| |b| (|a| |b| + a . b))``, which is

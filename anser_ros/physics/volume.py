@@ -1,4 +1,4 @@
-"""The tracked volume: the box over the board in which tools are tracked.
+"""Defines the tracked volume: the box over the board in which tools are tracked.
 
 The refit makes the field right in it, and the tracker gives poses in it. The setup document states
 it (key ``volume``); where it does not, it follows from the board's size, see `over_board`.
@@ -29,7 +29,7 @@ same box."""
 
 @dataclass(frozen=True)
 class TrackedVolume:
-    """A box, m, frame fg; the default is the tracker's box over an Anser board.
+    """Describes a box, m, frame fg; the default is the tracker's box over an Anser board.
 
     It is what `over_board` and `with_fringe` make of the demo's board (`test/test_setup.py`), for
     setups whose board nobody can draw.
@@ -95,7 +95,7 @@ class TrackedVolume:
 
     @property
     def ceiling(self) -> float:
-        """Height over the board up to which tools are tracked, m."""
+        """Return the height over the board up to which tools are tracked, m."""
         return self.high[2]
 
     def contains(self, position: Array) -> bool:

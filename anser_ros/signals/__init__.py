@@ -1,1 +1,1 @@
-"""From samples to fluxes: windows, least-squares demodulation, conversion, and device time."""
+"""Makes fluxes of samples: windows, least-squares demodulation, conversion, and device time."""

@@ -1,4 +1,4 @@
-"""The map from a device's samples to the host's time, by the records that arrive earliest."""
+"""Maps a device's samples to the host's time, by the records that arrive earliest."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ else happens."""
 
 
 class ClockState(Enum):
-    """What is known of the stamps; the value is the word for an operator."""
+    """Names what is known of the stamps; the value is the word for an operator."""
 
     SETTLING = 'settling'
     GOOD = 'ok'
@@ -239,14 +239,14 @@ class SampleClock:
 
     @property
     def wants_answer(self) -> bool:
-        """Whether an answer of the device would help: the line is new, or late for a while."""
+        """Return whether an answer of the device would help: the line is new, or late for long."""
         if self._line is None or self._false_answers >= _FALSE_ANSWERS:
             return False
         return not self._settled or self.is_doubted
 
     @property
     def is_doubted(self) -> bool:
-        """Whether all blocks have been late for so long that no stall of the host explains it."""
+        """Return whether all blocks have been late for longer than a host's stall explains."""
         late_from = self._late_from_ns
         return late_from is not None and self._newest_ns - late_from > _DOUBT_NS
 
@@ -259,7 +259,7 @@ class SampleClock:
 
     @property
     def lateness_s(self) -> float:
-        """By how much the earliest of the recent arrivals was late, s."""
+        """Return by how much the earliest of the recent arrivals was late, s."""
         return max(min((late for _, late in self._earliest), default=0.0), 0.0) / 1e9
 
     @property
@@ -272,12 +272,12 @@ class SampleClock:
         return math.hypot(_FLOOR_S, min(self.lateness_s, LARGEST_LATENESS_S))
 
     def is_good(self, sample: float) -> bool:
-        """Whether the host time of a sample is known to 5 ms."""
+        """Return whether the host time of a sample is known to 5 ms."""
         return self._settled and self.confirmed >= sample
 
     @property
     def is_settled(self) -> bool:
-        """Whether the line is relied on, apart from how late the newest arrivals are."""
+        """Return whether the line is relied on, apart from how late the newest arrivals are."""
         return self._settled
 
     def host_ns(self, sample: float) -> int:

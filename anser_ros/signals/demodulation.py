@@ -1,4 +1,4 @@
-"""Least-squares demodulation of all drive tones of all channels at once.
+"""Demodulates all drive tones of all channels at once by least squares.
 
 A window of samples x(t) of one channel is modelled as
 
@@ -40,7 +40,7 @@ much noise and save the error of a moving tool."""
 
 @dataclass(frozen=True)
 class ToneFit:
-    """Fitted phasors of one window, in the unit of the samples.
+    """Holds fitted phasors of one window, in the unit of the samples.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The line below a cloud of arrivals, whose delays are unknown and never negative."""
+"""Fits the line below a cloud of arrivals, whose delays are unknown and never negative."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _TYPICAL_SHARE = 3e-5
 
 
 class Envelope:
-    """The line below the offsets of arrivals, over the device's time.
+    """Describes the line below the offsets of arrivals, over the device's time.
 
     Every record arrives late by an unknown delay that is never negative. Arrival minus device time
     therefore lies above a line whose slope is the difference of the two clocks' rates, and touches

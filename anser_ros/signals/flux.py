@@ -1,4 +1,4 @@
-"""Conversion of phasors in codes to fluxes in tesla, referred to the measured coil currents.
+"""Converts phasors in codes to fluxes in tesla, referred to the measured coil currents.
 
 A coil of N turns and area A behind an amplifier of gain G turns a flux density B exp(+j w t) along
 its axis into the voltage (Faraday's law; the winding sense makes the sign positive)
@@ -26,7 +26,7 @@ from anser_ros.signals.demodulation import ToneFit
 
 @dataclass(frozen=True)
 class FluxWindow:
-    """Fluxes and currents of one window.
+    """Holds fluxes and currents of one window.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Rates of change of the fluxes from earlier windows, for windows too short to fit them."""
+"""Finds rates of change of the fluxes from earlier windows, for windows too short to fit them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FEWEST_WINDOWS = 3
 
 
 class FluxRates:
-    """The slopes of the fluxes over the last windows, by a straight line through them.
+    """Finds the slopes of the fluxes over the last windows, by a straight line through them.
 
     Over `REACH_S` the slopes are determined so well that subtracting their effect from a short
     window adds hardly any noise.

@@ -1,4 +1,4 @@
-"""Repeated samples: a column whose newest samples equal, bit for bit, what it said before.
+"""Finds repeated samples: a column whose newest samples equal, bit for bit, what it said before.
 
 Fresh samples carry new noise, so that a long run of them never equals an earlier one. How long a
 run must be follows from the noise that a column is seen to have: at the lag at which its tones
@@ -118,17 +118,17 @@ class RepetitionWatch:
 
     @property
     def noiseless(self) -> NDArray[np.bool_]:
-        """Columns whose samples hold too little noise to tell new from old, shape (C,)."""
+        """Return the columns with too little noise in their samples to tell new from old, (C,)."""
         return self._needed > self._longest
 
     @property
     def needed(self) -> NDArray[np.int64]:
-        """Samples that a run of each column must have to count as repeated, shape (C,)."""
+        """Return how long a run of each column must be to count as repeated, samples, (C,)."""
         return self._needed
 
     @property
     def repeats(self) -> bool:
-        """Whether no column said anything new lately, and one repeats what it said."""
+        """Return whether no column said anything new lately, and one repeats what it said."""
         repeating = self._run >= self._needed
         return bool(np.all(repeating | self.noiseless) and np.any(repeating))
 
@@ -163,7 +163,7 @@ class RepetitionWatch:
         return np.where(self._until > first, self._age, 0)
 
     def recalls(self, position: int, codes: NDArray[np.int16]) -> bool | None:
-        """Whether the samples at a position were these (n, C); None where they are a hole."""
+        """Return whether the samples at a position were these (n, C); None where it is a hole."""
         rows = len(self._history)
         if position < max(0, self.position - rows) or position + len(codes) > self.position:
             return False

@@ -1,4 +1,4 @@
-"""Compiled search for runs of samples that a column has said before, a sample at a time.
+"""Searches, compiled and a sample at a time, for runs of samples that a column has said before.
 
 All arrays have a place for each of C columns. Positions count samples since the last reset; the
 sample at position p is in row p mod H of the history (H, C).

@@ -1,4 +1,4 @@
-"""The device's ticks beside its samples: both come from one clock and must advance together."""
+"""Compares the device's ticks with its samples: they share a clock and must advance together."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class TickCheck:
         self._begin(sample, ticks)
 
     def confirms(self, samples: int, ticks: int) -> bool:
-        """Whether a block `samples` after the last one may have these ticks."""
+        """Return whether a block `samples` after the last one may have these ticks."""
         if not self.trusted:
             return samples <= _LONGEST_HOLE_S * self._rate_hz
         advance = self._advance(self._last_ticks, ticks, samples)

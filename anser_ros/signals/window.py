@@ -1,4 +1,4 @@
-"""Overlapping windows, cut from a stream of sample blocks, with the samples that they miss."""
+"""Cuts overlapping windows from a stream of sample blocks, with the samples that they miss."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FULL_SCALE = (-32768, 32767)
 
 @dataclass(frozen=True)
 class Window:
-    """One window of samples of all channels.
+    """Holds one window of samples of all channels.
 
     Attributes
     ----------
@@ -53,13 +53,13 @@ class Window:
 
     @property
     def dropped(self) -> bool:
-        """Whether samples are missing inside the window."""
+        """Return whether samples are missing inside the window."""
         return not bool(self.present.all())
 
 
 @dataclass
 class CutterCounters:
-    """Counters of the windows, samples and blocks of a stream, and of its restarts."""
+    """Counts the windows, samples and blocks of a stream, and its restarts."""
 
     windows: int = 0
     windows_lost: int = 0

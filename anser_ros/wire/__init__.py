@@ -1,1 +1,1 @@
-"""What goes over wires and into files: frames, port, bags, setup and model documents."""
+"""Holds what goes over wires and into files: frames, port, bags, setup and model documents."""

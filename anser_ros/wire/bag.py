@@ -42,7 +42,7 @@ POSE_TYPE = 'geometry_msgs/msg/PoseStamped'
 
 
 class RawMessage(NamedTuple):
-    """One message as it lies in the bag: serialised (CDR), with its schema for decoding."""
+    """Holds one message as it lies in the bag: serialised (CDR), with its schema for decoding."""
 
     topic: str
     type_name: str
@@ -54,7 +54,7 @@ class RawMessage(NamedTuple):
 
 @dataclass
 class Salvage:
-    """The losses of a reader, filled in while the messages are iterated."""
+    """Counts the losses of a reader, filled in while the messages are iterated."""
 
     lost: str = ''
     bad_chunks: int = 0
@@ -332,7 +332,7 @@ def read_bag(path: str | os.PathLike[str]) -> Bag:
 
 
 def read_fluxes(path: str | os.PathLike[str]) -> dict[str, RecordedFluxes]:
-    """The fluxes of a bag that need not have a setup, by ``tool`` and ``reference``."""
+    """Return the fluxes of a bag that need not have a setup, by ``tool`` and ``reference``."""
     collector = _Collector()
     for raw in iter_messages(path, Salvage()):
         if raw.topic.endswith(('/tool/flux', '/reference/flux')):

@@ -1,4 +1,4 @@
-"""The account of a bag: its topics, counts and times, and rosbag2's ``metadata.yaml`` of it."""
+"""Keeps account of a bag's topics, counts and times, and writes rosbag2's ``metadata.yaml``."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -34,7 +34,7 @@ def qos_profile(
 
 @dataclass
 class TopicRecord:
-    """A topic of a bag and how much of it was written."""
+    """Records a topic of a bag and how much of it was written."""
 
     name: str
     type_name: str
@@ -45,7 +45,7 @@ class TopicRecord:
 
 @dataclass
 class BagRecord:
-    """What a bag holds so far; times are log times in ns."""
+    """Records what a bag holds so far; times are log times in ns."""
 
     topics: dict[int, TopicRecord] = field(default_factory=dict)
     messages: int = 0
@@ -54,7 +54,7 @@ class BagRecord:
 
     @property
     def duration_s(self) -> float:
-        """Time between the first and the last message."""
+        """Return the time between the first and the last message, s."""
         return (self.last_ns - self.first_ns) * 1e-9
 
 
@@ -101,7 +101,8 @@ def write_metadata(path: Path, record: BagRecord, ros_distro: str, is_closed: bo
 
 
 def told(folder: Path) -> dict[str, Any]:
-    """What a bag's ``metadata.yaml`` tells: ``duration_s``, ``messages``, ``closed``; {} without.
+    """Return what a bag's ``metadata.yaml`` tells: ``duration_s``, ``messages``, ``closed``; {}
+    without.
 
     A bag that was not closed holds more than that: its readers don't look here.
     """

@@ -81,7 +81,7 @@ class _Closing(ABC):
 
 
 class BagWriter(_Closing):
-    """One MCAP file being written.
+    """Writes messages into one MCAP file.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ class BagWriter(_Closing):
 
     @property
     def is_open(self) -> bool:
-        """Whether messages can still be written."""
+        """Return whether messages can still be written."""
         return not self._raw.closed
 
     def add_topic(

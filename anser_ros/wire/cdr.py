@@ -1,4 +1,4 @@
-"""Serialised bytes of the three message types that a session is made of, without ROS.
+"""Serialises the three message types that a session is made of, without ROS.
 
 Plain CDR, little endian: a value lies at a multiple of its own size, counted from the byte after
 the four-byte header; a string or a sequence is its length as uint32 and then its items.

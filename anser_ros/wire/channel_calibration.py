@@ -1,4 +1,5 @@
-"""The channel calibration document (`anser_channels/1`): from volts at the converter to tesla.
+"""Reads the channel calibration (`anser_channels/1`), which leads from volts at the converter to
+tesla.
 
 For each sensor channel it holds the effective area a = N A G of coil and amplifier, m^2, so that
 V = j w a B exp(-j w d), and the delay d, s, of everything behind the coil. It belongs to a control
@@ -25,7 +26,7 @@ _KEYS = ('area_m2', 'delay_s')
 
 @dataclass(frozen=True)
 class ChannelResponse:
-    """Effective area (m^2, negative when wired the other way round) and delay (s)."""
+    """Holds effective area (m^2, negative when wired the other way round) and delay (s)."""
 
     area_m2: float
     delay_s: float = 0.0
@@ -33,7 +34,7 @@ class ChannelResponse:
 
 @dataclass(frozen=True)
 class ChannelCalibration:
-    """Responses of all channels.
+    """Holds the responses of all channels.
 
     Attributes
     ----------

@@ -28,7 +28,7 @@ MOST_BYTES = 256 * 2**20
 
 
 class ForeignMessage(NamedTuple):
-    """One message: its topic, type, time of recording, ns, bytes (CDR), and its type's text."""
+    """Holds one message: its topic, type, recording time, ns, bytes (CDR), and its type's text."""
 
     topic: str
     type_name: str

@@ -1,4 +1,4 @@
-"""The search for records in a byte stream, also after garbage."""
+"""Searches for records in a byte stream, also after garbage."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SHORTEST_PAYLOAD = 4096
 
 @dataclass
 class FrameCounters:
-    """Counters of the reader, in records unless the name has another unit."""
+    """Counts what the reader met, in records unless the name has another unit."""
 
     records: int = 0
     bad_header: int = 0

@@ -1,4 +1,4 @@
-"""Records of the control unit's serial protocol, version 1: encode and decode one of them.
+"""Encodes and decodes single records of the control unit's serial protocol, version 1.
 
 The protocol is written down in `docs/cu_protocol.md`; the two must agree. Everything is little
 endian. `frame_reader` finds records in a stream; this module knows what is inside one.

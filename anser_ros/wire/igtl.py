@@ -1,4 +1,5 @@
-"""Messages of OpenIGTLink, protocol version 3: what is sent of poses, and what clients ask for.
+"""Packs and reads messages of OpenIGTLink, protocol version 3: poses that are sent, clients'
+requests.
 
 The layouts are those of the protocol's specification (openigtlink.org/developers/spec). All
 numbers are big-endian, lengths are in millimetres. Header version 1 is what the oldest clients
@@ -50,7 +51,7 @@ _TABLE = _crc_table()
 
 @dataclass(frozen=True)
 class Header:
-    """What stands in front of a message: version, type, device, and the length of its body."""
+    """Holds what stands before a message: version, type, device, and the length of its body."""
 
     version: int
     kind: str
@@ -60,7 +61,7 @@ class Header:
 
 @dataclass(frozen=True)
 class Tracked:
-    """One instrument of TDATA: name, position, m, and quaternion x y z w."""
+    """Holds one instrument of TDATA: name, position, m, and quaternion x y z w."""
 
     name: str
     position_m: Sequence[float]
@@ -95,7 +96,8 @@ def resolution_s(header: Header, body: bytes) -> float:
 
 
 def device_names(named: Mapping[str, str]) -> dict[str, str]:
-    """The device of each name: what was made for it, of which a longer one loses its beginning.
+    """Return the device of each name; a longer name than the protocol has room for loses its
+    beginning.
 
     Raises
     ------
@@ -119,7 +121,7 @@ def device_names(named: Mapping[str, str]) -> dict[str, str]:
 
 
 def state_device(device: str) -> str:
-    """Name of the device that tells the state of another one."""
+    """Return the name of the device that tells the state of another one."""
     return (device + '/state')[-NAME_BYTES:]
 
 

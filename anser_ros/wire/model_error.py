@@ -1,4 +1,4 @@
-"""The byte layout of a field model's uncertainty, which travels beside the model.
+"""Lays out the bytes of a field model's uncertainty, which travels beside the model.
 
 A point for every dipole that a mode moves: ``mode`` and ``dipole`` uint16, ``flux_error`` float32
 (T: what the model leaves unexplained) and ``follows`` uint32 (1 while every frame of
@@ -34,7 +34,7 @@ _HEAD = [('mode', '<u2'), ('dipole', '<u2'), ('flux_error', '<f4'), ('follows', 
 
 @dataclass(frozen=True)
 class ModelError:
-    """Unexplained flux (T) and modes (R, N, K), complex, A m^2; R may be 0.
+    """Holds the unexplained flux (T) and modes (R, N, K), complex, A m^2; R may be 0.
 
     ``follows`` says whether the model follows the references: each of their frames has its own.
     ``withheld`` is 0, or the code of the state for which the server wants no pose to be given.

@@ -1,4 +1,4 @@
-"""Model files: YAML text, read and written as plain data (what it means is the field model's)."""
+"""Reads and writes model files, YAML text, as plain data (what it means is the field model's)."""
 
 import os
 import tempfile

@@ -1,4 +1,4 @@
-"""The byte layouts of the two point clouds, flux and field model, without any ROS message.
+"""Lays out the bytes of the two point clouds, flux and field model, without any ROS message.
 
 Fields are read by name and offset, never by position, so a cloud with other fields in between,
 or in another order, is read right. A field is the tuple ``(name, offset, datatype, count)`` with
@@ -35,7 +35,7 @@ _CODES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'
 
 @dataclass(frozen=True)
 class FluxPoints:
-    """The fluxes of one demodulation window with a row for each sensor.
+    """Holds the fluxes of one demodulation window with a row for each sensor.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class FluxPoints:
 
 @dataclass(frozen=True)
 class DipolePoints:
-    """A field model as dipoles: positions (N, 3) m, directions (N, 3), moments (N, K) A m^2."""
+    """Holds a model's dipoles: positions (N, 3) m, directions (N, 3), moments (N, K) A m^2."""
 
     positions: Array
     directions: Array

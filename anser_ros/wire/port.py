@@ -1,4 +1,5 @@
-"""The control unit's serial port: a reader thread that survives cables, and names every fault.
+"""Runs the control unit's serial port: a reader thread that survives cables, and names every
+fault.
 
 The thread reads, finds records and queues them; it never waits for the receiver. A receiver that
 is too slow loses whole blocks, counted as `overrun_blocks`. The port is reopened with growing
@@ -38,7 +39,7 @@ _GARBAGE_BYTES = 256
 
 
 class PortState(Enum):
-    """What the port is doing now; the value is the words for an operator."""
+    """Names what the port is doing now; the value is the words for an operator."""
 
     CLOSED = 'closed'
     ABSENT = 'no port'
@@ -50,7 +51,7 @@ class PortState(Enum):
 
 @dataclass
 class PortCounters:
-    """Faults since the port was started; each is an event unless the name says otherwise."""
+    """Counts faults since the port started; each is an event unless the name says otherwise."""
 
     gap_blocks: int = 0
     wrong_baud: int = 0
@@ -64,7 +65,7 @@ class PortCounters:
 
 @dataclass(frozen=True)
 class Batch:
-    """Records that were received together.
+    """Holds records that were received together.
 
     Attributes
     ----------
@@ -166,7 +167,7 @@ class ControlUnitPort:
 
     @property
     def has_more(self) -> bool:
-        """Whether records have come that the receiver has not got yet."""
+        """Return whether records have come that the receiver has not got yet."""
         return bool(self._held) or not self._queue.empty()
 
     def get(self, timeout_s: float) -> Batch | None:
@@ -193,13 +194,13 @@ class ControlUnitPort:
         return None
 
     def fault_counters(self) -> dict[str, int]:
-        """All counters by name, the frame reader's included."""
+        """Return all counters by name, the frame reader's included."""
         ours = {field.name: getattr(self.counters, field.name) for field in fields(self.counters)}
         return ours | self._reader.fault_counters()
 
     @property
     def last_refusal(self) -> str:
-        """The reason why the last refused record was refused."""
+        """Return the reason why the last refused record was refused."""
         return self._reader.last_refusal
 
     def _run(self) -> None:

@@ -1,4 +1,4 @@
-"""Topics of poses, and the setup document of a session that has nothing else."""
+"""Names topics of poses, and makes the setup document of a session that has nothing else."""
 
 from collections.abc import Iterable
 
@@ -13,7 +13,7 @@ SCHEMA = 'anser_poses/1'
 
 
 def tracked_topic(sensor: str) -> str:
-    """Topic of a sensor of a tracker that gives poses."""
+    """Return the topic of a sensor of a tracker that gives poses."""
     return f'{TRACKED}{topic_of(sensor)}{ENDING}'
 
 

@@ -1,4 +1,4 @@
-"""The serial protocols of control units that a port can speak.
+"""Lists the serial protocols of control units that a port can speak.
 
 A protocol turns bytes into records and commands into bytes. The records (`records.Hello`,
 `SampleBlock`, `DeviceStatus`, `Reply`) are what the rest of the package knows of any control unit:
@@ -38,7 +38,7 @@ class RecordReader(Protocol):
 
 @dataclass(frozen=True)
 class SerialProtocol:
-    """How a kind of control unit speaks.
+    """Describes how a kind of control unit speaks.
 
     Attributes
     ----------

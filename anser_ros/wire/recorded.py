@@ -1,4 +1,4 @@
-"""A recorded session as arrays; reading one from a file is the business of `wire.bag`."""
+"""Holds a recorded session as arrays; reading one from a file is the business of `wire.bag`."""
 
 from dataclasses import dataclass, field
 
@@ -10,7 +10,7 @@ from anser_ros.wire.setup import Setup
 
 @dataclass(frozen=True)
 class RecordedFluxes:
-    """Fluxes of one topic.
+    """Holds the fluxes of one topic.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class RecordedFluxes:
 
 @dataclass(frozen=True)
 class PoseStream:
-    """Poses of one topic: stamps (M,), positions (M, 3) in m, quaternions x y z w (M, 4)."""
+    """Holds poses of one topic: stamps (M,), positions (M, 3) in m, quaternions x y z w (M, 4)."""
 
     stamp_ns: NDArray[np.int64]
     position: NDArray[np.float64]
@@ -39,7 +39,7 @@ class PoseStream:
 
 @dataclass(frozen=True)
 class Bag:
-    """A recorded session: setup, fluxes, optical poses, and what was refused or lost."""
+    """Holds a recorded session: setup, fluxes, optical poses, and what was refused or lost."""
 
     path: str
     setup: Setup

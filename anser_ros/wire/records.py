@@ -1,4 +1,4 @@
-"""What the control unit and the host tell each other, as objects: hellos, samples, commands.
+"""Defines what the control unit and the host tell each other: hellos, samples, commands.
 
 `frames` turns these records into bytes and back; `docs/cu_protocol.md` says what each field means.
 """
@@ -30,14 +30,14 @@ SAMPLES_HEAD = struct.Struct('<IQHHHH')
 
 
 class ChannelKind(IntEnum):
-    """What an ADC channel measures: a sensor coil, or the sum of the emitter coils' currents."""
+    """Names what an ADC channel measures: a sensor coil, or the sum of the emitters' currents."""
 
     SENSE = 0
     CURRENT = 1
 
 
 class DeviceState(IntEnum):
-    """What the control unit is doing."""
+    """Names what the control unit is doing."""
 
     IDLE = 0
     STREAMING = 1
@@ -45,7 +45,7 @@ class DeviceState(IntEnum):
 
 
 class StatusFlag(IntFlag):
-    """Conditions that the control unit reports about itself."""
+    """Names conditions that the control unit reports about itself."""
 
     SYNTHESISER_UNLOCKED = 1
     DRIVER_OVERHEATED = 2
@@ -55,13 +55,13 @@ class StatusFlag(IntFlag):
 
 
 class SamplesFlag(IntFlag):
-    """Conditions of one block of samples."""
+    """Names conditions of one block of samples."""
 
     LOST_BEFORE = 1
 
 
 class ReplyCode(IntEnum):
-    """The control unit's answer to a command."""
+    """Names the control unit's answers to a command."""
 
     OK = 0
     UNKNOWN_COMMAND = 1
@@ -72,7 +72,7 @@ class ReplyCode(IntEnum):
 
 @dataclass(frozen=True)
 class Channel:
-    """One column of the sample blocks.
+    """Describes one column of the sample blocks.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class Hello:
-    """What the control unit is and how it samples; sent once a second and after each change.
+    """Tells what the control unit is and how it samples; sent once a second and after each change.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class Hello:
 
 @dataclass(frozen=True)
 class SampleBlock:
-    """Consecutive samples of all channels.
+    """Holds consecutive samples of all channels.
 
     Attributes
     ----------
@@ -134,7 +134,7 @@ class SampleBlock:
 
 @dataclass(frozen=True)
 class DeviceStatus:
-    """Health of the control unit, sent once a second and when it changes."""
+    """Tells the control unit's health, once a second and when it changes."""
 
     state: DeviceState
     flags: StatusFlag
@@ -146,7 +146,7 @@ class DeviceStatus:
 
 @dataclass(frozen=True)
 class Reply:
-    """Answer to the command that carried the same tag."""
+    """Answers the command that carried the same tag."""
 
     command: int
     code: ReplyCode
@@ -155,22 +155,22 @@ class Reply:
 
 @dataclass(frozen=True)
 class Identify:
-    """Command: send a hello now."""
+    """Commands the control unit to send a hello now."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """Command: stream sample blocks, from sequence number 0."""
+    """Commands the control unit to stream sample blocks, from sequence number 0."""
 
 
 @dataclass(frozen=True)
 class Stop:
-    """The command to stop streaming."""
+    """Commands the control unit to stop streaming."""
 
 
 @dataclass(frozen=True)
 class SetFrequencies:
-    """Command: drive the coils at these tones; answered, then followed by a new hello."""
+    """Commands to drive the coils at these tones; answered, then followed by a new hello."""
 
     frequencies_hz: tuple[float, ...]
 
@@ -180,7 +180,7 @@ Payload = Hello | SampleBlock | DeviceStatus | Reply | Identify | Start | Stop |
 
 @dataclass(frozen=True)
 class Record:
-    """One record of the stream: its payload, and the tag that ties a reply to its command."""
+    """Holds one record of the stream: its payload, and the tag that ties a reply to a command."""
 
     payload: Payload
     tag: int = 0

@@ -1,4 +1,4 @@
-"""One serial line by pyserial: opened, read as fast as it can be, closed, its errors in words."""
+"""Opens one serial line by pyserial, reads as fast as it can, and puts its errors into words."""
 
 from __future__ import annotations
 

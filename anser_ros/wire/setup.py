@@ -1,4 +1,4 @@
-"""The setup document (`anser_setup/1`): which coils drive, which listen, and where they are.
+"""Reads the setup document (`anser_setup/1`): which coils drive, which listen, and where they are.
 
 The YAML text travels in every bag and on the latched topic ``setup``. Sensor positions and axes
 are given in the frame of the sensor's body; the body ``fg`` is the field generator itself.
@@ -44,7 +44,7 @@ is thick, no model of its field holds, and heights are sampled in a geometric se
 
 @dataclass(frozen=True)
 class Coil:
-    """One emitter coil: centre (m, frame fg), turn about z (degrees) and drive frequency (Hz)."""
+    """Describes an emitter coil: centre (m, frame fg), turn about z (degrees), drive tone (Hz)."""
 
     name: str
     centre_m: Vector
@@ -54,7 +54,7 @@ class Coil:
 
 @dataclass(frozen=True)
 class Emitter:
-    """The field generator: its kind, the geometry that all coils share, and the coils.
+    """Describes the field generator: its kind, the geometry that all coils share, and the coils.
 
     ``geometry`` holds the document's remaining keys (``turns``, ``side_m``, ``pitch_m``,
     ``layers``, ``thickness_m``, ``current_a`` for ``square_spiral_pcb``), as given.
@@ -67,7 +67,7 @@ class Emitter:
 
 @dataclass(frozen=True)
 class SensorSpec:
-    """One coil: its channel, name, body, and position (m) and unit axis in the body's frame."""
+    """Describes a coil: channel, name, body, position (m) and unit axis in the body's frame."""
 
     channel: int
     name: str
@@ -79,7 +79,7 @@ class SensorSpec:
 
 @dataclass(frozen=True)
 class Setup:
-    """A validated setup document.
+    """Holds a validated setup document.
 
     ``volume`` holds the corners, low and high (m, frame fg), of the box in which tools are
     tracked; None where the document leaves it to the board's size. ``tips`` holds the tips of
@@ -97,16 +97,16 @@ class Setup:
 
     @cached_property
     def refit(self) -> RefitSettings:
-        """How the refit follows, by what is stated and the defaults of the rest."""
+        """Return how the refit follows: what is stated, and defaults for the rest."""
         return settings_from(self.stated)
 
     @property
     def accuracy(self) -> Accuracy:
-        """How accurate the instruments are, by what is stated and the defaults of the rest."""
+        """Return how accurate the instruments are: what is stated, and defaults for the rest."""
         return self.refit.accuracy
 
     def with_stated(self, stated: Mapping[str, float]) -> 'Setup':
-        """The setup with further values stated, which go before the document's own.
+        """Return the setup with further values stated, which go before the document's own.
 
         Raises
         ------
@@ -118,7 +118,7 @@ class Setup:
         return replace(self, stated=together)
 
     def with_tips(self, tips: Mapping[str, TipSpec]) -> 'Setup':
-        """The setup with further tips, which go before its own.
+        """Return the setup with further tips, which go before its own.
 
         Raises
         ------
@@ -160,12 +160,12 @@ class Setup:
 
     @property
     def bodies(self) -> tuple[str, ...]:
-        """Names of the bodies that move, in the order of their first sensor."""
+        """Return the names of the bodies that move, in the order of their first sensor."""
         return tuple(dict.fromkeys(s.body for s in self.tool_sensors))
 
     @property
     def emitter_names(self) -> tuple[str, ...]:
-        """Names of the emitters, in the order of the flux fields."""
+        """Return the names of the emitters, in the order of the flux fields."""
         return tuple(coil.name for coil in self.emitter.coils)
 
     @property
@@ -174,17 +174,17 @@ class Setup:
         return tuple(coil.frequency_hz for coil in self.emitter.coils)
 
     def follows_as(self, other: 'Setup') -> bool:
-        """Whether a refit by another setup, and its baseline, hold for this one too."""
+        """Return whether a refit by another setup, and its baseline, hold for this one too."""
         return self.has_same_board(other) and self.refit == other.refit
 
     def has_same_board(self, other: 'Setup') -> bool:
-        """Whether two setups have the same emitters, sensors and tracked volume."""
+        """Return whether two setups have the same emitters, sensors and tracked volume."""
         ours = (self.frame_id, self.emitter, self.sensors, self.volume)
         return ours == (other.frame_id, other.emitter, other.sensors, other.volume)
 
 
 def topic_of(name: str) -> str:
-    """Relative ROS topic stem of a sensor's or body's name.
+    """Return the relative ROS topic stem of a sensor's or body's name.
 
     A token that begins with a digit is not legal in a ROS 2 name, so it is joined to the token
     before it: ``tool_a/0/x`` becomes ``tool_a_0/x``; a leading digit gets ``sensor_`` in front.

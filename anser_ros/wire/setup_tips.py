@@ -1,4 +1,4 @@
-"""Tips of tools: the key ``tips`` of a setup document, and files that hold nothing else."""
+"""Reads and writes tips of tools: the key ``tips`` of a setup document, and files of tips only."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ NOT_NEGATIVE = -1e-9
 
 @dataclass(frozen=True)
 class TipSpec:
-    """A tool's tip in its body's frame, m, and its covariance, m^2, as `UPPER` has it."""
+    """Describes a tool's tip in its body's frame, m, with its covariance, m^2, by `UPPER`."""
 
     position_m: Vector
     covariance_m2: tuple[float, ...] = (0.0,) * 6
@@ -97,7 +97,7 @@ def refuse_homeless(tips: Iterable[str], bodies: Mapping[str, str], topics: Iter
 
 
 def tip_name(body: str) -> str:
-    """What a body's tip is called, in topics and in ``/diagnostics``."""
+    """Return what a body's tip is called, in topics and in ``/diagnostics``."""
     return f'{body}/tip'
 
 
@@ -119,7 +119,7 @@ def read_tips(text: str) -> dict[str, TipSpec]:
 
 
 def dump_tips(tips: Mapping[str, TipSpec]) -> dict[str, Any]:
-    """The value of the key ``tips`` that `parse_tips` reads back."""
+    """Return the value of the key ``tips`` that `parse_tips` reads back."""
     return {
         body: {'position_m': list(t.position_m), 'covariance_m2': list(t.covariance_m2)}
         for body, t in tips.items()
@@ -127,7 +127,7 @@ def dump_tips(tips: Mapping[str, TipSpec]) -> dict[str, Any]:
 
 
 def with_tips(text: str, tips: Mapping[str, TipSpec]) -> str:
-    """A document's text with these tips beside those it has; all else stays letter for letter.
+    """Return a document's text with these tips beside its own; all else stays letter for letter.
 
     Raises
     ------

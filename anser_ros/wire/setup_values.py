@@ -1,4 +1,4 @@
-"""Values of a setup document, each taken whole or refused with its place in the document.
+"""Takes values of a setup document whole, or refuses them with their place in the document.
 
 All functions raise `SetupError` with one line that says where the value stands and what it is.
 """

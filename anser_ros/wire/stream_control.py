@@ -1,4 +1,4 @@
-"""The next command that the control unit needs in order to stream what the host wants."""
+"""Chooses the next command that the control unit needs in order to stream what the host wants."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class StreamControl:
 
     @property
     def tones_agree(self) -> bool:
-        """Whether the control unit drives the tones of the setup document."""
+        """Return whether the control unit drives the tones of the setup document."""
         return self.hello is not None and self._agree(self.hello)
 
     def take(self, record: Record, arrival_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""TCP ports on which this package serves unless a parameter says another."""
+"""Lists the TCP ports on which this package serves unless a parameter says another."""
 
 LIVE_VIEW = 8642
 """The page of `dashboard`; no registered service has it."""

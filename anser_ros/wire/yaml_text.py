@@ -1,4 +1,4 @@
-"""YAML from anybody: plain data only, within bounds of size, depth and what aliases stand for."""
+"""Reads YAML from anybody: plain data only, within bounds of size, depth and aliases."""
 
 from typing import Any
 
