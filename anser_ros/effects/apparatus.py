@@ -1,4 +1,4 @@
-"""What a session consists of, as far as effects need it to say at which sites they may sit."""
+"""Describes a session as far as effects need it to say at which sites they may sit."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Apparatus:
-    """Tools, references, emitters and the space that they take up.
+    """Holds tools, references, emitters and the space that they take up.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Apparatus:
         return self.tool_channels + tuple(int(c) for c in extra)
 
     def clusters(self) -> list[tuple[int, ...]]:
-        """Channels of tool sensors that share one centre, where there are two or more."""
+        """Return the channels of tool sensors that share one centre, two or more of them."""
         return [
             tuple(table.channel[rows].tolist())
             for table in self.tools

@@ -1,4 +1,4 @@
-"""The term of metal whose body is a sum of modes, and which the search refines.
+"""Defines the term of metal whose body is a sum of modes, and which the search refines.
 
 A simple body has few modes; a real one has more, and the data say which (`with_body`). Metal whose
 answer changes with time has a course besides, which may be refined as well (`freer`).
@@ -27,7 +27,7 @@ that the data don't tell from growing without bound."""
 
 @dataclass(frozen=True)
 class Richness:
-    """How finely metal is shaped.
+    """Says how finely metal is shaped.
 
     Attributes
     ----------
@@ -46,7 +46,8 @@ class Richness:
 
 @dataclass(frozen=True, kw_only=True)
 class BodyTerm(Term):
-    """Metal of modes: theta is its course, then real and imaginary parts of their amplitudes.
+    """Holds metal of modes: theta is its course, then real and imaginary parts of their
+    amplitudes.
 
     Attributes
     ----------
@@ -72,7 +73,7 @@ class BodyTerm(Term):
 
     @property
     def placed(self) -> int:
-        """Parameters of the course, which come before the amplitudes."""
+        """Return how many parameters the course has, which come before the amplitudes."""
         return int(self.theta.size) - 2 * int(self.modes.shape[1])
 
     @property
@@ -96,7 +97,7 @@ class BodyTerm(Term):
         raise NotImplementedError
 
     def with_body(self, kind: str, modes: Array, spread: Array) -> Self:
-        """The same course, another body, whose amplitudes are still zero."""
+        """Return the same course with another body, whose amplitudes are still zero."""
         theta = np.concatenate([self.course, np.zeros(2 * modes.shape[1])])
         return replace(self, kind=kind, modes=modes, spread=spread, theta=theta)
 
@@ -116,5 +117,5 @@ class BodyTerm(Term):
         return None
 
     def restarted(self) -> Self | None:
-        """The body as it is, where its course started from; None where that isn't known."""
+        """Return the body as it is, where its course started from; None where that isn't known."""
         return None

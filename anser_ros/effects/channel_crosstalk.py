@@ -84,7 +84,7 @@ class ChannelCrosstalk(Effect[Term]):
         return matrix
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the whole matrix, ones on its diagonal."""
+        """Record the whole matrix, ones on its diagonal."""
         size = len(term.site['channels'])
         sigma = np.zeros((size, size))
         for value, place in zip(sigmas(covariance), _pairs(size), strict=True):
@@ -96,7 +96,7 @@ class ChannelCrosstalk(Effect[Term]):
         )
 
     def possible(self, record: EffectRecord) -> bool:
-        """Whether the leaks, the matrix less its diagonal of ones, are in their range."""
+        """Return whether the leaks, the matrix less its diagonal of ones, are in their range."""
         leaks = np.asarray(record.parameters['matrix'], dtype=np.float64)
         leaks = leaks - np.eye(len(leaks))
         return super().possible(replace(record, parameters={'matrix': leaks}))

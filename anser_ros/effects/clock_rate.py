@@ -36,7 +36,7 @@ class ClockRate(Effect[Term]):
         return np.array([0.1, 3e-3])
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """Minus the flux's rate of change, constant and growing with time."""
+        """Return minus the flux's rate of change, constant and growing with time."""
         if view.is_reference:
             return None
         rate = -flux_rate(view)
@@ -47,7 +47,7 @@ class ClockRate(Effect[Term]):
         return replace(track, time=track.time * (1 + term.theta[1]) + term.theta[0])
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the offset and the rate."""
+        """Record the offset and the rate."""
         sigma = sigmas(covariance)
         return EffectRecord(
             self.name,

@@ -39,7 +39,7 @@ class CoilCrosstalk(Effect[Term]):
     remedy = Remedy.FLUX
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Every ordered pair, and every pair both ways."""
+        """Try every ordered pair, and every pair both ways."""
         coils = range(apparatus.emitters)
         one_way = [Term(self, {'coils': p}, np.zeros(2)) for p in permutations(coils, 2)]
         both = [

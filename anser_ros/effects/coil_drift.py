@@ -33,7 +33,7 @@ def _shape(time: Array, tau: float) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class CoilDriftTerm(Term):
-    """The drift of one emitter.
+    """Holds the drift of one emitter.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
         return np.array([0])
 
     def prior(self, term: CoilDriftTerm) -> Array:
-        """Amounts are some percent, time constants are known to a factor of five."""
+        """Expect amounts of some percent, and time constants known to a factor of five."""
         return np.array([0.1, 1.6])
 
     def _own(self, term: CoilDriftTerm, view: View) -> ComplexArray:
@@ -98,7 +98,7 @@ class CoilDrift(Effect[CoilDriftTerm]):
         return out
 
     def started(self, term: CoilDriftTerm, solution: Array) -> Sequence[CoilDriftTerm]:
-        """The time constant whose curve comes nearest to the probe's sum."""
+        """Start with the time constant whose curve comes nearest to the probe's sum."""
         duration = term.duration
         time = np.linspace(0.0, duration, 60)
         curves = [_shape(time, share * duration) for share in PROBED_SHARES]

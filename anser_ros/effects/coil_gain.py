@@ -30,7 +30,7 @@ class CoilGain(Effect[Term]):
         return [Term(self, {'coil': k}, np.zeros(2)) for k in range(apparatus.emitters)]
 
     def prior(self, term: Term) -> Array:
-        """A strength is off by some ten percent."""
+        """Expect a strength that is off by some ten percent."""
         return np.full(2, 0.3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
@@ -47,7 +47,7 @@ class CoilGain(Effect[Term]):
         return matrix[None]
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the gain's size and phase."""
+        """Record the gain's size and phase."""
         figures, sigmas = figures_of(term.theta, covariance)
         return EffectRecord(self.name, {'coil': term.site['coil'], **figures}, sigmas)
 

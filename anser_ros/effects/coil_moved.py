@@ -37,7 +37,7 @@ class CoilMoved(Effect[Term]):
         return np.full(3, 3e-3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """Moving the source is moving the sensor the other way."""
+        """Move the sensor the other way, which does the same as moving the source."""
         coil = term.site['coil']
         out = view.columns(3)
         out[:, :, coil] = -np.moveaxis(view.d_position[..., coil], 2, -1)
@@ -46,7 +46,7 @@ class CoilMoved(Effect[Term]):
     def sources(
         self, term: Term, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
-        """The emitter at its new place, less the one at the old."""
+        """Return the emitter at its new place, less the one at the old."""
         return self._shifted(term, base)
 
     def light(self, term: Term, illumination: Dipoles) -> Dipoles:

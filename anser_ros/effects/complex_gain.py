@@ -1,4 +1,4 @@
-"""A complex gain as two numbers beside one, and as the size and phase that a record has."""
+"""Writes a complex gain as two numbers beside one, and as the size and phase that a record has."""
 
 from typing import Any
 

@@ -95,11 +95,11 @@ class ConductivePlate(Effect[Term]):
         return term.with_theta(theta)
 
     def covers(self, term: Term, candidate: Term) -> bool:
-        """One sheet is looked for; another height or size is the same sheet's."""
+        """Cover a sheet of any height and size: only one sheet is looked for."""
         return candidate.effect is self
 
     def resting(self, term: Term) -> Resting:
-        """What the sheet's currents lack, in waves over the sheet."""
+        """Return what the sheet's currents lack, in waves over the sheet."""
         edge = float(term.theta[1])
         return Resting(term.theta[[2, 3, 0]], [(sheet_shapes(edge), sheet_sizes(edge))])
 

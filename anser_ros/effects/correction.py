@@ -34,7 +34,7 @@ LIVE = (Remedy.FLUX, Remedy.SENSORS)
 
 
 def drifts(record: EffectRecord) -> bool:
-    """Whether a record's course over time is one that another session doesn't repeat.
+    """Return whether a record's course over time is one that another session doesn't repeat.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def _term(effect: Effect[Any], record: EffectRecord) -> Term:
 
 @dataclass(frozen=True)
 class Correction:
-    """The corrections that a model's effect records ask for.
+    """Makes the corrections that a model's effect records ask for.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class Correction:
     def of(
         records: Sequence[EffectRecord], sensors: SensorTable, frequencies: Sequence[float]
     ) -> 'Correction':
-        """Corrections of a model's records; raises `ModelFileError` on a record that is none."""
+        """Make the corrections of a model's records; raises `ModelFileError` if one is none."""
         corrected = []
         for record in records:
             effect = effect_named(record.name)
@@ -103,12 +103,12 @@ class Correction:
 
     @property
     def changes_flux(self) -> bool:
-        """Whether any term makes `flux` change the measured flux."""
+        """Return whether any term makes `flux` change the measured flux."""
         return bool(self._with(Remedy.FLUX))
 
     @property
     def drifting(self) -> tuple[str, ...]:
-        """Effects that only references, or a recorded course, can correct."""
+        """Return the effects that only references, or a recorded course, can correct."""
         return tuple(term.label for term in self.terms if term.effect.drifts)
 
     @property
@@ -117,14 +117,14 @@ class Correction:
         return tuple(term.label for term in self.terms if not term.effect.drifts)
 
     def sensors(self, table: SensorTable | None = None) -> SensorTable:
-        """The sensors (by default those given at the start) as they truly are."""
+        """Return the sensors (by default those given at the start) as they truly are."""
         out = self.surveyed if table is None else table
         for term in self._with(Remedy.SENSORS):
             out = term.effect.table(term, out)
         return out
 
     def gain_changes(self) -> Array | None:
-        """Changes of gains since the model was made that sensors may share, shape (G, S).
+        """Return changes of gains since the model was made that sensors may share, shape (G, S).
 
         Relative, one standard deviation each; None where no effect tells of any.
         """
@@ -133,7 +133,7 @@ class Correction:
         return np.concatenate(known) if known else None
 
     def optical(self, track: PoseTrack) -> PoseTrack:
-        """An optical track on the fluxes' clock and in fg."""
+        """Return an optical track on the fluxes' clock and in fg."""
         # As in the forward chain: the order in which the effects are listed.
         for term in self._with(Remedy.OPTICAL):
             track = term.effect.optical(term, track)
@@ -147,7 +147,7 @@ class Correction:
         *,
         recorded: bool = False,
     ) -> ComplexArray:
-        """A frame's fluxes as sound sensors and emitters would have given them.
+        """Return a frame's fluxes as sound sensors and emitters would have given them.
 
         Parameters
         ----------

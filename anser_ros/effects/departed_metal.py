@@ -1,4 +1,4 @@
-"""Metal that rested near while a field was learnt, and moves: what its moving changes.
+"""Models metal that rested near while a field was learnt, and moves: what its moving changes.
 
 The learnt field has the metal at rest in it, and so have the references' steady readings. What is
 left is the field of the metal where it is, less that of the same metal where it rested: so its
@@ -20,7 +20,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True, kw_only=True)
 class DepartedTerm(MovingTerm):
-    """Moving metal relative to where it is at ``rest_s``, s since the session's start."""
+    """Holds moving metal relative to where it is at ``rest_s``, s since the session's start."""
 
     rest_s: float
 
@@ -30,11 +30,11 @@ class DepartedTerm(MovingTerm):
         return MovingTerm(**{f.name: getattr(self, f.name) for f in fields(MovingTerm)})
 
     def resting(self, view: View) -> View:
-        """The view as if all of it were recorded while the metal rests."""
+        """Return the view as if all of it were recorded while the metal rests."""
         return replace(view, time=np.full(view.time.shape, self.rest_s))
 
     def flux(self, view: View, shift: Array) -> ComplexArray:
-        """Flux (F, S, K) of the whole body, moved by a shift (m), less that at rest."""
+        """Return the flux (F, S, K) of the whole body, moved by a shift (m), less that at rest."""
         return self.alone.flux(view, shift) - self.alone.flux(self.resting(view), shift)
 
     def unit(self, view: View) -> NDArray[np.inexact]:
@@ -42,7 +42,7 @@ class DepartedTerm(MovingTerm):
         return np.asarray(self.alone.unit(view) - self.alone.unit(self.resting(view)))
 
     def rest_flux(self, view: View) -> ComplexArray:
-        """What the metal at rest adds to a view, (F, S, K), T."""
+        """Return what the metal at rest adds to a view, (F, S, K), T."""
         return self.alone.flux(self.resting(view), np.zeros(3))
 
     def rest_columns(self, view: View) -> ComplexArray:
@@ -53,7 +53,7 @@ class DepartedTerm(MovingTerm):
 
 @dataclass(frozen=True)
 class DepartedMetal(MovingMetal):
-    """Metal on a free path from its rest and back; no effect of a model, which has none of it.
+    """Takes metal on a free path from its rest and back; a model has none of it to correct.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class DepartedMetal(MovingMetal):
         return DepartedTerm(**parts, rest_s=self.rest_s)
 
     def columns(self, term: MovingTerm, view: View) -> ComplexArray | None:
-        """Derivatives where the metal is, less those where it rests."""
+        """Return the derivatives where the metal is, less those where it rests."""
         assert isinstance(term, DepartedTerm)
         there = super().columns(term.alone, view)
         rest = super().columns(term.alone, term.resting(view))

@@ -1,4 +1,4 @@
-"""What every effect looks like: one interface, and one file for each effect.
+"""Defines what every effect looks like: one interface, and one file for each effect.
 
 The measurement chain that an effect may change runs in this order::
 
@@ -52,7 +52,7 @@ on the values that it changes is another effect's stand-in."""
 
 
 class Remedy(Enum):
-    """What is corrected while tracking, so that an effect does no harm."""
+    """Names what is corrected while tracking, so that an effect does no harm."""
 
     FLUX = 'the measured flux is corrected'
     SENSORS = 'the sensor table is corrected'
@@ -62,7 +62,7 @@ class Remedy(Enum):
 
 
 class Family(Enum):
-    """How the search for effects treats an effect."""
+    """Names how the search for effects treats an effect."""
 
     STEADY = 'a constant, or a curve with few parameters'
     METAL_AT_REST = 'metal that stays where it is; refined by what it is besides a simple body'
@@ -73,13 +73,13 @@ class Family(Enum):
 
     @property
     def is_metal(self) -> bool:
-        """Whether it is metal, at rest or moving."""
+        """Return whether it is metal, at rest or moving."""
         return self in (Family.METAL_AT_REST, Family.MOVING_METAL)
 
 
 @dataclass(frozen=True)
 class Resting:
-    """Where metal at rest is, and what it may be besides its few parameters.
+    """Says where metal at rest is, and what it may be besides its few parameters.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class Resting:
 
 
 class Effect(Generic[TermT]):
-    """Base of all effects: it changes nothing.
+    """Changes nothing; it is the base of all effects.
 
     Attributes
     ----------
@@ -146,11 +146,11 @@ class Effect(Generic[TermT]):
 
     # --- search ------------------------------------------------------------------------------
     def candidates(self, apparatus: Apparatus) -> Sequence[TermT]:
-        """The effect at every site where it may sit, with parameters of zero."""
+        """Return the effect at every site where it may sit, with parameters of zero."""
         return ()
 
     def prior(self, term: TermT) -> Array:
-        """Standard deviation of each parameter before anything is measured, shape (q,)."""
+        """Return each parameter's standard deviation before anything is measured, shape (q,)."""
         return np.ones(term.theta.size)
 
     def columns(self, term: TermT, view: View) -> ComplexArray | None:
@@ -162,21 +162,21 @@ class Effect(Generic[TermT]):
         return np.arange(term.theta.size)
 
     def probe(self, term: TermT, view: View) -> ComplexArray | None:
-        """Linear columns that tell quickly whether the effect is there; by default `columns`."""
+        """Return linear columns that tell quickly whether the effect is there, or `columns`."""
         return self.columns(term, view)
 
     def directions(self, term: TermT, view: View) -> ComplexArray | None:
-        """Columns (F, S, K, q), a standard deviation long, along which every frame may move."""
+        """Return columns (F, S, K, q), a standard deviation long, for each frame to move along."""
         return None
 
     def started(self, term: TermT, solution: Array) -> Sequence[TermT]:
-        """Start values for the full fit from the solution of the probe."""
+        """Return start values for the full fit from the solution of the probe."""
         return (term.with_theta(solution),)
 
     def along(
         self, time: Array, course: Array, solution: Array, apparatus: Apparatus
     ) -> Sequence[TermT]:
-        """Start values from where ``still`` fits best in each stretch of time.
+        """Return start values from where ``still`` fits best in each stretch of time.
 
         Parameters
         ----------
@@ -196,50 +196,50 @@ class Effect(Generic[TermT]):
 
     # --- comparison --------------------------------------------------------------------------
     def complexity(self, term: TermT) -> int:
-        """Parameters that are paid for when explanations are compared."""
+        """Return how many parameters are paid for when explanations are compared."""
         return int(term.theta.size)
 
     def covers(self, term: TermT, candidate: Term) -> bool:
-        """Whether a candidate is what a term of this effect in force stands for already."""
+        """Return whether a term of this effect in force stands for a candidate already."""
         return candidate.seat == term.seat
 
     def rivals(self, term: TermT, other: Term) -> bool:
-        """Whether a steady term is about the same thing, so that one of both is superfluous."""
+        """Return whether a steady term is about the same thing, so that one is superfluous."""
         return False
 
     def belongs(self, term: TermT, other: Term) -> bool:
-        """Whether a term of this effect is part of another term's explanation."""
+        """Return whether a term of this effect is part of another term's explanation."""
         return False
 
     def freedom(self, term: TermT) -> int:
-        """Values that a term leaves open in all frames together."""
+        """Return how many values a term leaves open in all frames together."""
         return 0
 
     def silenced(self, term: TermT) -> tuple[int, ...]:
-        """Channels that must take no part in anything where the effect is there."""
+        """Return channels that must take no part in anything where the effect is there."""
         return ()
 
     # --- refinement: what the term is, for those effects that are refined ------------------------
     def resting(self, term: TermT) -> Resting | None:
-        """Where metal at rest is and what it may be besides; None for any other effect."""
+        """Return where metal at rest is and what it may be besides; None for any other effect."""
         return None
 
     def body(self, term: TermT) -> 'BodyTerm | None':
-        """The term of metal whose body and course can be refined; None for any other effect."""
+        """Return the term of metal whose body and course are refined; None for other effects."""
         return None
 
     def opened(self, term: TermT) -> 'FluctuationTerm | None':
-        """The term of an effect whose spread is found; None for any other effect."""
+        """Return the term of an effect whose spread is found; None for any other effect."""
         return None
 
     # --- forward -----------------------------------------------------------------------------
     @property
     def moving(self) -> bool:
-        """Whether its field changes with time (`moving_flux`), and is no constant `sources`."""
+        """Return whether its field changes with time (`moving_flux`), unlike `sources`."""
         return self.family is Family.MOVING_METAL
 
     def optical(self, term: TermT, track: PoseTrack) -> PoseTrack:
-        """True track of the body from the optical one."""
+        """Return the true track of the body from the optical one."""
         return track
 
     def table(self, term: TermT, sensors: SensorTable) -> SensorTable:
@@ -247,17 +247,17 @@ class Effect(Generic[TermT]):
         return sensors
 
     def light(self, term: TermT, illumination: Dipoles) -> Dipoles:
-        """The emitters' own field as metal sees it, from the one that is known."""
+        """Return the emitters' own field as metal sees it, from the one that is known."""
         return illumination
 
     def sources(
         self, term: TermT, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
-        """Dipoles that the effect adds; ``base`` makes the field where sensors are."""
+        """Return dipoles that the effect adds; ``base`` makes the field where sensors are."""
         return None
 
     def moving_flux(self, term: TermT, view: View) -> ComplexArray:
-        """What a ``moving`` effect adds to a view before the emitters' stage, (F, S, K)."""
+        """Return what a ``moving`` effect adds to a view before the emitters' stage, (F, S, K)."""
         return np.zeros_like(view.flux)
 
     def emitter_matrix(self, term: TermT, time: Array, omega: Array) -> ComplexArray | None:
@@ -271,19 +271,19 @@ class Effect(Generic[TermT]):
         return None
 
     def gain_changes(self, term: TermT, sensors: SensorTable) -> Array | None:
-        """Relative changes of gains since, one standard deviation each, shape (G, S)."""
+        """Return relative changes of gains since, one standard deviation each, shape (G, S)."""
         return None
 
     def offset(
         self, term: TermT, channels: NDArray[np.int64], emitters: int
     ) -> ComplexArray | None:
-        """Phasors that are added, shape (S, K), T."""
+        """Return phasors that are added, shape (S, K), T."""
         return None
 
     def compress(
         self, term: TermT, channels: NDArray[np.int64], flux: ComplexArray
     ) -> ComplexArray:
-        """What the channels make of fluxes of shape (F, S, K)."""
+        """Return what the channels make of fluxes of shape (F, S, K)."""
         return flux
 
     # --- records -----------------------------------------------------------------------------
@@ -292,11 +292,11 @@ class Effect(Generic[TermT]):
         raise NotImplementedError
 
     def term(self, record: EffectRecord) -> TermT:
-        """The term that a record stands for; raises `ModelFileError` on missing parameters."""
+        """Return the term of a record; raises `ModelFileError` on missing parameters."""
         raise NotImplementedError
 
     def possible(self, record: EffectRecord) -> bool:
-        """Whether the numbers of a record are in the ranges of ``plausible``."""
+        """Return whether the numbers of a record are in the ranges of ``plausible``."""
         for key, (low, high) in self.plausible.items():
             value = record.parameters.get(key)
             if value is None or isinstance(value, str):
@@ -326,7 +326,7 @@ def unit_matrix(size: int) -> ComplexArray:
 
 
 def orthogonal_pair(axis: Array) -> Array:
-    """Two unit vectors, shape (2, 3), that make a right-handed frame with a unit axis."""
+    """Return two unit vectors, shape (2, 3), that make a right-handed frame with a unit axis."""
     start = np.eye(3)[int(np.argmin(np.abs(axis)))]
     first = np.cross(axis, start)
     first /= np.linalg.norm(first)

@@ -11,7 +11,7 @@ from anser_ros.field.model import EffectRecord
 
 @dataclass(frozen=True, kw_only=True)
 class ExcessNoiseTerm(Term):
-    """How much the noise has grown.
+    """Says how much the noise has grown.
 
     Attributes
     ----------
@@ -24,7 +24,7 @@ class ExcessNoiseTerm(Term):
 
 
 class ExcessNoise(Effect[ExcessNoiseTerm]):
-    """Found from the residuals' spread once they show no structure (`anser_ros.diagnosis`)."""
+    """Is found from the residuals' spread once they show no structure (`anser_ros.diagnosis`)."""
 
     name = 'excess_noise'
     summary = 'the noise is larger than it should be, and nothing else'
@@ -34,7 +34,7 @@ class ExcessNoise(Effect[ExcessNoiseTerm]):
     family = Family.SEEN
 
     def record(self, term: ExcessNoiseTerm, covariance: Array) -> EffectRecord:
-        """The factor, and the channels where not all have it."""
+        """Record the factor, and the channels where not all have it."""
         parameters: dict[str, object] = {'factor': term.factor}
         if 'channels' in term.site:
             parameters['channels'] = list(term.site['channels'])
@@ -50,6 +50,6 @@ EFFECTS = (EXCESS_NOISE,)
 
 
 def excess_noise_of(factor: float, sigma: float, channels: Sequence[int]) -> ExcessNoiseTerm:
-    """Noise that has grown on some channels, or on all where none are named."""
+    """Return noise that has grown on some channels, or on all where none are named."""
     site = {'channels': tuple(channels)} if channels else {}
     return ExcessNoiseTerm(EXCESS_NOISE, site, factor=factor, sigma=sigma)

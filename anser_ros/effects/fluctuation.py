@@ -1,4 +1,4 @@
-"""What another effect's parameters do when they change from one frame to the next.
+"""Lets another effect's parameters change from one frame to the next.
 
 A parameter that steps, swings or rattles has no curve to fit. It is a random number a frame, with
 a spread found from the data, and what it does to a frame is left open along the columns of the
@@ -41,7 +41,7 @@ a curve with several parameters."""
 
 @dataclass(frozen=True, kw_only=True)
 class FluctuationTerm(Term):
-    """Something constant that fluctuates; theta is empty.
+    """Holds something constant that fluctuates; theta is empty.
 
     Attributes
     ----------
@@ -58,17 +58,17 @@ class FluctuationTerm(Term):
     frames: int = 1
 
     def columns(self, view: View) -> ComplexArray | None:
-        """Columns (F, S, K, q) of unit size along which a frame may move."""
+        """Return columns (F, S, K, q) of unit size along which a frame may move."""
         return None if self.constant is None else self.constant.effect.columns(self.constant, view)
 
     @property
     def expected(self) -> Array:
-        """Standard deviation of each parameter that the constant effect expects, shape (q,)."""
+        """Return each parameter's standard deviation by the constant effect, shape (q,)."""
         return np.zeros(0) if self.constant is None else self.constant.effect.prior(self.constant)
 
 
 class Fluctuation(Effect[FluctuationTerm]):
-    """Base of the fluctuations, each of one constant effect.
+    """Lets one constant effect fluctuate; it is the base of all that do so.
 
     Attributes
     ----------
@@ -98,13 +98,13 @@ class Fluctuation(Effect[FluctuationTerm]):
         return OPEN
 
     def covers(self, term: FluctuationTerm, candidate: Term) -> bool:
-        """It stands for the constant effect at its site too, whose columns are its own."""
+        """Cover the constant effect at its site too, whose columns are its own."""
         if candidate.effect.name == self.of.name:
             return candidate.seat[1] == term.seat[1]
         return super().covers(term, candidate)
 
     def rivals(self, term: FluctuationTerm, other: Term) -> bool:
-        """What is constant at its site, and whatever is steady on its coil or channel."""
+        """Rival what is constant at its site, and whatever is steady on its coil or channel."""
         if other.effect.family is Family.FLUCTUATION:
             return False
         if other.effect.name == self.of.name:
@@ -122,7 +122,7 @@ class Fluctuation(Effect[FluctuationTerm]):
         return None if columns is None or term.spread is None else columns * term.spread
 
     def record(self, term: FluctuationTerm, covariance: Array) -> EffectRecord:
-        """Where it is, and how much it is; sigma is that of a spread of so many numbers."""
+        """Record where it is, and how much; sigma is that of a spread of so many numbers."""
         spread = np.zeros(1) if term.spread is None else term.spread
         rms = float(np.sqrt(np.sum(spread**2)))
         where: dict[str, Any] = {
@@ -132,14 +132,14 @@ class Fluctuation(Effect[FluctuationTerm]):
         return EffectRecord(self.name, {**where, 'rms': rms}, {'rms': sigma})
 
     def term(self, record: EffectRecord) -> FluctuationTerm:
-        """Where it is; what it does in a frame only the frame can tell."""
+        """Return where it is; what it does in a frame only the frame can tell."""
         needed(record, 'rms')
         where = {k: v for k, v in record.parameters.items() if k != 'rms'}
         return FluctuationTerm(self, where)
 
 
 class CoilFluctuation(Fluctuation):
-    """A `CoilGain` that changes; live, the references tell the strength of the moment."""
+    """Changes a `CoilGain`; live, the references tell the strength of the moment."""
 
     name = 'coil_fluctuation'
     summary = "an emitter's strength steps, swings or fails, not as a warming coil's does"
@@ -151,7 +151,7 @@ class CoilFluctuation(Fluctuation):
 
 
 class SensorGainDrift(Fluctuation):
-    """A `SensorGain` that changes from frame to frame."""
+    """Changes a `SensorGain` from frame to frame."""
 
     name = 'sensor_gain_drift'
     summary = "a sensor's gain changes with time"
@@ -160,7 +160,7 @@ class SensorGainDrift(Fluctuation):
 
 
 class ToolGainDrift(Fluctuation):
-    """A `ToolGain` that changes from frame to frame."""
+    """Changes a `ToolGain` from frame to frame."""
 
     name = 'tool_gain_drift'
     summary = "the gain that all of a tool's sensors share changes with time"
@@ -169,7 +169,7 @@ class ToolGainDrift(Fluctuation):
 
 
 class LooseSensorAxis(Fluctuation):
-    """A `SensorAxis` that changes from frame to frame."""
+    """Changes a `SensorAxis` from frame to frame."""
 
     name = 'loose_sensor_axis'
     summary = "a sensor's axis changes with time"
@@ -178,7 +178,7 @@ class LooseSensorAxis(Fluctuation):
 
 
 class LooseSensorPosition(Fluctuation):
-    """A `SensorPosition` that changes, of clusters: one coil reads too little for it."""
+    """Changes a `SensorPosition`, of clusters only: one coil reads too little for it."""
 
     name = 'loose_sensor_position'
     summary = "a cluster's place in its body changes with time"
@@ -191,7 +191,7 @@ class LooseSensorPosition(Fluctuation):
 
 
 class StampJitter(Fluctuation):
-    """A `TimeOffset` that changes from frame to frame."""
+    """Changes a `TimeOffset` from frame to frame."""
 
     name = 'stamp_jitter'
     summary = 'the optical stamps are early or late by a different time in every frame'
@@ -200,7 +200,7 @@ class StampJitter(Fluctuation):
 
 
 class OpticalJitter(Fluctuation):
-    """A `Registration` that changes: what the optical poses err by beyond what they may."""
+    """Changes a `Registration`: what the optical poses err by beyond what they may."""
 
     name = 'optical_jitter'
     summary = 'the optical poses err by more than they may'

@@ -48,7 +48,7 @@ class LeverArm(Effect[Term]):
         )
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the offset and the body."""
+        """Record the offset and the body."""
         return EffectRecord(
             self.name,
             {'offset_m': term.theta.tolist(), 'body': term.site['body']},

@@ -1,4 +1,4 @@
-"""Where metal that moves is at each time: straight from rest to rest, or freely along a spline."""
+"""Tells where moving metal is at each time: straight from rest to rest, or along a spline."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -23,7 +23,7 @@ recorded."""
 
 
 class MetalPath(Protocol):
-    """A path with ``count`` parameters, through ``knots`` (s) where it is free."""
+    """Leads along ``count`` parameters, through ``knots`` (s) where it is free."""
 
     @property
     def count(self) -> int:
@@ -31,17 +31,16 @@ class MetalPath(Protocol):
 
     @property
     def knots(self) -> tuple[float, ...]:
-        """Times at which the place is free; none where the path is straight."""
+        """Return the times at which the place is free; none where the path is straight."""
 
     def centre(self, theta: Array, time: Array) -> Array:
         """Return the body's centre at each time, shape (F, 3), m."""
 
     def rates(self, theta: Array, time: Array) -> Array:
-        """Derivative of the centre by the parameters, (F, 3, count)."""
+        """Return the derivative of the centre by the parameters, (F, 3, count)."""
 
     def nodes(self, theta: Array, time: Array) -> tuple[Array, Array, Array]:
-        """A coordinate (n,) along which fields change smoothly, the centre (n, 3) at some of its
-        values, and the coordinate at each time."""
+        """Return steps (n,) along the way, the centres there (n, 3), m, and each time's step."""
 
     def prior(self) -> Array:
         """Return the prior standard deviation of each parameter, shape (count,)."""
@@ -52,7 +51,7 @@ class MetalPath(Protocol):
 
 @dataclass(frozen=True)
 class StraightPath:
-    """Parameters: start and end (m), start and end time (s), ease.
+    """Leads straight on; its parameters are start and end (m), start and end time (s), ease.
 
     The centre rests, goes straight from start to end between the two times, and rests. An ease of
     0 is even speed, of 1 a smooth step.
@@ -62,7 +61,7 @@ class StraightPath:
     knots: tuple[float, ...] = ()
 
     def progress(self, theta: Array, time: Array) -> Array:
-        """Share of the way made at each time, 0 to 1."""
+        """Return the share of the way made at each time, 0 to 1."""
         u = np.clip((time - theta[6]) / max(float(theta[7] - theta[6]), SHORTEST), 0.0, 1.0)
         return np.asarray(u + theta[8] * u * (1 - u) * (2 * u - 1))
 
@@ -97,7 +96,7 @@ class StraightPath:
         return np.concatenate([np.full(6, 0.1), np.full(2, 10.0), [0.5]])
 
     def bounded(self, theta: Array) -> Array:
-        """The end comes after the start, and the body never goes back."""
+        """Put the end after the start, and keep the body from going back."""
         out = theta.copy()
         out[7] = max(out[7], out[6] + SHORTEST)
         out[8] = np.clip(out[8], -0.5, 1.0)
@@ -106,7 +105,7 @@ class StraightPath:
 
 @dataclass(frozen=True)
 class FreePath:
-    """Parameters: the centre (m) at each knot, between which it goes along a natural spline.
+    """Leads along a natural spline; its parameters are the centre (m) at each knot.
 
     Attributes
     ----------
@@ -132,13 +131,13 @@ class FreePath:
         return np.asarray(self._weights(time) @ theta.reshape(-1, 3))
 
     def rates(self, theta: Array, time: Array) -> Array:
-        """Derivative of the centre by the parameters, (F, 3, count)."""
+        """Return the derivative of the centre by the parameters, (F, 3, count)."""
         weights = self._weights(time)
         rates = weights[:, None, :, None] * np.eye(3)[None, :, None, :]
         return np.asarray(rates.reshape(time.size, 3, -1))
 
     def nodes(self, theta: Array, time: Array) -> tuple[Array, Array, Array]:
-        """The time: a free path may turn back."""
+        """Use the time as coordinate: a free path may turn back."""
         count = NODES_PER_KNOT * (len(self.knots) - 1) + 1
         times = np.linspace(self.knots[0], self.knots[-1], count)
         return times, self.centre(theta, times), np.clip(time, times[0], times[-1])

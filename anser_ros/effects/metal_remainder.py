@@ -1,4 +1,4 @@
-"""What a simple metal body or sheet leaves: finer couplings, and light that is not quite known.
+"""Models what a simple metal body or sheet leaves: finer couplings, and light not quite known.
 
 Not an effect of its own (no registry holds it): it belongs to the metal that it refines, so that
 the corrected field is as good as the data allow while the metal's own parameters stay few.
@@ -26,14 +26,14 @@ STEP_M = 0.5e-3
 
 
 class Leftover(Protocol):
-    """A linear part of a metal's answer, its parameters of unit prior size."""
+    """Holds a linear part of a metal's answer, its parameters of unit prior size."""
 
     @property
     def count(self) -> int:
         """Return the number of its real parameters."""
 
     def columns(self, view: View) -> ComplexArray:
-        """Flux of each parameter, (F, S, K, count)."""
+        """Return the flux of each parameter, (F, S, K, count)."""
 
     def sources(self, theta: Array, illumination: Dipoles, omega: Array) -> Dipoles:
         """Return the dipoles that stand for the whole leftover."""
@@ -41,7 +41,7 @@ class Leftover(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Couplings:
-    """Modes: fixed combinations of couplings, each with a complex amplitude.
+    """Combines couplings into fixed modes, each with a complex amplitude.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class Couplings:
 
 @dataclass(frozen=True, eq=False)
 class Lighting:
-    """Each emitter's strength and place (x, y, z), as metal sees them.
+    """Changes each emitter's strength and place (x, y, z), as metal sees them.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class Lighting:
 
 @dataclass(frozen=True, kw_only=True)
 class RemainderTerm(Term):
-    """A leftover of one metal; theta is the leftover's parameters.
+    """Holds a leftover of one metal; theta is the leftover's parameters.
 
     Attributes
     ----------
@@ -151,7 +151,7 @@ class RemainderTerm(Term):
 
 
 class MetalRemainder(Effect[RemainderTerm]):
-    """What the few parameters of metal at rest leave (`Couplings` or `Lighting`)."""
+    """Takes what the few parameters of metal at rest leave (`Couplings` or `Lighting`)."""
 
     name = 'metal_remainder'
     summary = 'what a simple metal body leaves'
@@ -159,24 +159,24 @@ class MetalRemainder(Effect[RemainderTerm]):
     family = Family.REMAINDER
 
     def of(self, parent: Term, leftover: Leftover) -> RemainderTerm:
-        """A leftover of a metal that is at rest, with parameters of zero."""
+        """Return a leftover of a metal that is at rest, with parameters of zero."""
         return RemainderTerm(
             self, {'of': parent.effect.name}, np.zeros(leftover.count),
             parent=parent.seat, leftover=leftover,
         )  # fmt: skip
 
     def belongs(self, term: RemainderTerm, other: Term) -> bool:
-        """Whether ``other`` is the metal that this leftover belongs to."""
+        """Return whether ``other`` is the metal that this leftover belongs to."""
         return term.parent == other.seat
 
     def columns(self, term: RemainderTerm, view: View) -> ComplexArray | None:
-        """The leftover's own columns: it is linear in its parameters."""
+        """Return the leftover's own columns: it is linear in its parameters."""
         return term.leftover.columns(view)
 
     def sources(
         self, term: RemainderTerm, base: Dipoles, illumination: Dipoles, omega: Array
     ) -> Dipoles | None:
-        """The dipoles of the leftover, none while all is zero."""
+        """Return the dipoles of the leftover, none while all is zero."""
         if not np.any(term.theta):
             return None
         return term.leftover.sources(term.theta, illumination, omega)

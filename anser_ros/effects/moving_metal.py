@@ -1,4 +1,4 @@
-"""A metal object that moves during the session."""
+"""A metal object moves during the session."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ KNOTS = 9
 
 @dataclass(frozen=True, kw_only=True)
 class MovingTerm(BodyTerm):
-    """Metal on a path; theta is the path's parameters, then the modes' amplitudes.
+    """Holds metal on a path; theta is the path's parameters, then the modes' amplitudes.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class MovingTerm(BodyTerm):
         return len(self.path.knots)
 
     def centres(self, time: Array) -> Array:
-        """Where the body is at each time, (F, 3), m, frame fg."""
+        """Return where the body is at each time, (F, 3), m, frame fg."""
         return self.path.centre(self.course, time)
 
     def _seen(self, view: View, shift: Array) -> tuple[Array, ComplexArray]:
@@ -89,7 +89,7 @@ class MovingTerm(BodyTerm):
         return self.shapes.heard(centre, view.centres, view.axes, view.sensors.length), drive
 
     def flux(self, view: View, shift: Array) -> ComplexArray:
-        """Flux (F, S, K) of the whole body, moved by a shift (m)."""
+        """Return the flux (F, S, K) of the whole body, moved by a shift (m)."""
         return self.shapes.flux(*self._seen(view, shift), self.couplings, view.omega)
 
     def unit(self, view: View) -> NDArray[np.inexact]:
@@ -108,14 +108,14 @@ class MovingTerm(BodyTerm):
         return replace(self, path=path, theta=theta)
 
     def restarted(self) -> Self | None:
-        """The body on the path that the search started with."""
+        """Return the body on the path that the search started with."""
         if self.first is None:
             return None
         return self.with_theta(np.concatenate([self.first, self.theta[self.first.size :]]))
 
 
 class MovingMetal(Effect[MovingTerm]):
-    """Metal on a straight path from rest to rest, or on a free one. The body doesn't turn."""
+    """Moves metal straight from rest to rest, or on a free path. The body doesn't turn."""
 
     name = 'moving_metal'
     summary = 'a metal object moves during the session'
@@ -164,7 +164,7 @@ class MovingMetal(Effect[MovingTerm]):
         return max(int(term.theta.size), SHAPED)
 
     def body(self, term: MovingTerm) -> MovingTerm:
-        """The term, whose body and path are refined."""
+        """Return the term itself, whose body and path are refined."""
         return term
 
     def amounts(self, term: MovingTerm) -> NDArray[np.int64]:
@@ -172,7 +172,7 @@ class MovingMetal(Effect[MovingTerm]):
         return np.arange(term.placed, term.theta.size)
 
     def prior(self, term: MovingTerm) -> Array:
-        """The path's own prior and the modes' sizes; held metal stays on its path."""
+        """Return the path's own prior and the modes' sizes; held metal stays on its path."""
         path = term.path.prior()
         if term.held:
             path = np.full(path.size, FROZEN)
@@ -207,7 +207,7 @@ class MovingMetal(Effect[MovingTerm]):
         return term.flux(view, np.zeros(3))
 
     def record(self, term: MovingTerm, covariance: Array) -> EffectRecord:
-        """Path, times, polarisability, and all that makes the term again."""
+        """Record path, times, polarisability, and all that makes the term again."""
         total, couplings = term.shapes.polarisability(term.couplings), UNIT * term.couplings
         times = np.linspace(0.0, term.duration, PATH_SAMPLES)
         start, end = moving_times(term.path, term.course, times)

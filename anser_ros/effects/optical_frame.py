@@ -1,4 +1,4 @@
-"""What else an optical frame may be besides turned and shifted: too large, or on the move."""
+"""An optical frame may be more than turned and shifted: it may be too large, or on the move."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -36,11 +36,11 @@ class OpticalScale(Effect[Term]):
         return [Term(self, {}, np.zeros(4))] if apparatus.tools else []
 
     def prior(self, term: Term) -> Array:
-        """Scales err by a percent, shifts are some millimetres."""
+        """Expect scales that err by a percent, and shifts of some millimetres."""
         return np.array([0.01, 5e-3, 5e-3, 5e-3])
 
     def amounts(self, term: Term) -> NDArray[np.int64]:
-        """The scale alone: a shift is a registration's."""
+        """Return the scale's index alone: a shift is a registration's."""
         return np.array([0])
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
@@ -58,7 +58,7 @@ class OpticalScale(Effect[Term]):
         return replace(track, position=(track.position + term.theta[1:]) / (1 + term.theta[0]))
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the scale and the shift."""
+        """Record the scale and the shift."""
         sigma = sigmas(covariance)
         return EffectRecord(
             self.name,
@@ -74,7 +74,7 @@ class OpticalScale(Effect[Term]):
 
 @dataclass(frozen=True, kw_only=True)
 class RegistrationDriftTerm(Term):
-    """The drift of the optical tracker.
+    """Holds the drift of the optical tracker.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class RegistrationDrift(Effect[RegistrationDriftTerm]):
         return np.arange(3, 6)
 
     def columns(self, term: RegistrationDriftTerm, view: View) -> ComplexArray | None:
-        """All sensors moved the other way, from the start and more and more."""
+        """Move all sensors the other way, from the start and more and more."""
         if view.is_reference:
             return None
         out, back = view.columns(6), -np.moveaxis(view.d_position, 2, -1)
@@ -130,7 +130,7 @@ class RegistrationDrift(Effect[RegistrationDriftTerm]):
         return replace(track, position=track.position - term.theta[:3] - share * term.theta[3:])
 
     def record(self, term: RegistrationDriftTerm, covariance: Array) -> EffectRecord:
-        """The record has the first translation and the velocity."""
+        """Record the first translation and the velocity."""
         sigma, duration = sigmas(covariance), term.duration
         return EffectRecord(
             self.name,

@@ -11,7 +11,7 @@ from anser_ros.field.model import EffectRecord
 
 @dataclass(frozen=True, kw_only=True)
 class OutliersTerm(Term):
-    """How many frames stand out.
+    """Says how many frames stand out.
 
     Attributes
     ----------
@@ -24,7 +24,7 @@ class OutliersTerm(Term):
 
 
 class Outliers(Effect[OutliersTerm]):
-    """Found as frames that stand out from their neighbours in time (`anser_ros.diagnosis`)."""
+    """Is found as frames that stand out from their neighbours in time (`anser_ros.diagnosis`)."""
 
     name = 'outliers'
     summary = 'some frames belong to no model'
@@ -34,7 +34,7 @@ class Outliers(Effect[OutliersTerm]):
     family = Family.SEEN
 
     def record(self, term: OutliersTerm, covariance: Array) -> EffectRecord:
-        """The share of frames, and the channels where not all have them."""
+        """Record the share of frames, and the channels where not all have them."""
         parameters: dict[str, object] = {'fraction': term.fraction}
         if 'channels' in term.site:
             parameters['channels'] = list(term.site['channels'])
@@ -46,7 +46,7 @@ class Outliers(Effect[OutliersTerm]):
 
 
 class LooseContact(Outliers):
-    """As `Outliers`, where always the same channels stand out."""
+    """Does what `Outliers` does, where always the same channels stand out."""
 
     name = 'loose_contact'
     summary = 'single readings of a channel fail now and then'
@@ -57,7 +57,7 @@ EFFECTS = (OUTLIERS, LOOSE_CONTACT)
 
 
 def known_share(records: Sequence[EffectRecord]) -> float:
-    """Share of the frames that a model's records know to stand out in every session."""
+    """Return the share of frames that a model's records know to stand out in every session."""
     return sum(
         float(record.parameters.get('fraction', 0.0))
         for record in records
@@ -66,7 +66,7 @@ def known_share(records: Sequence[EffectRecord]) -> float:
 
 
 def outliers_of(fraction: float, sigma: float, channels: Sequence[int]) -> OutliersTerm:
-    """Outliers in whole frames, or of some channels, which is what a loose contact does."""
+    """Return outliers in whole frames, or of some channels, which is what a loose contact does."""
     if not channels:
         return OutliersTerm(OUTLIERS, fraction=fraction, sigma=sigma)
     site = {'channels': tuple(channels)}

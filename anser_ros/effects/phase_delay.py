@@ -37,7 +37,7 @@ class PhaseDelay(Effect[Term]):
         return np.asarray((-1j * UNIT * view.omega * view.linear)[..., None])
 
     def emitter_matrix(self, term: Term, time: Array, omega: Array) -> ComplexArray:
-        """The turn of each emitter's phasors on the diagonal."""
+        """Return the turn of each emitter's phasors on the diagonal."""
         return np.diag(np.exp(-1j * omega * term.theta[0] * UNIT))[None]
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:

@@ -82,7 +82,7 @@ class Pickup(Effect[Term]):
 
 
 class ReferenceChanged(Pickup):
-    """As `Pickup`, of a reference sensor: it doesn't move, so any lasting change is a constant."""
+    """Acts as `Pickup` on a reference sensor, which rests: any lasting change is a constant."""
 
     name = 'reference_changed'
     summary = "a reference sensor's reading changed for good: it was moved, turned or picks up"

@@ -1,4 +1,4 @@
-"""What the sensors of a body should read, when a list of effects holds: the forward chain."""
+"""Predicts what the sensors of a body read when a list of effects holds: the forward chain."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Fields:
-    """The fields that a prediction starts from.
+    """Holds the fields that a prediction starts from.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ def reference_view(
 
 
 def true_track(track: PoseTrack, terms: Sequence[Term]) -> PoseTrack:
-    """The optical track on the fluxes' clock and in fg."""
+    """Return the optical track on the fluxes' clock and in fg."""
     for term in terms:
         track = term.effect.optical(term, track)
     return track
@@ -121,7 +121,7 @@ def _poses(body: Measurements, terms: Sequence[Term]) -> tuple[Array, Array, Arr
 
 
 def lit(terms: Sequence[Term], illumination: Dipoles) -> Dipoles:
-    """The emitters' own field where metal is, with what the effects do to it."""
+    """Return the emitters' own field where metal is, with what the effects do to it."""
     for term in terms:
         illumination = term.effect.light(term, illumination)
     return illumination

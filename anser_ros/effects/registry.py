@@ -1,4 +1,4 @@
-"""All effects, found by looking: a module in this package that defines `EFFECTS` is one.
+"""Finds all effects by looking: a module in this package that defines `EFFECTS` is one.
 
 Adding an effect means adding its file; nothing else needs to know.
 """
@@ -16,12 +16,12 @@ from anser_ros.errors import ModelFileError
 
 @cache
 def all_effects() -> dict[str, Effect[Any]]:
-    """Every effect by its name, in alphabetical order."""
+    """Return every effect by its name, in alphabetical order."""
     return effects_in(package)
 
 
 def effects_in(room: ModuleType) -> dict[str, Any]:
-    """The effects that the modules of a package define, by their names in alphabetical order."""
+    """Return the effects that the modules of a package define, by name in alphabetical order."""
     found: dict[str, Any] = {}
     for info in pkgutil.iter_modules(room.__path__):
         module = importlib.import_module(f'{room.__name__}.{info.name}')
@@ -33,7 +33,7 @@ def effects_in(room: ModuleType) -> dict[str, Any]:
 
 
 def effect_named(name: str) -> Effect[Any]:
-    """The effect with a name; raises `ModelFileError` when there is none."""
+    """Return the effect with a name; raises `ModelFileError` when there is none."""
     try:
         return all_effects()[name]
     except KeyError:

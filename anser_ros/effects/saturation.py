@@ -31,7 +31,7 @@ FLUX, VOLTAGE = 'flux', 'voltage'
 
 
 def third_order(flux: ComplexArray) -> ComplexArray:
-    """What one unit of 1/fs^2 adds to fluxes (..., K), to third order."""
+    """Return what one unit of 1/fs^2 adds to fluxes (..., K), to third order."""
     squared = np.abs(flux) ** 2
     total = squared.sum(axis=-1, keepdims=True)
     return np.asarray(-(0.5 * total - 0.25 * squared) * flux)
@@ -56,7 +56,7 @@ def compressed(flux: ComplexArray, per_full_scale_squared: float, shape: str) ->
 
 @dataclass(frozen=True, kw_only=True)
 class SaturationTerm(Term):
-    """The saturation of one channel.
+    """Holds the saturation of one channel.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class Saturation(Effect[SaturationTerm]):
         ]
 
     def covers(self, term: SaturationTerm, candidate: Term) -> bool:
-        """Whether the term is on the candidate's channel, which saturates along one curve only."""
+        """Return whether the term is on the candidate's channel, which has one curve only."""
         if candidate.effect is not self:
             return False
         return bool(candidate.site['channel'] == term.site['channel'])
@@ -110,7 +110,7 @@ class Saturation(Effect[SaturationTerm]):
         return np.full(1, 3.0)
 
     def columns(self, term: SaturationTerm, view: View) -> ComplexArray | None:
-        """The third-order loss, or differences along the whole curve."""
+        """Return the third-order loss, or differences along the whole curve."""
         row = view.row(term.site['channel'])
         if row is None:
             return None
@@ -137,7 +137,7 @@ class Saturation(Effect[SaturationTerm]):
         return out
 
     def record(self, term: SaturationTerm, covariance: Array) -> EffectRecord:
-        """The record has the full scale and the curve."""
+        """Record the full scale and the curve."""
         value = max(float(term.theta[0]), 1e-9)
         full_scale = 1 / np.sqrt(UNIT * value)
         relative = 0.5 * float(np.sqrt(covariance[0, 0])) / value

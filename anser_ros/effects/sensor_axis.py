@@ -26,7 +26,7 @@ from anser_ros.physics.sensor import SensorTable
 
 @dataclass(frozen=True, kw_only=True)
 class SensorAxisTerm(Term):
-    """One sensor's tilt, or one cluster's turn.
+    """Holds one sensor's tilt, or one cluster's turn.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class SensorAxis(Effect[SensorAxisTerm]):
         return np.full(term.theta.size, 0.1)
 
     def columns(self, term: SensorAxisTerm, view: View) -> ComplexArray | None:
-        """Derivative by the axis, along the tangents or across the cluster's turn."""
+        """Return the derivative by the axis, along the tangents or across the cluster's turn."""
         if view.is_reference:
             return None
         out = view.columns(term.theta.size)

@@ -31,11 +31,11 @@ class SensorGain(Effect[Term]):
         return [Term(self, {'channel': c}, np.zeros(2)) for c in apparatus.channels]
 
     def prior(self, term: Term) -> Array:
-        """A gain is within some ten percent of one."""
+        """Expect a gain within some ten percent of one."""
         return np.full(2, 0.3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """The channel's own flux, in phase and turned by a quarter."""
+        """Return the channel's own flux, in phase and turned by a quarter."""
         row = view.row(term.site['channel'])
         if row is None:
             return None
@@ -53,7 +53,7 @@ class SensorGain(Effect[Term]):
         return matrix
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the gain's size and phase."""
+        """Record the gain's size and phase."""
         figures, sigmas = figures_of(term.theta, covariance)
         return EffectRecord(self.name, {'channel': term.site['channel'], **figures}, sigmas)
 

@@ -1,4 +1,4 @@
-"""Sensors that are wired the other way round."""
+"""Some sensors are wired the other way round."""
 
 from collections.abc import Mapping
 from typing import ClassVar
@@ -12,7 +12,7 @@ from anser_ros.field.model import EffectRecord
 
 
 class SensorPolarity(Effect[Term]):
-    """No parameter: the channels' signs are turned round."""
+    """Turns the channels' signs round, without a parameter."""
 
     name = 'sensor_polarity'
     summary = 'a sensor is wired the other way round'

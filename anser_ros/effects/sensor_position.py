@@ -23,7 +23,7 @@ class SensorPosition(Effect[Term]):
     remedy = Remedy.SENSORS
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
-        """Single sensors and clusters of bodies that carry more than those."""
+        """Try single sensors and clusters of bodies that carry more than those."""
         groups: list[tuple[int, ...]] = []
         for table in apparatus.tools:
             if len(table) > 1:
@@ -53,7 +53,7 @@ class SensorPosition(Effect[Term]):
         )
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the channels and the offset."""
+        """Record the channels and the offset."""
         return EffectRecord(
             self.name,
             {'channels': list(term.site['channels']), 'offset_m': term.theta.tolist()},

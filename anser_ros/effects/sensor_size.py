@@ -19,7 +19,7 @@ UNIT = 1e-4
 
 @dataclass(frozen=True, kw_only=True)
 class SensorSizeTerm(Term):
-    """The coils of one body.
+    """Holds the coils of one body.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class SensorSize(Effect[SensorSizeTerm]):
         return np.full(1, 10.0)
 
     def columns(self, term: SensorSizeTerm, view: View) -> ComplexArray | None:
-        """Difference between the flux of a longer coil and the coil as it is."""
+        """Return the difference between the flux of a longer coil and the coil as it is."""
         rows = np.isin(view.sensors.channel, list(term.surveyed))
         if view.is_reference or not rows.any():
             return None
@@ -75,7 +75,7 @@ class SensorSize(Effect[SensorSizeTerm]):
         return view.along(difference)[..., None]
 
     def bounded(self, term: SensorSizeTerm) -> SensorSizeTerm:
-        """A squared length is not negative where that can be helped: the sum must not be."""
+        """Keep the squared length of every coil from becoming negative."""
         smallest = -min(v**2 for v in term.surveyed.values()) / UNIT
         return term.with_theta(np.maximum(term.theta, smallest))
 
@@ -89,7 +89,7 @@ class SensorSize(Effect[SensorSizeTerm]):
         return sensors.with_geometry(length=length)
 
     def record(self, term: SensorSizeTerm, covariance: Array) -> EffectRecord:
-        """The length (root mean square over the coils)."""
+        """Record the length (root mean square over the coils)."""
         base = float(np.mean(np.square(list(term.surveyed.values()))))
         length = float(np.sqrt(max(base + UNIT * term.theta[0], 0.0)))
         sigma = UNIT * float(np.sqrt(covariance[0, 0])) / (2 * max(length, 1e-4))

@@ -1,4 +1,4 @@
-"""Errors that all sensors have, each its own: populations of gains, axes and places."""
+"""All sensors have errors, each its own: populations of gains, axes and places."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -32,7 +32,7 @@ coils that are wound one by one have next to none, the axes of a chip nearly all
 
 @dataclass(frozen=True, kw_only=True)
 class SpreadTerm(Term):
-    """A population: theta holds the values of its channels, one channel after the other.
+    """Holds a population: theta is the values of its channels, one channel after the other.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ that is off is named by itself."""
 
 
 class SensorSpread(Effect[SpreadTerm]):
-    """Found by a calibration, which has every channel in many poses; a model carries it.
+    """Is found by a calibration, which has every channel in many poses; a model carries it.
 
     A diagnosis finds gains that sensors at one place share.
     """
@@ -86,7 +86,7 @@ class SensorSpread(Effect[SpreadTerm]):
     offset_of_values: ClassVar[tuple[float, ...]] = ()
 
     def record(self, term: SpreadTerm, covariance: Array) -> EffectRecord:
-        """Spread, channels, and each channel's values with their uncertainty."""
+        """Record spread, channels, and each channel's values with their uncertainty."""
         of_sigma = term.with_theta(sigmas(covariance))
         sigma = of_sigma.values.tolist()
         values = (term.values + self._offset(term.values.shape[1])).tolist()
@@ -151,11 +151,11 @@ class SensorGainSpread(SensorSpread):
         return out
 
     def prior(self, term: SpreadTerm) -> Array:
-        """Gains of a kind of sensor are within some percent of each other."""
+        """Expect gains of a kind of sensor within some percent of each other."""
         return np.full(term.theta.size, 0.05)
 
     def columns(self, term: SpreadTerm, view: View) -> ComplexArray | None:
-        """Each place's own fluxes, in phase and turned by a quarter."""
+        """Return each place's own fluxes, in phase and turned by a quarter."""
         if not term.groups or view.is_reference:
             return None
         out, found = view.columns(term.theta.size), False
@@ -179,7 +179,7 @@ class SensorGainSpread(SensorSpread):
         return np.asarray(unit_matrix(channels.size) + np.diag(parts[:, 0] + 1j * parts[:, 1]))
 
     def gain_changes(self, term: SpreadTerm, sensors: SensorTable) -> Array | None:
-        """A change for each place, where sensors at one place have their gains in common.
+        """Return a change for each place; sensors at one place have their gains in common.
 
         How far a gain moves until the next session, one session cannot tell. What it differs by
         among sensors of a kind is its natural size: the axes of one chip go up and down together.

@@ -1,4 +1,4 @@
-"""A metal object near the volume, at rest."""
+"""A metal object rests near the volume."""
 
 from collections.abc import Mapping, Sequence
 from itertools import product
@@ -47,7 +47,7 @@ the step of the grid of places. Nearer candidates only stand in for the body's s
 
 
 def places(apparatus: Apparatus) -> Array:
-    """Where metal is looked for: a grid about the board and the volume, shape (n, 3), m."""
+    """Return where metal is looked for: a grid about the board and the volume, (n, 3), m, fg."""
     low = np.minimum(apparatus.board[0], apparatus.visited_box[0])
     high = np.maximum(apparatus.board[1], apparatus.visited_box[1])
     size = float(np.max(high[:2] - low[:2]))
@@ -155,13 +155,13 @@ class StaticMetal(Effect[Term]):
         return (term.with_theta(np.concatenate([term.theta[:3], alpha.ravel()])),)
 
     def covers(self, term: Term, candidate: Term) -> bool:
-        """Metal that is near to metal in force is the same body."""
+        """Take metal that is near to metal in force for the same body."""
         if candidate.effect is not self:
             return False
         return bool(np.linalg.norm(candidate.theta[:3] - term.theta[:3]) < APART)
 
     def resting(self, term: Term) -> Resting:
-        """A compact body about its place; an extended one of small pieces where much is left."""
+        """Return a compact body at its place; small pieces of an extended one if much is left."""
         lattices = [(BODIES[kind](), body_sizes(kind)) for kind in SPACINGS]
         return Resting(term.theta[:3], [(multipoles(), body_sizes(COMPACT))], lattices)
 

@@ -1,4 +1,4 @@
-"""A term: one effect at one site, with values of its parameters."""
+"""Defines a term: one effect at one site, with values of its parameters."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -28,7 +28,7 @@ class Held:
 
 @dataclass(frozen=True)
 class Term:
-    """An effect at one site (a channel, a coil, a body, ...) with values of its parameters.
+    """Holds an effect at one site (a channel, a coil, a body, ...) with values of its parameters.
 
     An effect that needs to know more than a site says defines a subclass with more fields.
 
@@ -61,23 +61,23 @@ class Term:
         return replace(self, held=None)
 
     def belongs_to(self, other: 'Term') -> bool:
-        """Whether this term is part of another one's explanation, and goes when that one goes."""
+        """Return whether this term is part of another one's explanation and goes with that one."""
         return self.effect.belongs(self, other)
 
     @property
     def complexity(self) -> int:
-        """Parameters that are paid for when explanations are compared."""
+        """Return how many parameters are paid for when explanations are compared."""
         return self.effect.complexity(self)
 
     @property
     def channels(self) -> tuple[int, ...]:
-        """Channels that the site names; none where it is about something else."""
+        """Return the channels that the site names; none where it is about something else."""
         one = (int(self.site['channel']),) if 'channel' in self.site else ()
         return (*one, *(int(c) for c in self.site.get('channels', ())))
 
     @property
     def seat(self) -> tuple[str, str]:
-        """Name and site: the same for one term whatever its parameters, and held or free."""
+        """Return name and site: the same for one term whatever its parameters, held or free."""
         return self.effect.name, repr(sorted(self.site.items()))
 
     @property

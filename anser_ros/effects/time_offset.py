@@ -26,7 +26,7 @@ def flux_rate(view: View) -> ComplexArray:
 
 
 class TimeOffset(Effect[Term]):
-    """At flux stamp t the optical pose stamped t - theta applies, s."""
+    """Applies the optical pose stamped t - theta at flux stamp t; theta is in s."""
 
     name = 'time_offset'
     summary = 'the optical stamps are early or late'

@@ -35,11 +35,11 @@ class ToolGain(Effect[Term]):
         ]
 
     def prior(self, term: Term) -> Array:
-        """A gain is within some ten percent of one."""
+        """Expect a gain within some ten percent of one."""
         return np.full(2, 0.3)
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """The channels' own flux, in phase and turned by a quarter."""
+        """Return the channels' own flux, in phase and turned by a quarter."""
         rows = np.isin(view.sensors.channel, term.site['channels'])
         if not rows.any():
             return None
@@ -54,7 +54,7 @@ class ToolGain(Effect[Term]):
         return np.diag(np.where(own, 1 + complex(*term.theta), 1.0))
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the gain's size and phase."""
+        """Record the gain's size and phase."""
         figures, sigmas = figures_of(term.theta, covariance)
         return EffectRecord(
             self.name, {'channels': list(term.site['channels']), **figures}, sigmas

@@ -1,4 +1,4 @@
-"""The predicted readings of one body's sensors, with their derivatives."""
+"""Predicts the readings of one body's sensors, with their derivatives."""
 
 from dataclasses import dataclass, replace
 
@@ -14,7 +14,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class View:
-    """The predicted readings of one body's S sensors in F frames, with some effects in force.
+    """Holds predicted readings of a body's S sensors in F frames, with some effects in force.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class View:
     is_reference: bool
 
     def row(self, channel: int) -> int | None:
-        """Row of a channel, or None where the body doesn't carry it."""
+        """Return the row of a channel, or None where the body doesn't carry it."""
         found = np.flatnonzero(self.sensors.channel == channel)
         return int(found[0]) if found.size else None
 

@@ -23,7 +23,7 @@ from anser_ros.field.model import EffectRecord
 
 
 class SwappedChannels(Effect[Term]):
-    """Each of ``channels`` is read at the place of the one in ``read_as``."""
+    """Reads each of ``channels`` at the place of the one in ``read_as``."""
 
     name = 'swapped_channels'
     summary = 'sensors are plugged into each other'
@@ -43,7 +43,7 @@ class SwappedChannels(Effect[Term]):
         return matrix
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """True channels, and those that they are read as."""
+        """Record the true channels, and those that they are read as."""
         return EffectRecord(self.name, {k: list(term.site[k]) for k in ('channels', 'read_as')})
 
     def term(self, record: EffectRecord) -> Term:
@@ -53,7 +53,7 @@ class SwappedChannels(Effect[Term]):
 
 
 class SwappedCoils(Effect[Term]):
-    """Each emitter of ``coils`` is shown in the place of the one in ``read_as``."""
+    """Shows each emitter of ``coils`` in the place of the one in ``read_as``."""
 
     name = 'swapped_coils'
     summary = 'emitters are plugged into each other'
@@ -70,7 +70,7 @@ class SwappedCoils(Effect[Term]):
         return matrix[None]
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """True emitters, and those that they are read as."""
+        """Record the true emitters, and those that they are read as."""
         return EffectRecord(self.name, {k: list(term.site[k]) for k in ('coils', 'read_as')})
 
     def term(self, record: EffectRecord) -> Term:
@@ -81,7 +81,7 @@ class SwappedCoils(Effect[Term]):
 
 
 class DeadChannel(Effect[Term]):
-    """Channels whose readings are noise; they take no part in anything."""
+    """Silences channels whose readings are noise; they take no part in anything."""
 
     name = 'dead_channel'
     summary = 'a channel hears nothing'

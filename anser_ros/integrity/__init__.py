@@ -1,1 +1,1 @@
-"""May a pose be trusted: judges of what poses are made from, and the states that they say."""
+"""Judges whether a pose may be trusted, by what it is made from, and names the states of it."""

@@ -1,4 +1,4 @@
-"""A model that followed the references, while they are silent: it ages, and is then given up.
+"""Ages a model that followed the references while they are silent, and then gives it up.
 
 Metal goes on moving when nobody tells of it any more. So the model in force becomes less certain
 from frame to frame, by what the metal made of the field while it was still seen, and past a bound
@@ -35,7 +35,7 @@ metal may turn aside. With 0 that is not covered; more makes poses uncertain for
 
 @dataclass(frozen=True)
 class Standing:
-    """What a frame may be tracked with.
+    """Says what a frame may be tracked with.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class ModelAge:
 
     @property
     def newest_ns(self) -> int:
-        """Stamp of the newest answer, ns; 0 before there was one."""
+        """Return the stamp of the newest answer, ns; 0 before there was one."""
         return self._answers[-1][0] if self._answers else 0
 
     def forget(self) -> None:

@@ -1,4 +1,4 @@
-"""Whether a field model lies where the reference sensors say that the board is.
+"""Judges whether a field model lies where the reference sensors say that the board is.
 
 A model that lies beside its board as a whole gives poses that are as far off, and no residual of
 a tool shows it: every field of the model is a field of the board, a little elsewhere. References
@@ -67,7 +67,7 @@ not recorded."""
 
 @dataclass(frozen=True)
 class Misplacement:
-    """How far a model's board lies from where the references have it.
+    """Says how far a model's board lies from where the references have it.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Misplacement:
 
     @property
     def is_certain(self) -> bool:
-        """Whether the model lies so far aside that its poses cannot be trusted."""
+        """Return whether the model lies so far aside that its poses cannot be trusted."""
         far = float(np.linalg.norm(self.shift_m))
         across = float(self.sigma_m @ np.abs(self.shift_m)) / max(far, 1e-12)
         return self.misfit < EXPLAINED and far > max(FAR_M, FAR_SIGMAS * across)

@@ -1,4 +1,4 @@
-"""Whether reference readings are those of a field without metal.
+"""Judges whether reference readings are those of a field without metal.
 
 A baseline is what all later readings are compared with: metal that lay there when it was taken is
 part of the field for ever, and no refit sees it. So a baseline has to agree with what is known of
@@ -214,7 +214,7 @@ def check_as_drawn(
 
 
 def survey_errors(drawn: DrawnReadings, accuracy: Accuracy) -> Array:
-    """What each sensor's survey does to its readings, (S, 6, K), T a standard deviation.
+    """Return what each sensor's survey does to its readings, (S, 6, K), T a standard deviation.
 
     Six a sensor: its place along x, y and z, its axis along two directions across, its gain.
     """

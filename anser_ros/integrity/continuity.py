@@ -1,4 +1,4 @@
-"""One sensor's or body's poses through time: how far it may have moved, and when a track begins.
+"""Follows poses through time: how far a sensor or body may have moved, and when a track begins.
 
 A single residual that passes the gate proves little when most of its neighbours in time do not:
 of wrong poses a few pass by chance. So after refusals a pose needs others before it that are
@@ -38,14 +38,14 @@ leaps of uncertain poses pass."""
 
 
 class MotionBounds(NamedTuple):
-    """The largest speed (m/s) and acceleration (m/s^2) of a tool."""
+    """Holds the largest speed (m/s) and acceleration (m/s^2) of a tool."""
 
     speed_m_s: float
     acceleration_m_s2: float
 
 
 class Place(NamedTuple):
-    """Where something was, and how well that is known: stamp, position (m), and its sigma, m."""
+    """Says where something was, and how well that is known: stamp, position (m), its sigma, m."""
 
     stamp_ns: int
     position: Sequence[float]
@@ -94,7 +94,7 @@ class Continuity:
 
     @property
     def refused_share(self) -> float:
-        """Share of the last second's frames that were refused although there were signals."""
+        """Return the share of the last second's frames that were refused in spite of signals."""
         return self._refused / max(len(self._record), 1)
 
     def forget(self) -> None:

@@ -1,4 +1,4 @@
-"""What sensors read over a drawn board, and how that changes with place, direction and coils."""
+"""Predicts what sensors read over a drawn board, with its slopes by place, direction and coils."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ current that is 10 % off is another fault."""
 
 @dataclass(frozen=True)
 class DrawnReadings:
-    """Fluxes of S sensors over a drawn board of K coils, in phase, with their derivatives.
+    """Holds in-phase fluxes of S sensors over a drawn board of K coils, with their derivatives.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class DrawnReadings:
         return DrawnReadings(points, axes, along[0], np.array(along[1:]), by_axis)
 
     def turned(self, about: Array) -> Array:
-        """Derivative by a turn of all sensors about a point along x, y and z, (3, S, K), T/rad."""
+        """Return the derivative by turns of all sensors at a point about x, y, z, (3, S, K)."""
         eye = np.eye(3)
         moved = np.cross(eye[:, None, :], self.points - about)
         twisted = np.cross(eye[:, None, :], self.axes)
@@ -66,7 +66,8 @@ class DrawnReadings:
         )
 
     def by_manufacture(self, centres: Array) -> Array:
-        """What each coil's deviation from the drawing does, (6 K, S, K), T a standard deviation.
+        """Return what each coil's deviation from its drawing does, (6 K, S, K), T a standard
+        deviation.
 
         Six a coil: its strength, its place along x, y and z, its tilt about x and y.
         """

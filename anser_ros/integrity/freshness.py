@@ -1,4 +1,4 @@
-"""Whether a channel's readings are new: a reading without new noise is an old one.
+"""Judges whether a channel's readings are new: a reading without new noise is an old one.
 
 Each reading is compared with the channel's own readings of the last seconds. Two explanations
 compete: *new*, the difference holds the noise of two readings; *stuck*, it holds rounding alone,
@@ -157,5 +157,5 @@ class Freshness:
         return replace(frame, codes=np.where(self._ages > 0, STUCK_CODE, frame.codes))
 
     def reason(self, row: int) -> str:
-        """What is said of a stuck reading of the last frame."""
+        """Return what is said of a stuck reading of the last frame."""
         return f'stuck: the same reading as {self.age_s[row]:.2g} s ago'

@@ -1,4 +1,4 @@
-"""Whether the field model still fits what all sensors measure.
+"""Judges whether the field model still fits what all sensors measure.
 
 One sensor's residual may be bad for many reasons. When nearly all sensors' are for seconds, the
 model is of another board, out of date, or scaled wrong, and the few poses that pass the gate are
@@ -31,7 +31,7 @@ later after metal has gone."""
 
 
 class ModelRecord:
-    """How many readings the model explained lately."""
+    """Counts how many readings the model explained lately."""
 
     def __init__(self) -> None:
         self._frames: deque[tuple[int, int, int, float]] = deque()
@@ -46,7 +46,7 @@ class ModelRecord:
 
     @property
     def refused_share(self) -> float:
-        """Share of the last seconds' readings that the model did not explain."""
+        """Return the share of the last seconds' readings that the model did not explain."""
         return self._refused / max(self._total, 1)
 
     def add(self, stamp_ns: int, refused: int, total: int, residual: float) -> None:
@@ -81,7 +81,7 @@ class ModelRecord:
 
     @property
     def reason(self) -> str:
-        """Why the model is doubtful: the share, and how large residuals are."""
+        """Return why the model is doubtful: the share, and how large residuals are."""
         residuals = sorted(r for _, _, _, r in self._frames if math.isfinite(r))
         typical = residuals[len(residuals) // 2] if residuals else math.nan
         return (

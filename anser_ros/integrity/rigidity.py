@@ -1,4 +1,4 @@
-"""What the coils of a rigid body say of each other.
+"""Judges what the coils of a rigid body say of each other.
 
 A body's pose says where each of its coils is, and each coil says so itself. The two may differ by
 their errors, by what the body's survey has wrong, and by what the coil's gain has wrong; a coil
@@ -43,13 +43,13 @@ is not recorded."""
 
 
 def allowed_m(sigma_m: float, survey_m: float) -> float:
-    """How far, m, a coil may be from its place in the body by its own sigma and the survey's."""
+    """Return how far, m, a coil may be off its place in the body by its sigma and the survey's."""
     return max(SIGMAS * sigma_m, HARMFUL_M, SURVEYS * survey_m)
 
 
 @dataclass(frozen=True)
 class SurveyErrors:
-    """How well a tool is known: its coils' places, m an axis, their axes, rad, and their gains.
+    """Says how well a tool is known: its coils' places, m an axis, their axes, rad, and gains.
 
     A field over a board falls with the third power of the distance, so that a coil whose gain is
     wrong by g seems to be g/3 of its distance from the board elsewhere.
@@ -115,7 +115,7 @@ def distances(
     took_part: NDArray[np.bool_],
     survey: SurveyErrors,
 ) -> Array:
-    """How far each coil's own pose is from its place in the body.
+    """Return how far each coil's own pose is from its place in the body, m.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def distances(
 
 
 def reason(distance: float, away_m: float, turned_rad: float) -> str:
-    """What is said of a coil that contradicts its body."""
+    """Return what is said of a coil that contradicts its body."""
     sigmas = math.sqrt(distance)
     return (
         f'{1e3 * away_m:.2g} mm and {math.degrees(turned_rad):.2g} deg from its place in the '

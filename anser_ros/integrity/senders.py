@@ -1,4 +1,4 @@
-"""Whether a topic has one sender, told by the numbers that each sender gives its messages.
+"""Tells whether a topic has one sender, by the numbers that each sender gives its messages.
 
 The middleware numbers what a publisher sends, 1, 2, 3, but does not say who it was. Messages that
 continue one run of numbers are one stream; a second run is a second sender, known by its first
@@ -52,7 +52,7 @@ class Senders:
         self._runs, self.said = [], ''
 
     def continues(self, number: int | None) -> bool:
-        """Whether a message is the next one of the only sender that is heard."""
+        """Return whether a message is the next one of the only sender that is heard."""
         return len(self._runs) == 1 and number == self._runs[0].number + 1
 
     def take(

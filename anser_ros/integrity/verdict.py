@@ -1,4 +1,4 @@
-"""What the judges may say of a pose that its own frame had found good."""
+"""Names what the judges may say of a pose that its own frame had found good."""
 
 INCONSISTENT = 'inconsistent'
 """State of a coil whose pose contradicts the rest of its body."""

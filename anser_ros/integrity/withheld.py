@@ -1,4 +1,4 @@
-"""Why no pose is given though one could be solved: a state, and the reason in words."""
+"""Says why no pose is given though one could be solved: a state, and the reason in words."""
 
 from typing import NamedTuple
 
@@ -28,7 +28,7 @@ def state_of(code: int) -> str:
 
 
 class Withheld(NamedTuple):
-    """One reason for which all poses of a frame are withheld.
+    """Names one reason for which all poses of a frame are withheld.
 
     Attributes
     ----------
