@@ -1,1 +1,1 @@
-"""The live refit: the field model follows reference sensors while metal moves."""
+"""Refits live: the field model follows reference sensors while metal moves."""

@@ -1,4 +1,4 @@
-"""Agreement of reference coils: each one's readings against what the other coils predict for it.
+"""Compares each reference coil's readings with what the other coils predict for it.
 
 All of it follows from the decompositions that a `Bank` holds, by the rules of the conditional
 normal distribution; no matrix of the size of all readings is decomposed again.

@@ -1,4 +1,4 @@
-"""The refitted model: calibrated dipoles, the layer's added moments, and their uncertainty."""
+"""Assembles the refitted model: calibrated dipoles, the layer's moments, their uncertainty."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -41,7 +41,7 @@ points, a millisecond's work at the most."""
 
 @dataclass(frozen=True)
 class Geometry:
-    """Dipoles of the calibrated model and of some layers.
+    """Holds dipoles of the calibrated model and of some layers.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Geometry:
 
     @property
     def name(self) -> tuple[str, ...]:
-        """Names of the layers, which are equal for the same dipoles."""
+        """Return names of the layers, which are equal for the same dipoles."""
         return tuple(self.layer_rows)
 
     @classmethod

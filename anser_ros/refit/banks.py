@@ -1,4 +1,4 @@
-"""The hypotheses for each set of reference coils that is in use, each computed once."""
+"""Keeps the hypotheses for each set of reference coils that is in use, each computed once."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ Fewer, and coils that come and go cost a bank each time; more only cost memory."
 
 
 class Banks:
-    """Banks of hypotheses by the coils in use, with the slots for bodies of each.
+    """Keeps banks of hypotheses by the coils in use, with the slots for bodies of each.
 
     Parameters
     ----------

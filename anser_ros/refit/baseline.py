@@ -1,4 +1,4 @@
-"""The baseline: the reading of each reference sensor while no metal is near.
+"""Finds the baseline: the reading of each reference sensor while no metal is near.
 
 It is the mean over the last moments before the refit starts. The live refit works on the change
 of the readings since then, so that the errors of the survey cancel in it.
@@ -26,7 +26,7 @@ MOST_FRAMES = 2000
 
 
 class ReadingWindow:
-    """The most recent readings of a set of sensors.
+    """Holds the most recent readings of a set of sensors.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class ReadingWindow:
 
     @property
     def full(self) -> bool:
-        """Whether the readings reach back over (nearly) the whole span."""
+        """Return whether the readings reach back over (nearly) the whole span."""
         if len(self._frames) < FEWEST_FRAMES:
             return False
         return self._frames[-1][0] - self._frames[0][0] >= 0.9 * self._span_ns

@@ -1,4 +1,4 @@
-"""How probable each hypothesis about metal is, from frame to frame."""
+"""Follows how probable each hypothesis about metal is, from frame to frame."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,7 +12,7 @@ NOTHING = 0.99
 
 
 class Belief:
-    """Probabilities of the hypotheses; the first of them is that nothing has changed.
+    """Holds probabilities of the hypotheses; the first of them is that nothing has changed.
 
     Parameters
     ----------
@@ -39,12 +39,12 @@ class Belief:
 
     @property
     def something(self) -> bool:
-        """Whether the field may have changed, so that the calibrated model does not hold."""
+        """Return whether the field may have changed: the calibrated model does not hold then."""
         return bool(self.weights[0] < NOTHING)
 
     @property
     def log_odds(self) -> float:
-        """Logarithm of the odds that something has changed."""
+        """Return the logarithm of the odds that something has changed."""
         nothing = self.weights[0]
         return float(np.log(max(1.0 - nothing, 1e-300)) - np.log(max(nothing, 1e-300)))
 

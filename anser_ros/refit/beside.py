@@ -1,4 +1,4 @@
-"""What takes longer than a frame may, worked out beside the frames by one thread of the process.
+"""Works out what takes longer than a frame may beside the frames, by one thread of the process.
 
 A result comes into use at a fixed time after it was asked for, told by the stamps of the frames:
 so what the refit says does not depend on how busy the machine is, and a recording gives what was
@@ -29,7 +29,7 @@ def begin_beside(work: Callable[[], None]) -> None:
 
 
 class Beside(Generic[Result]):
-    """One piece of work that has been given to the thread.
+    """Runs one piece of work that has been given to the thread.
 
     Parameters
     ----------

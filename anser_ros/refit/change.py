@@ -1,4 +1,4 @@
-"""Which readings are refitted, how noisy they are, and their average while nothing moves."""
+"""Says which readings are refitted, how noisy they are, and averages them while nothing moves."""
 
 import math
 from dataclasses import dataclass, field
@@ -80,7 +80,7 @@ class NoiseLevel:
 
 @dataclass
 class Average:
-    """The running mean of the readings over the frames in which they do not change.
+    """Keeps the running mean of the readings over the frames in which they do not change.
 
     Each new frame is held against the mean so far, with the noise that is expected of their
     difference, and the mean begins anew at the first frame that is off: a change must be followed

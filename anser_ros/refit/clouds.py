@@ -1,4 +1,4 @@
-"""Hypotheses about the place of unknown metal, each a cloud of candidate sources.
+"""Makes hypotheses about the place of unknown metal, each a cloud of candidate sources.
 
 A *cloud* fills a part of space with point sources of independent polarisability, each of a
 variance proportional to the volume it stands for: the prior is then white in space and does not
@@ -38,7 +38,7 @@ BODY_RADIUS = 0.45
 
 @dataclass(frozen=True)
 class Region:
-    """The board's extent, and the volume over it in which the field must be right.
+    """Describes the board's extent, and the volume over it in which the field must be right.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Cloud:
-    """Candidate sources of one hypothesis.
+    """Holds candidate sources of one hypothesis.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Where reference coils tell most: the expected error of poses over a family of metals.
+"""Finds where reference coils tell most: the expected error of poses over a family of metals.
 
 For metal of a known kind and strength everything is Gaussian, so what any choice of coils would
 leave unknown follows before a coil is glued on: the posterior covariance of the metal's
@@ -35,7 +35,7 @@ MOST_EXCHANGES = 3
 
 @dataclass(frozen=True)
 class StatedMetal:
-    """One metal of the family, for C candidate coils.
+    """States one metal of the family, for C candidate coils.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class StatedMetal:
 
 @dataclass(frozen=True)
 class Design:
-    """A choice of coils.
+    """Holds a choice of coils.
 
     Attributes
     ----------

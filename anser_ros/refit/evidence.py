@@ -1,4 +1,4 @@
-"""Strengths that a hypothesis may have, and what one frame of readings says about each.
+"""Weighs strengths that a hypothesis may have, and what one frame of readings says about each.
 
 The strength is the variance that metal gives a reading. It is unknown, so the evidence of a
 hypothesis is its likelihood summed over a grid of strengths; those of the real and of the
@@ -19,7 +19,7 @@ STRENGTHS = 10.0 ** np.arange(-2.0, 11.0, 0.5)
 
 @dataclass(frozen=True)
 class FrameEvidence:
-    """The evidence of one frame for the hypotheses.
+    """Holds the evidence of one frame for the hypotheses.
 
     Attributes
     ----------

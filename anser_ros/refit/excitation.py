@@ -1,4 +1,4 @@
-"""The field of the emitters below and around the board, which drives the metal there.
+"""Computes the emitters' field below and around the board, which drives the metal there.
 
 A calibrated model is fitted where tools are, over the board. Carried on to below the board it is
 off by tens of percent near the coils, while the coils' drawing gives that field to a percent. So
@@ -34,7 +34,7 @@ SEARCH_HEIGHT_M = 0.02
 
 @dataclass(frozen=True)
 class Excitation:
-    """The driving field, in phase with the current of each emitter.
+    """Gives the driving field, in phase with the current of each emitter.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Readings of references beside their baselines, with a reason for each unusable one."""
+"""Puts references' readings beside their baselines, with a reason for each unusable one."""
 
 import math
 
@@ -62,7 +62,8 @@ def _least_power(baseline: ComplexArray) -> NDArray[np.float64]:
 
 
 class NoiseUnits:
-    """Changes of readings in units of the nominal noise, in phase with what drives the metal.
+    """Turns changes of readings into units of the nominal noise, in phase with what drives the
+    metal.
 
     Parameters
     ----------

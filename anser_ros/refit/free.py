@@ -1,4 +1,4 @@
-"""Free dipoles, a separate set for every emitter, as a rival of the shared polarisability.
+"""Fits free dipoles, a separate set for every emitter, as a rival of the shared polarisability.
 
 This is what a refit without the physics of metal does: each emitter's change is fitted by sources
 of its own, with nothing in common but where they may be. Clouds, noise, evidence for standoff and

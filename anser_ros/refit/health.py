@@ -1,4 +1,4 @@
-"""Faults of reference coils, each of which is judged by what the others predict for it.
+"""Finds faults of reference coils, each judged by what the others predict for it.
 
 A reference that is dead, moved, saturated or unplugged changes alone; metal changes many readings
 at once, in the proportions that the emitters' fields have at one place. So "coil s is at fault" is
@@ -53,7 +53,7 @@ MOST_AT_ONCE = 4
 
 
 class ReferenceHealth(NamedTuple):
-    """One reference coil in one frame.
+    """Says how one reference coil is in one frame.
 
     Attributes
     ----------
@@ -201,7 +201,7 @@ class ReferenceWatch:
 
     @property
     def is_outvoted(self) -> bool:
-        """Whether more coils disagree than are in use, so that either may be the wrong ones."""
+        """Return whether more coils disagree than are in use, so that either may be wrong."""
         return self.reason.count(DISAGREES) > self.count - int(self.excluded.sum())
 
     def agreed(self, coil: int, agrees: bool) -> None:

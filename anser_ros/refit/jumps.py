@@ -1,4 +1,4 @@
-"""Readings that jump: metal moves steadily and changes all references, faults do neither.
+"""Finds readings that jump: metal moves steadily and changes all references, faults do neither.
 
 One reference that is wrong contradicts the others. Where many go wrong at one moment, they outvote
 the good ones, and in what they read from then on they may look like metal. The moment itself tells
@@ -47,7 +47,7 @@ RETURNED = 0.1
 
 @dataclass(frozen=True)
 class Jumps:
-    """How far a frame's readings are off their courses.
+    """Says how far a frame's readings are off their courses.
 
     Attributes
     ----------
@@ -65,7 +65,8 @@ class Jumps:
 
 
 class Courses:
-    """Where each reference's change is on its way to, and how far those that jumped are off.
+    """Follows where each reference's change is on its way to, and how far those that jumped are
+    off.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Compiled products of every frame of the refit: each table is read once, in single precision.
+"""Compiles the products of every frame: each table is read once, in single precision.
 
 A frame's time goes into waiting for the tables, not into arithmetic. Single precision is 1e-7 of a
 reading that is at most 1e6 noise deviations. Sums may be reordered, so that they go through vector

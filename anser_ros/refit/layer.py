@@ -1,4 +1,4 @@
-"""The equivalent layer: a few dipoles that make the field of any cloud in the tracked volume.
+"""Finds the equivalent layer: few dipoles that make the field of any cloud in the tracked volume.
 
 A *layer* is a regular grid of dipoles on or below the board, or on a box around the volume; it
 takes the place of a cloud's many sources, whose field it reproduces where tools are.
@@ -51,7 +51,7 @@ INNER = 0.83
 
 @dataclass(frozen=True)
 class Layer:
-    """The dipoles that represent the field of a cloud.
+    """Holds the dipoles that represent the field of a cloud.
 
     Attributes
     ----------

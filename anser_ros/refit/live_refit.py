@@ -1,4 +1,4 @@
-"""Live refit: reference coils make the field model follow metal that moves.
+"""Makes the field model follow metal that moves, by reference coils.
 
 The calibrated model is kept; what is refitted is the change since a distortion-free baseline. All
 emitters illuminate the same metal, so one polarisability a source explains all of them, and a few
@@ -344,7 +344,7 @@ class LiveRefit:
         )  # fmt: skip
 
     def heed_tools(self, flux_noise_t: float) -> None:
-        """From now on let `witnessed` have a say; the noise is of the tools' components, T."""
+        """Let `witnessed` have a say from now on; the noise is of the tools' components, T."""
         self._witness = Witness(self._tables, self.model, self.settings.tools, flux_noise_t)
 
     def witnessed(self, readings: Sequence[ToolReading]) -> None:

@@ -1,4 +1,4 @@
-"""The uncertainty of the refit: a few modes and a remainder.
+"""Condenses the uncertainty of the refit into a few modes and a remainder.
 
 A *mode* is one direction in which the refitted model may be wrong: a set of moments whose field
 has the size of one standard deviation. Modes are independent of each other. They are the principal
@@ -23,7 +23,7 @@ MOST = len(STRENGTHS) - 1
 
 @dataclass(frozen=True)
 class ErrorLevel:
-    """The noise with the indices of the strengths of the real and the imaginary part."""
+    """Holds the noise with the indices of the strengths of the real and the imaginary part."""
 
     noise: float
     strengths: tuple[int, int]
@@ -37,7 +37,7 @@ class ErrorLevel:
 
 @dataclass(frozen=True)
 class PosteriorModes:
-    """The error of a hypothesis' posterior in units of the noise.
+    """Holds the error of a hypothesis' posterior in units of the noise.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Reference coils on patches that move: their baseline follows from their pose.
+"""Places reference coils on patches that move: their baseline follows from their pose.
 
 Such a coil has no recorded baseline. What it should read without metal is the calibrated model's
 flux where a tracker says that it is, and the tracker's error becomes noise of that reading, far
@@ -78,7 +78,7 @@ FLUX_AGE_NS = 100_000_000
 
 @dataclass(frozen=True)
 class Placed:
-    """The patches' coils in one frame.
+    """Holds the patches' coils in one frame.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The bank of hypotheses: their evidence, and the change of the field under each of them.
+"""Keeps the bank of hypotheses: their evidence, and the field's change under each of them.
 
 Every cloud's hypothesis is a Gaussian of the readings, ``y ~ N(0, a C + s^2 N)``: metal of a total
 strength ``a`` as the cloud has it, the survey's errors in proportion, and noise. In the
@@ -43,7 +43,7 @@ def make_room(table: dict[Any, Any], most: int) -> None:
 
 @dataclass(frozen=True)
 class Eigenbasis:
-    """What a prior's covariance is made of, for the readings in use.
+    """Says what a prior's covariance is made of, for the readings in use.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Eigenbasis:
 
 
 class Bank:
-    """All hypotheses for the references that are in use.
+    """Holds all hypotheses for the references that are in use.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The predictions of one hypothesis: the covariance of readings, and the map to the field.
+"""Predicts by one hypothesis: the covariance of readings, and the map to the field.
 
 With the excitation B_k(r_j) of emitter k at source j and the coupling G_s(r_j) of coil s, a source
 of the polarisability tensor P_j changes the reading by ``G_s(r_j)^T P_j B_k(r_j)``: the same P_j
@@ -31,7 +31,7 @@ How the value was chosen is not recorded."""
 
 @dataclass(frozen=True)
 class Response:
-    """The prior of a source's polarisability tensor, as variances of its independent parts.
+    """Holds the prior of a source's polarisability tensor, as variances of its independent parts.
 
     A compact piece answers alike in all directions. A flat piece answers across its face only,
     and pieces that touch drive each other: in recordings, metal below a board answers differently
@@ -65,7 +65,7 @@ BODY = Response('', 1.0, 0.0, 0.5)
 
 @dataclass(frozen=True)
 class CloudPrior:
-    """One hypothesis about the change of the readings.
+    """Holds one hypothesis about the change of the readings.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""A hypothesis' metal in few numbers: the directions in which poses feel it.
+"""Reduces a hypothesis' metal to few numbers: the directions in which poses feel it.
 
 The field of a cloud's thousands of sources, as the layer makes it in the tracked volume, has some
 tens of directions that matter to poses. Coordinates along them have unit variance for metal of
@@ -30,7 +30,7 @@ AT_ONCE = 400
 
 @dataclass(frozen=True)
 class ReducedPrior:
-    """The coordinates of a hypothesis.
+    """Holds the coordinates of a hypothesis.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The readings of reference coils by sources, and the errors of their survey.
+"""Predicts what reference coils read of sources, and what errors of their survey do.
 
 A surveyed coil is a little elsewhere, points a little elsewhere and has a little other gain than
 the table says. Without metal that is part of its baseline and cancels; of the change that metal

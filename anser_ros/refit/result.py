@@ -1,4 +1,4 @@
-"""The results that the live refit reports of a frame."""
+"""Defines the results that the live refit reports of a frame."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -35,7 +35,7 @@ WITHHELD = {
 
 @dataclass(frozen=True)
 class Metal:
-    """The sources of the change, as the most likely cloud has them.
+    """Describes the sources of the change, as the most likely cloud has them.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ def locate_metal(
 
 @dataclass(frozen=True)
 class RefitResult:
-    """The result of one frame of the references.
+    """Holds the result of one frame of the references.
 
     Attributes
     ----------
@@ -128,12 +128,12 @@ class RefitResult:
 
     @property
     def withheld(self) -> str:
-        """State for which poses are to be withheld; empty where the model may be used."""
+        """Return the state for which poses are withheld; empty where the model may be used."""
         return WITHHELD.get(self.state, '')
 
     @property
     def is_answer(self) -> bool:
-        """Whether the references told the model of this frame; else it is only the last resort."""
+        """Return whether the references told this frame's model; else it is the last resort."""
         return not self.withheld
 
     @cached_property
@@ -143,7 +143,7 @@ class RefitResult:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Names of the references that took no part."""
+        """Return the names of the references that took no part."""
         return tuple(r.name for r in self.references if r.state != health.OK)
 
     @cached_property

@@ -1,4 +1,4 @@
-"""A cheap search of hundreds of places for the compact bodies that merit a full hypothesis.
+"""Searches hundreds of places cheaply for the compact bodies that merit a full hypothesis.
 
 A body's readings lie in a few directions of the space of readings. With them alone, and one
 variance for all that they leave, its evidence costs a hundredth of the full one; the best few
@@ -61,7 +61,7 @@ def body_factor(cloud: Cloud, references: SensorTable, excitation: Array) -> Sin
 
 @dataclass
 class BodySearch:
-    """The directions of the bodies' readings for the coils in use.
+    """Holds the directions of the bodies' readings for the coils in use.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The few compact bodies that are full hypotheses at present, chosen frame by frame.
+"""Chooses, frame by frame, the few compact bodies that are full hypotheses at present.
 
 Hundreds of compact bodies (`refit.clouds`) are too many to be judged in full in every frame. So
 the bank has a few *slots*, places for one body each; a body that explains the readings better

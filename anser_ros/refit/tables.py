@@ -1,4 +1,4 @@
-"""The tables that a refit computes once: driving field, layers and predictions of all clouds."""
+"""Computes a refit's tables once: driving field, layers and predictions of all clouds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -39,7 +39,7 @@ MOST_ORIENTED = 1000
 
 @dataclass(frozen=True)
 class RefitTables:
-    """The precomputed tables of a refit.
+    """Holds the precomputed tables of a refit.
 
     Attributes
     ----------

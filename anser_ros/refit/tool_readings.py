@@ -1,4 +1,5 @@
-"""What the coils of a rigid tool read, by its pose, by their own errors, and by nothing else.
+"""Predicts what the coils of a rigid tool read, by its pose, by their own errors, and nothing
+else.
 
 The readings of a tool's coils are compared at the pose that was found for it. The pose is free, so
 what a step or turn of the tool would make of them says nothing (`ToolRows.pose`). What is wrong
@@ -31,7 +32,7 @@ from one frame to the next."""
 
 @dataclass(frozen=True)
 class ToolReading:
-    """What the coils of one rigid tool read at a pose that was found for it.
+    """Holds what the coils of one rigid tool read at a pose that was found for it.
 
     Attributes
     ----------
@@ -50,7 +51,7 @@ class ToolReading:
 
 
 class CoilErrors:
-    """What is wrong with a tool's coils: gain, place and axis of each, learnt without metal.
+    """Holds what is wrong with a tool's coils: gain, place and axis of each, learnt without metal.
 
     Parameters
     ----------
@@ -74,7 +75,7 @@ class CoilErrors:
 
     @property
     def posterior(self) -> tuple[Array, Array]:
-        """Mean (7 S,) and covariance of gain (re, im), place (3, m) and axis (2, rad)."""
+        """Return mean (7 S,) and covariance of gain (re, im), place (3, m) and axis (2, rad)."""
         if self._solved is None:
             covariance = np.linalg.inv(self._precision)
             mean = covariance @ self._told
@@ -91,7 +92,7 @@ class CoilErrors:
 
 @dataclass(frozen=True)
 class ToolRows:
-    """A tool's readings linearised at a pose, in noise units turned to the emitters' phases.
+    """Holds a tool's readings linearised at a pose, in noise units turned to the emitters' phases.
 
     Attributes
     ----------

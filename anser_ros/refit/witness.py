@@ -1,4 +1,5 @@
-"""Tools as witnesses of metal: what their coils contradict updates what the references leave open.
+"""Takes tools as witnesses of metal: what their coils contradict updates what references leave
+open.
 
 The references tell a hypothesis' metal with an error that is known (`refit.posterior`). A tool
 that wanders through the field sees this error: of the readings of its coils a pose takes six
@@ -63,7 +64,7 @@ class _Filter:
 
 
 class Witness:
-    """The filters of all hypotheses that count.
+    """Holds the filters of all hypotheses that count.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""Poses of single coils and rigid tools from frames of fluxes, with a state and a covariance."""
+"""Finds poses of single coils and rigid tools in frames of fluxes, with state and covariance."""

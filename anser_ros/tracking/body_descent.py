@@ -1,4 +1,4 @@
-"""Kernels of a rigid tool's solve: all of its coils at once, with errors that they share.
+"""Compiles the kernels of a rigid tool's solve: all of its coils at once, with errors they share.
 
 Compiled; `rigid` is what calls them. The residual of every coil and its slopes are whitened by the
 noise alone; errors that coils share enter by `fill_common` (Woodbury's identity).

@@ -1,4 +1,4 @@
-"""One rigid tool through time: all of its usable coils together, coils that disagree left out."""
+"""Follows a rigid tool through time by all of its usable coils, without those that disagree."""
 
 import math
 from dataclasses import dataclass, field
@@ -50,7 +50,7 @@ LEFT_OUT_S = 1.0
 
 @dataclass
 class BodyTrack:
-    """Memory of one body: its last good pose, its noise scale, the coils that disagreed."""
+    """Remembers one body: its last good pose, its noise scale, the coils that disagreed."""
 
     good: BodySolution | None = None
     good_ns: int = 0
@@ -65,7 +65,7 @@ class BodyTrack:
         self.left_out = frozenset()
 
     def expected(self, stamp_ns: int) -> Start | None:
-        """Where the body is if it moves on as it did between its last two good poses."""
+        """Return where the body is if it moves on as it did between its last two good poses."""
         if self.good is None:
             return None
         position, rotation = self.good.position, self.good.rotation
@@ -84,7 +84,7 @@ class BodyTrack:
 
 @dataclass(frozen=True)
 class BodyFit:
-    """A body's solution, the coils (indices) that took part, and the degrees of freedom."""
+    """Holds a body's solution, the coils (indices) that took part, and the degrees of freedom."""
 
     solution: BodySolution
     used: NDArray[np.int64]
@@ -96,13 +96,13 @@ class BodyFit:
         return self.solution.chi2 / self.freedom
 
     def good(self, gate: float) -> bool:
-        """Whether the descent has ended, and below the gate."""
+        """Return whether the descent has ended, and below the gate."""
         return self.solution.converged and self.ratio <= gate**2
 
 
 @dataclass(frozen=True)
 class BodyResult:
-    """An estimate with the fit behind it; None where nothing was solved."""
+    """Holds an estimate with the fit behind it; None where nothing was solved."""
 
     estimate: PoseEstimate
     fit: BodyFit | None = None

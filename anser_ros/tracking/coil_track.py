@@ -1,4 +1,4 @@
-"""One tool sensor through time: warm or cold solve, gate, state, uncertainty."""
+"""Follows one tool sensor through time: warm or cold solve, gate, state, uncertainty."""
 
 import math
 from dataclasses import dataclass, field
@@ -46,7 +46,7 @@ up to which the model's error at a pose is reused."""
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """What the model's uncertainty does to a sensor at a pose.
+    """Says what the model's uncertainty does to a sensor at a pose.
 
     Attributes
     ----------
@@ -73,11 +73,11 @@ class PoseErrors:
 
     @property
     def among_metal(self) -> bool:
-        """Whether the sensor is where the dipoles that stand for metal are no description."""
+        """Return whether the sensor is where dipoles that stand for metal describe it no more."""
         return self.among > 1.0
 
     def holds(self, context: SolveContext, position: Array, axis: Array) -> bool:
-        """Whether this is still good for a context and a pose."""
+        """Return whether this is still good for a context and a pose."""
         own = self.context
         if own.modes is not context.modes:
             return False
@@ -91,7 +91,7 @@ class PoseErrors:
 
 @numba.njit(cache=True, error_model='numpy')
 def carried_on(position, old_position, axis, old_axis, steps):  # type: ignore[no-untyped-def]
-    """Position and unit axis after so many more of the last steps."""
+    """Return position, m, and unit axis after so many more of the last steps."""
     new_position, new_axis, norm = np.empty(3), np.empty(3), 0.0
     for i in range(3):
         new_position[i] = position[i] + steps * (position[i] - old_position[i])
@@ -104,7 +104,7 @@ def carried_on(position, old_position, axis, old_axis, steps):  # type: ignore[n
 
 @dataclass
 class CoilTrack:
-    """Memory of one sensor: its last good pose, its noise scale, the model error near it.
+    """Remembers one sensor: its last good pose, its noise scale, the model error near it.
 
     While no pose is good, ``suspect`` is the best bad one. It tells whether anything has changed,
     so that the costly scan need not run in every frame of a long distortion; it never becomes a
@@ -126,7 +126,7 @@ class CoilTrack:
         self.failures = 0
 
     def expected(self, stamp_ns: int) -> Start | None:
-        """Where the sensor is if it moves on as it did between its last two good poses."""
+        """Return where the sensor is if it moves on as it did between its last two good poses."""
         if self.good is None:
             return None
         position, axis = self.good.position, self.good.axis
@@ -163,7 +163,7 @@ class _CoilFrame:
 
 @dataclass(frozen=True)
 class CoilResult:
-    """An estimate with the solution behind it and the errors reckoned with (None: not solved).
+    """Holds an estimate with its solution and the errors reckoned with (None: not solved).
 
     ``heard`` says of a coil that nothing was solved for that its fluxes are good all the same.
     """
@@ -176,7 +176,7 @@ class CoilResult:
 
     @property
     def usable(self) -> bool:
-        """Whether a body may use the coil: it has a solution, and is not among metal."""
+        """Return whether a body may use the coil: it has a solution, and is not among metal."""
         return (self.heard or self.solution is not None) and not (
             self.error and self.error.among_metal
         )

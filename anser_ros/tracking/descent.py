@@ -1,4 +1,5 @@
-"""Kernels of a single coil's solve: its flux and slopes, whitening, damped steps, descent.
+"""Compiles the kernels of a single coil's solve: flux and slopes, whitening, damped steps,
+descent.
 
 Compiled; `solve` is what calls them. A coil's pose is its position and its unit axis, which moves
 by a two-parameter step in its tangent plane. The damping is Marquardt's (Nocedal and Wright,

@@ -1,4 +1,4 @@
-"""Emitters that have died: tracking goes on with those that are left.
+"""Goes on tracking with the emitters that are left when others have died.
 
 An emitter of which no sensor has a flux (not finite, or exactly zero) has no part in the solve: it
 has no weight, and the covariance grows by what it would have told.
@@ -18,7 +18,7 @@ FEWEST_EMITTERS = 6
 
 @dataclass(frozen=True)
 class ReducedScene:
-    """A context without its dead emitters, and what it was made from."""
+    """Holds a context without its dead emitters, and what it was made from."""
 
     whole: SolveContext
     living: NDArray[np.bool_]

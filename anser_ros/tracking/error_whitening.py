@@ -1,4 +1,4 @@
-"""Whitening by noise and model error in one kernel, for models that change every frame."""
+"""Whitens by noise and model error in one kernel, for models that change every frame."""
 
 import math
 
@@ -63,7 +63,7 @@ def _fill_spacing(positions, spacing):  # type: ignore[no-untyped-def]
 
 
 def source_spacing(positions: Array, floor_m: float) -> Array:
-    """How far dipoles in the room where tools may be are from their neighbours, shape (N,).
+    """Return how far dipoles where tools may be are from their neighbours, m, shape (N,).
 
     Dipoles that stand for metal say nothing about the field between themselves and others of
     their kind. Those lower than ``floor_m`` are below all tools and get 0.

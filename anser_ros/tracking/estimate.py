@@ -1,4 +1,4 @@
-"""What tracking reports, and what it is told: states, pose estimates, settings."""
+"""Defines what tracking reports, and what it is told: states, pose estimates, settings."""
 
 import math
 from dataclasses import dataclass, field
@@ -50,7 +50,7 @@ right."""
 
 @dataclass(frozen=True)
 class TrackerSettings:
-    """What the tracker may assume.
+    """Says what the tracker may assume.
 
     Attributes
     ----------
@@ -113,7 +113,7 @@ class TrackerSettings:
 
     @property
     def has_gate(self) -> bool:
-        """Whether poses are refused for what they contradict."""
+        """Return whether poses are refused for what they contradict."""
         return self.gate < NO_GATE
 
     @property
@@ -122,7 +122,8 @@ class TrackerSettings:
         return self.volume or TrackedVolume()
 
     def margin(self, ratio: float) -> float:
-        """Chi-square by which a rival must be worse, at a residual power per freedom ``ratio``.
+        """Return the chi-square by which a rival must be worse, ``ratio`` being the residual power
+        per freedom.
 
         A misfit takes part in it as noise would; without a gate the best of poses that all fit
         badly is taken.
@@ -132,13 +133,13 @@ class TrackerSettings:
         return 2.0 * math.log(self.odds) * max(1.0, ratio)
 
     def leniency(self, scale: float) -> float:
-        """What ``max_sigma_m`` is multiplied by: without a gate, what misfit adds is forgiven."""
+        """Return the factor on ``max_sigma_m``: without a gate, what misfit adds is forgiven."""
         return 1.0 if self.has_gate else math.sqrt(max(1.0, scale))
 
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """One sensor's or body's pose in one frame, or why there is none.
+    """Holds one sensor's or body's pose in one frame, or why there is none.
 
     Attributes
     ----------
@@ -182,7 +183,7 @@ class PoseEstimate:
     reason: str = ''
 
     def with_sigma(self, sigma_position_m: float) -> 'PoseEstimate':
-        """The same estimate with another sigma of the position."""
+        """Return the same estimate with another sigma of the position."""
         return PoseEstimate(
             self.name, self.stamp_ns, self.state, self.position, self.axis, self.rotation,
             self.covariance, sigma_position_m, self.residual_t, self.chi2, self.model_id,
@@ -191,7 +192,7 @@ class PoseEstimate:
 
 
 def no_pose(name: str, stamp_ns: int, state: str, model_id: str, reason: str) -> PoseEstimate:
-    """An estimate without a pose: all figures NaN."""
+    """Return an estimate without a pose: all figures NaN."""
     nothing = np.full(3, np.nan)
     return PoseEstimate(
         name, stamp_ns, state, nothing, nothing, None, np.full((6, 6), np.nan), math.nan,
@@ -200,7 +201,7 @@ def no_pose(name: str, stamp_ns: int, state: str, model_id: str, reason: str) ->
 
 
 class NoiseScale:
-    """Running estimate of residual power over its expectation: 1 when the noise is as told.
+    """Estimates residual power over its expectation as frames pass: 1 when the noise is as told.
 
     An exponential mean over about ``memory`` good frames; it starts as if ``prior`` frames had
     been as expected.
@@ -213,7 +214,7 @@ class NoiseScale:
 
     @property
     def value(self) -> float:
-        """Residual power over its expectation, by which variances are multiplied."""
+        """Return residual power over its expectation, by which variances are multiplied."""
         return self._sum / self._weight
 
     def add(self, ratio: float) -> None:
@@ -225,8 +226,7 @@ class NoiseScale:
     def of_frame(
         self, ratio: float, usual: float, share: float, model_share: float, follows: bool
     ) -> float:
-        """Variance scale of one frame: the running one, more when the frame's residual asks for
-        it.
+        """Return one frame's variance scale: the running one, or more if its residual asks for it.
 
         Parameters
         ----------

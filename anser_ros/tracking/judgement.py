@@ -1,4 +1,4 @@
-"""A frame's poses, judged by each other and by the frames before, before any is given out.
+"""Judges a frame's poses by each other and by the frames before, before any is given out.
 
 Each pose has passed its own frame's gate. Here a coil has to agree with its body, a pose with
 where it came from, and the model with most of what is measured; see `anser_ros.integrity`.
@@ -32,7 +32,7 @@ CONTRADICTS = (states.RESIDUAL, states.INCONSISTENT)
 
 @dataclass(frozen=True)
 class RigidBody:
-    """A body's coils: their rows among the sensors, their places, and what was found."""
+    """Holds a body's coils: their rows among the sensors, their places, and what was found."""
 
     rows: NDArray[np.int64]
     coils: BodyCoils
@@ -40,7 +40,7 @@ class RigidBody:
 
 
 class Judgement:
-    """What the judges remember of a tracker's sensors and bodies."""
+    """Holds what the judges remember of a tracker's sensors and bodies."""
 
     def __init__(self) -> None:
         self._continuity: dict[str, Continuity] = {}

@@ -1,4 +1,4 @@
-"""Descent by position alone: the axis is the best one at every position (variable projection).
+"""Descends by position alone: the axis is the best one at every position (variable projection).
 
 From far away the joint descent is slow and ends in false minima, because position and axis trade
 against each other. With the axis eliminated three unknowns remain, and the slopes are those that

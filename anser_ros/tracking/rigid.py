@@ -1,4 +1,4 @@
-"""The 6-DoF pose of a rigid tool from all of its coils at once.
+"""Solves for the 6-DoF pose of a rigid tool from all of its coils at once.
 
 The rotation moves by a rotation vector in fg, R <- exp([w]) R, so no attitude is singular. Model
 errors are common to all coils; they enter as a low-rank part of the residuals' covariance
@@ -28,7 +28,7 @@ PARALLEL = 0.05
 
 @dataclass(frozen=True)
 class BodyCoils:
-    """Coils of a tool in its own frame: offsets (S, 3) m, unit axes (S, 3), lengths (S,) m.
+    """Holds a tool's coils in its own frame: offsets (S, 3) m, unit axes (S, 3), lengths (S,) m.
 
     ``changes`` (G, S) are relative changes of gains that several coils may have in common, one
     standard deviation each; None where there are none.
@@ -41,7 +41,7 @@ class BodyCoils:
 
     @cached_property
     def observable(self) -> bool:
-        """Whether two coils are not parallel, so that all six degrees of freedom are seen."""
+        """Return whether two coils are not parallel, so that all six degrees of freedom show."""
         return len(self.axes) > 1 and bool(
             np.linalg.svd(self.axes, compute_uv=False)[1] > PARALLEL
         )
@@ -65,7 +65,7 @@ class BodyCoils:
         )
 
     def gain_errors(self, flux: Array) -> Array:
-        """What the changes of gains make of fluxes (S, 2K): (S, G, 2K), T."""
+        """Return what the changes of gains make of fluxes (S, 2K): (S, G, 2K), T."""
         if self.changes is None:
             return np.zeros((len(flux), 0, flux.shape[1]))
         return np.asarray(self.changes.T[:, :, None] * flux[:, None, :])
@@ -73,7 +73,7 @@ class BodyCoils:
 
 @dataclass(frozen=True)
 class BodySolution:
-    """Where a rigid tool's solve ended.
+    """Says where a rigid tool's solve ended.
 
     Attributes
     ----------
@@ -186,7 +186,7 @@ def solve_body(
 def start_from_coils(
     coils: BodyCoils, positions: Array, axes: Array, weights: Array
 ) -> tuple[Array, Array] | None:
-    """Pose of a body from its coils' own 5-DoF poses (Wahba's problem).
+    """Return the pose of a body from its coils' own 5-DoF poses (Wahba's problem).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Rotations: matrices, rotation vectors, and the roll rule of a pose that has only an axis.
+"""Turns rotations between matrices and vectors, and sets the roll of a pose that has only an axis.
 
 What is here of scipy's ``Rotation`` is here again for its speed: trackers turn one rotation at a
 time, several times a pose and a frame. One call takes 5 to 9 us
@@ -28,7 +28,7 @@ def rotation_of_vector(vector: NDArray[np.generic]) -> Array:
 
 
 def rotation_between(first: Array, second: Array) -> Array:
-    """Rotation vector, shape (3,), rad, that takes the matrix ``first`` to ``second``, in fg."""
+    """Return the rotation vector (3,), rad, in fg, that takes matrix ``first`` to ``second``."""
     matrix = second @ first.T
     vector = 0.5 * np.array(
         [matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]
@@ -44,7 +44,7 @@ def rotation_between(first: Array, second: Array) -> Array:
 
 
 def quaternion_of_axis(axis: NDArray[np.generic]) -> tuple[float, float, float, float]:
-    """Unit quaternion (x, y, z, w) of the shortest rotation that takes +z to a unit axis.
+    """Return the unit quaternion (x, y, z, w) of the shortest rotation of +z to a unit axis.
 
     The written roll rule of a 5-DoF pose; about +x for the axis -z, where it is not unique.
     """

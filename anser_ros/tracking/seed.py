@@ -1,4 +1,5 @@
-"""A coil's pose without any guess: a scan of a precomputed grid, then polish of the best few.
+"""Finds a coil's pose without any guess: a scan of a precomputed grid, then polish of the best
+few.
 
 For a given position the fluxes are linear in the axis, ``y = B^T n`` with the emitters' fields as
 columns of B. With ``B B^T = L L^T`` the unexplained power at a grid point is ``|y|^2 - |c|^2``,
@@ -35,7 +36,7 @@ LAST_RESORT = 5
 
 @dataclass(frozen=True)
 class SeedGrid:
-    """Positions (G, 3) of the grid and, for each, what turns fluxes into an axis.
+    """Holds positions (G, 3) of the grid and, for each, what turns fluxes into an axis.
 
     Attributes
     ----------

@@ -1,4 +1,5 @@
-"""Pose of one coil from its complex fluxes: damped least squares with the dipoles' own gradient.
+"""Solves for a coil's pose from complex fluxes: damped least squares with the dipoles' own
+gradient.
 
 The unknowns are the position and the unit axis; the axis moves by a two-parameter step in its
 tangent plane, so that no direction is singular. In-phase and quadrature parts are fitted together,
@@ -27,7 +28,7 @@ need a few; the bound keeps the time of a frame limited when the fluxes fit no p
 
 @dataclass(frozen=True)
 class RealField:
-    """A field model laid out for the kernels.
+    """Holds a field model laid out for the kernels.
 
     Attributes
     ----------
@@ -82,7 +83,7 @@ class RealField:
 
 @dataclass(frozen=True)
 class CoilSolution:
-    """Where a coil's solve ended.
+    """Says where a coil's solve ended.
 
     Attributes
     ----------
@@ -112,7 +113,7 @@ class CoilSolution:
 
 
 def whitening_of(sigma: Array, modes: Array | None = None) -> Array:
-    """Matrix that turns a flux residual into one of unit covariance.
+    """Return the matrix that turns a flux residual into one of unit covariance.
 
     Parameters
     ----------

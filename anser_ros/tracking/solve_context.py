@@ -1,4 +1,4 @@
-"""A field model made ready for tracking: kernel layout, error model, cold-start grid."""
+"""Makes a field model ready for tracking: kernel layout, error model, cold-start grid."""
 
 import hashlib
 import math
@@ -27,7 +27,8 @@ GRID_TOLERANCE = 0.05
 
 
 class Starts:
-    """The cold start's grid in a field: made when it is needed, taken over where it still fits.
+    """Makes the cold start's grid in a field when it is needed, or takes it over where it still
+    fits.
 
     Parameters
     ----------
@@ -51,7 +52,7 @@ class Starts:
         return Starts(self._volume, self._spacing_m, before)
 
     def anew(self) -> 'Starts':
-        """For a field that has nothing in common with this one."""
+        """Return an empty one, for a field that has nothing in common with this one."""
         return Starts(self._volume, self._spacing_m)
 
     def landmarks(self, field: RealField) -> tuple[Array, Array]:
@@ -85,7 +86,7 @@ class Starts:
 
 @dataclass(frozen=True)
 class ErrorModes:
-    """A model's uncertainty, laid out for one product with sensors' coupling to its dipoles.
+    """Lays a model's uncertainty out for one product with sensors' coupling to its dipoles.
 
     Attributes
     ----------
@@ -139,7 +140,7 @@ class ErrorModes:
 
 @dataclass(frozen=True)
 class SolveContext:
-    """What every solve of a frame shares.
+    """Holds what every solve of a frame shares.
 
     Attributes
     ----------
@@ -171,12 +172,12 @@ class SolveContext:
 
     @cached_property
     def readings(self) -> int:
-        """Flux components that the field makes: a constant one has no quadrature."""
+        """Return how many flux components the field makes: a constant one has no quadrature."""
         return int((self.field.moments != 0.0).any(axis=0).sum())
 
     @cached_property
     def symmetry(self) -> SymmetryAxis | None:
-        """The axis about which the field is the same all around, where it has one."""
+        """Return the axis about which the field is the same all around, where it has one."""
         moments = self.field.moments.view(np.complex128)
         return symmetry_axis(self.field.positions, self.field.directions, moments)
 
@@ -200,7 +201,7 @@ class SolveContext:
     def error_whitening(
         self, points: Array, axes: Array, lengths: Array
     ) -> tuple[Array, Array, Array, Array]:
-        """What the model's error does to coils at some poses; see `error_whitening`."""
+        """Return what the model's error does to coils at some poses; see `error_whitening`."""
         modes = self.modes
         assert modes is not None
         return error_whitening(

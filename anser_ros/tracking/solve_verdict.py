@@ -1,4 +1,4 @@
-"""The verdict on one pose solve, the same for a coil, a body and a source.
+"""Gives the verdict on one pose solve, the same for a coil, a body and a source.
 
 A solve is judged by itself here: does its residual pass the gate, is the pose in the volume, did
 the descent end, is the pose certain enough, does no other pose explain the fluxes as well. What
@@ -38,7 +38,7 @@ def variance_scale(
     context: SolveContext,
     settings: TrackerSettings,
 ) -> float:
-    """Factor by which the variances of a pose are multiplied; 1 where the noise is not adapted.
+    """Return the factor on the variances of a pose; 1 where the noise is not adapted.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def verdict(
     in_metal: bool = False,
     rivals: Iterable[tuple[float, str]] = (),
 ) -> tuple[str, str]:
-    """State of a solved pose, and the reason in words where it is not ``ok``.
+    """Return the state of a solved pose, and the reason in words where it is not ``ok``.
 
     Parameters
     ----------
@@ -128,5 +128,5 @@ def verdict(
 
 
 def millimetres(place: Array) -> str:
-    """Coordinates of a place given in m, written in mm."""
+    """Return coordinates of a place given in m as text in mm."""
     return ', '.join(f'{1e3 * v:.1f}' for v in place)

@@ -1,4 +1,4 @@
-"""Where an axisymmetric source is, seen from a body with many sensors.
+"""Tracks where an axisymmetric source is, seen from a body with many sensors.
 
 A field that is the same all around its axis leaves one of a body's six degrees of freedom open:
 the turn about that axis. What the sensors do tell, jointly, is where the source is in the body's
@@ -42,7 +42,7 @@ FEWEST_SENSORS = UNKNOWNS + 1
 
 
 class SourceScan:
-    """Places around a body where a source may be, with what turns fluxes into a moment.
+    """Holds places around a body where a source may be, with what turns fluxes into a moment.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class SourceScan:
         self._coils = coils
 
     def best(self, flux: Array) -> list[tuple[Array, Array]]:
-        """Places (3,) and moments' directions (3,), body's frame, that explain fluxes (S,)."""
+        """Return places (3,) and moments' directions (3,), body's frame, that explain fluxes."""
         share = np.linalg.norm(np.einsum('gsi,s->gi', self._span, flux), axis=1)
         chosen: list[int] = []
         for index in np.argsort(-share, kind='stable')[: 40 * STARTS].tolist():
@@ -97,7 +97,7 @@ def _vector_basis(coils: BodyCoils, places: Array, axis: Array) -> Array:
 
 @dataclass
 class SourceTrack:
-    """Memory of one body: its scan, the last good pose, the noise scale."""
+    """Remembers one body: its scan, the last good pose, the noise scale."""
 
     scan: SourceScan | None = None
     coils: BodyCoils | None = None
@@ -112,7 +112,7 @@ class SourceTrack:
 
 @dataclass(frozen=True)
 class SourceFrame:
-    """One frame's fluxes (S, 2K) of a body in the field of an axisymmetric source."""
+    """Holds one frame's fluxes (S, 2K) of a body in the field of an axisymmetric source."""
 
     name: str
     stamp_ns: int
@@ -124,7 +124,9 @@ class SourceFrame:
 
     @cached_property
     def live(self) -> NDArray[np.bool_]:
-        """Flux components (2K,) that carry anything: a constant field has no quadrature."""
+        """Return which flux components (2K,) carry anything: constant fields
+        have no quadrature.
+        """
         return np.asarray((self.flux != 0.0).any(axis=0))
 
     @cached_property
@@ -156,7 +158,8 @@ class SourceFrame:
         return out
 
     def rolled(self, position: Array, rotation: Array) -> Start:
-        """The pose turned about the axis to where its coils are nearest to the volume's middle.
+        """Return the pose turned about the axis to where its coils are nearest to the volume's
+        middle.
 
         That is the rule by which the turn that nobody sees is written.
         """
@@ -210,7 +213,7 @@ def _distances(frame: SourceFrame) -> tuple[float, float]:
 
 
 def seen_from(axis: SymmetryAxis, position: Array, rotation: Array) -> tuple[Array, Array]:
-    """Place (..., 3) of a source and its axis in the frame of a body at poses (..., 3)."""
+    """Return place (..., 3) and axis of a source in the frame of a body at poses (..., 3)."""
     place = np.einsum('...ji,...j->...i', rotation, axis.point - position)
     return place, np.einsum('...ji,j->...i', rotation, axis.direction)
 

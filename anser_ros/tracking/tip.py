@@ -1,4 +1,4 @@
-"""The pose of a tool's tip: its body's, carried along the lever arm with its uncertainty."""
+"""Finds the pose of a tool's tip: its body's, carried along the lever arm with its uncertainty."""
 
 import math
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Tip:
-    """Where a tip is on its body.
+    """Says where a tip is on its body.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""From fluxes to poses with a state each: what the live node and the offline evaluation share.
+"""Turns fluxes into poses with a state each, for the live node and the offline evaluation alike.
 
 A frame gives one estimate for every tool sensor (5-DoF) and for every body whose coils fix all six
 degrees of freedom. A pose is good only when its state is ``ok``; only good poses start the next
@@ -133,19 +133,19 @@ class Tracker:
 
     @property
     def dead_emitters(self) -> tuple[str, ...]:
-        """Emitters that no sensor heard in the last frame while others were heard."""
+        """Return emitters that no sensor heard in the last frame while others were heard."""
         return self._intake.dead
 
     @property
     def drifting_effects(self) -> tuple[str, ...]:
-        """Effects of the model that are left to the references: no recorded course applies."""
+        """Return the model's effects left to the references: no recorded course applies."""
         if self._correction is None or self.settings.recorded_drift:
             return ()
         return self._correction.drifting
 
     @property
     def corrected_effects(self) -> tuple[str, ...]:
-        """Effects of the model that are undone on what is measured."""
+        """Return the model's effects that are undone on what is measured."""
         return () if self._correction is None else self._correction.corrected
 
     @property
@@ -167,7 +167,7 @@ class Tracker:
         return other
 
     def renamed(self, model_id: str) -> 'Tracker':
-        """The same tracker whose model has another name: one that was found anew, but the same."""
+        """Return the same tracker whose model has another name: one found anew, but the same."""
         other = Tracker.__new__(Tracker)
         other.__dict__.update(self.__dict__)
         if self._context is not None:

@@ -1,4 +1,4 @@
-"""How well a pose is known: its covariance, and whether its residual is what the noise allows.
+"""Computes how well a pose is known, and whether its residual is what the noise allows.
 
 A pose is wrong by the flux noise and by what is wrong with the field model. Both enter the
 whitening, so the inverse of the whitened normal matrix is the covariance. Roll about a coil's axis
@@ -30,7 +30,7 @@ def chi2_limit(degrees_of_freedom: int, probability: float) -> float:
 
 @numba.njit(cache=True, error_model='numpy')
 def bounded_inverse(information):  # type: ignore[no-untyped-def]
-    """Covariance of a symmetric, positive semidefinite information matrix.
+    """Return the covariance of a symmetric, positive semidefinite information matrix.
 
     Directions that it says next to nothing of are held to `UNKNOWN_VARIANCE`.
     """
@@ -52,7 +52,7 @@ def bounded_inverse(information):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model='numpy')
 def coil_covariance(normal, axis, roll_variance):  # type: ignore[no-untyped-def]
-    """Covariance of a single coil's pose.
+    """Return the covariance of a single coil's pose.
 
     Parameters
     ----------
