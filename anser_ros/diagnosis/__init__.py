@@ -1,1 +1,1 @@
-"""The search for what a model lacks: residuals, effects, confirmation, and what stays."""
+"""Searches for what a model lacks: residuals, effects, confirmation, and what stays."""

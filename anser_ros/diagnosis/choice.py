@@ -9,12 +9,13 @@ from anser_ros.effects.effect import Family
 
 
 def at_floor(fit: Fit) -> bool:
-    """Whether a fit leaves nothing but noise."""
+    """Return whether a fit leaves nothing but noise."""
     return misfit(fit) < NOTHING_LEFT * max(noise_scale(fit.state) ** 2, 1.0)
 
 
 def taken_from_others(fit: Fit) -> float:
-    """What a new fluctuation's freedom takes off that is some other effect's, still unexplained.
+    """Return what a new fluctuation's freedom takes off that is another effect's, unexplained so
+    far.
 
     Along each of its columns a frame loses one value's share of whatever stays.
     """
@@ -22,7 +23,7 @@ def taken_from_others(fit: Fit) -> float:
 
 
 def choose(fitted: Sequence[tuple[float, Fit]]) -> tuple[float, Fit]:
-    """The best fit, or a simpler one that is as good within what its parameters could gain.
+    """Return the best fit, or a simpler one that is as good within what its parameters could gain.
 
     Where several leave nothing but noise, the simplest is the explanation.
     """

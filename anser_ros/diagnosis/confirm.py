@@ -1,4 +1,4 @@
-"""Whether an effect is the same in all parts of the data, as a real one must be.
+"""Tests whether an effect is the same in all parts of the data, as a real one must be.
 
 What an unknown effect leaves is often picked up by some known one, with parameters that are
 different from one part of the data to the next. So each effect is fitted again in parts of the
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Confirmation:
-    """What speaks for an effect.
+    """Holds what speaks for an effect.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Confirmation:
 
     @property
     def holds(self) -> bool:
-        """Whether the effect may be named."""
+        """Return whether the effect may be named."""
         return (
             self.variation < LARGEST_VARIATION
             and self.share_of_rest > LEAST_OF_THE_REST
@@ -79,7 +79,7 @@ class Confirmation:
 
     @property
     def reason(self) -> str:
-        """Why it may not be named, in words."""
+        """Return why it may not be named, in words."""
         if not self.plausible:
             return 'its parameters are none that it can have'
         if not self.helps:
@@ -197,7 +197,7 @@ def _checked_open(problem: Problem, fit: Fit, term: Term, noise: float) -> Confi
 
 
 def doubtful(problem: Problem, fit: Fit, noise: float) -> list[tuple[Confirmation, Term]]:
-    """The effects of a fit that are not confirmed, the one with the least power first."""
+    """Return a fit's effects that are not confirmed, the one with the least power first."""
     checks = [
         (_checked(problem, fit, term, noise), term) for term in fit.effects if term.theta.size
     ]

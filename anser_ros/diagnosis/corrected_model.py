@@ -1,4 +1,4 @@
-"""The model with the effects found: field effects in its dipoles, the rest as records."""
+"""Puts the effects found into the model: field effects into its dipoles, the rest as records."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The numbers by which explanations are accepted, compared and named.
+"""Holds the numbers by which explanations are accepted, compared and named.
 
 Three currencies are compared here, and all count in the whitened sum of squares, where noise
 and the field model's own error, as large as they are expected, have a mean of one a value (noise
@@ -165,7 +165,7 @@ to dependences of next to nothing; larger leaves a remainder without the hint wh
 
 
 def as_good(spared: int) -> float:
-    """Gain, in units of the misfit, that an explanation with fewer parameters may lack.
+    """Return the gain, in units of the misfit, that an explanation with fewer parameters may lack.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What metal does at rest, told by how it moves: for a field that was learnt with it nearby.
+"""Tells what metal does at rest by how it moves, for a field that was learnt with it nearby.
 
 While it moves, tools and references see the metal where it is, less the metal where it rested.
 Body and path are fitted to that as to any metal that moves; a path starts straight away from where
@@ -70,7 +70,7 @@ metal in the field that was known well enough. Its choice is not recorded."""
 
 @dataclass(frozen=True)
 class Departure:
-    """Metal that moved during a scan, and where it rested.
+    """Holds metal that moved during a scan, and where it rested.
 
     Attributes
     ----------
@@ -86,16 +86,16 @@ class Departure:
 
     @property
     def term(self) -> DepartedTerm:
-        """The metal with its body and path, as it was fitted."""
+        """Return the metal with its body and path, as it was fitted."""
         return cast(DepartedTerm, self.fit.terms[0])
 
     @property
     def is_understood(self) -> bool:
-        """Whether body and path foretell the unseen blocks."""
+        """Return whether body and path foretell the unseen blocks."""
         return self.after < max(2.0, EXPLAINED * self.before)
 
     def rest_flux(self, view: View) -> tuple[ComplexArray, Array]:
-        """What the metal at rest adds to a view (F, S, K), and its standard deviation, T."""
+        """Return what resting metal adds to a view (F, S, K), and its standard deviation, T."""
         columns = self.term.rest_columns(view)
         variance = np.einsum(
             'fskp,pq,fskq->fsk', columns, self.fit.covariance, columns.conj(), optimize=True

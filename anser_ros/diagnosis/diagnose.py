@@ -1,4 +1,4 @@
-"""The whole loop: residual, effect, correction, and the error before and after on unseen data."""
+"""Runs the whole loop: residual, effect, correction, the error before and after on unseen data."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -42,7 +42,7 @@ on: time grows with them in proportion, and neighbouring frames tell much the sa
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found, and what speaks for it.
+    """Holds what was found, and what speaks for it.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class Diagnosis:
 
 @dataclass(frozen=True)
 class Screened:
-    """A problem as the search starts with it.
+    """Holds a problem as the search starts with it.
 
     Attributes
     ----------
@@ -99,13 +99,13 @@ class Screened:
     start: Problem
 
     def training(self, frames: int) -> Problem:
-        """About so many frames a tool of the blocks that effects are chosen and fitted on."""
+        """Return about so many frames a tool of the blocks to choose and fit effects on."""
         return _thinned(self.start.in_blocks(train_blocks()), frames)
 
 
 @dataclass(frozen=True)
 class Confirmed:
-    """The effects that are the same in all parts of the data.
+    """Holds the effects that are the same in all parts of the data.
 
     Attributes
     ----------

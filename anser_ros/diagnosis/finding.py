@@ -1,4 +1,4 @@
-"""One effect that was named, with what speaks for it."""
+"""Describes one effect that was named, with what speaks for it."""
 
 from dataclasses import dataclass, replace
 
@@ -14,7 +14,7 @@ from anser_ros.field.model import EffectRecord
 
 @dataclass(frozen=True)
 class Finding:
-    """One effect that was named.
+    """Describes one effect that was named.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class Finding:
 
 
 def fitted_finding(fit: Fit, index: int, unseen: Problem, search: Search) -> Finding:
-    """The finding of one term of the last fit; ``unseen`` took no part in it."""
+    """Return the finding of one term of the last fit; ``unseen`` took no part in it."""
     term = fit.terms[index]
     rest = [t for t in fit.terms if t is not term and not t.belongs_to(term)]
     without = rms(evaluate(unseen, rest))
@@ -57,7 +57,7 @@ def fitted_finding(fit: Fit, index: int, unseen: Problem, search: Search) -> Fin
 
 
 def plain_finding(term: Term, without: float) -> Finding:
-    """A finding that is seen without a fit, and that nothing is done about."""
+    """Return a finding that is seen without a fit, and that nothing is done about."""
     record = term.effect.record(term, np.zeros((0, 0)))
     evidence = {'summary': term.effect.summary, 'remedy': term.effect.remedy.value}
     return Finding(replace(record, evidence=evidence), None, without)

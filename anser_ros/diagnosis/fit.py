@@ -1,4 +1,4 @@
-"""Gauss-Newton on the parameters of all effects in force."""
+"""Fits the parameters of all effects in force by Gauss-Newton."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ Its choice is not recorded."""
 
 @dataclass(frozen=True)
 class Fit:
-    """Terms at their joint optimum.
+    """Holds terms at their joint optimum.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Fit:
 
     @property
     def effects(self) -> tuple[Term, ...]:
-        """The terms that explain something of their own, without what belongs to another."""
+        """Return the terms that explain something of their own, without others' parts."""
         return tuple(t for t in self.terms if t.effect.family is not Family.REMAINDER)
 
     @property
@@ -66,13 +66,15 @@ class Fit:
         return self.covariance[rows, rows]
 
     def held_out(self, folds: int) -> float:
-        """Cross-validated sum of squares, linear about the optimum, and what freedom cost."""
+        """Return the cross-validated sum of squares, linear about the optimum,
+        and freedom's cost.
+        """
         return self.sums.held_out(self.prior, folds) + self.state.penalty
 
 
 @dataclass(frozen=True)
 class Fitter:
-    """What effects are fitted on, and how.
+    """Says what effects are fitted on, and how.
 
     Attributes
     ----------
@@ -91,12 +93,12 @@ class Fitter:
     iterations: int
 
     def fit(self, terms: Sequence[Term], iterations: int | None = None) -> Fit:
-        """The joint fit of some terms; see `fit_terms`."""
+        """Fit some terms jointly; see `fit_terms`."""
         steps = self.iterations if iterations is None else iterations
         return fit_terms(self.problem, terms, self.blocks, steps)
 
     def held_out(self, fit: Fit) -> float:
-        """Cross-validated sum of squares of a fit, and what its freedom cost."""
+        """Return the cross-validated sum of squares of a fit, and what its freedom cost."""
         return fit.held_out(self.folds)
 
 
@@ -153,12 +155,12 @@ def _covariance(state: State, sums: BlockSums, prior: Array) -> Array:
 
 
 def misfit(fit: Fit) -> float:
-    """Mean square of the whitened residuals; one where only noise is left."""
+    """Return the mean square of the whitened residuals; one where only noise is left."""
     return fit.state.sum_of_squares / max(fit.state.count, 1)
 
 
 def stepped(terms: Sequence[Term], step: Array) -> list[Term]:
-    """Terms with a step added to all their parameters."""
+    """Return terms with a step added to all their parameters."""
     out, start = [], 0
     for term in terms:
         part = step[start : start + term.theta.size]

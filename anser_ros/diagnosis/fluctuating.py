@@ -1,4 +1,4 @@
-"""How much a parameter fluctuates from frame to frame, and what that explains.
+"""Finds how much a parameter fluctuates from frame to frame, and what that explains.
 
 Each frame's parameters are a draw from a normal distribution about zero. Its spread is found by
 expectation-maximisation; the gain is that of -2 log marginal likelihood, so the freedom is paid
@@ -29,7 +29,7 @@ a factor of two to go."""
 
 @dataclass(frozen=True)
 class Open:
-    """Normal equations of each frame: shapes (F, q, q) and (F, q)."""
+    """Holds the normal equations of each frame: shapes (F, q, q) and (F, q)."""
 
     normal: Array
     right: Array
@@ -54,7 +54,7 @@ def opened(state: State, term: Term) -> Open | None:
 
 
 def gain_of(found: Open, spread: Array) -> float:
-    """What -2 log marginal likelihood falls by with this spread."""
+    """Return what -2 log marginal likelihood falls by with this spread."""
     inner = np.eye(spread.size) + found.normal * spread[:, None] * spread[None, :]
     b = found.right * spread
     taken = np.einsum('fq,fq->', b, np.linalg.solve(inner, b[..., None])[..., 0])
@@ -62,7 +62,7 @@ def gain_of(found: Open, spread: Array) -> float:
 
 
 def fluctuation_of(state: State, term: Term) -> tuple[float, Term] | None:
-    """The gain of a fluctuation at its likeliest spread, and the term with it.
+    """Return the gain of a fluctuation at its likeliest spread, and the term with it.
 
     None for other effects, and where no spread gains anything.
     """
@@ -83,7 +83,7 @@ def fluctuation_of(state: State, term: Term) -> tuple[float, Term] | None:
 
 
 def respread(problem: Problem, terms: Sequence[Term]) -> tuple[Term, ...]:
-    """The terms with the spread of each fluctuation found anew beside the others."""
+    """Return the terms with the spread of each fluctuation found anew beside the others."""
     out = list(terms)
     for i, term in enumerate(out):
         if term.effect.family is Family.FLUCTUATION:

@@ -1,4 +1,4 @@
-"""The emitters' own field where no tool sensor ever was: beside the board and below it.
+"""Fits the emitters' own field where no tool sensor ever was: beside the board and below it.
 
 A calibrated model is only as good as its data: it may be any field at the places of metal and of
 reference sensors. Currents in a board make a sheet of vertical dipoles in its plane, so such a
@@ -34,7 +34,7 @@ where no sensor was. Its choice is not recorded."""
 
 @dataclass(frozen=True)
 class CleanReferences:
-    """Reference sensors, their clean readings, shape (R, K), T, and their relative gain error."""
+    """Holds reference sensors, their clean readings, (R, K), T, and their relative gain error."""
 
     sensors: SensorTable
     flux: ComplexArray
@@ -42,7 +42,7 @@ class CleanReferences:
 
 
 def board_box(model: FieldModel) -> Array:
-    """Lower and upper corner of the model's dipoles that carry the field, shape (2, 3), m."""
+    """Return the two corners of the model's dipoles that carry the field, shape (2, 3), m."""
     strength = np.abs(model.moments).max(axis=1)
     used = model.positions[strength > 1e-3 * strength.max()]
     return np.stack([used.min(axis=0), used.max(axis=0)])
@@ -54,7 +54,7 @@ def fit_illumination(
     points: Array,
     references: CleanReferences | None,
 ) -> Dipoles:
-    """A sheet of dipoles that is good in the volume, at the references and below the board.
+    """Return a sheet of dipoles that is good in the volume, at the references and below the board.
 
     Parameters
     ----------

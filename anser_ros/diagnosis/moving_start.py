@@ -28,7 +28,8 @@ def moving_starts(
     scorer: Scorer,
     blocks: NDArray[np.int64],
 ) -> list[tuple[float, Term]]:
-    """Expected gain and start values of effects that are another one at a place for each block.
+    """Return expected gain and start values of effects that are another one at a place for each
+    block.
 
     None where one place for all the session explains as much.
 

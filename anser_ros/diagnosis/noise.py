@@ -1,4 +1,4 @@
-"""Frames that belong to no model, and noise that has grown: what is seen once all is explained."""
+"""Finds frames that belong to no model, and noise that has grown, once all else is explained."""
 
 from collections.abc import Sequence
 
@@ -23,7 +23,7 @@ def outlier_findings(
     excess: float,
     known: Sequence[EffectRecord] = (),
 ) -> list[Finding]:
-    """Outliers or a loose contact, where frames stand out and nothing else makes them.
+    """Return outliers or a loose contact, where frames stand out and nothing else makes them.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def outlier_findings(
 
 
 def noise_findings(whole: Problem, after: State) -> list[Finding]:
-    """Excess noise, of all channels or of those that have it."""
+    """Return excess noise, of all channels or of those that have it."""
     factor = noise_t(after) / whole.spread.noise_t
     if factor <= NOISIER:
         return []

@@ -1,4 +1,4 @@
-"""Frames and single readings that stand out from their neighbours in time."""
+"""Finds frames and single readings that stand out from their neighbours in time."""
 
 from dataclasses import replace
 
@@ -91,7 +91,7 @@ def without_outliers(problem: Problem, state: State) -> Problem:
 
 
 def outlying_share(before: Problem, after: Problem) -> tuple[float, list[int]]:
-    """Share of frames that lost a reading, and the channels that lost most of them.
+    """Return the share of frames that lost a reading, and the channels that lost most of them.
 
     The list is empty where whole frames are out.
     """
@@ -112,5 +112,5 @@ def outlying_share(before: Problem, after: Problem) -> tuple[float, list[int]]:
 
 
 def clean_start(problem: Problem) -> Problem:
-    """The problem without what stands out before anything is explained."""
+    """Return the problem without what stands out before anything is explained."""
     return without_outliers(problem, evaluate(problem, ()))

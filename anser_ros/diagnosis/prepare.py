@@ -1,4 +1,4 @@
-"""From measurements to a problem: bins of references, time blocks, and what stays unseen."""
+"""Makes a problem of measurements: bins of references, time blocks, and what stays unseen."""
 
 from collections.abc import Sequence
 
@@ -34,12 +34,12 @@ MARGIN_S = 0.15
 
 
 def test_blocks() -> NDArray[np.int64]:
-    """Numbers of the blocks that are held out to the end."""
+    """Return the numbers of the blocks that are held out to the end."""
     return np.arange(TEST_EVERY // 2, BLOCKS, TEST_EVERY)
 
 
 def train_blocks() -> NDArray[np.int64]:
-    """Numbers of the blocks that effects are chosen and fitted on."""
+    """Return the numbers of the blocks that effects are chosen and fitted on."""
     return np.setdiff1d(np.arange(BLOCKS), test_blocks())
 
 

@@ -1,4 +1,4 @@
-"""A session set up for diagnosis: what was measured, what is expected, and the rows in blocks."""
+"""Sets a session up for diagnosis: what was measured, what is expected, and the rows in blocks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class References:
-    """Reference readings as means over short bins, with their clean baseline.
+    """Holds reference readings as means over short bins, with their clean baseline.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class References:
 
 @dataclass(frozen=True)
 class Problem:
-    """Everything that a diagnosis starts from.
+    """Holds everything that a diagnosis starts from.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Problem:
     good: tuple[Mask, ...]
 
     def frames(self, keep: Sequence[NDArray[np.generic]], bins: NDArray[np.generic]) -> 'Problem':
-        """The frames of each tool, and the bins, that are named by index or mask."""
+        """Return the frames of each tool, and the bins, that are named by index or mask."""
         references = self.references
         if references is not None:
             references = References(
@@ -94,7 +94,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Part:
-    """One body's prediction, residual and whitener at one state."""
+    """Holds one body's prediction, residual and whitener at one state."""
 
     view: View
     residual: Array
@@ -110,7 +110,7 @@ class Part:
 
 @dataclass(frozen=True)
 class State:
-    """A problem with a list of effects in force."""
+    """Holds a problem with a list of effects in force."""
 
     problem: Problem
     terms: tuple[Term, ...]
@@ -128,7 +128,7 @@ class State:
 
     @property
     def penalty(self) -> float:
-        """What the freedom that fluctuating effects leave to each frame costs."""
+        """Return what the freedom that fluctuating effects leave to each frame costs."""
         return float(sum(part.whitener.penalty for part in self.parts))
 
     @property
@@ -137,7 +137,7 @@ class State:
         return sum(part.count for part in self.parts)
 
     def design(self, term: Term, probe: bool = False) -> list[Array | None]:
-        """Whitened columns of a term, one array (F, n, q) a part, None where it has none."""
+        """Return whitened columns of a term, one array (F, n, q) a part, None for no columns."""
         columns = []
         for part in self.parts:
             find = term.effect.probe if probe else term.effect.columns

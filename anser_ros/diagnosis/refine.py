@@ -1,4 +1,4 @@
-"""The joint fit of all effects, metal as richly shaped as the data can tell.
+"""Fits all effects jointly, metal as richly shaped as the data can tell.
 
 A simple body has few parameters; a real one has more, which a prior holds small: how small is
 chosen by what predicts held-out blocks best. Place and couplings are fitted together, so a place
@@ -23,7 +23,7 @@ FINE = Richness(90, (17, 25), SOMETHING_LEFT)
 
 
 def settled(fitter: Fitter, terms: Sequence[Term], richness: Richness = COARSE) -> Fit:
-    """The joint fit of some effects, metal shaped and then held where it is.
+    """Return the joint fit of some effects, metal shaped and then held where it is.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What metal at rest is besides its few parameters, as richly as the data can tell."""
+"""Finds what metal at rest is besides its few parameters, as richly as the data can tell."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ class Remainders:
     richness: Richness
 
     def added(self, fit: Fit, index: int) -> Fit:
-        """The fit with what one metal at rest leaves; the same fit for any other effect."""
+        """Return the fit with what one metal at rest leaves; the same fit for any other effect."""
         plain = fit.terms
         if plain[index].effect.resting(plain[index]) is None:
             return fit

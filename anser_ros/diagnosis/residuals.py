@@ -1,4 +1,4 @@
-"""How large the residuals of the tools are."""
+"""Measures how large the residuals of the tools are."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from anser_ros.diagnosis.problem import Part, State
 
 
 def tool_parts(state: State) -> list[Part]:
-    """The parts of a state that are tools, not references."""
+    """Return the parts of a state that are tools, not references."""
     return [part for part in state.parts if not part.view.is_reference]
 
 

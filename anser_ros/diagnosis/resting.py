@@ -1,4 +1,4 @@
-"""Whether metal that seems to move rests, and something else changes with time."""
+"""Tests whether metal that seems to move rests, and something else changes with time."""
 
 from collections.abc import Callable, Sequence
 
@@ -17,7 +17,7 @@ def moves_or_rests(
     candidates: Callable[[Scorer], Sequence[tuple[Term, Score]]],
     explained: float,
 ) -> Fit:
-    """Metal that moves, or metal at rest where it explains as much, alone or beside one effect.
+    """Return metal that moves, or at rest where that explains as much, alone or beside one effect.
 
     Parameters
     ----------

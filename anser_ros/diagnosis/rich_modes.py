@@ -1,4 +1,4 @@
-"""Combinations of a metal's couplings that the data tell, of the size that predicts them best.
+"""Combines a metal's couplings into those that the data tell, of the size that predicts them best.
 
 Metal has many more couplings than any data tell. Those combinations of them that the data tell
 most about are its modes; how large a prior lets them be is chosen on held-out blocks of time.

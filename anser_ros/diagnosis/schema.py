@@ -1,4 +1,4 @@
-"""What every document of a diagnosis is called, of fluxes and of poses alone."""
+"""Names every document of a diagnosis, of fluxes and of poses alone."""
 
 SCHEMA = 'anser_diagnosis/1'
 """Name of the document's layout (`docs/interfaces.md`), which stands in it."""

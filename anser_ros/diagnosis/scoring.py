@@ -1,4 +1,4 @@
-"""Cross-validated worth of groups of columns, from sums over time blocks."""
+"""Scores groups of columns by cross-validation, from sums over time blocks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ is what metal left, and no effect's rival."""
 
 @dataclass(frozen=True)
 class BlockSums:
-    """Normal equations of some columns and the residual, block by block.
+    """Holds the normal equations of some columns and the residual, block by block.
 
     Attributes
     ----------
@@ -59,12 +59,12 @@ class BlockSums:
         return _estimate(raised, self.right.sum(axis=0), prior)
 
     def explained_alone(self, prior: Array) -> Array:
-        """What the columns explain in each block (B,), fitted to that block alone."""
+        """Return what the columns explain in each block (B,), fitted to that block alone."""
         covariance = _covariance(self.normal, prior)
         return np.asarray(np.einsum('bi,bij,bj->b', self.right, covariance, self.right))
 
     def held_out(self, prior: Array, folds: int) -> float:
-        """Sum of squared residuals of each fold, predicted from the others."""
+        """Return the sum of squared residuals of each fold, predicted from the others."""
         if self.size == 0:
             return float(self.squares.sum())
         total_normal, total_right = self.normal.sum(axis=0), self.right.sum(axis=0)
@@ -169,7 +169,7 @@ def _width(group: Columns) -> int:
 
 @dataclass(frozen=True)
 class Score:
-    """What one candidate is worth beside the effects that are in force.
+    """Says what one candidate is worth beside the effects that are in force.
 
     Attributes
     ----------

@@ -1,4 +1,5 @@
-"""Which effects hold: added one at a time while they pay on held-out blocks, then thinned out.
+"""Searches which effects hold: added one by one while they pay on held-out blocks, then thinned
+out.
 
 Every candidate is first scored by its linear columns (a score test beside the effects in force).
 The best ones are fitted in full, and the best of these is taken, or a simpler one that is as good.
@@ -33,7 +34,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """How the search goes.
+    """Says how the search goes.
 
     Attributes
     ----------
@@ -60,13 +61,15 @@ class SearchSettings:
     iterations: int = 8
 
     def fitter(self, problem: Problem, blocks: NDArray[np.int64]) -> Fitter:
-        """What fits effects on some blocks of a problem with these settings."""
+        """Return what fits effects on some blocks of a problem with these settings."""
         return Fitter(problem, blocks, self.folds, self.iterations)
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A row of the table of candidates: gain by the score test and, for finalists, by the fit."""
+    """Holds a row of the candidates' table: gain by the score test and, for
+    finalists, by the fit.
+    """
 
     term: Term
     parameters: int
@@ -76,7 +79,7 @@ class Candidate:
 
 @dataclass
 class Search:
-    """What the search found and tried.
+    """Holds what the search found and tried.
 
     Attributes
     ----------
@@ -141,7 +144,7 @@ def search_effects(
 
 
 def worth(gain: float, parameters: int, fit: Fit, how: SearchSettings) -> bool:
-    """Whether a gain pays for its parameters, with this fit left."""
+    """Return whether a gain pays for its parameters, with this fit left."""
     left = max(misfit(fit), 1.0)
     metal = any(term.effect.family.is_metal for term in fit.terms)
     share = how.least_share_beside_metal if metal else how.least_share

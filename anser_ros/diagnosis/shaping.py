@@ -1,4 +1,4 @@
-"""A richer body for metal that moves, and a freer course where that pays."""
+"""Shapes a richer body for metal that moves, and a freer course where that pays."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -41,14 +41,14 @@ class Shaping:
     richness: Richness
 
     def shaped(self, fit: Fit, index: int) -> Fit:
-        """The fit with one moving metal shaped; the same fit for any other effect."""
+        """Return the fit with one moving metal shaped; the same fit for any other effect."""
         body = _body(fit.terms[index])
         if body is None or body.richness == self.richness:
             return fit
         return self.freed(self._bodied(fit, index, body), index)
 
     def freed(self, fit: Fit, index: int) -> Fit:
-        """The fit with a freer course, as long as its parameters pay."""
+        """Return the fit with a freer course, as long as its parameters pay."""
         for knots in self.richness.knots:
             body = _body(fit.terms[index])
             if body is None or misfit(fit) < self.richness.left * noise_scale(fit.state) ** 2:
@@ -94,7 +94,7 @@ class Shaping:
         return self.shaped_as(best, index, body, [body.kind]) or best
 
     def shaped_as(self, fit: Fit, index: int, body: BodyTerm, kinds: Sequence[str]) -> Fit | None:
-        """The fit with the best of some kinds of bodies; None where none beats no body at all."""
+        """Return the fit with the best of some kinds of bodies; None if no body is better."""
         fitter = self.fitter
         bare = _with(fit.terms, index, body.with_theta(_without_amounts(body)))
         few = thinned(evaluate(fitter.problem, bare), fitter.blocks)

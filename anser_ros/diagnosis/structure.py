@@ -1,4 +1,4 @@
-"""What residuals depend on: means over cells of each variable, against what noise would give."""
+"""Tests what residuals depend on: means over cells of each variable, against what noise gives."""
 
 from dataclasses import dataclass
 
@@ -31,7 +31,7 @@ what one value is, and cells of fewer would add more noise than they tell."""
 
 @dataclass(frozen=True)
 class StructureTest:
-    """The test of one variable.
+    """Holds the test of one variable.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class StructureTest:
 
     @property
     def significant(self) -> bool:
-        """Whether noise hardly does that, and it matters."""
+        """Return whether noise hardly does that, and it matters."""
         return self.probability < SIGNIFICANT and self.share > MATTERS
 
 

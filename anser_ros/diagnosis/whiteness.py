@@ -1,4 +1,4 @@
-"""Whether grown residuals are noise: alike in all frames, readings and sizes, and normal.
+"""Tests whether grown residuals are noise: alike in all frames, readings and sizes, and normal.
 
 Hum, a common disturbance, rounding or a gain that rattles raise the residual's spread as noise
 does. Noise has no memory, is nobody else's, does not grow with the reading, and is normal.
@@ -42,7 +42,7 @@ noise away that are to be judged; larger lets a single outlier make noise look h
 
 @dataclass(frozen=True)
 class Whiteness:
-    """The strongest structure of each kind that noise does not make; zero where none is told."""
+    """Holds the strongest structure of each kind that is no noise; zero where none is told."""
 
     memory: float
     shared: float
@@ -51,12 +51,12 @@ class Whiteness:
 
     @property
     def holds(self) -> bool:
-        """Whether the residuals may be called noise."""
+        """Return whether the residuals may be called noise."""
         return not self.depends_on
 
     @property
     def depends_on(self) -> tuple[str, ...]:
-        """What they depend on, in the words of `docs/interfaces.md`."""
+        """Return what they depend on, in the words of `docs/interfaces.md`."""
         found: list[str] = []
         if self.memory > REMEMBERED:
             found.append('time')

@@ -1,4 +1,4 @@
-"""Residuals in units of what they may be: noise everywhere, pose jitter along six directions.
+"""Scales residuals by what they may be: noise everywhere, pose jitter along six directions.
 
 An optical pose that is a little off moves all channels and emitters of its frame together, along
 the six columns of the frame's pose Jacobian. Taking that known freedom out lowers the floor
@@ -35,7 +35,7 @@ def _survey_share(accuracy: Accuracy) -> float:
 
 @dataclass(frozen=True)
 class Spread:
-    """Standard deviations that are expected when all is well.
+    """Holds standard deviations that are expected when all is well.
 
     Attributes
     ----------
@@ -50,12 +50,12 @@ class Spread:
 
     @property
     def noise_t(self) -> float:
-        """The part of ``flux_t`` that is noise when all is well, T."""
+        """Return the part of ``flux_t`` that is noise when all is well, T."""
         return self.accuracy.flux_noise_t
 
     @property
     def reference_change(self) -> float:
-        """Relative error of the change that a reference sees, in proportion to the survey's."""
+        """Return the relative error of the change that a reference sees, by the survey's."""
         return REFERENCE_CHANGE * (_survey_share(self.accuracy) / _survey_share(Accuracy()))
 
 
@@ -146,7 +146,7 @@ class Whitener:
         return out.reshape(values.shape)
 
     def moves(self, values: Array) -> Array:
-        """Most probable move of each frame along each direction, in its spread: (F, m)."""
+        """Return the likeliest move of each frame along each direction, in its spread: (F, m)."""
         if self.basis is None:
             return np.zeros((values.shape[0], 0))
         y = values * self.weight

@@ -1,4 +1,4 @@
-"""Wiring faults: no small change of anything, they show in whose prediction a reading is like."""
+"""Finds wiring faults: no small changes, they show in whose prediction a reading resembles."""
 
 import numpy as np
 from numpy.typing import NDArray

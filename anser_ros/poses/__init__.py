@@ -1,1 +1,1 @@
-"""Trackers that give poses only: sessions, hand-eye, diagnosis, correction."""
+"""Serves trackers that give poses only: sessions, hand-eye, diagnosis, correction."""

@@ -1,4 +1,4 @@
-"""In which order, sense and unit poses were written, found where they do not fit as they stand."""
+"""Finds in which order, sense and unit poses were written, where they do not fit as they stand."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ SAME_SCALE = (0.75, 1.35)  # scales that need no unit
 
 @dataclass(frozen=True)
 class PoseReading:
-    """One way to read a stream's numbers, in the terms of `docs/interfaces.md`."""
+    """Describes one way to read a stream's numbers, in the terms of `docs/interfaces.md`."""
 
     stream: str = 'tracked'
     quaternion: str = 'xyzw'
@@ -47,7 +47,7 @@ class PoseReading:
 
     @property
     def is_plain(self) -> bool:
-        """Whether the numbers are what they say."""
+        """Return whether the numbers are what they say."""
         return (self.quaternion, self.handedness, self.unit) == ('xyzw', 'right', 'm')
 
     def record(self, before: float, after: float, ratio: float) -> EffectRecord:
@@ -94,7 +94,7 @@ class PoseReading:
 
 
 def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None]:
-    """The session as it is meant, and the convention by which it is, if that is another.
+    """Return the session as it is meant, and the convention by which it is, if that is another.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None
 
 
 def reading_words(record: EffectRecord) -> str:
-    """How a stream was read where it means something else than it says, with the evidence."""
+    """Return how a stream was read if it means something else than it says, with the evidence."""
     read, told = record.parameters, record.evidence
     said = []
     if read['unit'] != 'm':

@@ -1,4 +1,4 @@
-"""A pose model applied to poses one by one: the same offline and in the live node."""
+"""Applies a pose model to poses one by one: the same offline and in the live node."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ strain that a distortion may have."""
 
 @dataclass(frozen=True)
 class CorrectedPose:
-    """A pose without what the model knows of its errors.
+    """Holds a pose without what the model knows of its errors.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class PoseCorrector:
     def correct(
         self, sensor: str, stamp_ns: int, position: Array, quaternion: Array
     ) -> CorrectedPose:
-        """The pose of a sensor as it is, with its covariance and state.
+        """Return the pose of a sensor as it is, with its covariance and state.
 
         Parameters
         ----------

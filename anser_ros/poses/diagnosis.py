@@ -1,4 +1,4 @@
-"""Diagnosis of a session of poses: convention, hand-eye, search, and what held-out poses say.
+"""Diagnoses a session of poses: convention, hand-eye, search, and what held-out poses say.
 
 The stages are those of a diagnosis of fluxes: read and set up, search on four fifths of the blocks
 of time, judge on the fifth that took no part; then the parameters are fitted to all poses.
@@ -44,7 +44,7 @@ the value was chosen is not recorded."""
 
 @dataclass(frozen=True)
 class HeldOutErrors:
-    """Held-out errors of all sensors, and by sensor: distance (m) and angle (rad), rms."""
+    """Holds held-out errors of all sensors, and by sensor: distance (m) and angle (rad), rms."""
 
     position_m: float
     orientation_rad: float
@@ -53,7 +53,7 @@ class HeldOutErrors:
 
 @dataclass(frozen=True)
 class PoseDiagnosis:
-    """What a session of poses was found to contain.
+    """Holds what a session of poses was found to contain.
 
     Attributes
     ----------
@@ -281,12 +281,12 @@ recordings of one body levers were off by 9 mm and more beyond this, and by 4 mm
 
 
 def lever_is_told(part: PosePart, jitter_rad: float) -> NDArray[np.bool_]:
-    """Mask, shape (3,), of the components of a lever arm that the motion tells."""
+    """Return the mask (3,) of the components of a lever arm that the motion tells."""
     return (lever_blur(part, jitter_rad) < MOST_BLUR) & (lever_reach(part) < HARDLY_TOLD_M)
 
 
 def lever_reach(part: PosePart) -> Array:
-    """Lever arm, shape (3,), m, that makes the median error by the turns of the body alone."""
+    """Return the lever arm (3,), m, that makes the median error by the turns of the body alone."""
     far = np.linalg.norm(part.residual[part.used, :3], axis=1)
     told = np.linalg.inv(_told(part) + LEAST_JITTER_RAD**2 * np.eye(3))
     return np.asarray(np.median(far) * np.sqrt(np.diag(told)))
@@ -300,7 +300,7 @@ def _told(part: PosePart) -> Array:
 
 
 def lever_blur(part: PosePart, jitter_rad: float) -> Array:
-    """Share, shape (3,), by which the reference's own jitter of orientation shrinks a lever arm.
+    """Return by which share (3,) the reference's own jitter of orientation shrinks a lever arm.
 
     Turns that are known with an error make a lever arm too small by the error's share of their
     variance, whatever its formal uncertainty.

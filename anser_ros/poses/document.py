@@ -1,4 +1,4 @@
-"""The documents that a diagnosis of poses leaves, as `docs/interfaces.md` promises them."""
+"""Writes the documents that a diagnosis of poses leaves, as `docs/interfaces.md` promises them."""
 
 from typing import Any
 
@@ -53,7 +53,7 @@ def to_document(found: PoseDiagnosis) -> dict[str, Any]:
 
 
 def to_model(found: PoseDiagnosis) -> dict[str, Any]:
-    """What a corrector needs: the frames and the effects, and where they were learnt."""
+    """Return what a corrector needs: the frames and the effects, and where they were learnt."""
     document = to_document(found)
     places = np.concatenate([s.position for s in found.session.sensors.values()])
     low, high = np.percentile(places, [1, 99], axis=0)
@@ -71,7 +71,7 @@ def to_model(found: PoseDiagnosis) -> dict[str, Any]:
 
 
 def finite(value: Any) -> Any:
-    """Plain data with None where a number is not finite, which JSON has no word for."""
+    """Return plain data with None where a number is not finite, which JSON has no word for."""
     if isinstance(value, dict):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,5 @@
-"""What an effect of a tracker of poses looks like: one interface, one file for each effect.
+"""Defines what an effect of a tracker of poses looks like: one interface, one file for each
+effect.
 
 A tracked pose is predicted from the optical one in this order::
 
@@ -27,7 +28,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PoseSetting:
-    """What effects may know of a session before they are fitted.
+    """Holds what effects may know of a session before they are fitted.
 
     Attributes
     ----------
@@ -46,7 +47,7 @@ class PoseSetting:
 
 @dataclass(frozen=True)
 class PoseView:
-    """The predicted poses of one sensor, n of them, with what derivatives need.
+    """Holds predicted poses of one sensor, n of them, with what derivatives need.
 
     Attributes
     ----------
@@ -83,7 +84,7 @@ class PoseView:
 
 
 class Role(Enum):
-    """What an effect is to the search, which asks for this and for no effect by its name."""
+    """Names what an effect is to the search, which asks for this and for no effect by its name."""
 
     PLAIN = 'plain'
     CLOCK = 'clock'
@@ -97,14 +98,14 @@ class Role(Enum):
 
 
 class PoseEffect(Effect[Term]):
-    """Base of the effects on poses: it changes nothing."""
+    """Changes nothing; it is the base of the effects on poses."""
 
     role = Role.PLAIN
     blocks_in_space = False
     """Whether blocks of space and not of time decide on it."""
 
     def sites(self, setting: PoseSetting) -> Sequence[Term]:
-        """The effect at every site where it may sit, with parameters of zero."""
+        """Return the effect at every site where it may sit, with parameters of zero."""
         return ()
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
@@ -116,21 +117,21 @@ class PoseEffect(Effect[Term]):
         return None
 
     def clock(self, term: Term, sensor: str, time: Array) -> Array:
-        """Times on the optical clock, s, at which a sensor's poses apply."""
+        """Return the times on the optical clock, s, at which a sensor's poses apply."""
         return time
 
     def filter(self, term: Term, path: OpticalPath) -> OpticalPath:
-        """The body's path as a tracker that filters sees it."""
+        """Return the body's path as a tracker that filters sees it."""
         return path
 
     def seen(self, term: Term, position: Array) -> Array:
-        """Optical positions (n, 3) at the tracker's scale, m."""
+        """Return optical positions (n, 3) at the tracker's scale, m."""
         return position
 
     def corrected(
         self, term: Term, sensor: str, position: Array, rotation: Array
     ) -> tuple[Array, Array]:
-        """Tracked poses, (n, 3) m and (n, 3, 3), without what the effect does to them."""
+        """Return tracked poses, (n, 3) m and (n, 3, 3), without what the effect does to them."""
         return position, rotation
 
     def observed(self, sight: 'PoseSight') -> Sequence[EffectRecord]:
@@ -150,13 +151,13 @@ class PoseEffect(Effect[Term]):
         return term
 
     def acts_on(self, term: Term, sensor: str) -> bool:
-        """Whether a term is about a sensor: its own, or all where the site names none."""
+        """Return whether a term is about a sensor: its own, or all where the site names none."""
         return str(term.site.get('sensor', sensor)) == sensor
 
 
 @dataclass(frozen=True)
 class Sensing:
-    """What one sensor shows once the frames and effects are fitted.
+    """Holds what one sensor shows once the frames and effects are fitted.
 
     Attributes
     ----------
@@ -185,7 +186,7 @@ class Sensing:
 
 @dataclass(frozen=True)
 class PoseSight:
-    """A session and what its fit leaves: what is seen without a parameter to fit is seen here.
+    """Holds a session and what its fit leaves, where effects without a parameter to fit are seen.
 
     Attributes
     ----------
@@ -209,5 +210,5 @@ def effect_of(term: Term) -> PoseEffect:
 
 
 def is_of(term: Term, role: Role) -> bool:
-    """Whether the effect of a term has a role."""
+    """Return whether the effect of a term has a role."""
     return effect_of(term).role is role

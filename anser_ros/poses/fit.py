@@ -1,4 +1,4 @@
-"""Gauss-Newton on the two frames and all effects in force, and the noise that fits the rest."""
+"""Fits the two frames and all effects in force by Gauss-Newton, and the noise of the rest."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ LARGEST_STAMP_S = 0.1
 
 @dataclass(frozen=True)
 class PoseFit:
-    """Terms at their joint optimum.
+    """Holds terms at their joint optimum.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class PoseFit:
 
     @property
     def misfit(self) -> float:
-        """Mean square of the whitened residuals; one where only noise is left."""
+        """Return the mean square of the whitened residuals; one where only noise is left."""
         return self.state.sum_of_squares / max(self.state.count, 1)
 
     def held_out(self, in_space: bool = False) -> float:
@@ -67,7 +67,8 @@ class PoseFit:
         return sums.held_out(self.prior, FOLDS)
 
     def covariance(self) -> Array:
-        """Of all parameters, honest about errors that are alike within a block of time.
+        """Return the covariance of all parameters, honest about errors alike within a block of
+        time.
 
         The formal one is scaled by the misfit; where blocks scatter more than it says (White's
         sandwich with blocks as clusters), a parameter's variance is raised to that.
@@ -160,7 +161,7 @@ def _spread(part: PosePart) -> PoseNoise:
 
 
 def standing_out(fit: PoseFit) -> tuple[NDArray[np.bool_], ...]:
-    """Poses that no explanation reaches: far beyond the spread of their sensor's others."""
+    """Return poses that no explanation reaches: far beyond the spread of their sensor's others."""
     found = []
     for part in fit.state.parts:
         noise = replace(_spread(part), stamp_s=part.noise.stamp_s)
@@ -174,7 +175,7 @@ def standing_out(fit: PoseFit) -> tuple[NDArray[np.bool_], ...]:
 
 
 def noise_of(part: PosePart, with_stamps: bool = True) -> tuple[PoseNoise, float]:
-    """The likeliest noise of a sensor's residuals, and minus twice its log likelihood."""
+    """Return the likeliest noise of a sensor's residuals, and minus twice its log likelihood."""
     used = part.used
     residual, velocity = part.residual[used], part.view.velocity[used]
     if not len(residual):

@@ -1,4 +1,4 @@
-"""Files of poses as trackers and their programs write them: read into rows, nothing judged yet.
+"""Reads files of poses as trackers and their programs write them into rows, nothing judged yet.
 
 Four forms are told apart by their content: NDI ToolTracker's ``.tsv``; lines of ``Key: numbers``;
 TUM's ``t x y z qx qy qz qw``; and CSV with named columns.
@@ -43,7 +43,7 @@ _KEY = re.compile(r'(\w+):\s*((?:[^\s:]+(?:\s+|$)(?!:))*?)(?=\s*\w+:|\s*$)')
 
 @dataclass
 class RawRows:
-    """Rows of one sensor as they stand in a file, in the file's own units.
+    """Holds rows of one sensor as they stand in a file, in the file's own units.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Hand-eye calibration: registration, lever arm, mount and clocks of two streams, jointly.
+"""Calibrates hand-eye: registration, lever arm, mount and clocks of two streams, jointly.
 
 The first stage of a diagnosis of poses, alone: the two frames, the offset and the rate of the
 clocks, robustly, with uncertainties, and in words what the motion does not determine.
@@ -43,7 +43,7 @@ TILT_NEEDED_DEG = 20.0  # what is asked for where a lever arm is open
 
 @dataclass(frozen=True)
 class SensorFrames:
-    """One sensor on the body, its place and mount with what is known of them.
+    """Holds place and mount of one sensor on the body with what is known of them.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class SensorFrames:
 
 @dataclass(frozen=True)
 class HandEye:
-    """What two streams of poses have between them.
+    """Holds what two streams of poses have between them.
 
     Attributes
     ----------

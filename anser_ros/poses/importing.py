@@ -1,4 +1,4 @@
-"""Rows of tracked and optical poses, from files of any known form, as one session.
+"""Makes one session of tracked and optical poses, from files of any known form.
 
 Times of receipt (the host's counter) are taken as they stand. A device's own counter is put on
 the host's axis by the smallest delay, or begins at zero where a form has no host's time; where it

@@ -1,4 +1,4 @@
-"""What the last seconds of running trackers of poses show: the diagnosis, and what has changed.
+"""Tells what the last seconds of running trackers of poses show: the diagnosis, and what changed.
 
 A diagnosis of a recording takes the two frames as they are. Live they are known from earlier, so
 that a camera that was pushed, or a sensor that came loose, is told from what was there before.
@@ -47,7 +47,7 @@ FEWEST_POSES = 20  # poses of the later half of a window by which a change is ju
 
 @dataclass(frozen=True)
 class PoseSighting:
-    """What one look at the last seconds found.
+    """Holds what one look at the last seconds found.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class PoseSighting:
 
     @property
     def is_clear(self) -> bool:
-        """Whether there is nothing to be said."""
+        """Return whether there is nothing to be said."""
         return not self.findings and not self.remark
 
 
@@ -94,7 +94,7 @@ class _Known:
 
 
 class PoseWatch:
-    """A watch looks at one window after the other, and remembers the frames it learnt first.
+    """Looks at one window after the other, and remembers the frames it learnt first.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The last seconds of running trackers of poses, as the session that a recording would be."""
+"""Keeps the last seconds of running trackers of poses as the session that they would record."""
 
 from collections import deque
 from collections.abc import Iterable, Sequence
@@ -52,12 +52,12 @@ class PoseWindow:
 
     @property
     def span_s(self) -> float:
-        """Time between the oldest and the newest tracked pose that is kept, s."""
+        """Return the time between the oldest and the newest tracked pose that is kept, s."""
         spans = [r[-1][0] - r[0][0] for n, r in self._rows.items() if n != REFERENCE and r]
         return max(spans, default=0) * NANO
 
     def session(self, without: Iterable[str] = ()) -> PoseSession | None:
-        """What is in the window, without some streams; None while nothing is tracked.
+        """Return what is in the window, without some streams; None while nothing is tracked.
 
         Raises
         ------

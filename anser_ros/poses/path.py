@@ -1,4 +1,4 @@
-"""The optical body's path between its poses: smooth, with velocity, or behind a low pass."""
+"""Fills the optical body's path between its poses: smooth, with velocity, or behind a low pass."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -26,7 +26,7 @@ SMALLEST_STEP_S = 0.002  # grid of a filter, s: a hand moves by 0.2 mm in it
 
 @dataclass(frozen=True)
 class OpticalPath:
-    """A body's path as cubic pieces through its poses, with the slopes of a parabola at each.
+    """Describes a body's path as cubic pieces through its poses, with a parabola's slopes at each.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class OpticalPath:
         return values[:, :3], matrices, velocity, valid
 
     def filtered(self, tau: float, two_sided: bool = False) -> 'OpticalPath':
-        """The path behind a first-order low pass with a time constant, s.
+        """Return the path behind a first-order low pass with a time constant, s.
 
         Two-sided, it looks as far ahead as back, with the same width and no delay.
         """

@@ -1,4 +1,4 @@
-"""An error map of points as a model of poses, which the corrector applies like any other."""
+"""Writes an error map of points as a model of poses, which the corrector applies like others."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ SMOOTH = 'smooth'
 
 
 def to_point_model(found: ErrorMap, sensor: str, source: str) -> dict[str, Any]:
-    """What a corrector needs of an error map; a map that is not confirmed is none.
+    """Return what a corrector needs of an error map; a map that is not confirmed is none.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def to_point_model(found: ErrorMap, sensor: str, source: str) -> dict[str, Any]:
 
 
 def smooth_map(record: EffectRecord) -> PositionMap:
-    """The map of a record: what is added to tracked positions.
+    """Return the map of a record: what is added to tracked positions.
 
     Raises
     ------

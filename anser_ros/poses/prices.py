@@ -1,4 +1,4 @@
-"""What an effect on poses must explain on blocks that it has not seen, to be named."""
+"""Says what an effect on poses must explain on blocks that it has not seen, to be named."""
 
 from collections.abc import Sequence
 
@@ -29,7 +29,9 @@ share, or more where that is less than `SCALE_M`."""
 
 
 def price(term: Term, total: float, fit: PoseFit) -> float:
-    """Gain, in units of the misfit, that a term must have beside a sum of squares ``total``."""
+    """Return the gain, in units of the misfit, that a term must have beside a squared sum
+    ``total``.
+    """
     misfit, share = fit.misfit, LEAST_SHARE
     # Only the errors of its own sensor, and of positions where it is a map, can be explained.
     rows = slice(3) if is_of(term, Role.MAP) else slice(6)
@@ -50,5 +52,5 @@ def _map_share(term: Term, parts: Sequence[PosePart]) -> float:
 
 
 def is_scale(term: Term) -> bool:
-    """Whether a map is that of one sensor's scale."""
+    """Return whether a map is that of one sensor's scale."""
     return is_of(term, Role.MAP) and int(term.site['degree']) == 0

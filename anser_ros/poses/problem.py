@@ -1,4 +1,4 @@
-"""A session of poses set up for fitting: what is predicted, and by how much it is missed."""
+"""Sets a session of poses up for fitting: what is predicted, and by how much it is missed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """How far a sensor's poses are off without any effect, one standard deviation.
+    """Says how far a sensor's poses are off without any effect, one standard deviation.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class PoseNoise:
     stamp_s: float = 0.0
 
     def whitened(self, values: Array, velocity: Array) -> Array:
-        """Values (n, 6, ...) in units of their spread; velocity (n, 6) as `PoseView` has it."""
+        """Return values (n, 6, ...) in units of their spread; velocity (n, 6) as in `PoseView`."""
         scale = np.repeat([1 / self.position_m, 1 / self.orientation_rad], 3)
         shape = (1, 6) + (1,) * (values.ndim - 2)
         out = values * scale.reshape(shape)
@@ -52,7 +52,7 @@ class PoseNoise:
 
 @dataclass(frozen=True)
 class PoseProblem:
-    """Everything that a fit starts from.
+    """Holds everything that a fit starts from.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class PoseProblem:
     noise: tuple[PoseNoise, ...]
 
     def rows(self, keep: Sequence[NDArray[np.generic]]) -> 'PoseProblem':
-        """The poses of each sensor that are named by index or mask."""
+        """Return the poses of each sensor that are named by index or mask."""
         return replace(
             self,
             sensors=tuple(s.rows(k) for s, k in zip(self.sensors, keep, strict=True)),
@@ -93,7 +93,7 @@ class PoseProblem:
         return self.rows([np.isin(blocks, wanted) for blocks in self.blocks])
 
     def state(self, terms: Sequence[Term]) -> 'PoseState':
-        """All poses predicted with some effects in force, and what they are missed by."""
+        """Return all poses predicted with some effects in force, and what they are missed by."""
         parts = []
         for i, sensor in enumerate(self.sensors):
             view, residual, known = _predicted(self.path, sensor, terms)
@@ -147,7 +147,7 @@ def _predicted(
 
 @dataclass(frozen=True)
 class PosePart:
-    """One sensor's prediction and residual.
+    """Holds one sensor's prediction and residual.
 
     Attributes
     ----------
@@ -169,7 +169,7 @@ class PosePart:
 
     @property
     def white(self) -> Array:
-        """Residuals in units of their spread, weighted, shape (n, 6)."""
+        """Return residuals in units of their spread, weighted, shape (n, 6)."""
         return self.weight[:, None] * self.noise.whitened(self.residual, self.view.velocity)
 
     @property
@@ -180,7 +180,7 @@ class PosePart:
 
 @dataclass(frozen=True)
 class PoseState:
-    """A problem with a list of terms in force."""
+    """Holds a problem with a list of terms in force."""
 
     problem: PoseProblem
     terms: tuple[Term, ...]
@@ -197,7 +197,7 @@ class PoseState:
         return int(6 * sum(np.count_nonzero(part.used) for part in self.parts))
 
     def rms(self, sensor: str | None = None) -> tuple[float, float]:
-        """Distance (m) and angle (rad), root mean square over the poses that count."""
+        """Return distance (m) and angle (rad), root mean square over the poses that count."""
         chosen = [p.residual[p.used] for p in self.parts if sensor in (None, p.view.sensor)]
         every = np.concatenate(chosen) if chosen else np.zeros((0, 6))
         if not len(every):

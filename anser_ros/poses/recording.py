@@ -1,4 +1,4 @@
-"""Sessions of poses in bags: read by topic, and written."""
+"""Reads sessions of poses from bags, by topic, and writes them."""
 
 import os
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""All effects of trackers of poses, found by looking, as those on fluxes are."""
+"""Finds all effects of trackers of poses by looking, as those on fluxes are found."""
 
 from functools import cache
 
@@ -9,5 +9,5 @@ from anser_ros.poses.effect import PoseEffect
 
 @cache
 def pose_effects() -> dict[str, PoseEffect]:
-    """Every effect on poses by its name, in alphabetical order."""
+    """Return every effect on poses by its name, in alphabetical order."""
     return effects_in(package)

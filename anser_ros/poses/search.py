@@ -1,4 +1,4 @@
-"""Which effects a session of poses shows: each must pay for itself on blocks that it has not seen.
+"""Searches which effects a session of poses shows: each must pay on blocks that it has not seen.
 
 The currencies and prices are those of `anser_ros.diagnosis.decisions`: gains in the whitened sum
 of squares, cross-validated over blocks of time, and for what depends on place over blocks of
@@ -43,7 +43,7 @@ SCALE_DIFFERS = 0.003  # difference of scales that matters: 1 mm in a tracked vo
 
 @dataclass(frozen=True)
 class PoseEvidence:
-    """What speaks for a term that is in force.
+    """Holds what speaks for a term that is in force.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class PoseEvidence:
 
 @dataclass(frozen=True)
 class PoseSearch:
-    """What a search came to.
+    """Holds what a search came to.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class PoseSearch:
 
 
 def with_noise(fit: PoseFit) -> PoseFit:
-    """The fit with the noise that it shows, and without the poses that stand out from that."""
+    """Return the fit with the noise that it shows, and without poses that stand out from that."""
     problem = fit.state.problem
     for _ in range(NOISE_ROUNDS):
         out = standing_out(fit)
@@ -98,7 +98,7 @@ def with_noise(fit: PoseFit) -> PoseFit:
 
 
 def likely_noise(part: PosePart) -> tuple[PoseNoise, float]:
-    """A sensor's noise, with an error of its stamps where it is believed, and what that gains."""
+    """Return a sensor's noise, with a stamps' error if that is believed, and what that gains."""
     plain, without = noise_of(part, with_stamps=False)
     full, cost = noise_of(part, with_stamps=True)
     gain = without - cost
@@ -122,7 +122,7 @@ def search_effects(start: PoseFit, say: Callable[[str], None] | None = None) -> 
 
 
 def effects_of(fit: PoseFit) -> list[Term]:
-    """The terms that are effects, without the two frames."""
+    """Return the terms that are effects, without the two frames."""
     return [term for term in fit.terms if not isinstance(term, FrameTerm)]
 
 

@@ -1,4 +1,4 @@
-"""Poses of one sensor or body over time, and a session of several with an optical reference."""
+"""Holds poses of one sensor or body over time, and sessions of several with optical poses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -33,7 +33,7 @@ Smaller refuses rounded files; larger takes other numbers for quaternions."""
 
 @dataclass(frozen=True)
 class PoseSequence:
-    """Poses of one sensor or body in the order of their stamps.
+    """Holds poses of one sensor or body in the order of their stamps.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class PoseSequence:
         return np.asarray(Rotation.from_quat(self.quaternion).as_matrix()).reshape(-1, 3, 3)
 
     def rows(self, keep: NDArray[np.generic]) -> 'PoseSequence':
-        """The poses that are named by index or mask."""
+        """Return the poses that are named by index or mask."""
         return replace(
             self,
             time=self.time[keep],
@@ -78,20 +78,20 @@ class PoseSequence:
 
     @property
     def repeated(self) -> Mask:
-        """Mask (n,) of poses that are those before them, number for number."""
+        """Return the mask (n,) of poses that are those before them, number for number."""
         same = (np.diff(self.position, axis=0) == 0).all(axis=1)
         same &= (np.diff(self.quaternion, axis=0) == 0).all(axis=1)
         return np.concatenate([[False], same]) if self.size else np.zeros(0, dtype=bool)
 
     def track(self) -> PoseTrack:
-        """The first of each run of the same pose, as a track that can be interpolated."""
+        """Return the first of each run of the same pose, as a track that can be interpolated."""
         fresh = self.rows(~self.repeated)
         _, first = np.unique(fresh.time, return_index=True)
         return PoseTrack(fresh.time[first], fresh.position[first], fresh.quaternion[first])
 
 
 def missing_words(poses: PoseSequence) -> str:
-    """How many poses of a stream are none, in words; empty where all are."""
+    """Return how many poses of a stream are none, in words; empty where all are."""
     if not poses.missing.size:
         return ''
     count = poses.size + poses.missing.size
@@ -100,7 +100,7 @@ def missing_words(poses: PoseSequence) -> str:
 
 @dataclass(frozen=True)
 class PoseSession:
-    """One recording of a tracker that gives poses, with an optical reference.
+    """Holds one recording of a tracker that gives poses, with an optical reference.
 
     Attributes
     ----------
@@ -160,7 +160,7 @@ def leaps(poses: PoseSequence) -> Mask:
 
 
 def sequence_of(name: str, time: Array, position: Array, quaternion: Array) -> PoseSequence:
-    """A sequence from rows as they were written: sorted, markers for no pose taken out.
+    """Return a sequence from rows as they were written: sorted, markers for no pose taken out.
 
     Parameters
     ----------

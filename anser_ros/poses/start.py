@@ -1,4 +1,4 @@
-"""From a session to a first fit: blocks, a coarse time offset, two frames in closed form."""
+"""Starts a fit from a session: blocks, a coarse time offset, two frames in closed form."""
 
 from collections.abc import Sequence
 
@@ -154,14 +154,14 @@ def _space_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[NDArr
 
 
 def train_blocks(problem: PoseProblem) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Blocks of time to choose and fit on, and those that are held out."""
+    """Return blocks of time to choose and fit on, and those that are held out."""
     every = np.unique(np.concatenate(problem.blocks))
     held = np.arange(every.size) % HELD_OUT == HELD_OUT - 2
     return every[~held], every[held]
 
 
 def coarse_offset(problem: PoseProblem) -> float:
-    """The offset, s, at which tracked places are most nearly linear in the optical pose."""
+    """Return the offset, s, at which tracked places are most nearly linear in the optical pose."""
     chosen = []
     for poses in problem.sensors:
         step = max(1, poses.size // COARSE_POSES)
@@ -201,7 +201,7 @@ def _misfit(path: OpticalPath, sensors: Sequence[PoseSequence], offset: float) -
 
 
 def frames_from_places(tracked: Array, optical: Array) -> Array:
-    """The rotation (3, 3) that takes optical places (n, 3) to tracked ones, by Kabsch."""
+    """Return the rotation (3, 3) that takes optical places (n, 3) to tracked ones, by Kabsch."""
     left, right = tracked - np.median(tracked, axis=0), optical - np.median(optical, axis=0)
     u, _, vt = np.linalg.svd(left.T @ right)
     return np.asarray(u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt)
@@ -241,7 +241,7 @@ def _product(left: Array, right: Array) -> Array:
 
 
 def started(problem: PoseProblem, offset: float, frame: Array | None = None) -> list[Term]:
-    """OpticalFrame, mounts and an offset to start a fit from; a known frame is the identity."""
+    """Return OpticalFrame, mounts and an offset to start from; a known frame is the identity."""
     pairs = []
     for poses in problem.sensors:
         place, turn, _, known = problem.path.at(poses.time - offset)
@@ -273,7 +273,7 @@ def _middle(turns: Rotation) -> Array:
 
 
 def first_fit(problem: PoseProblem, offset: float, is_one_frame: bool) -> PoseFit:
-    """The best robust fit of the two frames from several starts."""
+    """Return the best robust fit of the two frames from several starts."""
     starts = [started(problem, offset, frame) for frame in _frames(problem, offset, is_one_frame)]
     fits = [robust_fit(problem, terms) for terms in starts]
     return min(fits, key=first_cost)
@@ -292,7 +292,7 @@ def _frames(problem: PoseProblem, offset: float, is_one_frame: bool) -> list[Arr
 
 
 def first_cost(fit: PoseFit) -> float:
-    """Median distance (m), and angle as if at a hand's breadth, of a sensor in the mean."""
+    """Return median distance (m), and angle as if at a hand's breadth, of a sensor in the mean."""
     total = 0.0
     for part in fit.state.parts:
         far = np.linalg.norm(part.residual[:, :3], axis=1)

@@ -1,4 +1,4 @@
-"""What the residual of held-out poses still depends on."""
+"""Tests what the residual of held-out poses still depends on."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ recorded."""
 
 
 def depends_on(state: PoseState) -> tuple[str, ...]:
-    """Names of what the residual depends on, the strongest first."""
+    """Return names of what the residual depends on, the strongest first."""
     shares = {}
     for name in ('time', 'position', 'orientation', 'speed'):
         found = [_share(part, name) for part in state.parts if np.count_nonzero(part.used) > 30]

@@ -1,4 +1,4 @@
-"""Two sensors exchanged for a while: found by whose prediction each pose fits, and put back."""
+"""Finds sensors exchanged for a while by whose prediction each pose fits, and puts them back."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,7 +24,7 @@ FEWEST, LEAST_SHARE = 5, 0.01  # poses in a span, and share of a sensor's poses,
 def swapped_spans(
     problem: PoseProblem, fit: PoseFit
 ) -> list[tuple[str, str, list[tuple[float, float]]]]:
-    """Pairs of sensors, and the spans (s) in which each gives the other's poses."""
+    """Return pairs of sensors, and the spans (s) in which each gives the other's poses."""
     found = []
     for a, b in combinations(range(len(problem.sensors)), 2):
         masks = [_looks_like(problem, fit, i, j) for i, j in ((a, b), (b, a))]
@@ -77,7 +77,7 @@ def _runs(
 def put_back(
     session: PoseSession, swaps: Sequence[tuple[str, str, list[tuple[float, float]]]]
 ) -> tuple[PoseSession, list[EffectRecord]]:
-    """The session with exchanged poses under their own names, and the records of it."""
+    """Return the session with exchanged poses under their own names, and the records of it."""
     sensors, records = dict(session.sensors), []
     for one, other, spans in swaps:
         left, right = sensors[one], sensors[other]

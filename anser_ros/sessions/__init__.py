@@ -1,1 +1,1 @@
-"""Recorded sessions: read, prepared, tracked, evaluated, diagnosed, and watched while they run."""
+"""Reads, prepares, tracks, evaluates and diagnoses recorded sessions; watches those that run."""

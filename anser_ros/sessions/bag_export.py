@@ -1,4 +1,4 @@
-"""Poses and fluxes of a bag as files that other programs read: CSV, TUM, MATLAB."""
+"""Writes poses and fluxes of a bag as files that other programs read: CSV, TUM, MATLAB."""
 
 import csv
 import os

@@ -1,4 +1,4 @@
-"""A bag of somebody else's made into a session: topics renamed, a setup document added."""
+"""Makes a session of somebody else's bag: topics renamed, a setup document added."""
 
 import os
 from collections import Counter
@@ -20,7 +20,7 @@ SETUP_TYPE = 'std_msgs/msg/String'
 
 @dataclass(frozen=True)
 class ImportedBag:
-    """What came of an import.
+    """Says what came of an import.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class ImportedBag:
 
 
 def parse_remaps(entries: Sequence[str]) -> dict[str, str]:
-    """New names by old ones from entries ``FROM:=TO``.
+    """Return new names by old ones from entries ``FROM:=TO``.
 
     Raises
     ------

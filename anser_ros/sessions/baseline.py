@@ -1,4 +1,4 @@
-"""What a session's reference sensors read without metal, from a recording of the same board."""
+"""Finds what a session's references read without metal, from a recording of the same board."""
 
 import math
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ is farther away belongs to another setup, whose readings would be taken for meta
 
 @dataclass(frozen=True)
 class Baseline:
-    """Clean readings of a session's reference sensors.
+    """Holds clean readings of a session's reference sensors.
 
     Attributes
     ----------
@@ -57,12 +57,12 @@ FEWEST_FRAMES = 12
 
 
 def baseline_of(recording: Session, sensors: SensorTable, model: FieldModel) -> Baseline:
-    """Clean readings of reference sensors; raises as `clean_flux`."""
+    """Return clean readings of reference sensors; raises as `clean_flux`."""
     return Baseline(recording.path, clean_flux(recording, sensors, model))
 
 
 def clean_flux(recording: Session, sensors: SensorTable, model: FieldModel) -> ComplexArray:
-    """Mean readings of a recording that there is no metal in, as far as anything tells.
+    """Return mean readings of a recording without metal in it, as far as anything tells.
 
     Arguments, result and further errors are those of `baseline_flux`.
 
@@ -114,7 +114,7 @@ def check_clean(
 
 
 def board_place_of(model: FieldModel, sensors: SensorTable, setup: Setup) -> BoardPlace | None:
-    """What compares the places that a model and references have the board at.
+    """Return what compares the places that a model and references have the board at.
 
     None for the drawing itself, for a board that cannot be drawn, and for a model with metal.
     """
@@ -179,7 +179,7 @@ def _mean_of(flux: ComplexArray) -> ComplexArray:
 
 
 def readings_of(recording: Session) -> ReferenceReadings | None:
-    """What a calibration keeps of its references; None without them, or near metal that moves."""
+    """Return what a calibration keeps of references; None without any or near moving metal."""
     reference = recording.reference
     if reference is None:
         return None
@@ -196,7 +196,7 @@ def readings_of(recording: Session) -> ReferenceReadings | None:
 
 
 def baseline_flux(baseline: Session, sensors: SensorTable) -> ComplexArray:
-    """Mean reading of each reference sensor in a recording without metal.
+    """Return the mean reading of each reference sensor in a recording without metal.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Calibration of recorded sessions: boards checked, tools gathered, the drawing as a prior."""
+"""Calibrates recorded sessions: boards checked, tools gathered, the drawing as a prior."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -45,7 +45,7 @@ def _difference(one: Setup, other: Setup) -> str:
 
 
 def generator_of(setup: Setup) -> Generator:
-    """Where the setup's coils are; their side from the geometry, or from their spacing."""
+    """Return where the setup's coils are; their side from the geometry, or from their spacing."""
     centres = np.array([coil.centre_m for coil in setup.emitter.coils])
     turns = np.array([coil.rotation_deg for coil in setup.emitter.coils])
     side = setup.emitter.geometry.get('side_m')

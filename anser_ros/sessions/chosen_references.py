@@ -1,4 +1,4 @@
-"""A session with only some of its reference sensors, as if the others had never been there."""
+"""Leaves some reference sensors out of a session, as if they had never been there."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Two evaluations of the same frames compared: errors and shares with a pose, with intervals.
+"""Compares two evaluations of the same frames: errors and shares with a pose, with intervals.
 
 Frames of one moment share what made their errors, so whole stretches of time are resampled (the
 moving-block idea of Künsch, Annals of Statistics 17, 1989), all coils of a stretch together.
@@ -38,7 +38,7 @@ FEWEST_BLOCKS = 5
 
 @dataclass(frozen=True)
 class Difference:
-    """The interval of a difference, second less first, and which side of zero it is on.
+    """Holds the interval of a difference, second less first, and which side of zero it is on.
 
     Attributes
     ----------
@@ -51,13 +51,13 @@ class Difference:
 
     @property
     def sign(self) -> int:
-        """Sign of the difference where the whole interval is on one side of zero, else 0."""
+        """Return the sign of the difference where the whole interval has one, else 0."""
         return int(self.low > 0) - int(self.high < 0)
 
 
 @dataclass(frozen=True)
 class Compared(Difference):
-    """The errors of one coil or body, or of all coils, in the frames that both have.
+    """Compares the errors of one coil or body, or of all coils, in the frames that both have.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class Compared(Difference):
 
 @dataclass(frozen=True)
 class ComparedShares(Difference):
-    """The shares of frames with a pose, of one coil or body, of the frames that both know.
+    """Compares the shares of frames with a pose, of one coil or body, in the frames both know.
 
     Attributes
     ----------
@@ -101,12 +101,12 @@ class ComparedShares(Difference):
 
     @property
     def verdict(self) -> str:
-        """Which has poses more often: ``a``, ``b``, or ``neither``."""
+        """Return which has poses more often: ``a``, ``b``, or ``neither``."""
         return {1: 'b', 0: 'neither', -1: 'a'}[self.sign]
 
 
 def read_errors(folder: Path) -> dict[str, dict[Key, float]]:
-    """Errors of position (m) and orientation (rad) by stamp and name, of an evaluation's folder.
+    """Return errors of position (m) and orientation (rad) by stamp and name, of an evaluation.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def read_errors(folder: Path) -> dict[str, dict[Key, float]]:
 
 
 def read_states(folder: Path) -> dict[Key, float]:
-    """Whether there is a pose, 1 or 0, by stamp and name of a coil or body.
+    """Return whether there is a pose, 1 or 0, by stamp and name of a coil or body.
 
     Raises
     ------

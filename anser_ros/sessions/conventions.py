@@ -1,4 +1,4 @@
-"""In which units and order optical poses and fluxes were written, as the fluxes themselves tell.
+"""Finds units and order in which optical poses and fluxes were written, by what the fluxes tell.
 
 Poses predict the fluxes of the drawn board. Where they do not as they stand, and do when they are
 read in another unit or another order, that is how they were written. Where neither fits (an
@@ -40,7 +40,7 @@ board that is not as drawn stay far below."""
 
 @dataclass(frozen=True)
 class Reading:
-    """One way to read the numbers of a pose.
+    """Describes one way to read the numbers of a pose.
 
     Attributes
     ----------

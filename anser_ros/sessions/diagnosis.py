@@ -1,4 +1,4 @@
-"""Diagnosis of a recorded session, and how its held-out part is tracked without and with it.
+"""Diagnoses a recorded session, and tracks its held-out part without and with what was found.
 
 The stages are `prepare`, `correct`, `problem_of`, `anser_ros.diagnosis.diagnose.diagnose` (which
 screens, searches, confirms and concludes), `held_out_part` and `track_held_out`; each can be
@@ -37,7 +37,7 @@ poses."""
 
 @dataclass(frozen=True)
 class TrackingErrors:
-    """Errors over all coils tracked singly in the held-out part, or of the source seen there.
+    """Holds errors of all coils tracked singly in the held-out part, or of the source seen there.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class TrackingErrors:
 
 @dataclass(frozen=True)
 class SessionDiagnosis:
-    """What a model lacks on a session.
+    """Holds what a model lacks on a session.
 
     Attributes
     ----------
@@ -137,14 +137,14 @@ def problem_of(corrected: PreparedSession, spread: Spread | None = None) -> Prob
 
 
 def spread_of(prepared: PreparedSession) -> Spread:
-    """How far readings and poses may be from what a right model says."""
+    """Return how far readings and poses may be from what a right model says."""
     accuracy = prepared.session.setup.accuracy
     accuracy = replace(accuracy, flux_noise_t=prepared.noise_t or accuracy.flux_noise_t)
     return Spread(float(np.hypot(accuracy.flux_noise_t, prepared.model.flux_error_t)), accuracy)
 
 
 def held_out_part(session: Session, problem: Problem) -> Session:
-    """The frames in the blocks that took no part, and the first frame, which sets the clock.
+    """Return the frames of the blocks that took no part, and the first one, which sets the clock.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The document that a diagnosis leaves, as `docs/interfaces.md` promises it."""
+"""Writes the document that a diagnosis leaves, as `docs/interfaces.md` promises it."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The emitters of a setup as it draws them: their field, and the nominal model of it."""
+"""Takes the emitters of a setup as it draws them: their field, and the nominal model of it."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +14,7 @@ from anser_ros.wire.setup import Setup
 
 @dataclass(frozen=True)
 class Drawing:
-    """What a setup's geometry gives; all of it is None where it describes no known kind of board.
+    """Holds what a setup's geometry gives; all of it is None for no known kind of board.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Drawing:
 
     @cached_property
     def model(self) -> FieldModel | None:
-        """The nominal model, made when it is first asked for, which takes about a second.
+        """Return the nominal model, made when it is first asked for, which takes about a second.
 
         None also where dipoles do not reach the accuracy that is asked of it.
         """

@@ -1,4 +1,4 @@
-"""Evaluation of a recorded session: its poses tracked, and compared with the optical ones.
+"""Evaluates a recorded session: tracks its poses, and compares them with the optical ones.
 
 The stages are `prepare`, `track` and `compare`; each can be called alone, and `track_session` runs
 all of them. What they give is written by `evaluation_document` and `pose_table`.
@@ -21,7 +21,7 @@ from anser_ros.tracking.source_track import seen_from
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Tracked poses and their errors.
+    """Holds tracked poses and their errors.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The document that an evaluation leaves, as `docs/interfaces.md` promises it."""
+"""Writes the document that an evaluation leaves, as `docs/interfaces.md` promises it."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The field model that follows a recorded session's reference sensors, as it does live."""
+"""Lets the field model follow a recorded session's reference sensors, as it does live."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ from anser_ros.tracking.estimate import OK, PoseEstimate
 
 @dataclass
 class RefitSummary:
-    """In how many frames the refit was in which state, and left out which reference sensor."""
+    """Counts in how many frames the refit was in which state, and left out which reference."""
 
     states: Counter[str] = field(default_factory=Counter)
     left_out: Counter[str] = field(default_factory=Counter)
@@ -93,7 +93,7 @@ class ModelFollower:
         self.summary = RefitSummary()
 
     def at(self, frame: SessionFrame) -> Standing:
-        """What a frame is tracked with: the model of its references, or the last one, aged."""
+        """Return what a frame is tracked with: its references' model, or the last one, aged."""
         if self._patches is not None and frame.tools is not None:
             tools = frame.tools
             self._patches.take_flux(frame.stamp_ns, tools.channels, tools.flux, tools.flags)

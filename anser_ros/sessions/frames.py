@@ -1,4 +1,4 @@
-"""A recorded session as the frames that its nodes received, one after the other."""
+"""Yields a recorded session as the frames that its nodes received, one after the other."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class FrameReadings:
-    """What S sensors read in one frame.
+    """Holds what S sensors read in one frame.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class FrameReadings:
 
 @dataclass(frozen=True)
 class SessionFrame:
-    """All that was measured under one stamp.
+    """Holds all that was measured under one stamp.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class SessionFrame:
 
 
 def frames_of(session: Session) -> Iterator[SessionFrame]:
-    """Every stamp of a session in order, with what was measured under it."""
+    """Yield every stamp of a session in order, with what was measured under it."""
     rows: dict[float, tuple[list[tuple[Measurements, int]], list[int]]] = {}
     for tool in session.tools:
         for row, time in enumerate(tool.time.tolist()):

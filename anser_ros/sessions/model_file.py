@@ -1,4 +1,4 @@
-"""Field models read from files and written to them."""
+"""Reads field models from files and writes them."""
 
 import os
 from dataclasses import replace
@@ -48,7 +48,7 @@ def save_model(path: str | os.PathLike[str], model: FieldModel) -> None:
 
 
 def is_snapshot(model: FieldModel) -> bool:
-    """Whether a model, or one that it was made from, was saved with a refit's change in it."""
+    """Return whether a model, or one it was made from, was saved with a refit's change in it."""
     return model.provenance.get('source') == SNAPSHOT
 
 

@@ -1,4 +1,4 @@
-"""Patches of a recorded session, which carry reference coils that move, followed as live."""
+"""Follows, as live, patches of a recorded session, which carry reference coils that move."""
 
 from collections.abc import Sequence
 
@@ -37,7 +37,7 @@ def parse_patches(entries: Sequence[str]) -> dict[str, str]:
 
 
 class PatchFollower:
-    """A refit with the coils of patches, whose poses lie in the session's own bag.
+    """Runs a refit with the coils of patches, whose poses lie in the session's own bag.
 
     The live node works a refit for new places out beside its callbacks and goes on without the
     patches meanwhile; here that takes no time.

@@ -1,4 +1,4 @@
-"""Whether a recording can be what its units, clocks and poses say, before anything works on it.
+"""Judges whether a recording can be what its units, clocks and poses say, before it is used.
 
 Every check speaks on evidence only, and names it; what the data can't decide passes.
 """

@@ -1,4 +1,4 @@
-"""Errors of tracked poses against the optical ones, and the figures that are quoted of them."""
+"""Compares tracked poses with the optical ones, and makes the figures that are quoted of that."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PoseSeries:
-    """Every estimate of one sensor or body, with its error where the truth is known.
+    """Holds every estimate of one sensor or body, with its error where the truth is known.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class PoseSeries:
 
     @property
     def ok(self) -> NDArray[np.bool_]:
-        """Mask (F,) of the frames in which a pose was given."""
+        """Return the mask (F,) of the frames in which a pose was given."""
         return np.array([estimate.state == OK for estimate in self.estimates], dtype=bool)
 
 
@@ -88,7 +88,7 @@ def body_series(
 
 
 def metrics(series: PoseSeries) -> dict[str, Any]:
-    """The figures of one sensor or body as the evaluation document has them.
+    """Return the figures of one sensor or body as the evaluation document has them.
 
     These are the number of compared poses, the share of frames with a pose, and the RMSE, mean
     error, 50th and 95th percentile (equation 7 of the article) of position and orientation; None

@@ -1,4 +1,4 @@
-"""The tables of poses that an evaluation leaves, as `docs/interfaces.md` promises them."""
+"""Writes the tables of poses that an evaluation leaves, as `docs/interfaces.md` promises them."""
 
 import csv
 from math import isfinite

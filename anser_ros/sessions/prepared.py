@@ -1,4 +1,4 @@
-"""A session with everything about it that is worked out once and then only read.
+"""Prepares a session: everything about it is worked out once and then only read.
 
 All that evaluates or diagnoses a session starts with `prepare` and hands its result on: the board,
 the noise, the baseline and the corrections are the same wherever they are needed, and the model
@@ -24,7 +24,7 @@ from anser_ros.sessions.volume import pose_volume
 
 @dataclass(frozen=True)
 class PreparedSession:
-    """A session and a model that fits it, with what follows from the two.
+    """Holds a session and a model that fits it, with what follows from the two.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class PreparedSession:
 
     @property
     def sensors(self) -> SensorTable:
-        """All tool sensors, one body after the other, as the setup has them."""
+        """Return all tool sensors, one body after the other, as the setup has them."""
         return self.session.sensors
 
     def with_session(self, session: Session) -> 'PreparedSession':
@@ -130,7 +130,7 @@ def _correction(model: FieldModel, session: Session) -> Correction:
 
 
 def correct(prepared: PreparedSession) -> PreparedSession:
-    """The session as the effects that the model knows already leave it.
+    """Return the session as the effects that the model knows already leave it.
 
     Fluxes are those that sound sensors and emitters would have given, sensors are where they
     truly are, and optical poses are on the fluxes' clock and in the frame fg.
@@ -157,7 +157,7 @@ def _corrected(prepared: PreparedSession, measurements: Measurements) -> Measure
 
 
 def with_truth(measurements: Measurements, correction: Correction) -> Measurements:
-    """Measurements whose sensors and optical poses are as a model's corrections say."""
+    """Return measurements whose sensors and optical poses are as a model's corrections say."""
     out = replace(measurements, sensors=correction.sensors(measurements.sensors))
     if measurements.track is None:
         return out

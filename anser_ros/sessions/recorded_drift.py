@@ -1,4 +1,4 @@
-"""Drifts of emitters, whose course over time holds on the session they were found on only.
+"""Dates drifts of emitters, whose course holds only on the session that they were found on.
 
 A diagnosis notes that session in the drift's evidence, by its first stamp, so that a later
 evaluation can tell whether it tracks the same session.
@@ -15,7 +15,7 @@ FOUND_ON = 'session_start_ns'
 
 
 def date_drifts(model: FieldModel, session: Session) -> FieldModel:
-    """The model, with drifts that are not dated yet dated by the session they were found on."""
+    """Return the model, its drifts without a date dated by the session they were found on."""
     effects = tuple(
         replace(effect, evidence={**effect.evidence, FOUND_ON: session.start_ns})
         if drifts(effect) and FOUND_ON not in effect.evidence
@@ -26,6 +26,6 @@ def date_drifts(model: FieldModel, session: Session) -> FieldModel:
 
 
 def is_recorded(model: FieldModel, session: Session) -> bool:
-    """Whether this is the session on which one of the model's drifts was found."""
+    """Return whether this is the session on which one of the model's drifts was found."""
     found = [effect.evidence.get(FOUND_ON) for effect in model.effects if drifts(effect)]
     return session.start_ns in found

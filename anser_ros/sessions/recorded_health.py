@@ -1,4 +1,4 @@
-"""What the nodes reported about themselves in ``/diagnostics`` during a recording."""
+"""Reads what the nodes reported about themselves in ``/diagnostics`` during a recording."""
 
 import os
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ BUSY = {
 
 
 def last_words(path: str | os.PathLike[str]) -> dict[str, Mapping[str, str]]:
-    """The last values of every status by its name.
+    """Return the last values of every status by its name.
 
     A bag without diagnostics, or one that cannot be read yet, gives an empty mapping.
     """
@@ -82,7 +82,7 @@ def _level(status: Any) -> int:
 
 
 def overload(path: str | os.PathLike[str]) -> list[str]:
-    """Signs in words that the machine was too busy for a recording; empty for a sound one."""
+    """Return signs, in words, that the machine was too busy for a recording; empty if sound."""
     signs = []
     for name, values in last_words(path).items():
         for key, meaning in BUSY.items():
@@ -93,7 +93,7 @@ def overload(path: str | os.PathLike[str]) -> list[str]:
 
 
 def kept_share(session: Session) -> float:
-    """Share of a recording's frames with tool readings, which is 1 where no window is missing.
+    """Return the share of frames with tool readings, which is 1 where no window is missing.
 
     How many there should be follows from the median time between two frames; of several tools the
     best counts.

@@ -1,4 +1,4 @@
-"""The poses that live trackers published during a recording, against its optical ones."""
+"""Compares the poses that live trackers published during a recording with its optical ones."""
 
 import os
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LiveErrors:
-    """Errors of the poses of one sensor or body.
+    """Holds errors of the poses of one sensor or body.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class LiveErrors:
 
 
 def published_poses(path: str | os.PathLike[str], topics: Sequence[str]) -> dict[str, PoseStream]:
-    """What each PoseStamped topic of a bag carries."""
+    """Return what each PoseStamped topic of a bag carries."""
     # Nodes that read no bag run where the packages that read bags are not installed.
     from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages
 

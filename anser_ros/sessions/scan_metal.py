@@ -1,4 +1,4 @@
-"""Metal that moved during a scan and rested near it before and after: taken off the scan.
+"""Takes metal that moved during a scan, and rested near it before and after, off the scan.
 
 Frames in which it moves are left out of a calibration, but a field that is learnt from the others
 has the resting metal in it. How it moves tells what it does at rest
@@ -43,7 +43,7 @@ ASKED = 60
 
 @dataclass(frozen=True)
 class RestingMetal:
-    """What metal at rest did to the fluxes of a session's tools.
+    """Holds what metal at rest did to the fluxes of a session's tools.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""A recorded session as arrays: the messages of a bag on one time axis."""
+"""Holds a recorded session as arrays: the messages of a bag on one time axis."""
 
 import os
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ hand at 0.1 m/s would be a centimetre off. Smaller, a slow recorder could not sa
 
 @dataclass(frozen=True)
 class Session:
-    """One recording as measurements of every body.
+    """Holds one recording as measurements of every body.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Session:
         return sensor_table(()).joined(*(tool.sensors for tool in self.tools))
 
     def with_stated(self, stated: Mapping[str, float]) -> 'Session':
-        """The session with values stated that go before its setup document's.
+        """Return the session with values stated that go before its setup document's.
 
         Raises
         ------
@@ -70,7 +70,7 @@ class Session:
 
 
 def sensor_table(specs: tuple[SensorSpec, ...]) -> SensorTable:
-    """The specified sensors as a table, in the given order."""
+    """Return the specified sensors as a table, in the given order."""
     return SensorTable(
         channel=np.array([s.channel for s in specs], dtype=np.int64),
         name=tuple(s.name for s in specs),
@@ -82,7 +82,7 @@ def sensor_table(specs: tuple[SensorSpec, ...]) -> SensorTable:
 
 
 def measured_noise(setup: Setup) -> float:
-    """Noise of the fluxes' components that the acquisition measured when it wrote the setup, T.
+    """Return the noise of the fluxes' components that the acquisition measured with the setup, T.
 
     It is 0 where the setup tells none, and where ``flux_noise_t`` is stated, which goes before.
     """
@@ -94,7 +94,7 @@ def measured_noise(setup: Setup) -> float:
 
 
 def tracking_noise(setup: Setup) -> float:
-    """Noise that tracking starts from, T: what is stated, or was measured where that is larger."""
+    """Return the noise that tracking starts from, T: what is stated, or was measured if larger."""
     return max(setup.accuracy.flux_noise_t, measured_noise(setup))
 
 
@@ -112,7 +112,7 @@ def stamp_sigma(setup: Setup) -> float:
 
 
 def pose_track(stream: PoseStream, start_ns: int) -> PoseTrack:
-    """A recorded pose stream on the time axis of a session that starts at a stamp."""
+    """Return a recorded pose stream on the time axis of a session that starts at a stamp."""
     time = (stream.stamp_ns - start_ns) * NANO
     return PoseTrack(np.asarray(time, dtype=np.float64), stream.position, stream.quaternion)
 
@@ -209,7 +209,7 @@ def load_session(path: str | os.PathLike[str]) -> Session:
 
 
 def empty_session(setup: Setup, path: str) -> Session:
-    """A session of a setup in which nothing has been recorded yet: all arrays have no frame."""
+    """Return a session of a setup with nothing recorded yet: all arrays have no frame."""
     tables = [sensor_table(specs) for specs in (setup.tool_sensors, setup.reference_sensors)]
     tool, reference = (_no_fluxes(t, len(setup.emitter.coils)) if len(t) else None for t in tables)
     return session_of(Bag(path, setup, '', tool, reference, {}))

@@ -1,4 +1,4 @@
-"""The last seconds of a running system, as the session that a recording of them would be."""
+"""Keeps the last seconds of a running system, as the session that a recording would be."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -109,12 +109,12 @@ class SlidingWindow:
 
     @property
     def span_s(self) -> float:
-        """Time between the oldest and the newest reading that is kept."""
+        """Return the time between the oldest and the newest reading that is kept, s."""
         spans = [f.rows[-1][0] - f.rows[0][0] for f in (self._tool, self._reference) if f.rows]
         return max(spans, default=0) * NANO
 
     def session(self) -> Session | None:
-        """What is in the window; None while there are no fluxes.
+        """Return what is in the window; None while there are no fluxes.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""The field model that a command starts from: a file, or the nominal one of the setup."""
+"""Chooses the field model that a command starts from: a file, or the nominal one of the setup."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -39,7 +39,7 @@ def board_of(setup: Setup) -> Board:
 
 
 def model_of(name: str) -> FieldModel | None:
-    """The model of a file, None for an empty name and for that of the setup's own geometry.
+    """Return the model of a file; None for an empty name, and for that of the setup's geometry.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def model_of(name: str) -> FieldModel | None:
 
 
 def starting_model(setup: Setup, given: FieldModel | None) -> FieldModel:
-    """The model to start from live: the given one, or the nominal one of the setup's geometry.
+    """Return the model to start from live: the given one, or the geometry's nominal one.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def check_emitters(setup: Setup, given: FieldModel) -> None:
 def model_for(
     name: str, session: 'Session', snapshot: bool = False, resurveyed: Sequence[str] = ()
 ) -> FieldModel:
-    """The model that ``name`` stands for: a file's path, or ``nominal``.
+    """Return the model that ``name`` stands for: a file's path, or ``nominal``.
 
     ``snapshot`` says whether a snapshot of a refit will do, which is no calibration, and
     ``resurveyed`` names bodies whose sensors are the same, surveyed anew.
@@ -99,7 +99,7 @@ def model_for(
 
 
 def is_nominal(model: FieldModel) -> bool:
-    """Whether a model is the drawing of a board, or was made from it without a calibration."""
+    """Return whether a model is a board's drawing, or was made from it without a calibration."""
     return model.provenance.get('source') == NOMINAL
 
 

@@ -1,4 +1,4 @@
-"""Tables of fluxes or tracked poses, and of optical poses, made into a session by a document.
+"""Makes a session of tables of fluxes or tracked poses, and of optical poses, by a document.
 
 The document names the files, their columns, units, the order of quaternions and the time base;
 `docs/howto/import.md` has every key with examples.
@@ -47,7 +47,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class ImportedTables:
-    """Number of messages, by topic, that were written."""
+    """Counts the messages, by topic, that were written."""
 
     messages: dict[str, int]
 

@@ -1,4 +1,4 @@
-"""Tables of numbers from CSV, NumPy and MATLAB files, and columns of them by name."""
+"""Reads tables of numbers from CSV, NumPy and MATLAB files, and columns of them by name."""
 
 import csv
 import re
@@ -20,7 +20,7 @@ ENDINGS = ('.csv', '.npy', '.npz', '.mat')
 
 @dataclass(frozen=True)
 class NumberTable:
-    """The arrays of one file by name; the first index of each counts rows.
+    """Holds the arrays of one file by name; the first index of each counts rows.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class NumberTable:
     arrays: Mapping[str, NDArray[Any]]
 
     def array(self, name: str) -> NDArray[Any]:
-        """The whole array of a name; `ParameterError` where there is none."""
+        """Return the whole array of a name; `ParameterError` where there is none."""
         if name not in self.arrays:
             known = ', '.join(list(self.arrays)[:20])
             raise ParameterError(f'{self.path}: no {name!r}; there are: {known}')

@@ -1,4 +1,4 @@
-"""Poses of a recorded session, tracked as the live nodes would."""
+"""Tracks the poses of a recorded session as the live nodes would."""
 
 import time
 from collections.abc import Callable
@@ -18,7 +18,7 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True)
 class TrackedSession:
-    """What tracking a session gave.
+    """Holds what tracking a session gave.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class TrackedSession:
 
 
 def in_phase_model(model: FieldModel) -> FieldModel:
-    """The model without its quadrature part, as the article's own method uses it."""
+    """Return the model without its quadrature part, as the article's own method uses it."""
     modes = None if model.modes is None else model.modes.real.astype(complex)
     return replace(model, moments=model.moments.real.astype(complex), modes=modes)
 

@@ -1,4 +1,4 @@
-"""What a setup document says about tracking: noise, stamps, tools, volume."""
+"""Takes what a setup document says about tracking: noise, stamps, tools, volume."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from anser_ros.wire.setup import Setup
 
 
 def settings_for(setup: Setup, settings: TrackerSettings) -> TrackerSettings:
-    """Settings with what the setup states or measured, and its volume where they have none."""
+    """Return settings with what the setup states or measured, and its volume if they have none."""
     return replace(
         settings,
         flux_noise_t=tracking_noise(setup),

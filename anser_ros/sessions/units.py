@@ -1,4 +1,4 @@
-"""Units that numbers are often written in by mistake, told from how much too large they are."""
+"""Tells units that numbers are often written in by mistake by how much too large they are."""
 
 import math
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""The tracked volume of a setup: what its document states, or what follows from its board."""
+"""Finds the tracked volume of a setup: what its document states, or what its board suggests."""
 
 from anser_ros.errors import FitError
 from anser_ros.physics.volume import TrackedVolume
@@ -13,7 +13,7 @@ def stated_volume(setup: Setup) -> TrackedVolume | None:
 
 
 def pose_volume(setup: Setup) -> TrackedVolume:
-    """The box in which poses are accepted.
+    """Return the box in which poses are accepted.
 
     It is the stated volume, or else the default volume over the board with its fringe; a board
     that can't be drawn from the setup gets the box of an Anser board.

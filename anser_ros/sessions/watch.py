@@ -1,4 +1,4 @@
-"""A light diagnosis of the last seconds, which says whether the model lacks anything, and what.
+"""Diagnoses the last seconds lightly: whether the model lacks anything, and what.
 
 A look costs little while all is well, and while what was found last still explains what is seen;
 only something new starts a search.
@@ -45,7 +45,7 @@ tool that stays closer shows that something is wrong, but not what."""
 
 @dataclass(frozen=True)
 class Sighting:
-    """What a look found.
+    """Holds what a look found.
 
     Attributes
     ----------
@@ -84,12 +84,12 @@ class Sighting:
 
     @property
     def is_clear(self) -> bool:
-        """Whether all is as the model says."""
+        """Return whether all is as the model says."""
         return self.excess < EXCESS and not self.findings
 
 
 class Watch:
-    """A watch looks at one window after the other, and remembers what it found.
+    """Looks at one window after the other, and remembers what it found.
 
     Parameters
     ----------

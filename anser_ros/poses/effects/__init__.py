@@ -1,1 +1,1 @@
-"""The effects of trackers of poses, one file each."""
+"""Holds the effects of trackers of poses, one file each."""

@@ -1,4 +1,4 @@
-"""The clocks of the tracker and of the optical reference: an offset, and a rate."""
+"""The clocks of the tracker and of the optical reference differ by an offset and a rate."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -19,7 +19,7 @@ AGREE_S = 3.0
 
 
 class PoseTimeOffset(PoseEffect):
-    """At stamp t of a tracked pose the optical pose stamped t - theta applies, s."""
+    """Applies the optical pose stamped t - theta at stamp t of a tracked pose, s."""
 
     name = 'time_offset'
     summary = 'the tracked stamps are late (positive) or early by the optical clock'
@@ -46,7 +46,7 @@ class PoseTimeOffset(PoseEffect):
         return time - term.theta[0] if self.acts_on(term, sensor) else time
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the offset, and the sensor where it is one sensor's."""
+        """Record the offset, and the sensor where it is one sensor's."""
         values = {**term.site, 'offset_s': float(term.theta[0])}
         return EffectRecord(self.name, values, {'offset_s': float(sigmas(covariance)[0])})
 
@@ -71,7 +71,7 @@ class PoseClockRate(PoseEffect):
         return [Term(self, {'middle_s': 0.5 * setting.duration}, np.zeros(1))]
 
     def prior(self, term: Term) -> Array:
-        """Rates err by some parts in a thousand."""
+        """Expect rates that err by some parts in a thousand."""
         return np.full(1, 2.0)
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
@@ -84,7 +84,7 @@ class PoseClockRate(PoseEffect):
         return np.asarray(time - 1e-3 * term.theta[0] * (time - float(term.site['middle_s'])))
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the rate, and the time at which the offset is the offset."""
+        """Record the rate, and the time at which the offset is the offset."""
         sigma = 1e3 * float(sigmas(covariance)[0])
         values = {'rate_ppm': 1e3 * float(term.theta[0]), 'middle_s': term.site['middle_s']}
         return EffectRecord(self.name, values, {'rate_ppm': sigma})

@@ -1,4 +1,4 @@
-"""What comes and goes, or shifts, during a session: metal that moves, a mount that is loose."""
+"""Something comes and goes, or shifts, in a session: metal that moves, a mount that is loose."""
 
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
@@ -38,7 +38,7 @@ and up to which the others' must be lower."""
 
 
 def windows_of(sensing: Sensing, sight: PoseSight) -> NDArray[np.int64]:
-    """Window of each pose of a sensor that counts; -1 for the others."""
+    """Return the window of each pose of a sensor that counts; -1 for the others."""
     start = min(float(s.view.time[0]) for s in sight.sensors)
     share = (sensing.view.time - start) / max(sight.setting.duration, 1e-9)
     window = np.clip((WINDOWS * share).astype(np.int64), 0, WINDOWS - 1)
@@ -46,7 +46,9 @@ def windows_of(sensing: Sensing, sight: PoseSight) -> NDArray[np.int64]:
 
 
 def episode_windows(sensing: Sensing, sight: PoseSight) -> list[int]:
-    """Windows in which a sensor is off though it was right at the same places at other times."""
+    """Return windows in which a sensor is off though it was right at these
+    places at other times.
+    """
     window = windows_of(sensing, sight)
     square = np.sum(sensing.residual[:, :3] ** 2, axis=1)
     judged = [w for w in range(WINDOWS) if np.count_nonzero(window == w) >= FEWEST_POSES]
@@ -82,7 +84,7 @@ class PoseMovingMetal(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'t_start_s': 's', 't_end_s': 's'}
 
     def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
-        """One record for all sensors that are off at the time."""
+        """Return one record for all sensors that are off at the time."""
         found = {s.view.sensor: episode_windows(s, sight) for s in sight.sensors}
         found = {name: windows for name, windows in found.items() if windows}
         if not found:
@@ -104,7 +106,7 @@ class LooseMount(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'rms_m': 'm', 'rms_deg': 'deg'}
 
     def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
-        """The sensor whose shifts are its own; with one sensor it could be anything else."""
+        """Return the sensor whose shifts are its own; a single sensor's could be anything else."""
         if len(sight.sensors) < 2:
             return []
         shifts = {s.view.sensor: _shifts(s, sight) for s in sight.sensors}

@@ -69,13 +69,13 @@ class FieldDistortion(PoseEffect):
         return Term(self, {**site, **place}, np.zeros(3 * count))
 
     def bent(self, term: Term) -> Term:
-        """The map without its linear part, which something else has."""
+        """Return the map without its linear part, which something else has."""
         site = {**term.site, 'lowest': 2}
         count = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, int(site['degree']), 2).shape[1]
         return Term(self, site, np.zeros(3 * count))
 
     def whole(self, term: Term) -> Term:
-        """The map of the same degree with its linear part, on all sensors."""
+        """Return the map of the same degree with its linear part, on all sensors."""
         site = {k: v for k, v in term.site.items() if k not in ('lowest', 'sensor')}
         count = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, int(site['degree'])).shape[1]
         return Term(self, site, np.zeros(3 * count))
@@ -99,7 +99,7 @@ class FieldDistortion(PoseEffect):
         return out
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
-        """Minus what it adds to the tracked positions."""
+        """Return minus what it adds to the tracked positions."""
         if not self.acts_on(term, view.sensor):
             return None
         out = np.zeros((view.time.size, 6, term.theta.size))
@@ -107,11 +107,11 @@ class FieldDistortion(PoseEffect):
         return out
 
     def shift(self, term: Term, position: Array) -> Array:
-        """What is added to tracked positions (n, 3), m."""
+        """Return what is added to tracked positions (n, 3), m."""
         return self._derivative(term, position) @ term.theta
 
     def shift_and_variance(self, term: Term, position: Array, sigma: Array) -> tuple[Array, Array]:
-        """What is added to tracked positions (n, 3), m, and its variance (n,) a coordinate, m^2.
+        """Return what is added to positions (n, 3), m, and its variance a coordinate (n,), m^2.
 
         The parameters' standard deviations ``sigma``, mm, are taken for independent.
         """
@@ -128,7 +128,7 @@ class FieldDistortion(PoseEffect):
         return position + self.shift(term, position), rotation
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
-        """The record has the map, and how far it moves poses at their rms distance."""
+        """Record the map, and how far it moves poses at their rms distance."""
         degree = int(term.site['degree'])
         # A scale's first number moves all three coordinates, as its shift does together.
         rms = UNIT_M * float(np.linalg.norm(term.theta)) / (np.sqrt(3) if degree else 1.0)

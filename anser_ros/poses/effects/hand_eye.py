@@ -1,4 +1,4 @@
-"""The two unknown frames: always fitted, and no effect.
+"""Fits the two unknown frames, which are always there and no effect.
 
 One term holds the registration (optical frame to the tracker's), one a sensor its place and its
 mount on the body. Both are kept as a start and small turns about it.
@@ -22,7 +22,7 @@ FREE = 1e3
 
 @dataclass(frozen=True, kw_only=True)
 class FrameTerm(Term):
-    """A frame as a start and a step from it.
+    """Holds a frame as a start and a step from it.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class FrameTerm(Term):
         return self.theta[:3]
 
     def rebased(self) -> Self:
-        """The same frame with a turn of zero."""
+        """Return the same frame with a turn of zero."""
         return type(self)(
             self.effect, self.site, np.array([*self.theta[:3], 0, 0, 0]), self.held,
             start=self.rotation,
@@ -61,7 +61,7 @@ class OpticalFrame(PoseEffect):
         return np.full(6, FREE)
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
-        """A shift of all poses, and a turn about the tracker's origin."""
+        """Return the derivative by a shift of all poses and a turn about the tracker's origin."""
         assert isinstance(term, FrameTerm)
         out = np.zeros((view.time.size, 6, 6))
         out[:, :3, :3] = np.eye(3)
@@ -81,7 +81,7 @@ class Mount(PoseEffect):
         return np.full(6, FREE)
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
-        """A shift and a turn in the body's frame, of this sensor's poses alone."""
+        """Return the derivative of this sensor's poses by shift and turn in the body's frame."""
         if not self.acts_on(term, view.sensor):
             return None
         body = view.frame @ view.turn

@@ -1,4 +1,4 @@
-"""Noise of a sensor that is larger than the others', or grows with the distance."""
+"""A sensor's noise is larger than the others', or grows with the distance."""
 
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
@@ -88,7 +88,7 @@ class PoseExcessNoise(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'factor': '1'}
 
     def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
-        """Each sensor that is noisier than the median of the others."""
+        """Return each sensor that is noisier than the median of the others."""
         noise = {}
         law = RangeNoise().observed(sight)
         exponent = float(law[0].parameters['exponent']) if law else 0.0
@@ -115,7 +115,7 @@ class RangeNoise(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'exponent': '1', 'reference_m': 'm'}
 
     def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
-        """A power law of all sensors together, each with a level of its own."""
+        """Return a power law of all sensors together, each with a level of its own."""
         # Each sensor has a level of its own, so only what changes within one tells a power.
         pairs = [pair for pair in map(jitter, sight.sensors) if pair[0].size >= FEWEST]
         if not pairs:

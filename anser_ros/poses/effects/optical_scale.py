@@ -34,7 +34,7 @@ class PoseOpticalScale(PoseEffect):
         return np.full(1, 30.0)
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
-        """Positions shrink towards the optical origin; the registration takes the rest."""
+        """Shrink positions towards the optical origin; the registration takes the rest."""
         out = np.zeros((view.time.size, 6, 1))
         out[:, :3, 0] = -1e-3 * view.optical @ view.frame.T / (1 + 1e-3 * term.theta[0])
         return out

@@ -1,4 +1,4 @@
-"""Stamps that are those of a receipt or of a poll, and not of the measurement."""
+"""Stamps are those of a receipt or of a poll, and not of the measurement."""
 
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
@@ -28,7 +28,7 @@ some poses lost, and no poll's: another clock falls into step for less."""
 
 
 def stamp_step(time: Array) -> float:
-    """The step, s, that all intervals between stamps are multiples of, or zero."""
+    """Return the step, s, that all intervals between stamps are multiples of, or zero."""
     steps = np.diff(time)
     steps = steps[steps > FINEST_S / 2]
     if steps.size < 20:
@@ -77,7 +77,7 @@ class ReceiptJitter(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'rms_s': 's'}
 
     def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
-        """Where the residual lies along the velocity and grows with it."""
+        """Look for a residual that lies along the velocity and grows with it."""
         rms, gain = _is_wide(sight)
         if rms < LEAST_S or gain < BELIEVED or _step(sight, rms):
             return []
@@ -94,7 +94,7 @@ class QuantisedStamps(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'step_s': 's'}
 
     def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
-        """Where an error of the stamps is that of their grid."""
+        """Look for an error of the stamps that is that of their grid."""
         rms, gain = _is_wide(sight)
         step = _step(sight, rms) if rms >= LEAST_S and gain >= BELIEVED else 0.0
         if not step:

@@ -1,4 +1,4 @@
-"""What is wrong with a stream itself: poses that come again, are missing, or belong nowhere."""
+"""Finds what is wrong with a stream: poses that come again, are missing, or belong nowhere."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import ClassVar
@@ -38,7 +38,7 @@ reflections near by."""
 
 
 class StalePoses(PoseEffect):
-    """The same pose, number for number, under a new stamp while the body moves."""
+    """Reports the same pose, number for number, under a new stamp while the body moves."""
 
     name = 'stale_poses'
     summary = 'the same pose again under a new stamp'
@@ -64,7 +64,7 @@ class StalePoses(PoseEffect):
 
 
 class MissingPoses(PoseEffect):
-    """A device's marker for no pose, or no pose for much longer than usual."""
+    """Reports a device's marker for no pose, or no pose for much longer than usual."""
 
     name = 'missing_poses'
     summary = 'poses are missing, or marked as such by the device'
@@ -90,7 +90,7 @@ class MissingPoses(PoseEffect):
 
 
 class PoseOutliers(PoseEffect):
-    """Poses that no explanation reaches, such as a marker seen in its other solution."""
+    """Reports poses that no explanation reaches, such as a marker seen in its other solution."""
 
     name = 'outliers'
     summary = 'poses that belong to no model, such as those of a marker in its other solution'

@@ -37,7 +37,7 @@ class TrackerLag(PoseEffect):
     role = Role.FILTER
 
     def sites(self, setting: PoseSetting) -> Sequence[Term]:
-        """All sensors of a tracker are filtered alike."""
+        """Return one term for all sensors, which a tracker filters alike."""
         return [Term(self, {}, np.array([tau])) for tau in TAUS_S]
 
     def prior(self, term: Term) -> Array:
