@@ -1,4 +1,4 @@
-"""Real-time electromagnetic tracking with online compensation of metal distortion.
+"""Tracks electromagnetically in real time, with online compensation of metal distortion.
 
 The functions of `anser_ros.api` are names of this package. They are imported when the first of
 them is used, so ``import anser_ros`` itself loads nothing.

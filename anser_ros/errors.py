@@ -1,11 +1,11 @@
-"""Every error that this package raises on purpose: one root, one child a kind of cause.
+"""Defines every error that this package raises on purpose: one root, one child a kind of cause.
 
 A message is one clear line that names the rule and what was found instead.
 """
 
 
 class AnserError(Exception):
-    """Root of all errors raised on purpose."""
+    """Something is wrong that the package names on purpose; it is the root of all its errors."""
 
 
 class SetupError(AnserError):
@@ -13,7 +13,7 @@ class SetupError(AnserError):
 
 
 class FrameError(AnserError):
-    """Bytes on the control unit's port that are no valid frame."""
+    """Bytes on the control unit's port are no valid frame."""
 
 
 class PortError(AnserError):
@@ -21,19 +21,19 @@ class PortError(AnserError):
 
 
 class LayoutError(AnserError):
-    """A point cloud whose fields or bytes don't fit the layout that it should have."""
+    """A point cloud's fields or bytes don't fit the layout that it should have."""
 
 
 class BagError(AnserError):
-    """A bag that can't be read, or that lacks what was asked of it."""
+    """A bag can't be read, or lacks what was asked of it."""
 
 
 class ModelFileError(AnserError):
-    """A model file that is none, or that doesn't fit the session."""
+    """A model file is none, or doesn't fit the session."""
 
 
 class FitError(AnserError):
-    """Data that can't determine the model that was asked for."""
+    """The data can't determine the model that was asked for."""
 
 
 class TrackingError(AnserError):
@@ -45,8 +45,8 @@ class ParameterError(AnserError):
 
 
 class DiagnosisError(AnserError):
-    """A session that can't be diagnosed."""
+    """A session can't be diagnosed."""
 
 
 class PlausibilityError(AnserError):
-    """Data that contradict their own units, clocks or conventions."""
+    """Data contradict their own units, clocks or conventions."""

@@ -1,4 +1,4 @@
-"""Short names of contents: what is equal has the same one, on every machine and in every file."""
+"""Names contents shortly: what is equal has one name, on every machine and in every file."""
 
 import hashlib
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ nobody can set or measure a length or a moment so well."""
 
 @dataclass(frozen=True)
 class Identity:
-    """What a setup is of.
+    """Says what a setup is of.
 
     Attributes
     ----------

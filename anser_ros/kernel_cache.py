@@ -1,4 +1,4 @@
-"""Whether the compiled kernels are on disk, and who compiles them: shared by all processes.
+"""Knows whether the compiled kernels are on disk, and who compiles them: shared by all processes.
 
 Numba keeps what it has compiled beside the source files, or in the user's cache. With an empty
 cache every process compiles all that it needs, processes that start together each the same. So one
@@ -22,7 +22,7 @@ DECORATOR = '@numba.njit'
 
 
 class KernelCache:
-    """The mark, the lock and the progress of one state of the kernels' sources.
+    """Keeps the mark, the lock and the progress of one state of the kernels' sources.
 
     Parameters
     ----------
@@ -52,12 +52,12 @@ class KernelCache:
 
     @property
     def is_full(self) -> bool:
-        """Whether all kernels have been compiled as their sources are now."""
+        """Return whether all kernels have been compiled as their sources are now."""
         return self._mark.exists()
 
     @property
     def done(self) -> int:
-        """How many kernels are known to be there."""
+        """Return how many kernels are known to be there."""
         try:
             return len(set(self._progress.read_text(encoding='utf-8').split()))
         except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""The parser of every command line of the package: what is wrong is one clear line."""
+"""Parses every command line of the package: what is wrong is one clear line."""
 
 import argparse
 from typing import NoReturn

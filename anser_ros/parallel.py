@@ -1,4 +1,4 @@
-"""Independent pieces of work, shared among threads.
+"""Shares independent pieces of work among threads.
 
 What is worked out does not depend on who does it: the pieces are the same for any number of
 threads, and their results are taken in the pieces' order. So a result is the same, bit by bit, on

@@ -1,4 +1,4 @@
-"""What an installation may state about itself: how accurate it is, and how the refit follows.
+"""Defines what an installation may state about itself: its accuracy, and how the refit follows.
 
 Every value has one name and one default, and both stand here. The name is the key in the setup
 document's sections ``accuracy`` and ``refit``, the parameter of a node, and the name in
@@ -41,7 +41,7 @@ def _check(settings: object) -> None:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How accurate an installation's instruments are: one standard deviation of each error.
+    """Says how accurate an installation's instruments are: one standard deviation of each error.
 
     The defaults are those of the Anser sessions that this package was developed on: their noise
     and jitter, and the accuracy that their survey of the reference sensors states. A value that
@@ -111,7 +111,7 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class ToolSettings:
-    """How well tools are known, and how fast they may be.
+    """Says how well tools are known, and how fast they may be.
 
     Raises
     ------
@@ -148,7 +148,7 @@ class ToolSettings:
 
 @dataclass(frozen=True)
 class RefitSettings:
-    """How the live refit follows; nothing here belongs to a particular board or metal.
+    """Says how the live refit follows; nothing here belongs to a particular board or metal.
 
     Raises
     ------
@@ -251,7 +251,7 @@ def settings_from(stated: Mapping[str, Any]) -> RefitSettings:
 
 
 def parse_entries(entries: list[str]) -> dict[str, float]:
-    """Values from entries ``NAME=VALUE``, as `settings_from` takes them.
+    """Return values from entries ``NAME=VALUE``, as `settings_from` takes them.
 
     Raises
     ------

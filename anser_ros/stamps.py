@@ -1,4 +1,4 @@
-"""Stamps: whole nanoseconds, from a ROS message and back, and what turns them into seconds."""
+"""Converts stamps: whole nanoseconds, from a ROS message and back, and what makes them seconds."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The library for scripts and notebooks: sessions, models, tracking and diagnosis without ROS.
+"""Offers scripts and notebooks sessions, models, tracking and diagnosis without ROS.
 
 Everything public here is a name of the package itself: ``from anser_ros import load_session``.
 Quantities are in SI units and in the frame ``fg`` of the field generator's board, unless the name

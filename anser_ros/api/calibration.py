@@ -1,4 +1,4 @@
-"""Calibration as a function: sessions in, a model with its held-out error out."""
+"""Offers calibration as a function: sessions in, a model with its held-out error out."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from anser_ros.sessions.session import Session
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """A calibrated model and how good it is.
+    """Holds a calibrated model and how good it is.
 
     Attributes
     ----------

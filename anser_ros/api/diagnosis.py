@@ -1,4 +1,4 @@
-"""Diagnosis as a function: a session and a model in, named effects and a better model out."""
+"""Offers diagnosis as a function: session and model in, named effects and a better model out."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from anser_ros.sessions.session import Session
 
 @dataclass(frozen=True)
 class DiagnosisResult:
-    """What a model lacks on a session.
+    """Holds what a model lacks on a session.
 
     Attributes
     ----------

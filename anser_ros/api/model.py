@@ -1,4 +1,4 @@
-"""The field model as a script sees it: load, save, predict."""
+"""Offers the field model as a script sees it: load, save, predict."""
 
 import os
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from anser_ros.sessions.starting_model import board_of
 
 @dataclass(frozen=True)
 class Model:
-    """A field model: the field of every emitter, with its uncertainty and known effects.
+    """Predicts the field of every emitter, with its uncertainty and known effects.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Model:
 
     @property
     def emitters(self) -> tuple[str, ...]:
-        """Names of the K emitters, in the order of the flux columns."""
+        """Return the names of the K emitters, in the order of the flux columns."""
         return self.field.emitters
 
     @property
@@ -76,7 +76,7 @@ class Model:
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Names of the effects that the model corrects, as a diagnosis found them."""
+        """Return the names of the effects that the model corrects, as a diagnosis found them."""
         return tuple(effect.name for effect in self.field.effects)
 
     def flux(self, position: ArrayLike, axis: ArrayLike) -> NDArray[np.complex128]:

@@ -1,4 +1,4 @@
-"""Tracking as a function: a session and a model in, arrays of poses out."""
+"""Offers tracking as a function: a session and a model in, arrays of poses out."""
 
 import os
 from collections.abc import Callable, Mapping
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TrackedPoses:
-    """Poses of one coil or one rigid body over F frames.
+    """Holds poses of one coil or one rigid body over F frames.
 
     Attributes
     ----------
@@ -65,13 +65,13 @@ class TrackedPoses:
 
     @property
     def ok(self) -> NDArray[np.bool_]:
-        """Mask (F,) of the frames that have a pose."""
+        """Return the mask (F,) of the frames that have a pose."""
         return np.asarray(self.state == 'ok')
 
 
 @dataclass(frozen=True)
 class TrackingResult:
-    """Poses of all coils and bodies of a session.
+    """Holds the poses of all coils and bodies of a session.
 
     Attributes
     ----------

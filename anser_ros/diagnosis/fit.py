@@ -66,9 +66,7 @@ class Fit:
         return self.covariance[rows, rows]
 
     def held_out(self, folds: int) -> float:
-        """Return the cross-validated sum of squares, linear about the optimum,
-        and freedom's cost.
-        """
+        """Return the cross-validated squares, linear about the optimum, plus what freedom cost."""
         return self.sums.held_out(self.prior, folds) + self.state.penalty
 
 

@@ -67,9 +67,7 @@ class SearchSettings:
 
 @dataclass(frozen=True)
 class Candidate:
-    """Holds a row of the candidates' table: gain by the score test and, for
-    finalists, by the fit.
-    """
+    """Holds a row of the candidates' table: gain by the score test, and by the finalists' fit."""
 
     term: Term
     parameters: int

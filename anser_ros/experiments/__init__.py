@@ -1,1 +1,1 @@
-"""The article's experiments, redone on recordings, with the report and the figures of them."""
+"""Redoes the article's experiments on recordings, with the report and the figures of them."""

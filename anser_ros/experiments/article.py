@@ -1,4 +1,4 @@
-"""The figures that the article prints in its Tables II to V, in mm, degrees and mA/m as there."""
+"""Holds the figures of the article's Tables II to V, in mm, degrees and mA/m as printed there."""
 
 from collections.abc import Mapping
 

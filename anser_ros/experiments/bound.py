@@ -1,4 +1,4 @@
-"""The Cramer-Rao bound: the smallest error of a pose that the flux noise allows."""
+"""Computes the Cramer-Rao bound: the smallest error of a pose that the flux noise allows."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""Error maps for a tracker that gives positions only: real Anser output over a grid board."""
+"""Learns error maps for a tracker of positions only: real Anser output over a grid board."""
 
 import os
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from anser_ros.measured import anser_board
 
 @dataclass(frozen=True)
 class BoardRun:
-    """One run: its errors in held-out blocks, registered to the others, without and with a map.
+    """Holds one run's errors in held-out blocks, registered to the others, without and with a map.
 
     Attributes
     ----------

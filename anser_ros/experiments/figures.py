@@ -1,4 +1,4 @@
-"""The article's Figs. 2 and 5 to 10, drawn from the results of the experiments."""
+"""Draws the article's Figs. 2 and 5 to 10 from the results of the experiments."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

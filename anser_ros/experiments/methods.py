@@ -1,4 +1,4 @@
-"""The field models that are compared: the drawing, the article's method, and this package's."""
+"""Makes the field models compared: the drawing, the article's method, and this package's."""
 
 from collections.abc import Sequence
 from dataclasses import replace

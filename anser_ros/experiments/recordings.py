@@ -1,4 +1,4 @@
-"""The recordings that the experiments need, in a folder with one bag each."""
+"""Keeps the recordings that the experiments need, in a folder with one bag each."""
 
 import os
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ NAMES = (
 
 @dataclass(frozen=True)
 class Recordings:
-    """A folder with one bag for each of `NAMES`.
+    """Opens a folder with one bag for each of `NAMES`.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The refit's error by number of references, compared with simpler methods.
+"""Compares the refit's error by number of references with simpler methods.
 
 All methods have the same references and start from the same calibrated model: the frozen model,
 free dipoles for every emitter (`refit.free`), and the shared polarisability. No gate refuses a
@@ -35,7 +35,7 @@ FROZEN, FREE, SHARED = 'frozen model', 'free dipoles', 'shared polarisability'
 
 @dataclass(frozen=True)
 class AblationRow:
-    """The error of one method with one number of references on one session.
+    """Holds the error of one method with one number of references on one session.
 
     Attributes
     ----------

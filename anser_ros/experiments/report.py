@@ -1,4 +1,4 @@
-"""The report of the experiments in Markdown: printed values, the article's method, and ours."""
+"""Reports the experiments in Markdown: printed values, the article's method, and ours."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

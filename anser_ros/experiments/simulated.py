@@ -1,4 +1,5 @@
-"""The experiments' recordings by the package's own simulator, used where no others are at hand.
+"""Simulates the experiments' recordings by the package's own simulator, where no others are at
+hand.
 
 The board differs slightly from its drawing. Plates and the X-ray head are lattices of metal balls
 that the board magnetises and that do not magnetise each other. They are rougher than real plates
@@ -42,7 +43,7 @@ METALS = {'aluminium': (35e6, 1.0), 'mu-metal': (1.8e6, 1e4)}
 
 @dataclass(frozen=True)
 class Raster:
-    """A path on which a body rests at the points of a lattice, one a second, held by hand.
+    """Moves a body so that it rests at the points of a lattice, one a second, held by hand.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The article's experiments on recordings: Tables II to V, and the data of its figures."""
+"""Runs the article's experiments on recordings: Tables II to V, and the data of its figures."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -38,7 +38,7 @@ Errors = dict[str, SensorErrors]
 
 @dataclass
 class Results:
-    """The results of all experiments.
+    """Holds the results of all experiments.
 
     Attributes
     ----------
@@ -122,7 +122,7 @@ class Study:
 
     @cached_property
     def drawing(self) -> FieldModel:
-        """The drawing's Biot-Savart model with gains from the recording without metal."""
+        """Return the drawing's Biot-Savart model with gains from the recording without metal."""
         return drawn_model(self.factory, [self.factory])
 
     def run(self) -> Results:

@@ -1,4 +1,4 @@
-"""Errors of tracked poses compared with the optical ones, sensor by sensor."""
+"""Compares tracked poses with the optical ones, sensor by sensor."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """One sensor's errors frame by frame, with NaN where it was not tracked.
+    """Holds one sensor's errors frame by frame, with NaN where it was not tracked.
 
     Attributes
     ----------

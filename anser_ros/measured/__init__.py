@@ -1,4 +1,4 @@
-"""Importers of other people's measurements, and recipes of commands that find what is in them.
+"""Imports other people's measurements, with recipes of commands that find what is in them.
 
 A data set has a ``RECIPE`` (`recipe.Recipe`): its sessions, the commands that are run on them, and
 the figures that these give. Sets that the commands do not reach yet have ``analyse(folder)``,
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ReportRow:
-    """One line of the table that `anser measured` prints.
+    """Holds one line of the table that `anser measured` prints.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What a real Anser tracker reported at the places of a flat board, and whether it can be mapped.
+"""Maps what a real Anser tracker reported at the places of a flat board, where it can be mapped.
 
 Positions only, no fluxes (github kilianod5150/Matlab-Anser, BSD-3; read where they lie). The
 places are those of a board with 41 holes; the tracker's points are registered to them, and an
@@ -32,7 +32,7 @@ def places() -> Array:
 
 
 def load(folder: Path) -> dict[str, Array]:
-    """Reported points (m) of every run, by the names of the files.
+    """Return the reported points (m) of every run, by the names of the files.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def load(folder: Path) -> dict[str, Array]:
 
 
 def analyse(folder: Path) -> dict[str, ErrorMap]:
-    """The map of every run, with its error in blocks that took no part in anything."""
+    """Return the map of every run, with its error in blocks that took no part in anything."""
     there = places()
     return {
         name: learn_error_map(points, there, registers=True)
@@ -76,7 +76,7 @@ def rows(analysis: dict[str, ErrorMap]) -> list[ReportRow]:
 
 
 def tables(analysis: dict[str, ErrorMap]) -> str:
-    """What was tried for each run, and what lies across the board, which no map touches."""
+    """Return what was tried for each run, and what lies across the board, which no map touches."""
     lines = []
     for name, found in analysis.items():
         across = 1e3 * (found.before.out_of_plane or 0.0)

@@ -1,4 +1,4 @@
-"""Forward search for effects, scored on blocks that took no part in each fit.
+"""Searches forward for effects, scored on blocks that took no part in each fit.
 
 A candidate is a name. What a set of names leaves on each held-out block is asked of the caller, so
 the search knows no physics: it adds the name that explains most, as long as the gain stands clear
@@ -24,7 +24,7 @@ WORTH = 0.01
 
 @dataclass(frozen=True)
 class CandidateTrial:
-    """One candidate tried on top of others.
+    """Records one candidate tried on top of others.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class CandidateTrial:
 
 @dataclass(frozen=True)
 class CandidateSearch:
-    """What the search chose, and everything it tried."""
+    """Holds what the search chose, and everything it tried."""
 
     chosen: tuple[str, ...]
     trials: tuple[CandidateTrial, ...]
@@ -144,7 +144,7 @@ def _prune(
 
 
 def search_text(title: str, search: CandidateSearch, unit: str, scale: float = 1.0) -> str:
-    """Every candidate and its held-out score, as text."""
+    """Return every candidate and its held-out score, as text."""
     lines = [
         f'{title}: held-out residual {scale * search.start:.4g} {unit} at the start, '
         f'{scale * search.end:.4g} {unit} with {", ".join(search.chosen) or "nothing"}',

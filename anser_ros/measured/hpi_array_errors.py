@@ -1,4 +1,4 @@
-"""Errors that all chips of a SQUID array share, weighed by the likelihood of the signals.
+"""Finds errors that all chips of a SQUID array share, weighed by the likelihood of the signals.
 
 Nothing here sees where the coils were digitised: the likelihood of the channels' signals chooses,
 with half the logarithm of the number of signals as the price of a parameter, and the logarithm of
@@ -37,7 +37,7 @@ START = ChipErrors(3e-4, 0.01, 0.01)
 
 @dataclass(frozen=True)
 class SharedError:
-    """One candidate for an error that all chips share.
+    """Describes one candidate for an error that all chips share.
 
     Attributes
     ----------

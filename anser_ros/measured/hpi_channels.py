@@ -1,4 +1,4 @@
-"""Which SQUID channels are wrong, and how: signs, noise, and what the stored numbers are."""
+"""Finds which SQUID channels are wrong, and how: signs, noise, and what the stored numbers are."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ NOISY = 5.0
 
 @dataclass(frozen=True)
 class ChannelFindings:
-    """The epoch beside the stored amplitudes.
+    """Holds the epoch beside the stored amplitudes.
 
     Attributes
     ----------

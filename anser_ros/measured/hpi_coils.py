@@ -1,4 +1,4 @@
-"""Four coils on a head before 306 SQUID channels: tones, wrong channels, places.
+"""Analyses four coils on a head before 306 SQUID channels: tones, wrong channels, places.
 
 The data (github mne-tools/mne-python, BSD-3) are read where they lie.
 """
@@ -56,7 +56,7 @@ FREEDOM = 4.0
 
 @dataclass(frozen=True)
 class HpiData:
-    """The data that the file holds, in SI units."""
+    """Holds the data of the file, in SI units."""
 
     array: SquidArray
     stored: Array
@@ -68,7 +68,7 @@ class HpiData:
 
 @dataclass(frozen=True)
 class HpiHeldOut:
-    """Channels left out, predicted from the others.
+    """Holds channels left out, predicted from the others.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class HpiHeldOut:
 
 @dataclass(frozen=True)
 class HpiAnalysis:
-    """Everything of this data set."""
+    """Holds everything of this data set."""
 
     data: HpiData
     tones: Tones
@@ -182,7 +182,7 @@ def hold_out(
 
 
 def student_loss(left: Array) -> float:
-    """Mean negative log density of Student's t, up to a constant."""
+    """Return the mean negative log density of Student's t, up to a constant."""
     return float(np.mean(0.5 * (FREEDOM + 1.0) * np.log1p(left**2 / FREEDOM)))
 
 
@@ -198,7 +198,7 @@ def expected_power(array: SquidArray, data: CoilData, fit: CoilFit) -> Array:
 
 
 def choose_leads(loss: Array) -> int:
-    """Number of dipoles (of losses (D, folds)): the last that still lowers the held-out loss."""
+    """Return the number of dipoles, of losses (D, folds): the last that lowers the unseen loss."""
     best = 0
     for n in range(1, len(loss)):
         if np.mean(loss[n] - loss[best]) < -WORTH:

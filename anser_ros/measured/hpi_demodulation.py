@@ -1,4 +1,4 @@
-"""Raw samples of SQUID channels to phasors of several tones at once, and each channel's noise."""
+"""Turns raw samples of SQUID channels into phasors of several tones, and each channel's noise."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ OFF_TONE_HZ = (4.0, 16.0)
 
 @dataclass(frozen=True)
 class Tones:
-    """Phasors of an epoch.
+    """Holds phasors of an epoch.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ def _solve(samples: Array, design: Array, count: int) -> tuple[Complex, Array]:
 
 
 def find_tones(samples: Array, rate_hz: float) -> Array:
-    """Frequencies (Hz) of the tones that all channels (S, T) share.
+    """Return the frequencies (Hz) of the tones that all channels (S, T) share.
 
     Peaks of the mean spectrum are removed one by one, so that a tone inside the window's skirts
     of a stronger one is found too; the joint least-squares fit settles the frequencies.
@@ -101,7 +101,7 @@ def _settle(samples: Array, time_s: Array, tones: list[float], bin_hz: float) ->
 def demodulate(
     samples: Array, rate_hz: float, frequencies_hz: Array, reference: NDArray[np.bool_]
 ) -> Tones:
-    """All tones and the drift of every channel in one least-squares fit.
+    """Fit all tones and the drift of every channel at once by least squares.
 
     Parameters
     ----------

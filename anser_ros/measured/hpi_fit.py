@@ -1,4 +1,4 @@
-"""Places of the coils on a head, with the stray field of their leads and errors of the array.
+"""Fits places of the coils on a head, with the stray field of their leads and errors of the array.
 
 A coil's tone is not the coil's alone: its lead runs along the head, and where it is not twisted
 tightly it is a loop of its own, a hundredth of the coil and less, but close to other channels. A
@@ -35,7 +35,7 @@ weight."""
 
 @dataclass(frozen=True)
 class CoilData:
-    """Signals of one tone.
+    """Holds the signals of one tone.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class CoilData:
 
 @dataclass(frozen=True)
 class CoilFit:
-    """One coil and the dipoles of its lead.
+    """Describes one coil and the dipoles of its lead.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ def _linear(matrix: Array, right: Array) -> tuple[Array, Array]:
 
 
 def first_place(array: SquidArray, data: CoilData, starts: Array) -> Array:
-    """Place of a single dipole, channels weighted within their kind only, m.
+    """Return the place of a single dipole, m, channels weighted within their kind only.
 
     This is the plain fit: it knows no noise and no chip errors.
     """
@@ -141,7 +141,7 @@ def student_weight(white: SquidWhitener, left: Array) -> Array:
 
 
 def student_loss(left: Array) -> float:
-    """Negative log density of all chips' whitened residuals (3C,), up to a constant."""
+    """Return the negative log density of all chips' whitened residuals (3C,), up to a constant."""
     power = np.sum(left.reshape(-1, 3) ** 2, axis=1)
     return float(np.sum(0.5 * (FREEDOM + 3.0) * np.log1p(power / FREEDOM)))
 
@@ -202,7 +202,7 @@ class LeadSearch:
         self._columns = np.concatenate([array.signals(p) for p in self._grid], axis=1)
 
     def place(self, data: CoilData, fit: CoilFit) -> Array:
-        """Grid point whose dipole explains most of a fit's whitened residual, m."""
+        """Return the grid point, m, whose dipole explains most of a fit's whitened residual."""
         left = fit.white.apply(data.signals - fit.predicted)
         columns = fit.white.apply(self._columns).reshape(len(left), -1, 3)
         columns = columns / np.linalg.norm(columns, axis=0)
@@ -220,7 +220,7 @@ def grow_chain(
     leads: LeadSearch,
     most: int,
 ) -> list[CoilFit]:
-    """Fits with 0, 1, ... `most` dipoles of the lead, each grown from the one before."""
+    """Return fits with 0, 1, ... `most` dipoles of the lead, each grown from the one before."""
     chain = [fit_coil(array, data, start, errors)]
     for _ in range(most):
         place = leads.place(data, chain[-1])

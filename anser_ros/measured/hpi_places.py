@@ -1,4 +1,4 @@
-"""Fitted coils beside their digitised places: rigid alignment, and where the stylus touched."""
+"""Puts fitted coils beside digitised places: rigid alignment, and where the stylus touched."""
 
 import itertools
 
@@ -13,7 +13,7 @@ ARMS_M = np.arange(-6e-3, 6.001e-3, 5e-5)
 
 
 def rigid_distance(fitted: Array, digitised: Array) -> Array:
-    """Distances (n,) of points after the best rotation and shift; rows correspond."""
+    """Return the distances (n,) of points after the best rotation and shift; rows correspond."""
     a, b = fitted - fitted.mean(axis=0), digitised - digitised.mean(axis=0)
     turn = Rotation.align_vectors(b, a)[0]
     return np.asarray(np.linalg.norm(turn.apply(a) - b, axis=1))
@@ -45,13 +45,13 @@ def outward(places_m: Array, moments: Array) -> Array:
 
 
 def best_arm(places_m: Array, axes: Array, digitised_m: Array) -> float:
-    """Arm (m) along the axes that brings rows of places closest to the digitised ones."""
+    """Return the arm (m) along the axes that brings rows of places closest to digitised ones."""
     misfit = [rms(rigid_distance(places_m - arm * axes, digitised_m)) for arm in ARMS_M]
     return float(ARMS_M[int(np.argmin(misfit))])
 
 
 def arms_left_out(places_m: Array, moments: Array, digitised_m: Array) -> tuple[Array, Array]:
-    """A lever arm that every coil shares, found without the coil that it is scored on.
+    """Return a lever arm that every coil shares, found without the coil that it is scored on.
 
     Returns
     -------

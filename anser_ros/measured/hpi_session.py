@@ -1,4 +1,4 @@
-"""A session of four coils before an array: the coils are emitters, magnetometers the references.
+"""Makes a session of four coils before an array: coils are emitters, magnetometers the references.
 
 Frame `fg` is the array's. An emitter's centre is where the vendor's own fit has it. The fluxes are
 the raw epoch's phasors in the stored unit, signs and noise as they were sampled. Gradiometers are
@@ -21,7 +21,7 @@ KIND = 'head_coil'
 
 
 def phasors(data: HpiData) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
-    """Tones (K,), Hz, and fluxes (S, K), T, of the magnetometers, coils in the stored order."""
+    """Return tones (K,), Hz, and magnetometers' fluxes (S, K), T, coils in the stored order."""
     array = data.array
     tones = demodulate(
         data.epoch, data.rate_hz, find_tones(data.epoch, data.rate_hz), array.is_magnetometer
@@ -32,7 +32,7 @@ def phasors(data: HpiData) -> tuple[NDArray[np.float64], NDArray[np.complex128]]
 
 
 def setup_of(data: HpiData, frequencies_hz: NDArray[np.float64]) -> Setup:
-    """Four emitters where the vendor has them; a reference a magnetometer."""
+    """Return four emitters where the vendor has them, and a reference for each magnetometer."""
     array = data.array
     chosen = np.flatnonzero(array.is_magnetometer)
     centres = array.centres_m
@@ -60,7 +60,7 @@ def write_session(data: HpiData, path: Path) -> None:
 
 
 def write_sessions(folder: Path, into: Path) -> list[Path]:
-    """The data set as a session; the file written."""
+    """Write the data set as a session; return the file written."""
     into.mkdir(parents=True, exist_ok=True)
     path = into / 'hpi_coils.mcap'
     write_session(load(folder), path)

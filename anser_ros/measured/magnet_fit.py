@@ -1,4 +1,4 @@
-"""Effects of a magnet recording: fitted on its own poses, chosen on blocks left out of it."""
+"""Fits effects of a magnet recording on its own poses, chosen on blocks left out of it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ SETTLED = 1e-4
 
 @dataclass(frozen=True)
 class Jitter:
-    """Standard deviations of the stated poses (optical system or robot): m and rad, per axis."""
+    """Holds standard deviations of stated poses (optical system or robot): m and rad, per axis."""
 
     position_m: float
     angle_rad: float
@@ -37,7 +37,7 @@ class Jitter:
 
 @dataclass(frozen=True)
 class MagnetFit:
-    """What one recording taught.
+    """Holds what one recording taught.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class MagnetFit:
 
 
 def start_moment(recording: Recording, source: Source) -> float:
-    """Strength that fits all readings with equal relative weight, A m^2."""
+    """Return the strength that fits all readings with equal relative weight, A m^2."""
     unit = predict(recording, source, 1.0, {})
     weight = 1.0 / np.linalg.norm(recording.field_t, axis=2, keepdims=True)
     return float(np.sum(unit * recording.field_t * weight**2) / np.sum((unit * weight) ** 2))
@@ -202,7 +202,7 @@ def search(
 
 
 def held_out_power(matrix: Array, residual: Array, block: NDArray[np.int64]) -> Array:
-    """Mean squared whitened residual of each block, solved from the other blocks, shape (B,)."""
+    """Return each block's mean squared whitened residual, solved from the others, shape (B,)."""
     normal = np.array([_gram(matrix[block == b]) for b in np.unique(block)])
     right = np.array(
         [

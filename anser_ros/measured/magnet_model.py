@@ -1,4 +1,4 @@
-"""Forward model of a magnet seen by an array of three-axis sensors, and its small effects.
+"""Models a magnet seen by an array of three-axis sensors, and its small effects.
 
 Reciprocity: the magnet is the field generator, the sensors are the tool. An effect is a block of
 small parameters, either the same few for each sensor (`per sensor`) or common to all.
@@ -19,7 +19,7 @@ Parameters = Mapping[str, Array]
 
 @dataclass(frozen=True)
 class Recording:
-    """F poses of a magnet before S three-axis sensors, frame of the optical system.
+    """Holds F poses of a magnet before S three-axis sensors, frame of the optical system.
 
     Attributes
     ----------
@@ -73,13 +73,13 @@ class Recording:
 
 @dataclass(frozen=True)
 class Source:
-    """The magnet as dipoles along its z: nodes (N, 3), m, and weights (N,) that sum to one."""
+    """Holds the magnet as dipoles along its z: nodes (N, 3), m, and weights (N,) of sum one."""
 
     nodes_m: Array
     weights: Array
 
     def field(self, points_m: Array) -> Array:
-        """Field (T) per A m^2 at points (..., 3) of the magnet's own frame."""
+        """Return the field (T) per A m^2 at points (..., 3) of the magnet's own frame."""
         flat = points_m.reshape(-1, 3)
         along = np.broadcast_to([0.0, 0.0, 1.0], self.nodes_m.shape)
         basis = field_basis(flat, self.nodes_m, along)
@@ -93,7 +93,7 @@ def point_source() -> Source:
 
 @dataclass(frozen=True)
 class EffectSpec:
-    """Parameters of one effect.
+    """Describes the parameters of one effect.
 
     Attributes
     ----------
@@ -140,7 +140,7 @@ SATURATION_SCALE_T = 1e-2
 
 
 def zero(name: str, sensors: int) -> Array:
-    """Parameters of an effect that is not there, shape (S, count) or (count,)."""
+    """Return parameters of an effect that is not there, shape (S, count) or (count,)."""
     spec = EFFECTS[name]
     return np.zeros((sensors, spec.count) if spec.per_sensor else (spec.count,))
 
@@ -159,7 +159,7 @@ def _source_field(source: Source, points: Array, octupole: float, step_m: float)
 
 
 def predict(recording: Recording, source: Source, moment: float, found: Parameters) -> Array:
-    """Readings of every sensor, own axes, shape (F, S, 3), T.
+    """Return the readings of every sensor, own axes, shape (F, S, 3), T.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ def _readings(field: Array, found: Parameters) -> Array:
 def columns(
     recording: Recording, source: Source, moment: float, found: Parameters, name: str
 ) -> Array:
-    """Derivatives of `predict` by the parameters of one effect, in units of their spread.
+    """Return the derivatives of `predict` by the parameters of one effect, per spread.
 
     Returns
     -------
@@ -257,7 +257,7 @@ def columns(
 
 
 def add(found: Parameters, names: Sequence[str], step: Array, sensors: int) -> dict[str, Array]:
-    """Parameters after a step in units of the spreads, in the order of `names`."""
+    """Return parameters after a step in units of the spreads, in the order of `names`."""
     out, at = {key: np.asarray(value) for key, value in found.items()}, 0
     for name in names:
         here = out.get(name, zero(name, sensors))

@@ -1,4 +1,4 @@
-"""A magnet before a patch of 16 three-axis magnetometers: importer and recipe.
+"""Imports a magnet before a patch of 16 three-axis magnetometers, and has its recipe.
 
 By reciprocity the layout of sessions fits as it stands: frame `fg` is the magnet's own, turned so
 that the patch is above it; its one emitter is a constant dipole (written as a tone of 1 Hz, since
@@ -124,7 +124,7 @@ def as_recording(name: str, parts: dict[str, Array], background_t: Array) -> Rec
 
 
 def load(folder: Path, name: str) -> Recording:
-    """One file of poses, its own background subtracted."""
+    """Read one file of poses, its own background subtracted."""
     parts, _ = read_poses(folder / f'{name}.csv', 'm')
     background = read_table(folder / f'{name}_background_uT.csv')[1] * 1e-6
     if background.shape != (SENSORS, 3):
@@ -133,7 +133,7 @@ def load(folder: Path, name: str) -> Recording:
 
 
 def file_names(folder: Path) -> list[str]:
-    """Names of the files of poses that are there."""
+    """Return the names of the files of poses that are there."""
     names = sorted(path.stem for path in folder.glob('data*.csv') if not path.stem.endswith('_uT'))
     if len(names) < 2:
         raise FitError(f'{folder} must hold at least two files of poses, found {len(names)}')
@@ -194,8 +194,7 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
 
 
 def commands(bags: list[Path], out: Path) -> list[list[str]]:
-    """A model of each file, without and with what its own scan is found to contain; the others
-    tracked with it."""
+    """Return the commands that model each file, with and without effects, and track the others."""
     told = []
     for bag in bags:
         for kind, options in (('plain', ['--estimate', 'none']), ('full', [])):

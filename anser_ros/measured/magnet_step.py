@@ -1,4 +1,4 @@
-"""The positions of the sensors, as the file of the robot that carries a magnet shows them.
+"""Finds the positions of the sensors, as the file of the robot that carries a magnet shows them.
 
 A large magnet is carried past the patch by a robot, its axis always along z. Its own size and the
 sensors' constant offsets make a point-dipole model believe that the patch is somewhere else.
@@ -43,7 +43,7 @@ N_BLOCKS = 5
 
 @dataclass(frozen=True)
 class StepAnalysis:
-    """The effects and positions that the analysis found.
+    """Holds the effects and positions that the analysis found.
 
     Attributes
     ----------
@@ -85,12 +85,12 @@ def _with(names: tuple[str, ...], *more: str) -> tuple[str, ...]:
 
 
 def shift_mm(model: MagnetFit) -> float:
-    """How far the patch seems to be from where it is stated, mm."""
+    """Return how far the patch seems to be from where it is stated, mm."""
     return float(np.linalg.norm(model.found['registration'][:3])) * 2.0
 
 
 def scatter_mm(model: MagnetFit) -> float:
-    """Rms distance of the single sensors from the stated grid, the common shift removed, mm."""
+    """Return the rms distance of single sensors from the stated grid less the common shift, mm."""
     places = model.found['sensor_position']
     return 1e3 * float(np.sqrt(np.mean(np.sum((places - places.mean(axis=0)) ** 2, axis=1))))
 

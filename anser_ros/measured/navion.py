@@ -1,4 +1,4 @@
-"""Three electromagnets and a plate of Hall sensors: what the dipole model lacks, height by height.
+"""Finds what the dipole model of three electromagnets lacks at a plate of Hall sensors, by height.
 
 The data (Boehler et al., IEEE T-RO 2022, doi 10.1109/TRO.2022.3197107, Apache-2.0) are read where
 they lie. Every height of the plate is predicted from the other heights; see `navion_held_out` for

@@ -1,4 +1,4 @@
-"""The Navion files as arrays, read where they lie.
+"""Reads the Navion files as arrays where they lie.
 
 Boehler et al., IEEE T-RO 2022, doi 10.1109/TRO.2022.3197107, Apache-2.0.
 """
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class NavionData:
-    """The steady readings and what belongs to them.
+    """Holds the steady readings and what belongs to them.
 
     Attributes
     ----------
@@ -88,6 +88,6 @@ def load(folder: Path) -> NavionData:
 
 
 def inner(data: NavionData) -> list[int]:
-    """Heights that have others above and below: predicted by interpolation."""
+    """Return the heights that have others above and below, which interpolation predicts."""
     height = data.coils.height_m
     return [p for p, h in enumerate(height) if height.min() < h < height.max()]

@@ -1,4 +1,4 @@
-"""Joint fit of dipoles, sensor errors, plate poses, plate bends and metal to plates at heights.
+"""Fits dipoles, sensor errors, plate poses, plate bends and metal jointly to plates at heights.
 
 One Gauss-Newton for all of it. Each sensor's own errors touch only its own readings, so they are
 marginalised: they widen that sensor's noise covariance, and what is left is one generalised
@@ -46,7 +46,7 @@ _METAL_STEP = 0.01
 
 @dataclass(frozen=True)
 class PlateFit:
-    """What a joint fit found.
+    """Holds what a joint fit found.
 
     Attributes
     ----------

@@ -33,7 +33,7 @@ _NO_METAL = np.zeros((0, 3))
 
 @dataclass(frozen=True)
 class Trial:
-    """One candidate of one round in one fold.
+    """Records one candidate of one round in one fold.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Fold:
-    """What one fold chose, and the model without and with it.
+    """Holds what one fold chose, and the model without and with it.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ def run_fold(data: PlateData, held: int, tell: Callable[[str], None] = lambda _:
 
 @dataclass(frozen=True)
 class Choice:
-    """What was chosen: the magnets' dipoles, the fits without and with effects, all trials."""
+    """Holds what was chosen: the magnets' dipoles, fits without and with effects, all trials."""
 
     cloud: Array
     plain: PlateFit
@@ -193,7 +193,7 @@ def _drop_each(data: PlateData, held: int, cloud: Array, best: PlateFit) -> dict
 
 
 def with_own_pose(data: PlateData, held: int, fit: PlateFit) -> tuple[Array, Array]:
-    """Errors when the plate's pose and bend come from the other half of its own sensors.
+    """Return errors when the plate's pose and bend come from the other half of its own sensors.
 
     The sensors are split like a chess board's fields.
 
@@ -218,14 +218,14 @@ def with_own_pose(data: PlateData, held: int, fit: PlateFit) -> tuple[Array, Arr
 
 
 def chess_even(grid_m: Array) -> NDArray[np.bool_]:
-    """Which sensors (S,) of a square grid stand on the chess board's even fields."""
+    """Return which sensors (S,) of a square grid stand on the chess board's even fields."""
     pitch = np.min(np.diff(np.unique(np.round(grid_m[:, 0], 6))))
     steps = np.round((grid_m - grid_m.min(axis=0)) / pitch).astype(int)
     return np.asarray(steps[:, :2].sum(axis=1) % 2 == 0)
 
 
 def fit_state(data: PlateData, held: int, fit: PlateFit, sensors: NDArray[np.bool_]) -> Array:
-    """Pose and bend of one plate from some of its sensors, everything else given."""
+    """Return pose and bend of one plate from some of its sensors, everything else given."""
     plate, widths = Plate(data.grid_m), Widths()
     height = float(data.height_m[held])
     state = np.zeros(plate.n_state)

@@ -1,4 +1,4 @@
-"""A plate of three-axis sensors at several heights above magnets: geometry, data and prediction.
+"""Describes a plate of three-axis sensors at several heights: geometry, data and prediction.
 
 The plate is a thin board. Held up at its rim it is shifted, tilted and bent a little, differently
 at every height; each sensor has its own gains, its own small rotation and its own crosstalk, the
@@ -26,7 +26,7 @@ BEND_SPAN = 0.12
 
 @dataclass(frozen=True)
 class PlateData:
-    """The coil fields that a plate's sensors read at several heights.
+    """Holds the coil fields that a plate's sensors read at several heights.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class PlateData:
 
 @dataclass(frozen=True)
 class HallSensorErrors:
-    """What each sensor adds: a reading is ``matrix @ (R^T B(position + shift))``.
+    """Says what each sensor adds: a reading is ``matrix @ (R^T B(position + shift))``.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class HallSensorErrors:
 
 @dataclass(frozen=True)
 class Sources:
-    """Dipoles and their moments for each coil's full current.
+    """Holds dipoles and their moments for each coil's full current.
 
     Attributes
     ----------
@@ -126,7 +126,7 @@ def rotation_matrices(vectors: Array) -> Array:
 
 
 class Plate:
-    """Where a plate's sensors stand, and how they are turned, for a pose and a bend.
+    """Says where a plate's sensors stand, and how they are turned, for a pose and a bend.
 
     A plate's state at one height is the vector of its shift (m, 3), its rotation (rad, 3) and the
     coefficients of its bend (m): ``w(x, y) = sum_k c_k x^a y^b`` with 2 <= a + b <= `BEND_DEGREE`
@@ -146,7 +146,7 @@ class Plate:
 
     @property
     def n_state(self) -> int:
-        """Numbers that describe the plate at one height."""
+        """Return how many numbers describe the plate at one height."""
         return 6 + int(self.lift.shape[1])
 
     def place(self, height_m: float, state: Array, shift_m: Array) -> tuple[Array, Array]:
@@ -159,7 +159,7 @@ class Plate:
         return origin + local @ whole.T, turned
 
     def motion(self, height_m: float, state: Array, position: Array) -> tuple[Array, Array]:
-        """Displacement and turn of each sensor per unit of the state: (S, n_state, 3) each."""
+        """Return displacement and turn of each sensor per unit of the state, (S, n_state, 3)."""
         n_sensors = len(position)
         whole = rotation_matrices(state[None, 3:6])[0]
         arm = position - (self.centre + np.array([0.0, 0.0, height_m]) + state[:3])

@@ -1,4 +1,4 @@
-"""The folds of the Navion data, the prediction of whole states, and every candidate as text."""
+"""Reports the Navion folds, the prediction of whole states, and every candidate as text."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _ONE_OBJECT = 1.0 / 3.0
 
 @dataclass(frozen=True)
 class NavionAnalysis:
-    """Everything that was found, fold by fold."""
+    """Holds everything that was found, fold by fold."""
 
     data: NavionData
     folds: tuple[Fold, ...]
@@ -72,7 +72,7 @@ def predict_states(data: NavionData, fit: PlateFit, known: list[int], height_m: 
 
 
 def memory_table(analysis: NavionAnalysis) -> str:
-    """Held-out RMSE (mT) of the terms that a linear magnet doesn't have, raw and explained."""
+    """Return the held-out RMSE (mT) of terms no linear magnet has, raw and explained."""
     data = analysis.data
     lines = ['term                      raw    explained (held-out RMSE, mT)']
     residual = np.zeros_like(data.terms_t)
@@ -92,7 +92,7 @@ def memory_table(analysis: NavionAnalysis) -> str:
 
 
 def tables(analysis: NavionAnalysis) -> str:
-    """Candidates and what each was worth, as text.
+    """Return candidates and what each was worth, as text.
 
     The first part lists, for every round, what a candidate adds in log evidence on the heights
     that the fold knows (this chooses) and the component RMSE at the height left out (this only

@@ -1,4 +1,4 @@
-"""Sessions of the plate over three magnets: the plate as one tool, and one sensor as a tool.
+"""Makes sessions of a plate over three magnets: the plate as one tool, and one sensor as a tool.
 
 The emitters are the three coils, driven with a constant current (written as tones of 1, 2 and 3
 Hz, since tones are asked for and must differ; all phasors are real). A flux is a coil's share of
@@ -48,7 +48,7 @@ def in_fg(points: Array) -> Array:
 
 
 def emitter_of(data: NavionData) -> Emitter:
-    """Three coils, each where one dipole explains its field best."""
+    """Return three coils, each where one dipole explains its field best."""
     coils = tuple(
         Coil(f'coil{k}', vector(place), 0.0, float(1 + k))
         for k, place in enumerate(in_fg(np.array(locate_magnets(data.coils))))
@@ -97,7 +97,7 @@ def write_sensor(data: NavionData, emitter: Emitter, path: Path) -> None:
 
 
 def write_sessions(folder: Path, into: Path) -> list[Path]:
-    """The data set as two sessions; the files written."""
+    """Write the data set as two sessions; return the files written."""
     into.mkdir(parents=True, exist_ok=True)
     data = load(folder)
     emitter = emitter_of(data)

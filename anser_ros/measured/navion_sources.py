@@ -1,4 +1,4 @@
-"""Where the sources are: one dipole a coil finds its magnet, a scan finds metal nearby.
+"""Locates the sources: one dipole a coil finds its magnet, a scan finds metal nearby.
 
 Nothing here knows the rig's drawing. A magnet is where one dipole a coil fits that coil's field
 best; its cloud is a cuboctahedron about that place. Metal is where one more dipole, free in all
@@ -28,7 +28,7 @@ _BATCH = 64
 
 
 def locate_magnets(data: PlateData) -> Array:
-    """Place (K, 3), m, of the single dipole that explains each coil's field best.
+    """Return the place (K, 3), m, of the single dipole that explains each coil's field best.
 
     The start is the best point of a coarse grid around the plates; the moment is eliminated.
     """
@@ -101,7 +101,7 @@ def scan_for_metal(data: PlateData, fit: PlateFit, metal_am2: float) -> tuple[Ar
 
 
 def polarizability(sources: Sources, index: int) -> tuple[Array, float]:
-    """Polarisability (3, 3), m^3, of one metal object, and how far it is from symmetric.
+    """Return the polarisability (3, 3), m^3, of a metal object, and how far it is from symmetric.
 
     The object's moments were free in every coil. One small object answers all coils with one
     symmetric tensor, ``mu0 m_k = alpha B_k`` (reciprocity); large asymmetry, 0 to 1, says that the

@@ -1,4 +1,4 @@
-"""Currents: how the eight states split into fields, what the iron remembers, and the slow supply.
+"""Splits the eight states of the currents into fields, what the iron remembers, and a slow supply.
 
 Eight sign combinations of three equal currents are a complete two-level design: the readings are
 one constant, three coil fields, three pair terms and one triple term (Box, Hunter and Hunter,
@@ -27,7 +27,8 @@ _OFFSET_T = 3e-4
 
 
 def split_states(reading_t: Array, sign: Array) -> Array:
-    """Constant, coil, pair and triple terms (8, ...) of the readings (8, ...) of eight states.
+    """Return constant, coil, pair and triple terms (8, ...) of the eight states' readings (8,
+    ...).
 
     Raises
     ------
@@ -51,7 +52,7 @@ def _design(sign: Array) -> Array:
 
 @dataclass(frozen=True)
 class Memory:
-    """What a reading contains besides the linear coil fields.
+    """Holds what a reading contains besides the linear coil fields.
 
     Attributes
     ----------
@@ -92,7 +93,7 @@ def learn_memory(data: PlateData, terms_t: Array, fit: PlateFit) -> Memory:
 
 
 def predict_memory(data: PlateData, fit: PlateFit, memory: Memory) -> Array:
-    """Pair and triple terms (P, 4, S, 3), T, at heights whose plate state nobody knows."""
+    """Return pair and triple terms (P, 4, S, 3), T, at heights whose plate state nobody knows."""
     states = np.zeros((len(data.height_m), fit.states.shape[1]))
     position, sensing = sensor_frames(data, fit, states)
     basis = vector_basis(position.reshape(-1, 3), fit.sources.position_m)
@@ -116,7 +117,8 @@ def sensor_frames(data: PlateData, fit: PlateFit, states: Array) -> tuple[Array,
 
 @dataclass(frozen=True)
 class Slew:
-    """The supply ramps its current: it starts `delay_s` after the command and then moves steadily.
+    """Describes a supply that ramps its current: it starts `delay_s` after the command, then moves
+    steadily.
 
     Attributes
     ----------
@@ -128,7 +130,7 @@ class Slew:
     rate_a_per_s: float
 
     def settled_s(self, change_a: float) -> float:
-        """Seconds after a command at which a change of `change_a` has arrived."""
+        """Return the seconds after a command at which a change of `change_a` has arrived."""
         return self.delay_s + abs(change_a) / self.rate_a_per_s
 
 

@@ -1,4 +1,4 @@
-"""One linearisation of the joint plate fit: columns, marginal covariance, solution, evidence.
+"""Linearises the joint plate fit once: columns, marginal covariance, solution, evidence.
 
 Rows are a sensor's readings, (K coils, P heights, 3 axes). Columns are shared (moments, plate
 states, metal places) or a sensor's own (gains, turns, leaks, shift). A sensor's own errors touch
@@ -37,7 +37,7 @@ GENERATORS = np.array([*_GAIN, *_TURN, *_LEAK])
 
 @dataclass(frozen=True)
 class Widths:
-    """Expected size (1 sigma) of everything that is unknown; from how such rigs are made.
+    """Holds the expected size (1 sigma) of everything unknown; from how such rigs are made.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Widths:
 
 @dataclass(frozen=True)
 class NavionProblem:
-    """What doesn't change while Gauss-Newton runs.
+    """Holds what doesn't change while Gauss-Newton runs.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class NavionProblem:
 
 @dataclass
 class Estimate:
-    """The unknowns that Gauss-Newton steps change.
+    """Holds the unknowns that Gauss-Newton steps change.
 
     Attributes
     ----------
@@ -145,7 +145,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Whitened:
-    """The last linear system, for the search of one more dipole.
+    """Holds the last linear system, for the search of one more dipole.
 
     Attributes
     ----------
@@ -170,7 +170,7 @@ class Whitened:
 
 @dataclass(frozen=True)
 class Solution:
-    """Shared unknowns, each sensor's own with their variance, and the rows' residual (T)."""
+    """Holds shared unknowns, each sensor's own with their variance, and the rows' residual (T)."""
 
     shared: Array
     sensor: Array
@@ -179,7 +179,7 @@ class Solution:
 
 
 class System:
-    """One linearisation: rows are (S, K * P * 3), columns the shared unknowns."""
+    """Linearises once: rows are (S, K * P * 3), columns the shared unknowns."""
 
     def __init__(self, problem: NavionProblem, now: Estimate, moving: bool) -> None:
         self.problem, self.now = problem, now
@@ -300,7 +300,7 @@ class System:
         return solution.residual.reshape(self.problem.reading.shape)
 
     def log_evidence(self, solution: Solution) -> float:
-        """Laplace approximation of the log evidence, up to a constant of the readings."""
+        """Return Laplace's approximation of the log evidence, up to a constant of the readings."""
         problem = self.problem
         freedom, noise = problem.widths.freedom, problem.widths.noise_t
         square = (self.residual(solution) ** 2).sum(axis=(1, 3)) / noise**2
@@ -314,7 +314,7 @@ class System:
         return float(fit - 0.5 * penalty + 0.5 * volume)
 
     def whitened(self) -> Whitened:
-        """What the search of one more dipole needs."""
+        """Return what the search of one more dipole needs."""
         root = np.linalg.cholesky(self.normal)
         basis = np.linalg.solve(root, self.white.T).T
         residual = self.white_target - basis @ (basis.T @ self.white_target)

@@ -1,4 +1,4 @@
-"""A three-axis sensor tracked as a tool: 6-DoF pose from three coils' fields, from a cold start.
+"""Tracks a three-axis sensor as a tool: 6-DoF pose from three coils' fields, from a cold start.
 
 Three coils and three axes give nine numbers for six unknowns. The Gram matrix of the three fields
 doesn't depend on the sensor's orientation, so a table of it over the volume gives the start.
@@ -27,13 +27,13 @@ _START_SPACING = 0.04
 
 @dataclass(frozen=True)
 class ToolErrors:
-    """Distance (m) and angle (rad) of each tracked sensor from where it was put."""
+    """Holds distance (m) and angle (rad) of each tracked sensor from where it was put."""
 
     position_m: Array
     angle_rad: Array
 
     def rmse(self) -> tuple[float, float]:
-        """Root mean squares over all sensors, m and rad; none is left out."""
+        """Return root mean squares over all sensors, m and rad; none is left out."""
         return (
             float(np.sqrt(np.mean(self.position_m**2))),
             float(np.sqrt(np.mean(self.angle_rad**2))),

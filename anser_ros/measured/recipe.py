@@ -1,4 +1,4 @@
-"""A data set as a recipe: its sessions, the shipped commands that are run on them, the figures."""
+"""Defines a data set as a recipe: its sessions, the shipped commands run on them, the figures."""
 
 import json
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from anser_ros.measured import ReportRow
 
 @dataclass(frozen=True)
 class Recipe:
-    """What `anser measured` does with a data set.
+    """Says what `anser measured` does with a data set.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Frames of somebody else's measurement, written as an MCAP session that any command reads."""
+"""Writes frames of somebody else's measurement as an MCAP session that any command reads."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 def vector(values: Array) -> Vector:
-    """Three plain numbers, as a setup document has them."""
+    """Return three plain numbers, as a setup document has them."""
     return (float(values[0]), float(values[1]), float(values[2]))
 
 

@@ -1,4 +1,4 @@
-"""An array of SQUID channels: three on a chip, each a weighted sum of points; its errors.
+"""Models an array of SQUID channels, three on a chip, each a weighted sum of points; its errors.
 
 The chips were surveyed, not the field at them. A chip that sits a little elsewhere, is tilted or
 has a gain of its own moves its three channels together; that is a covariance here, not a
@@ -26,7 +26,7 @@ LEFT_OUT = 1e8
 
 @dataclass(frozen=True)
 class ChipErrors:
-    """Standard deviations of a chip's place (m), tilt (rad) and its channels' gains."""
+    """Holds standard deviations of a chip's place (m), tilt (rad) and its channels' gains."""
 
     place_m: float
     tilt_rad: float
@@ -35,7 +35,7 @@ class ChipErrors:
 
 @dataclass(frozen=True)
 class SquidArray:
-    """Geometry of S channels on C chips.
+    """Holds the geometry of S channels on C chips.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class SquidArray:
         return np.asarray(np.sum(self.points_m * used, axis=1) / used.sum(axis=1))
 
     def signals(self, place_m: Array) -> Array:
-        """Signal of each channel per unit moment along x, y and z at a place (3,): (S, 3)."""
+        """Return each channel's signal per unit moment on x, y and z at a place (3,): (S, 3)."""
         count = self.points_m.shape[1]
         basis = flux_basis(
             self.points_m.reshape(-1, 3),
@@ -75,7 +75,7 @@ class SquidArray:
         return np.asarray(np.einsum('sqk,sq->sk', basis, self.weights))
 
     def chip_columns(self, place_m: Array, moment: Array) -> Array:
-        """Change of each channel's signal as its chip moves (m) and turns (rad): (S, 6)."""
+        """Return each channel's change as its chip moves (m) and turns (rad): (S, 6)."""
         out = np.empty((len(self.names), 6))
         for axis, unit in enumerate(np.eye(3)):
             ends = [self.signals(place_m - s * STEP_M * unit) @ moment for s in (1.0, -1.0)]
@@ -94,7 +94,7 @@ class SquidArray:
         )
 
     def changed(self, by: Mapping[str, float]) -> 'SquidArray':
-        """The array with one of the errors that all chips may share.
+        """Return the array with one of the errors that all chips may share.
 
         `array_offset` (m): every coil further out along its normal; `array_scale`: all distances
         from the origin larger; `magnetometer_size`, `gradiometer_size`: coils larger about their
@@ -118,7 +118,7 @@ class SquidArray:
 
 @dataclass(frozen=True)
 class SquidWhitener:
-    """Inverse Cholesky factors of the chips' covariances, and what their channels share.
+    """Holds inverse Cholesky factors of the chips' covariances, and what their channels share.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ class SquidWhitener:
     half_log_det: float
 
     def explained(self, left: Array) -> Array:
-        """Expected part of residuals (S,) that the chips' places and tilts make.
+        """Return the expected part of residuals (S,) that the chips' places and tilts make.
 
         A channel that took no part is told by the other channels of its chip.
         """

@@ -29,8 +29,8 @@ share, or more where that is less than `SCALE_M`."""
 
 
 def price(term: Term, total: float, fit: PoseFit) -> float:
-    """Return the gain, in units of the misfit, that a term must have beside a squared sum
-    ``total``.
+    """Return the gain, in units of the misfit, that a term must have; ``total`` is the squared
+    sum.
     """
     misfit, share = fit.misfit, LEAST_SHARE
     # Only the errors of its own sensor, and of positions where it is a map, can be explained.

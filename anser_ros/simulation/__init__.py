@@ -1,1 +1,1 @@
-"""A simulated control unit and its world: board, tools, metal, sampling, faults and recordings."""
+"""Simulates a control unit and its world: board, tools, metal, sampling, faults and recordings."""

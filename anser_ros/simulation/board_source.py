@@ -1,4 +1,4 @@
-"""The field of the simulated board, by Biot and Savart's law over all tracks of its coils."""
+"""Computes the simulated board's field by Biot and Savart's law over all tracks of its coils."""
 
 from __future__ import annotations
 

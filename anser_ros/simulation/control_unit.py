@@ -1,4 +1,4 @@
-"""A simulated control unit that turns the bytes of commands into the bytes of records.
+"""Simulates a control unit that turns the bytes of commands into the bytes of records.
 
 It has no clock: its owner tells it how many samples of time have passed.
 """
@@ -44,7 +44,7 @@ _COMMANDS = (Identify, Start, Stop, SetFrequencies)
 
 @dataclass(frozen=True)
 class Piece:
-    """The bytes of one record, with what a port needs to know of it.
+    """Holds the bytes of one record, with what a port needs to know of it.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Piece:
 
 
 class ControlUnit:
-    """A control unit that speaks the protocol of `docs/cu_protocol.md`.
+    """Speaks the protocol of `docs/cu_protocol.md` as a control unit does.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ class ControlUnit:
 
     @property
     def streaming(self) -> bool:
-        """Whether the unit sends samples."""
+        """Return whether the unit sends samples."""
         return self._state is DeviceState.STREAMING
 
     def receive(self, data: bytes) -> list[Piece]:

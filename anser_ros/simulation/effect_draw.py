@@ -1,4 +1,4 @@
-"""Random draws of an effect and its parameters, for tests that do not know the answer."""
+"""Draws an effect and its parameters at random, for tests that do not know the answer."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ RANDOM = 'random'
 
 @dataclass(frozen=True)
 class Drawn:
-    """A drawn effect with its name and parameters.
+    """Holds a drawn effect with its name and parameters.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Unit:
-    """The sensors that an effect is put into, with the response of their channels."""
+    """Holds the sensors that an effect is put into, with the response of their channels."""
 
     setup: Setup
     channels: ChannelCalibration

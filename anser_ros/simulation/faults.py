@@ -1,4 +1,4 @@
-"""Faults of the line between control unit and host that a simulator can be asked for."""
+"""Makes faults of the line between control unit and host that a simulator can be asked for."""
 
 from __future__ import annotations
 

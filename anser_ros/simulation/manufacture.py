@@ -1,5 +1,4 @@
-"""A simulated board with the errors of its manufacture, which differs slightly from its
-drawing."""
+"""Simulates a board with the errors of its manufacture, slightly different from its drawing."""
 
 from __future__ import annotations
 

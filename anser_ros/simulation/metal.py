@@ -1,4 +1,4 @@
-"""Metal bodies, simulated as rigid clouds of conducting and permeable spheres."""
+"""Simulates metal bodies as rigid clouds of conducting and permeable spheres."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class MetalBody:
-    """A rigid cloud of equal spheres on a path, which do not drive each other.
+    """Moves a rigid cloud of equal spheres, which do not drive each other, on a path.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Paths of simulated bodies: a tool on a smooth path, and metal that approaches and leaves."""
+"""Moves simulated bodies on paths: a tool on a smooth one, metal that approaches and leaves."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Path = Callable[[float], Pose]
 
 @dataclass(frozen=True)
 class Lissajous:
-    """A path that is a sine in each coordinate and in each component of the rotation vector.
+    """Describes a path of a sine in each coordinate and each component of the rotation vector.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ def tool_paths(bodies: Sequence[str], phase_rad: float = 0.0) -> Mapping[str, Pa
 
 @dataclass(frozen=True)
 class Approach:
-    """A path that comes near, stays, and leaves again, each way along a smooth ramp.
+    """Describes a path that comes near, stays, and leaves again, each way along a smooth ramp.
 
     Attributes
     ----------

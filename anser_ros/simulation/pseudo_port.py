@@ -1,4 +1,4 @@
-"""A simulated serial port: a pseudo-terminal behind a link that keeps its name."""
+"""Simulates a serial port: a pseudo-terminal behind a link that keeps its name."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ loses blocks instead of falling behind more and more."""
 
 
 class PseudoPort:
-    """The device's end of the line, which never blocks.
+    """Holds the device's end of the line, which never blocks.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class PseudoPort:
 
     @property
     def plugged(self) -> bool:
-        """Whether the cable is plugged in."""
+        """Return whether the cable is plugged in."""
         return self._fds is not None
 
     def plug(self) -> None:

@@ -1,4 +1,4 @@
-"""Simulated faults of sensors, coils, amplifiers and clocks, put into a control unit's signals.
+"""Puts simulated faults of sensors, coils, amplifiers and clocks into a control unit's signals.
 
 An effect overrides the stage at which it acts. The stages run in the order of the methods: the
 world's fluxes, the coil currents, the voltages of all samples before the converter, the device
@@ -21,7 +21,7 @@ ComplexArray = NDArray[np.complex128]
 
 
 class RawEffect:
-    """The base of all effects, which changes nothing at any stage."""
+    """Changes nothing at any stage; it is the base of all effects."""
 
     def setup(self, setup: Setup) -> Setup:
         """Return the true setup, which the effect may make differ from its document."""
@@ -46,7 +46,7 @@ class RawEffect:
 
 @dataclass(frozen=True)
 class RawChannelCrosstalk(RawEffect):
-    """Crosstalk between the sensors of one cluster.
+    """Makes crosstalk between the sensors of one cluster.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class RawChannelCrosstalk(RawEffect):
 
 @dataclass(frozen=True)
 class CompressingAmplifier(RawEffect):
-    """An amplifier of one sensor that saturates: v becomes ``limit * tanh(v / limit)``."""
+    """Saturates one sensor's amplifier: v becomes ``limit * tanh(v / limit)``."""
 
     column: int
     limit_v: float
@@ -82,7 +82,7 @@ class CompressingAmplifier(RawEffect):
 
 @dataclass(frozen=True)
 class CrossoverAmplifier(RawEffect):
-    """A crossover distortion of one sensor: v becomes ``v - dead * tanh(v / dead)``.
+    """Distorts one sensor by crossover: v becomes ``v - dead * tanh(v / dead)``.
 
     The diagnosis has no such effect. The weaker all tones are, the larger is the lost fraction.
     """
@@ -99,7 +99,7 @@ class CrossoverAmplifier(RawEffect):
 
 @dataclass(frozen=True)
 class LooseSensor(RawEffect):
-    """A loose contact of one sensor: periodically its voltage drops to a small remainder.
+    """Loosens a sensor's contact: periodically its voltage drops to a small remainder.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class LooseSensor(RawEffect):
 
 @dataclass(frozen=True)
 class OpticalClock(RawEffect):
-    """A clock of the optical tracker that is early by a constant, and runs fast."""
+    """Makes the optical tracker's clock early by a constant, and fast."""
 
     early_s: float = 0.0
     fast_ppm: float = 0.0
@@ -140,7 +140,7 @@ class OpticalClock(RawEffect):
 
 @dataclass(frozen=True)
 class TiltedSensor(RawEffect):
-    """A sensor that has come loose and has another axis than the setup document states."""
+    """Tilts a sensor that has come loose: its axis is not the setup document's."""
 
     column: int
     axis: tuple[float, float, float]
@@ -154,7 +154,7 @@ class TiltedSensor(RawEffect):
 
 @dataclass(frozen=True)
 class ChannelGain(RawEffect):
-    """A wrong gain of one channel."""
+    """Makes the gain of one channel wrong."""
 
     column: int
     gain: float
@@ -168,7 +168,7 @@ class ChannelGain(RawEffect):
 
 @dataclass(frozen=True)
 class GainRipple(RawEffect):
-    """A gain of all channels that oscillates, as by a bad supply; the diagnosis has none such."""
+    """Makes all gains oscillate, as by a bad supply; the diagnosis has no such effect."""
 
     depth: float
     period_s: float
@@ -181,7 +181,7 @@ class GainRipple(RawEffect):
 
 @dataclass(frozen=True)
 class CoilWeakens(RawEffect):
-    """A coil whose field changes at constant current, as by a turn that heats up and shorts."""
+    """Changes a coil's field at constant current, as by a turn that heats up and shorts."""
 
     coil: int
     amount: float

@@ -1,4 +1,4 @@
-"""Simulated recordings: the fluxes of a world with noise, and optical poses with jitter, in a bag.
+"""Simulates recordings: a world's fluxes with noise, and optical poses with jitter, in a bag.
 
 These bags are used where no recordings of a real device are at hand; figures from them are always
 called simulated.
@@ -30,7 +30,7 @@ STATIC_NOISE_T = 30e-12
 
 @dataclass(frozen=True)
 class Errors:
-    """Standard deviations of the errors of a recording's instruments.
+    """Holds standard deviations of the errors of a recording's instruments.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class GridScan:
-    """A path on which a body rests at one grid point after another, layer by layer.
+    """Moves a body so that it rests at one grid point after another, layer by layer.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Sampling of the world's fluxes into the codes of an analogue-to-digital converter."""
+"""Samples the world's fluxes into the codes of an analogue-to-digital converter."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ OVERLOAD_GAIN = 1e4
 
 @dataclass(frozen=True)
 class FrontEnd:
-    """The analogue side of a control unit with its converter.
+    """Describes the analogue side of a control unit with its converter.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The simulated world around a control unit: a board, moving tools, reference coils and metal.
+"""Simulates the world around a control unit: a board, moving tools, reference coils and metal.
 
 It gives the true flux of every sensor at any time. Samples, noise and bytes are added elsewhere.
 """
@@ -22,7 +22,7 @@ FieldSource = Callable[[Array], ComplexArray]
 
 
 class World:
-    """The sensors of a setup in the field of a board and of metal.
+    """Holds the sensors of a setup in the field of a board and of metal.
 
     Parameters
     ----------

@@ -46,9 +46,7 @@ def windows_of(sensing: Sensing, sight: PoseSight) -> NDArray[np.int64]:
 
 
 def episode_windows(sensing: Sensing, sight: PoseSight) -> list[int]:
-    """Return windows in which a sensor is off though it was right at these
-    places at other times.
-    """
+    """Return windows in which a sensor is off that was right at other times at the same places."""
     window = windows_of(sensing, sight)
     square = np.sum(sensing.residual[:, :3] ** 2, axis=1)
     judged = [w for w in range(WINDOWS) if np.count_nonzero(window == w) >= FEWEST_POSES]
