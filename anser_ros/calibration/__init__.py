@@ -1,1 +1,1 @@
-"""From measurements of a board to its field model: moments, dipole positions, and their choice."""
+"""Makes a field model of measurements of a board: moments, dipole positions, and their choice."""

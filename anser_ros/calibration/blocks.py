@@ -1,4 +1,4 @@
-"""Spatial blocks for held-out errors: whole frames in cells of space, dealt to folds."""
+"""Cuts spatial blocks for held-out errors: whole frames in cells of space, dealt to folds."""
 
 from collections.abc import Sequence
 

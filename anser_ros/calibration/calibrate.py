@@ -1,4 +1,4 @@
-"""The calibration of a field model: checks, choice by held-out error, and the final fit."""
+"""Calibrates a field model: checks, choice by held-out error, and the final fit."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -37,7 +37,7 @@ FEW_SENSORS = 1.0 / 3.0
 
 @dataclass(frozen=True)
 class Options:
-    """Options of a calibration.
+    """Holds the options of a calibration.
 
     Attributes
     ----------

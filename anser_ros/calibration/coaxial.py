@@ -1,4 +1,5 @@
-"""Emitters without a drawing: a few dipoles on one axis for each, place and axis from the data.
+"""Fits emitters without a drawing: a few dipoles on one axis for each, place and axis from the
+data.
 
 A magnet, an electromagnet or a coil of unknown shape has an axis; around it the field hardly
 changes. One dipole is its far field. Equal distances h along the axis make three or five dipoles

@@ -1,4 +1,4 @@
-"""The drawn coils where they lie: each is shifted, turned and scaled in strength as fluxes ask.
+"""Places the drawn coils where they lie: each is shifted, turned and scaled as fluxes ask.
 
 A board's coils are etched, glued and soldered a fraction of a millimetre beside their drawing, and
 near them that is most of what a drawing misses. Six coordinates and a complex gain a coil are told
@@ -52,7 +52,7 @@ class CoilPlacer:
 
     @property
     def sites(self) -> DipoleSites:
-        """The dipoles of the coils as drawn."""
+        """Return the dipoles of the coils as drawn."""
         return DipoleSites(self.nominal.positions, self.nominal.directions)
 
     def fit(

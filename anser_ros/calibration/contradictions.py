@@ -1,4 +1,4 @@
-"""Sessions of one tool that tell different things of its sensors.
+"""Finds sessions of one tool that tell different things of its sensors.
 
 Every session gets parameters of its own, beside the field that all share, about the joint
 estimate: what two sessions then say of a sensor must differ by no more than is uncertain of it.
@@ -28,7 +28,7 @@ moves poses by less than a tenth of a millimetre."""
 
 @dataclass(frozen=True)
 class Contradiction:
-    """A sensor, or body, of which two sessions say different things.
+    """Names a sensor, or body, of which two sessions say different things.
 
     Attributes
     ----------

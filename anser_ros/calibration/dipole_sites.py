@@ -1,4 +1,4 @@
-"""Positions and directions of virtual dipoles, and the matrix from their moments to readings."""
+"""Holds positions and directions of virtual dipoles, and maps their moments to readings."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DipoleSites:
-    """Positions (m) and unit directions of N virtual dipoles, shape (N, 3), frame fg."""
+    """Holds positions (m) and unit directions of N virtual dipoles, shape (N, 3), frame fg."""
 
     positions: Array
     directions: Array

@@ -1,4 +1,4 @@
-"""Frames of a scan that belong to no steady field and pose: moving metal, reflected poses."""
+"""Finds frames of a scan that no steady field and pose explain: moving metal, reflected poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ have settled; more cost a fit each."""
 
 @dataclass(frozen=True)
 class Span:
-    """A part of a session in which the field was not steady.
+    """Marks a part of a session in which the field was not steady.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ def glitches(steps: Array, usable: Mask, stated: Array) -> Mask:
 
 
 def stretches(time: Array) -> NDArray[np.int64]:
-    """Number of the stretch of time that each frame is in, shape (F,)."""
+    """Return the number of the stretch of time that each frame is in, shape (F,)."""
     if time.size < 2:
         return np.zeros(time.size, dtype=np.int64)
     length = max(BIN_S, BIN_FRAMES * float(np.median(np.diff(time))))
@@ -187,7 +187,7 @@ def spans_of(time: Array, unsteady: Mask) -> list[Span]:
 
 
 def outside(time: Array, spans: Sequence[Span]) -> Mask:
-    """Which times lie in none of the spans."""
+    """Return which times lie in none of the spans."""
     out = np.ones(time.size, dtype=bool)
     for span in spans:
         out &= ~span.holds(time)

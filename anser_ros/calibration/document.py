@@ -1,4 +1,4 @@
-"""The document ``calibration.json`` that a calibration writes (see docs/interfaces.md)."""
+"""Makes the document ``calibration.json`` that a calibration writes (see docs/interfaces.md)."""
 
 from typing import Any
 

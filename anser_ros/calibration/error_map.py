@@ -1,4 +1,4 @@
-"""A smooth map from tracked to true positions, learnt where the true positions are known.
+"""Learns a smooth map from tracked to true positions where the true positions are known.
 
 This is the usual calibration of trackers that give poses and no fluxes, and the article's last
 step of distortion compensation (Table V, "compensated and corrected"). The three components of the
@@ -53,7 +53,7 @@ plane: a board that is drilled on a machine is thinner, a volume is not."""
 
 @dataclass(frozen=True)
 class HeldOutError:
-    """Root mean square errors, m, of places that took no part.
+    """Holds root mean square errors, m, of places that took no part.
 
     Attributes
     ----------
@@ -69,13 +69,13 @@ class HeldOutError:
 
     @property
     def judged(self) -> float:
-        """The one that a map is chosen and judged by."""
+        """Return the one that a map is chosen and judged by."""
         return self.whole if self.in_plane is None else self.in_plane
 
 
 @dataclass(frozen=True)
 class ErrorMap:
-    """A fitted map from tracked to true positions.
+    """Maps tracked to true positions as it was fitted.
 
     Attributes
     ----------
@@ -112,12 +112,12 @@ class ErrorMap:
 
     @property
     def before_m(self) -> float:
-        """The error without a map that counts, m."""
+        """Return the error without a map that counts, m."""
         return self.before.judged
 
     @property
     def after_m(self) -> float:
-        """The error with what the other blocks decide that counts, m."""
+        """Return the error with what the other blocks decide that counts, m."""
         return self.after.judged
 
     @property
@@ -127,12 +127,12 @@ class ErrorMap:
 
     @property
     def helps(self) -> bool:
-        """Whether the map is more than the identity."""
+        """Return whether the map is more than the identity."""
         return self.shape.trend >= 0
 
     @property
     def is_confirmed(self) -> bool:
-        """Whether blocks that took no part confirm the map clearly, so that it may be used."""
+        """Return whether unseen blocks confirm the map clearly, so that it may be used."""
         return bool(self.helps and self.clearness > CLEAR)
 
     def apply(self, tracked: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Least squares of many rows with several right-hand sides, of which one small matrix is kept."""
+"""Solves least squares of many rows and several right-hand sides by one small kept matrix."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ columns (some 1e-7 / (0.1 m)^3 T / (A m^2)); it only avoids numbers of very diff
 
 
 class TriangularFactor:
-    """A least-squares problem as the triangular factor of its rows, by QR, block after block.
+    """Keeps a least-squares problem as the triangular factor of its rows, by QR, block by block.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class TriangularFactor:
 
 
 class GramFactor:
-    """The same problem as the inner products of its columns.
+    """Keeps the same problem as the inner products of its columns.
 
     It is several times faster than `TriangularFactor` and has half the digits. That is enough for
     rounds that only prepare the next one, and for fits whose damping is far above the rounding;
@@ -80,7 +80,7 @@ class GramFactor:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """A least-squares problem in its singular vectors, which make every damping cheap.
+    """Keeps a least-squares problem in its singular vectors, which make every damping cheap.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class Spectrum:
 
     @property
     def rank(self) -> int:
-        """Number of singular values above the rounding error."""
+        """Return the number of singular values above the rounding error."""
         limit = self.values[0] * np.finfo(float).eps * max(self.vectors.shape)
         return int((self.values > limit).sum())
 

@@ -1,4 +1,4 @@
-"""Held-out errors: how well a model predicts a block of space that it was not fitted to.
+"""Computes held-out errors: how well a model predicts a block of space it was not fitted to.
 
 There are two figures for every block. The first is the residual at the measured pose, as in the
 article; its largest part is the jitter of the pose times the gradient of the field. The second is
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Residuals of blocks that took no part in the fit that predicts them.
+    """Holds residuals of blocks that took no part in the fit that predicts them.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class HeldOut:
 
     @property
     def score_t(self) -> float:
-        """Root of the mean chi-square times the noise, T, which compares fits of other noise."""
+        """Return the root mean chi-square times the noise, T, to compare fits of other noise."""
         return float(self.noise_t * np.sqrt(self.chi_square))
 
 

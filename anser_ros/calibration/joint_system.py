@@ -1,4 +1,4 @@
-"""The normal equations of a field and of the sensors' parameters, with every pose marginalised.
+"""Sums normal equations of a field and of the sensors' parameters, with every pose marginalised.
 
 All of a frame's readings share the error of its optical pose, along six known directions J. With
 flux noise sigma and the covariance S of the pose the readings have the covariance
@@ -39,7 +39,7 @@ SYSTEM_ROWS = 1200
 
 @dataclass(frozen=True)
 class FieldModes:
-    """Combinations of dipoles whose fluxes are orthogonal over a scan's readings.
+    """Combines dipoles whose fluxes are orthogonal over a scan's readings.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class FieldModes:
 
 @dataclass(frozen=True)
 class Linear:
-    """The readings of one body about the present estimate.
+    """Holds the readings of one body about the present estimate.
 
     Attributes
     ----------
@@ -236,7 +236,7 @@ class JointSystem:
 
 @dataclass(frozen=True)
 class Eliminated:
-    """What remains for the parameters once the field is eliminated.
+    """Holds what remains for the parameters once the field is eliminated.
 
     Attributes
     ----------
@@ -259,6 +259,6 @@ class Eliminated:
     field_variance: Array
 
     def field_step(self, step: Array, modes: int) -> Array:
-        """The field's step (M, 2K) that goes with a step of the parameters (Q,)."""
+        """Return the field's step (M, 2K) that goes with a step of the parameters (Q,)."""
         flat = self.inside[:, -1] - self.inside[:, :-1] @ step
         return np.asarray(flat.reshape(-1, modes).T)

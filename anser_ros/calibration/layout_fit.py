@@ -1,4 +1,4 @@
-"""The fit of a layout: its dipoles are placed, pulled towards the drawn board, moved if asked."""
+"""Fits a layout: its dipoles are placed, pulled towards the drawn board, moved if asked."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ LEAST_EXTENSION = 1.1
 
 @dataclass(frozen=True)
 class LayoutFit:
-    """The dipoles of a fitted layout, the moments that they are pulled to, and the fit.
+    """Holds the dipoles of a fitted layout, the moments that they are pulled to, and the fit.
 
     Attributes
     ----------

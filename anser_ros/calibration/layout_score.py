@@ -1,4 +1,4 @@
-"""The predictive error of layouts for held-out blocks of space, for every damping at once.
+"""Scores layouts by predictive error for held-out blocks of space, for every damping at once.
 
 All layouts are compared at the same poses (corrected once with a rich layer) and on the same
 blocks of space. A layout costs one matrix: the rows of each fold are summed to a Gram matrix,
@@ -41,7 +41,7 @@ field is not biased, and enough to hold a rich layer."""
 
 @dataclass(frozen=True)
 class LayoutCandidate:
-    """A layout with its best damping and its score on held-out blocks.
+    """Holds a layout with its best damping and its score on held-out blocks.
 
     Attributes
     ----------

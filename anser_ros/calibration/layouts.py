@@ -1,5 +1,4 @@
-"""Layouts of virtual dipoles: layers over the field generator's extent, or dipoles on its
-coils."""
+"""Lays virtual dipoles out: in layers over the field generator's extent, or on its coils."""
 
 from dataclasses import dataclass
 
@@ -17,7 +16,7 @@ UNIT_Z = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True)
 class Generator:
-    """Places and size of the coils of a field generator.
+    """Holds places and size of the coils of a field generator.
 
     Attributes
     ----------
@@ -41,7 +40,7 @@ class Generator:
 
     @property
     def middle(self) -> Array:
-        """Centre of that rectangle at the coils' mean height, shape (3,), m."""
+        """Return the centre of that rectangle at the coils' mean height, shape (3,), m."""
         low, high = self._bounds()
         return np.array([*((low + high) / 2.0), self.centres[:, 2].mean()])
 
@@ -54,7 +53,7 @@ class Generator:
 
 @dataclass(frozen=True)
 class Layout:
-    """A rule by which dipoles are placed and fitted.
+    """Describes a rule by which dipoles are placed and fitted.
 
     Attributes
     ----------

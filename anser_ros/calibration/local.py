@@ -1,4 +1,4 @@
-"""Local models: overlapping regions with separate moments, joined smoothly into one layer.
+"""Fits local models: overlapping regions with separate moments, joined smoothly into one layer.
 
 The article solves smaller problems for sub-regions where a single one is not accurate enough. Here
 the measured volume is split in two along each of its longer sides. The moments of every region are
@@ -31,7 +31,7 @@ and would not determine the field's change across them."""
 
 
 class Regions:
-    """A smooth partition of unity over the volume of some points.
+    """Divides the volume of some points smoothly: the weights of all regions add up to one.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Moments of virtual dipoles from fluxes at poses that jitter (errors in variables).
+"""Fits moments of virtual dipoles to fluxes at poses that jitter (errors in variables).
 
 Each optical pose is wrong by a few hundredths of a millimetre, and all sensors of the body and all
 emitters share that error along six known directions. The fit therefore alternates between (a) the
@@ -52,7 +52,7 @@ fits with nearly as many parameters as readings, whose noise would be divided by
 
 @dataclass(frozen=True)
 class MomentFit:
-    """Fitted moments with their residual noise and condition.
+    """Holds fitted moments with their residual noise and condition.
 
     Attributes
     ----------

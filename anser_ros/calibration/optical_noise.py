@@ -1,4 +1,4 @@
-"""The jitter of an optical tracker, estimated from poses that the fluxes tell much better."""
+"""Estimates the jitter of an optical tracker from poses that the fluxes tell much better."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ SMALLEST_RAD = 1e-7
 
 @dataclass(frozen=True)
 class OpticalNoise:
-    """Jitter of one optical pose along and about each axis, before it is interpolated.
+    """Holds the jitter of an optical pose along and about each axis, before interpolation.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class OpticalNoise:
 
 
 def interpolation_share(measurements: Measurements) -> Array:
-    """Share of a pose's variance that linear interpolation to each frame leaves, shape (F,).
+    """Return which share of a pose's variance linear interpolation leaves at each frame, (F,).
 
     Between two poses of independent jitter, at the fraction a of the way, it is
     ``(1 - a)^2 + a^2``.

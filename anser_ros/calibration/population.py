@@ -1,4 +1,4 @@
-"""Widths of populations from the data, and which kinds of errors the data speak for at all.
+"""Finds widths of populations, and which kinds of errors the data speak for at all.
 
 The likelihood of the parameters is Gaussian about the present estimate. A population's values are
 random with one width, which is the one that makes the data most probable (empirical Bayes; MacKay,
@@ -42,7 +42,7 @@ FEWEST = 4
 
 @dataclass(frozen=True)
 class Likelihood:
-    """What the data say of Q parameters: a Gaussian about ``values``.
+    """Holds what the data say of Q parameters: a Gaussian about ``values``.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class Likelihood:
 
 @dataclass(frozen=True)
 class Posterior:
-    """Parameters with their widths.
+    """Holds parameters with their widths.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Corrections of the jitter of optical poses, frame by frame, from the fluxes of all sensors."""
+"""Corrects the jitter of optical poses, frame by frame, from the fluxes of all sensors."""
 
 from dataclasses import dataclass, replace
 
@@ -33,7 +33,7 @@ def pose_precision(accuracy: Accuracy) -> Array:
 
 @dataclass(frozen=True)
 class PoseTerms:
-    """Residuals of the fluxes with their derivatives by the pose.
+    """Holds residuals of the fluxes with their derivatives by the pose.
 
     Attributes
     ----------

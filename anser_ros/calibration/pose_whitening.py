@@ -1,4 +1,4 @@
-"""Residuals with the pose of their frame marginalised: the part of them that no pose explains.
+"""Marginalises the pose of each frame: what stays of residuals is the part that no pose explains.
 
 The jitter of a frame's pose shifts and turns all sensors of the body together. To first order it
 changes the frame's fluxes along six known directions, the columns of J (the derivatives of the
@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 
 class PoseWhitener:
-    """The inverse of each frame's covariance C, prepared once for many residuals.
+    """Keeps the inverse of each frame's covariance C, prepared once for many residuals.
 
     By the matrix inversion lemma it takes a 6 x 6 matrix a frame (Golub and Van Loan, Matrix
     Computations, section 2.1.4).

@@ -1,4 +1,4 @@
-"""What is added to tracked positions: a trend, and a smooth function on top of it."""
+"""Adds to tracked positions a trend, and a smooth function on top of it."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ trend and no distance: what differs there is the rounding of the numbers."""
 
 @dataclass(frozen=True)
 class Shape:
-    """A choice of map.
+    """Describes a choice of map.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ IDENTITY = Shape(-1, 0.0, 0.0)
 
 
 class PositionMap:
-    """What a map of one shape, fitted to some points, adds to tracked positions.
+    """Holds what a map of one shape, fitted to some points, adds to tracked positions.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Dipole positions fitted together with their moments by variable projection.
+"""Fits dipole positions together with their moments by variable projection.
 
 The moments are linear and are eliminated at every step (Golub and Pereyra, Inverse Problems 19,
 2003); only the positions are left to a damped Gauss-Newton search. With Kaufman's derivative the
@@ -77,7 +77,7 @@ def position_slopes(points: Array, axes: Array, lengths: Array, dipoles: DipoleS
 
 @dataclass(frozen=True)
 class PositionFit:
-    """Dipoles at optimised positions with their damped moments.
+    """Holds dipoles at optimised positions with their damped moments.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The drawn board as a prior: its field, expressed as the moments of any set of dipoles.
+"""Takes the drawn board as a prior: its field as the moments of any set of dipoles.
 
 The damping pulls a fit towards these moments instead of zero, so that what the data do not
 determine stays as drawn. The drawing is first scaled by one complex gain an emitter, because the
@@ -41,7 +41,7 @@ singular value. It only keeps nearly parallel columns from making huge moments."
 
 
 class DrawnBoard:
-    """The drawn board's field in and around a measured volume, scaled to the measurements.
+    """Holds the drawn board's field in and around a measured volume, scaled to the measurements.
 
     Parameters
     ----------

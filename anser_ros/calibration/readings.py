@@ -1,4 +1,4 @@
-"""The usable readings of measurements, taken in blocks of frames that fit into memory."""
+"""Takes the usable readings of measurements in blocks of frames that fit into memory."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -18,7 +18,7 @@ BLOCK_ROWS = 8192
 
 
 class Readings(NamedTuple):
-    """P usable readings of sensors with a pose, for K emitters.
+    """Holds P usable readings of sensors with a pose, for K emitters.
 
     Attributes
     ----------

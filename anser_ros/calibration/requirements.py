@@ -1,4 +1,4 @@
-"""Requirements that measurements must meet to determine a field model."""
+"""Checks requirements that measurements must meet to determine a field model."""
 
 from collections.abc import Callable, Sequence
 

@@ -1,4 +1,4 @@
-"""The result of a calibration with its residuals and its provenance."""
+"""Holds the result of a calibration with its residuals and its provenance."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Residuals:
-    """Residuals of a model at the measured poses.
+    """Holds the residuals of a model at the measured poses.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Residuals:
 
     @property
     def rmse_t(self) -> float:
-        """Root mean square over the readings of all emitters, T."""
+        """Return the root mean square over the readings of all emitters, T."""
         return float(np.sqrt(np.mean(self.each_t**2)))
 
 
@@ -55,7 +55,7 @@ def residuals(measurements: Sequence[Measurements], model: FieldModel) -> Residu
 
 @dataclass(frozen=True)
 class Scan:
-    """A scan as sound sensors and a sound clock would have given it.
+    """Holds a scan as sound sensors and a sound clock would have given it.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class Scan:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A field model with the figures of its fit and of its choice.
+    """Holds a field model with the figures of its fit and of its choice.
 
     Attributes
     ----------
@@ -130,7 +130,7 @@ class Calibration:
 
     @property
     def better_than_nominal(self) -> bool:
-        """Whether the held-out error is below the nominal model's, or there is none to compare."""
+        """Return whether the held-out error is below the nominal model's, or nothing compares."""
         return self.nominal_rmse_t is None or rms(self.held_out.error) < self.nominal_rmse_t
 
 

@@ -1,4 +1,4 @@
-"""The choice of the dipoles' layout and of the damping by the predictive error of held-out blocks.
+"""Chooses the dipoles' layout and the damping by the predictive error of held-out blocks.
 
 The search goes from coarse to fine layers and then varies their size, their depth and the kind of
 the dipoles. Its result, dipoles that are moved and overlapping regions are the finalists, among
@@ -72,7 +72,7 @@ layer of fixed dipoles has about three times as many as moved ones with the same
 
 @dataclass(frozen=True)
 class Selection:
-    """The result of a search through layouts.
+    """Holds the result of a search through layouts.
 
     Attributes
     ----------

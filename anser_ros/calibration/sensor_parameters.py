@@ -1,4 +1,4 @@
-"""What a scan's sensors, optics and clocks may be off by: parameters, and what they do to fluxes.
+"""Lists what a scan's sensors, optics and clocks may be off by, and what that does to fluxes.
 
 A body's S sensors have a complex gain each (real part minus one, imaginary part), a tilt of the
 axis (rad, along two directions across the surveyed axis) and a place (m, in the body's frame);
@@ -55,7 +55,7 @@ rounding makes of it."""
 
 @dataclass(frozen=True)
 class Survey:
-    """Estimated errors of the sensors of one body and of the optical clock.
+    """Holds estimated errors of the sensors of one body and of the optical clock.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class Survey:
 
 
 def is_followed(measurements: Measurements) -> bool:
-    """Whether the optical tracker followed the body's movement, so that clocks can be told.
+    """Return whether the optical tracker followed the body's movement, so that clocks can be told.
 
     A recording of a pose at each point where the tool rested says nothing of its clock.
     """
@@ -116,7 +116,7 @@ def is_followed(measurements: Measurements) -> bool:
 
 
 def has_turned(measurements: Measurements) -> bool:
-    """Whether a body turned about two axes at least by enough to tell its lever arm.
+    """Return whether a body turned about two axes at least by enough to tell its lever arm.
 
     A shift of all sensors of a body that does not turn is a shift of the field.
     """
@@ -140,7 +140,7 @@ def velocity_of(measurements: Measurements) -> Array:
 
 
 class SensorParameters:
-    """The order of the parameters in their vector, and what they do to fluxes.
+    """Orders the parameters in their vector, and knows what they do to fluxes.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ class SensorParameters:
         return np.concatenate(found) if found else np.zeros(0, dtype=np.int64)
 
     def groups(self) -> list[tuple[str, NDArray[np.int64]]]:
-        """Parameters that share a prior's width: a kind's, with gain and phase apart."""
+        """Return parameters that share a prior's width: a kind's, with gain and phase apart."""
         out = []
         for kind in self.kinds:
             rows = self.rows(kind)
@@ -197,7 +197,7 @@ class SensorParameters:
         return out
 
     def gains_at_one_place(self) -> list[NDArray[np.int64]]:
-        """Indices of the gains (their real parts) of the sensors at each place with several."""
+        """Return indices of the gains (real parts) of the sensors at each place with several."""
         out = []
         for body, table in zip(self.bodies, self.tables, strict=True):
             if (own := self.slices.get(('gains', body))) is not None:

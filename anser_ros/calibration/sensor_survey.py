@@ -1,4 +1,4 @@
-"""What is wrong with a scan's own sensors, clock and optics, found together with the field.
+"""Finds what is wrong with a scan's own sensors, clock and optics, together with the field.
 
 Every step solves for the field and all parameters at once, with the poses marginalised
 (`joint_system`), and then weighs the parameters with the widths of their populations
@@ -153,7 +153,7 @@ class SensorSurveyor:
         self.field_width = FIELD_WIDTH
 
     def survey(self, body: str) -> Survey:
-        """The survey of a body's sensors by the present estimate."""
+        """Return the survey of a body's sensors by the present estimate."""
         return self.parameters.survey(body, self.values)
 
     def fit(self) -> SurveyResult:

@@ -1,4 +1,4 @@
-"""What a survey found, as records: those that a model carries, and those that only tell."""
+"""Records what a survey found: what a model carries, and what is only told."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""What a scan says of its own sensors, clock and optics."""
+"""Holds what a scan says of its own sensors, clock and optics."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from anser_ros.calibration.sensor_parameters import SensorParameters, Survey
 
 @dataclass(frozen=True)
 class SurveyResult:
-    """What a scan says of its own sensors, clock and optics.
+    """Holds what a scan says of its own sensors, clock and optics.
 
     Attributes
     ----------

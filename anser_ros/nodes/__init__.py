@@ -1,1 +1,1 @@
-"""The ROS 2 nodes: the only place that knows rclpy and the message packages."""
+"""Holds the ROS 2 nodes: the only place that knows rclpy and the message packages."""

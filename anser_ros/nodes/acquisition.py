@@ -1,4 +1,4 @@
-"""Samples of a control unit's serial port to fluxes.
+"""Turns samples of a control unit's serial port into fluxes.
 
 Three threads, and none waits for another: the port's reads and queues, this node's worker
 demodulates and publishes, the executor serves parameters and diagnostics.

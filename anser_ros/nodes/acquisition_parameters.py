@@ -1,4 +1,4 @@
-"""The parameters of the acquisition."""
+"""Lists the parameters of the acquisition."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from anser_ros.wire.protocols import PROTOCOLS
 
 @dataclass(frozen=True)
 class AcquisitionParameters:
-    """Parameters of the acquisition."""
+    """Holds the parameters of the acquisition."""
 
     device: str = parameter(
         '/dev/ttyACM0', "the control unit's port, or auto: listen on all ports for its hello"

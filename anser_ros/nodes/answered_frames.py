@@ -26,7 +26,7 @@ frame is tracked at once. At 50 frames a second that is four seconds, beyond any
 
 
 class AnsweredFrames(Generic[Model, Frame]):
-    """Frames and models in the order in which they are to be used.
+    """Keeps frames and models in the order in which they are to be used.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class AnsweredFrames(Generic[Model, Frame]):
 
     @property
     def waiting(self) -> bool:
-        """Whether a frame waits for its model."""
+        """Return whether a frame waits for its model."""
         return bool(self._frames)
 
     def add_model(self, stamp_ns: int, model: Model, now_s: float) -> None:

@@ -24,7 +24,7 @@ FEWEST = 10
 
 
 class Backlog:
-    """Typical spacing of messages, and the time that each takes.
+    """Estimates the typical spacing of messages, and the time that each takes.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class Backlog:
         self._work_s.append(seconds)
 
     def is_hopeless(self, age_s: float) -> bool:
-        """Whether a message of this age shows a backlog that will not be gone soon."""
+        """Return whether a message of this age shows a backlog that will not be gone soon."""
         if age_s < SHORTEST_LATE_S or len(self._work_s) < FEWEST:
             return False
         spacing_s, work_s = median(self._spacing_s), median(self._work_s)

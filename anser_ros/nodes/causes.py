@@ -1,4 +1,4 @@
-"""Why things are as they are, in the words of the nodes' own diagnostics, the gravest first.
+"""Tells why things are as they are, in the words of the nodes' diagnostics, the gravest first.
 
 A service answers with the same words, as both come from the node that knows.
 """
@@ -17,7 +17,7 @@ LEAST_LOSS = 0.05
 
 
 class Told(NamedTuple):
-    """What was said last of a node or of a part of it: level, words, figures by name."""
+    """Holds what was said last of a node or of a part of it: level, words, figures by name."""
 
     level: int
     message: str

@@ -28,7 +28,7 @@ class ChainError(AnserError):
 
 
 class ChainClient:
-    """The nodes of a namespace, as `anser_ros.web.loop.Chain` has them.
+    """Reaches the nodes of a namespace, as `anser_ros.web.loop.Chain` has them.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class ChainClient:
         }
 
     def is_there(self, service: str) -> bool:
-        """Whether somebody offers a service."""
+        """Return whether somebody offers a service."""
         return bool(self._triggers[service].service_is_ready())
 
     async def trigger(self, service: str) -> str:
@@ -100,7 +100,7 @@ class ChainClient:
         return await _text_parameter(getter, BASELINE_FILE) if getter.service_is_ready() else ''
 
     def figures(self, since_s: float) -> dict[str, float | None]:
-        """How well it goes, not before a time (of ``time.time``)."""
+        """Return how well it goes, not before a time (of ``time.time``)."""
         view = self._view()
         if view is None:
             return {}

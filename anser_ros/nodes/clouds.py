@@ -1,4 +1,4 @@
-"""Flux clouds as messages."""
+"""Writes flux clouds as messages."""
 
 import array
 

@@ -25,7 +25,7 @@ REFRESH_EVERY = 50
 
 
 class Consumers:
-    """The nodes that subscribe to topics.
+    """Finds the nodes that subscribe to topics.
 
     Parameters
     ----------

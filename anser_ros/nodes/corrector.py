@@ -24,7 +24,7 @@ QUIET_S = 1.0
 
 @dataclass(frozen=True)
 class CorrectorParameters:
-    """Parameters of the corrector."""
+    """Holds the parameters of the corrector."""
 
     model: str = parameter('', 'model.yaml of `anser diagnose --poses`')
     tracked: str = parameter('/tracked', 'what the topics of tracked poses begin with')

@@ -1,4 +1,4 @@
-"""A control unit behind a pseudo-terminal, with the optical truth beside it."""
+"""Simulates a control unit behind a pseudo-terminal, with the optical truth beside it."""
 
 import json
 import math
@@ -52,7 +52,7 @@ that is so late would hardly catch up, and what it sent would be old."""
 
 @dataclass(frozen=True)
 class CuSimulatorParameters:
-    """Parameters of the simulated control unit."""
+    """Holds the parameters of the simulated control unit."""
 
     link: str = parameter('/tmp/anser_cu', 'path under which the port can be opened')
     setup_file: str = parameter('demo_setup.yaml', 'setup document: a path, or a file of config/')

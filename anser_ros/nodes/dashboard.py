@@ -1,4 +1,6 @@
-"""A live view in the browser: scene, states, curves, and the loop of diagnosis and correction."""
+"""Shows a live view in the browser: scene, states, curves, the loop of
+diagnosis and correction.
+"""
 
 import sys
 from dataclasses import dataclass
@@ -20,7 +22,7 @@ from anser_ros.wire.tcp_ports import LIVE_VIEW
 
 @dataclass(frozen=True)
 class DashboardParameters:
-    """Parameters of the live view."""
+    """Holds the parameters of the live view."""
 
     host: str = parameter(
         '127.0.0.1', 'address that the page is served on; any but this machine needs a token'

@@ -1,4 +1,4 @@
-"""Message types of the installation by name: class, definition text and type hash."""
+"""Finds message types of the installation by name: class, definition text and type hash."""
 
 import importlib
 import json

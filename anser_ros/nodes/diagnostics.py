@@ -1,4 +1,4 @@
-"""What a node says of itself: statuses, counters, and warnings that do not flood."""
+"""Reports what a node says of itself: statuses, counters, and warnings that do not flood."""
 
 import math
 from collections import Counter
@@ -15,7 +15,7 @@ TROUBLE_TOLD_S = 10.0
 
 
 class Level(IntEnum):
-    """The levels of diagnostic_msgs."""
+    """Names the levels of diagnostic_msgs."""
 
     OK = 0
     WARN = 1
@@ -25,7 +25,7 @@ class Level(IntEnum):
 
 @dataclass(frozen=True)
 class Status:
-    """One line of ``/diagnostics``.
+    """Holds one line of ``/diagnostics``.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ def diagnostic_array(node: str, statuses: Iterable[Status], stamp: Time) -> Diag
 
 
 class Trouble:
-    """What went wrong last, and whether that is still news.
+    """Remembers what went wrong last, and whether that is still news.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Faults of the line that happened lately, in words for an operator."""
+"""Remembers faults of the line that happened lately, in words for an operator."""
 
 from collections.abc import Mapping
 
@@ -54,19 +54,19 @@ class RecentFaults:
 
     @property
     def words(self) -> str:
-        """What happened lately with its count, the gravest first; empty when nothing did."""
+        """Return what happened lately with its count, the gravest first; empty if nothing did."""
         found = [name for name in FAULTS if name in self._recent]
         parts = [f'{name} {self._recent[name][1]} ({FAULTS[name]})' for name in found[:MOST]]
         return '; '.join(parts)
 
     @property
     def level(self) -> Level:
-        """ERROR when the stream stood still, WARN when parts of it were lost."""
+        """Return ERROR when the stream stood still, WARN when parts of it were lost."""
         return Level.ERROR if any(name in self._recent for name in GRAVE) else Level.WARN
 
 
 def device_words(status: DeviceStatus) -> str:
-    """What the control unit itself complains of, with the count of what it lost."""
+    """Return what the control unit itself complains of, with the count of what it lost."""
     names = [flag.name.lower().replace('_', ' ') for flag in StatusFlag if flag & status.flags]
     if StatusFlag.OVERRUN & status.flags:
         names.append(f'{status.dropped_blocks} blocks dropped')

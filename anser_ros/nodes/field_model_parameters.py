@@ -1,4 +1,4 @@
-"""The parameters of the node that serves the field model."""
+"""Lists the parameters of the node that serves the field model."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from anser_ros.sessions.starting_model import NOMINAL
 
 @dataclass(frozen=True)
 class FieldModelParameters:
-    """Parameters of the field model's server."""
+    """Holds the parameters of the field model's server."""
 
     model_file: str = parameter(
         NOMINAL,

@@ -1,4 +1,4 @@
-"""The fluxes of one window, and the queue in which frames wait until their stamps are good."""
+"""Holds a window's fluxes, and the queue in which frames wait until their stamps are good."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ are shorter, and a new line settles in less; a pose that is older is of little u
 
 @dataclass(frozen=True)
 class Staleness:
-    """Why sensors are stale; each array has a place for each of them, shape (S,).
+    """Says why sensors are stale; each array has a place for each of them, shape (S,).
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Staleness:
 
 @dataclass(frozen=True)
 class FluxFrame:
-    """The fluxes of one window.
+    """Holds the fluxes of one window.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Flux messages to arrays; what is no flux message of the setup is refused and counted.
+"""Reads flux messages into arrays; what is no flux message of the setup is refused and counted.
 
 What a frame says beyond its layout is judged by `frames.intake`.
 """

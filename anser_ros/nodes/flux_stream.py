@@ -1,4 +1,4 @@
-"""One connection's samples to fluxes: windows, demodulation, tesla, flags and stamps."""
+"""Turns one connection's samples into fluxes: windows, demodulation, tesla, flags and stamps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
 
 @dataclass(frozen=True)
 class StreamOptions:
-    """How to demodulate: window and rate, and what to fit besides the tones."""
+    """Says how to demodulate: window and rate, and what to fit besides the tones."""
 
     window_s: float
     rate_hz: float
@@ -33,7 +33,7 @@ class StreamOptions:
 
 
 class FluxStream:
-    """Made anew for every hello that differs from the one before.
+    """Turns samples into fluxes; it is made anew for every hello that differs from the one before.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ class FluxStream:
 
     @property
     def blocks_wanted(self) -> int:
-        """Blocks until a frame may be ready: one while frames wait for a block to confirm them."""
+        """Return how many blocks until a frame may be ready: one while frames wait for it."""
         if self.waiting:
             return 1
         return -(-self._cutter.samples_wanted // self._block_samples)

@@ -1,4 +1,4 @@
-"""Frames and models from node to node within one process: as objects, without the middleware.
+"""Hands frames and models from node to node in one process: as objects, without the middleware.
 
 What is handed over is published all the same, for the recorder and everybody else. A node that
 gets a topic so has no subscription to it: it would do everything twice.
@@ -22,7 +22,7 @@ of a host, less than the time between two words of a node on itself."""
 
 @dataclass(frozen=True)
 class HandedFlux:
-    """The fluxes of a window, as a reader of their message has them.
+    """Holds the fluxes of a window, as a reader of their message has them.
 
     Attributes
     ----------
@@ -38,14 +38,14 @@ class HandedFlux:
 
 @dataclass(frozen=True, eq=False)
 class Taking:
-    """What a node has instead of a subscription."""
+    """Stands in for a subscription where a node is handed the topic."""
 
     topic_name: str
     taker: Taker
 
 
 class Aside:
-    """A thread that works on the newest of what is handed over, so that who gives it goes on.
+    """Works in a thread on the newest of what is handed over, so that who gives it goes on.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class Aside:
 
 
 class Handover:
-    """Topics that nodes of this process offer each other, by their full names.
+    """Keeps the topics that nodes of this process offer each other, by their full names.
 
     Who gives frames says when there is a pause before the next: what the nodes say of themselves
     is put off until then, so that no pose waits for it.
@@ -110,7 +110,7 @@ class Handover:
         self._offered[topic] = lasts
 
     def offers(self, topic: str) -> bool:
-        """Whether a topic is given to those who take it."""
+        """Return whether a topic is given to those who take it."""
         return topic in self._offered
 
     def take(self, topic: str, taker: Taker) -> Taking:

@@ -1,4 +1,4 @@
-"""A TCP server that sends every client the same OpenIGTLink messages, and answers what it asks."""
+"""Serves every TCP client the same OpenIGTLink messages, and answers what it asks."""
 
 import contextlib
 import select
@@ -212,7 +212,7 @@ class IgtlServer:
                 client.put(newer if newer and client.version > 1 else data)
 
     def is_tracking_due(self, now_s: float) -> bool:
-        """Whether a client wants TDATA by now, a monotonic time."""
+        """Return whether a client wants TDATA by now, a monotonic time."""
         with self._lock:
             return any(client.is_due(now_s) for client in self._clients)
 

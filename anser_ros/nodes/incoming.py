@@ -1,4 +1,4 @@
-"""Messages as they arrive: what is too large is refused before it is turned into an object.
+"""Takes messages as they arrive: what is too large is refused before it becomes an object.
 
 Whoever can publish on a topic can send any number of bytes on it. Turning a cloud of a million
 points into a message takes a third of a second, and one of a hundred thousand fields longer; so

@@ -1,4 +1,4 @@
-"""The first start of a node after an installation: it waits until all kernels are compiled."""
+"""Starts a node for the first time after an installation: it waits until kernels are compiled."""
 
 import subprocess
 import sys

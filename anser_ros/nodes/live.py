@@ -1,4 +1,4 @@
-"""Acquisition, field model and tracker in one process: frames go from node to node as objects.
+"""Runs acquisition, field model and tracker in one process, which hands frames on as objects.
 
 The nodes, their names, topics, parameters and services are those of three processes. A frame is
 demodulated and tracked in one thread, and its poses go out before anything else is done with it:

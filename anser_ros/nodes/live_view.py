@@ -1,4 +1,4 @@
-"""What the live view shows: the newest of every coil and body, and the last minutes of them."""
+"""Holds what the live view shows: the newest of every coil and body, and their last minutes."""
 
 import math
 import struct
@@ -50,7 +50,7 @@ def read_pose(data: bytes) -> tuple[float, Array]:
 
 @dataclass(frozen=True)
 class Figures:
-    """How well it goes, over all coils and a stretch of time; NaN where nothing is known.
+    """Says how well it goes, over all coils and a stretch of time; NaN where nothing is known.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Figures:
 
 
 class LiveView:
-    """Arrays of all targets, by their numbers.
+    """Holds arrays of all targets, by their numbers.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ class LiveView:
         return self.told.get(f'{self.namespace}/tracker: {name}', Told(1, 'waiting', {}))
 
     def figure(self, node: str, key: str) -> float:
-        """A number that a node of the chain told, NaN where it did not."""
+        """Return a number that a node of the chain told, NaN where it did not."""
         told = self.told.get(f'{self.namespace}/{node}')
         return _number(told, key)
 
@@ -177,7 +177,7 @@ class LiveView:
         return np.array([_number(self.told_of(t.name), 'residual_t') for t in self.targets])
 
     def tracked(self) -> Array:
-        """Share of frames with a pose of every target."""
+        """Return the share of frames with a pose of every target."""
         pairs = [
             [_number(self.told_of(t.name), key) for key in ('rate_hz', 'frame_rate_hz')]
             for t in self.targets
@@ -190,7 +190,7 @@ class LiveView:
         return causes(self.told, self.namespace, self.setup.flux_rate_hz)
 
     def silent_s(self, name: str) -> float:
-        """Time since something was said under a name, s."""
+        """Return the time since something was said under a name, s."""
         return time.monotonic() - self._told_s.get(name, -math.inf)
 
     def add_point(self) -> tuple[float, Array, Array, Array]:
@@ -209,7 +209,7 @@ class LiveView:
 
     @property
     def error_m(self) -> Array:
-        """Distance to the optical pose at the last point, m; NaN where there is none."""
+        """Return the distance to the optical pose at the last point, m; NaN where none is."""
         return self._error_m
 
     def _errors(self) -> Array:

@@ -1,4 +1,4 @@
-"""What only the stream tells of its own accuracy, for the setup document."""
+"""Measures what only the stream tells of its own accuracy, for the setup document."""
 
 import math
 from dataclasses import replace
@@ -65,7 +65,7 @@ class MeasuredAccuracy:
         return True
 
     def stated_in(self, setup: Setup, rate_hz: float) -> Setup:
-        """The setup with the stream's true rate and what was measured."""
+        """Return the setup with the stream's true rate and what was measured."""
         measured: dict[str, float] = {}
         if self._noise_t:
             measured[FLUX_NOISE] = float(f'{self._noise_t:.2g}')

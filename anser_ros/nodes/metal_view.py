@@ -1,4 +1,4 @@
-"""The metal that the refit sees, as a marker for the operator."""
+"""Shows the metal that the refit sees, as a marker for the operator."""
 
 import time
 

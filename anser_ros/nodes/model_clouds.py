@@ -1,4 +1,4 @@
-"""Field models as messages, and back: the dipoles, and beside them their uncertainty."""
+"""Turns field models into messages, and back: the dipoles, and beside them their uncertainty."""
 
 import array
 from collections.abc import Sequence
@@ -112,7 +112,7 @@ def layout_of(message: PointCloud2) -> list[PointFieldTuple]:
 
 
 def width_of(message: PointCloud2) -> int:
-    """Number of points of a cloud that has one row.
+    """Return the number of points of a cloud that has one row.
 
     Raises
     ------

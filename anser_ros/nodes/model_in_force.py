@@ -1,4 +1,4 @@
-"""The model that the tracker uses, with its age while the references say nothing."""
+"""Keeps the model that the tracker uses, with its age while the references say nothing."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ where a recording is played. Its age counts from when it came."""
 
 
 class ModelInForce:
-    """The published model, as the fluxes of each moment may be tracked with it.
+    """Holds the published model, as the fluxes of each moment may be tracked with it.
 
     Parameters
     ----------

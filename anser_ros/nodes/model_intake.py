@@ -1,4 +1,4 @@
-"""What arrives on ``field_model`` and ``field_model_error``, brought together."""
+"""Brings together what arrives on ``field_model`` and ``field_model_error``."""
 
 from collections import deque
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ MOST_EARLY = 32
 
 @dataclass(frozen=True)
 class GivenModel:
-    """A model as it came; ``error`` is None where nobody tells its uncertainty."""
+    """Holds a model as it came; ``error`` is None where nobody tells its uncertainty."""
 
     stamp_ns: int
     data: bytes
@@ -29,17 +29,17 @@ class GivenModel:
 
     @property
     def follows(self) -> bool:
-        """Whether every frame of the references is answered by a model of its stamp."""
+        """Return whether every frame of the references is answered by a model of its stamp."""
         return self.error is not None and self.error.follows
 
     @property
     def withheld(self) -> str:
-        """State for which the server wants no pose to be given; empty where there is none."""
+        """Return the state for which the server wants no pose to be given; empty where none is."""
         code = 0 if self.error is None else self.error.withheld
         return state_of(code)
 
     def is_same_as(self, other: 'GivenModel | None') -> bool:
-        """Whether only the stamp differs."""
+        """Return whether only the stamp differs."""
         return other is not None and self.points is other.points and self.error is other.error
 
     def field_model(self, setup: Setup, file_model: FieldModel | None) -> FieldModel:
@@ -85,7 +85,7 @@ class ModelIntake:
 
     @property
     def has_error(self) -> bool:
-        """Whether an uncertainty has come."""
+        """Return whether an uncertainty has come."""
         return self._read is not None or bool(self._early)
 
     def take(self, message: PointCloud2) -> GivenModel:

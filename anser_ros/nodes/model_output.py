@@ -1,4 +1,4 @@
-"""The two topics of the field model: its dipoles, and how uncertain they are."""
+"""Publishes the two topics of the field model: its dipoles, and how uncertain they are."""
 
 from sensor_msgs.msg import PointCloud2
 

@@ -1,4 +1,4 @@
-"""A live table of sensors, rates and latencies."""
+"""Shows a live table of sensors, rates and latencies."""
 
 import sys
 import time
@@ -36,7 +36,7 @@ LEVELS = {0: 'green', 1: 'yellow', 2: 'red', 3: 'red'}
 
 @dataclass(frozen=True)
 class MonitorParameters:
-    """Parameters of the monitor."""
+    """Holds the parameters of the monitor."""
 
     duration_s: float = parameter(
         0.0, 'ends by itself so long after the first pose; 0 for never, s', minimum=0.0

@@ -1,4 +1,4 @@
-"""What a field_model hears of reference coils on bodies that move: their poses and fluxes."""
+"""Gathers what a field_model hears of reference coils on moving bodies: poses and fluxes."""
 
 from collections.abc import Callable, Mapping
 from typing import Any

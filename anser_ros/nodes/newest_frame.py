@@ -1,4 +1,4 @@
-"""Which frame of fluxes a node works on next: the one that came, or the newest of a backlog."""
+"""Chooses which frame a node works on next: the one that came, or the newest of a backlog."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -87,7 +87,7 @@ def newest_of(
 
 
 def take_waiting(subscription: Any) -> list[Any]:
-    """Messages, as bytes and with their information, that wait in a queue, oldest first.
+    """Return messages, as bytes and with their information, that wait in a queue, oldest first.
 
     They leave the queue so.
     """

@@ -1,4 +1,4 @@
-"""The base of every node: parameters, diagnostics, guarded callbacks, start and end.
+"""Gives every node its base: parameters, diagnostics, guarded callbacks, start and end.
 
 A node is a class with a name and a parameter table::
 
@@ -56,11 +56,11 @@ takes. The start of a refit takes seconds, which nobody waits for."""
 
 @dataclass(frozen=True)
 class NoParameters:
-    """The table of a node without parameters."""
+    """Stands for the table of a node without parameters."""
 
 
 class AnserNode(Node):
-    """Base of the nodes.
+    """Gives all nodes their parameters, diagnostics and guarded callbacks.
 
     Attributes
     ----------
@@ -169,7 +169,7 @@ class AnserNode(Node):
 
     @property
     def hands_over(self) -> bool:
-        """Whether other nodes of this process get what this one publishes directly."""
+        """Return whether other nodes of this process get what this one publishes directly."""
         return self._handover is not None
 
     def count(self, name: str, by: int = 1) -> None:

@@ -1,4 +1,4 @@
-"""A subscription that believes one publisher, and says so where there are more."""
+"""Subscribes to a topic and believes one publisher, and says so where there are more."""
 
 import time
 from collections.abc import Callable, Hashable, Mapping
@@ -77,7 +77,7 @@ class OneSource:
 
     @property
     def said(self) -> str:
-        """Why the topic can't be believed now; empty while it has one sender."""
+        """Return why the topic can't be believed now; empty while it has one sender."""
         now_s = time.monotonic()
         said = self._sources.look(self._count(now_s), now_s)
         latched = self._arguments[1].durability == DurabilityPolicy.TRANSIENT_LOCAL
@@ -92,7 +92,7 @@ class OneSource:
         return said
 
     def publishers(self) -> int:
-        """How many publishers the graph knows, idle ones included."""
+        """Return how many publishers the graph knows, idle ones included."""
         return self._count(time.monotonic())
 
     def hears(self, info: Mapping[str, Any], lasting: Hashable = None) -> bool:

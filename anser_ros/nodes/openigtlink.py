@@ -28,7 +28,7 @@ WATCH_PERIOD_S = 0.05
 
 @dataclass(frozen=True)
 class OpenIGTLinkParameters:
-    """Parameters of the OpenIGTLink server."""
+    """Holds the parameters of the OpenIGTLink server."""
 
     host: str = parameter('127.0.0.1', 'address to listen on; 0.0.0.0 lets other machines in')
     port: int = parameter(OPENIGTLINK, 'TCP port, 0 for a free one', minimum=0, maximum=65535)
@@ -218,7 +218,7 @@ def check_templates(table: OpenIGTLinkParameters) -> None:
 
 
 def devices_of(setup: Setup, table: OpenIGTLinkParameters) -> dict[str, str]:
-    """Device of each body, of its tip and, where they are wanted, of each coil.
+    """Return the device of each body, of its tip and, where they are wanted, of each coil.
 
     Raises
     ------

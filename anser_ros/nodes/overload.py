@@ -1,4 +1,4 @@
-"""What is said where a computer is too slow for the frames that come."""
+"""Says where a computer is too slow for the frames that come."""
 
 import os
 
@@ -18,7 +18,7 @@ def too_slow(skipped: int, worked: int) -> str:
 
 
 class Load:
-    """Words for what was skipped since one asked last, from the counters of a node."""
+    """Finds words for what was skipped since one asked last, from the counters of a node."""
 
     def __init__(self) -> None:
         self._told = 0, 0

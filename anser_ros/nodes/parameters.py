@@ -1,4 +1,4 @@
-"""A node's parameter table: a frozen dataclass whose fields are made by :func:`parameter`.
+"""Defines a node's parameter table: a frozen dataclass of fields made by :func:`parameter`.
 
 The dataclass is the only place that knows a parameter's name, type, default, range and meaning.
 The node declares it, ``--help`` prints it, and an instance of it is what the node reads::
@@ -22,7 +22,7 @@ SCALARS = (bool, int, float, str)
 
 @dataclasses.dataclass(frozen=True)
 class Rule:
-    """What a parameter's value must satisfy, and what it means.
+    """Says what a parameter's value must satisfy, and what it means.
 
     Attributes
     ----------
@@ -69,12 +69,12 @@ FOREIGN_PREFIXES = ('qos_overrides.',)
 
 
 def is_foreign(name: str) -> bool:
-    """Whether a parameter is rclpy's own."""
+    """Return whether a parameter is rclpy's own."""
     return name in FOREIGN or name.startswith(FOREIGN_PREFIXES)
 
 
 def is_known(table: type, name: str) -> bool:
-    """Whether a node with a table knows a parameter."""
+    """Return whether a node with a table knows a parameter."""
     return name in types(table) or is_foreign(name)
 
 

@@ -1,4 +1,4 @@
-"""Reference coils on patches that move: poses from a topic, fluxes among the tools'.
+"""Follows reference coils on patches that move: poses from a topic, fluxes among the tools'.
 
 A patch is a body of the setup whose pose somebody else tracks. Its coils join the fixed references
 for as long as pose and flux are fresh; where one is missing, they are left out and said to be.
@@ -66,7 +66,8 @@ def start_refit(
 
 
 class Patches(PatchCoils):
-    """Patches that messages tell of; a refit for new places is worked out beside the callbacks.
+    """Follows the patches that messages tell of; a refit for new places is worked out beside the
+    callbacks.
 
     Parameters
     ----------
@@ -112,7 +113,7 @@ class Patches(PatchCoils):
         self.put(body, stamp_of(message), position, rotation_of_quaternion(quaternion / norm))
 
     def moved_refit(self, refit: LiveRefit, stamp_ns: int) -> LiveRefit | None:
-        """A refit for where the patches are now, when it is needed and has been worked out.
+        """Return a refit for where the patches are now, when it is needed and has been worked out.
 
         Parameters
         ----------

@@ -62,12 +62,12 @@ class PlaceWatch:
 
     @property
     def is_open(self) -> bool:
-        """Whether references could tell, and none has been heard."""
+        """Return whether references could tell, and none has been heard."""
         return self._place is not None and not self._has_heard
 
     @property
     def awaits(self) -> bool:
-        """Whether references that are announced, or may still be, are about to tell."""
+        """Return whether references that are announced, or may still be, are about to tell."""
         is_early = time.monotonic() - self._begin_s < DISCOVERY_S
         return self.is_open and (is_early or self._announced() > 0)
 

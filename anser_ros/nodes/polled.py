@@ -1,4 +1,4 @@
-"""Topics that are looked at now and then: between two looks a message costs no Python.
+"""Looks at topics now and then: between two looks a message costs no Python.
 
 An executor runs Python for each message. A display that is renewed a few times a second needs
 only the newest one: the middleware keeps as many as the depth says, and they are taken together.
@@ -26,7 +26,7 @@ def polling_node(name: str, namespace: str) -> Node:
 
 
 class Polled:
-    """A subscription whose messages are taken when asked for.
+    """Subscribes to a topic whose messages are taken when asked for.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Poses as messages: one pair of topics a sensor or body, and /tf where it is installed."""
+"""Publishes poses: one pair of topics a sensor or body, and /tf where it is installed."""
 
 import math
 import time
@@ -23,7 +23,7 @@ except ImportError:  # the wheels don't have it
 
 @dataclass
 class Tally:
-    """What happened to one sensor or body since the last diagnostics."""
+    """Counts what happened to one sensor or body since the last diagnostics."""
 
     begin_s: float = field(default_factory=time.monotonic)
     frames: int = 0
@@ -33,7 +33,7 @@ class Tally:
 
 
 class PoseTopic:
-    """The two pose topics of one sensor or body; its messages are built once and filled anew."""
+    """Publishes a sensor's or body's two pose topics; its messages are built once, filled anew."""
 
     def __init__(self, node: Any, name: str, frame_id: str, prefix: str = '') -> None:
         self.name = name
@@ -55,12 +55,12 @@ class PoseTopic:
 
     @property
     def listeners(self) -> int:
-        """How many subscriptions get what is published now."""
+        """Return how many subscriptions get what is published now."""
         both = self._pose, self._uncertain
         return sum(publisher.get_subscription_count() for publisher in both)
 
     def is_matched(self, node: Any) -> bool:
-        """Whether everybody who subscribes to the topics would get what is published now."""
+        """Return whether all who subscribe to the topics would get what is published now."""
         return all(
             publisher.get_subscription_count() >= node.count_subscribers(publisher.topic_name)
             for publisher in (self._pose, self._uncertain)
@@ -151,7 +151,7 @@ class PoseTopic:
 
 
 def transform_publisher(node: Any) -> Any:
-    """Publisher of /tf, or None where its message type is not installed."""
+    """Return a publisher of /tf, or None where its message type is not installed."""
     if TFMessage is None:
         return None
     return node.create_publisher(TFMessage, '/tf', qos.EVENTS)

@@ -1,4 +1,4 @@
-"""Topics of poses that a watcher takes, and what it saw in them, in words."""
+"""Takes topics of poses for a watcher, and says what it saw in them."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ QUIET_S = 2.0
 
 
 def sensor_of(topic: str) -> str:
-    """Name of a sensor by its topic: what stands between ``/tracked/`` and ``/pose``, or all."""
+    """Return a sensor's name by its topic: what is between ``/tracked/`` and ``/pose``, or all."""
     return topic.removeprefix(TRACKED).removesuffix(ENDING).strip('/').replace('/', '_')
 
 
@@ -79,12 +79,12 @@ class PoseStreams:
         return take
 
     def quiet_topics(self) -> tuple[str, ...]:
-        """Topics on which nothing comes now."""
+        """Return topics on which nothing comes now."""
         now_s = time.monotonic()
         return tuple(topic for topic, at in self._heard.items() if now_s - at > QUIET_S)
 
     def session(self) -> PoseSession | None:
-        """What is in the window, of the topics on which something comes."""
+        """Return what is in the window, of the topics on which something comes."""
         return self.window.session(without=[self._topics[t] for t in self.quiet_topics()])
 
 

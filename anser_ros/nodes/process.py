@@ -1,4 +1,4 @@
-"""The process of one node: its arguments, its signals, its executor and its exit code."""
+"""Runs the process of one node: its arguments, its signals, its executor and its exit code."""
 
 import argparse
 import gc

@@ -1,4 +1,4 @@
-"""How busy the processors are, by the system and by this process."""
+"""Measures how busy the processors are, by the system and by this process."""
 
 import os
 import time
@@ -8,7 +8,7 @@ LEAST_S = 1.0
 
 
 class Processor:
-    """Shares since the last look that was long enough ago."""
+    """Measures shares since the last look that was long enough ago."""
 
     def __init__(self) -> None:
         self._own_s, self._at_s = time.process_time(), time.monotonic()

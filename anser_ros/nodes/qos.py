@@ -1,4 +1,4 @@
-"""Quality of service of every topic: one profile a kind of topic, the same on both ends."""
+"""Sets the quality of service of every topic: one profile a kind of topic, alike on both ends."""
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 

@@ -174,7 +174,7 @@ class Readiness:
 
     @property
     def poses(self) -> list[str]:
-        """Topics of the poses that are made of the fluxes."""
+        """Return topics of the poses that are made of the fluxes."""
         return [self._node.resolve_topic_name(topic) for topic in self._poses]
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:

@@ -38,7 +38,7 @@ STAMPED = (
 
 @dataclass(frozen=True)
 class RecorderParameters:
-    """Parameters of the recorder."""
+    """Holds the parameters of the recorder."""
 
     directory: str = parameter('recordings', 'folder that gets one folder a bag')
     name: str = parameter(

@@ -15,7 +15,7 @@ GAP_FACTOR = 1.5
 
 @dataclass
 class TopicLog:
-    """What arrived of one topic.
+    """Records what arrived of one topic.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class TopicLog:
 
     @property
     def faults(self) -> str:
-        """What is wrong with the topic, in words; empty when nothing is."""
+        """Return what is wrong with the topic, in words; empty when nothing is."""
         found = []
         if self.lost:
             found.append(f'{self.lost} lost')

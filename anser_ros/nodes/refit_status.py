@@ -1,4 +1,4 @@
-"""What `/diagnostics` says of model and refit: their figures, and a line for every reference."""
+"""Tells ``/diagnostics`` of model and refit: their figures, and a line for every reference."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ TROUBLED = tuple(WITHHELD)
 
 
 def no_baseline(namespace: str) -> str:
-    """Words for the console where references are there, but nothing to compare them with."""
+    """Return words for the console if references are there, but nothing to compare them with."""
     return (
         'no baseline of the references, so the model does not follow them, and metal will make '
         f'poses vanish (state residual): with no metal near, call {namespace}/field_model/'

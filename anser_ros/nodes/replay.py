@@ -52,7 +52,7 @@ ATTEMPTS_OF_LISTENERS = 2
 
 @dataclass(frozen=True)
 class ReplayParameters:
-    """Parameters of the replay: what two of them on one graph must not share."""
+    """Holds the parameters of the replay: what two of them on one graph must not share."""
 
     optical: str = optical_parameter()
     clock: str = parameter('/clock', 'topic of the time in the bag')

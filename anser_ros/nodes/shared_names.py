@@ -1,4 +1,4 @@
-"""Names outside a node's namespace, which two boards on one graph must not share.
+"""Lists names outside a node's namespace, which two boards on one graph must not share.
 
 Poses of an optical tracker, the clock of a replay and the frames in ``/tf`` are everybody's by
 default; a second board has others by these parameters.
@@ -14,7 +14,7 @@ OPTICAL = '/optical'
 
 
 def optical_parameter() -> Any:
-    """The parameter of a node that has to do with optical poses."""
+    """Return the parameter of a node that has to do with optical poses."""
     return parameter(OPTICAL, 'namespace of the optical poses: NAMESPACE/BODY/pose')
 
 

@@ -1,4 +1,4 @@
-"""A sighting in words, for an operator who reads /diagnostics."""
+"""Puts a sighting into words, for an operator who reads /diagnostics."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -50,7 +50,7 @@ def titles_of(findings: Sequence[EffectRecord]) -> str:
 
 
 def title_of(record: EffectRecord) -> str:
-    """Name of an effect and where it sits."""
+    """Return the name of an effect and where it sits."""
     sites = [
         f'{key} {plain_text(record.parameters[key])}' for key in SITES if key in record.parameters
     ]
@@ -68,7 +68,7 @@ def figures_of(record: EffectRecord) -> str:
 
 
 def plain_text(value: Any) -> str:
-    """A parameter as an operator reads it: numbers short, lists and mappings without quotes."""
+    """Return a parameter as an operator reads it: numbers short, lists and mappings unquoted."""
     if isinstance(value, str):
         return value
     if isinstance(value, complex):

@@ -1,4 +1,4 @@
-"""Node parameters for the values of `anser_ros.settings`, which the setup document may state too.
+"""Makes node parameters of `anser_ros.settings`, whose values the setup document may state too.
 
 A parameter that is 0, its default, leaves the value to the setup document; any other goes before
 it. The names, ranges and meanings are those of `anser_ros.settings.VALUES`.
@@ -20,7 +20,7 @@ def stated(name: str) -> Any:
 
 
 def stated_by(table: Any) -> dict[str, float]:
-    """The values that a node's parameters state, without those that are 0.
+    """Return the values that a node's parameters state, without those that are 0.
 
     Raises
     ------

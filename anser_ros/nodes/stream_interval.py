@@ -1,4 +1,4 @@
-"""What the acquisition has published since it last told of itself."""
+"""Counts what the acquisition has published since it last told of itself."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from anser_ros.nodes.flux_frame import FluxFrame, Staleness
 
 @dataclass
 class Interval:
-    """What happened since the last diagnostics."""
+    """Counts what happened since the last diagnostics."""
 
     begin_s: float
     frames: int = 0

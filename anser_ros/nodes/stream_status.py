@@ -1,4 +1,4 @@
-"""What an acquisition says of emitters and sensors: a line each, and what is wrong in words."""
+"""Tells what an acquisition says of emitters and sensors: a line each, what is wrong in words."""
 
 from collections.abc import Iterable, Sequence
 
@@ -28,7 +28,7 @@ def signal_troubles(
     flags: np.ndarray | None,
     staleness: Staleness | None = None,
 ) -> list[tuple[Level, str]]:
-    """What is wrong with the signals, by the names of emitters and sensors.
+    """Return what is wrong with the signals, by the names of emitters and sensors.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def _why_stale(staleness: Staleness | None, row: int) -> str:
 
 
 def clock_troubles(stream: FluxStream) -> list[tuple[Level, str]]:
-    """What is wrong with the stamps, and with the device's own clock."""
+    """Return what is wrong with the stamps, and with the device's own clock."""
     clock, found = stream.clock, []
     if clock.state is ClockState.LATE and clock.is_doubted:
         words = f'clock: everything arrives {clock.lateness_s:.2g} s late'
@@ -134,7 +134,7 @@ def sensor_statuses(
     flags: np.ndarray | None,
     staleness: Staleness | None = None,
 ) -> list[Status]:
-    """State and noise of each sensor, by the flags since the last look."""
+    """Return state and noise of each sensor, by the flags since the last look."""
     seen = frame.flags if flags is None or len(flags) != len(frame.flags) else flags
     statuses = []
     for row, sensor in enumerate(stream.sensors):

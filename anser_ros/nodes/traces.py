@@ -1,4 +1,4 @@
-"""What came in for every sensor and body, and how far it is from the optical truth."""
+"""Traces what came in for every sensor and body, and how far it is from the optical truth."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ LONGEST_GAP_S = 0.1
 
 
 def latency_of(now_s: float, stamp_s: float) -> float:
-    """How old a pose is as it comes, s; NaN where its stamp is not of now."""
+    """Return how old a pose is as it comes, s; NaN where its stamp is not of now."""
     age_s = now_s - stamp_s
     return age_s if abs(age_s) < LIVE_WITHIN_S else float('nan')
 
 
 @dataclass(frozen=True)
 class Target:
-    """A sensor or a body that is tracked.
+    """Names a sensor or a body that is tracked.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Target:
 
 
 def targets_of(setup: Setup) -> list[Target]:
-    """All tool sensors of a setup, and the bodies that carry more than one."""
+    """Return all tool sensors of a setup, and the bodies that carry more than one."""
     sensors = [Target(s.name, s.body, s.position_m, s.axis) for s in setup.tool_sensors]
     carried = [sensor.body for sensor in sensors]
     bodies = [
@@ -54,7 +54,7 @@ def targets_of(setup: Setup) -> list[Target]:
 
 @dataclass
 class OpticalTrace:
-    """Poses of one body by an optical tracker, or the simulator's truth."""
+    """Keeps poses of one body by an optical tracker, or the simulator's truth."""
 
     stamp_s: list[float] = field(default_factory=list)
     position: list[tuple[float, ...]] = field(default_factory=list)
@@ -73,7 +73,7 @@ class OpticalTrace:
             del values[:-but]
 
     def track(self, since: int = 0) -> PoseTrack | None:
-        """The poses from number `since` on, None when there are less than two."""
+        """Return the poses from number `since` on, None when there are less than two."""
         if len(self.stamp_s) - since < 2:
             return None
         return PoseTrack(
@@ -85,7 +85,7 @@ class OpticalTrace:
 
 @dataclass
 class PoseTrace:
-    """Poses of one target by one tracker.
+    """Keeps poses of one target by one tracker.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class PoseTrace:
     latency_s: list[float] = field(default_factory=list)
 
     def errors(self, optical: PoseTrack, since: int = 0) -> tuple[Array, Array]:
-        """Distance (m) and angle (rad) to the truth of the poses from number `since` on.
+        """Return distance (m) and angle (rad) to the truth of the poses from number `since` on.
 
         NaN where the optical track does not reach.
         """
@@ -118,7 +118,7 @@ class PoseTrace:
 
 @dataclass(frozen=True)
 class Row:
-    """The newest of one target, for a table.
+    """Holds the newest of one target, for a table.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class Row:
 
 
 class Traces:
-    """All targets of one chain of nodes."""
+    """Keeps all targets of one chain of nodes."""
 
     def __init__(self, targets: list[Target]) -> None:
         self.of = {target.name: PoseTrace(target) for target in targets}

@@ -1,4 +1,4 @@
-"""Fluxes to poses: one for every tool sensor and rigid body, with covariance, state and reason.
+"""Turns fluxes into poses of every tool sensor and rigid body, with covariance, state and reason.
 
 A pose is published only while its state is ``ok``; why there is none stands in ``/diagnostics``.
 """

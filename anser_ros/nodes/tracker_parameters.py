@@ -1,4 +1,4 @@
-"""The parameters of the tracker, and the settings of the core that they make."""
+"""Lists the parameters of the tracker, and makes the core's settings of them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from anser_ros.wire.setup_tips import TipSpec, read_tips
 
 @dataclass(frozen=True)
 class TrackerParameters:
-    """Parameters of the tracker."""
+    """Holds the parameters of the tracker."""
 
     model_file: str = parameter(
         '',

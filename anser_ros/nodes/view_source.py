@@ -1,4 +1,4 @@
-"""What the page shows of the graph: topics are looked at, and become arrays and words."""
+"""Tells the page what the graph shows: topics are looked at, and become arrays and words."""
 
 import math
 import os
@@ -41,7 +41,7 @@ COIL_M = 0.07
 
 
 class ViewSource:
-    """As `anser_ros.web.page.ShownGraph` has it.
+    """Shows the graph to the page, as `anser_ros.web.page.ShownGraph` has it.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ class ViewSource:
     # What is shown ------------------------------------------------------------------------
 
     def world(self) -> dict[str, Any] | None:
-        """What stands still, the targets, and the curves so far."""
+        """Return what stands still, the targets, and the curves so far."""
         view = self.view
         if view is None:
             return None
@@ -190,7 +190,7 @@ class ViewSource:
         return [] if self.view is None else self.view.frame()
 
     def table(self) -> list[list[Any]]:
-        """Level, state, reason, sigma (mm), error (mm), residual (pT) and rate of every target."""
+        """Return level, state, reason, sigma, error (mm), residual (pT), rate of every target."""
         view = self.view
         if view is None:
             return []

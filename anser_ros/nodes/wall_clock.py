@@ -1,4 +1,4 @@
-"""The system's clock beside the monotonic one: what separates them, and when it was set."""
+"""Compares the system's clock with the monotonic one: what separates them, and when it was set."""
 
 import time
 from collections.abc import Callable

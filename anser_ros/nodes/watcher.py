@@ -45,7 +45,7 @@ SILENCE_S = 2.0
 
 @dataclass(frozen=True)
 class WatcherParameters:
-    """Parameters of the watcher."""
+    """Holds the parameters of the watcher."""
 
     model_file: str = parameter(
         NOMINAL,
@@ -80,7 +80,7 @@ class WatcherParameters:
 
 @dataclass(frozen=True)
 class Task:
-    """One look: at what, and with whom."""
+    """Says what one look is at, and with whom."""
 
     watch: Watch | PoseWatch
     session: Session | PoseSession
