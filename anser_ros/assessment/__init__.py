@@ -1,1 +1,1 @@
-"""How good a tracker is, by the protocols that the field publishes, and where a tool's tip is."""
+"""Assesses how good a tracker is by the field's published protocols, and where a tool's tip is."""

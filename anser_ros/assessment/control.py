@@ -1,4 +1,4 @@
-"""Repeated assessments against control limits: pass, note, alert or fail.
+"""Compares repeated assessments with control limits: pass, note, alert or fail.
 
 A figure's limits are those of Shewhart's chart of individual values: the mean of earlier
 sessions, and multiples of the deviation that neighbouring sessions show (the mean of their
@@ -35,7 +35,7 @@ SMALLEST_SHARE = 0.02
 
 @dataclass(frozen=True)
 class ControlLimits:
-    """Limits of one figure.
+    """Holds the limits of one figure.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class ControlLimits:
     sigma: float
 
     def reach(self, deviations: float, figures: int) -> float:
-        """How far a figure in order may be from the mean, in deviations, for one of so many.
+        """Return how many deviations a figure in order may be off the mean, for one of so many.
 
         Parameters
         ----------
@@ -69,7 +69,7 @@ def _multiple(count: int, deviations: float, figures: int) -> float:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a figure is worth beside those of earlier sessions.
+    """Says what a figure is worth beside those of earlier sessions.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class Verdict:
 
 
 def limits_of(earlier: Sequence[float]) -> ControlLimits | None:
-    """Limits from the figures of earlier sessions, in their order."""
+    """Return limits from the figures of earlier sessions, in their order."""
     values = np.asarray(earlier, dtype=np.float64)
     values = values[np.isfinite(values)]
     if values.size < FEWEST:
@@ -103,7 +103,7 @@ def limits_of(earlier: Sequence[float]) -> ControlLimits | None:
 def judged(
     value: float, earlier: Sequence[float], tolerance: float | None = None, figures: int = 1
 ) -> Verdict:
-    """What a figure is worth.
+    """Return what a figure is worth.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Error and latency of a moving tool by its speed, against a moving reference.
+"""Finds error and latency of a moving tool by its speed, against a moving reference.
 
 Hand-eye gives the two frames and the offset of the clocks. What is late about a pose moves it back
 along its own velocity, so the error along the velocity over the speed is a time: the latency that
@@ -30,7 +30,7 @@ SLOWEST_M_S = 0.02  # median speed below which a recording is of a rest
 
 @dataclass(frozen=True)
 class SpeedGroup:
-    """Poses of similar speed.
+    """Holds poses of similar speed.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class SpeedGroup:
 
 @dataclass(frozen=True)
 class Dynamics:
-    """What a moving tool shows.
+    """Holds what a moving tool shows.
 
     Attributes
     ----------

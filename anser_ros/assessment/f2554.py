@@ -1,4 +1,4 @@
-"""The figures of ASTM F2554: readings of a single point, and distances between known points.
+"""Computes the figures of ASTM F2554: readings of one point, and distances of known points.
 
 ASTM F2554, "Standard Practice for Measurement of Positional Accuracy of Computer Assisted Surgical
 Systems": how far readings of one location scatter while the tool is turned about it, and how far
@@ -38,7 +38,7 @@ ALONE = 0.5
 def single_point(
     poses: PoseSequence, rng: np.random.Generator
 ) -> tuple[ErrorGroup, dict[str, IntervalEstimate]]:
-    """Distances of the readings from their mean, mm, and the largest between two of them, m.
+    """Return distances of the readings from their mean, mm, and the largest between two, m.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def _span(place: Array) -> float:
 def point_to_point(
     points: Sequence[StillPoint], true: Array, rng: np.random.Generator
 ) -> tuple[ErrorGroup, dict[str, IntervalEstimate]]:
-    """Errors of all distances between points, mm, and what a rigid fit of the points leaves, m.
+    """Return errors of all distances between points, mm, and what a rigid fit leaves, m.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def point_to_point(
 
 
 def standing_alone(place: Array, true: Array) -> tuple[int, float, float] | None:
-    """The one point that a rigid fit is much better without, and what it leaves with and without.
+    """Return the one point that a rigid fit is much better without, and what both fits leave.
 
     A marker seen in its other solution does that, or a tip that was not in its divot; None where
     no single point does, or there are too few to tell.

@@ -1,4 +1,4 @@
-"""A folder of earlier assessments, one small file each, and the verdict on a new one."""
+"""Keeps earlier assessments in a folder, a small file each, and gives the verdict on a new one."""
 
 import json
 import re
@@ -16,7 +16,7 @@ SCHEMA = 'anser_accuracy_history/1'
 
 
 def figures_of(found: Assessment) -> dict[str, float]:
-    """All figures of an assessment by name; of groups their mean and root mean square."""
+    """Return all figures of an assessment by name; of groups their mean and root mean square."""
     figures = {name: estimate.value for name, estimate in found.estimates.items()}
     for name, group in found.groups.items():
         figures |= {f'{name}/{key}': group.summary[key].value for key in ('Mean', 'RMS')}
@@ -30,7 +30,8 @@ def _is_watched(name: str, protocol: str) -> bool:
 def judge(
     found: Assessment, folder: Path, tolerances: Mapping[str, float]
 ) -> tuple[str, dict[str, Verdict], int]:
-    """State of a session, the verdict on each figure, and how many earlier sessions there are.
+    """Return a session's state, the verdict on each figure, and how many earlier sessions there
+    are.
 
     Sessions of the same protocol and body count, but no later ones, and no figure that was an
     alert or failed in its session.

@@ -1,4 +1,4 @@
-"""Hummel's protocol: distances on a board of holes, and a ring of rotations.
+"""Follows Hummel's protocol: distances on a board of holes, and a ring of rotations.
 
 Hummel et al., "Design and application of an assessment protocol for electromagnetic tracking
 systems", Med. Phys. 32 (2005); the small volume of Maier-Hein et al., Med. Phys. 39 (2012).
@@ -52,7 +52,7 @@ ORDERS = ('rows', 'serpentine')
 
 @dataclass(frozen=True)
 class ErrorGroup:
-    """Errors of one kind.
+    """Holds errors of one kind.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class ErrorGroup:
 
 @dataclass(frozen=True)
 class Grid:
-    """The board's layout: rows, columns, spacing in m, and MITK's name of it where it has one."""
+    """Describes the board's layout: rows, columns, spacing in m, and MITK's name of it or none."""
 
     rows: int
     columns: int
@@ -85,7 +85,7 @@ class Grid:
 
     @classmethod
     def of(cls, count: int, shape: tuple[int, int] | None, spacing_m: float) -> 'Grid':
-        """The layout of so many points.
+        """Return the layout of so many points.
 
         Raises
         ------
@@ -116,7 +116,7 @@ class Grid:
 
 
 def grid_points(points: Sequence[StillPoint], grid: Grid, order: str = 'rows') -> Array:
-    """Positions by row and column, shape (rows, columns, 3), m.
+    """Return positions by row and column, shape (rows, columns, 3), m.
 
     Raises
     ------
@@ -159,7 +159,7 @@ def _off(place: Array, grid: Grid) -> tuple[float, float]:
 
 
 def distance_errors(place: Array, grid: Grid, rng: np.random.Generator) -> dict[str, ErrorGroup]:
-    """Errors of the protocol's distances, by MITK's names, as far as the board is long enough.
+    """Return errors of the protocol's distances, by MITK's names, up to the board's length.
 
     MITK gives 15 cm, 30 cm and accumulated distances for the standard volume alone; here every
     board has those that fit. Intervals draw lines of holes again: along one, errors hang together.
@@ -190,7 +190,7 @@ def distance_errors(place: Array, grid: Grid, rng: np.random.Generator) -> dict[
 
 
 def lines_alike(place: Array, grid: Grid) -> bool:
-    """Whether distances have the same errors as those beside them, as a distorted field makes.
+    """Return whether distances err as those beside them do, as in a distorted field.
 
     Parallel distances share no hole, so the noise of holes leaves them uncorrelated.
 
@@ -250,7 +250,7 @@ def grouped(
     unit: str, words: Sequence[str], signed: Array, clusters: Sequence[NDArray[np.int64]],
     rng: np.random.Generator,
 ) -> ErrorGroup:  # fmt: skip
-    """Errors with intervals from resamples of whole clusters, of several ways the widest."""
+    """Return errors with intervals from resamples of clusters, the widest of several ways."""
     size = np.abs(signed)
     found = [
         summarised(size, cluster_weights(labels, rng), int(np.unique(labels).size))
@@ -260,14 +260,14 @@ def grouped(
 
 
 def matching_error(place: Array, grid: Grid) -> float:
-    """Root mean square distance, m, from the board laid on the points: MITK's grid matching."""
+    """Return the rms distance, m, from the board laid on the points: MITK's grid matching."""
     rows, columns = np.meshgrid(np.arange(grid.rows), np.arange(grid.columns), indexing='ij')
     true = grid.spacing_m * np.stack([rows, columns, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
     return rigid_distance(true.astype(np.float64), place.reshape(-1, 3))
 
 
 def rigid_distance(true: Array, measured: Array) -> float:
-    """Root mean square distance, m, of points (n, 3) that are laid on each other rigidly."""
+    """Return the rms distance, m, of points (n, 3) that are laid on each other rigidly."""
     left, right = measured - measured.mean(axis=0), true - true.mean(axis=0)
     root = Rotation.align_vectors(left, right)[1]  # of the sum of squares
     return float(root / np.sqrt(len(true)))
@@ -276,7 +276,7 @@ def rigid_distance(true: Array, measured: Array) -> float:
 def rotation_errors(
     points: Sequence[StillPoint], step_deg: float, axis: Array | None, rng: np.random.Generator
 ) -> ErrorGroup:
-    """Errors of the turns from one hole of the ring to the next, as MITK has them.
+    """Return errors of the turns from one hole of the ring to the next, as MITK has them.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Statistics of errors, and 95 % intervals that know which errors hang together.
+"""Computes statistics of errors, and 95 % intervals that know which errors hang together.
 
 Errors that share points or moments are not independent: whole clusters are drawn again (cluster
 bootstrap), and of distances between points the points (vertex bootstrap of Snijders and Borgatti,
@@ -23,7 +23,7 @@ FEWEST = 3  # clusters without which nothing is resampled
 
 @dataclass(frozen=True)
 class IntervalEstimate:
-    """A figure with its interval; the ends are NaN where there is none."""
+    """Holds a figure with its interval; the ends are NaN where there is none."""
 
     value: float
     low: float = float('nan')
@@ -31,7 +31,7 @@ class IntervalEstimate:
 
 
 def mitk_statistics(values: Array) -> dict[str, float]:
-    """Statistics under the names, and by the rules, of MITK's HummelProtocolEvaluation.
+    """Return statistics under the names, and by the rules, of MITK's HummelProtocolEvaluation.
 
     Quartiles are elements of the sorted list: the ones at a quarter, a half, and both together of
     the number, rounded down.
@@ -55,7 +55,7 @@ def mitk_statistics(values: Array) -> dict[str, float]:
 def cluster_weights(
     clusters: NDArray[np.int64], rng: np.random.Generator, draws: int = DRAWS
 ) -> Array:
-    """How often each error is in each resample of whole clusters, shape (draws, n)."""
+    """Return how often each error is in each resample of whole clusters, shape (draws, n)."""
     names, index = np.unique(clusters, return_inverse=True)
     counts = rng.multinomial(names.size, np.full(names.size, 1 / names.size), size=draws)
     return np.asarray(counts[:, index], dtype=np.float64)
@@ -64,14 +64,14 @@ def cluster_weights(
 def vertex_weights(
     pairs: NDArray[np.int64], rng: np.random.Generator, draws: int = DRAWS
 ) -> Array:
-    """How often each pair (n, 2) of points is in each resample of the points, shape (draws, n)."""
+    """Return how often each pair (n, 2) of points is in each resample of points, (draws, n)."""
     count = int(pairs.max()) + 1
     counts = rng.multinomial(count, np.full(count, 1 / count), size=draws)
     return np.asarray(counts[:, pairs[:, 0]] * counts[:, pairs[:, 1]], dtype=np.float64)
 
 
 def summarised(values: Array, weights: Array, clusters: int) -> dict[str, IntervalEstimate]:
-    """Mean, root mean square, standard deviation, median and 95th percentile with intervals.
+    """Return mean, root mean square, deviation, median and 95th percentile with intervals.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def summarised(values: Array, weights: Array, clusters: int) -> dict[str, Interv
 
 
 def widest(found: Sequence[dict[str, IntervalEstimate]]) -> dict[str, IntervalEstimate]:
-    """The same figures from several ways of drawing again, each with the ends farthest out."""
+    """Return the same figures from several ways of drawing again, with the ends farthest out."""
     widened = {}
     for name, first in found[0].items():
         low = np.array([one[name].low for one in found])
@@ -139,7 +139,7 @@ def _statistics(ordered: Array, weights: Array) -> Mapping[str, Array]:
 
 
 def independent_for_variance(values: Array) -> float:
-    """Number of independent values that tell a variance as well as these do.
+    """Return how many independent values tell a variance as well as these do.
 
     Of a stationary series it is ``n / (1 + 2 sum rho_k^2)``.
     """
@@ -147,7 +147,7 @@ def independent_for_variance(values: Array) -> float:
 
 
 def independent_for_mean(values: Array) -> float:
-    """Number of independent values that tell a mean as well: ``n / (1 + 2 sum rho_k)``."""
+    """Return how many independent values tell a mean as well: ``n / (1 + 2 sum rho_k)``."""
     return _independent(values, 1)
 
 
@@ -178,7 +178,7 @@ def deviation_interval(value: float, freedoms: float) -> IntervalEstimate:
 
 
 def blocks_of_time(time: Array, count: int) -> NDArray[np.int64]:
-    """Number of the equal stretch of time, of so many, that each moment (n,) is in."""
+    """Return the number of the equal stretch of time, of so many, that each moment (n,) is in."""
     length = max(float(np.ptp(time)), 1e-9)
     numbers = (count * (time - time.min()) / length).astype(np.int64)
     return np.asarray(np.minimum(numbers, count - 1), dtype=np.int64)

@@ -1,4 +1,4 @@
-"""What metal beside a sensor at rest does: the shift of its pose from that without metal."""
+"""Measures what metal beside a resting sensor does: its pose's shift from that without metal."""
 
 from collections.abc import Sequence
 
@@ -20,7 +20,7 @@ FEWEST_POSES = 10  # poses of a rest, without which its mean has no uncertainty
 def metal_shifts(
     base: PoseSequence, others: Sequence[tuple[str, PoseSequence]]
 ) -> dict[str, IntervalEstimate]:
-    """Distance (m) and angle (rad) of each recording's mean pose from that without metal.
+    """Return distance (m) and angle (rad) of each recording's mean pose from that without metal.
 
     The interval is of the distance: the shift's own uncertainty along it (errors that are alike in
     time count once), and never below zero.

@@ -1,4 +1,4 @@
-"""The tip of a stylus from poses while it turns about a point that its tip rests on.
+"""Finds a stylus' tip from poses while it turns about a point that its tip rests on.
 
 Of each pose ``p + R t = c`` holds, with the tip ``t`` in the body's frame and the point ``c`` in
 the tracker's: the algebraic one-step form of Yaniv (Proc. SPIE 9415, 2015), solved here on the
@@ -44,7 +44,7 @@ SMALLEST_SIGMA_M = 1e-7  # of a coordinate; what is exact has no scale
 
 @dataclass(frozen=True)
 class PivotLimits:
-    """Bounds from which on a pivot calibration is refused.
+    """Holds bounds from which on a pivot calibration is refused.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class PivotLimits:
 
 @dataclass(frozen=True)
 class PivotFit:
-    """A tip, and how well it is known.
+    """Holds a tip, and how well it is known.
 
     Attributes
     ----------

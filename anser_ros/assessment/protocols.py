@@ -1,4 +1,4 @@
-"""One assessment a protocol: from the poses of recordings to figures with intervals."""
+"""Assesses by protocols, one each: from the poses of recordings to figures with intervals."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -38,7 +38,7 @@ EVEN_ENOUGH = 0.9
 
 @dataclass(frozen=True)
 class ProtocolOptions:
-    """What a protocol is told beside its recordings.
+    """Holds what a protocol is told beside its recordings.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class ProtocolOptions:
 
 @dataclass(frozen=True)
 class Assessment:
-    """What a protocol found.
+    """Holds what a protocol found.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Poses to assess: of a topic of a bag, of a body tracked from fluxes, or of a file of poses."""
+"""Takes poses to assess from a topic of a bag, a body tracked from fluxes, or a file of poses."""
 
 import os
 from collections.abc import Callable
@@ -31,7 +31,7 @@ TOOL = 'tool'
 
 @dataclass(frozen=True)
 class PoseSource:
-    """Which poses are meant; what is not said is found where there is only one.
+    """Says which poses are meant; what is not said is found where there is only one.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class PoseSource:
 
 @dataclass(frozen=True)
 class AssessedPoses:
-    """The poses of one body, and what is known beside them.
+    """Holds the poses of one body, and what is known beside them.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ def _carried(found: AssessedPoses, tip: Array) -> AssessedPoses:
 
 
 def pose_topics(path: str | os.PathLike[str]) -> tuple[list[str], Setup | None]:
-    """Topics of poses in a bag, and its setup document where it is one of a board."""
+    """Return topics of poses in a bag, and its setup document where it is one of a board."""
     topics: set[str] = set()
     setup = None
     decoder = MessageDecoder()

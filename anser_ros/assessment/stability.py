@@ -1,4 +1,4 @@
-"""A tool at rest: jitter, drift, and the overlapping Allan deviation of its position."""
+"""Assesses a resting tool: jitter, drift, and its position's overlapping Allan deviation."""
 
 from dataclasses import dataclass
 
@@ -32,7 +32,7 @@ ALPHAS = (2, 1, 0, -1, -2)  # exponents of frequency that allantools has interva
 
 @dataclass(frozen=True)
 class AllanCurve:
-    """Overlapping Allan deviation of one coordinate.
+    """Holds the overlapping Allan deviation of one coordinate.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class AllanCurve:
 
 @dataclass(frozen=True)
 class Rest:
-    """What a tool at rest shows.
+    """Holds what a tool at rest shows.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Where a tool rested: pauses of a recording, each a point with its mean pose and scatter."""
+"""Finds where a tool rested: pauses of a recording, each a point with mean pose and scatter."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ LONGEST_GAP_S = 1.0  # silence that ends a pause
 
 @dataclass(frozen=True)
 class PauseRule:
-    """What is a point.
+    """Says what counts as a point.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class PauseRule:
 
 @dataclass(frozen=True)
 class StillPoint:
-    """A place where the tool rested.
+    """Describes a place where the tool rested.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class StillPoint:
 
 
 def point_of(poses: PoseSequence) -> StillPoint:
-    """The point of poses that all belong to it; poses far off the median take no part.
+    """Return the point of poses that all belong to it; poses far off the median take no part.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def point_of(poses: PoseSequence) -> StillPoint:
 
 
 def still_points(poses: PoseSequence, rule: PauseRule | None = None) -> list[StillPoint]:
-    """All pauses of a recording, in their order.
+    """Return all pauses of a recording, in their order.
 
     Parameters
     ----------

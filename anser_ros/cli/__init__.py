@@ -1,1 +1,1 @@
-"""The offline commands of the console script, with their reports, figures and processes."""
+"""Holds the offline commands of the console script, with their reports, figures and processes."""

@@ -1,4 +1,4 @@
-"""The document `accuracy.json`, and its figures as rows of text."""
+"""Makes the document `accuracy.json`, and its figures as rows of text."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -96,7 +96,7 @@ def _verdict(verdict: Verdict) -> dict[str, Any]:
 
 
 def figure_rows(found: Assessment, document: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
-    """Name, value with unit, interval, and state of every figure."""
+    """Return name, value with unit, interval, and state of every figure."""
     judged = document.get('qa', {}).get('figures', {})
     rows = []
     for name, estimate in found.estimates.items():

@@ -1,4 +1,4 @@
-"""An assessment as one self-contained page: figures, what they are made from, pictures."""
+"""Shows an assessment as a self-contained page: figures, what they are made from, pictures."""
 
 import html
 from typing import Any

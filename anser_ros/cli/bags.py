@@ -1,4 +1,4 @@
-"""The command that records the small simulated sessions of the folder bags/."""
+"""Records the small simulated sessions of the folder bags/."""
 
 import argparse
 import contextlib

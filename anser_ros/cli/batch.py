@@ -1,4 +1,4 @@
-"""One command on many sessions with Dask: on this machine's cores, or on a cluster that is there.
+"""Runs one command on many sessions with Dask: on this machine's cores, or on a cluster.
 
 A worker runs the code of the command itself, one session at a time. The scheduler gives the
 session of a worker that dies to another one; what a session left is in its folder and in the

@@ -1,4 +1,4 @@
-"""The command that fits a field model to recorded sessions."""
+"""Fits a field model to recorded sessions."""
 
 import argparse
 import json

@@ -1,4 +1,4 @@
-"""The figures of a calibration: what was tried for the field, and how the sensors differ."""
+"""Draws a calibration: what was tried for the field, and how the sensors differ."""
 
 from pathlib import Path
 

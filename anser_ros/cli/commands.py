@@ -1,4 +1,4 @@
-"""Every command of the package with its one line of help: the only list of them.
+"""Lists every command of the package with its one line of help: the only list of them.
 
 A command's name is that of its module. A node's lies in ``anser_ros/nodes`` and runs as a process
 of its own; a composed one, beside it, is several nodes in one process; the others lie in

@@ -1,4 +1,4 @@
-"""Summary and picture of a demo, from the file that the monitor writes."""
+"""Sums a demo up and draws its picture, from the file that the monitor writes."""
 
 from __future__ import annotations
 

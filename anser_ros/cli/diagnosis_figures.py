@@ -1,4 +1,4 @@
-"""What a diagnosis leaves, drawn over time, over the volume, by channel and by emitter.
+"""Draws what a diagnosis leaves over time, over the volume, by channel and by emitter.
 
 In all of them 1 is what noise alone would give.
 """
@@ -57,7 +57,7 @@ def _rms(part: Part, axis: int) -> Array:
 
 
 def image(figure: Figure) -> str:
-    """The figure as an HTML element that holds the picture itself; the figure is closed."""
+    """Return the figure as an HTML element that holds the picture itself; the figure is closed."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format='png', dpi=110)
     plt.close(figure)

@@ -1,4 +1,4 @@
-"""The diagnosis as one self-contained page for readers who do not know the code."""
+"""Shows the diagnosis as a self-contained page for readers who do not know the code."""
 
 import html
 from collections.abc import Iterator, Sequence

@@ -1,4 +1,4 @@
-"""What a diagnosis found, in words for people."""
+"""Puts what a diagnosis found into words for people."""
 
 from collections import Counter
 from typing import Any
@@ -71,12 +71,12 @@ def _named(effect: dict[str, Any]) -> str:
 
 
 def short_ones(parameters: dict[str, Any]) -> list[tuple[str, Any]]:
-    """Parameters that fit a line, by name; long lists and mappings are left out."""
+    """Return parameters that fit a line, by name; long lists and mappings are left out."""
     return [(key, value) for key, value in parameters.items() if _size(value) <= LONGEST]
 
 
 def paths(parameters: dict[str, Any]) -> list[tuple[str, dict[str, list[Any]]]]:
-    """Parameters that are courses of something over time, by name: columns of equal length."""
+    """Return parameters that are courses over time, by name: columns of equal length."""
     return [
         (key, value)
         for key, value in parameters.items()

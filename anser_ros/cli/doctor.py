@@ -54,7 +54,7 @@ TIMEX_BYTES = 512
 
 @dataclass(frozen=True)
 class Observation:
-    """One thing that was looked at: how it is, and what to do where it is not well."""
+    """Holds one thing that was looked at: how it is, and what to do where it is not well."""
 
     name: str
     state: str
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
 def looks(
     device: str | None, seconds: float
 ) -> Iterator[tuple[str, Callable[[], list[Observation]]]]:
-    """Everything that is looked at, by what it is called."""
+    """Return everything that is looked at, by what it is called."""
     yield 'Python', python
     yield 'packages', packages
     yield 'kernels', kernels
@@ -124,7 +124,7 @@ def python() -> list[Observation]:
 
 
 def packages(has: Callable[[str], Any] = find_spec) -> list[Observation]:
-    """Every package that is imported somewhere: its version, or how to get it."""
+    """Check every package that is imported somewhere: its version, or how to get it."""
     found = []
     for module in (*MODULES, *PYPI):
         name = DISTRIBUTIONS.get(module, module)
@@ -216,7 +216,7 @@ def clock(tool: str = 'timedatectl') -> list[Observation]:
 
 
 def kernel_clock() -> bool | None:
-    """Whether somebody keeps the kernel's clock right; None where it has no word of that."""
+    """Return whether somebody keeps the kernel's clock right; None where it does not say."""
     try:
         state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX_BYTES))
     except (OSError, AttributeError):
@@ -234,7 +234,7 @@ def disk(folder: Path, least: int = LEAST_FREE_BYTES) -> list[Observation]:
 
 
 def domain() -> list[Observation]:
-    """Which of the graphs of the network is ours: whether its number is one that works."""
+    """Check which of the network's graphs is ours: whether its number is one that works."""
     text = os.environ.get('ROS_DOMAIN_ID', '0')
     number = int(text) if re.fullmatch('[0-9]{1,9}', text) else -1
     if number in SAFE_DOMAINS:
@@ -276,7 +276,7 @@ def _ros_remedy(last: str) -> str:
 
 
 def graph_findings(told: dict[str, Any]) -> list[Observation]:
-    """What a look at the graph means."""
+    """Return what a look at the graph means."""
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
     reach = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')
     words = f'{told["middleware"]}, domain {domain}, discovery {reach}'

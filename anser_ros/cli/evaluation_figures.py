@@ -1,4 +1,4 @@
-"""What an evaluation found, drawn: errors over time, over the volume, by coil, and against sigma.
+"""Draws what an evaluation found: errors over time and volume, by coil, and against sigma.
 
 Each figure is a PNG of its own, and all stand in one page that needs nothing else.
 """

@@ -172,7 +172,7 @@ def to_document(found: HandEye) -> dict[str, Any]:
 
 
 def clock_words(document: dict[str, Any]) -> list[str]:
-    """What is known of the clocks, in lines."""
+    """Return what is known of the clocks, in lines."""
     lines, clock = [], document['clock']
     if clock['offset_s'] is not None:
         late = 'late' if clock['offset_s'] > 0 else 'early'

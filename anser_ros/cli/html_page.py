@@ -1,4 +1,4 @@
-"""Self-contained pages of HTML: their frame, their style and their tables."""
+"""Makes self-contained pages of HTML: their frame, their style and their tables."""
 
 import html
 from collections.abc import Iterable, Sequence

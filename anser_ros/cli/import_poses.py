@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def parse_name(text: str) -> tuple[str, str]:
-    """A sensor's name as it is found, and the one that it shall have."""
+    """Return a sensor's name as it is found, and the one that it shall have."""
     found, _, new = text.partition('=')
     if not found or not new:
         raise ParameterError(f'--name takes FOUND=NEW, got {text!r}')

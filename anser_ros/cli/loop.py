@@ -1,4 +1,4 @@
-"""The loop: an effect in simulated samples is diagnosed blind, corrected and measured again."""
+"""Runs the loop: an effect in simulated samples is found blind, corrected and measured again."""
 
 import argparse
 import json

@@ -1,4 +1,4 @@
-"""Results of a loop: truth and finding, their parameters, and the errors of the second run."""
+"""Holds results of a loop: truth and finding, their parameters, the errors of the second run."""
 
 from collections.abc import Mapping
 from typing import Any

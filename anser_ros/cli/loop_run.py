@@ -1,4 +1,4 @@
-"""One run of the loop with simulated control unit, acquisition, trackers and recorder."""
+"""Runs a loop once with simulated control unit, acquisition, trackers and recorder."""
 
 import shutil
 import tempfile
@@ -41,7 +41,7 @@ away."""
 
 @dataclass(frozen=True)
 class LoopFiles:
-    """The files of the setup and of the uncorrected model, which all runs of a loop share."""
+    """Holds the files of setup and uncorrected model, which all runs of a loop share."""
 
     setup: Path
     model: Path
@@ -74,7 +74,7 @@ def make_world(folder: Path) -> LoopFiles:
 
 @dataclass(frozen=True)
 class Run:
-    """The settings of one run: what is simulated, and which nodes track it.
+    """Holds the settings of one run: what is simulated, and which nodes track it.
 
     Attributes
     ----------

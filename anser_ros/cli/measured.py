@@ -1,4 +1,4 @@
-"""The command that analyses other people's measurements and compares errors before and after."""
+"""Analyses other people's measurements and compares errors before and after."""
 
 import argparse
 import contextlib

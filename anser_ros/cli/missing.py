@@ -1,4 +1,4 @@
-"""Packages that rosdep does not know: what needs them asks for them in a line."""
+"""Handles packages that rosdep does not know: what needs them asks for them in a line."""
 
 from importlib.util import find_spec
 
@@ -36,6 +36,6 @@ def check(node: str) -> None:
 
 
 def words_of(module: str) -> str:
-    """What is missing, with its remedy; the module may be one inside a package."""
+    """Return what is missing, with its remedy; the module may be one inside a package."""
     package = module.split('.')[0]
     return f'{package} is not installed: pip install {PYPI.get(package, package)}'

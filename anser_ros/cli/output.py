@@ -1,4 +1,4 @@
-"""The folders that commands write to, and what a command says when it has done its work."""
+"""Checks folders that commands write to, and says what a command has done."""
 
 import json
 import os
@@ -31,7 +31,7 @@ def check_file(path: Path) -> None:
 
 
 def check_new_file(path: Path) -> None:
-    """As `check_file`, for a file that must not be there yet, as a bag must not."""
+    """Check as `check_file` does a file that must not be there yet, as a bag must not."""
     if path.exists():
         raise ParameterError(f'{path}: is there already')
     make_folder(path.parent)
@@ -39,7 +39,7 @@ def check_new_file(path: Path) -> None:
 
 @dataclass(frozen=True)
 class Result:
-    """What a command has found out about a session, and how it says so.
+    """Holds what a command has found out about a session, and how it says so.
 
     Attributes
     ----------

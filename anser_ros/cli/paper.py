@@ -1,4 +1,4 @@
-"""The command that redoes the article's experiments: Tables II to V, Figs. 2 and 5 to 10."""
+"""Redoes the article's experiments: Tables II to V, Figs. 2 and 5 to 10."""
 
 import argparse
 import json

@@ -54,7 +54,7 @@ RANDOM_TRIES, SEED = 20, 1
 
 @dataclass(frozen=True)
 class Proposal:
-    """What was found: the candidates, the designs by their number of coils, and random ones."""
+    """Holds what was found: the candidates, the designs by number of coils, and random ones."""
 
     candidates: SensorTable
     region: Region

@@ -1,4 +1,4 @@
-"""The picture of a proposal of places: where the coils are, and what more of them would gain."""
+"""Draws a proposal of places: where the coils are, and what more of them would gain."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

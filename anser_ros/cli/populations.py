@@ -1,4 +1,4 @@
-"""Populations of sensors' errors, as a table and a picture of each channel's values."""
+"""Shows populations of sensors' errors as a table and a picture of each channel's values."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""The diagnosis of a tracker of poses as one self-contained page for a clinic's engineer."""
+"""Shows the diagnosis of a tracker of poses as a self-contained page for a clinic's engineer."""
 
 import html
 from typing import Any

@@ -1,4 +1,4 @@
-"""The options of commands that take a session of poses, and what they do with one."""
+"""Adds options to commands that take a session of poses, and does with one what they say."""
 
 import argparse
 import csv
@@ -46,7 +46,7 @@ def need_model(args: argparse.Namespace) -> None:
 
 
 def load_poses(path: Path | str, args: argparse.Namespace) -> PoseSession:
-    """The session that the options name."""
+    """Load the session that the options name."""
     topics = {}
     for text in args.topics:
         name, _, topic = text.partition('=')

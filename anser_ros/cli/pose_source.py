@@ -1,4 +1,4 @@
-"""The options of commands that assess the poses of one body, and poses of the live graph."""
+"""Adds options to commands that assess a body's poses, and takes poses of the live graph."""
 
 import argparse
 import json
@@ -43,7 +43,7 @@ def add_source_options(parser: argparse.ArgumentParser, *, tip: bool = True) -> 
 
 
 def source_of(args: argparse.Namespace) -> PoseSource:
-    """Which poses the options mean.
+    """Return which poses the options mean.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""How far a command is: a bar on a terminal, lines on stderr now and then elsewhere."""
+"""Shows how far a command is: a bar on a terminal, lines on stderr now and then elsewhere."""
 
 import sys
 import time

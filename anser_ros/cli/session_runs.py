@@ -1,4 +1,4 @@
-"""One command on each of several sessions: what is done with one, and what it left.
+"""Runs one command on each of several sessions: what is done with one, and what it left.
 
 Each session has a folder of its own; one that fails is an outcome as the others are.
 """
@@ -29,7 +29,7 @@ ALONE = threading.Lock()
 
 @dataclass(frozen=True)
 class SessionRun:
-    """A command on one session.
+    """Runs a command on one session.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class SessionRun:
 
 
 def runs_of(command: str, args: argparse.Namespace) -> list[SessionRun]:
-    """The runs of a command on all sessions of its arguments, each into a folder of its own."""
+    """Return the runs of a command on all sessions of its arguments, each into its own folder."""
     runs = []
     for session, name in zip(args.sessions, names_of(args.sessions), strict=True):
         own = argparse.Namespace(**{**vars(args), 'session': session, 'sessions': [session]})
@@ -65,7 +65,7 @@ def runs_of(command: str, args: argparse.Namespace) -> list[SessionRun]:
 
 
 def names_of(sessions: Sequence[str]) -> list[str]:
-    """Names for sessions by their paths: as many last parts as tell them apart.
+    """Return names for sessions by their paths: as many last parts as tell them apart.
 
     Raises
     ------

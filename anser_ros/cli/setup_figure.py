@@ -1,4 +1,4 @@
-"""A setup document drawn: board, references and volume from above and from the side, and tools."""
+"""Draws a setup document: board, references and volume from above and the side, and tools."""
 
 from collections import defaultdict
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A setup document put together from its parts: texts that people type, in mm and degrees."""
+"""Makes a setup document of its parts: texts that people type, in mm and degrees."""
 
 import csv
 import itertools
@@ -62,7 +62,7 @@ def number_of(text: str, what: str) -> float:
 
 
 def numbers_of(text: str, counts: Sequence[int], what: str) -> list[float]:
-    """Numbers with commas or blanks between them, as many as one of the counts says."""
+    """Return numbers with commas or blanks between them, as many as one of the counts says."""
     parts = text.replace(',', ' ').split()
     if len(parts) not in counts:
         wanted = ' or '.join(map(str, counts))
@@ -92,7 +92,7 @@ def anser_emitter() -> Document:
 
 
 def coil_of(name: str, text: str) -> Document:
-    """An emitter coil from ``x, y, z, turn about z, tone`` in mm, degrees and Hz."""
+    """Return an emitter coil of ``x, y, z, turn about z, tone`` in mm, degrees and Hz."""
     x, y, z, turn, tone = numbers_of(text, (5,), f'coil {name}')
     return {
         'name': name, 'centre_m': metres((x, y, z)), 'rotation_deg': turn, 'frequency_hz': tone,
@@ -100,7 +100,7 @@ def coil_of(name: str, text: str) -> Document:
 
 
 def sensor_of(text: str, body: str = '') -> Document:
-    """A sensor from ``channel, name, body, x, y, z, axis[, length]``, mm; axis as `axis_of`.
+    """Return a sensor of ``channel, name, body, x, y, z, axis[, length]``, mm; see `axis_of`.
 
     Where a ``body`` is given it does not stand in the text.
     """
@@ -138,7 +138,7 @@ def axis_of(text: str, what: str) -> list[float]:
 
 
 def rows_of(path: Path, columns: Sequence[str]) -> list[str]:
-    """The rows of a CSV file with a head, each as the text that is typed for it.
+    """Return the rows of a CSV file with a head, each as the text that is typed for it.
 
     Raises
     ------
@@ -196,7 +196,7 @@ class _RowDumper(yaml.SafeDumper):
 
 
 def text_of(document: Document) -> tuple[str, Setup]:
-    """The document as YAML, and what readers make of it.
+    """Return the document as YAML, and what readers make of it.
 
     Raises
     ------
@@ -209,7 +209,7 @@ def text_of(document: Document) -> tuple[str, Setup]:
 
 
 def advice_on(setup: Setup) -> list[str]:
-    """What is allowed, and will be missed later; a line each."""
+    """Return what is allowed, and will be missed later; a line each."""
     found, emitters = [], setup.emitter.coils
     if len(emitters) < LEAST_EMITTERS:
         found.append(

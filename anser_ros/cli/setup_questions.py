@@ -1,4 +1,4 @@
-"""The questions of `anser setup`: each answer is checked when it is given, and asked for again."""
+"""Asks the questions of `anser setup`: answers are checked when given, and asked for again."""
 
 from collections.abc import Callable
 from pathlib import Path

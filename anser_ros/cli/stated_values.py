@@ -1,4 +1,4 @@
-"""Options that several commands share: values stated, bodies surveyed anew."""
+"""Adds options that several commands share: values stated, bodies surveyed anew."""
 
 import argparse
 

@@ -1,4 +1,4 @@
-"""One table of many sessions: a row each, those that failed with why, as CSV, page and text."""
+"""Makes a table of many sessions, a row each, the failed ones with why, as CSV, page and text."""
 
 import csv
 import html
@@ -24,7 +24,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a command left of one session.
+    """Holds what a command left of one session.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Column:
-    """A figure of the summary.
+    """Describes a figure of the summary.
 
     Attributes
     ----------

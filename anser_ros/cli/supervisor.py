@@ -1,4 +1,4 @@
-"""Processes that are started, watched and ended together, without the package `launch`."""
+"""Starts, watches and ends processes together, without the package `launch`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TAIL_LINES = 8
 
 @dataclass(frozen=True)
 class Child:
-    """A process that a supervisor has started.
+    """Holds a process that a supervisor has started.
 
     Attributes
     ----------

@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 class Topics:
-    """Full names of one board: topics in its namespace and of the optical tracker, frames."""
+    """Holds a board's full names: topics in its namespace and of the optical tracker, frames."""
 
     def __init__(self, namespace: str, optical: str, prefix: str) -> None:
         self.namespace = namespace
@@ -70,7 +70,7 @@ class Topics:
         self._optical = optical
 
     def frame(self, setup: Setup) -> str:
-        """The name of the board's frame."""
+        """Return the name of the board's frame."""
         return f'{self._prefix}{setup.frame_id}'
 
     def own(self, name: str) -> str:

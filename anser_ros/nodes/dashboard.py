@@ -1,6 +1,4 @@
-"""Shows a live view in the browser: scene, states, curves, the loop of
-diagnosis and correction.
-"""
+"""Shows a live view in the browser: scene, states, curves, diagnosis and correction."""
 
 import sys
 from dataclasses import dataclass

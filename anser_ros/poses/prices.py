@@ -29,9 +29,7 @@ share, or more where that is less than `SCALE_M`."""
 
 
 def price(term: Term, total: float, fit: PoseFit) -> float:
-    """Return the gain, in units of the misfit, that a term must have; ``total`` is the squared
-    sum.
-    """
+    """Return the gain, in units of the misfit, that a term needs; ``total`` is the squared sum."""
     misfit, share = fit.misfit, LEAST_SHARE
     # Only the errors of its own sensor, and of positions where it is a map, can be explained.
     rows = slice(3) if is_of(term, Role.MAP) else slice(6)

@@ -1,1 +1,1 @@
-"""The live view's page in the browser, without ROS: layout, jobs, files, who may look."""
+"""Serves the live view's page in the browser, without ROS: layout, jobs, files, who may look."""

@@ -1,4 +1,4 @@
-"""The folder of recordings: all that the page can read or write lies in it."""
+"""Keeps the folder of recordings: all that the page can read or write lies in it."""
 
 from pathlib import Path
 
@@ -13,7 +13,7 @@ MOST = 100
 
 
 class RecordingFolder:
-    """Recordings and results by their names; no name leads out of the folder.
+    """Finds recordings and results by their names; no name leads out of the folder.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ class RecordingFolder:
         self.path = path.expanduser().resolve()
 
     def recordings(self) -> list[str]:
-        """Names of the bags, the newest first."""
+        """Return names of the bags, the newest first."""
         if not self.path.is_dir():
             return []
         bags = [entry for entry in self.path.iterdir() if _is_bag(entry)]
@@ -33,7 +33,7 @@ class RecordingFolder:
         return [entry.name for entry in bags[:MOST]]
 
     def recording(self, name: str) -> Path:
-        """Path of a bag.
+        """Return the path of a bag.
 
         Raises
         ------
@@ -58,7 +58,7 @@ class RecordingFolder:
                 return path
 
     def shown(self, result: str, name: str) -> Path | None:
-        """Path of a file of a result that may be shown, None where there is none."""
+        """Return the path of a result's file that may be shown, None where there is none."""
         path = self.path / RESULTS / result / name
         is_inside = Path(result).name == result and result not in ('.', '..')
         if not is_inside or name not in SHOWN or path.is_symlink() or not path.is_file():

@@ -1,4 +1,4 @@
-"""Who may look: only this machine, or who knows the token; and how many at a time."""
+"""Decides who may look: only this machine, or who knows the token; and how many at a time."""
 
 import hmac
 from collections.abc import Awaitable, Callable, MutableMapping
@@ -23,12 +23,12 @@ FULL = (1013, 'too many pages')
 
 
 def is_local(host: str) -> bool:
-    """Whether an address can be reached from this machine alone."""
+    """Return whether an address can be reached from this machine alone."""
     return host in LOOPBACK
 
 
 class Guard:
-    """An ASGI application in front of another one, which refuses who may not come in.
+    """Stands before another ASGI application, and refuses who may not come in.
 
     Parameters
     ----------

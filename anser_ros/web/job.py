@@ -1,4 +1,4 @@
-"""A command of the suite as a process of its own, with what it says of its progress."""
+"""Runs a command of the suite as a process of its own, with what it says of its progress."""
 
 import asyncio
 import contextlib
@@ -25,7 +25,7 @@ PATIENCE_S = 3.0
 
 
 class Job:
-    """One run of a command.
+    """Runs a command once.
 
     Parameters
     ----------
@@ -57,12 +57,12 @@ class Job:
 
     @property
     def seconds(self) -> float:
-        """How long it has run, or took."""
+        """Return how long it has run, or took, s."""
         return time.monotonic() - self._began_s if math.isnan(self._took_s) else self._took_s
 
     @property
     def failure(self) -> str:
-        """Why it failed, in a line; empty while it runs and when it did not."""
+        """Return why it failed, in a line; empty while it runs and when it did not."""
         if self.exit_code in (None, 0):
             return ''
         if self._is_ended:

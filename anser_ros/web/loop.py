@@ -1,4 +1,4 @@
-"""The loop that a person closes on the page: record, diagnose, load the better model, or undo."""
+"""Lets a person close the loop on the page: record, diagnose, load the better model, or undo."""
 
 import asyncio
 import json
@@ -24,22 +24,24 @@ MOST_UNDONE = 20
 
 
 class Chain(Protocol):
-    """What the page can ask of the running nodes."""
+    """Says what the page can ask of the running nodes."""
 
     async def trigger(self, service: str) -> str:
         """Call a service and return its answer; AnserError where it refuses."""
 
     async def model_files(self) -> dict[str, str]:
-        """The model file of each node that has one, ``field_model`` first."""
+        """Return the model file of each node that has one, ``field_model`` first."""
 
     async def load_model(self, files: Mapping[str, str]) -> None:
         """Give nodes other model files; AnserError where one refuses."""
 
     async def baseline_file(self) -> str:
-        """The recording without metal that the nodes were started with; empty for none."""
+        """Return the recording without metal that the nodes were started with; empty for none."""
 
     def figures(self, since_s: float) -> dict[str, float | None]:
-        """How well it goes: ``tracked``, ``error_mm``, ``residual_pt`` of the last seconds."""
+        """Return how well it goes: the last seconds' ``tracked``, ``error_mm``,
+        ``residual_pt``.
+        """
 
     def mark(self, words: str) -> None:
         """Mark this moment in the curves."""
@@ -47,7 +49,7 @@ class Chain(Protocol):
 
 @dataclass(frozen=True)
 class Found:
-    """What a command has found.
+    """Holds what a command has found.
 
     Attributes
     ----------
@@ -70,13 +72,13 @@ class Found:
 
     @property
     def model(self) -> Path:
-        """The model that it wrote."""
+        """Return the path of the model that it wrote."""
         return self.folder / 'model.yaml'
 
 
 @dataclass(frozen=True)
 class Loaded:
-    """A change of the model: what was there before, and how well it went with that."""
+    """Remembers a change of the model: what was there before, and how well it went with that."""
 
     before: dict[str, str]
     figures: dict[str, float | None]
@@ -84,7 +86,7 @@ class Loaded:
 
 
 class CorrectionLoop:
-    """State of the loop, one for all pages; every step says in words how it went.
+    """Holds the loop's state, one for all pages; every step says in words how it went.
 
     Attributes
     ----------
@@ -116,22 +118,22 @@ class CorrectionLoop:
 
     @property
     def is_running(self) -> bool:
-        """Whether a command runs."""
+        """Return whether a command runs."""
         return self.job is not None and self.job.exit_code is None
 
     @property
     def can_load(self) -> bool:
-        """Whether there is a model to load that is not in force."""
+        """Return whether there is a model to load that is not in force."""
         return self.found is not None and str(self.found.model) != self.model
 
     @property
     def can_undo(self) -> bool:
-        """Whether a model was loaded here."""
+        """Return whether a model was loaded here."""
         return bool(self._loaded)
 
     @property
     def model_name(self) -> str:
-        """The model in force: its place in the folder of recordings, else its whole path."""
+        """Return the model in force: its place in the recordings' folder, else its whole path."""
         path = Path(self.model)
         inside = path.is_relative_to(self.folder.path)
         return str(path.relative_to(self.folder.path)) if inside else self.model
@@ -267,7 +269,7 @@ class CorrectionLoop:
     # What is shown ------------------------------------------------------------------------
 
     def comparison(self) -> list[tuple[str, str, str]]:
-        """Rows of label, before and after: live, where a model was loaded, and held out."""
+        """Return rows of label, before and after: live, where a model was loaded, and held out."""
         rows = []
         if self._loaded:
             last = self._loaded[-1]

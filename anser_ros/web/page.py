@@ -1,4 +1,4 @@
-"""The page: header, what moves (`instrument.js`), and the loop with its buttons."""
+"""Lays the page out: header, what moves (`instrument.js`), and the loop with its buttons."""
 
 import asyncio
 import contextlib
@@ -28,11 +28,11 @@ _LIBRARIES = (ui.scene, ui.echart)
 
 
 class ShownGraph(Protocol):
-    """What the page shows; numbers that are not known are None."""
+    """Says what the page shows; numbers that are not known are None."""
 
     @property
     def version(self) -> int:
-        """Changes where there is another world to show."""
+        """Return a number that changes where there is another world to show."""
 
     def look(self) -> None:
         """Take in what has come."""
@@ -41,33 +41,33 @@ class ShownGraph(Protocol):
         """Take the next point of the curves."""
 
     def world(self) -> dict[str, Any] | None:
-        """What stands still, targets, and the curves so far; None before there is a setup."""
+        """Return what stands still, targets, and curves so far; None before there is a setup."""
 
     def frame(self) -> list[Any]:
-        """The targets' places, as `LiveView.frame`."""
+        """Return the targets' places, as `LiveView.frame` does."""
 
     def table(self) -> list[list[Any]]:
-        """Level, state, reason, sigma, error, residual and rate of every target."""
+        """Return level, state, reason, sigma, error, residual and rate of every target."""
 
     def metal(self) -> list[list[float]]:
-        """Balls where metal seems to be: x, y, z and radius, m."""
+        """Return balls where metal seems to be: x, y, z and radius, m."""
 
     def point(self) -> list[Any]:
-        """The newest point of the curves: time, errors, residuals."""
+        """Return the newest point of the curves: time, errors, residuals."""
 
     def marks(self) -> list[list[Any]]:
-        """Moments in the curves: time and words."""
+        """Return moments in the curves: time and words."""
 
     def status(self) -> dict[str, Any]:
-        """What header and lists say."""
+        """Return what header and lists say."""
 
 
 class Instrument(Element, component='instrument.js'):
-    """Scene, table and curves."""
+    """Draws scene, table and curves."""
 
 
 class Screen:
-    """One page that is open in a browser."""
+    """Holds one page that is open in a browser."""
 
     def __init__(self, source: ShownGraph, loop: CorrectionLoop) -> None:
         self._source, self._loop = source, loop
@@ -151,7 +151,7 @@ class Screen:
 
     @property
     def is_seen(self) -> bool:
-        """Whether the browser is connected."""
+        """Return whether the browser is connected."""
         return bool(self._client.has_socket_connection)
 
     def show_frame(self, rows: list[Any]) -> None:
@@ -288,7 +288,7 @@ def _table(title: str, rows: Any) -> str:
 
 
 class Pages:
-    """All open pages, and what drives them.
+    """Holds all open pages, and what drives them.
 
     Parameters
     ----------
@@ -320,7 +320,7 @@ class Pages:
 
     @property
     def count(self) -> int:
-        """How many pages are open."""
+        """Return how many pages are open."""
         return len(self._screens)
 
     async def _drive(self) -> None:

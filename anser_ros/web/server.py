@@ -1,4 +1,4 @@
-"""The page's server: uvicorn in a thread of its own, behind the guard."""
+"""Serves the page: uvicorn in a thread of its own, behind the guard."""
 
 import contextlib
 import secrets
@@ -106,7 +106,7 @@ class PageServer:
 
     @property
     def url(self) -> str:
-        """The address for a browser, the token included."""
+        """Return the address for a browser, the token included."""
         host = f'[{self._host}]' if ':' in self._host else self._host
         return f'http://{host}:{self.port}/' + (f'?token={self._token}' if self._token else '')
 
