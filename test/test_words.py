@@ -15,6 +15,10 @@ from conftest import by_room
 PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 FEWEST_WORDS = 4
 """A sentence of fewer words than these is a fragment."""
+TITLE_WORDS = ('What', 'Whether', 'How', 'Why', 'Which')
+"""A docstring that begins with one of these is a title, and so is one of a function that begins
+with an article: it says neither `Return` nor what is done."""
+ARTICLES = ('The', 'A', 'An')
 FILES = sorted(PACKAGE.rglob('*.py'))
 DEFINITIONS = (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
@@ -29,7 +33,7 @@ def first_sentence(docstring):
     return re.split(r'(?<=[.?!])\s+(?=[A-Z`])', paragraph)[0]
 
 
-def fault_of(docstring):
+def fault_of(docstring, is_function=False):
     """What is wrong with a docstring's first sentence, or None."""
     if not docstring:
         return 'has no docstring'
@@ -40,6 +44,8 @@ def fault_of(docstring):
         return f'does not begin with a capital letter: {sentence!r}'
     if len(sentence.split()) < FEWEST_WORDS:
         return f'is a fragment: {sentence!r}'
+    if sentence.split()[0] in (*TITLE_WORDS, *(ARTICLES if is_function else ())):
+        return f'has a title, and no sentence: {sentence!r}'
     return None
 
 
@@ -65,7 +71,7 @@ def docstring_faults(source):
     if fault:
         yield f'1: the module {fault}'
     for name, node in public_definitions(tree.body):
-        fault = fault_of(ast.get_docstring(node))
+        fault = fault_of(ast.get_docstring(node), not isinstance(node, ast.ClassDef))
         if fault:
             yield f'{node.lineno}: {name} {fault}'
 
@@ -143,6 +149,8 @@ def test_the_walk_sees_what_it_should():
         '    def f(self):\n        """two words and more."""\n'
     )
     assert [fault.split(':')[0] for fault in docstring_faults(fragments)] == ['2', '4']
+    titles = '"""Holds a module of some kind."""\ndef f():\n    """The number of all coils."""\n'
+    assert [fault.split(':')[0] for fault in docstring_faults(titles)] == ['2']
     assert list(docstring_faults('def f(): pass')) != []
     assert list(constant_faults('LIMIT = 3\n\nOTHER = (1.0, 2.0)\n"""Why."""\n')) == [
         '1: nothing explains LIMIT = 3'

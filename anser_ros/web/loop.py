@@ -39,9 +39,7 @@ class Chain(Protocol):
         """Return the recording without metal that the nodes were started with; empty for none."""
 
     def figures(self, since_s: float) -> dict[str, float | None]:
-        """Return how well it goes: the last seconds' ``tracked``, ``error_mm``,
-        ``residual_pt``.
-        """
+        """Return ``tracked``, ``error_mm`` and ``residual_pt`` of the last seconds."""
 
     def mark(self, words: str) -> None:
         """Mark this moment in the curves."""
