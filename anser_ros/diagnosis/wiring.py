@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.effects.sensor_polarity import SENSOR_POLARITY
-from anser_ros.effects.term import Term
+from anser_ros.effects.term import Site, Term
 from anser_ros.effects.wiring import DEAD_CHANNEL, SWAPPED_CHANNELS, SWAPPED_COILS
 
 Array = NDArray[np.float64]
@@ -57,7 +57,7 @@ def wiring_faults(problem: Problem) -> list[Term]:
         order = np.argmax(alike, axis=1)
         moved = _moved(alike, ~silent)
         if moved.size:
-            site = {
+            site: Site = {
                 'channels': tuple(int(c) for c in channels[order[moved]]),
                 'read_as': tuple(int(c) for c in channels[moved]),
             }
@@ -122,5 +122,5 @@ def _swapped_coils(state: State) -> Term | None:
     order, moved = np.argmax(alike, axis=1), _moved(alike, np.ones(emitters, dtype=bool))
     if not moved.size:
         return None
-    site = {'coils': tuple(int(c) for c in order[moved]), 'read_as': tuple(moved.tolist())}
-    return Term(SWAPPED_COILS, site)
+    true = tuple(int(c) for c in order[moved])
+    return Term(SWAPPED_COILS, {'coils': true, 'read_as': tuple(moved.tolist())})

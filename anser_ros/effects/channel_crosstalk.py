@@ -17,6 +17,7 @@ from anser_ros.effects.effect import (
     needed,
     sigmas,
     unit_matrix,
+    whole_numbers,
 )
 from anser_ros.effects.term import Term
 from anser_ros.effects.view import View
@@ -103,7 +104,7 @@ class ChannelCrosstalk(Effect[Term]):
 
     def term(self, record: EffectRecord) -> Term:
         """Read the leaks from a record's matrix, whose diagonal is scaled to one."""
-        channels = tuple(int(c) for c in needed(record, 'channels'))
+        channels = whole_numbers(record, 'channels')
         matrix = np.asarray(needed(record, 'matrix'), dtype=np.float64)
         if matrix.shape != (len(channels), len(channels)):
             raise ModelFileError(

@@ -15,6 +15,7 @@ from anser_ros.effects.effect import (
     needed,
     sigmas,
     unit_matrix,
+    whole_numbers,
 )
 from anser_ros.effects.term import Term
 from anser_ros.effects.view import View
@@ -92,7 +93,7 @@ class CoilCrosstalk(Effect[Term]):
 
     def term(self, record: EffectRecord) -> Term:
         """Read the source, the target and the share that leaks from a record."""
-        coils = tuple(int(c) for c in needed(record, 'coils'))
+        coils = whole_numbers(record, 'coils')
         eps = float(needed(record, 'eps'))
         if record.parameters.get('mutual'):
             return Term(self, {'coils': coils, 'mutual': True}, np.array([eps]))

@@ -315,6 +315,11 @@ def needed(record: EffectRecord, key: str) -> Any:
         raise ModelFileError(f'model: the effect {record.name} lacks {key!r}') from None
 
 
+def whole_numbers(record: EffectRecord, key: str) -> tuple[int, ...]:
+    """Return the channels or coils of a record; raises `ModelFileError` when they are missing."""
+    return tuple(int(number) for number in needed(record, key))
+
+
 def sigmas(covariance: Array) -> Array:
     """Return the standard deviations that a covariance matrix holds."""
     return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from anser_ros.effects.effect import Array, Effect, Family, Remedy, needed
-from anser_ros.effects.term import Term
+from anser_ros.effects.term import Site, Term
 from anser_ros.field.model import EffectRecord
 
 
@@ -51,5 +51,5 @@ EFFECTS = (EXCESS_NOISE,)
 
 def excess_noise_of(factor: float, sigma: float, channels: Sequence[int]) -> ExcessNoiseTerm:
     """Return noise that has grown on some channels, or on all where none are named."""
-    site = {'channels': tuple(channels)} if channels else {}
+    site: Site = {'channels': tuple(channels)} if channels else {}
     return ExcessNoiseTerm(EXCESS_NOISE, site, factor=factor, sigma=sigma)

@@ -8,7 +8,7 @@ column however it goes, explains nothing but what those columns can, and hides n
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
@@ -21,12 +21,13 @@ from anser_ros.effects.effect import (
     Family,
     Remedy,
     needed,
+    whole_numbers,
 )
 from anser_ros.effects.registration import Registration
 from anser_ros.effects.sensor_axis import SensorAxis
 from anser_ros.effects.sensor_gain import SensorGain
 from anser_ros.effects.sensor_position import SensorPosition
-from anser_ros.effects.term import Term
+from anser_ros.effects.term import Site, Term
 from anser_ros.effects.time_offset import TimeOffset
 from anser_ros.effects.tool_gain import ToolGain
 from anser_ros.effects.view import View
@@ -125,9 +126,9 @@ class Fluctuation(Effect[FluctuationTerm]):
         """Record where it is, and how much; sigma is that of a spread of so many numbers."""
         spread = np.zeros(1) if term.spread is None else term.spread
         rms = float(np.sqrt(np.sum(spread**2)))
-        where: dict[str, Any] = {
-            k: list(v) if k == 'channels' else v for k, v in term.site.items()
-        }
+        where: dict[str, Any] = {**term.site}
+        if 'channels' in where:
+            where['channels'] = list(where['channels'])
         sigma = rms / float(np.sqrt(2 * max(term.frames, 1)))
         return EffectRecord(self.name, {**where, 'rms': rms}, {'rms': sigma})
 
@@ -135,7 +136,9 @@ class Fluctuation(Effect[FluctuationTerm]):
         """Return where it is; what it does in a frame only the frame can tell."""
         needed(record, 'rms')
         where = {k: v for k, v in record.parameters.items() if k != 'rms'}
-        return FluctuationTerm(self, where)
+        if 'channels' in where:
+            where['channels'] = whole_numbers(record, 'channels')
+        return FluctuationTerm(self, cast(Site, where))
 
 
 class CoilFluctuation(Fluctuation):

@@ -69,5 +69,6 @@ def outliers_of(fraction: float, sigma: float, channels: Sequence[int]) -> Outli
     """Return outliers in whole frames, or of some channels, which is what a loose contact does."""
     if not channels:
         return OutliersTerm(OUTLIERS, fraction=fraction, sigma=sigma)
-    site = {'channels': tuple(channels)}
-    return OutliersTerm(LOOSE_CONTACT, site, fraction=fraction, sigma=sigma)
+    return OutliersTerm(
+        LOOSE_CONTACT, {'channels': tuple(channels)}, fraction=fraction, sigma=sigma
+    )

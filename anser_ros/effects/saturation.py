@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed
-from anser_ros.effects.term import Term
+from anser_ros.effects.term import Site, Term
 from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
 
@@ -153,7 +153,7 @@ class Saturation(Effect[SaturationTerm]):
     def term(self, record: EffectRecord) -> SaturationTerm:
         """Read the channel's full scale, T, from a record."""
         full_scale = float(needed(record, 'full_scale_t'))
-        site = {
+        site: Site = {
             'channel': int(needed(record, 'channel')),
             'shape': str(record.parameters.get('shape', SHAPES[0])),
             'sees': str(record.parameters.get('sees', FLUX)),

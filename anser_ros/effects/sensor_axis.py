@@ -16,8 +16,9 @@ from anser_ros.effects.effect import (
     needed,
     orthogonal_pair,
     sigmas,
+    whole_numbers,
 )
-from anser_ros.effects.term import Term
+from anser_ros.effects.term import Site, Term
 from anser_ros.effects.view import View
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
@@ -141,14 +142,14 @@ class SensorAxis(Effect[SensorAxisTerm]):
         """Read a sensor's true axis, or the cluster's rotation, from a record."""
         if 'channels' in record.parameters:
             theta = np.radians(np.asarray(needed(record, 'rotation_deg'), dtype=np.float64))
-            return SensorAxisTerm(self, {'channels': tuple(record.parameters['channels'])}, theta)
+            return SensorAxisTerm(self, {'channels': whole_numbers(record, 'channels')}, theta)
         surveyed = np.asarray(needed(record, 'surveyed_axis'), dtype=np.float64)
         axis = np.asarray(needed(record, 'axis'), dtype=np.float64)
         along = float(axis @ surveyed)
         if along <= 0:
             raise ModelFileError('model: sensor_axis turns an axis by a right angle or more')
         theta = orthogonal_pair(surveyed) @ (axis / along)
-        site = {'channel': int(needed(record, 'channel'))}
+        site: Site = {'channel': int(needed(record, 'channel'))}
         return SensorAxisTerm(self, site, theta, surveyed=tuple(surveyed.tolist()))
 
 

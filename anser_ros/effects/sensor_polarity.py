@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Family, Remedy, needed
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Family, Remedy, whole_numbers
 from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
 
@@ -31,7 +31,7 @@ class SensorPolarity(Effect[Term]):
 
     def term(self, record: EffectRecord) -> Term:
         """Read the channels that are reversed from a record."""
-        channels = tuple(int(c) for c in needed(record, 'channels'))
+        channels = whole_numbers(record, 'channels')
         return Term(self, {'channels': channels})
 
 

@@ -6,7 +6,15 @@ from typing import ClassVar
 import numpy as np
 
 from anser_ros.effects.apparatus import Apparatus
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed, sigmas
+from anser_ros.effects.effect import (
+    Array,
+    ComplexArray,
+    Effect,
+    Remedy,
+    needed,
+    sigmas,
+    whole_numbers,
+)
 from anser_ros.effects.term import Term
 from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
@@ -63,7 +71,7 @@ class SensorPosition(Effect[Term]):
     def term(self, record: EffectRecord) -> Term:
         """Read the channels and their offset, m, from a record."""
         offset = np.asarray(needed(record, 'offset_m'), dtype=np.float64)
-        return Term(self, {'channels': tuple(needed(record, 'channels'))}, offset)
+        return Term(self, {'channels': whole_numbers(record, 'channels')}, offset)
 
 
 EFFECTS = (SensorPosition(),)

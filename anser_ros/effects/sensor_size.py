@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from anser_ros.effects.apparatus import Apparatus
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed, whole_numbers
 from anser_ros.effects.term import Term
 from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
@@ -105,7 +105,7 @@ class SensorSize(Effect[SensorSizeTerm]):
 
     def term(self, record: EffectRecord) -> SensorSizeTerm:
         """Read the coils' length from a record."""
-        channels = tuple(int(c) for c in needed(record, 'channels'))
+        channels = whole_numbers(record, 'channels')
         surveyed = record.parameters.get('surveyed_length_m') or [0.0] * len(channels)
         base = float(np.mean(np.square(surveyed)))
         theta = (float(needed(record, 'length_m')) ** 2 - base) / UNIT

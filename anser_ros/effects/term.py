@@ -1,8 +1,7 @@
 """Defines a term: one effect at one site, with values of its parameters."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Literal, Self, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +10,35 @@ if TYPE_CHECKING:
     from anser_ros.effects.effect import Effect
 
 Array = NDArray[np.float64]
+
+
+class Site(TypedDict, total=False):
+    """Says where an effect acts, by the keys that it needs, in the words of records and reports.
+
+    It is a plain mapping, as it is printed, compared and written; the type checker knows each key
+    and the type of its value.
+    """
+
+    channel: int
+    channels: tuple[int, ...]
+    coil: int  # number of an emitter
+    coils: tuple[int, ...]  # of crosstalk: the one that leaks, and the one that it leaks into
+    read_as: tuple[int, ...]  # for each of the channels or coils, the one whose place it has
+    body: str
+    mutual: Literal[True]  # the leak is the same both ways
+    shape: str  # curve of a saturation
+    sees: str  # what a saturating channel sees: one tone, or all together
+    of: str  # name of the effect whose remainder it is
+    sensor: str  # name of a sensor of a tracker of poses; all of its sensors where there is none
+    place: tuple[float, ...]  # where resting metal is looked for, m, frame fg
+    z: float  # height of a sheet, m, frame fg
+    edge: float  # length of its edge, m
+    degree: int  # of a map's polynomial
+    lowest: int  # lowest degree in it, 1 where it is not told
+    centre_m: list[float]  # where the polynomial's coordinates are zero, frame of the tracker
+    size_m: float  # what they are divided by
+    middle_s: float  # time at which a clock's offset is its offset
+    two_sided: Literal[True]  # a filter that looks ahead as far as back
 
 
 @dataclass(frozen=True)
@@ -35,7 +63,7 @@ class Term:
     Attributes
     ----------
     effect : Effect
-    site : mapping
+    site : Site
         What tells this candidate from others of the same effect, as reports and records show it.
     theta : ndarray, shape (q,)
         Parameters in the units that the effect works in; zero is no effect.
@@ -44,7 +72,7 @@ class Term:
     """
 
     effect: 'Effect[Any]'
-    site: Mapping[str, Any] = field(default_factory=dict)
+    site: Site = field(default_factory=lambda: Site())
     theta: Array = field(default_factory=lambda: np.zeros(0))
     held: Held | None = None
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.complex_gain import figures_of, theta_of
-from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, whole_numbers
 from anser_ros.effects.term import Term
 from anser_ros.effects.view import View
 from anser_ros.field.model import EffectRecord
@@ -62,7 +62,7 @@ class ToolGain(Effect[Term]):
 
     def term(self, record: EffectRecord) -> Term:
         """Return the term of a gain and a phase."""
-        return Term(self, {'channels': tuple(needed(record, 'channels'))}, theta_of(record))
+        return Term(self, {'channels': whole_numbers(record, 'channels')}, theta_of(record))
 
 
 EFFECTS = (ToolGain(),)

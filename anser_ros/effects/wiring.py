@@ -15,8 +15,8 @@ from anser_ros.effects.effect import (
     Effect,
     Family,
     Remedy,
-    needed,
     unit_matrix,
+    whole_numbers,
 )
 from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
@@ -44,12 +44,15 @@ class SwappedChannels(Effect[Term]):
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Record the true channels, and those that they are read as."""
-        return EffectRecord(self.name, {k: list(term.site[k]) for k in ('channels', 'read_as')})
+        site = term.site
+        return EffectRecord(
+            self.name, {'channels': list(site['channels']), 'read_as': list(site['read_as'])}
+        )
 
     def term(self, record: EffectRecord) -> Term:
         """Read from a record which channels are swapped, and with which."""
-        site = {k: tuple(int(c) for c in needed(record, k)) for k in ('channels', 'read_as')}
-        return Term(self, site)
+        true, shown = whole_numbers(record, 'channels'), whole_numbers(record, 'read_as')
+        return Term(self, {'channels': true, 'read_as': shown})
 
 
 class SwappedCoils(Effect[Term]):
@@ -71,13 +74,15 @@ class SwappedCoils(Effect[Term]):
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Record the true emitters, and those that they are read as."""
-        return EffectRecord(self.name, {k: list(term.site[k]) for k in ('coils', 'read_as')})
+        site = term.site
+        return EffectRecord(
+            self.name, {'coils': list(site['coils']), 'read_as': list(site['read_as'])}
+        )
 
     def term(self, record: EffectRecord) -> Term:
         """Read the swapped emitters from a record, and as which they are read."""
-        return Term(
-            self, {k: tuple(int(c) for c in needed(record, k)) for k in ('coils', 'read_as')}
-        )
+        true, shown = whole_numbers(record, 'coils'), whole_numbers(record, 'read_as')
+        return Term(self, {'coils': true, 'read_as': shown})
 
 
 class DeadChannel(Effect[Term]):
@@ -99,7 +104,7 @@ class DeadChannel(Effect[Term]):
 
     def term(self, record: EffectRecord) -> Term:
         """Read the channels that are dead from a record."""
-        return Term(self, {'channels': tuple(int(c) for c in needed(record, 'channels'))})
+        return Term(self, {'channels': whole_numbers(record, 'channels')})
 
 
 SWAPPED_CHANNELS, SWAPPED_COILS, DEAD_CHANNEL = SwappedChannels(), SwappedCoils(), DeadChannel()

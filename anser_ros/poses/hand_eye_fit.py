@@ -224,7 +224,7 @@ def _told(
     for index, term in enumerate(fit.terms):
         if not (isinstance(term, FrameTerm) and isinstance(term.effect, Mount)):
             continue
-        name = str(term.site['sensor'])
+        name = term.site['sensor']
         part = next(p for p in fit.state.parts if p.view.sensor == name)
         record = hand_eye_record(
             term, spreads[index], frame, spreads[base], lever_is_told(part, shaking)

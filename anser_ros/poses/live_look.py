@@ -227,7 +227,7 @@ def _later_half(problem: PoseProblem) -> PoseProblem:
 
 
 def _has(problem: PoseProblem, term: Term) -> bool:
-    return str(term.site['sensor']) in {poses.name for poses in problem.sensors}
+    return term.site['sensor'] in {poses.name for poses in problem.sensors}
 
 
 def _misfits(state: PoseState) -> dict[str, float]:

@@ -51,4 +51,4 @@ def _map_share(term: Term, parts: Sequence[PosePart]) -> float:
 
 def is_scale(term: Term) -> bool:
     """Return whether a map is that of one sensor's scale."""
-    return is_of(term, Role.MAP) and int(term.site['degree']) == 0
+    return is_of(term, Role.MAP) and term.site['degree'] == 0

@@ -169,7 +169,7 @@ def _beside_scale(sites: Sequence[Term], force: Sequence[Term]) -> list[Term]:
     if not any(is_of(term, Role.SCALE) for term in force):
         return list(sites)
     maps = [t for t in sites if is_of(t, Role.MAP) and 'sensor' not in t.site]
-    bent = [effect_of(t).bent(t) for t in maps if int(t.site['degree']) > 1]
+    bent = [effect_of(t).bent(t) for t in maps if t.site['degree'] > 1]
     return [t for t in sites if t not in maps] + bent
 
 
@@ -209,9 +209,9 @@ def _is_part(term: Term, others: Sequence[Term]) -> bool:
             continue
         if other.site.get('sensor') not in (None, term.site.get('sensor')):
             continue
-        lowest = int(other.site.get('lowest', 1))
-        own = int(term.site.get('lowest', 1)), int(term.site.get('degree', 1))
-        if lowest <= own[0] and int(other.site['degree']) >= own[1]:
+        lowest = other.site.get('lowest', 1)
+        own = term.site.get('lowest', 1), term.site.get('degree', 1)
+        if lowest <= own[0] and other.site['degree'] >= own[1]:
             return True
     return False
 

@@ -257,8 +257,8 @@ def started(problem: PoseProblem, offset: float, frame: Array | None = None) -> 
         terms.append(frame_term(OpticalFrame(), {}, shift, rotation))
     for poses, (_, turned, _, turn) in zip(problem.sensors, pairs, strict=True):
         mounts = Rotation.from_matrix(turn.transpose(0, 2, 1) @ (rotation.T @ turned))
-        site = {'sensor': poses.name}
-        terms.append(frame_term(Mount(), site, np.zeros(3), _middle(mounts)))
+        middle = _middle(mounts)
+        terms.append(frame_term(Mount(), {'sensor': poses.name}, np.zeros(3), middle))
     return [*terms, Term(PoseTimeOffset(), {}, np.array([offset]))]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.effect import Remedy, needed, sigmas
-from anser_ros.effects.term import Term
+from anser_ros.effects.term import Site, Term
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView, Role
 
@@ -52,7 +52,8 @@ class PoseTimeOffset(PoseEffect):
 
     def term(self, record: EffectRecord) -> Term:
         """Read the offset, s, from a record."""
-        site = {k: v for k, v in record.parameters.items() if k == 'sensor'}
+        sensor = record.parameters.get('sensor')
+        site: Site = {} if sensor is None else {'sensor': str(sensor)}
         return Term(self, site, np.array([float(needed(record, 'offset_s'))]))
 
 
@@ -76,12 +77,12 @@ class PoseClockRate(PoseEffect):
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
         """Return minus the velocity, the more the farther from the session's middle."""
-        apart = 1e-3 * (view.time - float(term.site['middle_s']))
+        apart = 1e-3 * (view.time - term.site['middle_s'])
         return -(view.velocity * apart[:, None])[:, :, None]
 
     def clock(self, term: Term, sensor: str, time: Array) -> Array:
         """Return the stamps, s, without what their clock gains."""
-        return np.asarray(time - 1e-3 * term.theta[0] * (time - float(term.site['middle_s'])))
+        return np.asarray(time - 1e-3 * term.theta[0] * (time - term.site['middle_s']))
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Record the rate, and the time at which the offset is the offset."""

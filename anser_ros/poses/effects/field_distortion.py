@@ -3,13 +3,13 @@
 from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import combinations_with_replacement
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.effect import Remedy, needed, sigmas
-from anser_ros.effects.term import Term
+from anser_ros.effects.term import Site, Term
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView, Role
 
@@ -61,23 +61,27 @@ class FieldDistortion(PoseEffect):
 
     def at(self, setting: PoseSetting, degree: int, sensor: str | None) -> Term:
         """Return the effect of a degree on one sensor, or on all."""
-        site = {} if sensor is None else {'sensor': sensor}
-        place = {'degree': degree, 'centre_m': setting.centre.tolist(), 'size_m': setting.size}
+        own: Site = {} if sensor is None else {'sensor': sensor}
+        site: Site = {
+            **own, 'degree': degree, 'centre_m': setting.centre.tolist(), 'size_m': setting.size,
+        }  # fmt: skip
         if degree == 0:
-            return Term(self, {**site, **place}, np.zeros(4))
+            return Term(self, site, np.zeros(4))
         count = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, degree).shape[1]
-        return Term(self, {**site, **place}, np.zeros(3 * count))
+        return Term(self, site, np.zeros(3 * count))
 
     def bent(self, term: Term) -> Term:
         """Return the map without its linear part, which something else has."""
-        site = {**term.site, 'lowest': 2}
-        count = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, int(site['degree']), 2).shape[1]
+        site: Site = {**term.site, 'lowest': 2}
+        count = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, site['degree'], 2).shape[1]
         return Term(self, site, np.zeros(3 * count))
 
     def whole(self, term: Term) -> Term:
         """Return the map of the same degree with its linear part, on all sensors."""
-        site = {k: v for k, v in term.site.items() if k not in ('lowest', 'sensor')}
-        count = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, int(site['degree'])).shape[1]
+        site: Site = {**term.site}
+        site.pop('lowest', None)
+        site.pop('sensor', None)
+        count = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, site['degree']).shape[1]
         return Term(self, site, np.zeros(3 * count))
 
     def prior(self, term: Term) -> Array:
@@ -86,8 +90,8 @@ class FieldDistortion(PoseEffect):
 
     def _derivative(self, term: Term, position: Array) -> Array:
         """What each parameter moves positions (n, 3) by, shape (n, 3, q), m."""
-        centre, size = np.asarray(term.site['centre_m']), float(term.site['size_m'])
-        degree, lowest = int(term.site['degree']), int(term.site.get('lowest', 1))
+        centre, size = np.asarray(term.site['centre_m']), term.site['size_m']
+        degree, lowest = term.site['degree'], term.site.get('lowest', 1)
         if degree == 0:
             away = ((position - centre) / size)[:, :, None]
             shift = np.broadcast_to(np.eye(3), (len(position), 3, 3))
@@ -129,12 +133,10 @@ class FieldDistortion(PoseEffect):
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Record the map, and how far it moves poses at their rms distance."""
-        degree = int(term.site['degree'])
+        degree = term.site['degree']
         # A scale's first number moves all three coordinates, as its shift does together.
         rms = UNIT_M * float(np.linalg.norm(term.theta)) / (np.sqrt(3) if degree else 1.0)
-        strain = (rms if degree else UNIT_M * abs(float(term.theta[0]))) / float(
-            term.site['size_m']
-        )
+        strain = (rms if degree else UNIT_M * abs(float(term.theta[0]))) / term.site['size_m']
         spread = UNIT_M * float(np.sqrt(np.mean(sigmas(covariance) ** 2)))
         return EffectRecord(
             self.name,
@@ -150,7 +152,9 @@ class FieldDistortion(PoseEffect):
         """Read the map's coefficients, mm, from a record."""
         keys = ('sensor', 'degree', 'lowest', 'centre_m', 'size_m')
         site = {k: record.parameters[k] for k in keys if k in record.parameters}
-        return Term(self, site, np.asarray(needed(record, 'coefficients_mm'), dtype=np.float64))
+        return Term(
+            self, cast(Site, site), np.asarray(needed(record, 'coefficients_mm'), dtype=np.float64)
+        )
 
 
 EFFECTS = (FieldDistortion(),)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.effects.term import Term
+from anser_ros.effects.term import Site, Term
 from anser_ros.poses.effect import PoseEffect, PoseView
 
 Array = NDArray[np.float64]
@@ -100,7 +100,7 @@ def _cross(vectors: Array) -> Array:
     return out
 
 
-def frame_term(effect: Any, site: dict[str, Any], place: Array, turn: Array) -> FrameTerm:
+def frame_term(effect: Any, site: Site, place: Array, turn: Array) -> FrameTerm:
     """Return the term of a frame at a place (m) with a rotation matrix."""
     return FrameTerm(effect, site, np.array([*place, 0, 0, 0]), start=turn)
 

@@ -19,9 +19,6 @@ TAUS_S = (0.015, 0.03, 0.06, 0.12, 0.24)
 delay, beyond a quarter nobody would work with the tracker."""
 
 
-TWO_SIDED = 'two_sided'
-
-
 class TrackerLag(PoseEffect):
     """Theta is the time constant, s, of a first-order low pass on position and rotation.
 
@@ -46,11 +43,11 @@ class TrackerLag(PoseEffect):
 
     def filter(self, term: Term, path: OpticalPath) -> OpticalPath:
         """Return the optical path as it is behind the tracker's filter."""
-        return path.filtered(float(term.theta[0]), TWO_SIDED in term.site)
+        return path.filtered(float(term.theta[0]), 'two_sided' in term.site)
 
     def rival(self, term: Term) -> Term:
         """Return the same smoothing without a sense of time."""
-        return Term(self, {TWO_SIDED: True}, term.theta)
+        return Term(self, {'two_sided': True}, term.theta)
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Record the filter's time constant and its uncertainty, s."""
