@@ -190,7 +190,7 @@ class PoseWatch:
 
 
 def frozen_streams(session: PoseSession) -> tuple[tuple[EffectRecord, ...], float]:
-    """Streams that give one pose over and over while another moves, and since when (s)."""
+    """Return streams that give one pose over and over while another moves, and since when (s)."""
     streams, found, since = session.streams, [], np.inf
     for name, poses in streams.items():
         fresh = np.flatnonzero(~poses.repeated)
