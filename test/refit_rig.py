@@ -103,6 +103,7 @@ class Rig:
             self.say(0.0)
         reply = self.node._on_set_baseline(Trigger.Request(), Trigger.Response())
         assert reply.success, reply.message
+        self.until(lambda: self.node.counters['refit_starts'] == 1)
 
     def close(self):
         self.executor.shutdown()

@@ -13,7 +13,7 @@ from anser_ros.field.nominal import nominal_model
 from anser_ros.physics.board import Board, build_board
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.refit import live_refit
+from anser_ros.refit import tables
 from anser_ros.refit.layer import Layer
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.tables import RefitTables
@@ -140,17 +140,17 @@ def tables_made_once():
     So do refits that only the references tell apart share what layers make of clouds. Both are
     functions of what they are kept by, and are worked out once for all tests of a process.
     """
-    build, project = live_refit.build_tables, Layer.project
+    build, project = tables.build_tables, Layer.project
 
-    def shared(model, references, settings, drawing, *rest):
+    def shared(model, references, settings, drawing, *rest, **told):
         arrays = model.positions, model.directions, model.moments, references.position
         arrays += references.axis, references.length, references.channel
         if drawing is not None:
             arrays += (drawing(PLACES),)
-        told = references.name, model.frequencies_hz, settings, rest
-        key = (*(array.tobytes() for array in arrays), repr(told))
+        words = references.name, model.frequencies_hz, settings, rest
+        key = (*(array.tobytes() for array in arrays), repr(words))
         if key not in TABLES:
-            TABLES[key] = build(model, references, settings, drawing, *rest)
+            TABLES[key] = build(model, references, settings, drawing, *rest, **told)
         return TABLES[key]
 
     def projected(layer, sources):
@@ -162,6 +162,6 @@ def tables_made_once():
         return PROJECTED[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(live_refit, 'build_tables', shared)
+        patch.setattr(tables, 'build_tables', shared)
         patch.setattr(Layer, 'project', projected)
         yield

@@ -116,6 +116,7 @@ def test_another_model_while_it_runs(server, tmp_path):
         server.reference.publish(server.cloud.message(points, FIRST_NS + i * 40_000_000))
     server.spin_until(lambda: server.node.counters['frames'] == 8)
     assert call(server, Trigger, 'set_baseline').success
+    server.spin_until(lambda: server.node.counters['refit_starts'] == 1, 30.0)
     before = len(server.models)
     for name, why in (('other.yaml', 'emitters'), ('nowhere.yaml', 'nowhere.yaml')):
         refused = give(name)
@@ -126,6 +127,7 @@ def test_another_model_while_it_runs(server, tmp_path):
     server.spin_until(lambda: len(server.models) > before)
     served = read_dipoles(server.models[-1])
     np.testing.assert_allclose(served.moments, 1.01 * model.moments)
+    server.spin_until(lambda: server.node.counters['refit_starts'] == 2, 30.0)
     points = server.points(clean, channels=references.channel)
     server.reference.publish(server.cloud.message(points, FIRST_NS + 400_000_000))
     server.spin_until(lambda: server.node.counters['refits'] == 1)

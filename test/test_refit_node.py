@@ -121,7 +121,7 @@ def test_every_kind_of_bad_flux_has_its_counter_as_in_the_tracker(make):
     assert [named[f'ref/{i}'] for i in range(4)] == [
         'not finite', 'absurd', 'not finite', 'flagged',
     ]  # fmt: skip
-    assert node._result.state == 'frozen'
+    assert node._refit.result.state == 'frozen'
     send(clean[:-2])
     send(clean[:0])
     send(forward_ns=0)
@@ -171,7 +171,7 @@ def test_a_baseline_of_too_few_is_refused_and_the_old_one_holds(make):
 
     rig = make()
     rig.start()
-    refit = rig.node._refit
+    refit = rig.node._refit.current
     few = np.where(np.arange(len(rig.world.baseline))[:, None] < 3, 0.0, np.nan)
     for _ in range(20):
         rig.say(few)
@@ -181,7 +181,7 @@ def test_a_baseline_of_too_few_is_refused_and_the_old_one_holds(make):
     assert said not in state.message
     with pytest.raises(FitError, match='3 of 16 reference sensors; 4 are needed'):
         rig.node._on_set_baseline(Trigger.Request(), Trigger.Response())
-    assert rig.node._refit is refit
+    assert rig.node._refit.current is refit
     state = rig.node.status()
     assert state.level == Level.WARN and said + 'a baseline of 3 of 16' in state.message
     for _ in range(20):
@@ -209,7 +209,8 @@ def test_metal_at_rest_is_in_no_baseline(make):
         rig.node._on_set_baseline(Trigger.Request(), Trigger.Response())
     for _ in range(24):
         rig.say(0.0)
-    assert rig.node._refit is not None and 'no baseline' not in rig.node.status().message
+    rig.until(lambda: rig.node._refit.current is not None)
+    assert 'no baseline' not in rig.node.status().message
 
 
 def test_a_model_beside_its_board_gives_no_poses_until_the_references_agree(make):
@@ -232,10 +233,11 @@ def test_a_model_beside_its_board_gives_no_poses_until_the_references_agree(make
     assert codes[-1] == code_of(OTHER_MODEL)
     for _ in range(12):
         rig.say(aside - here)
-    assert codes[-1] == code_of(OTHER_MODEL) and rig.node._refit is None
+    assert codes[-1] == code_of(OTHER_MODEL) and not rig.node._refit.is_making
     for _ in range(24):
         rig.say(0.0)
-    assert codes[-1] == 0 and rig.node._refit is not None
+    rig.until(lambda: rig.node._refit.current is not None)
+    assert codes[-1] == 0
     assert rig.node.status().level == Level.OK
 
 
@@ -295,7 +297,7 @@ def test_coils_on_a_patch_take_part_where_the_pose_says(make):
         time.sleep(0.002)
 
     def left_out():
-        return rig.node._result.left_out
+        return rig.node._refit.result.left_out
 
     frame(False)
     assert left_out() == ('patch/0', 'patch/1'), 'nothing was worked out for that place yet'
@@ -307,10 +309,10 @@ def test_coils_on_a_patch_take_part_where_the_pose_says(make):
     for _ in range(40):
         frame(False)
     assert left_out() == ()
-    assert rig.node._result.state == 'frozen'
+    assert rig.node._refit.result.state == 'frozen'
     for _ in range(3):
         frame(True)
-    assert rig.node._result.state == 'refit'
+    assert rig.node._refit.result.state == 'refit'
     assert left_out() == ()
     # Moved by a millimetre it goes on; far away it waits; without a pose it is left out.
     frame(True, shift=1e-3)
@@ -320,7 +322,7 @@ def test_coils_on_a_patch_take_part_where_the_pose_says(make):
     for _ in range(15):
         frame(True, lost=True)
     assert left_out() == ('patch/0', 'patch/1')
-    assert rig.node._result.state == 'refit'
+    assert rig.node._refit.result.state == 'refit'
 
 
 def test_what_is_no_patch_is_refused(make):

@@ -26,16 +26,14 @@ from anser_ros.nodes.metal_view import MetalView
 from anser_ros.nodes.model_output import ModelOutput
 from anser_ros.nodes.moving_coils import MovingCoils
 from anser_ros.nodes.newest_frame import NewestSource
-from anser_ros.nodes.node import AnserNode, Level, Status, main
+from anser_ros.nodes.node import LONGEST_END_S, AnserNode, Level, Status, main
 from anser_ros.nodes.one_source import LOOK_S, said_of, setup_source
-from anser_ros.nodes.patches import start_refit
 from anser_ros.nodes.place_watch import PlaceWatch
+from anser_ros.nodes.refit_in_force import RefitInForce
 from anser_ros.nodes.stated_parameters import stated_by
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.baseline import ReadingWindow, check_enough
 from anser_ros.refit.change import Pace
-from anser_ros.refit.live_refit import LiveRefit
-from anser_ros.refit.result import RefitResult
 from anser_ros.sessions.baseline import clean_flux, clean_mean
 from anser_ros.sessions.model_file import SNAPSHOT, as_saved, is_snapshot, save_model
 from anser_ros.sessions.patches import parse_patches
@@ -65,16 +63,12 @@ class FieldModelNode(AnserNode):
         self._window: ReadingWindow | None = None
         self._base: FieldModel | None = None
         self._model: FieldModel | None = None
-        self._refit: LiveRefit | None = None
-        self._result: RefitResult | None = None
-        self._baseline: NDArray[np.complex128] | None = None
         self._frozen = self._unfit = False
         self._told: tuple[bool, ...] = ()
         self._place = PlaceWatch()
         self._trouble = Trouble()
         self._frames: Intake | None = None
         self._stamp_ns = 0
-        self._refit_s = 0.0
         self._heard_s = 0.0
         self._pace = Pace(table.refit_rate_hz)
         self._output = ModelOutput(self)
@@ -83,12 +77,13 @@ class FieldModelNode(AnserNode):
         self._fluxes = NewestSource(self, 'reference/flux', self._on_flux)
         topics = parse_patches(table.patches)
         self._moving = MovingCoils(self, topics, lambda: self._frame_id, self._refuse)
+        self._refit = RefitInForce(self._moving, self._pace, self.count)
         self._sources = [setups, self._fluxes, *self._moving.sources]
         self.create_service(Trigger, 'field_model/reset', self._on_reset)
         self.create_service(Trigger, 'field_model/save', self._on_save)
         self.create_service(SetBool, 'field_model/freeze', self._on_freeze)
         self.create_service(Trigger, 'field_model/set_baseline', self._on_set_baseline)
-        self.create_timer(LOOK_S, self._tell_changes, clock=self.steady_clock)
+        self.create_timer(LOOK_S, self._look, clock=self.steady_clock)
         if self._file_model is not None:
             self._base = self._file_model
             self._output.name_origin(self._file_model)
@@ -113,19 +108,21 @@ class FieldModelNode(AnserNode):
             return
         self._setup_text, self._setup, table = message.data, setup, self.parameters
         self._trouble.forget()
-        self._refit = self._result = self._baseline = None
+        self._refit.forget_baseline()
         self._references = sensor_table(setup.reference_sensors)
         self._frames = Intake(self._references.channel, self.count)
         self._window = ReadingWindow(self._references, len(base.emitters), table.baseline_s)
         self._output.name_origin(base)
         self._unfit, self._base = False, base
         self._place = PlaceWatch.of(base, self._references, setup, self._fluxes.publishers)
+        self._refit.prepare(setup, base, self._references, table.refit)
         if base is not self._model:
             self._serve(base, self.get_clock().now().nanoseconds)
         self._tell_changes()
         if self._baseline_bag is not None and len(self._references):
             try:
-                self._follow(clean_flux(self._baseline_bag, self._references, base))
+                baseline = clean_flux(self._baseline_bag, self._references, base)
+                self._follow(baseline, is_awaited=True)
             except AnserError as error:
                 self._refuse_baseline(error)
         elif len(self._references) and table.refit and not table.baseline_at_start:
@@ -146,56 +143,43 @@ class FieldModelNode(AnserNode):
             for kind, many in frame.kinds.items():
                 self.count(f'readings_{kind}', many)
             window.add(frame)
+            self._heard_s = time.monotonic()
+            self._take_refit()
             if self._place.look(frame, window) and not self._follows and self._model is not None:
                 self._serve(self._model, stamp_ns)
-            if self._refit is None and self.parameters.baseline_at_start and window.full:
+            has_none = self._refit.current is None and not self._refit.is_making
+            if has_none and self.parameters.baseline_at_start and window.full:
                 self._begin(window, setup)
-            if self._refit is not None and self._follows:
-                self._update(self._refit, frame)
+            if self._refit.current is not None and self._follows:
+                self._update(frame)
         except AnserError as error:
             self._refuse('fluxes_refused', error)
 
-    def _update(self, refit: LiveRefit, frame: Frame) -> None:
+    def _update(self, frame: Frame) -> None:
         """Let the model follow the references, not more often than wanted.
 
         Every frame is answered by the model in force for it, even where that is as before: so the
         tracker knows what to track a frame with, and gives the poses that are found offline.
         """
-        stamp_ns, self._heard_s = frame.stamp_ns, time.monotonic()
-        if not self._pace.is_due(stamp_ns):
+        result, model = self._refit.follow(frame), self._model
+        if result is None:
             self.count('frames_between_refits')
-            if self._model is not None:
-                self._serve(self._model, stamp_ns, self._withheld)
-            return
-        begin_s = time.monotonic()
-        if self._moving.patches is None:
-            self._result = refit.follow(frame)
-        else:
-            moved = self._moving.patches.moved_refit(refit, stamp_ns)
-            if moved is not None:  # the patches' new places have been worked out
-                self._refit = refit = moved
-                self.count('patch_moves')
-            self._result = self._moving.patches.follow(refit, frame)
-        self.count('refits')
-        model = self._result.model if self._result.is_answer else self._model
+        elif result.is_answer:
+            model = result.model
         if model is not None:
-            self._serve(model, stamp_ns, self._withheld)
-        self._refit_s = time.monotonic() - begin_s
-        self._metal.show(self._result, self._frame_id, stamp_ns)
+            self._serve(model, frame.stamp_ns, self._refit.withheld)
+        if result is not None:
+            self._metal.show(result, self._frame_id, frame.stamp_ns)
 
     @property
     def _frame_id(self) -> str:
         return self._setup.frame_id if self._setup is not None else 'fg'
 
     @property
-    def _withheld(self) -> str:
-        """State for which trackers are to give no pose for the present frame."""
-        return '' if self._result is None else self._result.withheld
-
-    @property
     def _follows(self) -> bool:
-        """Whether every frame of the references is answered by a model of its own."""
-        return self._refit is not None and self.parameters.refit and not self._frozen
+        """Whether every frame of the references is answered by a model of its own, or will be."""
+        is_there = self._refit.current is not None or self._refit.is_awaited
+        return is_there and self.parameters.refit and not self._frozen
 
     @property
     def _state(self) -> tuple[bool, ...]:
@@ -243,23 +227,33 @@ class FieldModelNode(AnserNode):
         self._no_baseline = str(error)
         self._refuse('baselines_refused', error)
 
+    def _look(self) -> None:
+        """Notice what changes without a frame."""
+        self._take_refit()
+        self._tell_changes()
+
     def _tell_changes(self) -> None:
         """Let receivers know of another state than the one that they were told."""
         if self._model is not None and self._told != self._state:
-            withheld = self._withheld if self._follows else ''
+            withheld = self._refit.withheld if self._follows else ''
             self._serve(self._model, self.get_clock().now().nanoseconds, withheld)
 
-    def _follow(self, baseline: NDArray[np.complex128]) -> None:
-        """Refit from now on to what differs from a baseline, shape (S, K), T."""
-        if self._base is None or self._references is None or self._setup is None:
-            raise FitError('no setup yet')
-        self._refit, self._moving.patches = start_refit(
-            self._setup, self._base, self._references, baseline, self._moving.bodies
-        )
-        self._baseline = baseline
-        self._result, self._heard_s, self._no_baseline = None, time.monotonic(), ''
+    def _follow(self, baseline: NDArray[np.complex128], is_awaited: bool = False) -> None:
+        """Refit to what differs from a baseline, shape (S, K), T, as soon as that can be done."""
+        self._refit.begin(baseline, is_awaited)
+        self._no_baseline = ''
         self._tell_changes()
         self.count('baselines')
+
+    def _take_refit(self) -> None:
+        """Use a refit that has been made meanwhile, and tell of it."""
+        try:
+            if not self._refit.take():
+                return
+            self._heard_s = time.monotonic()
+        except FitError as error:
+            self._refuse_baseline(error)
+        self._tell_changes()
 
     def _exchange(self, file_model: FieldModel | None) -> None:
         """Start from another model; the baseline holds, as no model is in the readings.
@@ -269,17 +263,16 @@ class FieldModelNode(AnserNode):
         ModelFileError, SetupError
             When there is no such model for the setup.
         """
-        setup, baseline, references = self._setup, self._baseline, self._references
+        setup, references = self._setup, self._references
         base = file_model if setup is None else starting_model(setup, file_model)
-        started = None
-        if setup and base and baseline is not None and references is not None:
-            started = start_refit(setup, base, references, baseline, self._moving.bodies)
         self._file_model, self._base = file_model, base
         if base is None:
             return
         self._place = PlaceWatch.of(base, references, setup, self._fluxes.publishers)
-        self._refit, self._moving.patches = started or (None, None)
-        self._result, self._unfit, self._heard_s = None, False, time.monotonic()
+        if setup is not None and references is not None:
+            self._refit.prepare(setup, base, references, self.parameters.refit)
+            self._refit.begin_again()
+        self._unfit, self._heard_s = False, time.monotonic()
         self._trouble.forget()
         self._output.name_origin(base)
         self._serve_start(base)
@@ -294,9 +287,7 @@ class FieldModelNode(AnserNode):
     def _on_reset(self, _request: Any, response: Any) -> Any:
         if self._base is None:
             raise FitError('no model yet')
-        if self._refit is not None:
-            self._refit.reset()
-        self._result = None
+        self._refit.reset()
         self._serve_start(self._base)
         response.success, response.message = True, 'the model is the one from the start'
         return response
@@ -360,7 +351,7 @@ class FieldModelNode(AnserNode):
         values['fingerprint'] = '' if self._base is None else self._base.fingerprint
         values |= refit_status.model_values(model, self.parameters.model_file)
         values |= {'stamp_ns': self._stamp_ns, 'freeze': self._frozen}
-        values['refit_time_s'] = self._refit_s
+        values['refit_time_s'] = self._refit.update_s
         activity = self._activity(values)
         if self._is_uncalibrated:
             activity = f'{why.UNCALIBRATED}: calibrate, or set allow_uncalibrated; {activity}'
@@ -378,19 +369,26 @@ class FieldModelNode(AnserNode):
             said = f'{why.REFERENCES_LOST}: no reference fluxes for {silent_s:.1f} s'
             return Status('', Level.ERROR, said, values)
         is_troubled = values.get('refit_state') in refit_status.TROUBLED
+        is_troubled |= self._refit.is_awaited and self._follows
         is_troubled |= bool(self._no_baseline and self.parameters.refit)
         level = Level.WARN if is_troubled or self._is_uncalibrated else Level.OK
         return Status('', level, activity, values)
 
     def _activity(self, values: dict[str, object]) -> str:
-        if self._frozen or self._refit is None or not self.parameters.refit:
-            return refit_status.rest_words(self._frozen, self.parameters.refit, self._no_baseline)
-        values |= refit_status.refit_values(self._result)
-        return refit_status.refit_words(self._result, self._no_baseline)
+        result, making, refused = self._refit.result, self._refit.words, self._no_baseline
+        if self._refit.current is None or self._frozen or not self.parameters.refit:
+            return refit_status.rest_words(self._frozen, self.parameters.refit, refused, making)
+        values |= refit_status.refit_values(result)
+        return refit_status.refit_words(result, refused, making)
 
     def part_statuses(self) -> list[Status]:
         """Return a line for every reference sensor that the refit looks at."""
-        return refit_status.reference_statuses(self._result)
+        return refit_status.reference_statuses(self._refit.result)
+
+    def stop_working(self) -> bool:
+        """End what is worked on aside, a refit that is being made among it."""
+        has_ended = self._refit.end(LONGEST_END_S)
+        return super().stop_working() and has_ended
 
 
 if __name__ == '__main__':

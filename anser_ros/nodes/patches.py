@@ -11,58 +11,17 @@ from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
 
 from anser_ros.errors import FrameError
-from anser_ros.field.model import FieldModel
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.patches import PatchCoils
-from anser_ros.sessions.drawing import Drawing
-from anser_ros.sessions.session import sensor_table
-from anser_ros.sessions.volume import stated_volume
 from anser_ros.settings import RefitSettings
 from anser_ros.stamps import stamp_of
 from anser_ros.tracking.rotations import rotation_of_quaternion
-from anser_ros.wire.setup import Setup
 
 ComplexArray = NDArray[np.complex128]
 
 WORKER = 'patches'
 """Name of the thread that works a refit out; there is none while nothing is worked out."""
-
-
-def start_refit(
-    setup: Setup,
-    model: FieldModel,
-    references: SensorTable,
-    baseline: ComplexArray,
-    bodies: tuple[str, ...],
-) -> tuple[LiveRefit, 'Patches | None']:
-    """Start a refit to what differs from a baseline.
-
-    Parameters
-    ----------
-    setup : Setup
-        An emitter that can't be drawn from it has to do with the model's own dipoles.
-    model : FieldModel
-    references : SensorTable
-        The fixed ones.
-    baseline : ndarray, shape (R, K), complex
-        Their readings without metal, T.
-    bodies : tuple of str
-        Bodies whose coils are further references, while their poses are known.
-
-    Returns
-    -------
-    refit : LiveRefit
-    patches : Patches or None
-        None where no sensor is on such a body.
-    """
-    drawing, volume = Drawing.of(setup).field, stated_volume(setup)
-    moving = tuple(s for s in setup.tool_sensors if s.body in bodies)
-    if not moving:
-        refit = LiveRefit(model, references, baseline, setup.refit, drawing, volume=volume)
-        return refit, None
-    patches = Patches(sensor_table(moving), baseline, setup.frame_id, setup.refit)
-    return patches.started(model, references, drawing=drawing, volume=volume), patches
 
 
 class Patches(PatchCoils):

@@ -45,23 +45,27 @@ def refit_values(result: RefitResult | None) -> dict[str, object]:
     }
 
 
-def refit_words(result: RefitResult | None, refused: str = '') -> str:
+def refit_words(result: RefitResult | None, refused: str = '', making: str = '') -> str:
     """Return what the refit did in this frame, and why where something was in its way.
 
-    ``refused`` is why a baseline that was asked for since then is none.
+    ``refused`` is why a baseline that was asked for since then is none, ``making`` how far the
+    refit to another one is.
     """
     words = f'; a new baseline was refused: {refused}' if refused else ''
+    words += f'; the next {making}' if making else ''
     if result is None:
         return f'baseline set{words}'
     return (result.state if not result.reason else f'{result.state}: {result.reason}') + words
 
 
-def rest_words(is_held: bool, is_wanted: bool, no_baseline: str) -> str:
+def rest_words(is_held: bool, is_wanted: bool, no_baseline: str, making: str = '') -> str:
     """Return why the model does not follow the references."""
     if is_held:
         return 'held as it is: freeze was called'
     if not is_wanted:
         return 'constant'
+    if making:
+        return f'constant, {making}'
     return f'constant, no baseline: {no_baseline}' if no_baseline else 'constant, no baseline yet'
 
 

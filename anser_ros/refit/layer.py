@@ -9,6 +9,7 @@ the calibrated model is such a layer itself, its own dipoles take the change and
 grow at all. Metal beside or over the volume needs dipoles beside and over it.
 """
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -92,9 +93,8 @@ class Layer:
         if told not in self._projected:
             # Clouds are asked for in turn, each for all of its responses.
             self._projected.clear()
-            parts = np.array_split(sources, -(-len(sources) // AT_ONCE) or 1)
             self._projected[told] = np.hstack(
-                [self.inverse @ _field_rows(self.points, part) for part in parts]
+                [self.inverse @ _field_rows(self.points, part) for part in _parts(sources)]
             )
         return self._projected[told]
 
@@ -104,9 +104,21 @@ class Layer:
         At the samples that it was fitted at, or at other points (P, 3).
         """
         at = self.points if points is None else points
-        wanted = _field_rows(at, sources)
-        made = component_rows(at, self.positions, self.directions) @ self.project(sources)
-        return float(np.linalg.norm(made - wanted) / np.linalg.norm(wanted))
+        rows = component_rows(at, self.positions, self.directions)
+        projected, done = self.project(sources), 0
+        off = size = 0.0
+        for part in _parts(sources):  # the field of all at once is hundreds of megabytes
+            wanted = _field_rows(at, part)
+            made = rows @ projected[:, done : done + wanted.shape[1]]
+            done += wanted.shape[1]
+            off += float(np.linalg.norm(made - wanted)) ** 2
+            size += float(np.linalg.norm(wanted)) ** 2
+        return math.sqrt(off / size)
+
+
+def _parts(sources: Array) -> list[Array]:
+    """Return sources (M, 3) in parts of at most `AT_ONCE`."""
+    return np.array_split(sources, -(-len(sources) // AT_ONCE) or 1)
 
 
 def _axes_at(points: Array) -> tuple[Array, Array]:

@@ -22,6 +22,7 @@ from anser_ros.integrity.withheld import REFERENCES_DOUBTFUL
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit import health
+from anser_ros.refit import tables as refit_tables
 from anser_ros.refit.agreement import distance_of, evidence_without, left_out
 from anser_ros.refit.assembly import Assembly
 from anser_ros.refit.banks import Banks
@@ -43,7 +44,6 @@ from anser_ros.refit.result import (
     locate_metal,
 )
 from anser_ros.refit.slots import SLOTS, BodySlots
-from anser_ros.refit.tables import build_tables
 from anser_ros.refit.tool_readings import ToolReading
 from anser_ros.refit.witness import Witness
 from anser_ros.settings import RefitSettings
@@ -77,6 +77,8 @@ class LiveRefit:
         only known from a tracker (see `refit.patches`).
     volume : TrackedVolume, optional
         Where the field must be right; by default the volume over such a board.
+    tables : RefitTables, optional
+        Of all these but the baseline and the noise, where they are there already.
 
     Raises
     ------
@@ -93,13 +95,16 @@ class LiveRefit:
         drawing: FieldFunction | None = None,
         noise: Array | None = None,
         volume: TrackedVolume | None = None,
+        tables: refit_tables.RefitTables | None = None,
     ) -> None:
         self.model = model
         self.references = references
         self.settings = settings or RefitSettings()
         self.baseline = checked_baseline(model, references, baseline)
         self._row_noise = checked_noise(noise, len(references), len(model.emitters))
-        self._tables = build_tables(model, references, self.settings, drawing, volume)
+        self._tables = tables or refit_tables.build_tables(
+            model, references, self.settings, drawing, volume
+        )
         self._witness: Witness | None = None
         self._prepare()
         self.reset()

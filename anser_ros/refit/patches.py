@@ -161,10 +161,6 @@ class PatchCoils:
         """Return whether coils have moved so far that the refit has to be built anew."""
         return self._built_at is None or bool(has_moved(self._built_at, now).any())
 
-    def start_table(self) -> SensorTable:
-        """Return the coils at some place over the board, for a first refit without them."""
-        return self.coils.with_geometry(self.coils.position + np.array([0.0, 0.0, 0.3]))
-
     def follow(self, refit: LiveRefit, frame: Frame) -> RefitResult:
         """Refit to a frame of the fixed references and to the patches' coils at their places."""
         placed = self.frame(frame.stamp_ns, refit.model)
@@ -182,7 +178,7 @@ class PatchCoils:
         options
             Of `LiveRefit`, but for its settings.
         """
-        start = self.start_table()
+        start = start_table(self.coils)
         clean = np.concatenate(
             [self.fixed, clean_reading(model, start, self.settings.accuracy)[0]]
         )
@@ -195,6 +191,11 @@ class PatchCoils:
     def settle(self, at: SensorTable) -> None:
         """Put the refit that was computed for the patches' present places in force."""
         self._built_at = at
+
+
+def start_table(coils: SensorTable) -> SensorTable:
+    """Return patches' coils at some place over the board, for a first refit without them."""
+    return coils.with_geometry(coils.position + np.array([0.0, 0.0, 0.3]))
 
 
 def noise_of(sigma: Array, n_fixed: int, nominal_t: float) -> Array:

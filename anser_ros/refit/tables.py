@@ -1,6 +1,6 @@
 """Computes a refit's tables once: driving field, layers and predictions of all clouds."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,7 +32,11 @@ from anser_ros.settings import RefitSettings
 
 Array = NDArray[np.float64]
 Hypothesis = tuple[Cloud, Response, Layer]
+Told = Callable[[float], None]
+"""Is told between two pieces of the work which share of it is done."""
 
+START = 0.1
+"""Share of the tables' work that is done before the first hypothesis, on the article's board."""
 MOST_ORIENTED = 1000
 """Number of sources from which on a cloud has no tensors, whose cost grows with the sources."""
 
@@ -113,14 +117,16 @@ def build_tables(
     settings: RefitSettings,
     drawing: FieldFunction | None,
     volume: TrackedVolume | None = None,
+    told: Told = lambda share: None,
 ) -> RefitTables:
-    """Compute the tables; raises `FitError` as `excitation_for` does."""
+    """Compute the tables; raises `FitError` as `excitation_for` does, and what ``told`` raises."""
     excitation, region = excitation_for(model, drawing, volume)
+    told(START)
     clouds = default_clouds(region)
     bottom = bottom_layer(model, region, excitation, clouds[0].positions)
     box = box_layer(region, excitation)
     hypotheses = _hypotheses(clouds, bottom, box)
-    priors = _priors(hypotheses, references, excitation, model.frequencies_hz, settings)
+    priors = _priors(hypotheses, references, excitation, model.frequencies_hz, settings, told)
     around = bodies(region)
     return RefitTables(
         excitation,
@@ -165,18 +171,22 @@ def _priors(
     excitation: Excitation,
     frequencies_hz: tuple[float, ...],
     settings: RefitSettings,
+    told: Told = lambda share: None,
 ) -> tuple[CloudPrior, ...]:
-    rng = np.random.default_rng(settings.seed)
-    return tuple(
-        build_prior(
-            cloud,
-            response,
-            layer,
-            references,
-            excitation.field(cloud.positions),
-            np.array(frequencies_hz),
-            settings.accuracy,
-            rng,
+    rng, out = np.random.default_rng(settings.seed), []
+    sizes = np.cumsum([0, *(len(cloud.positions) for cloud, _, _ in hypotheses)])
+    for (cloud, response, layer), done in zip(hypotheses, sizes[:-1].tolist(), strict=True):
+        told(START + (1.0 - START) * done / float(sizes[-1]))
+        out.append(
+            build_prior(
+                cloud,
+                response,
+                layer,
+                references,
+                excitation.field(cloud.positions),
+                np.array(frequencies_hz),
+                settings.accuracy,
+                rng,
+            )
         )
-        for cloud, response, layer in hypotheses
-    )
+    return tuple(out)

@@ -1,0 +1,161 @@
+"""A refit is made beside the callbacks: the node answers meanwhile, and says how far it is."""
+
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from refit_rig import Rig, setup_text
+from refit_world import anser_world
+
+from anser_ros.errors import FitError
+from anser_ros.integrity.withheld import REFERENCES_LOST, code_of
+from anser_ros.nodes.diagnostics import Level
+from anser_ros.refit import tables
+from anser_ros.sessions.model_file import save_model
+from anser_ros.wire.setup import parse_setup
+
+pytestmark = pytest.mark.usefixtures('shared_tables')
+
+
+class Held:
+    """Lets the making of a refit begin, and go on when it is told to."""
+
+    def __init__(self, monkeypatch):
+        from anser_ros.nodes import refit_start
+
+        self.let, self.share = threading.Event(), 0.4
+        build, refit = tables.build_tables, refit_start.LiveRefit
+
+        def held(*given, told, **named):
+            told(self.share)
+            assert self.let.wait(20.0)
+            return build(*given, told=told, **named)
+
+        def held_refit(*given, **named):
+            assert self.let.wait(20.0)
+            return refit(*given, **named)
+
+        monkeypatch.setattr(tables, 'build_tables', held)
+        monkeypatch.setattr(refit_start, 'LiveRefit', held_refit)
+
+
+@pytest.fixture
+def held(monkeypatch):
+    return Held(monkeypatch)
+
+
+@pytest.fixture
+def rig(ros, tmp_path, held):
+    rig = Rig(ros, tmp_path, refit_rate_hz=1000.0)
+    rig.codes, write = [], rig.node._output.new_error
+    rig.node._output.new_error = lambda *given: rig.codes.append(given[-1]) or write(*given)
+    yield rig
+    held.let.set()
+    rig.close()
+
+
+def given_baseline(rig):
+    from std_msgs.msg import String
+    from std_srvs.srv import Trigger
+
+    if rig.node._setup is None:
+        rig.node._on_setup(String(data=setup_text(rig.world)))
+    for _ in range(12):
+        rig.say(0.0)
+    reply = rig.node._on_set_baseline(Trigger.Request(), Trigger.Response())
+    assert reply.success, reply.message
+
+
+def test_frames_and_services_are_answered_while_the_first_refit_is_made(rig, held):
+    from std_srvs.srv import Trigger
+
+    given_baseline(rig)
+    rig.until(lambda: 'refit being prepared, 40%' in rig.node.status().message)
+    assert rig.node.status().level == Level.OK, 'poses go on as before the baseline'
+    for _ in range(3):
+        rig.say(0.0)
+    assert rig.node._on_reset(Trigger.Request(), Trigger.Response()).success
+    assert rig.node.counters['refits'] == 0 and rig.codes[-1] == 0
+    held.let.set()
+    rig.until(lambda: rig.node.counters['refit_starts'] == 1)
+    assert 'prepared' not in rig.node.status().message
+    rig.say(0.0)
+    assert rig.node.counters['refits'] == 1
+
+
+def test_the_former_refit_goes_on_until_that_to_a_new_baseline_is_there(rig, held):
+    held.let.set()
+    given_baseline(rig)
+    rig.until(lambda: rig.node.counters['refit_starts'] == 1)
+    former = rig.node._refit.current
+    held.let.clear()
+    given_baseline(rig)
+    before = rig.node.counters['refits']
+    rig.say(0.0)
+    assert rig.node.counters['refits'] == before + 1 and rig.node._refit.current is former
+    assert rig.node.status().message == 'frozen; the next refit being prepared, 100%'
+    assert rig.codes[-1] == 0
+    held.let.set()
+    rig.until(lambda: rig.node.counters['refit_starts'] == 2)
+    assert rig.node._refit.current is not former
+
+
+def test_another_model_gives_no_poses_before_its_refit_is_made(rig, held, tmp_path):
+    from rclpy.parameter import Parameter
+
+    held.let.set()
+    given_baseline(rig)
+    rig.until(lambda: rig.node.counters['refit_starts'] == 1)
+    rig.say(0.0)
+    held.let.clear()
+    model = rig.world.model
+    save_model(tmp_path / 'better.yaml', replace(model, moments=1.01 * model.moments))
+    better = Parameter('model_file', value=str(tmp_path / 'better.yaml'))
+    assert rig.node.set_parameters([better])[0].successful
+    for _ in range(3):
+        rig.say(0.0)
+        assert rig.codes[-1] == code_of(REFERENCES_LOST)
+    rig.until(lambda: '40%' in rig.node.status().message)
+    assert rig.node.status().level == Level.WARN
+    held.let.set()
+    rig.until(lambda: rig.node.counters['refit_starts'] == 2)
+    assert rig.codes[-1] == code_of(REFERENCES_LOST), 'no frame has been answered yet'
+    rig.say(0.0)
+    assert rig.codes[-1] == 0
+
+
+def test_a_refit_that_cannot_be_made_is_said_and_awaited_no_longer(rig, monkeypatch):
+    def none(*_given, **_named):
+        raise FitError('the emitters make no field')
+
+    monkeypatch.setattr(tables, 'build_tables', none)
+    given_baseline(rig)
+    rig.until(lambda: rig.node.counters['baselines_refused'] == 1)
+    state = rig.node.status()
+    assert state.level == Level.WARN and 'no baseline: the emitters make no field' in state.message
+    assert not rig.node._refit.is_making and rig.node.counters['callback_faults'] == 0
+
+
+def test_tables_that_nobody_wants_any_more_are_given_up(ros, monkeypatch):
+    from anser_ros.nodes.refit_start import RefitStart
+
+    world, begun, goes_on = anser_world(), threading.Event(), threading.Event()
+
+    def endless(*_given, told):
+        begun.set()
+        while True:
+            told(0.5)
+            goes_on.wait(20.0)
+
+    monkeypatch.setattr(tables, 'build_tables', endless)
+    setup = parse_setup(setup_text(world))
+    start = RefitStart(setup, world.model, world.references, ())
+    start.begin(np.zeros((16, 8), complex), is_awaited=True)
+    assert start.is_awaited and start.taken() is None and start.is_making
+    assert begun.wait(20.0)
+    time.sleep(0.01)
+    assert not start.end(0.01), 'it is between two words'
+    goes_on.set()
+    assert start.end(20.0)
