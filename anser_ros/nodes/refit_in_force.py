@@ -131,7 +131,7 @@ class RefitInForce:
         return self.result.withheld
 
     def reset(self) -> None:
-        """Forget all frames."""
+        """Let the refit forget all frames, and its last result."""
         if self.current is not None:
             self.current.reset()
         self.result = None
