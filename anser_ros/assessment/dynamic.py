@@ -22,10 +22,13 @@ from anser_ros.poses.hand_eye_fit import HandEye
 
 Array = NDArray[np.float64]
 
-GROUPS = 5  # groups of speeds, with equal numbers of poses
-FEWEST_POSES = 100
-BLOCKS = 20  # stretches of time that are drawn again
-SLOWEST_M_S = 0.02  # median speed below which a recording is of a rest
+GROUPS = 5  # groups of speeds, with equal numbers of poses: a row of the table each
+FEWEST_POSES = 100  # fewer leave a group less than 20, whose 95th percentile would be one pose
+BLOCKS = 20
+"""Stretches of time that are drawn again. More are so short that neighbours err alike; with fewer
+the ends of an interval depend on single ones."""
+SLOWEST_M_S = 0.02
+"""Median speed below which a recording is of a rest: a jitter of 0.1 mm is 5 ms of latency then."""
 
 
 @dataclass(frozen=True)

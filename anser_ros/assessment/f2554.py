@@ -25,7 +25,7 @@ from anser_ros.poses.sequence import PoseSequence
 Array = NDArray[np.float64]
 
 FEWEST_READINGS = 10  # of a point: fewer give no mean that a bad reading leaves alone
-MOST_READINGS = 2000  # readings that take part, evenly over the recording
+MOST_READINGS = 2000  # that take part, evenly over the recording: two million pairs of them
 BLOCKS = 20  # stretches of time that are drawn again: a hand's tilt takes about a second
 FAR_M = 0.05
 """Extent of readings, m, beyond which they are no readings of one location."""

@@ -17,8 +17,8 @@ Array = NDArray[np.float64]
 LEVEL = 0.95
 """Probability with which an interval holds what it is an interval of."""
 DRAWS = 1000  # resamples; the ends of an interval scatter by a few hundredths of its width
-CHUNK = 1_000_000  # numbers of a piece of the resamples, for the memory
-FEWEST = 3  # clusters without which nothing is resampled
+CHUNK = 1_000_000  # numbers of a piece of the resamples, which takes 8 MB of memory
+FEWEST = 3  # clusters without which nothing is resampled: two have three different resamples
 
 
 @dataclass(frozen=True)

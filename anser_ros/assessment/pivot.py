@@ -24,13 +24,13 @@ MOST_POSES = 3000  # poses that take part, evenly over the recording; more tell 
 DRAWS = 300
 """Samples drawn: with half of the poses wrong, one in sixteen has four right ones."""
 SAMPLE = 4  # poses of a sample; three turns about two axes already determine tip and point
-SCORED = 400  # poses that a sample is judged by
+SCORED = 400  # poses that a sample is judged by: their median distance is good to 3 %
 MEDIAN_SIZE = 1.538
 """Median length of a vector of three normal coordinates over their standard deviation."""
 CUT = 4.0
 """Distance, in standard deviations of a coordinate, from which a pose is not one of the pivot:
 of normal errors one in nine hundred."""
-ROUNDS = 8  # refits while the poses that agree still change
+ROUNDS = 8  # refits while the poses that agree still change: an end where two sets alternate
 LEAST_SHARE = 0.5
 """Share of poses that must agree. With fewer, the tip rested on two places or on none."""
 LEAST_TILT_DEG = 8.0
@@ -39,7 +39,7 @@ place along it is refused: noise and distortions then decide on it."""
 TWO_AXES = 0.25
 """Share of the middle tilt below which the least one is called turning about a single axis."""
 BLOCKS = 20  # stretches of time whose errors count as alike
-SMALLEST_SIGMA_M = 1e-7  # of a coordinate; what is exact has no scale
+SMALLEST_SIGMA_M = 1e-7  # of a coordinate; simulated poses without noise have no scale
 
 
 @dataclass(frozen=True)

@@ -19,14 +19,14 @@ from anser_ros.poses.sequence import PoseSequence
 
 Array = NDArray[np.float64]
 
-FEWEST_POSES = 50  # poses below which nothing is said of a rest
+FEWEST_POSES = 50  # fewer tell a standard deviation to worse than 10 %
 AXES = ('x', 'y', 'z')
 EVEN = 1.5
 """Interval of two poses, in median intervals, from which on the series is not evenly spaced."""
 HOUR_S = 3600.0  # seconds in an hour
 FARTHEST_M = 0.02
 """Extent of the poses, m, from which on they are of a tool that was moved: the central 90 %."""
-LEAST_TERMS = 4  # averages that an Allan deviation needs to be shown
+LEAST_TERMS = 4  # averages of a shown Allan deviation: fewer leave it uncertain by half
 ALPHAS = (2, 1, 0, -1, -2)  # exponents of frequency that allantools has intervals for
 
 

@@ -60,9 +60,9 @@ COARSE_ROWS = 5000
 MOST_ROWS = 22_000
 """Readings of the last steps; more are thinned. Their time grows in proportion."""
 COARSE_STEPS = 6
-"""First steps at most."""
+"""First steps at most, with `COARSE_ROWS`; `SMALL_STEP` ends them earlier."""
 FINE_STEPS = 3
-"""Last steps at most."""
+"""Last steps at most, with `MOST_ROWS`: they start where few readings led to."""
 SMALL_STEP = 0.1
 """Step, in standard deviations, below which another one is not worth its time."""
 LOOSE = OpticalNoise(1e-3, 1e-2)

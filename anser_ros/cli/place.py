@@ -43,11 +43,11 @@ AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, -1, -1]]) / np.
 )
 """Axes that a coil may have where nobody states them: three of a cluster, and two oblique ones."""
 LENGTH_M = 0.008
-"""Length of a coil that is not stated, m."""
+"""Length of a coil that is not stated, m: about that of the coils of the demo's setup."""
 FARTHEST = 10.0
 """Distance of a coil, in halves of the board, beyond which it hears nothing of it."""
 MOST_CANDIDATES = 400
-"""Coils to choose from; more take minutes and gigabytes."""
+"""Coils to choose from at most; more take minutes and gigabytes."""
 RANDOM_TRIES, SEED = 20, 1
 """Choices by chance that the found one is compared with, and the seed of these."""
 

@@ -23,7 +23,7 @@ ROUNDS = 5
 REACH_M = 0.14
 """Half size of the grid of start positions, m: the size of a head."""
 GRID_STEP_M = 0.02
-"""Distance of neighbouring start positions, m."""
+"""Distance of neighbouring start positions, m: a fifth of a head's radius."""
 GRID_GAP_M = (0.02, 0.12)
 """Smallest and largest distance of a start position from the nearest channel, m."""
 LEAD_MOMENT = 3e-10

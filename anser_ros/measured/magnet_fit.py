@@ -22,7 +22,7 @@ from anser_ros.measured.magnet_model import (
 Array = NDArray[np.float64]
 
 ROUNDS = 4
-"""Largest number of Gauss-Newton rounds."""
+"""Largest number of Gauss-Newton rounds; the small effects are nearly linear."""
 SETTLED = 1e-4
 """Step, in units of each parameter's spread, below which the rounds end."""
 

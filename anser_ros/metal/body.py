@@ -19,11 +19,13 @@ from anser_ros.metal.scattering import UNIT, Shapes
 Array = NDArray[np.float64]
 
 RADIUS = 0.025
-"""Of the sphere on which amplitudes are taken, m."""
+"""Of the sphere on which amplitudes are taken, m: it sets their unit, and nothing else."""
 HIGHEST = 4
-"""Largest order of a multipole."""
+"""Largest order l of a multipole. Its field falls with distance r as 1 / r^(l + 2), so higher ones
+matter only to sensors that almost touch the metal."""
 TOGETHER = 6
-"""Largest sum of two orders that are coupled."""
+"""Largest sum of two orders that are coupled: what they make falls as the radius over the distance
+to the power of the sum and one."""
 ODD = 0.2
 """Couplings that a body lacks which is its own mirror image, as a share of others; so much of its
 radius its centre may lie beside the symmetric body's."""

@@ -18,7 +18,7 @@ MODEL_FILE, BASELINE_FILE = 'model_file', 'baseline_file'
 HOLDERS = ('field_model', 'tracker', 'watcher')
 """Nodes with a model file, in the order in which they are given another one."""
 ANSWER_S = 10.0
-"""Time that an answer is waited for, s."""
+"""Time that an answer is waited for, s: nodes of a busy machine answer late."""
 LOADING_S = 60.0
 """Time for a node to load a model and to begin its refit with it, s."""
 

@@ -21,7 +21,7 @@ BETTER = 0.5
 """Share (0 to 1) of the misfit as it stands below which another reading is the right one. Larger
 re-reads a session that is only distorted; smaller refuses a right reading of a tracker that is
 poor besides. Its choice is not recorded."""
-FEW_POSES = 150  # poses of a sensor by which a reading is judged
+FEW_POSES = 150  # poses of a sensor that a reading is judged by, a fit each: a median needs few
 HOPELESS_M = 25e-3
 """Median misfit, m, with which no reading fits and a session is refused: its files do not belong
 together, or mean something that is not known here. Smaller refuses sessions with much distortion;
@@ -33,7 +33,7 @@ UNITS = {
 }  # fmt: skip
 """What a unit of the numbers is in m when they are taken for m, or for what is said."""
 NEAR_UNIT = 0.12  # relative error of a scale that a unit explains; lever arms make as much
-SAME_SCALE = (0.75, 1.35)  # scales that need no unit
+SAME_SCALE = (0.75, 1.35)  # scales that need no unit: no two units are nearer than 2.5
 
 
 @dataclass(frozen=True)

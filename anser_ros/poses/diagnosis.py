@@ -269,7 +269,7 @@ def _records(
 
 
 LEAST_JITTER_RAD = 1e-5  # no reference tells turns better; none at all has no inverse
-FEWEST_TURNS = 20  # poses that tell a reference's jitter
+FEWEST_TURNS = 20  # poses that tell a reference's jitter, to 16 %
 MOST_BLUR = 0.1  # share by which a lever arm that is given may be too small
 LEAST_KNOWN_M, LEAST_KNOWN_RAD = 0.01, 0.1
 """Standard deviation of a lever arm's component, m, or a turn, rad, beyond which it is not given:

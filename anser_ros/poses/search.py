@@ -29,8 +29,8 @@ SMOOTH_STEPS = 2.0
 """Intervals of the reference up to which a filter may only smooth its noise. Fewer call smoothing
 a lag; more take a lag for smoothing. How the value was chosen is not recorded."""
 MOST_EFFECTS = 6  # effects in force after which the search ends: more would be stand-ins
-FULL_FITS = 3  # candidates that are fitted in full in each round
-NOISE_ROUNDS = 3  # times that noise and what stands out are told apart
+FULL_FITS = 3  # candidates fitted in full in each round, which takes most of the time
+NOISE_ROUNDS = 3  # times that noise and what stands out, which depend on each other, are found
 STAMP_GAIN = 25.0
 """Minus twice the log likelihood that an error of the stamps must take off, a sensor, to be
 believed; chance takes off one."""

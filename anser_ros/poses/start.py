@@ -38,7 +38,7 @@ that are alike for seconds, and a session of four sensors has to be done within 
 effects uncertain; more cost time."""
 COARSE_S, COARSE_STEP_S = 1.5, 0.05
 """Range and step of the first look for a time offset, s."""
-COARSE_POSES = 300  # poses of that first look
+COARSE_POSES = 300  # poses of that look; it takes a regression at each of its steps
 CLEARLY = 0.8
 """Share of the misfit at no offset below which a coarse offset is taken. Smaller starts at no
 offset although there is one; larger starts at an offset that noise has made. How the value was

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 FAR, FITS = 8.0, 0.25
 """Distance of a pose from its own prediction, in spreads, from which it may be another sensor's,
 and the share of it that is left from the other's prediction."""
-NEAR_S = 1.0  # s; spans that are nearer to each other are one
+NEAR_S = 1.0  # s; nearer spans are one: nobody swaps two plugs and back in a second
 FEWEST, LEAST_SHARE = 5, 0.01  # poses in a span, and share of a sensor's poses, that are a swap
 
 

@@ -27,7 +27,8 @@ Uncertainty = tuple[ComplexArray | None, float]
 """Modes and flux error of a model."""
 
 MOST_MODES = 16
-"""Sets of modes that are kept; the oldest is dropped."""
+"""Sets of modes that are kept, which bounds the memory; the oldest is dropped, and is worked out
+again when its coils and hypothesis come back."""
 KEEP_FRAMES = 25
 """Frames for which an inflation is kept at least before it may fall."""
 RIVAL = 0.05

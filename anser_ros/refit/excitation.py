@@ -27,7 +27,7 @@ AGREEMENT = 0.9
 SEARCH_M = 1.0
 """Half size of the square in which the board is searched, m."""
 SEARCH_POINTS = 61
-"""Points along a side of that search, about 3 cm apart."""
+"""Points along a side of that search, about 3 cm apart: less than a coil of a board is wide."""
 SEARCH_HEIGHT_M = 0.02
 """Height over the board at which its field is compared, m."""
 

@@ -49,7 +49,7 @@ RETRY_FRAMES = 25
 OUTSTANDING = 8.0
 """A change this many times the median coil's is looked at as a possible fault."""
 MOST_AT_ONCE = 4
-"""Coils that may fail together and be found."""
+"""Coils that may fail together and be found. Metal that is near makes more of them stand out."""
 
 
 class ReferenceHealth(NamedTuple):

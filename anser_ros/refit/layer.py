@@ -47,7 +47,8 @@ MOST_MIDDLE = 60
 CLEAR = 0.35
 """Samples nearer to a body's sources than this part of its radius don't count."""
 INNER = 0.83
-"""Part of the tracked volume that the box is fitted in."""
+"""Part of the tracked volume that the box is fitted in: near the faces, the field of what is just
+outside has more detail than the box can make."""
 
 
 @dataclass(frozen=True)
@@ -265,7 +266,6 @@ def box_layer(region: Region, excitation: Excitation) -> Layer:
         directions.append(inwards * _upright(positions[-1]))
     stacked = np.concatenate(positions)
     stacked[:, :2] += volume.middle
-    # Near the faces the field of what is just outside has more detail than the box can make.
     points = region.volume.samples(*SAMPLES, part=INNER)
     axes = np.concatenate(directions)
     return _build(AROUND, None, stacked, axes, points, excitation, region.half)

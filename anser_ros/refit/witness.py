@@ -43,7 +43,8 @@ larger, with five no smaller (four references, the head at the board)."""
 ODD = 1.5
 """Squared misfit of a tool's readings, over what is expected, from which they count less."""
 CONSIDERED = 1e-3
-"""Probability from which on a hypothesis has a filter."""
+"""Probability from which on a hypothesis has a filter, which costs time. One that is less probable
+hardly changes the mean, whatever a tool says of it."""
 ELSEWHERE = 0.1
 """Weight of the whole volume beside the surroundings of the tools, where modes are chosen."""
 NEAR_M = 0.01

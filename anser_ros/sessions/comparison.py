@@ -31,9 +31,9 @@ BLOCK_NS = 1_000_000_000
 DRAWS = 2000
 """Resamples: the ends of a 95 % interval then vary by a few percent of its width."""
 SHARE = 0.95
-"""Share of the resamples that lie in the interval."""
+"""Share of the resamples that lie in the interval, as is usual in the field's publications."""
 FEWEST_BLOCKS = 5
-"""Stretches below which an interval means nothing."""
+"""Stretches below which an interval means nothing: its ends would be those of single ones."""
 
 
 @dataclass(frozen=True)

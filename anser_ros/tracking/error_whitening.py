@@ -13,7 +13,8 @@ from anser_ros.physics.dipole import GAUSS_OFFSET
 Array = NDArray[np.float64]
 
 SAME_PLACE_M = 1e-6
-"""Dipoles nearer to each other are components of one."""
+"""Dipoles nearer to each other than this, m, are components of one: rounding moves them apart by
+less, and no layout has neighbours within a millimetre."""
 
 
 @numba.njit(cache=True, error_model='numpy')

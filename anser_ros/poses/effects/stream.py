@@ -22,7 +22,7 @@ MOVING_M = 5e-4
 """Way between two poses, m, from which a body moves: trackers tell a tenth of it. Smaller takes
 jitter for motion, so that a tracker at rest seems to repeat poses; larger sees no motion in slow
 hands."""
-NEAR = 3  # poses before and after by which motion is judged
+NEAR = 3  # poses before and after that motion is judged by: one wrong neighbour decides nothing
 FEWEST_MISSING = 0.005  # share of poses, or of the time, from which missing ones are named
 FEWEST_MARKED, FEWEST_MARKED_SHARE = 5, 1e-3
 """Markers for no pose, and their share, from which they are named: a device wrote them itself."""
@@ -30,7 +30,7 @@ LONG_GAPS = 6.0
 """Gap in median intervals that counts as missing poses: a poll is late by one or two."""
 PAUSE_S, MANY_PAUSES = 2.0, 4
 """Pauses of this length, s, where there are so many, lie between recordings and are no gaps."""
-FEWEST_POSES = 3  # outliers that must be there at least
+FEWEST_POSES = 3  # outliers that must be there at least: one or two are an accident
 FAR = 14.0
 """Distance of the median outlier in spreads of a coordinate from which it is one: errors of real
 trackers have tails of half that. Smaller names the tails of usual errors; larger misses
