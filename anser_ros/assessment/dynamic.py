@@ -28,7 +28,8 @@ BLOCKS = 20
 """Stretches of time that are drawn again. More are so short that neighbours err alike; with fewer
 the ends of an interval depend on single ones."""
 SLOWEST_M_S = 0.02
-"""Median speed below which a recording is of a rest: a jitter of 0.1 mm is 5 ms of latency then."""
+"""Median speed below which a recording is of a rest, where a jitter of 0.1 mm is 5 ms of
+latency."""
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,9 @@ LEAST_DRIFT = 2e-4
 """Change of a strength (rms, relative) from which on it is one; it moves a pose by a hundredth of
 a millimetre."""
 CERTAIN = 5.0
-"""The same in standard deviations of what noise makes of it. Smaller takes noise for a drift;
-larger leaves a drift in the data where references are noisy. Its choice is not recorded."""
+"""The same in standard deviations of what noise makes of it: of a mean over the session, noise
+alone hardly ever makes five times what it usually does. Smaller takes noise for a drift; larger
+leaves a drift in the data where references are noisy."""
 COMMON = 0.995
 """Share of the power of an emitter's changes that one factor must explain. It explains all of a
 drift; of a large metal body that comes up from below it explains up to 97 %, so that less would

@@ -48,7 +48,7 @@ to the tools above the board, and hardly ever goes level. Smaller, and starts ar
 and metal that is drawn aside is looked for below. How the value was chosen is not recorded."""
 AROUND = 8
 """Directions to the side in which a way is tried, one in 45 deg. Fewer may start too far from the
-true way for the fit to find it; time grows with their number. Its choice is not recorded."""
+true way for the fit to find it; time grows with their number."""
 FEW_FRAMES, SOME_FRAMES, MANY_FRAMES = 25, 60, 300
 """Frames of a tool, about, on which ways are compared, refined, and fitted at last. Fewer are
 faster and noisier; more cost time in proportion and tell little, as neighbouring frames are alike.

@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 BINS = 12
 """Cells into which frames are binned by one variable, so that each has tens of frames in a session
 of some hundreds. Fewer blur what changes quickly with the variable; more leave fewer frames for
-each mean. Its choice is not recorded."""
+each mean."""
 SIGNIFICANT = 1e-5
 """Probability in noise below which a dependence is one; eight variables are tested, on residuals
 whose noise is only estimated. Larger reports chance, smaller needs more frames to see anything. No

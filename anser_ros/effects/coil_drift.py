@@ -24,7 +24,7 @@ from anser_ros.field.model import EffectRecord
 PROBED_SHARES = (0.1, 0.5, 2.5)
 """Time constants of the probe, as shares of the session: from one that has ended early to one that
 is nearly a straight line. Closer ones have nearly parallel columns; fewer miss courses between
-them. Their choice is not recorded."""
+them."""
 
 
 def _shape(time: Array, tau: float) -> Array:

@@ -24,8 +24,9 @@ STABLE_SHARE = 0.25
 another: what it is known by at all is worse than how it keeps. Smaller, and a warm amplifier is
 taken for metal; larger, and metal that moves poses by a tenth of a millimetre is not noticed."""
 CERTAIN = 4.0
-"""Changes below so many times their noise are none. Smaller takes noise for metal; larger misses
-metal that weak readings see. Its choice is not recorded."""
+"""Changes below so many times their noise are none: it is the median sensor's, all emitters
+together, which noise alone hardly takes past twice what it usually is. Smaller takes noise for
+metal; larger misses metal that weak readings see."""
 FEWEST_SENSORS = RefitSettings.min_references
 """Sensors that have to be known: with fewer, the emitters' strengths explain what metal does."""
 SAME_PLACE_M = 1e-4

@@ -35,9 +35,9 @@ STAMP_GAIN = 25.0
 """Minus twice the log likelihood that an error of the stamps must take off, a sensor, to be
 believed; chance takes off one."""
 SAME_SCALE = 3.0
-"""Standard deviations by which the scales of two sensors may differ that see one reference.
-Smaller takes noise for scales of their own; larger takes true differences for one scale. Its
-choice is not recorded."""
+"""Standard deviations by which the scales of two sensors may differ that see one reference: noise
+makes a pair differ more once in 370. Smaller takes noise for scales of their own; larger takes
+true differences for one scale."""
 SCALE_DIFFERS = 0.003  # difference of scales that matters: 1 mm in a tracked volume
 
 

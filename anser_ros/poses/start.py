@@ -21,8 +21,7 @@ Array = NDArray[np.float64]
 
 BLOCKS = 25
 """Blocks of time of one recording: five folds of five, each long against a hand's motion. Fewer
-hold out much at a time; more are shorter than the time over which errors are alike. How the value
-was chosen is not recorded."""
+hold out much at a time; more are shorter than the time over which errors are alike."""
 PAUSE_S = 2.0
 """Pause, s, that parts static recordings; where there are several, each is a block."""
 AT_REST_M, POSES_AT_REST = 2e-3, 4

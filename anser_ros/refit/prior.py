@@ -25,8 +25,7 @@ Array = NDArray[np.float64]
 
 N_SAMPLES = 48
 """Draws from the prior, from which the posterior's uncertainty is made. Fewer make the uncertainty
-itself uncertain, by a tenth with 48; more cost memory and the start of the refit in proportion.
-How the value was chosen is not recorded."""
+itself uncertain, by a tenth with 48; more cost memory and the start of the refit in proportion."""
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,7 @@ recorded."""
 BETTER = 3.0
 """Gain of approximate log evidence for which a body takes another's slot: odds of twenty to one,
 so that two that explain alike do not take turns. Smaller, and bodies change places with the noise;
-larger, and a body that has become the likely one waits for frames. How the value was chosen is not
-recorded."""
+larger, and a body that has become the likely one waits for frames."""
 EVERY = 4
 """Frames from one look at all bodies to the next. Fewer cost time in every frame; more, and a new
 body is seen some hundredths of a second later. How the value was chosen is not recorded."""

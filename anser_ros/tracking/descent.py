@@ -21,8 +21,8 @@ linearised field is no guide any more; shorter steps only need more evaluations.
 FIRST_DAMPING = 1e-8
 """Next to nothing: most starts are so near that the plain step ends within the noise."""
 LEAST_RAISED = 1e-3
-"""Damping at least after a step that failed. Growing from `FIRST_DAMPING` alone, several more steps
-would fail until they get shorter."""
+"""Damping at least after a step that failed. Growing from `FIRST_DAMPING` alone, several more
+would fail until steps get shorter."""
 CONVERGED_CHI2 = 1e-6
 """Fall of chi-square below which a step is not worth another one (a thousandth of a sigma)."""
 TRUSTED_CHI2, TRUSTED_MOVE_M, TRUSTED_TURN = 0.03, 50e-6, 1e-3

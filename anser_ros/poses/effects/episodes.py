@@ -15,8 +15,7 @@ Mask = NDArray[np.bool_]
 
 WINDOWS = 40
 """Windows of time that a session is cut into: an episode of a twentieth is seen in two. Fewer miss
-short episodes; more leave too few poses in a window to judge it. How the value was chosen is not
-recorded."""
+short episodes; more leave too few poses in a window to judge it."""
 FEWEST_POSES = 4  # poses that a window needs to be judged: fewer may be outliers
 TIMES = 9.0
 """Squared error over the median window's from which a window belongs to an episode: three times

@@ -15,9 +15,9 @@ LEAST_S = 2e-3
 """Error of the stamps, s, from which it is named: less moves a hand by a tenth of a millimetre.
 Smaller names what harms nobody; larger leaves errors of a fast hand unnamed."""
 BELIEVED = 25.0
-"""Minus twice the log likelihood that it must take off in the median sensor; chance takes one.
-Smaller takes chance for an error of the stamps in one of many sessions; larger misses one that
-takes little off. How the value was chosen is not recorded."""
+"""Minus twice the log likelihood that it must take off in the median sensor; chance takes one, and
+so much once in two million sensors. Smaller takes chance for an error of the stamps; larger misses
+one that takes little off."""
 FINEST_S = 2e-3  # finest step of a poll, s: at 0.5 m/s a finer one moves poses by 0.3 mm rms
 STEP_SHARE = (0.15, 0.7)
 """Error over the step that rounding to a step makes: 0.29 if even, more if a poll is late."""
