@@ -1,4 +1,6 @@
-"""The refit that a field_model follows its references with, and the next one while it is made."""
+"""Keeps the refit that a field_model follows its references with, and the next
+while it is made.
+"""
 
 import time
 from collections.abc import Callable
@@ -110,17 +112,17 @@ class RefitInForce:
 
     @property
     def words(self) -> str:
-        """How far the refit is that is being made; empty where none is."""
+        """Return how far the refit is that is being made; empty where none is."""
         return '' if self._start is None else self._start.words
 
     @property
     def is_making(self) -> bool:
-        """Whether a refit is being made."""
+        """Return whether a refit is being made."""
         return self._start is not None and self._start.is_making
 
     @property
     def is_awaited(self) -> bool:
-        """Whether there is none yet, and no pose is to be given before there is."""
+        """Return whether there is none yet, and no pose is to be given before there is."""
         return self.current is None and self._start is not None and self._start.is_awaited
 
     @property

@@ -1,4 +1,4 @@
-"""A refit that is made beside the callbacks, which go on meanwhile.
+"""Makes a refit beside the callbacks, which go on meanwhile.
 
 Its tables, seconds of work, need the model and the references' places only, so they are begun
 before there is a baseline. What a baseline adds is half a second more, for each baseline anew.
@@ -98,12 +98,12 @@ class RefitStart:
 
     @property
     def is_making(self) -> bool:
-        """Whether a refit is being made, for which there is a baseline."""
+        """Return whether a refit is being made, for which there is a baseline."""
         return self._made is not None
 
     @property
     def words(self) -> str:
-        """How far it is; empty while none is being made."""
+        """Return how far it is; empty while none is being made."""
         return f'refit being prepared, {self._share:.0%}' if self.is_making else ''
 
     def end(self, longest_s: float = 0.0) -> bool:
