@@ -29,7 +29,7 @@ class BagError(AnserError):
 
 
 class ModelFileError(AnserError):
-    """A model file is none, or doesn't fit the session."""
+    """A file is not a model file, or doesn't fit the session."""
 
 
 class FitError(AnserError):

@@ -39,7 +39,7 @@ class Model:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a model file; raises `ModelFileError` when it is none."""
+        """Read a model file; raises `ModelFileError` when it is not one."""
         return cls(load_model(path))
 
     @classmethod

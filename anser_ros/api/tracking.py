@@ -44,7 +44,7 @@ class TrackedPoses:
     residual_t : ndarray, shape (F,)
         Root mean square of measured minus modelled flux, T.
     position_error_m, orientation_error_rad : ndarray, shape (F,)
-        Against the optical pose; NaN where there is none.
+        Against the optical pose; NaN without one.
     reason : tuple of str, length F
         In words why a frame has no pose; empty where it has one.
     """

@@ -39,7 +39,7 @@ def judge(
     Raises
     ------
     ParameterError
-        When a tolerance is of a figure that there is none of, or a file is none of a history.
+        When a tolerance is for an unknown figure, or a file is not of a history.
     """
     figures = figures_of(found)
     unknown = sorted(set(tolerances) - set(figures))

@@ -45,7 +45,7 @@ class ProtocolOptions:
     pause : PauseRule
         What is a point.
     grid : tuple of int, or None
-        Rows and columns of a board that is none of the protocol's.
+        Rows and columns of a board that is not one of the protocol's.
     spacing_m, step_deg : float
         Of the board's holes, and of the ring's.
     order : str

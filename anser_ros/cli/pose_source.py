@@ -70,7 +70,7 @@ def live_poses(
     Raises
     ------
     ParameterError
-        When the time is none that can be waited.
+        When the time is not one that can be waited.
     BagError
         When there is no ROS, or no pose on the topic.
     PlausibilityError

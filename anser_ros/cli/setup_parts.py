@@ -50,7 +50,7 @@ def number_of(text: str, what: str) -> float:
     Raises
     ------
     ParameterError
-        When it is none.
+        When the text is not a finite number.
     """
     try:
         value = float(text)

@@ -81,7 +81,7 @@ class Confirmation:
     def reason(self) -> str:
         """Return why it may not be named, in words."""
         if not self.plausible:
-            return 'its parameters are none that it can have'
+            return 'its parameters are outside their range'
         if not self.helps:
             return 'only the references speak for it, the tools against it'
         if self.variation >= LARGEST_VARIATION:

@@ -113,7 +113,7 @@ class BodyTerm(Term):
         return replace(self.with_body(kind, modes, spread), richness=richness)
 
     def freer(self, knots: int) -> Self | None:
-        """Return the same body on a freer course near this one; None where there is none."""
+        """Return the same body on a freer course near this one; None where no freer one exists."""
         return None
 
     def restarted(self) -> Self | None:

@@ -76,7 +76,7 @@ class ConductivePlate(Effect[Term]):
         ]
 
     def amounts(self, term: Term) -> NDArray[np.int64]:
-        """Return the edge's index: a sheet without size is none."""
+        """Return the edge's index: a sheet without size has no effect."""
         return np.array([1])
 
     def prior(self, term: Term) -> Array:

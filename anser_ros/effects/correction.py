@@ -89,7 +89,7 @@ class Correction:
     def of(
         records: Sequence[EffectRecord], sensors: SensorTable, frequencies: Sequence[float]
     ) -> 'Correction':
-        """Make the corrections of a model's records; raises `ModelFileError` if one is none."""
+        """Make the corrections of a model's records; raises `ModelFileError` on an unknown one."""
         corrected = []
         for record in records:
             effect = effect_named(record.name)

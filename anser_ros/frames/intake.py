@@ -97,7 +97,7 @@ class Intake:
         Whether the user goes on without emitters that died: what is read of them is then set to
         zero and is no fault.
     error : type
-        What is raised for a frame that is none.
+        What is raised for what is not a frame.
 
     Attributes
     ----------

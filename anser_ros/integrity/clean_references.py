@@ -24,7 +24,7 @@ STABLE_SHARE = 0.25
 another: what it is known by at all is worse than how it keeps. Smaller, and a warm amplifier is
 taken for metal; larger, and metal that moves poses by a tenth of a millimetre is not noticed."""
 CERTAIN = 4.0
-"""Changes below so many times their noise are none: it is the median sensor's, all emitters
+"""Changes below so many times their noise do not count: it is the median sensor's, all emitters
 together, which noise alone hardly takes past twice what it usually is. Smaller takes noise for
 metal; larger misses metal that weak readings see."""
 FEWEST_SENSORS = RefitSettings.min_references

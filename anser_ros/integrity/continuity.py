@@ -121,7 +121,7 @@ class Continuity:
         Returns
         -------
         str
-            Why the pose is not confirmed; empty where it is, and where there is none.
+            Why the pose is not confirmed; empty where it is, and where there is no pose.
         """
         last_ns = self._last_ns
         alone = not last_ns or not 0 < stamp_ns - last_ns <= STREAM_GAP_S / NANO

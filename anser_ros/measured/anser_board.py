@@ -37,7 +37,7 @@ def load(folder: Path) -> dict[str, Array]:
     Raises
     ------
     FitError
-        When there is none, or one has another number of points than the board has places.
+        When no run is there, or one has another number of points than the board has places.
     BagError
         When a file is no list of fiducials.
     """
@@ -61,7 +61,7 @@ def analyse(folder: Path) -> dict[str, ErrorMap]:
 
 
 def rows(analysis: dict[str, ErrorMap]) -> list[ReportRow]:
-    """Return in-plane errors before and after; a map that the blocks do not confirm is none."""
+    """Return in-plane errors before and after; unconfirmed maps are not used."""
     out = []
     for name, found in analysis.items():
         before, after = 1e3 * found.before_m, 1e3 * found.after_m

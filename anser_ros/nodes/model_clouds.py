@@ -130,7 +130,7 @@ def read_dipoles(message: PointCloud2) -> DipolePoints:
     Raises
     ------
     LayoutError
-        When it is none, has no dipole, or a direction is no unit vector.
+        When it is not a field model, has no dipole, or a direction is no unit vector.
     """
     points = decode_field_model(
         layout_of(message), message.point_step, width_of(message), message.data,

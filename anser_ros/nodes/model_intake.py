@@ -94,7 +94,7 @@ class ModelIntake:
         Raises
         ------
         LayoutError
-            When it is none, or has no stamp.
+            When it is not a field model, or has no stamp.
         """
         stamp_ns, newest = stamp_of(message), self.newest
         if stamp_ns <= 0:
@@ -110,7 +110,7 @@ class ModelIntake:
         Raises
         ------
         LayoutError
-            When it is none of that model.
+            When it does not belong to that model.
         """
         self._early.append(message)
         newest = self.newest

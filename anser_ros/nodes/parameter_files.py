@@ -73,8 +73,8 @@ def checked(name: str, nodes: Collection[str]) -> str:
     SetupError
         There is no such file.
     ParameterError
-        It is no YAML, holds no section, or one whose node is none of ``nodes``: with it all would
-        start with their defaults.
+        It is no YAML, holds no section, or one whose node is not among ``nodes``: all would start
+        with their defaults then.
     """
     path = str(config_path(name))
     try:

@@ -105,7 +105,7 @@ def _without_ros(arguments: Sequence[str]) -> list[str]:
     """Return the node's own arguments, the program's name left out."""
     try:
         return list(remove_ros_args(arguments)[1:])
-    except (RCLError, UnknownROSArgsError) as error:  # such as a params file that is none
+    except (RCLError, UnknownROSArgsError) as error:  # such as a file without parameters
         raise ParameterError(f'ROS arguments: {error}') from error
 
 

@@ -122,7 +122,7 @@ class RefitInForce:
 
     @property
     def is_awaited(self) -> bool:
-        """Return whether there is none yet, and no pose is to be given before there is."""
+        """Return whether no refit is there yet, and no pose is to be given before one is."""
         return self.current is None and self._start is not None and self._start.is_awaited
 
     @property

@@ -88,7 +88,7 @@ class RefitStart:
         Raises
         ------
         FitError
-            When there is none for this model, these references or this baseline.
+            When no refit can be made for this model, these references or this baseline.
         """
         made = self._made
         if made is None or not made.done():

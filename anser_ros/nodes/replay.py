@@ -312,7 +312,7 @@ class Replay(AnserNode):
 
 
 def _message_of(message: RawMessage, kind: type) -> Any:
-    """Return the decoded message, or None where the bytes are none of that type."""
+    """Return the decoded message, or None where the bytes are not of that type."""
     try:
         return deserialize_message(message.data, kind)
     except Exception:  # noqa: BLE001 - rclpy names none that is narrower

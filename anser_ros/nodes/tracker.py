@@ -1,6 +1,6 @@
 """Turns fluxes into poses of every tool sensor and rigid body, with covariance, state and reason.
 
-A pose is published only while its state is ``ok``; why there is none stands in ``/diagnostics``.
+A pose is published only while its state is ``ok``; why it is not stands in ``/diagnostics``.
 """
 
 import sys

@@ -157,7 +157,7 @@ class Watcher(AnserNode):
         Raises
         ------
         AnserError
-            When the setup is none, or model or baseline do not fit it.
+            When the text is not a setup, or model or baseline do not fit it.
         """
         setup = parse_setup(text).with_stated(self._stated)
         # An empty window has a session's setup already, and a model must fit that.

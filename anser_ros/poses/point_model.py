@@ -17,7 +17,7 @@ SMOOTH = 'smooth'
 
 
 def to_point_model(found: ErrorMap, sensor: str, source: str) -> dict[str, Any]:
-    """Return what a corrector needs of an error map; a map that is not confirmed is none.
+    """Return what a corrector needs of an error map; a map that is not confirmed corrects nothing.
 
     Parameters
     ----------

@@ -78,7 +78,7 @@ def import_bag(
     BagError
         When the bag cannot be read, has no message, or lacks a topic that is to be renamed.
     SetupError
-        When the setup document is none.
+        When the text is not a setup document.
     """
     if setup_text:
         parse_setup(setup_text)

@@ -60,7 +60,7 @@ def import_tables(document: Path, out: Path) -> ImportedTables:
     ParameterError
         When the document or a table breaks a rule, with the file's name.
     SetupError
-        When the setup document is none.
+        When the text is not a setup document.
     BagError
         When the file to write is there already.
     """

@@ -45,7 +45,7 @@ class NumberTable:
         Raises
         ------
         ParameterError
-            When there is none, or what is there is no column.
+            When there is no such name, or what it names is no column.
         """
         match = REFERENCE.match(str(reference))
         if match is None:

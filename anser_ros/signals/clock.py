@@ -18,7 +18,7 @@ are worked off faster than new ones come, and push the line down meanwhile."""
 _SETTLE_UNPROVEN_NS = 3_000_000_000
 """The same (3 s) where answers bound it only loosely, as from a device that is slow to answer, or
 where one that did answer has not yet: if everything is late, so is its answer. All of the time
-arrivals must be in time, so that a line that a busy host makes late is none."""
+arrivals must be in time, so that a line that a busy host makes late does not count."""
 _REFUTED_NS = 1_000_000.0
 """By how much (1 ms) an answer must show a line to be too early to refute it: what the line itself
 is uncertain by. More lets a device lose so much time unseen."""

@@ -38,7 +38,7 @@ USUAL_GATE = 4.0
 and poses are lost to the model's own small errors; larger, and distorted poses pass."""
 
 NO_GATE = 1e6
-"""A gate of so much or more is none: no pose is refused for what it contradicts."""
+"""A gate of so much or more is no gate: no pose is refused for what it contradicts."""
 
 HIDDEN = 20.0 / 11.0
 """Power of a distortion that goes into the pose over the power that stays in the residual. A

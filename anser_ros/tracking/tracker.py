@@ -67,7 +67,7 @@ class Tracker:
     TrackingError
         When there is no sensor, a channel or name appears twice, or the model can't be used.
     ModelFileError
-        When an effect of the model is none that can be undone.
+        When an effect of the model is not one that can be undone.
     """
 
     def __init__(
