@@ -1,5 +1,6 @@
 """`anser diagnose` on simulated bags: a clean one passes, a wrong gain is named and mended."""
 
+import itertools
 import json
 from pathlib import Path
 
@@ -22,18 +23,19 @@ HELD_OUT = {
 }  # fmt: skip
 
 
-def with_gain(path: Path) -> Path:
-    """The moving session with one channel's readings too small."""
-    bag = read_bag(BAGS / 'moving.mcap')
+def rewritten(name: str, path: Path, gain: float = 1.0, step: int = 1) -> Path:
+    """A shipped session: every so many frames, and one channel's readings too small."""
+    bag = read_bag(BAGS / f'{name}.mcap')
     with SessionWriter(path) as writer:
         writer.write_setup(bag.setup_text, int(bag.tool.stamp_ns[0]))
-        gain = np.where(bag.tool.channel == CHANNEL, GAIN, 1.0)[:, None]
+        gains = np.where(bag.tool.channel == CHANNEL, gain, 1.0)[:, None]
         empty = np.full((bag.tool.channel.size, 3), np.nan)
-        for stamp, flux in zip(bag.tool.stamp_ns.tolist(), bag.tool.flux, strict=True):
+        frames = zip(bag.tool.stamp_ns.tolist(), bag.tool.flux, strict=True)
+        for stamp, flux in itertools.islice(frames, 0, None, step):
             flags = np.zeros(bag.tool.channel.size, int)
-            points = FluxPoints(bag.tool.channel, flags, flux * gain, empty, empty)
-            fields, step, data = encode_flux(points)
-            writer.write_flux('/anser/tool/flux', stamp, fields, step, len(gain), data)
+            points = FluxPoints(bag.tool.channel, flags, flux * gains, empty, empty)
+            fields, point_step, data = encode_flux(points)
+            writer.write_flux('/anser/tool/flux', stamp, fields, point_step, len(gains), data)
         for body, track in bag.optical.items():
             for stamp, position, quaternion in zip(
                 track.stamp_ns.tolist(), track.position, track.quaternion, strict=True
@@ -60,7 +62,7 @@ def test_a_clean_session_has_no_effect(tmp_path):
 
 @pytest.mark.long
 def test_a_wrong_gain_is_named_and_the_model_corrects_it(tmp_path):
-    bag = with_gain(tmp_path / 'gain.mcap')
+    bag = rewritten('moving', tmp_path / 'gain.mcap', GAIN)
     document = run(bag, tmp_path / 'out')
     (effect,) = document['effects']
     assert effect['name'] == 'sensor_gain'
@@ -76,6 +78,14 @@ def test_a_wrong_gain_is_named_and_the_model_corrects_it(tmp_path):
     assert 'http' not in page.replace('http-equiv', '')
     again = run(bag, tmp_path / 'again', tmp_path / 'out' / 'model.yaml')
     assert again['effects'] == [], 'the corrected model leaves nothing to find'
+
+
+@pytest.mark.long
+@pytest.mark.parametrize('name', sorted(path.stem for path in BAGS.glob('*.mcap')))
+def test_what_is_said_of_any_shipped_session_is_short(name, tmp_path, capsys):
+    run(rewritten(name, tmp_path / 'thinned.mcap', step=5), tmp_path / 'out')
+    said = [line for line in capsys.readouterr().out.split('\n') if 'residual on' in line]
+    assert len(said) == 1 and 100 < len(said[0]) < MOST_CHARACTERS
 
 
 @pytest.mark.parametrize(

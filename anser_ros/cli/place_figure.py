@@ -52,7 +52,6 @@ def write_figure(
         axes.set_title(words)
         axes.set_xlabel('x / m')
         axes.set_ylabel(f'{"xyz"[up]} / m')
-    figure.axes[0].legend(fontsize=8)
     axes = figure.add_subplot(1, 3, 3)
     counts = [len(design.coils) for design in designs]
     axes.plot(counts, [1e3 * design.error_m for design in designs], 's-', label='proposed')
@@ -69,5 +68,7 @@ def write_figure(
     axes.set_xlabel('reference coils')
     axes.set_ylabel('expected position error / mm')
     axes.grid(True, which='both', alpha=0.3)
-    axes.legend(fontsize=8)
+    for legend_of in (figure.axes[0], axes):
+        # Below, where no place and no error lies.
+        legend_of.legend(fontsize=8, loc='upper center', bbox_to_anchor=(0.5, -0.14), ncols=2)
     figure.savefig(path, dpi=120)
