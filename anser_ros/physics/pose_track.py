@@ -16,6 +16,11 @@ VELOCITY_STEP_S = 0.02
 """Half the time, s, over which a velocity is taken: much shorter multiplies the jitter of the
 poses, much longer smooths away how a hand accelerates."""
 
+REACH = (2, 3, 4)
+"""Poses before and after an interval by which its curvature is told: three tellings, of which the
+middle one counts, since a reflected pose is in one of them only. Nearer ones jitter more, farther
+ones miss how the acceleration changes; with these a pose's jitter grows by some percent."""
+
 
 @dataclass(frozen=True)
 class PoseTrack:
@@ -40,7 +45,10 @@ class PoseTrack:
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Interpolate the poses at other times.
 
-        Positions are interpolated linearly, rotations by spherical linear interpolation.
+        Positions are interpolated along the chord between two poses, rotations along the great
+        arc, and both are bent as the velocity changes there: a hand's path lies outside its
+        chords, and a field that was learnt along chords is too small by a part in ten thousand.
+        Where a track is too slow or too short to tell its curvature, the chord is kept.
 
         Parameters
         ----------
@@ -69,14 +77,21 @@ class PoseTrack:
             # Loaded here, as each start of a node would pay for it that interpolates no poses.
             from scipy.spatial.transform import Rotation, Slerp
 
-            inside = time[valid]
+            inside, bent = time[valid], _Bend(self.time, left[valid], right[valid], time[valid])
             for axis in range(3):
                 position[valid, axis] = np.interp(inside, self.time, self.position[:, axis])
+            position[valid] += bent.of(self.position)
             if self.time.size == 1:
                 rotation[valid] = Rotation.from_quat(self.quaternion[0]).as_matrix()
             else:
-                slerp = Slerp(self.time, Rotation.from_quat(self.quaternion))
-                rotation[valid] = slerp(inside).as_matrix()
+                slerp, samples = (
+                    Slerp(self.time, Rotation.from_quat(self.quaternion)),
+                    _aligned(self),
+                )
+                turned = slerp(inside).as_quat()
+                same = np.einsum('fi,fi->f', turned, samples[left[valid]]) >= 0.0
+                turned = np.where(same[:, None], turned, -turned) + bent.of(samples)
+                rotation[valid] = Rotation.from_quat(turned).as_matrix()
         return position, rotation, valid
 
     def velocity(self, time: Array) -> Array:
@@ -105,3 +120,53 @@ class PoseTrack:
             axis=1,
         )
         return np.concatenate([after - before, spin], axis=1) / span
+
+
+class _Bend:
+    """How far a path lies beside the chords between its samples, by its acceleration there.
+
+    Over an interval h, at the fraction u of the way, that is ``-u (1 - u) h^2 / 2`` times the
+    acceleration, which is told by how the velocity after the interval differs from that before.
+
+    Parameters
+    ----------
+    time : ndarray, shape (M,)
+        Of the samples, s.
+    left, right : ndarray of int, shape (F,)
+        Samples before and after each time.
+    at : ndarray, shape (F,)
+        The times, s.
+    """
+
+    def __init__(
+        self, time: Array, left: NDArray[np.int64], right: NDArray[np.int64], at: Array
+    ) -> None:
+        self.time, last = time, time.size - 1
+        first, final = np.maximum(left - REACH[-1], 0), np.minimum(right + REACH[-1], last)
+        told = (left - first == REACH[-1]) & (final - right == REACH[-1]) & (left < right)
+        self.rows = np.flatnonzero(told & (time[final] - time[first] <= LONGEST_GAP_S))
+        self.left, self.right, self.count = left[self.rows], right[self.rows], at.size
+        at, begin, end = at[self.rows], time[self.left], time[self.right]
+        self.factor = -0.5 * (at - begin) * (end - at)
+
+    def of(self, samples: Array) -> Array:
+        """Return what to add to samples (M, D) interpolated along chords, shape (F, D)."""
+        out = np.zeros((self.count, samples.shape[1]))
+        middle = np.median([self._acceleration(samples, reach) for reach in REACH], axis=0)
+        out[self.rows] = self.factor[:, None] * middle
+        return out
+
+    def _acceleration(self, samples: Array, reach: int) -> Array:
+        before, after = self.left - reach, self.right + reach
+        t0, t1, t2, t3 = (self.time[i] for i in (before, self.left, self.right, after))
+        s0, s1, s2, s3 = (samples[i] for i in (before, self.left, self.right, after))
+        change = (s3 - s2) / (t3 - t2)[:, None] - (s1 - s0) / (t1 - t0)[:, None]
+        return np.asarray(change / ((t3 + t2 - t1 - t0) / 2.0)[:, None])
+
+
+def _aligned(track: PoseTrack) -> Array:
+    """Return a track's quaternions (M, 4) with signs by which each is near the one before."""
+    quaternion = track.quaternion
+    near = np.einsum('mi,mi->m', quaternion[1:], quaternion[:-1]) >= 0.0
+    sign = np.cumprod(np.concatenate([[1.0], np.where(near, 1.0, -1.0)]))
+    return np.asarray(quaternion * sign[:, None])
