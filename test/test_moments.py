@@ -9,6 +9,7 @@
 | fit at corrected poses                 | the true field, closer than plain least squares  |
 | estimated noise                        | the noise put in                                 |
 | predictive chi-square                  | one, at the true field                           |
+| start at another fit's poses           | that fit's moments, at once, and leaves it alone |
 | gross outliers                         | the fit without them                             |
 """
 
@@ -232,3 +233,19 @@ def test_basis_rows_are_in_order_of_frames_and_sensors(rng):
     world = scene(rng, side=3, noise=0.0, jitter=0.0)
     flux = basis_rows(world.measurements, world.dipoles) @ world.moments
     assert np.allclose(flux.reshape(world.measurements.flux.shape), world.measurements.flux)
+
+
+def test_a_fit_starts_where_another_one_ended(rng):
+    world = scene(rng)
+    layer = place(LAYER, world.generator)
+    first = MomentFitter([world.measurements], layer, 1e-4, Accuracy())
+    found = first.fit(exact=False)
+    offsets = first.states[0].offset.copy()
+    other = MomentFitter([world.measurements], layer, 1e-4, Accuracy())
+    other.start_at(first)
+    moments, spectrum = other.solve(exact=False)
+    assert np.allclose(moments, found.moments, rtol=1e-9, atol=0.0)
+    assert other.noise_t == first.noise_t
+    other.correct(moments, spectrum.freedom(1e-4))
+    assert np.array_equal(first.states[0].offset, offsets)
+    assert not np.array_equal(other.states[0].offset, offsets)

@@ -1,17 +1,18 @@
 """Choices by held-out error: blocks, layouts, the drawn board as a prior, error maps."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from calibration_world import NOISE_T, scene
 
 from anser_ros.calibration.blocks import FOLDS, fold_of_frames
-from anser_ros.calibration.calibrate import Options, fit_scan, survey
+from anser_ros.calibration.calibrate import Options, best_damped, fit_scan, survey
 from anser_ros.calibration.error_map import FEWEST_POINTS, IDENTITY, learn_error_map
 from anser_ros.calibration.held_out import rms
 from anser_ros.calibration.layout_fit import fit_layout
-from anser_ros.calibration.layout_score import LayoutScorer
+from anser_ros.calibration.layout_score import DAMPINGS, LayoutCandidate, LayoutScorer
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.local import Regions
 from anser_ros.calibration.prior import DrawnBoard, emitter_gains
@@ -22,6 +23,7 @@ from anser_ros.settings import Accuracy
 
 EMITTERS = ('a', 'b', 'c')
 TONES = (1000.0, 1100.0, 1200.0)
+GENERATOR = Generator(np.zeros((1, 3)), np.zeros(1), 0.07)
 
 
 def calibrate(measurements, names, generator, emitters, tones, options=None, nominal=None):
@@ -340,3 +342,19 @@ def test_joined_regions_make_the_common_field_where_one_model_does(world):
 
 def rng_points():
     return np.random.default_rng(9).uniform([-0.07, -0.07, 0.125], [0.07, 0.07, 0.155], (100, 3))
+
+
+@pytest.mark.parametrize('start', range(len(DAMPINGS)))
+@pytest.mark.parametrize('best', [0, 3, len(DAMPINGS) - 1])
+def test_the_winner_gets_the_damping_that_its_own_folds_ask_for(start, best):
+    layout, tried = Layout('layer', 6, 1.0, 0.0), []
+
+    def tested(candidate):
+        tried.append(candidate.damping)
+        return SimpleNamespace(score_t=1.0 + abs(DAMPINGS.index(candidate.damping) - best))
+
+    winner = LayoutCandidate(layout, place(layout, GENERATOR), DAMPINGS[start], 1.0, ())
+    found, held_out = best_damped(winner, tested(winner), tested)
+    assert found.damping == DAMPINGS[best]
+    assert held_out.score_t == 1.0
+    assert len(tried) == len(set(tried)) <= abs(start - best) + 3

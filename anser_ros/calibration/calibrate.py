@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from anser_ros.calibration.blocks import fold_of_frames
 from anser_ros.calibration.held_out import HeldOut, predict_held_out
 from anser_ros.calibration.layout_fit import LayoutFit, fit_layout
-from anser_ros.calibration.layout_score import LayoutCandidate
+from anser_ros.calibration.layout_score import DAMPINGS, LayoutCandidate
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.moments import Progress
 from anser_ros.calibration.prior import DrawnBoard
@@ -103,11 +103,13 @@ def fit_scan(
     selection = choose_layout(
         thin, folds, generator, options.accuracy, progress, options.layout, drawn
     )
-    tested = [
-        (candidate, _tested(candidate, thin, folds, generator, options, nominal, selection))
-        for candidate in selection.finalists
-    ]
-    chosen, held_out = _better(tested)
+
+    def tested(candidate: LayoutCandidate) -> HeldOut:
+        return _tested(candidate, thin, folds, generator, options, nominal, selection)
+
+    chosen, held_out = _better([(one, tested(one)) for one in selection.finalists])
+    if options.damping is None:
+        chosen, held_out = best_damped(chosen, held_out, tested)
     damping = chosen.damping if options.damping is None else options.damping
     whole = fit_layout(
         posed, chosen.layout, damping, generator, options.accuracy, nominal, progress=progress
@@ -219,6 +221,27 @@ def _tested(
     return predict_held_out(
         thin, folds, fitter, options.accuracy, reference.noise_t, reference.quadrature_noise_t
     )
+
+
+def best_damped(
+    candidate: LayoutCandidate, held_out: HeldOut, tested: Callable[[LayoutCandidate], HeldOut]
+) -> tuple[LayoutCandidate, HeldOut]:
+    """Return the winner with a neighbouring damping, where its folds ask for that.
+
+    Layouts were compared at poses that a rich layer corrected, which are less exact than those of
+    the winner itself: it can do with less damping.
+    """
+    for direction in (-1, 1):
+        start, index = candidate.damping, DAMPINGS.index(candidate.damping) + direction
+        while 0 <= index < len(DAMPINGS):
+            other = replace(candidate, damping=DAMPINGS[index])
+            result = tested(other)
+            if result.score_t >= held_out.score_t:
+                break
+            candidate, held_out, index = other, result, index + direction
+        if candidate.damping != start:
+            break
+    return candidate, held_out
 
 
 def _better(tested: Sequence[tuple[LayoutCandidate, HeldOut]]) -> tuple[LayoutCandidate, HeldOut]:

@@ -172,6 +172,7 @@ def fit_layout(
     if nominal is not None and layout.prior == 'nominal':
         drawn = DrawnBoard(nominal, measurements)
     dipoles, prior = placed(layout, generator, drawn)
+    rich = None
     if layout.moved:
         layer = place(rich_layout(measurements, generator), generator)
         rich = MomentFitter(measurements, layer, RICH_DAMPING, accuracy)
@@ -180,6 +181,8 @@ def fit_layout(
             reference.measurements, reference.weights, dipoles, prior, layout, drawn
         )
     fitter = MomentFitter(measurements, dipoles, damping, accuracy, prior)
+    if rich is not None:
+        fitter.start_at(rich)
     fit = fitter.fit(alternations, progress, exact)
     if not layout.local:
         return LayoutFit(dipoles, prior, fit)

@@ -30,7 +30,7 @@ from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 
-DAMPINGS = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 1e-2)
+DAMPINGS = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
 """Dampings that are tried, as a fraction of the largest singular value of the scaled matrix. The
 smallest is far above the rounding of a Gram matrix (1e-8); beyond the largest only the drawn board
 would be left."""

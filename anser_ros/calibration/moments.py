@@ -11,7 +11,7 @@ section 5.3), so that millions of rows take no more memory than one block.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,6 +146,14 @@ class MomentFitter:
         usable = usable_weights(measured)
         offset = np.zeros((len(measured.time), 6))
         return _State(measured, measured, offset, usable.copy(), usable)
+
+    def start_at(self, other: 'MomentFitter') -> None:
+        """Begin with the poses, weights and noise to which another fit of these readings came."""
+        self.noise_t, self.quadrature_noise_t = other.noise_t, other.quadrature_noise_t
+        self.states = [
+            replace(state, offset=state.offset.copy(), weights=state.weights.copy())
+            for state in other.states
+        ]
 
     def solve(self, exact: bool = True) -> tuple[ComplexArray, Spectrum]:
         """Return the moments (N, K) at the present poses and weights, with their spectrum.
