@@ -163,7 +163,7 @@ class RefitSettings:
         metal does.
     min_references : int
         Reference sensors in use below which the calibrated model is kept. Eight emitters give
-        eight complex readings a sensor; with fewer than four sensors the place of metal is open.
+        eight complex readings per sensor; with fewer than four sensors the place of metal is open.
     average_frames : int
         Most frames that readings are averaged over while they do not change. More make the refit
         quieter at rest; movement ends the average at once.

@@ -29,14 +29,14 @@ def fold_of_frames(positions: Sequence[Array], folds: int = FOLDS) -> list[NDArr
     Parameters
     ----------
     positions : sequence of ndarray, shape (F, 3)
-        Body positions, m, one array a body and session.
+        Body positions, m, one array per body and session.
     folds : int
         Number of folds.
 
     Returns
     -------
     list of ndarray of int, shape (F,)
-        Folds of the frames, one array a body and session.
+        Folds of the frames, one array per body and session.
 
     Raises
     ------

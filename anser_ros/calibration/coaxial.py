@@ -61,7 +61,7 @@ def fit_coaxial(
     Parameters
     ----------
     corrected : sequence of Measurements
-        Measurements at their corrected poses, one a body and session; K emitters.
+        Measurements at their corrected poses, one per body and session; K emitters.
     weights : sequence of ndarray, shape (F, S)
         Weights of the readings.
     start : DipoleSites

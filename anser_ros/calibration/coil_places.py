@@ -1,9 +1,9 @@
 """Places the drawn coils where they lie: each is shifted, turned and scaled as fluxes ask.
 
 A board's coils are etched, glued and soldered a fraction of a millimetre beside their drawing, and
-near them that is most of what a drawing misses. Six coordinates and a complex gain a coil are told
-by far fewer readings than free moments are, and what they leave is so small that moments which are
-pulled to the coils so placed hold below a scan and beside it too.
+near them that is most of what a drawing misses. Six coordinates and a complex gain per coil are
+told by far fewer readings than free moments are, and what they leave is so small that moments
+which are pulled to the coils so placed hold below a scan and beside it too.
 """
 
 from collections.abc import Callable, Sequence
@@ -63,7 +63,7 @@ class CoilPlacer:
         Parameters
         ----------
         corrected : sequence of Measurements
-            Measurements at their corrected poses, one a body and session.
+            Measurements at their corrected poses, one per body and session.
         weights : sequence of ndarray, shape (F, S)
             Weights of the readings.
 

@@ -79,7 +79,7 @@ def predict_held_out(
     Parameters
     ----------
     measurements : sequence of Measurements
-        Tool measurements, one a body and session.
+        Tool measurements, one per body and session.
     folds : sequence of ndarray, shape (F,)
         Fold of each frame, an array for each of the measurements.
     fit : callable

@@ -112,7 +112,7 @@ def optimise_positions(
     Parameters
     ----------
     corrected : sequence of Measurements
-        Measurements at their corrected poses, one a body and session.
+        Measurements at their corrected poses, one per body and session.
     weights : sequence of ndarray, shape (F, S)
         Weights of the readings.
     dipoles : DipoleSites
@@ -154,7 +154,7 @@ def fit_layout(
     Parameters
     ----------
     measurements : sequence of Measurements
-        Tool measurements with poses, one a body and session.
+        Tool measurements with poses, one per body and session.
     layout : Layout
         The layout.
     damping : float

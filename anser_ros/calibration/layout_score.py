@@ -106,7 +106,7 @@ class LayoutScorer:
     Parameters
     ----------
     measurements : sequence of Measurements
-        Tool measurements with poses, one a body and session.
+        Tool measurements with poses, one per body and session.
     folds : sequence of ndarray, shape (F,)
         Fold of each frame.
     reference : DipoleSites

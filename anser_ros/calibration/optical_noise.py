@@ -42,7 +42,7 @@ class OpticalNoise:
 
     @property
     def relative_uncertainty(self) -> float:
-        """Return the relative standard deviation of both figures: three components a pose."""
+        """Return the relative standard deviation of both figures: three components per pose."""
         return float(1.0 / np.sqrt(max(6.0 * self.poses, 1.0)))
 
 
@@ -76,7 +76,7 @@ def estimate_noise(
     Parameters
     ----------
     steps, variances : sequence of ndarray, shape (F, 6)
-        Steps of the poses (m, rad) and what is uncertain in them, one a body and session.
+        Steps of the poses (m, rad) and what is uncertain in them, one per body and session.
     shares : sequence of ndarray, shape (F,)
         Of `interpolation_share`.
     kept : sequence of ndarray of bool, shape (F,)

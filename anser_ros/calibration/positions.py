@@ -104,7 +104,7 @@ class PositionFitter:
     Parameters
     ----------
     measurements : sequence of Measurements
-        Measurements at their corrected poses, one a body and session.
+        Measurements at their corrected poses, one per body and session.
     weights : sequence of ndarray, shape (F, S)
         Weights of the readings in [0, 1].
     dipoles : DipoleSites

@@ -1,7 +1,7 @@
 """Takes the drawn board as a prior: its field as the moments of any set of dipoles.
 
 The damping pulls a fit towards these moments instead of zero, so that what the data do not
-determine stays as drawn. The drawing is first scaled by one complex gain an emitter, because the
+determine stays as drawn. The drawing is first scaled by one complex gain per emitter, because the
 scale of the drive current, and most of the effect of a large metal sheet, is such a factor.
 """
 

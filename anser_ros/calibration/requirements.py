@@ -34,7 +34,7 @@ def check_measurements(
     Parameters
     ----------
     measurements : sequence of Measurements
-        Tool measurements, one a body and session.
+        Tool measurements, one per body and session.
     needed : int
         Number of readings an emitter that the dipoles need.
     field_alone : bool
@@ -43,7 +43,7 @@ def check_measurements(
     Returns
     -------
     int
-        The number of readings an emitter.
+        The number of readings per emitter.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def check_kept(
     Parameters
     ----------
     measurements, kept : sequence of Measurements
-        Tool measurements, one a body and session, before and after frames were left out.
+        Tool measurements, one per body and session, before and after frames were left out.
     needed : int
         Number of readings an emitter that the dipoles need.
 
@@ -135,7 +135,7 @@ def check_agreement(
     Parameters
     ----------
     measurements : sequence of Measurements
-        Tool measurements, one a body and session.
+        Tool measurements, one per body and session.
     names : sequence of str
         Name of the session of each.
     joint : MomentFit

@@ -60,7 +60,7 @@ class Scan:
     Attributes
     ----------
     measurements : tuple of Measurements
-        The frames that are used, one a body and session.
+        The frames that are used, one per body and session.
     accuracy : Accuracy
         Noise and jitter, estimated where they were.
     corrections : tuple of EffectRecord

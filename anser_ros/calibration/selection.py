@@ -58,7 +58,7 @@ LOCAL_COUNT = 10
 """Dipoles along a side of the layer that every region of a local model has."""
 LOCAL_READINGS = 24
 """Readings a dipole that local models need: four regions that overlap by half have about six
-readings a dipole each then."""
+readings per dipole each then."""
 MOVING_READINGS = 12
 """Fewest readings for each moved dipole: three times its three coordinates and its moment."""
 LEAST_GAIN = 0.08
@@ -112,7 +112,7 @@ def choose_layout(
     Parameters
     ----------
     measurements : sequence of Measurements
-        Tool measurements with poses, one a body and session.
+        Tool measurements with poses, one per body and session.
     folds : sequence of ndarray, shape (F,)
         Fold of each frame.
     generator : Generator

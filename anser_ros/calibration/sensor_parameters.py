@@ -234,7 +234,7 @@ class SensorParameters:
         return out, common
 
     def of(self, kind: str, body: str, values: Array) -> Array | None:
-        """Return a kind's parameters of a body, a row a sensor for a population; None where
+        """Return a kind's parameters of a body, a row per sensor for a population; None where
         fixed.
         """
         if (kind, body) not in self.slices:

@@ -113,7 +113,7 @@ class SensorSurveyor:
     Parameters
     ----------
     measurements : sequence of Measurements
-        Tool measurements, one a body and session; frames without a pose are left as they are.
+        Tool measurements, one per body and session; frames without a pose are left as they are.
     kinds : sequence of str
         What is estimated, of `sensor_parameters.KINDS`.
     generator : Generator

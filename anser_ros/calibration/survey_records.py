@@ -240,7 +240,7 @@ def tellings(
     result : SurveyResult
         The survey.
     measurements : sequence of Measurements
-        What was surveyed, one a body and session.
+        What was surveyed, one per body and session.
     """
     spans = [
         span

@@ -1,4 +1,4 @@
-"""Runs the console script `anser` with one verb a command; each is also a ROS executable.
+"""Runs the console script `anser` with one verb per command; each is also a ROS executable.
 
 A node is started by exec of its own module, so that this layer never loads rclpy; an offline
 command is imported only when it is the one asked for. `commands` lists both.

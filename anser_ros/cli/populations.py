@@ -29,7 +29,7 @@ def populations(records: Sequence[EffectRecord]) -> list[EffectRecord]:
 def population_table(
     records: Sequence[EffectRecord],
 ) -> tuple[list[str], list[list[str]]]:
-    """Return the head and the rows, one a channel, of the table of all populations.
+    """Return the head and the rows, one per channel, of the table of all populations.
 
     Of gains, the difference from one is shown.
     """

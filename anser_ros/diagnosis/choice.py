@@ -17,7 +17,7 @@ def taken_from_others(fit: Fit) -> float:
     """Return what a new fluctuation's freedom takes off that is another effect's, unexplained so
     far.
 
-    Along each of its columns a frame loses one value's share of whatever stays.
+    Along each of its columns per frame loses one value's share of whatever stays.
     """
     return FROM_OTHERS * fit.newest.effect.freedom(fit.newest) * max(misfit(fit) - 1.0, 0.0)
 

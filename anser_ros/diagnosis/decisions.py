@@ -131,7 +131,7 @@ CLEAR = 6.0
 """Standard deviations of the noise's power from which a remainder counts. A normal variable passes
 it once in 1e9, the power of normal noise in one cell of 400 frames once in 5e7. Where the median
 cell is taken its spread is a quarter larger, and a normal variable passes once in 1e6. Noise that
-depends on its neighbours passes oftener. One test an effect is made."""
+depends on its neighbours passes oftener. One test per effect is made."""
 WRONG_BY = 1.3
 """Variance over the noise's up to which a field model may be wrong, whatever it says: of a board
 beyond what was scanned. It is not held against an effect on everything."""

@@ -147,7 +147,7 @@ def _power(state: State) -> float:
 
 
 def _thinned(problem: Problem, frames: int) -> Problem:
-    """About so many frames a tool."""
+    """About so many frames per tool."""
     most = max((tool.time.size for tool in problem.tools), default=0)
     step = max(1, round(most / frames))
     keep = [np.arange(0, tool.time.size, step) for tool in problem.tools]

@@ -99,7 +99,7 @@ class Screened:
     start: Problem
 
     def training(self, frames: int) -> Problem:
-        """Return about so many frames a tool of the blocks to choose and fit effects on."""
+        """Return about so many frames per tool of the blocks to choose and fit effects on."""
         return _thinned(self.start.in_blocks(train_blocks()), frames)
 
 
@@ -192,7 +192,7 @@ def _without_dead(problem: Problem, known: Sequence[Term]) -> Problem:
 
 
 def _thinned(problem: Problem, frames: int) -> Problem:
-    """About so many frames a tool."""
+    """About so many frames per tool."""
     most = max((tool.time.size for tool in problem.tools), default=0)
     step = max(1, round(most / frames))
     keep = [np.arange(0, tool.time.size, step) for tool in problem.tools]

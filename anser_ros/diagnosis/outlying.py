@@ -37,8 +37,8 @@ that are hit by chance each has a ninth."""
 
 
 def find_outliers(state: State) -> tuple[Mask, ...]:
-    """Return the mask (F, S) of outlying readings, one a tool; a frame that stands out is out as a
-    whole.
+    """Return the mask (F, S) of outlying readings, one per tool; a frame that stands out is out as
+    a whole.
     """
     masks = []
     moves = any(term.effect.family is Family.FLUCTUATION for term in state.terms)

@@ -45,14 +45,14 @@ class Problem:
     ----------
     tools : tuple of Measurements
         Frames with a pose only.
-    blocks : tuple of ndarray of int, one a tool, shape (F,)
+    blocks : tuple of ndarray of int, one per tool, shape (F,)
         Number of the time block that each frame is in.
     references : References or None
     reference_blocks : ndarray of int, shape (B,)
     fields : Fields
     apparatus : Apparatus
     spread : Spread
-    good : tuple of ndarray of bool, one a tool, shape (F, S)
+    good : tuple of ndarray of bool, one per tool, shape (F, S)
         Values that take part (valid, and no outliers).
     """
 

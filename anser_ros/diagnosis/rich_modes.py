@@ -136,7 +136,7 @@ def _information(state: State, unit: Unit, count: int) -> Array:
 
 
 def _both_phases(state: State, unit: Unit, modes: Array) -> list[Array | None]:
-    """Whitened columns of modes in phase and in quadrature, one array a part."""
+    """Whitened columns of modes in phase and in quadrature, one array per part."""
     out: list[Array | None] = []
     for part in state.parts:
         flux = unit(part.view, modes)

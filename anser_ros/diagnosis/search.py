@@ -84,7 +84,7 @@ class Search:
     fit : Fit
         The effects that were kept, fitted on the problem that was searched.
     rounds : list of list of Candidate
-        All candidates' scores, a list a round.
+        All candidates' scores, a list per round.
     removed : list of Term
         Effects that others explained away.
     rivals : dict

@@ -1,8 +1,8 @@
 """Lets another effect's parameters change from one frame to the next.
 
-A parameter that steps, swings or rattles has no curve to fit. It is a random number a frame, with
-a spread found from the data, and what it does to a frame is left open along the columns of the
-effect that is constant otherwise, as the optical jitter is. A fluctuation costs one spread a
+A parameter that steps, swings or rattles has no curve to fit. It is a random number per frame,
+with a spread found from the data, and what it does to a frame is left open along the columns of
+the effect that is constant otherwise, as the optical jitter is. A fluctuation costs one spread per
 column however it goes, explains nothing but what those columns can, and hides nothing else.
 """
 

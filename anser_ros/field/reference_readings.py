@@ -37,7 +37,7 @@ class ReferenceReadings:
 
 
 def readings_document(readings: ReferenceReadings) -> dict[str, Any]:
-    """Return readings as plain lists and mappings, a row a sensor."""
+    """Return readings as plain lists and mappings, a row per sensor."""
     parts = np.stack([readings.flux.real, readings.flux.imag], axis=2).reshape(
         len(readings.name), -1
     )

@@ -83,7 +83,7 @@ def write_plate(data: NavionData, emitter: Emitter, path: Path) -> None:
         for k, place in enumerate(grid)
         for spec in _axes(PLATE, f'{PLATE}/s{k}', 3 * k, place)
     ]
-    # (P, K, S, 3) to a row a sensor and axis, (P, 3 S, K)
+    # (P, K, S, 3) to a row per sensor and axis, (P, 3 S, K)
     flux = data.coils.field_t.transpose(0, 2, 3, 1).reshape(heights.size, len(sensors), -1)
     _write(path, emitter, sensors, flux, heights[:, None] * np.array([0.0, 0.0, 1.0]))
 

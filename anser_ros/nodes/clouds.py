@@ -21,7 +21,7 @@ class FluxCloud:
         Parameters
         ----------
         points : FluxPoints
-            A row a sensor.
+            A row per sensor.
         stamp_ns : int
             Middle of the window, ns of the ROS clock.
         """

@@ -28,7 +28,7 @@ class HandedFlux:
     ----------
     stamp_ns : middle of the window, ns of the ROS clock
     frame_id : the setup's frame
-    points : a row a sensor, in single precision as messages are
+    points : a row per sensor, in single precision as messages are
     """
 
     stamp_ns: int

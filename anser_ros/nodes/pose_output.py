@@ -1,4 +1,4 @@
-"""Publishes poses: one pair of topics a sensor or body, and /tf where it is installed."""
+"""Publishes poses: one pair of topics per sensor or body, and /tf where it is installed."""
 
 import math
 import time

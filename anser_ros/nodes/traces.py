@@ -90,8 +90,8 @@ class PoseTrace:
     Attributes
     ----------
     target : what is tracked
-    stamp_s, sigma_m, latency_s : a value a pose; latency from the middle of the window
-    position, axis : three values a pose
+    stamp_s, sigma_m, latency_s : a value per pose; latency from the middle of the window
+    position, axis : three values per pose
     """
 
     target: Target

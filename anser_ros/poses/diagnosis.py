@@ -314,7 +314,7 @@ def turn_jitter(reference: PoseSequence) -> float:
     """Return the jitter of a reference's orientation, rad a coordinate, from its quietest
     stretches.
 
-    The squared second difference of noise has six times its variance a coordinate; the lowest
+    The squared second difference of noise has six times its variance per coordinate; the lowest
     quarter of that with three coordinates is at 1.21.
     """
     if reference.size < FEWEST_TURNS:

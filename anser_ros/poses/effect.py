@@ -193,7 +193,7 @@ class PoseSight:
     session : PoseSession
     setting : PoseSetting
     sensors : tuple of Sensing
-    blocks : tuple of ndarray of int, one a sensor
+    blocks : tuple of ndarray of int, one per sensor
         Block of time of each pose.
     """
 

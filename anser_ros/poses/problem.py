@@ -61,13 +61,13 @@ class PoseProblem:
     path : OpticalPath
         Of the reference.
     setting : PoseSetting
-    blocks : tuple of ndarray of int, one a sensor, shape (n,)
+    blocks : tuple of ndarray of int, one per sensor, shape (n,)
         Number of the time block that each pose is in.
-    places : tuple of ndarray of int, one a sensor, shape (n,)
+    places : tuple of ndarray of int, one per sensor, shape (n,)
         Number of the block of space.
-    weight : tuple of ndarray, one a sensor, shape (n,)
+    weight : tuple of ndarray, one per sensor, shape (n,)
         Square root of what a pose counts; zero leaves it out.
-    noise : tuple of PoseNoise, one a sensor
+    noise : tuple of PoseNoise, one per sensor
     """
 
     sensors: tuple[PoseSequence, ...]

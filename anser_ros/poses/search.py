@@ -69,7 +69,7 @@ class PoseSearch:
     ----------
     fit : PoseFit
         The two frames and all effects in force.
-    evidence : tuple of PoseEvidence or None, one a term
+    evidence : tuple of PoseEvidence or None, one per term
         None for the frames.
     refused : tuple of (str, str)
         Candidates that promised something, and why they are not named.

@@ -1,9 +1,9 @@
 """Makes the field model follow metal that moves, by reference coils.
 
 The calibrated model is kept; what is refitted is the change since a distortion-free baseline. All
-emitters illuminate the same metal, so one polarisability a source explains all of them, and a few
-dozen readings determine the change of the whole field. `docs/refit.md` tells the method with its
-figures, and what was tried and left.
+emitters illuminate the same metal, so one polarisability per source explains all of them, and a
+few dozen readings determine the change of the whole field. `docs/refit.md` tells the method with
+its figures, and what was tried and left.
 """
 
 import math

@@ -47,7 +47,7 @@ class RestingMetal:
 
     Attributes
     ----------
-    flux : tuple of ndarray, one a tool, shape (F, S, K), complex
+    flux : tuple of ndarray, one per tool, shape (F, S, K), complex
         In the frames that a scan holds, T.
     sigma_t : float
         Its standard deviation, root mean square of a phasor component, T.

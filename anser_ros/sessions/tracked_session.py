@@ -23,7 +23,7 @@ class TrackedSession:
     Attributes
     ----------
     estimates : dict of str to tuple of PoseEstimate
-        Of every sensor and body by its name, one a frame, in the order of the stamps.
+        Of every sensor and body by its name, one per frame, in the order of the stamps.
     seconds_per_frame : float
         Mean wall time that a frame took, the refit included.
     refit : RefitSummary or None

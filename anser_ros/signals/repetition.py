@@ -28,11 +28,11 @@ EVIDENCE_BITS = 80.0
 """Bits of surprise that a run must hold to count as repeated. A unit of 42 columns at 40 kS/s with
 two seconds of history compares 2^37 pairs of runs a second and 2^65 in ten years, so that one
 false alarm in ten years has a probability of 2^-15 even if all tones returned at every lag. Fewer
-bits give false alarms, more need longer runs: a column of 3 bits a sample needs 27 samples for
+bits give false alarms, more need longer runs: a column of 3 bits per sample needs 27 samples for
 80."""
 LONGEST_RUN_S = 0.025
 """Longest run, s, that a column may need. One that needs more has less than 80 bits of noise in it
-(0.08 bits a sample at 40 kS/s, 0.06 codes rms) and is noiseless; a longer one would let whole
+(0.08 bits per sample at 40 kS/s, 0.06 codes rms) and is noiseless; a longer one would let whole
 windows of repeated samples pass before they are found."""
 HISTORY_S = 2.5
 """How far back a repetition is found, s. Buffers that a fault of a driver or a cable can repeat

@@ -83,7 +83,7 @@ def search(  # type: ignore[no-untyped-def]
         row, at = first + i, position + i
         if followed:
             followed = _follow(history, row, at, needed, lag, run, until, age)
-        # Apart from the search, this takes several columns a step.
+        # Apart from the search, this takes several columns per step.
         for c in range(columns):
             fingerprint[c] = np.uint32(fingerprint[c] * FACTOR + np.uint32(history[row, c]))
         for c in range(columns):

@@ -42,7 +42,7 @@ class FluxPoints:
     channel, flags : ndarray, shape (S,)
         Channel number and flag bits (`SATURATED`, `STALE`, `DROPPED`).
     flux : ndarray, shape (S, K), complex
-        T, a column an emitter.
+        T, a column per emitter.
     position, axis : ndarray, shape (S, 3)
         m and unit vector, frame fg; NaN for sensors that move.
     """

@@ -29,7 +29,7 @@ class PoseTimeOffset(PoseEffect):
     role = Role.CLOCK
 
     def sites(self, setting: PoseSetting) -> Sequence[Term]:
-        """Try one offset for all sensors, and one a sensor."""
+        """Try one offset for all sensors, and one per sensor."""
         own = [Term(self, {'sensor': s}, np.zeros(1)) for s in setting.sensors]
         return [Term(self, {}, np.zeros(1)), *(own if len(own) > 1 else [])]
 

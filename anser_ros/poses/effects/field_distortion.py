@@ -115,7 +115,7 @@ class FieldDistortion(PoseEffect):
         return self._derivative(term, position) @ term.theta
 
     def shift_and_variance(self, term: Term, position: Array, sigma: Array) -> tuple[Array, Array]:
-        """Return what is added to positions (n, 3), m, and its variance a coordinate (n,), m^2.
+        """Return what is added to positions (n, 3), m, and its variance per coordinate (n,), m^2.
 
         The parameters' standard deviations ``sigma``, mm, are taken for independent.
         """
