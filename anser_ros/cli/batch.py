@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # Dask is loaded where it is used: the help is there without 
     from distributed import Client
 
 CONNECT_S = 10.0
-"""How long a scheduler is waited for, s."""
+"""How long a scheduler is waited for, s: one that runs answers at once."""
 WORKERS = {
     # Dask has glibc give freed memory back at once, and a thread look every 10 ms at what the
     # others do: with arrays of a few hundred kB that doubles and triples the time of a session.

@@ -40,7 +40,7 @@ METAL_RADIUS_M = 0.1
 # them near metal, and nobody would see the error that the refit avoids.
 FROZEN_TRACKER = {'gate': NO_GATE, 'adaptive': False}
 POLL_S = 0.05
-"""Time from one look at the processes to the next, s."""
+"""Time from one look at the processes to the next, s: an ended node is noticed in it."""
 # The file that the monitor writes.
 DATA = 'demo.npz'
 SHARED_TOPICS = ('setup', 'tool/flux', 'reference/flux')

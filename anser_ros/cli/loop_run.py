@@ -24,7 +24,7 @@ from anser_ros.wire.config_folder import config_path, read_config
 from anser_ros.wire.setup import dump_setup, parse_setup
 
 POLL_S = 0.2
-"""Time from one look at the processes to the next, s."""
+"""Time from one look at the processes to the next, s; a run takes tens of seconds."""
 RATE_HZ = 25.0
 """Rate of the fluxes, Hz; low enough for all processes together on two cores."""
 AFTER, BEFORE, UNGATED = '/anser', '/anser/before', '/anser/ungated'

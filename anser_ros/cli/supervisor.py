@@ -18,9 +18,9 @@ _PR_SET_PDEATHSIG = 1
 _TERMINATE_S = 1.5
 """Time for a process to end after SIGTERM, s, enough to close a bag; then it is killed."""
 _KILL_S = 1.0
-"""Time for the system to end a killed process, s."""
+"""Time for the system to end a killed process, s: only one that waits for a disk takes longer."""
 _TAIL_LINES = 8
-"""Last lines of a log that an error message shows."""
+"""Last lines of a log that an error message shows: a traceback's last calls and its reason."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ SCHEMA = 'anser_warm_up/1'
 POLL_S = 0.2
 """Time from one look at the processes to the next, s: how late their end is noticed."""
 SAY_S = 5.0
-"""Time from one line about the progress to the next, s."""
+"""Time from one line about the progress to the next, s; all takes about a minute."""
 PACKAGE = 'anser_ros.'
 
 

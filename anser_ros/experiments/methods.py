@@ -19,7 +19,7 @@ from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import NOMINAL, model_for
 
 ARTICLE_COUNT = 12
-"""Dipoles along a side of the article's layer."""
+"""Dipoles along a side of the article's layer, as it states."""
 OUTLINE = 1.0
 """Size of the article's layer as a multiple of the coils' outline."""
 

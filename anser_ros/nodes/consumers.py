@@ -19,7 +19,7 @@ REPLY_TIMEOUT_S = 2.0
 # A listener may be compiling its kernels.
 ATTEMPTS = 30
 POLL_S = 0.1
-"""How often a wait looks whether it was given up, s."""
+"""How often a wait looks whether it was given up, s: a Ctrl-C takes so long."""
 # How often the graph is asked for new listeners, in messages.
 REFRESH_EVERY = 50
 

@@ -12,7 +12,7 @@ from anser_ros.nodes import qos
 
 NAME = 'anser_doctor'
 SLICE_S = 0.1
-"""Longest time that one message is waited for, s."""
+"""Longest time that one message is waited for, s: the look ends that much late at most."""
 
 
 def main(seconds: float) -> None:

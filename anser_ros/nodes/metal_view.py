@@ -19,7 +19,7 @@ MOST_SHOWN = 400
 CENTROID_M = 0.03
 """Diameter of the ball that marks the centroid, m: large enough to be seen among the sources."""
 VIEW_PERIOD_S = 0.2
-"""How often the marker is renewed."""
+"""Time, s, from one marker to the next: eyes follow it, and it costs a message of kilobytes."""
 
 
 class MetalView:

@@ -13,7 +13,7 @@ from anser_ros.stamps import SECOND_NS
 
 NAME = 'anser_pose_look'
 SLICE_S = 0.1
-"""Longest time that one message is waited for, s."""
+"""Longest time that one message is waited for, s: the look ends that much late at most."""
 FIRST_S = 10.0
 """Least time, s, that the first pose is waited for: a graph takes seconds to be discovered."""
 

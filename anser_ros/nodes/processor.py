@@ -4,7 +4,7 @@ import os
 import time
 
 LEAST_S = 1.0
-"""Least time, s, over which shares are taken."""
+"""Least time, s, over which shares are taken: the system counts in ticks of 10 ms."""
 
 
 class Processor:

@@ -31,9 +31,9 @@ STREAM = QoSProfile(
 SILENT_S = 3.5
 """Time, s, after which a node that says nothing is said to be silent; it speaks once a second."""
 MOST_MARKS = 20
-"""Moments that are marked in the curves."""
+"""Moments that are marked in the curves: more words than these cover the curves."""
 MOST_METAL = 400
-"""Balls of metal that are drawn."""
+"""Balls of metal that are drawn; all are sent to every page whenever they change."""
 MOST_TOLD = 4096
 """Names in diagnostics of which what was said is kept: several lines for each of 1000 sensors."""
 COIL_M = 0.07

@@ -33,7 +33,8 @@ GOOD_ENOUGH = 0.05
 """Relative rms misfit of the nearest cloud, whose sources know nothing of each other, up to which
 the model's own dipoles are used: that of the layer that would be added."""
 SHALLOW = (12, 1.3, 0.15)
-"""Lattice near the board, as `DEEP` below describes it."""
+"""Lattice near the board, as `DEEP` below describes it. The two have 193 dipoles, few enough for a
+tracker to sum in every solve."""
 DEEP = (7, 2.5, 1.0)
 """Dipoles along a side, half size and depth of a lattice, the last two in halves of the board."""
 SAMPLES = (12, 7)

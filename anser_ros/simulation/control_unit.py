@@ -36,7 +36,7 @@ from anser_ros.wire.records import (
 )
 
 TICK_HZ = 1e6
-"""Rate of the device's timestamp counter, Hz."""
+"""Rate of the device's timestamp counter, Hz: microseconds, as usual in microcontrollers."""
 BLOCK_SAMPLES = 40
 """Sampling instants a block, unless a setting says another: 1 ms at the usual rate."""
 _COMMANDS = (Identify, Start, Stop, SetFrequencies)

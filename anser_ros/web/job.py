@@ -19,9 +19,9 @@ SHARE = re.compile(r'(\d+)%')
 KEPT_LINES = 20
 """Lines of what a command says that are kept, for the last ones say why it failed."""
 LONGEST_LINE = 65_536
-"""Bytes of a line that are taken as one."""
+"""Bytes of a line that are taken as one, which bounds the memory of a line without an end."""
 PATIENCE_S = 3.0
-"""Time for a command to end when it is told to, s."""
+"""Time for a command to end when it is told to, s; then it is killed."""
 
 
 class Job:

@@ -20,7 +20,7 @@ SETTLING_S = 2.0
 """Time, s, after a change of the model that the figures after it leave out: warm starts and
 averages of before have their end in it."""
 MOST_UNDONE = 20
-"""Changes of the model that can be undone."""
+"""Changes of the model that can be undone, which bounds what is kept of a long day."""
 
 
 class Chain(Protocol):

@@ -25,7 +25,7 @@ PATIENCE_S = 20.0
 """Time that a page may be silent, s, before it is taken for gone; it is loaded anew when it comes
 back. Shorter, and a browser that is busy drawing loses its page."""
 END_S = 2.0
-"""Time that open connections have at the end, s."""
+"""Time that open connections have at the end, s: a page that hangs must not hold the node."""
 SANDBOX = "sandbox; default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 """What a report may do: show its own pictures."""
 

@@ -18,7 +18,7 @@ _READ_TIMEOUT_S = 0.05
 _WRITE_TIMEOUT_S = 0.2
 """Longest time that a write may take, s; commands are short, so that a longer one is a fault."""
 _READ_BYTES = 1 << 16
-"""Largest number of bytes of one read."""
+"""Largest number of bytes of one read: more than a line of 12 Mbaud brings in 50 ms."""
 OPEN_FAILURES = {
     errno.EAGAIN: 'another program uses it',
     errno.EBUSY: 'another program uses it',
