@@ -14,10 +14,12 @@ from anser_ros.errors import ParameterError
 from anser_ros.nodes import node as base
 from anser_ros.nodes import parameters
 from anser_ros.nodes.node import AnserNode
+from anser_ros.settings import VALUES
 from anser_ros.wire.setup import parse_setup, topic_of
 
 CONFIG = Path(__file__).resolve().parents[1] / 'config'
 DOCUMENTS = sorted(CONFIG.glob('*.yaml'))
+NODES_ROOM = CONFIG.parent / 'anser_ros' / 'nodes'
 
 
 def is_parameter_file(document):
@@ -75,6 +77,17 @@ def test_the_main_file_names_every_parameter_of_every_node():
     for name in NODES:
         section = document[f'/**/{name}']['ros__parameters']
         assert set(section) == set(parameters.types(node_class(name).PARAMETERS)), name
+
+
+def test_every_parameter_is_read():
+    """A parameter that nothing asks for would promise what is not done; the names of
+    `anser_ros.settings` are read together, by `stated_by`.
+    """
+    trees = [ast.parse(path.read_text()) for path in NODES_ROOM.glob('*.py')]
+    read = {n.attr for tree in trees for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
+    tables = {name: set(node_class(name).PARAMETERS.__dataclass_fields__) for name in NODES}
+    unread = {name: names - read - set(VALUES) for name, names in tables.items()}
+    assert not {name: sorted(names) for name, names in unread.items() if names}
 
 
 def test_every_node_has_the_name_of_its_module():
