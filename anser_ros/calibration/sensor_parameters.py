@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.field.measurements import Measurements
-from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
+from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable, clusters_of
 from anser_ros.physics.tangent import tangents, tilted
 
@@ -104,17 +104,6 @@ class Survey:
         return replace(out, track=track, position=position, rotation=rotation, has_pose=seen)
 
 
-def is_followed(measurements: Measurements) -> bool:
-    """Return whether the optical tracker followed the body's movement, so that clocks can be told.
-
-    A recording of a pose at each point where the tool rested says nothing of its clock.
-    """
-    track = measurements.track
-    if track is None or track.time.size < 2:
-        return False
-    return float(np.median(np.diff(track.time))) <= LONGEST_GAP_S
-
-
 def has_turned(measurements: Measurements) -> bool:
     """Return whether a body turned about two axes at least by enough to tell its lever arm.
 
@@ -151,7 +140,7 @@ class SensorParameters:
     """
 
     def __init__(self, measurements: Sequence[Measurements], kinds: Sequence[str]) -> None:
-        told = set(kinds) if all(is_followed(m) for m in measurements) else {*kinds} - {*CLOCKS}
+        told = set(kinds) if all(m.is_followed for m in measurements) else {*kinds} - {*CLOCKS}
         if not all(has_turned(m) for m in measurements):
             told -= {'lever_arm'}
         known = (*KINDS, *EXTRA_KINDS)

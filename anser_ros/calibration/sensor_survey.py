@@ -46,7 +46,6 @@ from anser_ros.calibration.sensor_parameters import (
     PRIOR,
     SensorParameters,
     Survey,
-    is_followed,
 )
 from anser_ros.calibration.survey_result import SurveyResult
 from anser_ros.field.measurements import Measurements
@@ -329,7 +328,7 @@ class SensorSurveyor:
             good = seen & tool.known & ~bad
             tool.steady = tool.known
             # Poses that are seconds apart show each place once: what is missed there is no motion.
-            if watch and is_followed(tool.measured):
+            if watch and tool.measured.is_followed:
                 moving = unsteady_tool(at.part.time, at.part.position, frame_power, good)
                 tool.steady = tool.known & ~moving
             sound = tool.steady & ~bad

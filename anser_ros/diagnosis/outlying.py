@@ -28,6 +28,11 @@ directions are left in: the optical jitter along them is larger than the noise a
 pose to pose, so only a glitch stands out so far. Smaller takes jitter for glitches, larger keeps
 glitches in the fit. No more is known of its choice than that thresholds of the diagnosis were
 chosen on seeds below 100 (`docs/log.md`)."""
+PLACE_RATIO = 40.0
+"""The same for readings and frames of a body that rested at each place for seconds: its neighbours
+in time are centimetres away, and what the field's model misses differs between them. Over the
+middle of a simulated board single readings of an older model had 6 to 18; a contact that fails
+has thousands. Smaller takes a model's errors for loose contacts."""
 WHOLE = 0.5
 """Share of a frame's readings, and of frames that lost any, from which whole frames are out: more
 bad than good, so that what is left of the frame is not to be believed either."""
@@ -42,7 +47,9 @@ def find_outliers(state: State) -> tuple[Mask, ...]:
     """
     masks = []
     moves = any(term.effect.family is Family.FLUCTUATION for term in state.terms)
-    for part, good in zip(state.parts, state.problem.good, strict=False):
+    for part, tool, good in zip(
+        state.parts, state.problem.tools, state.problem.good, strict=False
+    ):
         emitters = state.problem.fields.omega.size
         # The residual along the pose's own directions is left in: an optical glitch shows there.
         size = (part.residual * part.whitener.weight) ** 2
@@ -52,8 +59,11 @@ def find_outliers(state: State) -> tuple[Mask, ...]:
         frames = np.where(good, readings, 0.0).sum(axis=1) / count
         jumps = np.where(good, _by_reading(size, good.shape[1], emitters), 0.0).sum(axis=1) / count
         values = _values(white, good.shape[1], emitters)
-        bad = _stands_out(readings, _ratio(READING_RATIO, values))
-        bad |= _stands_out(frames[:, None], _ratio(FRAME_RATIO, values * good.shape[1]))
+        of_reading = of_frame = PLACE_RATIO
+        if tool.track is None or tool.is_followed:
+            of_reading = _ratio(READING_RATIO, values)
+            of_frame = _ratio(FRAME_RATIO, values * good.shape[1])
+        bad = _stands_out(readings, of_reading) | _stands_out(frames[:, None], of_frame)
         if not moves:
             bad |= _stands_out(jumps[:, None], JUMP_RATIO)
         masks.append(bad & good)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.physics.pose_track import PoseTrack
+from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 from anser_ros.physics.sensor import SensorTable
 
 Array = NDArray[np.float64]
@@ -55,6 +55,17 @@ class Measurements:
     def usable(self) -> NDArray[np.bool_]:
         """Return the mask (F, S) of the values that have a pose and are valid."""
         return np.asarray(self.valid & self.has_pose[:, None])
+
+    @property
+    def is_followed(self) -> bool:
+        """Return whether the optical tracker followed the body, so that clocks can be told.
+
+        A recording of a pose at each point where the tool rested says nothing of its clock, and
+        shows each place once.
+        """
+        if self.track is None or self.track.time.size < 2:
+            return False
+        return float(np.median(np.diff(self.track.time))) <= LONGEST_GAP_S
 
     def frames(self, rows: NDArray[np.generic] | slice) -> 'Measurements':
         """Return the measurements of the frames given by index, mask or slice."""
