@@ -30,7 +30,8 @@ RUN = 8
 DIFFERENCE = 1.128
 """Mean of the difference of two normal values over their deviation."""
 SMALLEST_SHARE = 0.02
-"""Least deviation that is taken, in the mean: sessions that happen to be alike are no law."""
+"""Least standard deviation that limits are made with, as a share of the mean: sessions that happen
+to be alike do not make limits that the next one must break."""
 
 
 @dataclass(frozen=True)

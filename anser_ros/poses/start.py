@@ -291,7 +291,10 @@ def _frames(problem: PoseProblem, offset: float, is_one_frame: bool) -> list[Arr
 
 
 def first_cost(fit: PoseFit) -> float:
-    """Return median distance (m), and angle as if at a hand's breadth, of a sensor in the mean."""
+    """Return the median misfit of a sensor's poses, m, on average over the sensors.
+
+    An angle counts as what it moves at a hand's breadth, 0.1 m.
+    """
     total = 0.0
     for part in fit.state.parts:
         far = np.linalg.norm(part.residual[:, :3], axis=1)
