@@ -1,7 +1,7 @@
 """Holds the numbers by which explanations are accepted, compared and named.
 
 Three currencies are compared here, and all count in the whitened sum of squares, where noise
-and the field model's own error, as large as they are expected, have a mean of one a value (noise
+and the field model's own error, as large as they are expected, have a mean of one per value (noise
 alone has less):
 
 - the *gain* of an effect, what it takes off the cross-validated sum of squares of blocks of time

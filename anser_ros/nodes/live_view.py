@@ -17,7 +17,7 @@ from anser_ros.wire.setup import Setup
 
 Array = NDArray[np.float64]
 HISTORY = 240
-"""Points of the curves over time: two minutes at half a second a point."""
+"""Points of the curves over time: two minutes at half a second per point."""
 FRESH_S = 0.6
 """Age, s, up to which a pose is shown: at the lowest rate of poses, 5 Hz, three are missing."""
 OPTICAL_KEPT = 400

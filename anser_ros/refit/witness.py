@@ -4,7 +4,7 @@ open.
 The references tell a hypothesis' metal with an error that is known (`refit.posterior`). A tool
 that wanders through the field sees this error: of the readings of its coils a pose takes six
 numbers, and all others are left. They enter a Kalman filter over the coordinates of the error
-(`refit.reduced`), one filter a hypothesis, after the poses of their frame have been given: the
+(`refit.reduced`), one filter per hypothesis, after the poses of their frame have been given: the
 next frame's poses are then independent of them, and nothing is counted twice.
 
 Metal moves slowly, and with it the error that the references make of it. So the error is a
