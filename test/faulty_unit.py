@@ -133,6 +133,11 @@ class Ring:
         self._columns = columns
         self.on = False
 
+    @property
+    def is_full(self) -> bool:
+        """Return whether as many blocks have passed as are to be repeated."""
+        return len(self._past) == self._past.maxlen
+
     def __call__(self, payload: Payload, _time_s: float) -> Payload:
         """Return the record with old samples while it is on."""
         if not isinstance(payload, SampleBlock):

@@ -42,7 +42,7 @@ def test_what_repeats_itself_is_stale_and_said(line):
     unit, listener = line
     unit.tamper = ring = Ring(100)
     count = len(listener.tool)
-    listener.until(lambda: len(listener.tool) > count + 15)
+    listener.until(lambda: len(listener.tool) > count + 15 and ring.is_full)
     ring.on = True
     told = 'anser/acquisition: the control unit repeats itself'
     listener.until(lambda: told in listener.seen)

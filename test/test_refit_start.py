@@ -102,7 +102,7 @@ def test_the_former_refit_goes_on_until_that_to_a_new_baseline_is_there(rig, hel
     assert rig.node._refit.current is not former
 
 
-def test_another_model_gives_no_poses_before_its_refit_is_made(rig, held, tmp_path):
+def give_another_model(rig, held, tmp_path):
     from rclpy.parameter import Parameter
 
     held.let.set()
@@ -114,6 +114,20 @@ def test_another_model_gives_no_poses_before_its_refit_is_made(rig, held, tmp_pa
     save_model(tmp_path / 'better.yaml', replace(model, moments=1.01 * model.moments))
     better = Parameter('model_file', value=str(tmp_path / 'better.yaml'))
     assert rig.node.set_parameters([better])[0].successful
+
+
+def test_a_frame_of_a_recording_waits_for_the_refit(rig, held, tmp_path):
+    give_another_model(rig, held, tmp_path)
+    let_go = threading.Timer(0.1, held.let.set)
+    let_go.start()
+    rig.say(0.0)
+    let_go.join()
+    assert rig.node.counters['refit_starts'] == 2 and rig.codes[-1] == 0
+
+
+def test_another_model_gives_no_poses_before_its_refit_is_made(rig, held, tmp_path):
+    rig.stamp_ns = time.time_ns()
+    give_another_model(rig, held, tmp_path)
     for _ in range(3):
         rig.say(0.0)
         assert rig.codes[-1] == code_of(REFERENCES_LOST)

@@ -39,6 +39,7 @@ from anser_ros.sessions.model_file import SNAPSHOT, as_saved, is_snapshot, save_
 from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.session import load_session, sensor_table
 from anser_ros.sessions.starting_model import is_nominal, model_of, starting_model
+from anser_ros.stamps import is_live
 from anser_ros.wire.setup import Setup, parse_setup
 
 
@@ -144,6 +145,8 @@ class FieldModelNode(AnserNode):
                 self.count(f'readings_{kind}', many)
             window.add(frame)
             self._heard_s = time.monotonic()
+            if self._refit.is_awaited and not is_live(stamp_ns, time.time_ns()):
+                self._refit.wait()  # a recording that is played is worked off whole
             self._take_refit()
             if self._place.look(frame, window) and not self._follows and self._model is not None:
                 self._serve(self._model, stamp_ns)

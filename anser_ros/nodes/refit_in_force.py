@@ -90,6 +90,11 @@ class RefitInForce:
         if self._baseline is not None:
             self.begin(self._baseline, is_awaited=True)
 
+    def wait(self) -> None:
+        """Wait until the refit is made that is being made, if there is one."""
+        if self._start is not None:
+            self._start.wait()
+
     def take(self) -> bool:
         """Put a refit in force that has been made meanwhile; return whether there was one.
 

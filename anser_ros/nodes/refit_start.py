@@ -96,6 +96,11 @@ class RefitStart:
         self._made, self.is_awaited = None, False
         return made.result()
 
+    def wait(self) -> None:
+        """Wait until the refit is made that is being made, if there is one."""
+        if self._made is not None:
+            wait([self._made])
+
     @property
     def is_making(self) -> bool:
         """Return whether a refit is being made, for which there is a baseline."""
