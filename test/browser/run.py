@@ -190,12 +190,13 @@ class Trial:
         opened.value.close()
         self._click('Load corrected model')
         page.get_by_text('the new model is in force').wait_for()
+        found['tracked_again_s'] = self._tracked_again_s()
         page.wait_for_timeout(1e3 * FIGURES_S)
         found['tables'] = self._tables()
         self._picture('')
         self._click('Undo')
         page.get_by_text('the model of before is in force again').wait_for()
-        page.wait_for_timeout(4e3)
+        found['tracked_again_after_undo_s'] = self._tracked_again_s()
         found['after_undo'] = page.locator('.bar .pill').inner_text()
         live = found['tables']['live, last 10 s']
         found['closed'] = _fell(live['tracked frames, %'][::-1]) or _fell(live['error, mm rms'])
@@ -204,6 +205,14 @@ class Trial:
         if args.calibrate:
             found['closed'] &= found['baseline'].startswith('baseline of')
         return found
+
+    def _tracked_again_s(self) -> float:
+        """Return how long no pose is given while the refit to another model is made, s."""
+        began_s = time.monotonic()
+        self.page.wait_for_timeout(2e3)  # the page shows the last two seconds
+        pill = self.page.locator('.bar .pill')
+        pill.filter(has_text=re.compile('^[1-9]')).wait_for(timeout=3e4)
+        return round(time.monotonic() - began_s, 1)
 
     def _click(self, name: str) -> None:
         self.page.get_by_role('button', name=name, exact=True).click()
