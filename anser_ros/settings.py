@@ -162,8 +162,9 @@ class RefitSettings:
         gain error of its own. A larger one lets a change of one emitter explain more of what
         metal does.
     min_references : int
-        Reference sensors in use below which the calibrated model is kept. Eight emitters give
-        eight complex readings per sensor; with fewer than four sensors the place of metal is open.
+        Usable reference sensors below which a model that follows them is not updated: its poses
+        are withheld after `references_age_s`. Eight emitters give eight complex readings per
+        sensor; with fewer than four sensors the place of metal is open.
     average_frames : int
         Most frames that readings are averaged over while they do not change. More make the refit
         quieter at rest; movement ends the average at once.
@@ -193,7 +194,7 @@ class RefitSettings:
         0.003, "deviation of an emitter's strength relative to its measured current", 0.0, 1.0
     )
     min_references: int = _value(
-        4, 'reference sensors below which the calibrated model is kept', 1, 10_000
+        4, 'usable reference sensors below which poses are withheld', 1, 10_000
     )
     average_frames: int = _value(
         5, 'most frames that unchanging readings are averaged over', 1, 10_000
