@@ -27,7 +27,12 @@ class RecordReader(Protocol):
     last_refusal: str
 
     def feed(self, data: bytes) -> list[Record]:
-        """Take bytes as they come and return the records that they complete."""
+        """Take bytes as they come and return the records that they complete.
+
+        It must not raise, whatever the bytes are: an exception ends the thread of the port.
+        What cannot be read is counted, and its reason kept in ``last_refusal``. A hello has passed
+        `records.check_hello` before it is returned.
+        """
 
     def reset(self) -> None:
         """Forget what belongs to the connection that has ended."""
