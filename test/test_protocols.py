@@ -3,6 +3,7 @@
 import json
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -101,6 +102,19 @@ def test_a_port_speaks_another_protocol(wire, port):
     assert port.send(SetFrequencies(TONES)) == 1  # which the unit does not have
     tag = port.send(Start())
     assert wire.read() == f'go {tag}\n'.encode()
+
+
+def test_a_reader_that_fails_closes_the_port_and_it_is_opened_again(wire, port, monkeypatch):
+    wire.write(line('done', 'a verb that no command has', 1))
+    assert wait(lambda: port.counters.reader_failures == 1)
+    assert wait(lambda: port.state is PortState.WAITING and port.counters.opens == 2)
+    monkeypatch.setattr('test_protocols.HELLO', replace(HELLO, channels=HELLO.channels[:1]))
+    wire.write(line('hello'))
+    assert wait(lambda: port.counters.reader_failures == 2)
+    assert wait(lambda: port.counters.opens == 3)
+    monkeypatch.undo()
+    wire.write(line('hello'))
+    assert receive(port, 1) == [HELLO]
 
 
 def test_the_stream_is_started_by_the_same_rules(wire, port):

@@ -20,7 +20,7 @@ import serial
 from serial.tools import list_ports
 
 from anser_ros.errors import PortError
-from anser_ros.wire.protocols import ANSER, SerialProtocol
+from anser_ros.wire.protocols import ANSER, SerialProtocol, records_of
 from anser_ros.wire.records import Hello, Payload, Record, SampleBlock, Stop
 from anser_ros.wire.serial_line import cause_of, close_line, open_line, receiver_of
 
@@ -59,6 +59,7 @@ class PortCounters:
     unplug: int = 0
     overrun_blocks: int = 0
     open_failures: int = 0
+    reader_failures: int = 0
     opens: int = 0
     received_bytes: int = 0
 
@@ -224,6 +225,9 @@ class ControlUnitPort:
             self._queue.put(Batch(time.monotonic_ns(), ()))
             try:
                 self._read(port)
+            except PortError as error:
+                self.counters.reader_failures += 1
+                self.state, self.reason = PortState.ABSENT, str(error)
             except (serial.SerialException, OSError, TypeError) as error:
                 # pyserial raises TypeError when the descriptor vanishes between two of its calls
                 if not self._stopping.is_set():
@@ -255,7 +259,7 @@ class ControlUnitPort:
                 last_byte = now
                 garbage_bytes += len(data)
                 self.counters.received_bytes += len(data)
-                records = reader.feed(data)
+                records = records_of(reader, data)
                 if records:
                     last_record, garbage_bytes = now, 0
                     self.state = PortState.RECEIVING
@@ -337,10 +341,10 @@ def find_port(
         end = time.monotonic() + listen_s
         try:
             while time.monotonic() < end:
-                records = reader.feed(port.read(port.in_waiting or 1))
+                records = records_of(reader, port.read(port.in_waiting or 1))
                 if any(isinstance(record.payload, Hello) for record in records):
                     return device
-        except (serial.SerialException, OSError):
+        except (serial.SerialException, OSError, PortError):
             continue
         finally:
             close_line(port)

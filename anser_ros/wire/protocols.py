@@ -10,9 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from anser_ros.errors import PortError
 from anser_ros.wire.frame_reader import FrameReader
 from anser_ros.wire.frames import encode
-from anser_ros.wire.records import Payload, Record
+from anser_ros.wire.records import Hello, Payload, Record, check_hello
 
 
 class RecordReader(Protocol):
@@ -29,9 +30,8 @@ class RecordReader(Protocol):
     def feed(self, data: bytes) -> list[Record]:
         """Take bytes as they come and return the records that they complete.
 
-        It must not raise, whatever the bytes are: an exception ends the thread of the port.
-        What cannot be read is counted, and its reason kept in ``last_refusal``. A hello has passed
-        `records.check_hello` before it is returned.
+        It must not raise, whatever the bytes are: an exception closes the port, which is opened
+        again. What cannot be read is counted, and its reason kept in ``last_refusal``.
         """
 
     def reset(self) -> None:
@@ -56,6 +56,25 @@ class SerialProtocol:
 
     make_reader: Callable[[], RecordReader]
     encode: Callable[[Payload, int], bytes]
+
+
+def records_of(reader: RecordReader, data: bytes) -> list[Record]:
+    """Return the records that a reader completes with these bytes.
+
+    Raises
+    ------
+    PortError
+        When the reader fails, or gives a hello that no receiver could use.
+    """
+    try:
+        records = reader.feed(data)
+        for record in records:
+            if isinstance(record.payload, Hello):
+                check_hello(record.payload)
+    except Exception as error:
+        words = ' '.join(str(error).split())
+        raise PortError(f'the frame reader failed: {type(error).__name__}: {words}') from error
+    return records
 
 
 ANSER = SerialProtocol(FrameReader, encode)
