@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from conftest import Process, spin_until
 
+from anser_ros.nodes.replay import name_played
 from anser_ros.wire import cdr
 from anser_ros.wire.bag import Salvage, iter_messages
 from anser_ros.wire.bag_writer import BagWriter, SessionWriter
@@ -177,6 +178,21 @@ def test_loop_in_another_namespace_ends_at_a_signal(start, listener, tmp_path):
     # A pass has the setup, ten frames and ten optical poses, and takes 36 ms.
     assert part <= 21
     assert 0 <= 10 * passes + part / 2 - len(listener.stamps) < 20 + 300 * took_s
+
+
+@pytest.mark.parametrize(
+    ('topic', 'home', 'name'),
+    [
+        ('/anser/tool/flux', '/anser/', 'tool/flux'),
+        ('/left/tool/flux', '/left/', 'tool/flux'),
+        ('/optical/tool_a/pose', '/anser/', '/here/tool_a/pose'),
+        ('/left/optical/tool_a/pose', '/left/', '/here/tool_a/pose'),
+        ('/camera/image', '/left/', '/camera/image'),
+        ('/tool/flux', '/', '/tool/flux'),
+    ],
+)
+def test_what_a_bag_holds_is_played_in_this_namespace(topic, home, name):
+    assert name_played(topic, home, '/here/') == name
 
 
 def test_a_cut_bag_is_played_as_far_as_it_reads(start, listener, tmp_path):

@@ -13,7 +13,8 @@ from anser_ros.errors import ParameterError
 from anser_ros.stamps import NANO
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
-from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup, dump_setup, topic_of
+from anser_ros.wire.pose_topics import optical_topic
+from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup, dump_setup
 
 Array = NDArray[np.float64]
 
@@ -111,7 +112,7 @@ def write_session(
                 fields, step, data = encode_flux(_points(specs, frame))
                 writer.write_flux(topic, stamp, fields, step, len(specs), data)
         for body, (_, position, quaternion) in tracks.items():
-            topic = f'/optical/{topic_of(body)}/pose'
+            topic = optical_topic(body)
             listed = zip(pose_stamps[body], position.tolist(), quaternion.tolist(), strict=True)
             for stamp, place, turn in listed:
                 writer.write_pose(topic, stamp, place, turn)

@@ -20,7 +20,7 @@ from anser_ros.sessions.starting_model import model_for
 from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import OK
 from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages
-from anser_ros.wire.pose_topics import ENDING, OPTICAL
+from anser_ros.wire.pose_topics import ENDING, OPTICAL, optical_topic
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
 Array = NDArray[np.float64]
@@ -153,7 +153,7 @@ def _recorded(path: str | os.PathLike[str], wanted: PoseSource) -> AssessedPoses
                        'are tracked')  # fmt: skip
     named = chosen[: -len(ENDING)].lstrip('/') if chosen.endswith(ENDING) else chosen
     name = next((b for b in bodies if named.endswith(topic_of(b))), named)
-    reference = f'{OPTICAL}{topic_of(name)}{ENDING}'
+    reference = optical_topic(name)
     session = read_pose_session(
         path, {name: chosen}, wanted.optical or (reference if reference in topics else None)
     )

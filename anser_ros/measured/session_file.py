@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
+from anser_ros.wire.pose_topics import optical_topic
 from anser_ros.wire.setup import SensorSpec, Setup, Vector, dump_setup
 
 Array = NDArray[np.float64]
@@ -56,7 +57,7 @@ def write_frames(
                     writer.write_flux(topic, int(stamp), fields, step, len(rows), data)
             for body, (position, quaternion) in (poses or {}).items():
                 writer.write_pose(
-                    f'/optical/{body}/pose',
+                    optical_topic(body),
                     int(stamp),
                     position[frame].tolist(),
                     quaternion[frame].tolist(),

@@ -19,7 +19,7 @@ from anser_ros.errors import ParameterError
 from anser_ros.nodes import qos
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
-from anser_ros.nodes.shared_names import optical_parameter, optical_topic
+from anser_ros.nodes.shared_names import optical_parameter
 from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.control_unit import BLOCK_SAMPLES, ControlUnit, Piece
 from anser_ros.simulation.effect_draw import NONE as NO_EFFECT
@@ -41,6 +41,7 @@ from anser_ros.simulation.world import World
 from anser_ros.stamps import set_stamp
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.config_folder import read_config
+from anser_ros.wire.pose_topics import optical_topic
 from anser_ros.wire.setup import Setup, parse_setup
 
 STRETCH_S = 0.005
@@ -164,7 +165,7 @@ class CuSimulator(AnserNode):
         self._port = PseudoPort(Path(table.link))
         self._publishers_of = {
             body: self.create_publisher(
-                PoseStamped, optical_topic(table.optical, body), qos.STREAM
+                PoseStamped, optical_topic(body, table.optical), qos.STREAM
             )
             for body in setup.bodies
         }

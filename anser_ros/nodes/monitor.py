@@ -20,8 +20,9 @@ from anser_ros.nodes import qos
 from anser_ros.nodes.causes import Told, causes
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
-from anser_ros.nodes.shared_names import optical_parameter, optical_topic
+from anser_ros.nodes.shared_names import optical_parameter
 from anser_ros.nodes.traces import OpticalTrace, Row, Traces, latency_of, targets_of
+from anser_ros.wire.pose_topics import optical_topic
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 
 LINE_PERIOD_S = 1.0
@@ -108,7 +109,7 @@ class Monitor(AnserNode):
                     partial(self._on_pose, trace),
                 )
         for body, trace in self._optical.items():
-            topic = optical_topic(self.parameters.optical, body)
+            topic = optical_topic(body, self.parameters.optical)
             self._subscribe(PoseStamped, topic, partial(self._on_optical, trace))
 
     def _subscribe(self, kind: type, topic: str, callback: Any) -> None:

@@ -22,9 +22,10 @@ from anser_ros.nodes.definitions import message_class
 from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.readiness import Readiness
-from anser_ros.nodes.shared_names import OPTICAL, optical_parameter
+from anser_ros.nodes.shared_names import optical_parameter
 from anser_ros.stamps import set_stamp
 from anser_ros.wire.bag import RawMessage, Salvage, iter_messages
+from anser_ros.wire.pose_topics import OPTICAL
 from anser_ros.wire.yaml_text import read_yaml
 
 BAG_NAMESPACE = '/anser/'
@@ -155,11 +156,15 @@ class Replay(AnserNode):
     def _scan(self) -> None:
         """Read the bag once for its topics, so that all are announced before the first message."""
         salvage, counts = Salvage(), Counter[str]()
+        firsts: dict[str, RawMessage] = {}
         for message in iter_messages(self._bag, salvage):
             if self._is_played(message.topic):
                 counts[message.topic] += 1
-                if counts[message.topic] == 1:
-                    self._announce(message)
+                firsts.setdefault(message.topic, message)
+        setups = [topic for topic in firsts if topic.endswith('/setup')]
+        home = setups[0].removesuffix('setup') if setups else BAG_NAMESPACE
+        for message in firsts.values():
+            self._announce(message, home)
         wanted = any(topic.endswith(('/setup', *FLUX_ENDINGS)) for topic in self._outlets)
         if not wanted and not self._all_topics:
             raise BagError(f'{self._bag}: neither a setup nor fluxes that could be replayed')
@@ -170,21 +175,17 @@ class Replay(AnserNode):
         self.get_logger().info(f'{self._total} messages of {len(self._outlets)} topics')
 
     def _is_played(self, topic: str) -> bool:
-        if self._all_topics or topic.startswith('/optical/'):
+        if self._all_topics or OPTICAL in topic:
             return topic != '/clock'
         return topic not in OUTPUT_TOPICS and not topic.endswith(OUTPUT_ENDINGS)
 
-    def _announce(self, message: RawMessage) -> None:
+    def _announce(self, message: RawMessage, home: str) -> None:
         try:
             kind = message_class(message.type_name)
         except AnserError as error:
             self.warn('topics_left_out', f'{message.topic}: {error}')
             return
-        name = message.topic
-        if name.startswith(BAG_NAMESPACE):
-            name = name.removeprefix(BAG_NAMESPACE)  # into the namespace of this node
-        elif name.startswith(f'{OPTICAL}/'):
-            name = self.parameters.optical.rstrip('/') + name.removeprefix(OPTICAL)
+        name = name_played(message.topic, home, self.parameters.optical)
         profile = qos.LATCHED if _is_latched(message) else qos.STREAM
         self._types[message.topic] = kind
         self._outlets[message.topic] = self.create_publisher(kind, name, profile)
@@ -309,6 +310,24 @@ class Replay(AnserNode):
         if not self._loop:
             return part
         return f'the bag {self._passes} times, and {part} once more'
+
+
+def name_played(topic: str, home: str, optical: str) -> str:
+    """Return the name that a bag's topic is played under.
+
+    Parameters
+    ----------
+    topic : str
+        Name in the bag.
+    home : str
+        Namespace that the bag's nodes had, with a slash at its end; it gives way to the player's.
+    optical : str
+        Namespace of the optical poses here; in a bag they may be in one of their own.
+    """
+    _, is_optical, rest = topic.partition(OPTICAL)
+    if is_optical:
+        return f'{optical.rstrip("/")}/{rest}'
+    return topic.removeprefix(home) if home != '/' else topic
 
 
 def _message_of(message: RawMessage, kind: type) -> Any:

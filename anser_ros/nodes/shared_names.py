@@ -7,17 +7,9 @@ default; a second board has others by these parameters.
 from typing import Any
 
 from anser_ros.nodes.parameters import parameter
-from anser_ros.wire.setup import topic_of
-
-OPTICAL = '/optical'
-"""Where an optical tracker publishes, and what its poses are called in bags."""
+from anser_ros.wire.pose_topics import OPTICAL
 
 
 def optical_parameter() -> Any:
     """Return the parameter of a node that has to do with optical poses."""
-    return parameter(OPTICAL, 'namespace of the optical poses: NAMESPACE/BODY/pose')
-
-
-def optical_topic(namespace: str, body: str) -> str:
-    """Return the topic of a body's optical pose."""
-    return f'{namespace.rstrip("/")}/{topic_of(body)}/pose'
+    return parameter(OPTICAL.rstrip('/'), 'namespace of the optical poses: NAMESPACE/BODY/pose')

@@ -21,7 +21,7 @@ from anser_ros.nodes.causes import Told
 from anser_ros.nodes.live_view import LiveView, known
 from anser_ros.nodes.polled import STREAMS, Polled
 from anser_ros.nodes.processor import Processor
-from anser_ros.nodes.shared_names import optical_topic
+from anser_ros.wire.pose_topics import optical_topic
 from anser_ros.wire.setup import parse_setup, topic_of
 
 STREAM = QoSProfile(
@@ -134,7 +134,7 @@ class ViewSource:
             for target in view.targets
         ]  # fmt: skip
         self._optical = {
-            body: Polled(self._node, PoseStamped, optical_topic(self._optical_space, body), STREAM)
+            body: Polled(self._node, PoseStamped, optical_topic(body, self._optical_space), STREAM)
             for body in sorted(view.bodies)
         }
         self.view, self.version = view, self.version + 1

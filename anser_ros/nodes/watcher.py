@@ -21,7 +21,7 @@ from anser_ros.nodes.node import AnserNode, Level, Status, main
 from anser_ros.nodes.one_source import OneSource, said_of, setup_source
 from anser_ros.nodes.parameters import parameter
 from anser_ros.nodes.pose_streams import PoseStreams, pose_values, pose_words
-from anser_ros.nodes.shared_names import optical_parameter, optical_topic
+from anser_ros.nodes.shared_names import optical_parameter
 from anser_ros.nodes.sighting_words import figures_of, plain_text, title_of, values_of, words_of
 from anser_ros.nodes.stated_parameters import stated, stated_by
 from anser_ros.poses.live_look import PoseSighting, PoseWatch
@@ -33,6 +33,7 @@ from anser_ros.sessions.sliding_window import LIVE, SlidingWindow
 from anser_ros.sessions.starting_model import NOMINAL, model_for
 from anser_ros.sessions.watch import Sighting, Watch
 from anser_ros.stamps import SECOND_NS
+from anser_ros.wire.pose_topics import optical_topic
 from anser_ros.wire.setup import parse_setup
 
 POLL_S = 0.2
@@ -172,7 +173,7 @@ class Watcher(AnserNode):
             if body not in self._pose_subscriptions:
                 self._pose_subscriptions[body] = self.create_subscription(
                     PoseStamped,
-                    optical_topic(self.parameters.optical, body),
+                    optical_topic(body, self.parameters.optical),
                     self._taker(body),
                     qos.STREAM,
                 )

@@ -16,7 +16,8 @@ from anser_ros.sessions.conventions import check_conventions
 from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.units import LENGTH_UNITS, unit_words
 from anser_ros.sessions.volume import pose_volume
-from anser_ros.wire.setup import Setup
+from anser_ros.wire.pose_topics import optical_stem
+from anser_ros.wire.setup import Setup, topic_of
 
 Array = NDArray[np.float64]
 
@@ -148,7 +149,7 @@ def _check_refused(path: str, tool: Measurements, refused: Mapping[str, int]) ->
     words = []
     for what, count in refused.items():
         topic, _, reason = what.partition(': ')
-        if not topic.endswith(f'/optical/{tool.body}/pose'):
+        if optical_stem(topic) != topic_of(tool.body):
             continue
         if tool.track is None:
             raise PlausibilityError(

@@ -16,6 +16,7 @@ from anser_ros.simulation.world import World
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
+from anser_ros.wire.pose_topics import optical_topic
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, dump_setup
 
 Array = NDArray[np.float64]
@@ -152,7 +153,7 @@ def record(
             if (stamp, time) in optical:
                 for body in world.setup.bodies:
                     pose = _jittered(world.pose(body, time), errors, rng)
-                    writer.write_pose(f'/optical/{body}/pose', stamp, *pose)
+                    writer.write_pose(optical_topic(body), stamp, *pose)
             if (stamp, time) not in stamps:
                 continue
             flux = world.flux(time)

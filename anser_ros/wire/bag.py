@@ -24,6 +24,7 @@ from mcap_ros2.decoder import DecoderFactory
 from anser_ros.errors import BagError, LayoutError, SetupError
 from anser_ros.stamps import stamp_of
 from anser_ros.wire.points import STALE, FluxPoints, decode_flux
+from anser_ros.wire.pose_topics import optical_stem
 from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes
 from anser_ros.wire.setup import parse_setup
 
@@ -36,8 +37,6 @@ _RECORD_LIMIT = 256 * 2**20
 means a damaged or a hostile file, and memory for it is never asked for."""
 
 FLUX_TYPE = 'sensor_msgs/msg/PointCloud2'
-OPTICAL = '/optical/'
-"""Part of the topics of optical poses, before the body's name."""
 POSE_TYPE = 'geometry_msgs/msg/PoseStamped'
 
 
@@ -239,7 +238,7 @@ class _Collector:
                 self.setups.append(str(self.decoder.decode(raw).data))
             elif raw.topic.endswith(('/tool/flux', '/reference/flux')):
                 self._add_flux(raw)
-            elif OPTICAL in raw.topic and raw.type_name == POSE_TYPE:
+            elif optical_stem(raw.topic) and raw.type_name == POSE_TYPE:
                 self._add_pose(raw)
         except (BagError, LayoutError, AttributeError, TypeError, ValueError) as error:
             self.refused[f'{raw.topic}: {error}'] += 1
@@ -265,8 +264,7 @@ class _Collector:
         norm = float(np.linalg.norm(values[3:]))
         if not np.isfinite(values).all() or abs(norm - 1.0) > 1e-2:
             raise LayoutError('a pose with values not finite or a quaternion not of unit length')
-        # A board that shares its graph with others has a namespace of its own before it.
-        body = raw.topic.partition(OPTICAL)[2].removesuffix('/pose')
+        body = optical_stem(raw.topic)
         self.poses.setdefault(body, []).append((stamp_of(message), values))
 
     def flux_stream(self, which: str) -> RecordedFluxes | None:

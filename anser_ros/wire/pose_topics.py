@@ -17,9 +17,17 @@ def tracked_topic(sensor: str) -> str:
     return f'{TRACKED}{topic_of(sensor)}{ENDING}'
 
 
-def optical_topic(body: str) -> str:
-    """Return the topic of a body's optical poses."""
-    return f'{OPTICAL}{topic_of(body)}{ENDING}'
+def optical_topic(body: str, namespace: str = OPTICAL) -> str:
+    """Return the topic of a body's optical poses; a second board has another namespace."""
+    return f'{namespace.rstrip("/")}/{topic_of(body)}{ENDING}'
+
+
+def optical_stem(topic: str) -> str:
+    """Return the stem of the body whose optical poses a topic has, in whatever namespace.
+
+    It is empty for a topic of anything else.
+    """
+    return topic.partition(OPTICAL)[2].removesuffix(ENDING)
 
 
 def pose_setup(sensors: Iterable[str], body: str) -> str:
