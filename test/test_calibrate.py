@@ -256,7 +256,8 @@ def test_a_cut_scan_is_said_to_be_cut(tmp_path, capsys):
     whole = FACTORY.read_bytes()
     cut = tmp_path / 'cut.mcap'
     cut.write_bytes(whole[: len(whole) * 3 // 4])
-    assert calibrate(cut, '--out', tmp_path / 'm.yaml') == 0, 'with the frames that can be read'
+    few = ('--estimate', 'none', '--dipoles', '10')  # it is about the bag, not the model
+    assert calibrate(cut, *few, '--out', tmp_path / 'm.yaml') == 0, 'with what can be read'
     assert f'{cut}: the bag breaks off after' in capsys.readouterr().err
 
 
