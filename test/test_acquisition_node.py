@@ -74,8 +74,11 @@ class Listener:
         assert client.wait_for_service(10)
         request = SetParameters.Request()
         request.parameters = [Parameter(parameter, value=value).to_parameter_msg()]
-        future = client.call_async(request)
-        assert spin_until(self.node, future.done)
+        for _ in range(3):  # a reply is lost while the server does not know of its reader yet
+            future = client.call_async(request)
+            if spin_until(self.node, future.done, 5.0):
+                break
+        assert future.done()
         assert future.result().results[0].successful, future.result().results[0].reason
 
     def value(self, key, node='anser/acquisition'):

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from anser_ros.nodes.pose_output import PoseTopic
-from anser_ros.nodes.shared_names import optical_topic
 from anser_ros.wire.bag import read_bag
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
+from anser_ros.wire.pose_topics import optical_topic
 
 BAG = Path(__file__).resolve().parents[1] / 'bags' / 'moving.mcap'
 SHARED = {'/diagnostics', '/rosout', '/parameter_events'}
@@ -101,7 +101,7 @@ def test_a_bag_has_its_optical_poses_whatever_their_namespace(tmp_path, optical)
         writer.write_flux('/left/tool/flux', stamp, fields, step, count, data)
         track = bag.optical['tool_a']
         writer.write_pose(
-            optical_topic(optical, 'tool_a'), stamp, track.position[0], track.quaternion[0]
+            optical_topic('tool_a', optical), stamp, track.position[0], track.quaternion[0]
         )
     again = read_bag(tmp_path / 'left.mcap')
     np.testing.assert_allclose(again.optical['tool_a'].position[0], track.position[0])
