@@ -84,10 +84,8 @@ class PoseTrack:
             if self.time.size == 1:
                 rotation[valid] = Rotation.from_quat(self.quaternion[0]).as_matrix()
             else:
-                slerp, samples = (
-                    Slerp(self.time, Rotation.from_quat(self.quaternion)),
-                    _aligned(self),
-                )
+                slerp = Slerp(self.time, Rotation.from_quat(self.quaternion))
+                samples = _aligned(self)
                 turned = slerp(inside).as_quat()
                 same = np.einsum('fi,fi->f', turned, samples[left[valid]]) >= 0.0
                 turned = np.where(same[:, None], turned, -turned) + bent.of(samples)
