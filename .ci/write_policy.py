@@ -87,11 +87,9 @@ def _graph(setup_file: str) -> dict[tuple[str, str], list[str]]:
     import rclpy
     from geometry_msgs.msg import PoseStamped
     from rclpy.executors import SingleThreadedExecutor
-    from rclpy.parameter import Parameter
     from std_msgs.msg import String
 
     from anser_ros.nodes import qos
-    from anser_ros.nodes.node import AnserNode
     from anser_ros.wire.config_folder import read_config
     from anser_ros.wire.setup import parse_setup, topic_of
 
@@ -114,28 +112,38 @@ def _graph(setup_file: str) -> dict[tuple[str, str], list[str]]:
             'corrector': {'model': str(pose_model)},
             'dashboard': {'directory': folder, 'port': 0},
         }
-        for name in NODES:
-            module = importlib.import_module(f'anser_ros.nodes.{name}')
-            (kind,) = (
-                k for k in vars(module).values()
-                if isinstance(k, type) and issubclass(k, AnserNode) and vars(k).get('NAME') == name
-            )  # fmt: skip
-            values = [Parameter(key, value=value) for key, value in given.get(name, {}).items()]
-            made.append(kind(parameter_overrides=values))
-            executor.add_node(made[-1])
-        setup.publish(String(data=text))
-        found, since = _asked(peer), time.monotonic()
-        end = since + SETTLES_S
-        # Until poses are recorded and shown, and nothing new has come for a while.
-        while time.monotonic() < end and (time.monotonic() < since + 3.0 or not _settled(found)):
-            executor.spin_once(timeout_sec=0.1)
-            now = _asked(peer)
-            if now != found:
-                found, since = now, time.monotonic()
-        for node in made:
-            node.close()
-        executor.shutdown()
+        try:
+            for name in NODES:
+                made.append(_node(name, given.get(name, {})))
+                executor.add_node(made[-1])
+            setup.publish(String(data=text))
+            found, since = _asked(peer), time.monotonic()
+            end = since + SETTLES_S
+            # Until poses are recorded and shown, and nothing new has come for a while.
+            while time.monotonic() < end and (
+                time.monotonic() < since + 3.0 or not _settled(found)
+            ):
+                executor.spin_once(timeout_sec=0.1)
+                now = _asked(peer)
+                if now != found:
+                    found, since = now, time.monotonic()
+        finally:  # nodes have threads of their own, which would outlive an interruption
+            for node in made:
+                node.close()
+            executor.shutdown()
     return found
+
+
+def _node(name: str, parameters: Mapping[str, Any]) -> Any:
+    from rclpy.parameter import Parameter
+
+    from anser_ros.nodes.node import AnserNode
+
+    kinds = vars(importlib.import_module(f'anser_ros.nodes.{name}')).values()
+    nodes = [k for k in kinds if isinstance(k, type) and issubclass(k, AnserNode)]
+    (kind,) = (k for k in nodes if vars(k).get('NAME') == name)
+    values = [Parameter(key, value=value) for key, value in parameters.items()]
+    return kind(parameter_overrides=values)
 
 
 def _settled(found: Mapping[tuple[str, str], list[str]]) -> bool:

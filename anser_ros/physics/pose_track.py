@@ -1,6 +1,7 @@
 """Holds poses of one body over time, as a tracker with its own clock and rate reports them."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,13 @@ class PoseTrack:
     time: Array
     position: Array
     quaternion: Array
+
+    @cached_property
+    def _aligned(self) -> Array:
+        """Quaternions (M, 4) with signs by which each is near the one before."""
+        near = np.einsum('mi,mi->m', self.quaternion[1:], self.quaternion[:-1]) >= 0.0
+        sign = np.cumprod(np.concatenate([[1.0], np.where(near, 1.0, -1.0)]))
+        return np.asarray(self.quaternion * sign[:, None])
 
     def at(
         self, time: Array, longest_gap: float = LONGEST_GAP_S
@@ -85,7 +93,7 @@ class PoseTrack:
                 rotation[valid] = Rotation.from_quat(self.quaternion[0]).as_matrix()
             else:
                 slerp = Slerp(self.time, Rotation.from_quat(self.quaternion))
-                samples = _aligned(self)
+                samples = self._aligned
                 turned = slerp(inside).as_quat()
                 same = np.einsum('fi,fi->f', turned, samples[left[valid]]) >= 0.0
                 turned = np.where(same[:, None], turned, -turned) + bent.of(samples)
@@ -160,11 +168,3 @@ class _Bend:
         s0, s1, s2, s3 = (samples[i] for i in (before, self.left, self.right, after))
         change = (s3 - s2) / (t3 - t2)[:, None] - (s1 - s0) / (t1 - t0)[:, None]
         return np.asarray(change / ((t3 + t2 - t1 - t0) / 2.0)[:, None])
-
-
-def _aligned(track: PoseTrack) -> Array:
-    """Return a track's quaternions (M, 4) with signs by which each is near the one before."""
-    quaternion = track.quaternion
-    near = np.einsum('mi,mi->m', quaternion[1:], quaternion[:-1]) >= 0.0
-    sign = np.cumprod(np.concatenate([[1.0], np.where(near, 1.0, -1.0)]))
-    return np.asarray(quaternion * sign[:, None])

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from anser_ros.physics.dipole import flux_basis
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.tangent import tangents
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
@@ -28,15 +29,6 @@ def vector_basis(points: Array, axes: Array, lengths: Array | None, sources: Arr
         directions = np.broadcast_to(unit, sources.shape)
         out[:, :, component] = flux_basis(points, axes, lengths, sources, directions)
     return out
-
-
-def tangents(axes: Array) -> Array:
-    """Return two unit vectors across each axis, shape (S, 2, 3)."""
-    least = np.zeros_like(axes)
-    least[np.arange(len(axes)), np.abs(axes).argmin(axis=1)] = 1.0
-    first = np.cross(axes, least)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(axes, first)], axis=1)
 
 
 def survey_variants(

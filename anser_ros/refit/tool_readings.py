@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_jacobian
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.refit.references import tangents
+from anser_ros.physics.tangent import tangents
 from anser_ros.settings import ToolSettings
 
 Array = NDArray[np.float64]
