@@ -7,7 +7,7 @@ from pathlib import Path
 import yaml
 
 from anser_ros.cli.commands import NODES
-from anser_ros.nodes.node import AnserNode
+from anser_ros.nodes.runtime.node import AnserNode
 
 TARGET = Path(__file__).resolve().parents[1] / 'config' / 'anser.yaml'
 HEAD = """\

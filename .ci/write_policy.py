@@ -68,7 +68,7 @@ def policy(setup_file: str = 'demo_setup.yaml') -> str:
 
 def _profiles_of(node: str, graph: Mapping[tuple[str, str], list[str]]) -> list[str]:
     """A node of the package, and what it polls topics with."""
-    from anser_ros.nodes.polled import STREAMS
+    from anser_ros.nodes.output_parts.polled import STREAMS
 
     return sorted({name for name, _ in graph if name.removesuffix(STREAMS) == node})
 
@@ -89,7 +89,7 @@ def _graph(setup_file: str) -> dict[tuple[str, str], list[str]]:
     from rclpy.executors import SingleThreadedExecutor
     from std_msgs.msg import String
 
-    from anser_ros.nodes import qos
+    from anser_ros.nodes.runtime import qos
     from anser_ros.wire.config_folder import read_config
     from anser_ros.wire.setup import parse_setup, topic_of
 
@@ -137,7 +137,7 @@ def _graph(setup_file: str) -> dict[tuple[str, str], list[str]]:
 def _node(name: str, parameters: Mapping[str, Any]) -> Any:
     from rclpy.parameter import Parameter
 
-    from anser_ros.nodes.node import AnserNode
+    from anser_ros.nodes.runtime.node import AnserNode
 
     kinds = vars(importlib.import_module(f'anser_ros.nodes.{name}')).values()
     nodes = [k for k in kinds if isinstance(k, type) and issubclass(k, AnserNode)]

@@ -12,7 +12,7 @@ from launch_ros.actions import Node, PushRosNamespace
 from launch_ros.parameter_descriptions import ParameterValue
 
 from anser_ros.cli.commands import NODES
-from anser_ros.nodes.parameter_files import checked
+from anser_ros.nodes.runtime.parameter_files import checked
 from anser_ros.wire.config_folder import config_path
 from anser_ros.wire.tcp_ports import LIVE_VIEW, OPENIGTLINK
 

@@ -12,7 +12,7 @@ from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from anser_ros.nodes import qos
+from anser_ros.nodes.runtime import qos
 from anser_ros.wire.setup import dump_setup, parse_setup, topic_of
 
 RATE_HZ = 50.0

@@ -39,8 +39,8 @@ class Bench:
         from sensor_msgs.msg import PointCloud2
         from std_msgs.msg import String
 
-        from anser_ros.nodes import qos
-        from anser_ros.nodes.clouds import FluxCloud
+        from anser_ros.nodes.runtime import qos
+        from anser_ros.nodes.streams.clouds import FluxCloud
 
         self.peer = ros.create_node('bench', namespace='anser')
         self.node = node
@@ -105,7 +105,7 @@ class Bench:
         self.setup.publish(String(data=text or dump_setup(setup_of(SENSORS, reference_specs()))))
 
     def say_model(self, model, stamp_ns=5):
-        from anser_ros.nodes.model_clouds import CloudMaker
+        from anser_ros.nodes.streams.model_clouds import CloudMaker
 
         packed = encode_field_model(DipolePoints(model.positions, model.directions, model.moments))
         self.model.publish(CloudMaker().message(packed, 'fg', stamp_ns))

@@ -49,9 +49,9 @@ class Rig:
         from rclpy.parameter import Parameter
         from visualization_msgs.msg import MarkerArray
 
-        from anser_ros.nodes import qos
-        from anser_ros.nodes.clouds import FluxCloud
         from anser_ros.nodes.field_model import FieldModelNode
+        from anser_ros.nodes.runtime import qos
+        from anser_ros.nodes.streams.clouds import FluxCloud
 
         self.world = anser_world()
         save_model(folder / 'model.yaml', self.world.model)

@@ -8,7 +8,7 @@ import pytest
 from conftest import spin_until
 
 from anser_ros.errors import PortError, SetupError
-from anser_ros.nodes.flux_stream import FluxStream, StreamOptions
+from anser_ros.nodes.acquisition_parts.flux_stream import FluxStream, StreamOptions
 from anser_ros.simulation.control_unit import Piece
 from anser_ros.simulation.faults import FaultInjector
 from anser_ros.simulation.pseudo_port import PseudoPort
@@ -41,7 +41,7 @@ class Listener:
         from sensor_msgs.msg import PointCloud2
         from std_msgs.msg import String
 
-        from anser_ros.nodes import qos
+        from anser_ros.nodes.runtime import qos
 
         self.node = ros.create_node('listener')
         self.tool, self.reference, self.setups, self.optical = [], [], [], []

@@ -76,8 +76,8 @@ def test_the_drawing_and_a_model_with_metal_are_not_asked(recorded):
 def test_poses_wait_for_references_that_are_announced_and_not_for_others(recorded, monkeypatch):
     from types import SimpleNamespace
 
-    from anser_ros.nodes import place_watch
-    from anser_ros.nodes.place_watch import PlaceWatch
+    from anser_ros.nodes.field_model_parts import place_watch
+    from anser_ros.nodes.field_model_parts.place_watch import PlaceWatch
 
     session, model = recorded
     sensors, announced = session.reference.sensors, [0]

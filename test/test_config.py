@@ -11,9 +11,9 @@ import yaml
 
 from anser_ros.cli.commands import NODES
 from anser_ros.errors import ParameterError
-from anser_ros.nodes import node as base
-from anser_ros.nodes import parameters
-from anser_ros.nodes.node import AnserNode
+from anser_ros.nodes.runtime import node as base
+from anser_ros.nodes.runtime import parameters
+from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.settings import VALUES
 from anser_ros.wire.setup import parse_setup, topic_of
 
@@ -83,7 +83,7 @@ def test_every_parameter_is_read():
     """A parameter that nothing asks for would promise what is not done; the names of
     `anser_ros.settings` are read together, by `stated_by`.
     """
-    trees = [ast.parse(path.read_text()) for path in NODES_ROOM.glob('*.py')]
+    trees = [ast.parse(path.read_text()) for path in NODES_ROOM.rglob('*.py')]
     read = {n.attr for tree in trees for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
     tables = {name: set(node_class(name).PARAMETERS.__dataclass_fields__) for name in NODES}
     unread = {name: names - read - set(VALUES) for name, names in tables.items()}

@@ -168,7 +168,7 @@ def heard(client, server):
 
 
 def test_whatever_a_client_says_to_openigtlink():
-    from anser_ros.nodes.igtl_server import IgtlServer
+    from anser_ros.nodes.output_parts.igtl_server import IgtlServer
 
     server = IgtlServer('127.0.0.1', 0, lambda header: b'answer')
     try:

@@ -21,14 +21,14 @@ from tracking_world import certain_model
 from anser_ros.cli import demo, missing
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, ParameterError
-from anser_ros.nodes import live_view
-from anser_ros.nodes.causes import Told
-from anser_ros.nodes.chain_client import ChainClient, ChainError
 from anser_ros.nodes.dashboard import DashboardParameters
-from anser_ros.nodes.live_view import LiveView, read_pose
-from anser_ros.nodes.polled import polling_node
-from anser_ros.nodes.traces import latency_of
-from anser_ros.nodes.view_source import ViewSource
+from anser_ros.nodes.output_parts import live_view
+from anser_ros.nodes.output_parts.causes import Told
+from anser_ros.nodes.output_parts.chain_client import ChainClient, ChainError
+from anser_ros.nodes.output_parts.live_view import LiveView, read_pose
+from anser_ros.nodes.output_parts.polled import polling_node
+from anser_ros.nodes.output_parts.traces import latency_of
+from anser_ros.nodes.output_parts.view_source import ViewSource
 from anser_ros.sessions.volume import pose_volume
 from anser_ros.web import loop as loop_module
 from anser_ros.web.folder import RESULTS, RecordingFolder

@@ -15,8 +15,8 @@ from conftest import spin_until
 from anser_ros.cli.demo_report import draw, load, summarise
 from anser_ros.cli.main import main
 from anser_ros.cli.supervisor import Supervisor, tail
-from anser_ros.nodes.backlog import CATCH_UP_S
-from anser_ros.nodes.traces import OpticalTrace, PoseTrace, Traces, targets_of
+from anser_ros.nodes.output_parts.traces import OpticalTrace, PoseTrace, Traces, targets_of
+from anser_ros.nodes.streams.backlog import CATCH_UP_S
 from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import OK, STATES
 from anser_ros.wire.bag import MessageDecoder, Salvage, iter_messages
@@ -127,7 +127,7 @@ def test_monitor_measures_error_rate_and_latency(ros, start, tmp_path):
     from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
     from std_msgs.msg import String
 
-    from anser_ros.nodes import qos
+    from anser_ros.nodes.runtime import qos
 
     node = ros.create_node('fake')
     output = tmp_path / 'demo.npz'

@@ -137,7 +137,7 @@ class TestInterfacesPage:
         assert '```{literalinclude} ../config/anser.yaml' in page('interfaces')
 
     def test_every_service(self):
-        nodes = (REPO / 'anser_ros' / 'nodes').glob('*.py')
+        nodes = (REPO / 'anser_ros' / 'nodes').rglob('*.py')
         code = ''.join(path.read_text(encoding='utf-8') for path in nodes)
         services = re.findall(r"create_service\(\w+, '([\w/]+)'", code)
         assert len(services) == 6

@@ -1,7 +1,7 @@
 """Faults of the line in words, for as long as an operator needs to read them."""
 
-from anser_ros.nodes.diagnostics import Level
-from anser_ros.nodes.fault_memory import MEMORY_S, RecentFaults, device_words
+from anser_ros.nodes.acquisition_parts.fault_memory import MEMORY_S, RecentFaults, device_words
+from anser_ros.nodes.runtime.diagnostics import Level
 from anser_ros.wire.records import DeviceState, DeviceStatus, StatusFlag
 
 

@@ -41,7 +41,7 @@ def call(bench, kind, name, **request):
 
 
 def test_the_nominal_model_is_served_latched_with_its_uncertainty(server):
-    from anser_ros.nodes.model_clouds import read_dipoles, read_error
+    from anser_ros.nodes.streams.model_clouds import read_dipoles, read_error
     from anser_ros.stamps import stamp_of
 
     server.say_setup()
@@ -98,7 +98,7 @@ def test_another_model_while_it_runs(server, tmp_path):
     from rclpy.parameter import Parameter
     from std_srvs.srv import Trigger
 
-    from anser_ros.nodes.model_clouds import read_dipoles
+    from anser_ros.nodes.streams.model_clouds import read_dipoles
     from anser_ros.sessions.session import sensor_table
 
     def give(name):

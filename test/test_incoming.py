@@ -11,7 +11,7 @@ from anser_ros.wire.points import FLOAT32, MOST_POINTS, flux_fields
 
 @pytest.fixture
 def opened():
-    from anser_ros.nodes.incoming import opened
+    from anser_ros.nodes.runtime.incoming import opened
 
     return opened
 
@@ -37,7 +37,7 @@ def test_what_is_too_large_is_refused_unopened(opened, monkeypatch):
     from sensor_msgs.msg import PointCloud2
     from std_msgs.msg import String
 
-    from anser_ros.nodes import incoming
+    from anser_ros.nodes.runtime import incoming
 
     monkeypatch.setattr(incoming, 'deserialize_message', None)  # would fail if it were called
     with pytest.raises(LayoutError, match='bytes is refused'):
@@ -56,8 +56,8 @@ def test_a_node_counts_what_it_refuses_and_goes_on(ros):
     from sensor_msgs.msg import PointCloud2
     from std_msgs.msg import String
 
-    from anser_ros.nodes import qos
-    from anser_ros.nodes.node import AnserNode
+    from anser_ros.nodes.runtime import qos
+    from anser_ros.nodes.runtime.node import AnserNode
 
     class Taker(AnserNode):
         NAME = 'taker'

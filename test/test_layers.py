@@ -46,6 +46,17 @@ ALLOWED = {
     'web': {*CORE, 'cli'},
     'nodes': {*CORE, 'simulation', 'web'},
 }  # fmt: skip
+# What the rooms inside `nodes` may import of each other; the programs beside them may import all.
+WITHIN_NODES = {
+    'runtime': set(),
+    'streams': {'runtime'},
+    'acquisition_parts': {'runtime', 'streams'},
+    'field_model_parts': {'runtime', 'streams'},
+    'tracker_parts': {'runtime', 'streams'},
+    'bag_parts': {'runtime', 'streams'},
+    'watcher_parts': {'runtime', 'streams'},
+    'output_parts': {'runtime', 'streams'},
+}
 # Libraries that only some places may know.
 ROOMS = {
     'rclpy': ('nodes/',),
@@ -105,6 +116,21 @@ def test_imports_of_ours_point_inwards(paths):
     assert not faults, '\n'.join(faults)
 
 
+def test_parts_of_a_node_import_no_other_node():
+    nodes = PACKAGE / 'nodes'
+    rooms = {path.name for path in nodes.iterdir() if (path / '__init__.py').is_file()}
+    assert rooms == set(WITHIN_NODES)
+    faults = []
+    for path in nodes.rglob('*/*.py'):
+        room = path.relative_to(nodes).parts[0]
+        for name in imports(path):
+            parts = name.split('.')
+            is_of_nodes = parts[:2] == ['anser_ros', 'nodes'] and len(parts) > 2
+            if is_of_nodes and parts[2] not in WITHIN_NODES[room] | {room}:
+                faults.append(f'{place(path)} imports {name}')
+    assert not faults, '\n'.join(faults)
+
+
 def test_the_page_has_the_same_table_and_every_file():
     """What a newcomer reads about the rooms is what is enforced."""
     page = (PACKAGE.parent / 'docs' / 'architecture.md').read_text(encoding='utf-8')
@@ -120,8 +146,14 @@ def test_the_page_has_the_same_table_and_every_file():
     assert {*told, '__init__.py'} == set(ALLOWED)
     beside = {path.name for path in PACKAGE.glob('*.py')} - {'__init__.py'}
     assert set(re.findall(r'`(\w+\.py)`', page.split('### Inside')[0])) >= beside
-    parts = set(re.findall(r'`(\w+)`', page.split('### Inside')[1]))
-    assert {path.stem for path in (PACKAGE / 'nodes').glob('[!_]*.py')} <= parts
+    inside = page.split('### Inside')[1]
+    assert {path.stem for path in (PACKAGE / 'nodes').glob('[!_]*.py')} <= set(
+        re.findall(r'`(\w+)`', inside)
+    )
+    for room in WITHIN_NODES:
+        row = re.search(rf'^\| `{room}` .*', inside, re.M)
+        files = {path.stem for path in (PACKAGE / 'nodes' / room).glob('[!_]*.py')}
+        assert set(re.findall(r'`(\w+)`', row[0])) >= files, room
 
 
 def test_types_are_strict_in_the_core():
@@ -159,7 +191,12 @@ def test_the_walk_sees_imports_everywhere(tmp_path):
 
 def test_broad_excepts_are_the_outermost():
     """`except Exception` that swallows stands only where a callback, a thread or all ends."""
-    allowed = {'cli/main.py', 'nodes/node.py', 'nodes/process.py', 'nodes/replay.py'}
+    allowed = {
+        'cli/main.py',
+        'nodes/runtime/node.py',
+        'nodes/runtime/process.py',
+        'nodes/replay.py',
+    }
     for path in FILES:
         for node in nodes_of(path):
             if not isinstance(node, ast.ExceptHandler) or isinstance(node.body[-1], ast.Raise):

@@ -10,8 +10,8 @@ import pytest
 from conftest import spin_until
 
 from anser_ros.errors import ParameterError
-from anser_ros.nodes.handover import Aside, HandedFlux, Handover, Taking
-from anser_ros.nodes.parameter_files import names_for
+from anser_ros.nodes.runtime.handover import Aside, HandedFlux, Handover, Taking
+from anser_ros.nodes.runtime.parameter_files import names_for
 from anser_ros.wire.points import FluxPoints, as_sent, decode_flux, encode_flux
 
 
@@ -60,8 +60,8 @@ def test_what_is_worked_on_aside_has_nothing_to_do_with_a_node_that_is_gone(ros)
     """The thread ends with its node, and what it still does then is no fault of a callback."""
     from std_msgs.msg import String
 
-    from anser_ros.nodes import qos
-    from anser_ros.nodes.node import AnserNode
+    from anser_ros.nodes.runtime import qos
+    from anser_ros.nodes.runtime.node import AnserNode
 
     began, goes_on = threading.Event(), threading.Event()
 
@@ -123,7 +123,7 @@ def test_handed_fluxes_are_those_that_are_published():
 
 def test_parameters_of_one_node_are_given_to_it_alone():
     pytest.importorskip('rclpy')
-    from anser_ros.nodes import process
+    from anser_ros.nodes.runtime import process
 
     tracker, server = (
         type('T', (), {'NAME': name, 'PARAMETERS': make_dataclass('P', [(known, float, 0.0)])})
@@ -162,9 +162,9 @@ def test_a_file_tells_which_values_it_has_for_one_node(tmp_path):
 def test_frames_are_handed_over_as_objects_while_two_senders_are_still_told(ros):
     from sensor_msgs.msg import PointCloud2
 
-    from anser_ros.nodes import qos
-    from anser_ros.nodes.node import AnserNode
-    from anser_ros.nodes.one_source import OneSource
+    from anser_ros.nodes.runtime import qos
+    from anser_ros.nodes.runtime.node import AnserNode
+    from anser_ros.nodes.streams.one_source import OneSource
 
     class Giver(AnserNode):
         NAME = 'giver'
@@ -242,7 +242,7 @@ def test_what_several_nodes_cannot_be_given_is_one_line(start, words, said):
 def test_who_is_given_up_says_good_bye_to_devices_first(monkeypatch, is_noticed):
     """A process too busy to notice Ctrl-C ends all the same; the unit must not stream on."""
     pytest.importorskip('rclpy')
-    from anser_ros.nodes import process
+    from anser_ros.nodes.runtime import process
 
     done = []
 

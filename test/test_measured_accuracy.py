@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 
 from anser_ros.integrity.senders import Senders
-from anser_ros.nodes.measured_accuracy import MeasuredAccuracy, without_measured
+from anser_ros.nodes.acquisition_parts.measured_accuracy import MeasuredAccuracy
+from anser_ros.nodes.streams.measured_keys import without_measured
 from anser_ros.sessions.session import measured_noise, stamp_sigma
 from anser_ros.settings import Accuracy
 from anser_ros.wire.config_folder import read_config

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 from tracking_world import certain_model, setup_of, triaxial_tool
 
-from anser_ros.nodes.model_clouds import ModelWriter
-from anser_ros.nodes.model_in_force import ModelInForce
-from anser_ros.nodes.model_intake import ModelIntake
+from anser_ros.nodes.streams.model_clouds import ModelWriter
+from anser_ros.nodes.tracker_parts.model_in_force import ModelInForce
+from anser_ros.nodes.tracker_parts.model_intake import ModelIntake
 from anser_ros.physics.volume import TrackedVolume
 
 MODEL = certain_model()

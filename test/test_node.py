@@ -9,10 +9,10 @@ import pytest
 from conftest import Process, spin_until
 
 from anser_ros.errors import ParameterError, SetupError
-from anser_ros.nodes import parameters
-from anser_ros.nodes.diagnostics import Throttle, text_of
-from anser_ros.nodes.parameter_files import complaints
-from anser_ros.nodes.parameters import parameter
+from anser_ros.nodes.runtime import parameters
+from anser_ros.nodes.runtime.diagnostics import Throttle, text_of
+from anser_ros.nodes.runtime.parameter_files import complaints
+from anser_ros.nodes.runtime.parameters import parameter
 
 pytestmark = pytest.mark.light
 
@@ -115,9 +115,9 @@ import sys
 import time
 from dataclasses import dataclass
 from std_srvs.srv import Trigger
-from anser_ros.nodes.node import AnserNode, main
-from anser_ros.nodes.parameter_files import complaints
-from anser_ros.nodes.parameters import parameter
+from anser_ros.nodes.runtime.node import AnserNode, main
+from anser_ros.nodes.runtime.parameter_files import complaints
+from anser_ros.nodes.runtime.parameters import parameter
 
 @dataclass(frozen=True)
 class Table:
@@ -218,7 +218,7 @@ class TestProcess:
 class TestGraph:
     @pytest.fixture
     def node(self, ros):
-        from anser_ros.nodes.node import AnserNode, Level, Status
+        from anser_ros.nodes.runtime.node import AnserNode, Level, Status
 
         class Sample(AnserNode):
             NAME = 'sample'
@@ -291,7 +291,7 @@ class TestGraph:
 
 def test_the_executor_is_the_one_told_of_events_where_rclpy_has_it(monkeypatch):
     experimental = pytest.importorskip('rclpy.experimental')
-    from anser_ros.nodes import process
+    from anser_ros.nodes.runtime import process
 
     monkeypatch.setattr(experimental, 'EventsExecutor', lambda: 'events')
     assert process.make_executor() == 'events'

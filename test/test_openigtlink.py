@@ -12,7 +12,7 @@ import pytest
 from conftest import spin_until
 
 from anser_ros.errors import ParameterError, PortError
-from anser_ros.nodes.igtl_server import MOST_CLIENTS, IgtlServer
+from anser_ros.nodes.output_parts.igtl_server import MOST_CLIENTS, IgtlServer
 from anser_ros.wire import igtl
 from anser_ros.wire.setup import parse_setup
 

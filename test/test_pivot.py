@@ -248,7 +248,7 @@ def test_a_file_of_tips_that_is_not_there_is_the_callers_fault(tmp_path):
 def test_the_command_takes_poses_from_the_graph(ros, tmp_path, capsys):
     from geometry_msgs.msg import PoseStamped
 
-    from anser_ros.nodes import qos
+    from anser_ros.nodes.runtime import qos
 
     poses, tip, _ = pivoting(11)
     node = ros.create_node('pen')

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_port import HELLO, TONES, Wire, receive, wait
 
-from anser_ros.nodes.acquisition_parameters import AcquisitionParameters
+from anser_ros.nodes.acquisition_parts.acquisition_parameters import AcquisitionParameters
 from anser_ros.wire.frames import TYPE_OF
 from anser_ros.wire.port import ControlUnitPort, PortState, find_port
 from anser_ros.wire.protocols import PROTOCOLS, SerialProtocol

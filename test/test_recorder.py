@@ -10,7 +10,7 @@ from conftest import spin_until
 from mcap.reader import make_reader
 
 from anser_ros.errors import BagError
-from anser_ros.nodes.recording_log import TopicLog, report
+from anser_ros.nodes.bag_parts.recording_log import TopicLog, report
 from anser_ros.wire.bag import Salvage, iter_messages
 from anser_ros.wire.bag_metadata import BagRecord
 
@@ -242,7 +242,7 @@ class TestLog:
 
 class TestDefinitions:
     def test_unknown_types_are_refused(self):
-        from anser_ros.nodes.definitions import definition, message_class, type_hash
+        from anser_ros.nodes.bag_parts.definitions import definition, message_class, type_hash
 
         for name in ('no_msgs/msg/None', 'std_msgs/msg/Nothing', 'String'):
             with pytest.raises(BagError):
@@ -253,7 +253,7 @@ class TestDefinitions:
 
     def test_the_embedded_texts_agree_with_the_installed_ones(self):
         """Comments aside, and in any order."""
-        from anser_ros.nodes.definitions import definition
+        from anser_ros.nodes.bag_parts.definitions import definition
         from anser_ros.wire.cdr import DEFINITIONS
 
         def essence(text):

@@ -12,7 +12,7 @@ from refit_world import anser_world, metal_block
 
 from anser_ros.errors import FitError, FrameError, ModelFileError, ParameterError
 from anser_ros.integrity.withheld import OTHER_MODEL, REFERENCES_LOST, code_of
-from anser_ros.nodes.diagnostics import Level
+from anser_ros.nodes.runtime.diagnostics import Level
 from anser_ros.refit.result import Metal
 from anser_ros.sessions.model_file import load_model
 from anser_ros.stamps import stamp_of
@@ -244,7 +244,7 @@ def test_a_model_beside_its_board_gives_no_poses_until_the_references_agree(make
 def test_every_frame_is_answered_under_its_own_stamp(make):
     from sensor_msgs.msg import PointCloud2
 
-    from anser_ros.nodes import qos
+    from anser_ros.nodes.runtime import qos
 
     rig, got = make(refit_rate_hz=10.0), []
     rig.peer.create_subscription(PointCloud2, 'field_model', got.append, qos.LATCHED)
@@ -326,7 +326,7 @@ def test_coils_on_a_patch_take_part_where_the_pose_says(make):
 
 
 def test_what_is_no_patch_is_refused(make):
-    from anser_ros.nodes.patches import Patches
+    from anser_ros.nodes.field_model_parts.patches import Patches
     from anser_ros.sessions.patches import parse_patches
 
     assert parse_patches(['a=/x', 'b=/y']) == {'a': '/x', 'b': '/y'}
@@ -341,7 +341,7 @@ def test_what_is_no_patch_is_refused(make):
 
 
 def test_a_patch_leaves_no_thread_when_its_refit_is_worked_out(ros):
-    from anser_ros.nodes.patches import WORKER, Patches
+    from anser_ros.nodes.field_model_parts.patches import WORKER, Patches
 
     def workers():
         return [t for t in threading.enumerate() if t.name.startswith(WORKER)]
@@ -364,7 +364,7 @@ def test_a_patch_leaves_no_thread_when_its_refit_is_worked_out(ros):
 def test_markers_of_nothing_and_of_one_source(ros):
     from visualization_msgs.msg import Marker
 
-    from anser_ros.nodes.metal_view import centroid_message, metal_markers
+    from anser_ros.nodes.field_model_parts.metal_view import centroid_message, metal_markers
 
     assert [m.action for m in metal_markers(None, 'fg', 5).markers] == [Marker.DELETEALL]
     metal = Metal(np.ones((1, 3)), np.array([-3.0 + 0j]), np.array([1e-6]), np.ones(3), 0.05)
@@ -375,7 +375,7 @@ def test_markers_of_nothing_and_of_one_source(ros):
 
 
 def test_lost_references_are_told_to_the_trackers_and_to_the_operator(make):
-    from anser_ros.nodes.model_intake import ModelIntake
+    from anser_ros.nodes.tracker_parts.model_intake import ModelIntake
 
     rig, intake, given = make(references_age_s=0.5, refit_rate_hz=1000.0), ModelIntake(), []
     rig.node._output.errors.publish = lambda message: intake.take_error(message)

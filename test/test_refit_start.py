@@ -11,7 +11,7 @@ from refit_world import anser_world
 
 from anser_ros.errors import FitError
 from anser_ros.integrity.withheld import REFERENCES_LOST, code_of
-from anser_ros.nodes.diagnostics import Level
+from anser_ros.nodes.runtime.diagnostics import Level
 from anser_ros.refit import tables
 from anser_ros.sessions.model_file import save_model
 from anser_ros.wire.setup import parse_setup
@@ -23,7 +23,7 @@ class Held:
     """Lets the making of a refit begin, and go on when it is told to."""
 
     def __init__(self, monkeypatch):
-        from anser_ros.nodes import refit_start
+        from anser_ros.nodes.field_model_parts import refit_start
 
         self.let, self.share = threading.Event(), 0.4
         build, refit = tables.build_tables, refit_start.LiveRefit
@@ -153,7 +153,7 @@ def test_a_refit_that_cannot_be_made_is_said_and_awaited_no_longer(rig, monkeypa
 
 
 def test_tables_that_nobody_wants_any_more_are_given_up(ros, monkeypatch):
-    from anser_ros.nodes.refit_start import RefitStart
+    from anser_ros.nodes.field_model_parts.refit_start import RefitStart
 
     world, begun, goes_on = anser_world(), threading.Event(), threading.Event()
 

@@ -15,9 +15,9 @@ from anser_ros.calibration.pose_correction import pose_precision
 from anser_ros.cli import calibrate, diagnose, evaluate
 from anser_ros.cli.main import main
 from anser_ros.errors import ParameterError, SetupError
-from anser_ros.nodes.field_model_parameters import FieldModelParameters
-from anser_ros.nodes.stated_parameters import stated_by
-from anser_ros.nodes.tracker_parameters import TrackerParameters
+from anser_ros.nodes.field_model_parts.field_model_parameters import FieldModelParameters
+from anser_ros.nodes.runtime.stated_parameters import stated_by
+from anser_ros.nodes.tracker_parts.tracker_parameters import TrackerParameters
 from anser_ros.nodes.watcher import WatcherParameters
 from anser_ros.refit.patches import PatchCoils, clean_reading
 from anser_ros.refit.prior import UPRIGHT, build_prior

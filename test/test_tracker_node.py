@@ -158,7 +158,7 @@ def test_the_gate_may_change_while_it_runs(tracker):
 
 def test_transforms_where_they_are_installed(tracker, monkeypatch):
     """Stands in for tf2_msgs, which the wheels don't have."""
-    from anser_ros.nodes import pose_output
+    from anser_ros.nodes.tracker_parts import pose_output
 
     sent = []
     monkeypatch.setattr(pose_output, 'TFMessage', lambda transforms: list(transforms))
@@ -176,7 +176,7 @@ def test_transforms_where_they_are_installed(tracker, monkeypatch):
 
 
 def test_the_volume_of_the_setup_holds_unless_a_parameter_says_another(tracker):
-    from anser_ros.nodes.tracker_parameters import TrackerParameters, settings_of
+    from anser_ros.nodes.tracker_parts.tracker_parameters import TrackerParameters, settings_of
 
     rng, node = np.random.default_rng(8), tracker.node
     box = ((-0.1, -0.1, 0.2), (0.1, 0.1, 0.3))

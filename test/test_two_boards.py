@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from anser_ros.nodes.pose_output import PoseTopic
+from anser_ros.nodes.tracker_parts.pose_output import PoseTopic
 from anser_ros.wire.bag import read_bag
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux

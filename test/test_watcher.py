@@ -190,7 +190,7 @@ class Heard:
     def __init__(self, ros):
         from diagnostic_msgs.msg import DiagnosticArray
 
-        from anser_ros.nodes import qos
+        from anser_ros.nodes.runtime import qos
 
         self.node = ros.create_node('listener')
         self.lines = {}
@@ -245,7 +245,7 @@ def test_fluxes_of_another_frame_are_counted_and_not_looked_at(ros, moving):
     from rclpy.parameter import Parameter
     from std_msgs.msg import String
 
-    from anser_ros.nodes.clouds import FluxCloud
+    from anser_ros.nodes.streams.clouds import FluxCloud
     from anser_ros.nodes.watcher import Watcher
 
     node = Watcher(parameter_overrides=[Parameter('model_file', value=str(MODEL))])

@@ -114,7 +114,7 @@ def test_over_dds_a_late_tracker_is_named_with_no_field_model(ros):
     from geometry_msgs.msg import PoseStamped
     from rclpy.parameter import Parameter
 
-    from anser_ros.nodes import qos
+    from anser_ros.nodes.runtime import qos
     from anser_ros.nodes.watcher import Watcher
 
     world = World(7, duration=14.0, sensors=1)

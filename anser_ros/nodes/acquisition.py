@@ -15,27 +15,27 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from anser_ros.errors import AnserError, PortError
-from anser_ros.nodes import qos
-from anser_ros.nodes.acquisition_parameters import AcquisitionParameters
-from anser_ros.nodes.backlog import Backlog
-from anser_ros.nodes.clouds import FluxCloud
-from anser_ros.nodes.fault_memory import FAULTS, RecentFaults, device_words
-from anser_ros.nodes.flux_frame import FluxFrame, Staleness
-from anser_ros.nodes.flux_stream import FluxStream, StreamOptions
-from anser_ros.nodes.handover import HandedFlux
-from anser_ros.nodes.measured_accuracy import MeasuredAccuracy
-from anser_ros.nodes.node import AnserNode, Level, Status, main
-from anser_ros.nodes.overload import too_slow
-from anser_ros.nodes.process import TURN_S
-from anser_ros.nodes.stream_interval import Interval
-from anser_ros.nodes.stream_status import (
+from anser_ros.nodes.acquisition_parts.acquisition_parameters import AcquisitionParameters
+from anser_ros.nodes.acquisition_parts.fault_memory import FAULTS, RecentFaults, device_words
+from anser_ros.nodes.acquisition_parts.flux_frame import FluxFrame, Staleness
+from anser_ros.nodes.acquisition_parts.flux_stream import FluxStream, StreamOptions
+from anser_ros.nodes.acquisition_parts.measured_accuracy import MeasuredAccuracy
+from anser_ros.nodes.acquisition_parts.stream_interval import Interval
+from anser_ros.nodes.acquisition_parts.stream_status import (
     clock_troubles,
     clock_values,
     emitter_statuses,
     sensor_statuses,
     signal_troubles,
 )
-from anser_ros.nodes.wall_clock import WallClock
+from anser_ros.nodes.acquisition_parts.wall_clock import WallClock
+from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.handover import HandedFlux
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.process import TURN_S
+from anser_ros.nodes.streams.backlog import Backlog
+from anser_ros.nodes.streams.clouds import FluxCloud
+from anser_ros.nodes.streams.overload import too_slow
 from anser_ros.wire.channel_calibration import parse_channels
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.frames import TYPE_OF

@@ -10,9 +10,9 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 
 from anser_ros.errors import ParameterError
-from anser_ros.nodes import qos
-from anser_ros.nodes.node import AnserNode, Level, Status, main
-from anser_ros.nodes.parameters import parameter
+from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.parameters import parameter
 from anser_ros.poses.corrector import OK, OUTSIDE, PoseCorrector
 from anser_ros.stamps import set_stamp, stamp_of
 from anser_ros.wire.model_file import read_document

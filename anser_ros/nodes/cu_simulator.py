@@ -16,10 +16,10 @@ from geometry_msgs.msg import PoseStamped
 from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import ParameterError
-from anser_ros.nodes import qos
-from anser_ros.nodes.node import AnserNode, Level, Status, main
-from anser_ros.nodes.parameters import parameter
-from anser_ros.nodes.shared_names import optical_parameter
+from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.shared_names import optical_parameter
 from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.control_unit import BLOCK_SAMPLES, ControlUnit, Piece
 from anser_ros.simulation.effect_draw import NONE as NO_EFFECT

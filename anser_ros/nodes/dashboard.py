@@ -7,14 +7,14 @@ from typing import Any
 
 from std_msgs.msg import String
 
-from anser_ros.nodes import qos
-from anser_ros.nodes.chain_client import ChainClient
-from anser_ros.nodes.live_view import LiveView
-from anser_ros.nodes.node import AnserNode, Level, Status, main
-from anser_ros.nodes.parameters import parameter
-from anser_ros.nodes.polled import polling_node
-from anser_ros.nodes.shared_names import optical_parameter
-from anser_ros.nodes.view_source import ViewSource
+from anser_ros.nodes.output_parts.chain_client import ChainClient
+from anser_ros.nodes.output_parts.live_view import LiveView
+from anser_ros.nodes.output_parts.polled import polling_node
+from anser_ros.nodes.output_parts.view_source import ViewSource
+from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.shared_names import optical_parameter
 from anser_ros.wire.tcp_ports import LIVE_VIEW
 
 

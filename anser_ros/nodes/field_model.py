@@ -18,19 +18,19 @@ from anser_ros.errors import AnserError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
 from anser_ros.integrity import withheld as why
-from anser_ros.nodes import refit_status
-from anser_ros.nodes.diagnostics import Trouble
-from anser_ros.nodes.field_model_parameters import FieldModelParameters
-from anser_ros.nodes.flux_reader import read_frame
-from anser_ros.nodes.metal_view import MetalView
-from anser_ros.nodes.model_output import ModelOutput
-from anser_ros.nodes.moving_coils import MovingCoils
-from anser_ros.nodes.newest_frame import NewestSource
-from anser_ros.nodes.node import LONGEST_END_S, AnserNode, Level, Status, main
-from anser_ros.nodes.one_source import LOOK_S, said_of, setup_source
-from anser_ros.nodes.place_watch import PlaceWatch
-from anser_ros.nodes.refit_in_force import RefitInForce
-from anser_ros.nodes.stated_parameters import stated_by
+from anser_ros.nodes.field_model_parts import refit_status
+from anser_ros.nodes.field_model_parts.field_model_parameters import FieldModelParameters
+from anser_ros.nodes.field_model_parts.metal_view import MetalView
+from anser_ros.nodes.field_model_parts.model_output import ModelOutput
+from anser_ros.nodes.field_model_parts.moving_coils import MovingCoils
+from anser_ros.nodes.field_model_parts.place_watch import PlaceWatch
+from anser_ros.nodes.field_model_parts.refit_in_force import RefitInForce
+from anser_ros.nodes.runtime.diagnostics import Trouble
+from anser_ros.nodes.runtime.node import LONGEST_END_S, AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.stated_parameters import stated_by
+from anser_ros.nodes.streams.flux_reader import read_frame
+from anser_ros.nodes.streams.newest_frame import NewestSource
+from anser_ros.nodes.streams.one_source import LOOK_S, said_of, setup_source
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.baseline import ReadingWindow, check_enough
 from anser_ros.refit.change import Pace

@@ -8,7 +8,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 
-from anser_ros.nodes import qos
+from anser_ros.nodes.runtime import qos
 
 NAME = 'anser_doctor'
 SLICE_S = 0.1

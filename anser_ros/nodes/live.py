@@ -11,7 +11,7 @@ import sys
 
 from anser_ros.nodes.acquisition import Acquisition
 from anser_ros.nodes.field_model import FieldModelNode
-from anser_ros.nodes.process import TURN_S, main
+from anser_ros.nodes.runtime.process import TURN_S, main
 from anser_ros.nodes.tracker import TrackerNode
 
 CHAIN = (Acquisition, FieldModelNode, TrackerNode)

@@ -16,12 +16,12 @@ from rich.markup import escape
 from rich.table import Table
 from std_msgs.msg import String
 
-from anser_ros.nodes import qos
-from anser_ros.nodes.causes import Told, causes
-from anser_ros.nodes.node import AnserNode, Level, Status, main
-from anser_ros.nodes.parameters import parameter
-from anser_ros.nodes.shared_names import optical_parameter
-from anser_ros.nodes.traces import OpticalTrace, Row, Traces, latency_of, targets_of
+from anser_ros.nodes.output_parts.causes import Told, causes
+from anser_ros.nodes.output_parts.traces import OpticalTrace, Row, Traces, latency_of, targets_of
+from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.shared_names import optical_parameter
 from anser_ros.wire.pose_topics import optical_topic
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 

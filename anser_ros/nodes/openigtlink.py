@@ -11,11 +11,11 @@ from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import String
 
 from anser_ros.errors import AnserError, ParameterError
-from anser_ros.nodes import qos
-from anser_ros.nodes.igtl_server import IgtlServer
-from anser_ros.nodes.node import AnserNode, Level, Status, main
-from anser_ros.nodes.parameters import parameter
-from anser_ros.nodes.tracker_parameters import TrackerParameters
+from anser_ros.nodes.output_parts.igtl_server import IgtlServer
+from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.tracker_parts.tracker_parameters import TrackerParameters
 from anser_ros.tracking.estimate import OK, STALE
 from anser_ros.wire import igtl
 from anser_ros.wire.setup import Setup, parse_setup, topic_of

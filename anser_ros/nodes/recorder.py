@@ -13,11 +13,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_srvs.srv import Trigger
 
 from anser_ros.errors import AnserError
-from anser_ros.nodes.definitions import definition, message_class, type_hash
-from anser_ros.nodes.node import AnserNode, Level, Status, main
-from anser_ros.nodes.parameters import parameter
-from anser_ros.nodes.recording_log import TopicLog, report
-from anser_ros.nodes.shared_names import optical_parameter
+from anser_ros.nodes.bag_parts.definitions import definition, message_class, type_hash
+from anser_ros.nodes.bag_parts.recording_log import TopicLog, report
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.shared_names import optical_parameter
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.bag_metadata import qos_profile, write_metadata
 from anser_ros.wire.bag_writer import BagWriter

@@ -16,13 +16,13 @@ from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
 
 from anser_ros.errors import AnserError, BagError, ParameterError
-from anser_ros.nodes import qos
-from anser_ros.nodes.consumers import Consumers
-from anser_ros.nodes.definitions import message_class
-from anser_ros.nodes.node import AnserNode, Level, Status, main
-from anser_ros.nodes.parameters import parameter
-from anser_ros.nodes.readiness import Readiness
-from anser_ros.nodes.shared_names import optical_parameter
+from anser_ros.nodes.bag_parts.consumers import Consumers
+from anser_ros.nodes.bag_parts.definitions import message_class
+from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.shared_names import optical_parameter
+from anser_ros.nodes.streams.readiness import Readiness
 from anser_ros.stamps import set_stamp
 from anser_ros.wire.bag import RawMessage, Salvage, iter_messages
 from anser_ros.wire.pose_topics import OPTICAL

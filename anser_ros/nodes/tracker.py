@@ -16,22 +16,30 @@ from anser_ros.errors import AnserError
 from anser_ros.field.model import FieldModel
 from anser_ros.integrity.ageing import Standing
 from anser_ros.integrity.withheld import TWO_SOURCES, Withheld
-from anser_ros.nodes import qos
-from anser_ros.nodes.answered_frames import AnsweredFrames
-from anser_ros.nodes.backlog import Backlog
-from anser_ros.nodes.diagnostics import Trouble
-from anser_ros.nodes.flux_reader import read_frame
-from anser_ros.nodes.handover import HandedFlux
-from anser_ros.nodes.model_in_force import ModelInForce
-from anser_ros.nodes.model_intake import GivenModel, ModelIntake
-from anser_ros.nodes.newest_frame import newest_of
-from anser_ros.nodes.node import AnserNode, Level, Status, main
-from anser_ros.nodes.one_source import OneSource, said_of, setup_source
-from anser_ros.nodes.overload import Load
-from anser_ros.nodes.pose_output import PoseTopic, transform_message, transform_publisher
-from anser_ros.nodes.readiness import digest_of
-from anser_ros.nodes.stated_parameters import stated_by
-from anser_ros.nodes.tracker_parameters import TrackerParameters, settings_of, tips_of_file
+from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.diagnostics import Trouble
+from anser_ros.nodes.runtime.handover import HandedFlux
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.stated_parameters import stated_by
+from anser_ros.nodes.streams.backlog import Backlog
+from anser_ros.nodes.streams.flux_reader import read_frame
+from anser_ros.nodes.streams.newest_frame import newest_of
+from anser_ros.nodes.streams.one_source import OneSource, said_of, setup_source
+from anser_ros.nodes.streams.overload import Load
+from anser_ros.nodes.streams.readiness import digest_of
+from anser_ros.nodes.tracker_parts.answered_frames import AnsweredFrames
+from anser_ros.nodes.tracker_parts.model_in_force import ModelInForce
+from anser_ros.nodes.tracker_parts.model_intake import GivenModel, ModelIntake
+from anser_ros.nodes.tracker_parts.pose_output import (
+    PoseTopic,
+    transform_message,
+    transform_publisher,
+)
+from anser_ros.nodes.tracker_parts.tracker_parameters import (
+    TrackerParameters,
+    settings_of,
+    tips_of_file,
+)
 from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.starting_model import check_emitters, model_of
 from anser_ros.sessions.tracker_settings import settings_for

@@ -15,15 +15,21 @@ from std_msgs.msg import String
 from anser_ros.errors import AnserError
 from anser_ros.field.model import EffectRecord
 from anser_ros.integrity.withheld import TWO_SOURCES
-from anser_ros.nodes import qos
-from anser_ros.nodes.flux_reader import read_frame
-from anser_ros.nodes.node import AnserNode, Level, Status, main
-from anser_ros.nodes.one_source import OneSource, said_of, setup_source
-from anser_ros.nodes.parameters import parameter
-from anser_ros.nodes.pose_streams import PoseStreams, pose_values, pose_words
-from anser_ros.nodes.shared_names import optical_parameter
-from anser_ros.nodes.sighting_words import figures_of, plain_text, title_of, values_of, words_of
-from anser_ros.nodes.stated_parameters import stated, stated_by
+from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
+from anser_ros.nodes.runtime.parameters import parameter
+from anser_ros.nodes.runtime.shared_names import optical_parameter
+from anser_ros.nodes.runtime.stated_parameters import stated, stated_by
+from anser_ros.nodes.streams.flux_reader import read_frame
+from anser_ros.nodes.streams.one_source import OneSource, said_of, setup_source
+from anser_ros.nodes.watcher_parts.pose_streams import PoseStreams, pose_values, pose_words
+from anser_ros.nodes.watcher_parts.sighting_words import (
+    figures_of,
+    plain_text,
+    title_of,
+    values_of,
+    words_of,
+)
 from anser_ros.poses.live_look import PoseSighting, PoseWatch
 from anser_ros.poses.live_window import PoseWindow
 from anser_ros.poses.sequence import PoseSession

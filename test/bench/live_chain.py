@@ -56,8 +56,8 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.signals import SignalHandlerOptions
-from anser_ros.nodes import qos
-from anser_ros.nodes.process import make_executor
+from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.runtime.process import make_executor
 
 def main():
     output, *topics = sys.argv[1:]
@@ -95,7 +95,7 @@ FLOOR = """
 import sys, os, termios, tty
 import rclpy
 from geometry_msgs.msg import PoseStamped
-from anser_ros.nodes import qos
+from anser_ros.nodes.runtime import qos
 from anser_ros.wire.frame_reader import FrameReader
 from anser_ros.wire.frames import encode
 from anser_ros.wire.records import SampleBlock, Start

@@ -66,8 +66,8 @@ class Witness:
         from rclpy.executors import ExternalShutdownException
         from sensor_msgs.msg import PointCloud2
 
-        from anser_ros.nodes import qos
-        from anser_ros.nodes.process import make_executor
+        from anser_ros.nodes.runtime import qos
+        from anser_ros.nodes.runtime.process import make_executor
 
         self.setup = setup
         self.poses: list[SeenPose] = []

@@ -1,0 +1,33 @@
+"""Counts what the acquisition has published since it last told of itself."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from anser_ros.nodes.acquisition_parts.flux_frame import FluxFrame, Staleness
+
+
+@dataclass
+class Interval:
+    """Counts what happened since the last diagnostics."""
+
+    begin_s: float
+    frames: int = 0
+    delay_sum_s: float = 0.0
+    delay_max_s: float = 0.0
+    flags: np.ndarray | None = None
+    staleness: Staleness | None = None
+    repeats: int = 0
+    duplicates: int = 0
+    skipped: int = 0
+
+    def add(self, frame: FluxFrame, delay_s: float) -> None:
+        """Note a published frame."""
+        self.frames += 1
+        self.delay_sum_s += delay_s
+        self.delay_max_s = max(self.delay_max_s, delay_s)
+        known = self.flags is not None and self.flags.shape == frame.flags.shape
+        self.flags = self.flags | frame.flags if known else frame.flags
+        now = frame.staleness
+        self.staleness = self.staleness | now if known and self.staleness else now
+        self.repeats += frame.repeats

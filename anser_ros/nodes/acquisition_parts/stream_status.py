@@ -1,0 +1,171 @@
+"""Tells what an acquisition says of emitters and sensors: a line each, what is wrong in words."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from anser_ros.nodes.acquisition_parts.flux_frame import FluxFrame, Staleness
+from anser_ros.nodes.acquisition_parts.flux_stream import FluxStream
+from anser_ros.nodes.runtime.diagnostics import Level, Status
+from anser_ros.signals.clock import ClockState
+from anser_ros.wire.points import DROPPED, SATURATED, STALE
+from anser_ros.wire.setup import Coil
+
+MOST_NAMES = 4
+"""Sensors that are named in one line; of the others their number is told."""
+STATES = (
+    (STALE, Level.ERROR, 'stuck', 'all samples of a window are the same'),
+    (SATURATED, Level.WARN, 'saturated', ''),
+    (DROPPED, Level.WARN, 'samples lost', ''),
+)
+"""Flag bits of a sensor, the gravest first, with what they mean."""
+
+
+def signal_troubles(
+    coils: Sequence[Coil],
+    stream: FluxStream,
+    frame: FluxFrame | None,
+    flags: np.ndarray | None,
+    staleness: Staleness | None = None,
+) -> list[tuple[Level, str]]:
+    """Return what is wrong with the signals, by the names of emitters and sensors.
+
+    Parameters
+    ----------
+    coils : sequence of Coil
+        The emitters, in the order of the setup document.
+    stream : FluxStream
+        Of the connection.
+    frame : FluxFrame or None
+        The newest one.
+    flags : ndarray, shape (S,), or None
+        Flag bits that the sensors had since the last look. Lost samples are not told here: the
+        counters of the line say where they were lost.
+    staleness : Staleness, optional
+        Why they were stale.
+    """
+    found = []
+    if stream.missing:
+        names = _named(sensor.name for sensor in stream.missing)
+        found.append((Level.WARN, f'the control unit has no channel for {names}'))
+    if frame is not None and not frame.window.driven.all():
+        pairs = zip(coils, frame.window.driven, strict=True)
+        names = _named(coil.name for coil, driven in pairs if not driven)
+        found.append((Level.ERROR, f'no current in {names}'))
+    if flags is None or len(flags) != len(stream.sensors):
+        return found
+    for bit, level, word, _ in STATES[:2]:
+        bad = [s.name for s, flag in zip(stream.sensors, flags, strict=True) if flag & bit]
+        if bad and bit == STALE and staleness is not None:
+            found += _stuck(stream, flags, staleness)
+        elif bad:
+            found.append((level, f'{word}: {_named(bad)}'))
+    return found
+
+
+def _stuck(stream: FluxStream, flags: np.ndarray, staleness: Staleness) -> list[tuple[Level, str]]:
+    """Name the stuck sensors, those of one reason together."""
+    names: dict[str, list[str]] = {}
+    for row in np.flatnonzero(flags & STALE):
+        names.setdefault(_why_stale(staleness, row), []).append(stream.sensors[row].name)
+    return [(Level.ERROR, f'stuck: {_named(bad)} {why}'.strip()) for why, bad in names.items()]
+
+
+def _why_stale(staleness: Staleness | None, row: int) -> str:
+    """What a stale sensor does; empty where it is constant."""
+    if staleness is not None and staleness.age_s[row] > 0:
+        return f'repeats what it said {staleness.age_s[row]:.2g} s ago'
+    if staleness is not None and staleness.noiseless[row]:
+        return 'has no noise that tells new samples from old'
+    return ''
+
+
+def clock_troubles(stream: FluxStream) -> list[tuple[Level, str]]:
+    """Return what is wrong with the stamps, and with the device's own clock."""
+    clock, found = stream.clock, []
+    if clock.state is ClockState.LATE and clock.is_doubted:
+        words = f'clock: everything arrives {clock.lateness_s:.2g} s late'
+        found.append((Level.WARN, words))
+    elif clock.state is ClockState.SETTLING and stream.waiting.withheld:
+        found.append((Level.ERROR, 'clock: settling, no stamp is good yet'))
+    if stream.ticks.words:
+        words = f"clock: the device's ticks {stream.ticks.words}; stamps follow its samples"
+        found.append((Level.WARN, words))
+    return found
+
+
+def clock_values(stream: FluxStream) -> dict[str, object]:
+    """Return state, lateness and uncertainty of the clock, s."""
+    clock = stream.clock
+    return {
+        'clock': clock.state.value,
+        'lateness_s': clock.lateness_s,
+        'stamp_sigma_s': clock.sigma_s,
+    }
+
+
+def emitter_statuses(coils: Sequence[Coil], stream: FluxStream, frame: FluxFrame) -> list[Status]:
+    """Return a status with amplitude, noise and current of each emitter."""
+    window = frame.window
+    statuses = []
+    for k, coil in enumerate(coils):
+        driven = bool(window.driven[k])
+        statuses.append(
+            Status(
+                f'emitter {coil.name}',
+                Level.OK if driven else Level.ERROR,
+                'driven' if driven else 'no current',
+                {
+                    'frequency_hz': float(stream.tones_hz[k]),
+                    'current_a': float(abs(window.current[k])),
+                    'nominal_current_a': float(stream.nominal_a[k]),
+                    'current_noise_a': float(window.current_sigma[k]),
+                    'flux_rms_t': _rms(window.flux[:, k]),
+                    'flux_noise_t': _rms(window.sigma[:, k]),
+                },
+            )
+        )
+    return statuses
+
+
+def sensor_statuses(
+    stream: FluxStream,
+    frame: FluxFrame,
+    flags: np.ndarray | None,
+    staleness: Staleness | None = None,
+) -> list[Status]:
+    """Return state and noise of each sensor, by the flags since the last look."""
+    seen = frame.flags if flags is None or len(flags) != len(frame.flags) else flags
+    statuses = []
+    for row, sensor in enumerate(stream.sensors):
+        level, message = _sensor_state(
+            int(seen[row]), _why_stale(staleness or frame.staleness, row)
+        )
+        values = {
+            'channel': sensor.channel,
+            'flux_rms_t': _rms(frame.window.flux[row]),
+            'flux_noise_t': _rms(frame.window.sigma[row]),
+        }
+        statuses.append(Status(sensor.name, level, message, values))
+    return statuses
+
+
+def _sensor_state(flags: int, why_stale: str) -> tuple[Level, str]:
+    for bit, level, word, usual in STATES:
+        if flags & bit:
+            why = (why_stale if bit == STALE else '') or usual
+            return level, f'{word}: {why}' if why else word
+    return Level.OK, 'ok'
+
+
+def _named(names: Iterable[str]) -> str:
+    """The first few names, and how many more there are."""
+    known = list(names)
+    more = f' and {len(known) - MOST_NAMES} more' if len(known) > MOST_NAMES else ''
+    return ', '.join(known[:MOST_NAMES]) + more
+
+
+def _rms(values: np.ndarray) -> float:
+    """Root mean square of what is finite; 0 when nothing is."""
+    finite = np.abs(values[np.isfinite(values)])
+    return float(np.sqrt(np.mean(finite**2))) if finite.size else 0.0

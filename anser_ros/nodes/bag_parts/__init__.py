@@ -1,0 +1,1 @@
+"""Holds the parts of recorder and replay: message definitions, what was recorded, who listens."""

@@ -1,0 +1,162 @@
+"""Keeps the refit that a field_model follows its references with, and the next
+while it is made.
+"""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import FitError
+from anser_ros.field.model import FieldModel
+from anser_ros.frames.intake import Frame
+from anser_ros.integrity.withheld import REFERENCES_LOST
+from anser_ros.nodes.field_model_parts.moving_coils import MovingCoils
+from anser_ros.nodes.field_model_parts.refit_start import RefitStart
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.change import Pace
+from anser_ros.refit.live_refit import LiveRefit
+from anser_ros.refit.result import RefitResult
+from anser_ros.wire.setup import Setup
+
+
+class RefitInForce:
+    """Keeps the refit, its last result, and what it is made from.
+
+    Parameters
+    ----------
+    moving : MovingCoils
+        Gets the patches of the refit.
+    pace : Pace
+        How often there is to be a result.
+    count : callable
+        Counts an event by its name.
+
+    Attributes
+    ----------
+    current : LiveRefit or None
+    result : RefitResult or None
+        Of the newest frame, since the refit began or was reset.
+    update_s : float
+        Time that the last result took, s.
+    """
+
+    def __init__(self, moving: MovingCoils, pace: Pace, count: Callable[[str], None]) -> None:
+        self._moving, self._pace, self._count = moving, pace, count
+        self._start: RefitStart | None = None
+        self._baseline: NDArray[np.complex128] | None = None
+        self.current: LiveRefit | None = None
+        self.result: RefitResult | None = None
+        self.update_s = 0.0
+
+    def prepare(
+        self, setup: Setup, base: FieldModel, references: SensorTable, at_once: bool
+    ) -> None:
+        """Be without a refit, and begin at once with what needs no baseline for the next one."""
+        self.end()
+        self.current = self.result = self._moving.patches = self._start = None
+        if len(references):
+            self._start = RefitStart(setup, base, references, self._moving.bodies)
+            if at_once:
+                self._start.prepare()
+
+    def forget_baseline(self) -> None:
+        """Drop the baseline: the readings are to be others."""
+        self._baseline = None
+
+    def begin(self, baseline: NDArray[np.complex128], is_awaited: bool = False) -> None:
+        """Begin to make a refit to what differs from a baseline.
+
+        Parameters
+        ----------
+        baseline : ndarray, shape (S, K), complex
+            T.
+        is_awaited : bool
+            Whether no pose is to be given before it is there. Otherwise what is in force goes on.
+
+        Raises
+        ------
+        FitError
+            When there are no references.
+        """
+        if self._start is None:
+            raise FitError('the setup has no reference sensors')
+        self._baseline = baseline
+        self._start.begin(baseline, is_awaited)
+
+    def begin_again(self) -> None:
+        """Begin to make one to the last baseline, if there is one; it is awaited."""
+        if self._baseline is not None:
+            self.begin(self._baseline, is_awaited=True)
+
+    def wait(self) -> None:
+        """Wait until the refit is made that is being made, if there is one."""
+        if self._start is not None:
+            self._start.wait()
+
+    def take(self) -> bool:
+        """Put a refit in force that has been made meanwhile; return whether there was one.
+
+        Raises
+        ------
+        FitError
+            When none can be made.
+        """
+        started = None if self._start is None else self._start.taken()
+        if started is None:
+            return False
+        self.current, self._moving.patches = started
+        self.result = None
+        self._count('refit_starts')
+        return True
+
+    def end(self, longest_s: float = 0.0) -> bool:
+        """Give up what is being made; return whether that ended within some seconds."""
+        return self._start is None or self._start.end(longest_s)
+
+    @property
+    def words(self) -> str:
+        """Return how far the refit is that is being made; empty where none is."""
+        return '' if self._start is None else self._start.words
+
+    @property
+    def is_making(self) -> bool:
+        """Return whether a refit is being made."""
+        return self._start is not None and self._start.is_making
+
+    @property
+    def is_awaited(self) -> bool:
+        """Return whether no refit is there yet, and no pose is to be given before one is."""
+        return self.current is None and self._start is not None and self._start.is_awaited
+
+    @property
+    def withheld(self) -> str:
+        """State for which trackers are to give no pose for the newest frame."""
+        if self.result is None:
+            return REFERENCES_LOST if self.is_awaited else ''
+        return self.result.withheld
+
+    def reset(self) -> None:
+        """Let the refit forget all frames, and its last result."""
+        if self.current is not None:
+            self.current.reset()
+        self.result = None
+
+    def follow(self, frame: Frame) -> RefitResult | None:
+        """Return the result of a frame; None where the last one was less than the pace ago."""
+        refit, patches = self.current, self._moving.patches
+        if refit is None or not self._pace.is_due(frame.stamp_ns):
+            return None
+        begin_s = time.monotonic()
+        if patches is None:
+            self.result = refit.follow(frame)
+        else:
+            moved = patches.moved_refit(refit, frame.stamp_ns)
+            if moved is not None:  # the patches' new places have been worked out
+                self.current = refit = moved
+                self._count('patch_moves')
+            self.result = patches.follow(refit, frame)
+        self._count('refits')
+        self.update_s = time.monotonic() - begin_s
+        return self.result

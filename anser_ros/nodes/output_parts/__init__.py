@@ -1,0 +1,1 @@
+"""Holds the parts of monitor, dashboard and openigtlink: traces, causes, live view, server."""

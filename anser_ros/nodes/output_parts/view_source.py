@@ -1,0 +1,293 @@
+"""Tells the page what the graph shows: topics are looked at, and become arrays and words."""
+
+import math
+import os
+import struct
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from visualization_msgs.msg import Marker, MarkerArray
+
+from anser_ros.errors import AnserError
+from anser_ros.nodes.output_parts.causes import Told
+from anser_ros.nodes.output_parts.live_view import LiveView, known
+from anser_ros.nodes.output_parts.polled import STREAMS, Polled
+from anser_ros.nodes.output_parts.processor import Processor
+from anser_ros.nodes.runtime import qos
+from anser_ros.wire.pose_topics import optical_topic
+from anser_ros.wire.setup import parse_setup, topic_of
+
+STREAM = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=32, reliability=ReliabilityPolicy.BEST_EFFORT
+)
+"""Poses as they come; the newest matters, and there is room for those of a tick at 200 Hz."""
+SILENT_S = 3.5
+"""Time, s, after which a node that says nothing is said to be silent; it speaks once a second."""
+MOST_MARKS = 20
+"""Moments that are marked in the curves: more words than these cover the curves."""
+MOST_METAL = 400
+"""Balls of metal that are drawn; all are sent to every page whenever they change."""
+MOST_TOLD = 4096
+"""Names in diagnostics of which what was said is kept: several lines for each of 1000 sensors."""
+COIL_M = 0.07
+"""Side of an emitter coil, m, that is drawn where the setup does not tell it."""
+
+
+class ViewSource:
+    """Shows the graph to the page, as `anser_ros.web.page.ShownGraph` has it.
+
+    Parameters
+    ----------
+    node : Node
+        That of `polling_node`.
+    optical : str
+        Namespace of the optical poses.
+    refused : callable
+        Is told of what can't be read.
+    is_there : callable
+        Whether somebody offers a service.
+
+    Attributes
+    ----------
+    setup_text : str
+        The setup document that came last; another thread may put it there.
+    view : LiveView or None
+        What is shown of it.
+    version : int
+        Changes with the view.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        optical: str,
+        refused: Callable[[str], None],
+        is_there: Callable[[str], bool],
+    ) -> None:
+        self._node, self._optical_space = node, optical
+        self._own = {node.get_fully_qualified_name().strip('/').removesuffix(STREAMS)}
+        self._refused, self._is_there = refused, is_there
+        self.namespace = node.get_namespace().strip('/')
+        self.view: LiveView | None = None
+        self.version = 0
+        self.setup_text = self._shown_text = ''
+        self._diagnostics = Polled(node, DiagnosticArray, '/diagnostics', qos.EVENTS)
+        self._metals = Polled(node, MarkerArray, 'metal', qos.LATCHED)
+        self._poses: list[Polled] = []
+        self._optical: dict[str, Polled] = {}
+        self._told: dict[str, Told] = {}
+        self._balls: list[list[float]] = []
+        self._marks: deque[tuple[float, str]] = deque(maxlen=MOST_MARKS)
+        self._processor = Processor()
+
+    def mark(self, words: str) -> None:
+        """Mark this moment in the curves."""
+        self._marks.append((time.time(), words))
+
+    # What comes in ------------------------------------------------------------------------
+
+    def look(self) -> None:
+        """Take in what has come since the last time."""
+        self._take_setup(self.setup_text)
+        for message in self._diagnostics.messages(self._refused):
+            self._take_told(message)
+        if self.view is None:
+            return
+        for number, poses in enumerate(self._poses):
+            self._read(self.view.take_pose, number, poses)
+        for body, poses in self._optical.items():
+            self._read(self.view.take_optical, body, poses)
+
+    def _read(self, take: Callable[..., None], key: Any, polled: Polled) -> None:
+        try:
+            take(key, polled.take())
+        except (ValueError, struct.error) as error:
+            self._refused(str(error))
+
+    def _take_setup(self, text: str) -> None:
+        if text == self._shown_text:
+            return
+        self._shown_text = text
+        try:
+            setup = parse_setup(text)
+        except AnserError as error:
+            self._refused(str(error))
+            return
+        if self.view is not None and setup.has_same_board(self.view.setup):
+            self.view.setup = setup  # another rate or noise: what is shown goes on
+            return
+        for polled in (*self._poses, *self._optical.values()):
+            polled.close()
+        view = LiveView(setup, self.namespace)
+        for name, told in self._told.items():
+            view.take_told(name, told)
+        self._poses = [
+            Polled(self._node, PoseWithCovarianceStamped,
+                   f'{topic_of(target.name)}/pose_with_covariance', STREAM)
+            for target in view.targets
+        ]  # fmt: skip
+        self._optical = {
+            body: Polled(self._node, PoseStamped, optical_topic(body, self._optical_space), STREAM)
+            for body in sorted(view.bodies)
+        }
+        self.view, self.version = view, self.version + 1
+
+    def _take_told(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            is_ours = status.name.startswith(f'{self.namespace}/')
+            if not is_ours or (status.name not in self._told and len(self._told) >= MOST_TOLD):
+                continue
+            values = {pair.key: pair.value for pair in status.values}
+            told = Told(status.level[0], status.message, values)
+            self._told[status.name] = told
+            if self.view is not None:
+                self.view.take_told(status.name, told)
+
+    def add_point(self) -> None:
+        """Take the next point of the curves, and see where the metal is."""
+        if self.view is not None:
+            self.view.add_point()
+        for data, _ in self._metals.take()[-1:]:
+            self._balls = _balls(deserialize_message(data, MarkerArray))
+
+    # What is shown ------------------------------------------------------------------------
+
+    def world(self) -> dict[str, Any] | None:
+        """Return what stands still, the targets, and the curves so far."""
+        view = self.view
+        if view is None:
+            return None
+        coils, side = view.setup.emitter.coils, view.setup.emitter.geometry.get('side_m', COIL_M)
+        side = float(side) if isinstance(side, int | float) else COIL_M
+        reach = [max(abs(c.centre_m[axis]) for c in coils) + 0.75 * side for axis in (0, 1)]
+        # Numba, which it needs, is half of the start of a node that has none; a page comes later.
+        from anser_ros.sessions.volume import pose_volume
+
+        volume = pose_volume(view.setup)
+        return {
+            'board_m': reach,
+            'reach_m': max(reach),
+            'coils': [[*c.centre_m, math.radians(c.rotation_deg), side] for c in coils],
+            'references': [[*s.position_m, *s.axis] for s in view.setup.reference_sensors],
+            'volume_m': [list(volume.low), list(volume.high)],
+            'targets': [
+                {'name': t.name, 'is_body': n >= len(view.setup.tool_sensors)}
+                for n, t in enumerate(view.targets)
+            ],
+            'points': [_point(point) for point in view.points],
+            'marks': self.marks(),
+        }
+
+    def frame(self) -> list[Any]:
+        """Return the places of all targets that the view shows."""
+        return [] if self.view is None else self.view.frame()
+
+    def table(self) -> list[list[Any]]:
+        """Return level, state, reason, sigma, error (mm), residual (pT), rate of every target."""
+        view = self.view
+        if view is None:
+            return []
+        told = [view.told_of(target.name) for target in view.targets]
+        columns = zip(
+            told, 1e3 * view.sigma_m(), 1e3 * view.error_m, 1e12 * view.residual_t(),
+            view.rate_hz, strict=True,
+        )  # fmt: skip
+        return [
+            [one.level, one.message, one.values.get('reason', ''), *map(known, figures)]
+            for one, *figures in columns
+        ]
+
+    def metal(self) -> list[list[float]]:
+        """Return balls where metal seems to be."""
+        return self._balls
+
+    def point(self) -> list[Any]:
+        """Return the newest point of the curves."""
+        view = self.view
+        return [] if view is None or not view.points else _point(view.points[-1])
+
+    def marks(self) -> list[list[Any]]:
+        """Return the marked moments, each with its time and words."""
+        return [list(mark) for mark in self._marks]
+
+    def status(self) -> dict[str, Any]:
+        """Return what the page's header and lists say."""
+        view, space = self.view, self.namespace
+        own, busy = self._processor.shares()
+        status: dict[str, Any] = {
+            'place': f'/{space}', 'tracked': 'waiting for a setup', 'level': 1, 'recording': '',
+            'rate': '–', 'latency': '–', 'why': [], 'nodes': [], 'findings': [],
+            'processor': f'{busy:.0%} of {os.cpu_count()} cores', 'own': f'{own:.1%} of one',
+            'recorder': self._is_there('recorder/start'),
+            'field_model': self._is_there('field_model/set_baseline'),
+        }  # fmt: skip
+        if view is None:
+            return status
+        tracker = self._told.get(f'{space}/tracker', Told(1, 'no tracker', {}))
+        good = sum(view.told_of(target.name).level == 0 for target in view.targets)
+        rates = view.rate_hz[view.rate_hz > 0]
+        recorder = self._told.get(f'{space}/recorder')
+        is_recording = recorder is not None and recorder.message == 'recording'
+        return status | {
+            'tracked': f'{good} of {len(view.targets)} tracked',
+            'level': tracker.level if good == len(view.targets) else max(1, tracker.level),
+            'rate': f'{sorted(rates)[len(rates) // 2]:.0f}' if len(rates) else '0',
+            'latency': '–' if math.isnan(view.latency_s) else f'{1e3 * view.latency_s:.1f} ms',
+            'why': view.reasons(),
+            'nodes': self._nodes(view),
+            'findings': self._findings(view),
+            'recording': _recording(recorder) if recorder and is_recording else '',
+        }
+
+    def _nodes(self, view: LiveView) -> list[tuple[str, int, str]]:
+        found = []
+        for name, told in self._told.items():
+            home, _, short = name.rpartition('/')
+            if home == self.namespace and ':' not in name and name not in self._own:
+                if view.silent_s(name) > SILENT_S:
+                    told = Told(3, 'silent', {})
+                found.append((short, told.level, told.message))
+        return sorted(found)
+
+    def _findings(self, view: LiveView) -> list[tuple[int, str]]:
+        name = f'{self.namespace}/watcher'
+        if name not in self._told or view.silent_s(name) > SILENT_S:
+            return [(1, 'no watcher runs')]
+        parts = [
+            (told.level, f'{part.partition(": ")[2]}: {told.message}')
+            for part, told in self._told.items()
+            if part.startswith(f'{name}: ') and view.silent_s(part) <= SILENT_S
+        ]
+        own = self._told[name]
+        return [(own.level, own.message), *parts]
+
+
+def _recording(recorder: Told) -> str:
+    name = recorder.values.get('bag', '').rpartition('/')[2]
+    return f'{name} {float(recorder.values.get("duration_s", 0.0)):.0f} s'
+
+
+def _point(point: Any) -> list[Any]:
+    """A point of the curves: time (s), errors (mm) and residuals (pT)."""
+    time_s, error_m, residual_t, _ = point
+    return [
+        round(time_s, 3),
+        [known(value, 4) for value in 1e3 * error_m],
+        [known(value, 2) for value in 1e12 * residual_t],
+    ]
+
+
+def _balls(message: MarkerArray) -> list[list[float]]:
+    balls = []
+    for marker in message.markers:
+        radius = 0.5 * marker.scale.x
+        if marker.action == Marker.ADD and marker.type == Marker.SPHERE_LIST:
+            balls += [[p.x, p.y, p.z, radius] for p in marker.points]
+    return [[round(value, 4) for value in ball] for ball in balls[:MOST_METAL]]

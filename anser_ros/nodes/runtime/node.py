@@ -1,0 +1,392 @@
+"""Gives every node its base: parameters, diagnostics, guarded callbacks, start and end.
+
+A node is a class with a name and a parameter table::
+
+    class Tracker(AnserNode):
+        NAME = 'tracker'
+        EXAMPLE = '--ros-args -p model_file:=model.yaml'
+        PARAMETERS = TrackerParameters
+
+        def __init__(self, **options):
+            super().__init__(**options)
+            self.create_subscription(PointCloud2, 'tool/flux', self._on_flux, qos.STREAM)
+
+    if __name__ == '__main__':
+        sys.exit(main(Tracker))
+
+Callbacks given to ``create_subscription``, ``create_timer`` and ``create_service`` are guarded:
+an error is logged, counted and shown in ``/diagnostics``, and the node lives on.
+"""
+
+import argparse
+import contextlib
+import functools
+import threading
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from anser_ros.errors import AnserError
+from anser_ros.nodes.runtime import incoming, parameters, qos
+from anser_ros.nodes.runtime.diagnostics import Level, Status, Throttle, diagnostic_array
+from anser_ros.nodes.runtime.handover import Aside, Handover, Taking
+from anser_ros.nodes.runtime.process import main
+
+NAMESPACE = 'anser'
+DIAGNOSTICS_PERIOD_S = 1.0
+"""Time between two messages in /diagnostics, s, as other ROS nodes have it."""
+WARNING_PERIOD_S = 10.0
+"""Least time between two warnings of one kind in the log, s."""
+LONGEST_TURN_S = 0.05
+"""Time, s, that a timer waits while another thread works in its node, before it is left out until
+the next time: other nodes of the process wait meanwhile."""
+LONGEST_END_S = 0.2
+"""Time, s, that the end of a process waits for what its nodes work on aside: longer than a frame
+takes. The start of a refit takes seconds, which nobody waits for."""
+
+
+@dataclass(frozen=True)
+class NoParameters:
+    """Stands for the table of a node without parameters."""
+
+
+class AnserNode(Node):
+    """Gives all nodes their parameters, diagnostics and guarded callbacks.
+
+    Attributes
+    ----------
+    parameters : instance of ``PARAMETERS``
+        The values in force, frozen; a change that is allowed swaps the whole instance.
+    counters : collections.Counter
+        Events by name; all of them are shown in ``/diagnostics``.
+    exit_code : int or None
+        What the process ends with once :meth:`stop` was called.
+
+    Parameters
+    ----------
+    handover : Handover, optional
+        What nodes of the same process give each other directly.
+    beside : sequence of type, optional
+        The other nodes of the process: values that are given to all of them may be meant for one.
+    **options : object
+        As `rclpy.node.Node` takes them.
+    """
+
+    NAME: ClassVar[str]
+    EXAMPLE: ClassVar[str] = ''
+    """What may stand behind the name on a command line, for its help."""
+    PARAMETERS: ClassVar[type] = NoParameters
+    HAS_KERNELS: ClassVar[bool] = False
+    """Whether the node calculates with compiled kernels, and waits until all are there."""
+
+    WORKS_ASIDE: ClassVar[bool] = False
+    """Whether what is handed over is worked on in a thread of its own, the newest first."""
+
+    def __init__(
+        self,
+        handover: Handover | None = None,
+        beside: Sequence[type['AnserNode']] = (),
+        **options: Any,
+    ) -> None:
+        # The base class already creates services, so what guards them must be there first.
+        self._handover = handover
+        self._beside = tuple(beside)
+        # Where frames are handed over, they come in another thread than the executor's.
+        self._aside: Aside | None = None
+        self._turn: Any = contextlib.nullcontext() if handover is None else threading.RLock()
+        self.counters: Counter[str] = Counter()
+        self.exit_code: int | None = None
+        self._throttle = Throttle(WARNING_PERIOD_S)
+        self._fault: str | None = None
+        self._is_ending = False
+        self._faults_reported = 0
+        self.started_s = time.monotonic()
+        options.setdefault('namespace', NAMESPACE)
+        super().__init__(self.NAME, **options)
+        self.parameters = self._declare_table()
+        self.add_on_set_parameters_callback(self._on_set_parameters)
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.EVENTS)
+        self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._speak = self._guard(self._in_turn(self.publish_diagnostics, LONGEST_TURN_S))
+        timer = self._guard(self._diagnostics_due)
+        super().create_timer(DIAGNOSTICS_PERIOD_S, timer, clock=self.steady_clock)
+        if self.HAS_KERNELS:
+            # Numba is half of the start of a node that has none.
+            from anser_ros.nodes.runtime.kernel_start import wait_for_kernels
+
+            trouble = wait_for_kernels(self._say_starting)
+            if trouble:
+                self.warn('kernels_not_compiled', trouble)
+
+    # What a node may override -------------------------------------------------------------
+
+    @classmethod
+    def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
+        """Add the node's own command line; each argument goes to ``__init__`` by name."""
+
+    def status(self) -> Status:
+        """Return the state of the node itself."""
+        return Status('', Level.OK, 'running')
+
+    def part_statuses(self) -> Sequence[Status]:
+        """Return the states of what the node looks after: sensors, emitters, a port."""
+        return ()
+
+    def on_parameters(self, old: Any, new: Any) -> None:
+        """Act on changed parameters; ``self.parameters`` already holds the new ones."""
+
+    def close(self) -> None:
+        """Release what the node holds; called once at the end, signals already ignored."""
+
+    def farewell(self) -> None:
+        """Tell devices that it is over where the process is given up; in a thread of its own."""
+
+    # What a node uses ---------------------------------------------------------------------
+
+    def offer(self, publisher: Any, *, lasts: bool = False) -> None:
+        """Hand over what is published, too, to the nodes of this process that want it."""
+        if self._handover is not None:
+            self._handover.offer(publisher.topic_name, lasts=lasts)
+
+    def hand_over(self, publisher: Any, what: Any) -> None:
+        """Give something that is published to the nodes of this process."""
+        if self._handover is not None:
+            self._handover.give(publisher.topic_name, what)
+
+    def pause(self) -> None:
+        """Let the nodes of this process do what they put off: there is time until the next."""
+        if self._handover is not None:
+            self._handover.pause()
+
+    @property
+    def hands_over(self) -> bool:
+        """Return whether other nodes of this process get what this one publishes directly."""
+        return self._handover is not None
+
+    def count(self, name: str, by: int = 1) -> None:
+        """Count an event for ``/diagnostics``."""
+        self.counters[name] += by
+
+    def warn(self, kind: str, text: str) -> None:
+        """Count an event and log it: the first of a kind whole, then one in ten seconds."""
+        self.counters[kind] += 1
+        admitted = self._throttle.admit(kind, text, time.monotonic())
+        if admitted is not None:
+            self.get_logger().warning(admitted)
+
+    def stop(self, code: int = 0) -> None:
+        """End the process after the running callback."""
+        self.exit_code = code
+
+    def publish_diagnostics(self) -> None:
+        """Publish all statuses now."""
+        self._send_statuses(self._status_with_counters(), *self.part_statuses())
+
+    def _diagnostics_due(self) -> None:
+        """Publish them in the next pause between two frames, where there are such."""
+        if self._handover is None or not self._handover.put_off(self._speak_if_free):
+            self._speak()
+
+    def _speak_if_free(self) -> bool:
+        is_free = bool(self._turn.acquire(blocking=False))
+        if is_free:
+            try:
+                self._speak()
+            finally:
+                self._turn.release()
+        return is_free
+
+    def publish_end(self) -> None:
+        """Publish that the node has ended, so that its last state is not taken for a live one."""
+        self._send_statuses(
+            replace(self._status_with_counters(), level=Level.STALE, message='ended')
+        )
+
+    def _say_starting(self, text: str) -> None:
+        """Say what the start waits for, in the log once and in ``/diagnostics``."""
+        if self._throttle.admit('start', text, time.monotonic()) is not None:
+            self.get_logger().info(text)
+        self._send_statuses(Status('', Level.WARN, text))
+
+    def _status_with_counters(self) -> Status:
+        own = self.status()
+        level, message = own.level, own.message
+        if self.counters['callback_faults'] > self._faults_reported:
+            self._faults_reported = self.counters['callback_faults']
+            level, message = Level.ERROR, f'callback failed: {self._fault}'
+        values = {**own.values, **self.counters, 'uptime_s': time.monotonic() - self.started_s}
+        return Status(own.name, level, message, values)
+
+    def _send_statuses(self, *statuses: Status) -> None:
+        name = self.get_fully_qualified_name().strip('/')
+        stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(diagnostic_array(name, statuses, stamp))
+
+    # Guarded callbacks --------------------------------------------------------------------
+
+    def create_subscription(
+        self, msg_type, topic, callback, qos_profile, *, handed=None, **options
+    ):
+        """Subscribe as rclpy does, with the callback guarded, and what is too large refused.
+
+        What a node of this process hands over goes to ``handed``, by default the callback too.
+        """
+        bounded = incoming.is_bounded(msg_type) and not options.get('raw', False)
+
+        @functools.wraps(callback)
+        def opened(message, *info):
+            return callback(incoming.opened(message, msg_type) if bounded else message, *info)
+
+        name = self.resolve_topic_name(topic)
+        if self._handover is not None and self._handover.offers(name):
+            taker = self._guard(self._in_turn(handed or callback))
+            return self._handover.take(name, self._put_aside(name, taker))
+        guarded = self._guard(self._in_turn(opened))
+
+        @functools.wraps(callback)
+        def unpacked(*args):
+            # The events executor gives message and its information as one pair.
+            if len(args) == 1 and isinstance(args[0], tuple):
+                args = args[0]
+            return guarded(*args)
+
+        if bounded:
+            options['raw'] = True
+        return super().create_subscription(msg_type, topic, unpacked, qos_profile, **options)
+
+    def create_timer(self, timer_period_sec, callback, *args, **options):
+        """Make a timer as rclpy does, with the callback guarded."""
+        guarded = self._guard(self._in_turn(callback, LONGEST_TURN_S))
+        return super().create_timer(timer_period_sec, guarded, *args, **options)
+
+    def create_service(self, srv_type, srv_name, callback, **options):
+        """Serve as rclpy does; an error becomes ``success = False`` with its message."""
+        guarded = self._guard(self._in_turn(callback), is_service=True)
+        return super().create_service(srv_type, srv_name, guarded, **options)
+
+    def destroy_subscription(self, subscription: Any) -> bool:
+        """Destroy a subscription as rclpy does, or take no longer what is handed over."""
+        if isinstance(subscription, Taking) and self._handover is not None:
+            self._handover.drop(subscription)
+            return True
+        return super().destroy_subscription(subscription)
+
+    def _put_aside(self, topic: str, taker: Callable) -> Callable:
+        if not self.WORKS_ASIDE:
+            return taker
+        aside = self._aside = self._aside or Aside(lambda: self.count('frames_skipped'))
+        return lambda what: aside.put(topic, taker, what)
+
+    def stop_working(self) -> bool:
+        """End what is worked on aside; False where that still goes on after a while."""
+        self._is_ending = True
+        return self._aside is None or self._aside.end(LONGEST_END_S)
+
+    def destroy_node(self) -> None:
+        """Destroy the node as rclpy does; nothing is worked on aside for it afterwards."""
+        self.stop_working()
+        super().destroy_node()
+
+    def _in_turn(self, callback: Callable, longest_s: float = -1.0) -> Callable:
+        """A callback that waits for another one of this node in another thread.
+
+        One that comes again does not hold up other nodes for long, and is left out.
+        """
+
+        @functools.wraps(callback)
+        def in_turn(*args):
+            if not self._turn.acquire(timeout=longest_s):
+                return None
+            try:
+                return callback(*args)
+            finally:
+                self._turn.release()
+
+        return in_turn if self._handover is not None else callback
+
+    def _guard(self, callback: Callable, is_service: bool = False) -> Callable:
+        @functools.wraps(callback)
+        def guarded(*args):
+            reason = ''
+            try:
+                return callback(*args)
+            except AnserError as error:
+                reason = ' '.join(str(error).split())
+                self.warn(f'refused_{type(error).__name__}', reason)
+            except Exception as error:  # noqa: BLE001 - the node must outlive any callback
+                if self.context.ok() and not self._is_ending:
+                    reason = f'{type(error).__name__}: {error}'
+                    self._report_fault(reason)
+            if is_service:
+                return _failed(args[1], reason)
+            return None
+
+        return guarded
+
+    def _report_fault(self, reason: str) -> None:
+        self._fault = reason
+        self.counters['callback_faults'] += 1
+        text = f'callback failed\n{traceback.format_exc()}'
+        admitted = self._throttle.admit(f'fault {reason}', text, time.monotonic())
+        if admitted is not None:
+            self.get_logger().error(admitted)
+
+    # Parameters ---------------------------------------------------------------------------
+
+    def _declare_table(self) -> Any:
+        table = self.PARAMETERS
+        values: dict[str, Any] = {}
+        # rclpy drops overrides that nobody declares; a misspelt name must not pass silently.
+        others = {name for node in self._beside for name in parameters.types(node.PARAMETERS)}
+        given = [name for name in self._parameter_overrides if name not in others]
+        unknown = [name for name in given if not parameters.is_known(table, name)]
+        if unknown:
+            parameters.build(table, dict.fromkeys(sorted(unknown)))
+        for name, rule in parameters.rules(table).items():
+            default = getattr(table, name)
+            descriptor = ParameterDescriptor(
+                description=rule.description,
+                additional_constraints=', '.join(rule.choices),
+                read_only=not rule.live,
+                dynamic_typing=True,  # so that a whole number will do for a float
+            )
+            given = self.declare_parameter(name, _as_ros(default), descriptor).value
+            values[name] = default if given is None else given
+        return parameters.build(table, values)
+
+    def _on_set_parameters(self, changed: Sequence[Parameter]) -> SetParametersResult:
+        own = {p.name: p.value for p in changed if not parameters.is_foreign(p.name)}
+        if not own:
+            return SetParametersResult(successful=True)
+        old = self.parameters
+        try:
+            new = parameters.build(self.PARAMETERS, {**vars(old), **own})
+            with self._turn:
+                self.parameters = new
+                self.on_parameters(old, new)
+        except AnserError as error:
+            self.parameters = old
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+
+def _as_ros(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _failed(response: Any, reason: str) -> Any:
+    if hasattr(response, 'success'):
+        response.success, response.message = False, reason
+    return response
+
+
+__all__ = ['AnserNode', 'Level', 'Status', 'main']

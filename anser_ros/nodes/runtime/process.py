@@ -1,0 +1,303 @@
+"""Runs the process of one node: its arguments, its signals, its executor and its exit code."""
+
+import argparse
+import gc
+import os
+import signal
+import socket
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Sequence
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+import rclpy
+from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
+from rclpy.executors import Executor, SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+from anser_ros.errors import AnserError, ParameterError
+from anser_ros.nodes.runtime import parameter_files, parameters
+from anser_ros.nodes.runtime.handover import Handover
+from anser_ros.one_line_parser import OneLineParser
+from anser_ros.wire.config_folder import config_path
+
+if TYPE_CHECKING:
+    from anser_ros.nodes.runtime.node import AnserNode
+
+# How long a signal may go unnoticed by an idle node.
+SPIN_SLICE_S = 0.1
+# Where Fast DDS looks for profiles; the user's own ones hold.
+PROFILE_VARIABLES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
+PROFILES = 'fastdds.xml'
+# Without it, rmw_fastrtps sets how the memory of messages is kept itself; the ROS QoS hold anyway.
+READ_PROFILES = 'RMW_FASTRTPS_USE_QOS_FROM_XML'
+ENDING = (signal.SIGINT, signal.SIGTERM)
+NOTICE_S = 1.0
+"""How long, s, a busy process may take to notice that it is to end: the start of a refit takes
+seconds, and who presses Ctrl-C has the prompt back within 1.5 s."""
+TURN_S = 1e-3
+"""Time, s, after which a thread lets another one have its turn where samples are received.
+Python's usual 5 ms would be as much error in the time at which bytes arrive."""
+RENAMING = ('__node:=', '__name:=')
+"""Rules that rename all nodes of a process, which several can't be."""
+
+
+def main(
+    node_class: 'type[AnserNode] | Sequence[type[AnserNode]]',
+    argv: Sequence[str] | None = None,
+    name: str = '',
+) -> int:
+    """Run nodes until one of them ends, or until SIGINT or SIGTERM.
+
+    Parameters
+    ----------
+    node_class : type, or sequence of types
+        The node; or several that hand their frames over to each other, in the order of the chain.
+    argv : sequence of str, optional
+        The command line; that of the process by default.
+    name : str, optional
+        How the process is called, where it is not called like its node.
+
+    Returns
+    -------
+    int
+        0 ended as asked; 2 a wrong argument or parameter, said in one line; 1 a defect.
+    """
+    arguments = list(sys.argv if argv is None else argv)
+    classes = tuple(node_class) if isinstance(node_class, Sequence) else (node_class,)
+    name = name or classes[0].NAME
+    try:
+        own = _parse(name, classes, _without_ros(arguments))
+        if len(classes) > 1 and any(text.startswith(RENAMING) for text in arguments):
+            raise ParameterError(f'one node is renamed by -r {classes[-1].NAME}:__node:=NAME')
+        signals = _Signals()
+        _choose_profile()
+        common, meant = _meant_for(classes, arguments)
+        rclpy.init(args=common, signal_handler_options=SignalHandlerOptions.NO)
+        return _run(classes, own, arguments, meant, signals)
+    except AnserError as error:
+        print(f'{name}: {" ".join(str(error).split())}', file=sys.stderr)
+        return 2
+    except (_Interrupted, rclpy.exceptions.ROSInterruptException):
+        return 0
+    except Exception:  # noqa: BLE001 - the outermost place: whatever is left is a defect
+        traceback.print_exc()
+        return 1
+    finally:
+        rclpy.try_shutdown()
+
+
+def _choose_profile() -> None:
+    """Let the middleware announce nodes more often, and give back the memory of messages.
+
+    The first is so that nodes find each other at once, the second so that a huge message leaves
+    nothing behind.
+    """
+    if not any(os.environ.get(variable) for variable in PROFILE_VARIABLES):
+        os.environ[PROFILE_VARIABLES[0]] = str(config_path(PROFILES))
+        os.environ.setdefault(READ_PROFILES, '1')
+
+
+def _without_ros(arguments: Sequence[str]) -> list[str]:
+    """Return the node's own arguments, the program's name left out."""
+    try:
+        return list(remove_ros_args(arguments)[1:])
+    except (RCLError, UnknownROSArgsError) as error:  # such as a file without parameters
+        raise ParameterError(f'ROS arguments: {error}') from error
+
+
+def _parse(
+    name: str, classes: 'Sequence[type[AnserNode]]', arguments: Sequence[str]
+) -> dict[str, Any]:
+    module = classes[0].__module__ if len(classes) == 1 else '__main__'
+    summary = (sys.modules[module].__doc__ or '').strip().split('\n')[0]
+    tables = [(node.NAME, parameters.describe(node.PARAMETERS)) for node in classes]
+    prefix = '' if len(classes) == 1 else 'NODE:'
+    if prefix:
+        table = '\n'.join(f'{node}:\n{table}' for node, table in tables)
+    else:
+        table = tables[0][1]
+    example = classes[0].EXAMPLE
+    if prefix:
+        example = example.replace('-p ', f'-p {classes[0].NAME}:')
+    parser = OneLineParser(
+        prog=f'anser {name}',
+        description=summary,
+        epilog=f'example: anser {name} {example}\n\n'
+        f'parameters (--ros-args -p {prefix}NAME:=VALUE, or --params-file):\n{table}',
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    for node in classes:
+        node.add_arguments(parser)
+    return vars(parser.parse_args(arguments))
+
+
+def _meant_for(
+    classes: 'Sequence[type[AnserNode]]', arguments: Sequence[str]
+) -> tuple[list[str], dict[str, list[str]]]:
+    """Split off the parameters of one node among several, ``-p NODE:NAME:=VALUE``.
+
+    ROS has this too, but finds no node so that is in a namespace, and drops the value.
+    """
+    common, meant = [], {node.NAME: ['--ros-args'] for node in classes}
+    left = iter(arguments)
+    for text in left:
+        value = next(left, '') if text in ('-p', '--param') else None
+        node, _, rule = (value or '').partition(':')
+        if len(classes) > 1 and node in meant and ':=' in rule:
+            _check_known(classes, node, rule.partition(':=')[0])
+            meant[node] += [text, rule]
+        else:
+            common += [text] if value is None else [text, value]
+    return common, meant
+
+
+def _check_known(classes: 'Sequence[type[AnserNode]]', node: str, name: str) -> None:
+    """Refuse a value for one node among several that another one of them knows, or none."""
+    owners = [c.NAME for c in classes if parameters.is_known(c.PARAMETERS, name)]
+    if node not in owners:
+        hint = f'; {" and ".join(owners)} has it' if owners else ''
+        raise ParameterError(f'{node} has no parameter {name}{hint}')
+
+
+class _Interrupted(BaseException):
+    """A signal came while the node was still being made."""
+
+
+def _is_compiling(frame: FrameType | None) -> bool:
+    """Return whether the compiler is at work: exceptions in its callbacks are printed and lost."""
+    while frame is not None:
+        if str(frame.f_globals.get('__name__', '')).startswith('llvmlite.'):
+            return True
+        frame = frame.f_back
+    return False
+
+
+class _Signals:
+    """Catches SIGINT and SIGTERM from now on.
+
+    rclpy's own handlers end the context at once, so that a node could neither close its files
+    in order nor say its last word in ``/diagnostics``. A node that is still being made is given
+    up on the spot; one whose main thread does not get round to noticing, for a kernel is being
+    compiled, is ended by a thread that does.
+    """
+
+    def __init__(self) -> None:
+        self.is_node_made = False
+        self.caught: list[int] = []
+        self._noticed = threading.Event()
+        # What devices have to be told where the process is given up.
+        self.farewells: list[Callable[[], object]] = []
+        for number in ENDING:
+            signal.signal(number, self._catch)
+        # Python's handlers wait for the main thread; this channel does not.
+        self._reader, self._writer = socket.socketpair()
+        self._writer.setblocking(False)
+        signal.set_wakeup_fd(self._writer.fileno(), warn_on_full_buffer=False)
+        threading.Thread(target=self._watch, name='signals', daemon=True).start()
+
+    def ignore(self) -> None:
+        """Ignore all further ones: a second Ctrl-C must not cut the closing of files short."""
+        self._noticed.set()
+        for number in ENDING:
+            signal.signal(number, signal.SIG_IGN)
+
+    def _catch(self, number: int, frame: FrameType | None) -> None:
+        self.caught.append(number)
+        if not self.is_node_made and not _is_compiling(frame):
+            raise _Interrupted
+
+    def _watch(self) -> None:
+        while self._reader.recv(1)[0] not in ENDING:
+            pass
+        if self._noticed.wait(NOTICE_S):
+            return
+        for farewell in self.farewells:
+            try:
+                farewell()
+            except Exception:  # noqa: BLE001 - the process ends, whatever a device says
+                traceback.print_exc()
+        if not self._noticed.is_set():
+            sys.stderr.flush()
+            os._exit(0)
+
+
+def make_executor() -> Executor:
+    """Return the executor of a node: one thread, told of events where rclpy can do that.
+
+    With a dozen topics the waiting of the older one, which looks through all entities for every
+    message, costs several times what is done with the message. Jazzy has both since rclpy 7.1.4.
+    """
+    try:
+        from rclpy.experimental import EventsExecutor
+    except ImportError:
+        return SingleThreadedExecutor()
+    return EventsExecutor()
+
+
+def _run(
+    classes: 'Sequence[type[AnserNode]]',
+    own: dict[str, Any],
+    arguments: Sequence[str],
+    meant: dict[str, list[str]],
+    signals: _Signals,
+) -> int:
+    nodes: list[AnserNode] = []
+    code = 0
+    executor = make_executor()
+    handover = Handover()
+    try:
+        for node_class in classes:
+            options: dict[str, Any] = {}
+            if len(classes) > 1:
+                arguments_of = meant[node_class.NAME]
+                options = {'handover': handover, 'beside': classes, 'cli_args': arguments_of}
+            nodes.append(node_class(**own, **options))
+            signals.farewells.append(nodes[-1].farewell)
+        _complain(nodes, arguments)
+        for node in nodes:
+            executor.add_node(node)
+        # What is there now stays: looking through all of it for garbage takes up to 0.1 s.
+        gc.collect()
+        gc.freeze()
+        signals.is_node_made = True
+        while not signals.caught and all(node.exit_code is None for node in nodes):
+            executor.spin_once(timeout_sec=SPIN_SLICE_S)
+        code = max(node.exit_code or 0 for node in nodes)
+    finally:
+        signals.ignore()
+        for node in nodes:
+            node.close()
+        working = [node for node in nodes if not node.stop_working()]
+        for node in nodes:
+            node.publish_end()
+        if nodes:
+            executor.shutdown(timeout_sec=1.0)
+        if working:  # a thread that still calculates must not meet a node that is gone
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+        for node in nodes:
+            node.destroy_node()
+    return code
+
+
+def _complain(nodes: 'Sequence[AnserNode]', arguments: Sequence[str]) -> None:
+    """Warn of parameter files that say nothing to any of the nodes.
+
+    Raises
+    ------
+    ParameterError
+        When the section of one node among several has a value that it does not know.
+    """
+    for node in nodes if len(nodes) > 1 else ():
+        for name in parameter_files.names_for(arguments, node.get_name()):
+            if not parameters.is_known(node.PARAMETERS, name):
+                raise ParameterError(f'{node.get_name()} has no parameter {name}')
+    said = [parameter_files.complaints(arguments, node.get_name()) for node in nodes]
+    if all(said):
+        for text in said[-1]:
+            nodes[-1].get_logger().warning(text)

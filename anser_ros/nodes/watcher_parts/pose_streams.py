@@ -1,0 +1,113 @@
+"""Takes topics of poses for a watcher, and says what it saw in them."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+
+from anser_ros.errors import ParameterError
+from anser_ros.nodes.runtime import qos
+from anser_ros.nodes.streams.one_source import OneSource
+from anser_ros.nodes.watcher_parts.sighting_words import findings_words, titles_of
+from anser_ros.poses.live_look import PoseSighting
+from anser_ros.poses.live_window import PoseWindow
+from anser_ros.poses.sequence import REFERENCE, PoseSession
+from anser_ros.stamps import stamp_of
+from anser_ros.wire.pose_topics import ENDING, TRACKED
+
+if TYPE_CHECKING:
+    from anser_ros.nodes.runtime.node import AnserNode
+
+QUIET_S = 2.0
+"""Time without a pose on a topic, s, after which it is said to be silent."""
+
+
+def sensor_of(topic: str) -> str:
+    """Return a sensor's name by its topic: what is between ``/tracked/`` and ``/pose``, or all."""
+    return topic.removeprefix(TRACKED).removesuffix(ENDING).strip('/').replace('/', '_')
+
+
+class PoseStreams:
+    """Subscribes to topics of tracked poses and of a reference, into one window.
+
+    Attributes
+    ----------
+    window : PoseWindow
+    sources : list of OneSource
+    heard_s : float
+        When the last tracked pose came, by the monotonic clock.
+
+    Raises
+    ------
+    ParameterError
+        When two topics give sensors of the same name, or the reference is tracked as well.
+    """
+
+    def __init__(
+        self, node: 'AnserNode', tracked: Sequence[str], reference: str, window_s: float
+    ) -> None:
+        names = {topic: sensor_of(topic) for topic in tracked}
+        if len({*names.values(), REFERENCE}) < len(tracked) + 1 or reference in names:
+            raise ParameterError(
+                f'tracked_poses: the topics must give sensors of different names, none called '
+                f'{REFERENCE} or the reference: {", ".join(tracked)}'
+            )
+        if not reference and len(tracked) < 2:
+            raise ParameterError('reference_pose: a single sensor needs a reference')
+        self._topics = {**names, **({reference: REFERENCE} if reference else {})}
+        self._heard: dict[str, float] = dict.fromkeys(self._topics, 0.0)
+        self.window = PoseWindow(list(names.values()), window_s)
+        self.heard_s = 0.0
+        self._node = node
+        self.sources = [
+            OneSource(node, PoseStamped, topic, self._taker(topic, name), qos.STREAM)
+            for topic, name in self._topics.items()
+        ]
+
+    def _taker(self, topic: str, name: str) -> Callable[[PoseStamped], None]:
+        def take(message: PoseStamped) -> None:
+            p, q = message.pose.position, message.pose.orientation
+            pose = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+            self.window.take(name, stamp_of(message), pose)
+            self._heard[topic] = time.monotonic()
+            if name != REFERENCE:
+                self.heard_s = self._heard[topic]
+            self._node.count('poses')
+
+        return take
+
+    def quiet_topics(self) -> tuple[str, ...]:
+        """Return topics on which nothing comes now."""
+        now_s = time.monotonic()
+        return tuple(topic for topic, at in self._heard.items() if now_s - at > QUIET_S)
+
+    def session(self) -> PoseSession | None:
+        """Return what is in the window, of the topics on which something comes."""
+        return self.window.session(without=[self._topics[t] for t in self.quiet_topics()])
+
+
+def pose_words(seen: PoseSighting) -> str:
+    """Return what was seen of poses as one line for an operator."""
+    size = '' if np.isnan(seen.after_m) else f'error {1e3 * seen.after_m:.2f} mm'
+    if seen.findings:
+        with_them = f'{size} with it corrected' if size else ''
+        return '; '.join(filter(None, [findings_words(seen.findings), with_them, seen.remark]))
+    if seen.remark:
+        return '; '.join(filter(None, [seen.remark, size]))
+    return f'all is well; {size}'
+
+
+def pose_values(seen: PoseSighting) -> dict[str, object]:
+    """Return the figures of what was seen of poses, by name."""
+    return {
+        'poses_compared': seen.poses,
+        'position_rmse_before_m': seen.before_m,
+        'position_rmse_after_m': seen.after_m,
+        'position_floor_m': seen.jitter_m,
+        'misfit_of_known_frames_m': seen.misfit_m,
+        'unexplained': seen.unexplained,
+        'findings': titles_of(seen.findings),
+        'depends_on': ', '.join(seen.depends_on),
+    }
