@@ -46,6 +46,15 @@ def test_a_reference_that_fails_is_named_and_left_out(refit, fault, metal):
         assert result.model is world.model
 
 
+@pytest.mark.parametrize('times', [1.8, 3.0])
+def test_noise_above_what_the_setup_states_is_nobodys_fault(refit, times):
+    world, rng = anser_world(), np.random.default_rng(5)
+    for frame in range(1, 40):
+        flux = world.baseline + times * world.noise(rng)
+        result = refit.update(frame * STEP_NS, world.references.channel, flux)
+        assert result.left_out == () and not result.withheld, frame
+
+
 @pytest.mark.parametrize('metal', [False, True])
 def test_a_whole_plug_that_is_out_is_left_out(refit, metal):
     world = anser_world()

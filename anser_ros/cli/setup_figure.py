@@ -98,7 +98,14 @@ def _sensors(
     for sensor, end in zip(sensors, ends, strict=True):
         words = f'{sensor.name} ({sensor.channel})' if names else str(sensor.channel)
         together[tuple(end[[across, up]].round(3).tolist())].append(words)
+    foot = {tuple(one[[across, up]].round(3).tolist()) for one in place}
     for end, several in together.items():
-        panel.annotate('\n'.join(several), end, fontsize=6)
+        # What points at the viewer is named on the other side of its foot.
+        side, level = (-3, 'top') if end in foot else (3, 'bottom')
+        panel.annotate(
+            '\n'.join(several), end, (side, side), textcoords='offset points', fontsize=6,
+            ha='right' if end in foot else 'left', va=level,
+        )  # fmt: skip
     panel.update_datalim(ends[:, [across, up]])
+    panel.margins(0.4 if names else 0.1)
     panel.autoscale_view()

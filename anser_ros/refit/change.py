@@ -11,8 +11,10 @@ from anser_ros.refit.kernels import bend_power
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-MEMORY_FRAMES = 50.0
-"""Frames over which the ratio of measured to expected noise is averaged."""
+MEMORY_FRAMES = 50
+"""Frames over which the ratio of measured to expected noise is averaged. As long as there are
+fewer, more noise than expected is averaged over those there are: by a ratio that is too small all
+references seem to jump."""
 STEP = 1.1
 """Noise levels are rounded to powers of this, so that tables made for one serve for a while."""
 
@@ -59,6 +61,7 @@ class NoiseLevel:
     nominal_t: float
     _previous: list[ComplexArray] = field(default_factory=list)
     _ratio: float = 1.0
+    _known: int = 1
 
     def update(self, flux: ComplexArray) -> float:
         """Take in one frame (S, K), NaN where unknown, and return the noise over the nominal."""
@@ -67,11 +70,18 @@ class NoiseLevel:
             now = bend_power(flux, self._previous[1], self._previous[0])
             if math.isfinite(now):
                 now = min(now / (12.0 * self.nominal_t**2), 4.0 * self._ratio)
-                self._ratio += (now - self._ratio) / MEMORY_FRAMES
+                self._known = min(self._known + 1, MEMORY_FRAMES)
+                frames = self._known if now > self._ratio else MEMORY_FRAMES
+                self._ratio += (now - self._ratio) / frames
                 self._ratio = min(max(self._ratio, 1.0 / 400.0), 400.0)
         self._previous = [*self._previous[-1:], flux]
         steps = round(0.5 * math.log(self._ratio) / math.log(STEP))
         return float(STEP**steps)
+
+    @property
+    def is_measured(self) -> bool:
+        """Return whether frames have had a say: three in a row at least."""
+        return self._known > 1
 
     def forget(self) -> None:
         """Start anew after a gap in time; the level is kept."""

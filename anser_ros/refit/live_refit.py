@@ -253,8 +253,9 @@ class LiveRefit:
         self._courses.note(jumps, away[loud[away]])
         for coil in self._courses.returned().tolist():
             self._watch.recover(coil)
-        # The first frame has no course: metal may be there, and `_judged` asks who disagrees.
-        if not loud[coils].any() or not math.isfinite(jumps.since_s):
+        # The first frame has no course, and the second only the noise that was stated: metal may
+        # be there, and `_judged` asks who disagrees.
+        if not (loud[coils].any() and self._noise.is_measured and math.isfinite(jumps.since_s)):
             return
         bank, _ = self._bank()
         seen = bank.evaluate(parts[coils].reshape(-1, 2), level)
