@@ -102,7 +102,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
     parser.add_argument('--boards', type=int, default=120, help='of each kind')
     args = parser.parse_args()
-    print(f'| board | distortion | told alike | figure | {" | ".join(KINDS.values())} |')
+    print(f'| board | distortion | found correlated | figure | {" | ".join(KINDS.values())} |')
     print('|---' * (4 + len(KINDS)) + '|')
     for count, length_m in ROWS:
         print('\n'.join(row_of(count, length_m, args.boards)), flush=True)
