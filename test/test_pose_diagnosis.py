@@ -174,6 +174,7 @@ def test_another_order_or_sense_of_quaternions_is_named_and_undone(change, conve
     assert found.after.position_m < 1e-3
 
 
+@pytest.mark.long
 def test_inches_are_named():
     world = World(3, duration=20.0, sensors=1)
 
@@ -221,6 +222,7 @@ def test_a_lever_arm_that_the_motion_does_not_tell_is_not_given():
     assert not record.evidence['observable']
 
 
+@pytest.mark.long
 def test_the_command_writes_the_documents_that_are_promised(tmp_path, capsys):
     bag, out = tmp_path / 'a.mcap', tmp_path / 'out'
     write_pose_session(bag, World(8, duration=15.0, sensors=1).session())

@@ -5,6 +5,7 @@ import pytest
 from refit_frames import HEAD, STEP_NS, errors, run
 from refit_world import anser_world
 
+from anser_ros.integrity.withheld import REFERENCES_DOUBTFUL
 from anser_ros.refit.live_refit import LiveRefit
 
 # The refit that all share takes some five seconds to work out.
@@ -204,6 +205,42 @@ def test_references_that_go_wrong_together_are_left_out_or_doubted(
     assert result.left_out, 'what has jumped back is watched for a while'
     result = run(refit, world, change, seed=3, start=12, frames=60)
     assert result.withheld == '' and result.left_out == ()
+
+
+@pytest.mark.parametrize('times', [5, 30, 100])
+def test_references_that_were_all_noisy_are_trusted_again_after_the_hold(refit, times):
+    world, rng = anser_world(), np.random.default_rng(7)
+    run(refit, world, 0.0, 10)
+
+    def noisy(flux):
+        flux += times * world.noise(rng)
+
+    result = run(refit, world, 0.0, 40, start=11, fault=noisy)
+    assert result.withheld == REFERENCES_DOUBTFUL
+    result = run(refit, world, 0.0, 2 * refit.settings.hold_frames + 1, 8, 51)
+    assert (result.state, result.withheld, result.model) == ('frozen', '', world.model)
+
+
+@pytest.mark.parametrize(
+    ('share', 'of', 'is_seen'), [(0.2, 0.01, True), (0.5, 0.01, True), (0.5, 0.005, False)]
+)
+def test_a_gain_of_all_that_begins_within_a_window_is_over_when_it_is_over(
+    refit, share, of, is_seen
+):
+    """The window shows a part of it, which is no course that the references were on.
+
+    Where the parts are too small to be seen, its end is not: they read the baseline again.
+    """
+    world = anser_world()
+    run(refit, world, 0.0, 10)
+    for first, frames, gain in ((11, 1, share * of), (12, 20, of)):
+        result = run(
+            refit, world, 0.0, frames, first, first,
+            lambda flux, gain=gain: flux.__imul__(1.0 + gain),
+        )  # fmt: skip
+    assert (result.withheld == REFERENCES_DOUBTFUL) is is_seen
+    result = run(refit, world, 0.0, 2 * refit.settings.hold_frames + 1, 8, 32)
+    assert (result.state, result.withheld, result.model) == ('frozen', '', world.model)
 
 
 def test_frozen_references_are_left_out_however_many_they_are(refit):

@@ -117,6 +117,7 @@ def test_metal_that_has_left_is_forgotten(world):
     assert states[-1] == 'frozen'
 
 
+@pytest.mark.long
 def test_a_wrong_gain_is_learnt_and_is_no_metal(world, alone):
     gain = np.ones(9)
     gain[4] = 1.01
@@ -124,6 +125,7 @@ def test_a_wrong_gain_is_learnt_and_is_no_metal(world, alone):
     assert share < 0.8 * alone
 
 
+@pytest.mark.long
 def test_a_step_of_the_tool_is_no_metal(world):
     """To first order; what is left of a step of a tenth of a millimetre is below the noise."""
     place, step = way(0), np.array([1e-4, -5e-5, 8e-5])

@@ -64,7 +64,10 @@ class NoiseLevel:
     _known: int = 1
 
     def update(self, flux: ComplexArray) -> float:
-        """Take in one frame (S, K), NaN where unknown, and return the noise over the nominal."""
+        """Take in one frame (S, K), and return the noise over the nominal.
+
+        What is left out is NaN: noise may be its fault, which must not raise that of the others.
+        """
         if len(self._previous) == 2:
             # The median over coils, so that a coil that jumps does not count.
             now = bend_power(flux, self._previous[1], self._previous[0])

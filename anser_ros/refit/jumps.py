@@ -8,6 +8,7 @@ somewhere and cannot have come far since the last frame, or as coils that jumped
 beside others that did not.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -79,6 +80,8 @@ class Courses:
         self._step = np.zeros((count, width), dtype=np.complex128)
         self._last_ns = np.full(count, np.nan)
         self._step_ns = np.full(count, np.nan)
+        # A jump in the middle of a window shows in two frames: what was read before both.
+        self._before = np.zeros((2, count, width), dtype=np.complex128)
         self._away = np.zeros((count, width), dtype=np.complex128)
         self._farthest = np.zeros(count)
 
@@ -99,6 +102,7 @@ class Courses:
         since_s = float(np.median(ahead_ns[new])) * NANO if new.any() else np.inf
         self._step[new] = (change - self._last)[new]
         self._step_ns = np.where(new, ahead_ns, np.where(read, np.nan, self._step_ns))
+        self._before[0, read], self._before[1, read] = self._before[1, read], self._last[read]
         self._last[read] = change[read]
         self._last_ns = np.where(read, float(stamp_ns), self._last_ns)
         return Jumps(off, np.sqrt(variance), since_s)
@@ -106,7 +110,9 @@ class Courses:
     def note(self, jumps: Jumps, coils: NDArray[np.int64]) -> None:
         """Remember which references have jumped: a jump is no part of a course."""
         self._step_ns[coils] = np.nan
-        self._away[coils] += jumps.off[coils]
+        first = self._farthest[coils] == 0.0
+        whole = (self._last - self._before[0])[coils]
+        self._away[coils] += np.where(first[:, None], whole, jumps.off[coils])
         size = np.linalg.norm(self._away[coils], axis=1)
         self._farthest[coils] = np.maximum(self._farthest[coils], size)
 
@@ -114,12 +120,25 @@ class Courses:
         """Return the references that are off by jumps."""
         return np.flatnonzero(self._farthest > 0.0)
 
-    def returned(self) -> NDArray[np.int64]:
-        """Return the references that have jumped back just now, which is then forgotten."""
-        size = np.linalg.norm(self._away, axis=1)
-        back = np.flatnonzero((self._farthest > 0.0) & (size < RETURNED * self._farthest))
+    def returned(self, noise: Array) -> NDArray[np.int64]:
+        """Return the references that are no longer off by jumps, which is then forgotten.
+
+        One has jumped back when little of its jump is left. All have that jumped when all of them
+        read what they did in the baseline: they may have gone wrong unseen, in small steps, and
+        then the end of the fault was taken for a jump.
+
+        Parameters
+        ----------
+        noise : ndarray, shape (S,)
+            Of a phasor component of each, T.
+        """
+        away, size = self._farthest > 0.0, np.linalg.norm(self._away, axis=1)
+        calm = math.sqrt(NOTICED * 2 * self._away.shape[1]) * noise
+        back = away & (size < np.maximum(RETURNED * self._farthest, calm))
+        if (np.linalg.norm(self._last[away], axis=1) < calm[away]).all():
+            back = away
         self._away[back], self._farthest[back] = 0.0, 0.0
-        return back
+        return np.flatnonzero(back)
 
 
 def _bounded(bank: Bank, seen: FrameEvidence, largest: float) -> FrameEvidence:
@@ -143,7 +162,7 @@ def _is_foretold(bank: Bank, seen: FrameEvidence, jumps: Array) -> bool:
 
 
 def jumped(
-    bank: Bank, seen: FrameEvidence, jumps: Array, drift: float, largest: float
+    bank: Bank, seen: FrameEvidence, jumps: Array, spread: float, drift: float, largest: float
 ) -> NDArray[np.int64]:
     """Return the coils that jumped by themselves, as numbers among those in use; often none.
 
@@ -153,7 +172,9 @@ def jumped(
     seen : FrameEvidence
         Of the jumps, as if they were a change.
     jumps : ndarray, shape (U, K, 2)
-        Of the coils in use, in noise units.
+        Of the coils in use, in noise units, over their spread.
+    spread : float
+        Noise of a jump, in units of a reading's.
     drift : float
         Prior deviation of an emitter's strength.
     largest : float
@@ -169,12 +190,12 @@ def jumped(
     top = curve.max(axis=0)
     broad = top + np.log(np.exp(curve - top).mean(axis=0))
     apart = np.maximum(quiet, broad)
-    if apart.sum() - log_sum(seen.log_evidence) > FAULT_ODDS:
-        if _is_foretold(bank, free, jumps):
-            return np.empty(0, dtype=np.int64)
-        return np.flatnonzero((broad > quiet).any(axis=1))
-    if _is_common_gain(bank, seen, jumps, drift):
+    # Before all else: by a drift of all emitters the coils foretell each other's jumps too.
+    if _is_common_gain(bank, seen, jumps, spread * drift):
         return np.arange(len(jumps))
+    odds = apart.sum() - log_sum(seen.log_evidence)
+    if odds > FAULT_ODDS and not _is_foretold(bank, free, jumps):
+        return np.flatnonzero((broad > quiet).any(axis=1))
     return np.empty(0, dtype=np.int64)
 
 

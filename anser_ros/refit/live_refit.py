@@ -218,17 +218,17 @@ class LiveRefit:
         readable, reasons = self._baseline_check.read(frame, baseline)
         self._watch.note(readable, reasons, self.settings.min_references)
         usable = ordered if readable.all() else np.where(readable[:, None], ordered, np.nan)
-        level = self._noise.update(usable)
-        self._look_for_jumps(stamp_ns, usable - (self.baseline if baseline is None else baseline),
-                             level)  # fmt: skip
+        level = self._noise.update(np.where(self._in_use()[:, None], usable, np.nan))
+        clean = self.baseline if baseline is None else baseline
+        self._look_for_jumps(stamp_ns, usable - clean, level)
         if np.count_nonzero(self._in_use()) < self.settings.min_references:
             self._watch.wait(readable)
             return self._too_few(stamp_ns, level)
         if baseline is not None:
             # What is averaged is the change; the baseline moves with the coil.
             ordered = ordered - baseline + self.baseline
-        excluded = self._watch.excluded
-        used = np.where(excluded[:, None], np.nan, ordered) if excluded.any() else ordered
+        out = self._watch.excluded
+        used = np.where(out[:, None], np.nan, ordered) if out.any() else ordered
         mean, frames = self._average.update(used, level * self.settings.accuracy.flux_noise_t)
         if used is not ordered:
             mean = np.where(np.isfinite(mean), mean, ordered)
@@ -245,13 +245,13 @@ class LiveRefit:
         """Leave out coils whose change (S, K) has just jumped by itself."""
         jumps = self._courses.follow(stamp_ns, change)
         parts = self._units.of(jumps.off) / jumps.spread[:, None, None]
-        power = (parts**2).mean(axis=(1, 2)) / (level * self._row_noise[:: parts.shape[1]]) ** 2
-        loud = power > NOTICED
-        if not loud.any():
-            return
+        noise = level * self._row_noise[:: parts.shape[1]]
+        loud = (parts**2).mean(axis=(1, 2)) > NOTICED * noise**2
         away, coils = self._courses.away(), np.flatnonzero(self._in_use())
+        if not (loud.any() or away.size):
+            return
         self._courses.note(jumps, away[loud[away]])
-        for coil in self._courses.returned().tolist():
+        for coil in self._courses.returned(noise * self.settings.accuracy.flux_noise_t).tolist():
             self._watch.recover(coil)
         # The first frame has no course, and the second only the noise that was stated: metal may
         # be there, and `_judged` asks who disagrees.
@@ -260,7 +260,8 @@ class LiveRefit:
         bank, _ = self._bank()
         seen = bank.evaluate(parts[coils].reshape(-1, 2), level)
         largest = SUDDEN * jumps.since_s * self._units.size
-        found = coils[jumped(bank, seen, parts[coils], self.settings.emitter_drift, largest)]
+        spread, drift = float(np.median(jumps.spread[coils])), self.settings.emitter_drift
+        found = coils[jumped(bank, seen, parts[coils], spread, drift, largest)]
         for coil in found.tolist():
             self._watch.exclude(coil)
         if found.size:

@@ -75,7 +75,9 @@ class Rig:
             **WORLDS[world],
         )  # fmt: skip
         self.wait_until(self.is_whole, PATIENCE_S, 'a pose of everything')
-        time.sleep(2.0)  # baselines are set, estimates have settled
+        # Poses come before the refit is made: a fault then would find nothing that follows it.
+        self.wait_until(self.is_followed, PATIENCE_S, 'the refit')
+        time.sleep(2.0)  # estimates have settled
 
     def start(self, node: str, *words: str, called: str = '', **parameters: object) -> None:
         """Start a node under its own or another name."""
@@ -131,6 +133,10 @@ class Rig:
         names = [*(s.name for s in self.setup.tool_sensors), *self.setup.bodies]
         found = self.witness.count(now - WINDOW_S, now)
         return all(found[name] >= 0.5 * RATE_HZ * WINDOW_S for name in names)
+
+    def is_followed(self) -> bool:
+        """Return whether the model follows the references."""
+        return float(self.witness.values.get('anser/field_model', {}).get('refit_starts', 0)) > 0
 
     def crashed(self) -> list[str]:
         """Return what ended by itself, with its last words; each is told once."""

@@ -76,6 +76,7 @@ class Witness:
         self._truth: dict[str, list[tuple[float, ...]]] = defaultdict(list)
         self._words: dict[str, tuple[int, str]] = {}
         self.heard_s: dict[str, float] = {}
+        self.values: dict[str, dict[str, str]] = {}
         self.context = rclpy.Context()
         self.context.init(domain_id=domain)
         self.node = rclpy.create_node('witness', namespace='anser', context=self.context)
@@ -148,6 +149,7 @@ class Witness:
         for status in message.status:
             seen = (status.level[0], status.message)
             self.heard_s[status.name] = now
+            self.values[status.name] = {pair.key: pair.value for pair in status.values}
             if self._words.get(status.name) != seen:
                 self._words[status.name] = seen
                 self.states.append(SeenState(now, status.name, *seen))
