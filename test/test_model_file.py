@@ -24,6 +24,7 @@ def model() -> FieldModel:
         modes=rng.normal(size=(3, 6, 2)) + 1j * rng.normal(size=(3, 6, 2)),
         effects=(EffectRecord('sensor_gain', {'channel': 2, 'gain': 0.98, 'phase_deg': 0.1}),),
         provenance={'made_by': 'a test', 'heldout_flux_rmse_t': 1e-10},
+        shift_sigma_m=2e-5,
     )
 
 
@@ -36,6 +37,7 @@ def test_a_model_survives_its_file(tmp_path):
     assert after.effects == before.effects
     assert (after.emitters, after.frequencies_hz) == (before.emitters, before.frequencies_hz)
     assert after.flux_error_t == before.flux_error_t
+    assert after.shift_sigma_m == before.shift_sigma_m
     assert after.provenance == before.provenance
 
 
@@ -57,6 +59,7 @@ def test_added_dipoles_add_their_field():
         ({'schema': 'other/1'}, 'schema must be'),
         ({'emitters': []}, 'emitters'),
         ({'emitters': [{'name': 'a'}]}, 'malformed'),
+        ({'shift_sigma_m': 'far'}, 'shift_sigma_m is malformed'),
         ({'dipoles': [[1, 2]]}, 'rows of 10 numbers'),
         ({'dipoles': 'many'}, 'no table of numbers|rows of 10'),
         ({'dipoles': [[0.0] * 10]}, 'no unit vector'),

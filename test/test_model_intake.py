@@ -66,6 +66,13 @@ def test_what_is_not_said_yet_is_unknown():
     assert not intake.has_error
 
 
+def test_a_shift_that_all_poses_share_is_known_from_the_file():
+    given = ModelIntake().take(messages([0])[1][0])
+    setup = setup_of(triaxial_tool())
+    assert given.field_model(setup, None).shift_sigma_m == 0.0
+    assert given.field_model(setup, replace(MODEL, shift_sigma_m=1e-3)).shift_sigma_m == 1e-3
+
+
 def test_the_model_in_force_ages_by_the_clock_of_the_frames():
     model, maker, intake = certain_model(), ModelWriter(), ModelIntake()
     setup = setup_of(triaxial_tool())

@@ -123,6 +123,18 @@ def test_what_a_correction_makes_absurd_is_no_signal(rng):
     assert found['tool_a'].state == states.OK
 
 
+def test_a_shift_of_the_whole_field_is_in_every_sigma_and_refuses_no_pose(rng):
+    flux = fluxes(MODEL, TOOL, *random_pose(rng), rng)
+    sure, shifted = (
+        one_frame(Tracker(model, TOOL), flux, 10**12)
+        for model in (MODEL, replace(MODEL, shift_sigma_m=7e-3))
+    )
+    for name, one in shifted.items():
+        assert one.state == 'ok'
+        assert np.allclose(one.covariance - sure[name].covariance, np.diag([49e-6] * 3 + [0] * 3))
+        assert one.sigma_position_m == pytest.approx(np.sqrt(np.trace(one.covariance[:3, :3])))
+
+
 def test_the_gate_is_where_the_settings_say(rng):
     """Noise three times as large as it is taken to be misses a gate that is a little smaller."""
     position, rotation = random_pose(rng)

@@ -77,6 +77,9 @@ class FieldModel:
         has told.
     references : ReferenceReadings or None
         What the references read when it was calibrated.
+    shift_sigma_m : float
+        Standard deviation along each axis, m, of a shift that all places in the field share: what
+        the calibration could not tell between the field and where the tool's sensors are.
 
     Raises
     ------
@@ -95,6 +98,7 @@ class FieldModel:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     made_for: Identity | None = None
     references: ReferenceReadings | None = None
+    shift_sigma_m: float = 0.0
 
     def __post_init__(self) -> None:
         n, k = self.positions.shape[0], len(self.emitters)
@@ -119,6 +123,7 @@ class FieldModel:
                 self.positions, self.directions, self.moments, self.emitters, self.frequencies_hz,
                 self.flux_error_t, self.modes,
                 [[effect.name, plain(dict(effect.parameters))] for effect in self.effects],
+                *([self.shift_sigma_m] if self.shift_sigma_m else []),
             ]
         )  # fmt: skip
 
@@ -199,6 +204,7 @@ def to_document(model: FieldModel) -> dict[str, Any]:
         ],
         'provenance': dict(model.provenance),
         'flux_error_t': model.flux_error_t,
+        'shift_sigma_m': model.shift_sigma_m,
         'effects': [
             {
                 'name': effect.name,
@@ -270,8 +276,11 @@ def from_document(document: Any) -> FieldModel:
         names = tuple(str(item['name']) for item in emitters)
         frequencies = tuple(float(item['frequency_hz']) for item in emitters)
         flux_error = float(document.get('flux_error_t', 0.0))
+        shift_sigma = float(document.get('shift_sigma_m', 0.0))
     except (KeyError, TypeError, ValueError) as error:
-        raise ModelFileError(f'model: an emitter or flux_error_t is malformed: {error}') from error
+        raise ModelFileError(
+            f'model: an emitter, flux_error_t or shift_sigma_m is malformed: {error}'
+        ) from error
     k = len(names)
     table = _table(document.get('dipoles'), 6 + 2 * k, 'dipoles')
     norms = np.linalg.norm(table[:, 3:6], axis=1)
@@ -297,6 +306,7 @@ def from_document(document: Any) -> FieldModel:
         emitters=names,
         frequencies_hz=frequencies,
         flux_error_t=flux_error,
+        shift_sigma_m=shift_sigma,
         modes=modes,
         effects=tuple(_effect(item) for item in effects),
         provenance=provenance,

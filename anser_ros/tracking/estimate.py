@@ -190,6 +190,12 @@ class PoseEstimate:
             self.reason,
         )  # fmt: skip
 
+    def with_shift(self, sigma_m: float) -> 'PoseEstimate':
+        """Return the estimate with a shift, m along each axis, in its sigma and covariance."""
+        for i in range(3):  # the estimate's own matrix is nobody else's
+            self.covariance[i, i] += sigma_m**2
+        return self.with_sigma(math.sqrt(self.sigma_position_m**2 + 3.0 * sigma_m**2))
+
 
 def no_pose(name: str, stamp_ns: int, state: str, model_id: str, reason: str) -> PoseEstimate:
     """Return an estimate without a pose: all figures NaN."""

@@ -154,6 +154,8 @@ class SolveContext:
     model_id : str
     model_share : float
         Part of the expected residual's power that is the model's own error, the modes aside.
+    shift_sigma_m : float
+        The model's.
     """
 
     field: RealField
@@ -164,6 +166,7 @@ class SolveContext:
     high: Array
     model_id: str
     model_share: float
+    shift_sigma_m: float = 0.0
 
     @property
     def grid(self) -> SeedGrid:
@@ -247,4 +250,6 @@ def build_context(
     else:
         starts = previous.starts.following()
     share = 1.0 - settings.flux_noise_t**2 / variance
-    return SolveContext(field, sigma, modes, starts, low, high, name, share)
+    return SolveContext(
+        field, sigma, modes, starts, low, high, name, share, float(model.shift_sigma_m)
+    )

@@ -314,7 +314,12 @@ class Tracker:
                 context, self.settings,
             )  # fmt: skip
             bodies.append(RigidBody(rows, table, result))
-        yield from self._judgement.judged(stamp_ns, coils, bodies, self.settings)
+        judged = self._judgement.judged(stamp_ns, coils, bodies, self.settings)
+        if context.shift_sigma_m == 0.0:
+            yield from judged
+            return
+        # No judge reckons with it: what all poses share contradicts none of them.
+        yield from (estimate.with_shift(context.shift_sigma_m) for estimate in judged)
 
     def _source(self, frame: SourceFrame, usable: NDArray[np.bool_]) -> BodyResult:
         """Find the source in a body's frame; its pose stays unknown by a turn about the axis."""

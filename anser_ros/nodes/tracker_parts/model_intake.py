@@ -59,6 +59,7 @@ class GivenModel:
             points.positions, points.directions, points.moments, setup.emitter_names,
             setup.frequencies_hz,
             flux_error_t=0.0 if file_model is None else file_model.flux_error_t,
+            shift_sigma_m=0.0 if file_model is None else file_model.shift_sigma_m,
             effects=() if file_model is None else file_model.effects,
         )  # fmt: skip
         if self.error is None:
