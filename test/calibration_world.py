@@ -64,15 +64,18 @@ class Truth:
     lever: np.ndarray
 
 
-def hand(time, turn_rad=0.6):
-    """A hand's path through the volume, with turns."""
+def hand(time, turn_rad=0.6, flat=False):
+    """A hand's path through the volume, with turns; a flat one turns about z only."""
     waves = [np.sin(w * time + p) for w, p in ((0.9, 0.0), (1.3, 1.0), (1.7, 2.0))]
     position = np.stack(waves, axis=1) * [0.09, 0.09, 0.03] + [0.0, 0.0, 0.14]
     turns = [np.sin(w * time + p) for w, p in ((0.7, 2.0), (1.1, 0.5), (0.8, 1.0))]
-    return position, Rotation.from_rotvec(turn_rad * np.stack(turns, axis=1))
+    turn = turn_rad * np.stack(turns, axis=1)
+    if flat:
+        position[:, 2], turn[:, :2] = 0.14, 0.0
+    return position, Rotation.from_rotvec(turn)
 
 
-def moved_scan(world, table, rng, seconds, errors, turn_rad=0.6):
+def moved_scan(world, table, rng, seconds, errors, turn_rad=0.6, flat=False):
     """A scan at 25 Hz by a tool with these errors, and the truth about them."""
     count = len(table)
     gain = 1 + errors.gain * (rng.normal(size=count) + 1.25j * rng.normal(size=count))
@@ -83,7 +86,7 @@ def moved_scan(world, table, rng, seconds, errors, turn_rad=0.6):
     lever = np.array(errors.lever_m) + (place.mean(axis=0) if count == 1 else 0.0)
     place -= place.mean(axis=0)
     time = np.arange(round(25.0 * seconds)) / 25.0
-    position, turn = hand(time, turn_rad)
+    position, turn = hand(time, turn_rad, flat)
     points, axes = table.with_geometry(table.position + place + lever, axis).placed(
         position, turn.as_matrix()
     )
@@ -91,7 +94,7 @@ def moved_scan(world, table, rng, seconds, errors, turn_rad=0.6):
     flux = flux * gain[:, None]
     flux = flux + NOISE_T * (rng.normal(size=flux.shape) + 1j * rng.normal(size=flux.shape))
     seen = np.arange(-0.3, time[-1] + 0.3, 1 / 60.0)
-    there, turned = hand(seen, turn_rad)
+    there, turned = hand(seen, turn_rad, flat)
     there += errors.jitter * JITTER_M * rng.normal(size=there.shape)
     jitter = Rotation.from_rotvec(errors.jitter * JITTER_RAD * rng.normal(size=there.shape))
     there[rng.uniform(size=seen.size) < errors.reflected] += [0.02, -0.01, 0.015]

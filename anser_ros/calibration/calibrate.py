@@ -124,6 +124,7 @@ def fit_scan(
         emitters=emitters,
         frequencies_hz=frequencies_hz,
         flux_error_t=float(np.hypot(held_out.flux_error_t, scan.field_sigma_t)),
+        shift_sigma_m=0.0 if scan.survey is None else scan.survey.shift_sigma_m,
         effects=scan.corrections,
     )
     calibration = Calibration(

@@ -206,12 +206,12 @@ class Population:
         return {kind: size for kind, size in typical.items() if size > USEFUL[kind]}
 
     def fixed(self, likelihood: Likelihood) -> tuple[str, ...]:
-        """Return the kinds without a population that the data do not tell: they stay at zero.
+        """Return the kinds that the data do not tell: they stay at zero.
 
         What field and, say, a lever arm explain alike would else be shared out by the field's
-        prior, which knows nothing of tools.
+        prior, which knows nothing of tools; and a population's width is found from its values.
         """
-        return tuple(kind for kind in self.untold(likelihood) if kind not in POPULATIONS)
+        return tuple(self.untold(likelihood))
 
     def _power(self, likelihood: Likelihood, found: Posterior, kind: str) -> float:
         """What a kind of error does to the fluxes, in the power of their noise."""

@@ -7,6 +7,7 @@ middle of the scan and a rate (s a second).
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,6 +45,12 @@ USEFUL = {
 }  # fmt: skip
 """Standard deviation, in the parameters' own units, beyond which a scan does not tell them: that
 much makes errors of some tenths of a millimetre, as a tool that was not calibrated has."""
+SHARED_SHIFT = 'lever_arm'
+"""The kind that shifts all sensors of a body, and so the field, where nothing else tells them
+apart."""
+SURVEYED_M = 1e-3
+"""Standard deviation of a setup's lever arm, m along each axis, where no scan tells it: that of a
+tool measured with a ruler. All places that a coil is found at are off by as much."""
 TURNED_RAD = 0.05
 """Turn of a body, rad rms, about a second axis from which on it tells a lever arm: a millimetre is
 then 0.05 mm of movement. With less, what a field's model misses decides how a shift is shared out
@@ -142,7 +149,7 @@ class SensorParameters:
     def __init__(self, measurements: Sequence[Measurements], kinds: Sequence[str]) -> None:
         told = set(kinds) if all(m.is_followed for m in measurements) else {*kinds} - {*CLOCKS}
         if not all(has_turned(m) for m in measurements):
-            told -= {'lever_arm'}
+            told -= {SHARED_SHIFT}
         known = (*KINDS, *EXTRA_KINDS)
         self.asked = tuple(kind for kind in known if kind in kinds)
         self.kinds = tuple(kind for kind in known if kind in told)
@@ -164,6 +171,12 @@ class SensorParameters:
         for kind in self.kinds:
             if kind in CLOCKS:
                 self._add(kind, '', 1)
+
+    def fixed(self) -> 'SensorParameters':
+        """Return the same, none of which is estimated."""
+        other = copy(self)
+        other.kinds, other.slices, other._size = (), {}, 0
+        return other
 
     def _add(self, kind: str, body: str, size: int) -> None:
         self.slices[kind, body] = slice(self._size, self._size + size)

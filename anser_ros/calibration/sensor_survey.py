@@ -44,6 +44,8 @@ from anser_ros.calibration.prior import DrawnBoard
 from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
 from anser_ros.calibration.sensor_parameters import (
     PRIOR,
+    SHARED_SHIFT,
+    SURVEYED_M,
     SensorParameters,
     Survey,
 )
@@ -149,7 +151,7 @@ class SensorSurveyor:
         self.posterior: Posterior
         self.noise_t = FIT_NOISE * accuracy.flux_noise_t
         self.optical = LOOSE
-        self.field_width = FIELD_WIDTH
+        self.field_width, self.inflation = FIELD_WIDTH, 1.0
 
     def survey(self, body: str) -> Survey:
         """Return the survey of a body's sensors by the present estimate."""
@@ -160,6 +162,11 @@ class SensorSurveyor:
         total = COARSE_STEPS + 3 * FINE_STEPS
         tools = self._tools(COARSE_ROWS)
         self._start(tools)
+        # With fewer poses than modes of the field, errors of any size would seem certain.
+        if sum(len(tool.weights) for tool in tools) < self.modes.size.size:
+            self.parameters = self.parameters.fixed()
+            self.population = Population(self.parameters)
+            self.values = np.zeros(0)
         for step in range(COARSE_STEPS):
             self._tell(step / total)
             moved = self._step(tools, inspect=step > 0)
@@ -175,6 +182,7 @@ class SensorSurveyor:
                 continue
             if moved < SMALL_STEP:
                 break
+        whole = self.posterior
         posterior, left_out, evidence = self.population.chosen(self.likelihood)
         if 'gains' in evidence:
             posterior = self.population.with_common_gains(self.likelihood, posterior)
@@ -186,10 +194,12 @@ class SensorSurveyor:
             for m, known, tool in zip(self.measured, self.steady, tools, strict=True)
         )
         kept, reflected = self._all_frames(steady)
+        untold = self._untold()
         return SurveyResult(
             self.parameters, posterior, left_out, evidence, self.noise_t, self.optical,
-            self.population.alone, kept, steady, reflected,
-            self._untold(), self._contradictions(tools, tuple(evidence)),
+            self.population.alone, kept, steady, reflected, untold,
+            self._shift_sigma_m(untold, whole, sum(int(mask.sum()) for mask in kept)),
+            self._contradictions(tools, tuple(evidence)),
         )  # fmt: skip
 
     def _sums(
@@ -197,9 +207,10 @@ class SensorSurveyor:
     ) -> Eliminated:
         """What the tools say of some parameters beside the field."""
         system = JointSystem(parameters, self.modes, self.field.shape[1])
+        noise_t = float(np.sqrt(self.inflation)) * self.noise_t
         for tool, at in zip(tools, linear, strict=True):
             share = interpolation_share(at.part)
-            system.add(at, tool.weights, self.noise_t, self.optical.jitter, share)
+            system.add(at, tool.weights, noise_t, self.optical.jitter, share)
         precision = 1.0 / (self.field_width * self.flux_rms * self.modes.size) ** 2
         return system.eliminate(precision, self.middle - self.field)
 
@@ -217,6 +228,16 @@ class SensorSurveyor:
         not_tried = set(self.parameters.asked) - set(self.parameters.kinds)
         wide = {kind: PRIOR[kind] for kind in self.parameters.asked if kind in not_tried}
         return {**self.population.untold(self.likelihood), **wide}
+
+    def _shift_sigma_m(self, untold: dict[str, float], found: Posterior, frames: int) -> float:
+        """How well the place of the whole field is known, m along each axis."""
+        mean = self.optical.position_m * np.sqrt(self.optical.interpolated / max(frames, 1))
+        if SHARED_SHIFT not in self.parameters.asked:
+            return float(mean)
+        if SHARED_SHIFT in untold:
+            return float(np.hypot(mean, SURVEYED_M))
+        variance = np.diag(found.covariance)[self.parameters.rows(SHARED_SHIFT)].reshape(-1, 3)
+        return float(np.hypot(mean, np.sqrt(variance.mean(axis=1).min())))
 
     def _tell(self, share: float) -> None:
         if self.progress is not None:
@@ -239,7 +260,6 @@ class SensorSurveyor:
         measured = [tool.measured for tool in tools]
         sites = place(rich_layout(measured, self.generator), self.generator)
         self.modes = FieldModes.of(measured, sites)
-        self.count = sum(int(m.usable.sum()) for m in measured)
         moments, _ = MomentFitter(measured, sites, RICH_DAMPING, self.accuracy).solve(exact=False)
         self.middle = np.zeros((self.modes.size.size, 2 * moments.shape[1]))
         drawn = None
@@ -278,14 +298,20 @@ class SensorSurveyor:
             self._inspect(tools, linear, watch)
         rest = self._sums(tools, self.parameters, linear)
         # Errors of the field's model are alike in neighbouring frames: the scatter of whole
-        # stretches tells how much less the data say than independent readings would.
-        scatter = rest.scores.T @ rest.scores
-        size = np.sqrt(np.maximum(np.diag(rest.information), 1e-300))
-        told = np.trace(scatter / np.outer(size, size)) / max(len(size), 1)
-        self.inflation = max(1.0, float(told)) if inspect else 1.0
+        # stretches tells how much less the data say than independent readings would. It has to be
+        # known where they are weighed against the optical poses: else what the model misses is
+        # made good by a shift of the field and of the tool, which no single frame contradicts.
+        # The median, for a sensor that changes on the way scatters its own parameters alone.
+        stretches = len(rest.scores)
+        power = (rest.scores**2).sum(axis=0) * stretches / max(stretches - 1, 1)
+        size = np.maximum(np.diag(rest.information), 1e-300)
+        told = np.median(power / size) if len(size) else 1.0
+        before = self.inflation
+        self.inflation = max(1.0, float(told) * before) if inspect else 1.0
+        more = self.inflation / before
         self.likelihood = Likelihood(
-            rest.information / self.inflation + self.parameters.rule(),
-            (rest.gradient + rest.information @ self.values) / self.inflation,
+            rest.information / more + self.parameters.rule(),
+            (rest.gradient + rest.information @ self.values) / more,
             sum(float(tool.weights.sum()) for tool in tools)
             * self.field.shape[1]
             / self.inflation,

@@ -39,8 +39,8 @@ def untold_words(result: SurveyResult) -> tuple[str, ...]:
     words = []
     for kind, size in result.untold.items():
         factor, unit = UNITS[kind]
-        kept = 'it is weighed with its prior' if kind in result.evidence else "the setup's is kept"
-        words.append(f'{kind}: the scan tells it to {_short(factor * size)} {unit} only; {kept}')
+        told = f'{_short(factor * size)} {unit}'
+        words.append(f"{kind}: the scan tells it to {told} only; the setup's is kept")
     return tuple(words)
 
 

@@ -39,6 +39,9 @@ class SurveyResult:
     untold : dict of str to float
         Kinds that the scan does not tell, with the standard deviation that it leaves; these are
         as the setup says, or as their prior makes them.
+    shift_sigma_m : float
+        Standard deviation along each axis, m, of a shift that the whole field shares: of the lever
+        arm, and of the mean of all optical poses.
     contradictions : tuple of Contradiction
         Of which parameters two sessions say different things.
     """
@@ -54,6 +57,7 @@ class SurveyResult:
     steady: tuple[NDArray[np.bool_], ...]
     reflected: float
     untold: dict[str, float]
+    shift_sigma_m: float = 0.0
     contradictions: tuple[Contradiction, ...] = ()
 
     def survey(self, body: str) -> Survey:

@@ -1,0 +1,57 @@
+"""What a scan cannot tell: it is said, a model is made all the same, and poses own up to it."""
+
+import numpy as np
+import pytest
+from calibration_world import CENTRES, Errors, moved_scan, scene, tool_of
+
+from anser_ros.calibration.sensor_parameters import KINDS, SURVEYED_M
+from anser_ros.calibration.sensor_survey import SensorSurveyor
+from anser_ros.calibration.survey_records import untold_words
+from anser_ros.settings import Accuracy
+
+EIGHT = np.array([[x, y, 0.0] for x in (-0.09, 0.0, 0.09) for y in (-0.09, 0.0, 0.09) if x or y])
+
+
+def surveyed(seed, coils, seconds, turn_rad, errors, centres=EIGHT, flat=False):
+    """A survey of a scan by a hand, and what is true of it."""
+    rng = np.random.default_rng(seed)
+    world, table = scene(rng, side=4, centres=centres), tool_of(coils)
+    told, truth = moved_scan(world, table, rng, seconds, errors, turn_rad, flat)
+    return SensorSurveyor([told], KINDS, world.generator, Accuracy()).fit(), truth
+
+
+@pytest.mark.long
+def test_a_camera_that_jitters_shifts_neither_field_nor_tool():
+    found, truth = surveyed(26, 5, 30.0, 0.6, Errors(jitter=4.3))
+    assert np.abs(found.survey('tool').lever_arm - truth.lever).max() < 8e-5
+    assert 5e-6 < found.shift_sigma_m < 5e-5
+
+
+def test_a_scan_without_turns_tells_no_lever_arm_and_poses_know_it():
+    found, _ = surveyed(22, 3, 6.0, 0.01, Errors(), CENTRES)
+    assert 'lever_arm' in found.untold
+    line = "lever_arm: the scan tells it to 5 mm only; the setup's is kept"
+    assert line in untold_words(found)
+    assert found.shift_sigma_m == pytest.approx(SURVEYED_M, rel=0.01)
+
+
+def test_a_scan_of_seconds_tells_nothing_of_the_sensors_and_takes_the_setup():
+    found, _ = surveyed(23, 9, 2.0, 0.6, Errors())
+    assert set(found.untold) == set(KINDS) and not found.evidence
+    assert len(untold_words(found)) == len(KINDS)
+    survey = found.survey('tool')
+    assert (survey.gain == 1.0).all() and not survey.place.any() and not survey.lever_arm.any()
+    assert found.kept[0].sum() >= 45
+
+
+def test_of_one_coil_in_seconds_what_is_not_told_stays_at_the_setups():
+    found, _ = surveyed(31, 1, 8.0, 0.6, Errors())
+    assert {'axes', 'lever_arm'} <= set(found.untold)
+    assert not set(found.untold) & set(found.evidence)
+    assert np.abs(found.survey('tool').lever_arm).max() < 1e-9
+
+
+def test_a_flat_scan_says_what_it_cannot_give():
+    found, _ = surveyed(24, 3, 6.0, 0.6, Errors(), CENTRES, flat=True)
+    assert 'lever_arm' in found.untold and 'lever_arm' not in found.evidence
+    assert found.shift_sigma_m == pytest.approx(SURVEYED_M, rel=0.01)
