@@ -45,6 +45,10 @@ class OpticalNoise:
         """Return the relative standard deviation of both figures: three components per pose."""
         return float(1.0 / np.sqrt(max(6.0 * self.poses, 1.0)))
 
+    def mean_sigma_m(self, frames: int) -> float:
+        """Return the jitter of the mean of so many frames' poses along each axis, m."""
+        return float(self.position_m * np.sqrt(self.interpolated / max(frames, 1)))
+
 
 def interpolation_share(measurements: Measurements) -> Array:
     """Return which share of a pose's variance linear interpolation leaves at each frame, (F,).

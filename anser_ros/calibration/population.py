@@ -13,8 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.calibration.sensor_parameters import (
+    AS_PLACES,
     POPULATIONS,
     PRIOR,
+    SHARED_SHIFT,
+    SURVEYED_M,
     USEFUL,
     SensorParameters,
 )
@@ -197,13 +200,38 @@ class Population:
 
     def untold(self, likelihood: Likelihood) -> dict[str, float]:
         """Return the kinds that the data do not tell to a useful degree, and how far they do."""
+        told = self._told(likelihood)
+        return {kind: size for kind, size in told.items() if size > USEFUL[kind]}
+
+    def _told(self, likelihood: Likelihood) -> dict[str, float]:
+        """How far the data by themselves tell each kind: its typical standard deviation."""
         width = self._start(())
-        sigma = np.sqrt(np.maximum(np.diag(solve(likelihood, width).covariance), 0.0))
-        typical = {
-            kind: float(np.sqrt(np.mean(sigma[self.parameters.rows(kind)] ** 2)))
+        variance = np.maximum(np.diag(solve(likelihood, width).covariance), 0.0)
+        return {
+            kind: float(np.sqrt(np.mean(variance[self.parameters.rows(kind)])))
             for kind in self.parameters.kinds
         }
-        return {kind: size for kind, size in typical.items() if size > USEFUL[kind]}
+
+    def shift_sigma_m(self, likelihood: Likelihood, found: Posterior) -> float:
+        """Return how well a shift of all of a body's sensors is known, m along each axis.
+
+        Parameters
+        ----------
+        likelihood : Likelihood
+            Of all parameters.
+        found : Posterior
+            With all kinds.
+        """
+        parameters, told = self.parameters, self._told(likelihood)
+        if SHARED_SHIFT not in parameters.asked:
+            return 0.0
+        if told.get(SHARED_SHIFT, np.inf) <= USEFUL[SHARED_SHIFT]:
+            variance = np.diag(found.covariance)[parameters.rows(SHARED_SHIFT)].reshape(-1, 3)
+            return float(np.sqrt(variance.mean(axis=1).min()))
+        if 'places' not in told or all(len(table) < 2 for table in parameters.tables):
+            return SURVEYED_M
+        width = np.sqrt(np.mean(found.width[parameters.rows('places')] ** 2))
+        return float(min(SURVEYED_M, AS_PLACES * np.hypot(width, told['places'])))
 
     def fixed(self, likelihood: Likelihood) -> tuple[str, ...]:
         """Return the kinds that the data do not tell: they stay at zero.

@@ -51,6 +51,9 @@ apart."""
 SURVEYED_M = 1e-3
 """Standard deviation of a setup's lever arm, m along each axis, where no scan tells it: that of a
 tool measured with a ruler. All places that a coil is found at are off by as much."""
+AS_PLACES = 4.0
+"""The same in widths of the places' population, where that is less: a tool whose coils are where
+its setup has them is one that was measured well. An assumption, not a result."""
 TURNED_RAD = 0.05
 """Turn of a body, rad rms, about a second axis from which on it tells a lever arm: a millimetre is
 then 0.05 mm of movement. With less, what a field's model misses decides how a shift is shared out

@@ -44,8 +44,6 @@ from anser_ros.calibration.prior import DrawnBoard
 from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
 from anser_ros.calibration.sensor_parameters import (
     PRIOR,
-    SHARED_SHIFT,
-    SURVEYED_M,
     SensorParameters,
     Survey,
 )
@@ -194,11 +192,11 @@ class SensorSurveyor:
             for m, known, tool in zip(self.measured, self.steady, tools, strict=True)
         )
         kept, reflected = self._all_frames(steady)
-        untold = self._untold()
+        mean = self.optical.mean_sigma_m(sum(int(mask.sum()) for mask in kept))
         return SurveyResult(
             self.parameters, posterior, left_out, evidence, self.noise_t, self.optical,
-            self.population.alone, kept, steady, reflected, untold,
-            self._shift_sigma_m(untold, whole, sum(int(mask.sum()) for mask in kept)),
+            self.population.alone, kept, steady, reflected, self._untold(),
+            float(np.hypot(mean, self.population.shift_sigma_m(self.likelihood, whole))),
             self._contradictions(tools, tuple(evidence)),
         )  # fmt: skip
 
@@ -228,16 +226,6 @@ class SensorSurveyor:
         not_tried = set(self.parameters.asked) - set(self.parameters.kinds)
         wide = {kind: PRIOR[kind] for kind in self.parameters.asked if kind in not_tried}
         return {**self.population.untold(self.likelihood), **wide}
-
-    def _shift_sigma_m(self, untold: dict[str, float], found: Posterior, frames: int) -> float:
-        """How well the place of the whole field is known, m along each axis."""
-        mean = self.optical.position_m * np.sqrt(self.optical.interpolated / max(frames, 1))
-        if SHARED_SHIFT not in self.parameters.asked:
-            return float(mean)
-        if SHARED_SHIFT in untold:
-            return float(np.hypot(mean, SURVEYED_M))
-        variance = np.diag(found.covariance)[self.parameters.rows(SHARED_SHIFT)].reshape(-1, 3)
-        return float(np.hypot(mean, np.sqrt(variance.mean(axis=1).min())))
 
     def _tell(self, share: float) -> None:
         if self.progress is not None:
