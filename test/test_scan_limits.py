@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from calibration_world import CENTRES, Errors, moved_scan, scene, tool_of
 
+from anser_ros.calibration.population import Likelihood, Population
 from anser_ros.calibration.sensor_parameters import KINDS, SURVEYED_M
 from anser_ros.calibration.sensor_survey import SensorSurveyor
 from anser_ros.calibration.survey_records import untold_words
 from anser_ros.settings import Accuracy
 
 EIGHT = np.array([[x, y, 0.0] for x in (-0.09, 0.0, 0.09) for y in (-0.09, 0.0, 0.09) if x or y])
-SOUND = Errors(0.0, 0.0, 0.0, (0.0, 0.0, 0.0), 0.0, 1.0, 0.0)
 
 
 def surveyed(seed, coils, seconds, turn_rad, errors, centres=EIGHT, flat=False):
@@ -34,8 +34,11 @@ def test_a_scan_without_turns_tells_no_lever_arm_and_poses_know_it():
     line = "lever_arm: the scan tells it to 5 mm only; the setup's is kept"
     assert line in untold_words(found)
     assert 0.2e-3 < found.shift_sigma_m <= 1.01 * SURVEYED_M
-    sound, _ = surveyed(22, 3, 6.0, 0.01, SOUND, CENTRES)
-    assert sound.shift_sigma_m < 0.9 * found.shift_sigma_m, 'its setup knew the coils well'
+    population = Population(found.parameters)
+    size = len(found.parameters)
+    nothing, much = (Likelihood(told * np.eye(size), np.zeros(size)) for told in (0.0, 1e14))
+    assert population.shift_sigma_m(nothing, population.fit(nothing)) == SURVEYED_M
+    assert population.shift_sigma_m(much, population.fit(much)) < 1e-5, 'its setup knew the coils'
 
 
 def test_a_scan_of_seconds_tells_nothing_of_the_sensors_and_takes_the_setup():
