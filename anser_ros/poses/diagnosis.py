@@ -216,9 +216,11 @@ def _sensings(state: PoseState, out: tuple[NDArray[np.bool_], ...]) -> list[Sens
 
 
 def _sight(session: PoseSession, problem: PoseProblem, whole: PoseFit) -> PoseSight:
-    every = replace(problem, noise=whole.state.problem.noise).state(whole.terms)
-    out = standing_out(replace(whole, state=every))
-    sensings = tuple(_sensings(whole.state, out))
+    every = replace(problem, noise=whole.state.problem.noise)
+    out = standing_out(replace(whole, state=every.state(whole.terms)))
+    # What stands out of this fit, and not of the one before it: every pose is used or out.
+    weight = tuple(np.where(mask, 0.0, 1.0) for mask in out)
+    sensings = tuple(_sensings(replace(every, weight=weight).state(whole.terms), out))
     return PoseSight(session, problem.setting, sensings, problem.blocks)
 
 

@@ -15,7 +15,9 @@ from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView, Role
 Array = NDArray[np.float64]
 
 AGREE_S = 3.0
-"""Time before a session's start, or after its end, s, at which clocks are set to agree."""
+"""Time about a session's start or middle, s, at which clocks count as agreeing: programs set
+clocks when they start, and a rate by regression is about the middle. Smaller gives a clock that
+was set late in starting an offset as well; larger hides offsets in the rate."""
 
 
 class PoseTimeOffset(PoseEffect):
@@ -77,12 +79,13 @@ class PoseClockRate(PoseEffect):
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
         """Return minus the velocity, the more the farther from the session's middle."""
-        apart = 1e-3 * (view.time - term.site['middle_s'])
-        return -(view.velocity * apart[:, None])[:, :, None]
+        apart = 1e-3 * (view.time - term.site['middle_s']) / (1 + 1e-3 * term.theta[0]) ** 2
+        return np.asarray(-(view.velocity * apart[:, None])[:, :, None])
 
     def clock(self, term: Term, sensor: str, time: Array) -> Array:
-        """Return the stamps, s, without what their clock gains."""
-        return np.asarray(time - 1e-3 * term.theta[0] * (time - term.site['middle_s']))
+        """Return the stamps, s, without what their clock gains: a rate of r makes times 1 + r."""
+        middle = term.site['middle_s']
+        return np.asarray(middle + (time - middle) / (1 + 1e-3 * term.theta[0]))
 
     def record(self, term: Term, covariance: Array) -> EffectRecord:
         """Record the rate, and the time at which the offset is the offset."""
@@ -99,7 +102,8 @@ class PoseClockRate(PoseEffect):
 def one_clock(records: Sequence[EffectRecord], duration: float) -> list[EffectRecord]:
     """Return the records with one for the clock: a rate takes the offset of all sensors with it.
 
-    Clocks that agree some time near a session of ``duration`` s have a rate and no offset besides.
+    Clocks that agree about the start or the middle of a session of ``duration`` s have a rate and
+    no offset besides.
     """
     offset = next(
         (r for r in records if r.name == PoseTimeOffset.name and 'sensor' not in r.parameters),
@@ -109,10 +113,12 @@ def one_clock(records: Sequence[EffectRecord], duration: float) -> list[EffectRe
     if rate is None:
         return list(records)
     value = 0.0 if offset is None else float(offset.parameters['offset_s'])
-    most = 1e-6 * abs(float(rate.parameters['rate_ppm'])) * (0.5 * duration + AGREE_S)
+    gained = 1e-6 * float(rate.parameters['rate_ppm'])
+    # The offset is that at the middle, half a session after the start.
+    apart = min(abs(value), abs(value - 0.5 * gained * duration))
     whole = replace(rate, parameters={**rate.parameters, 'offset_s': value})
     kept = [whole if r is rate else r for r in records]
-    return [r for r in kept if r is not offset or abs(value) > most]
+    return [r for r in kept if r is not offset or apart > abs(gained) * AGREE_S]
 
 
 EFFECTS = (PoseTimeOffset(), PoseClockRate())

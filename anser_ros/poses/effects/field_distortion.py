@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from anser_ros.effects.effect import Remedy, needed, sigmas
 from anser_ros.effects.term import Site, Term
+from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView, Role
 
@@ -35,6 +36,21 @@ def monomials(position: Array, centre: Array, size: float, degree: int, lowest: 
 def _factors(order: int) -> NDArray[np.int64]:
     """Coordinates that are multiplied for each monomial of an order, shape (m, order)."""
     return np.array(list(combinations_with_replacement(range(3), order)), dtype=np.int64)
+
+
+def _lowest(site: Site) -> int:
+    """The lowest degree of a map's monomials.
+
+    What shifts all sensors alike is the registration's. What shifts one is its map's: left out, it
+    would move the frames, and with them the lever arms of the others.
+    """
+    return int(site.get('lowest', 0 if 'sensor' in site else 1))
+
+
+def _count(site: Site) -> int:
+    """The number of a map's monomials."""
+    basis = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, site['degree'], _lowest(site))
+    return int(basis.shape[1])
 
 
 class FieldDistortion(PoseEffect):
@@ -67,22 +83,19 @@ class FieldDistortion(PoseEffect):
         }  # fmt: skip
         if degree == 0:
             return Term(self, site, np.zeros(4))
-        count = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, degree).shape[1]
-        return Term(self, site, np.zeros(3 * count))
+        return Term(self, site, np.zeros(3 * _count(site)))
 
     def bent(self, term: Term) -> Term:
         """Return the map without its linear part, which something else has."""
         site: Site = {**term.site, 'lowest': 2}
-        count = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, site['degree'], 2).shape[1]
-        return Term(self, site, np.zeros(3 * count))
+        return Term(self, site, np.zeros(3 * _count(site)))
 
     def whole(self, term: Term) -> Term:
         """Return the map of the same degree with its linear part, on all sensors."""
         site: Site = {**term.site}
         site.pop('lowest', None)
         site.pop('sensor', None)
-        count = monomials(np.zeros((1, 3)), np.zeros(3), 1.0, site['degree']).shape[1]
-        return Term(self, site, np.zeros(3 * count))
+        return Term(self, site, np.zeros(3 * _count(site)))
 
     def prior(self, term: Term) -> Array:
         """Return a prior spread of 5 mm at the rms distance."""
@@ -91,12 +104,12 @@ class FieldDistortion(PoseEffect):
     def _derivative(self, term: Term, position: Array) -> Array:
         """What each parameter moves positions (n, 3) by, shape (n, 3, q), m."""
         centre, size = np.asarray(term.site['centre_m']), term.site['size_m']
-        degree, lowest = term.site['degree'], term.site.get('lowest', 1)
+        degree = term.site['degree']
         if degree == 0:
             away = ((position - centre) / size)[:, :, None]
             shift = np.broadcast_to(np.eye(3), (len(position), 3, 3))
             return UNIT_M * np.concatenate([away, shift], axis=2)
-        basis = monomials(position, centre, size, degree, lowest)
+        basis = monomials(position, centre, size, degree, _lowest(term.site))
         out = np.zeros((len(position), 3, term.theta.size))
         for axis in range(3):
             out[:, axis, axis::3] = UNIT_M * basis
@@ -136,7 +149,10 @@ class FieldDistortion(PoseEffect):
         degree = term.site['degree']
         # A scale's first number moves all three coordinates, as its shift does together.
         rms = UNIT_M * float(np.linalg.norm(term.theta)) / (np.sqrt(3) if degree else 1.0)
-        strain = (rms if degree else UNIT_M * abs(float(term.theta[0]))) / term.site['size_m']
+        # A shift strains nothing.
+        stretched = term.theta[3 * (_lowest(term.site) == 0) :] if degree else term.theta[:1]
+        strain = UNIT_M * float(np.linalg.norm(stretched)) / (np.sqrt(3) if degree else 1.0)
+        strain /= term.site['size_m']
         spread = UNIT_M * float(np.sqrt(np.mean(sigmas(covariance) ** 2)))
         return EffectRecord(
             self.name,
@@ -151,10 +167,14 @@ class FieldDistortion(PoseEffect):
     def term(self, record: EffectRecord) -> Term:
         """Read the map's coefficients, mm, from a record."""
         keys = ('sensor', 'degree', 'lowest', 'centre_m', 'size_m')
-        site = {k: record.parameters[k] for k in keys if k in record.parameters}
-        return Term(
-            self, cast(Site, site), np.asarray(needed(record, 'coefficients_mm'), dtype=np.float64)
-        )
+        site = cast(Site, {k: record.parameters[k] for k in keys if k in record.parameters})
+        theta = np.asarray(needed(record, 'coefficients_mm'), dtype=np.float64)
+        count = 3 * _count(site) if site['degree'] else 4
+        if theta.size != count:
+            raise ModelFileError(
+                f'{self.name}: {theta.size} coefficients_mm, such a map has {count}'
+            )
+        return Term(self, site, theta)
 
 
 EFFECTS = (FieldDistortion(),)

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from anser_ros.diagnosis.decisions import FEWEST_OUTLIERS
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import LONGEST_GAP_S
-from anser_ros.poses.effect import PoseEffect, PoseSight
+from anser_ros.poses.effect import PoseEffect, PoseSight, Sensing
+from anser_ros.poses.effects.episodes import episode_windows, windows_of
 from anser_ros.poses.sequence import PoseSequence, leaps
 
 Array = NDArray[np.float64]
@@ -99,7 +100,8 @@ class PoseOutliers(PoseEffect):
     def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
         """Return one record of the outlying poses of all sensors."""
         found = list(self._leaping(sight))
-        out = np.concatenate([s.out for s in sight.sensors])
+        outs = [_alone(sensing, sight) for sensing in sight.sensors]
+        out = np.concatenate(outs)
         used = np.concatenate([s.used for s in sight.sensors])
         count = int(np.count_nonzero(out))
         share = count / max(count + int(np.count_nonzero(used)), 1)
@@ -108,8 +110,8 @@ class PoseOutliers(PoseEffect):
         residual = np.concatenate([s.residual for s in sight.sensors])[out]
         noise = np.concatenate(
             [
-                np.tile([s.position_m, s.orientation_rad], (int(s.out.sum()), 1))
-                for s in sight.sensors
+                np.tile([s.position_m, s.orientation_rad], (int(mask.sum()), 1))
+                for s, mask in zip(sight.sensors, outs, strict=True)
             ]
         )
         far = np.linalg.norm(residual[:, :3], axis=1) / noise[:, 0]
@@ -120,7 +122,9 @@ class PoseOutliers(PoseEffect):
             'fraction': share,
             'position_m': float(np.median(np.linalg.norm(residual[:, :3], axis=1))),
             'orientation_rad': float(np.median(np.linalg.norm(residual[:, 3:], axis=1))),
-            'by_sensor': {s.view.sensor: int(s.out.sum()) for s in sight.sensors},
+            'by_sensor': {
+                s.view.sensor: int(m.sum()) for s, m in zip(sight.sensors, outs, strict=True)
+            },
         }
         return [_record(self.name, values, {'fraction': float(np.sqrt(share / out.size))})]
 
@@ -134,6 +138,12 @@ class PoseOutliers(PoseEffect):
         if share > FEWEST_OUTLIERS and np.count_nonzero(away) >= FEWEST_POSES:
             values = {'fraction': share, 'stream': reference.name}
             yield _record(self.name, values, {'fraction': float(np.sqrt(share / away.size))})
+
+
+def _alone(sensing: Sensing, sight: PoseSight) -> NDArray[np.bool_]:
+    """Poses of a sensor that stand out, less those of an episode, which are off together."""
+    inside = np.isin(windows_of(sensing, sight), episode_windows(sensing, sight))
+    return np.asarray(sensing.out & ~inside)
 
 
 def _record(
