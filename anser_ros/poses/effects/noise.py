@@ -24,20 +24,25 @@ CLEAR = 5.0  # standard deviations by which the noise must differ from a constan
 EXPONENTS = (2.8, 6.5)
 """Exponents of the noise that a field makes: the signal falls with the third power, the gradient
 with the fourth; what is outside is something else."""
+SHARES = np.array([1, 4, 1]) / 6
+"""Shares of the variances of three poses in that of their second difference."""
+NEW_SHARE = 1 / 3
+"""Share of squared second differences that is new: neighbours share values."""
 FEWEST = 60  # differences of neighbours that a power law is fitted to
 
 
 def jitter(sensing: Sensing) -> tuple[Array, Array]:
-    """Return squared noise (m^2, a coordinate) and distance (m) of poses beside near neighbours.
+    """Return squared noise (n,) of poses beside near neighbours, and distances (n, 3).
 
-    Second differences of the residual across the velocity, so that neither a slow course nor an
-    error of the stamps is in it.
+    Squares are m^2, a coordinate; the distances, m, are those of the pose before, of the pose and
+    of the one after it. Second differences of the residual across the velocity, so that neither a
+    slow course nor an error of the stamps is in it.
     """
     rows = np.flatnonzero(sensing.used)
     time, velocity = sensing.view.time[rows], sensing.view.velocity[rows, :3]
     residual = sensing.residual[rows, :3]
     if rows.size < 3:
-        return np.zeros(0), np.zeros(0)
+        return np.zeros(0), np.zeros((0, 3))
     second = residual[1:-1] - 0.5 * (residual[:-2] + residual[2:])
     speed = np.linalg.norm(velocity[1:-1], axis=1, keepdims=True)
     along = velocity[1:-1] / np.maximum(speed, 1e-9)
@@ -45,39 +50,46 @@ def jitter(sensing: Sensing) -> tuple[Array, Array]:
     usual = float(np.median(np.diff(time)))
     near = time[2:] - time[:-2] < max(NEAR_S, NEAR_STEPS * usual)
     square = np.sum(second**2, axis=1) / (1.5 * 2)
-    distance = np.linalg.norm(sensing.view.measured[rows][1:-1], axis=1)
-    return square[near], distance[near]
+    distance = np.linalg.norm(sensing.view.measured[rows], axis=1)
+    about = np.stack([distance[:-2], distance[1:-1], distance[2:]], axis=1)
+    return square[near], about[near]
 
 
 def power_law(square: Array, distance: Array) -> tuple[float, float, float]:
     """Return the exponent of the noise by distance above a floor, its sigma, and the likelihood's
     gain.
 
-    A squared deviation across the velocity has two degrees of freedom, so it is distributed
-    exponentially about the variance.
+    Square (n,) and distances (n, 3) are as of `jitter`. A squared deviation across the velocity
+    has two degrees of freedom, so it is distributed exponentially about the variance, which is
+    that of the three poses with their shares of a second difference.
     """
     place = np.log(distance / np.median(distance))
-    cut = np.minimum(square, 12 * np.median(square) * np.exp(8 * np.maximum(place, 0)))
+    cut = np.minimum(square, 12 * np.median(square) * np.exp(8 * np.maximum(place[:, 1], 0)))
 
-    def cost(values: Array) -> float:
-        variance = np.exp(values[0] + 2 * values[1] * place) + np.exp(values[2])
+    def cost(exponent: float, level: float, floor: float) -> float:
+        law = np.exp(np.clip(level + 2 * exponent * place, -60, 60)) @ SHARES
+        variance = law + np.exp(np.clip(floor, -60, 60))
         return float(np.sum(np.log(variance) + cut / variance))
+
+    def profile(exponent: float, start: Array) -> float:
+        """Least cost with the exponent held: level and floor go with it."""
+        found = minimize(lambda v: cost(exponent, v[0], v[1]), start, method='Nelder-Mead')
+        return float(found.fun)
 
     level = float(np.log(np.mean(cut)))
     best = min(
         (
-            minimize(cost, np.array([level, n, level - 2]), method='Nelder-Mead')
+            minimize(lambda v: cost(*v), np.array([n, level, level - 2]), method='Nelder-Mead')
             for n in (3.0, 5.0)
         ),
         key=lambda result: float(result.fun),
     )
-    exponent = float(best.x[1])
+    exponent, least = float(best.x[0]), float(best.fun)
     plain = cut.size * (level + 1)
-    # Neighbours share values in second differences: about a third of them is new.
-    step, share = 0.2, 1 / 3
-    sides = [cost(best.x + [0, way * step, 0]) for way in (-1, 1)]
-    curvature = max((sum(sides) - 2 * float(best.fun)) / step**2, 1e-9) * share
-    return exponent, float(1 / np.sqrt(curvature)), 2 * share * float(plain - best.fun)
+    step = 0.2
+    sides = [profile(exponent + way * step, best.x[1:]) for way in (-1, 1)]
+    curvature = max((sum(sides) - 2 * least) / step**2, 1e-9) * NEW_SHARE
+    return exponent, float(1 / np.sqrt(curvature)), 2 * NEW_SHARE * float(plain - least)
 
 
 class PoseExcessNoise(PoseEffect):
@@ -94,7 +106,7 @@ class PoseExcessNoise(PoseEffect):
         exponent = float(law[0].parameters['exponent']) if law else 0.0
         for sensing in sight.sensors:
             square, distance = jitter(sensing)
-            square = square / distance ** (2 * exponent)
+            square = square / distance[:, 1] ** (2 * exponent)
             if square.size >= FEWEST:
                 noise[sensing.view.sensor] = float(np.sqrt(np.median(square)))
         found = []
