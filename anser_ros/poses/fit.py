@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 from anser_ros.diagnosis.fit import ATTEMPTS, SETTLED, stepped
 from anser_ros.diagnosis.scoring import BlockSums
 from anser_ros.effects.term import Term
+from anser_ros.poses.effect import Role, is_of
 from anser_ros.poses.effects.hand_eye import FrameTerm
 from anser_ros.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState
 
@@ -73,9 +74,11 @@ class PoseFit:
         The formal one is scaled by the misfit; where blocks scatter more than it says (White's
         sandwich with blocks as clusters), a parameter's variance is raised to that.
         """
-        formal = self.sums.solve(self.prior)[1]
-        blocks = max(self.sums.squares.size, 2)
-        scores = self.sums.right @ formal
+        filtered = any(is_of(term, Role.FILTER) for term in self.terms)
+        sums = self.state.sums(filter_slopes=True) if filtered else self.sums
+        formal = sums.solve(self.prior)[1]
+        blocks = max(sums.squares.size, 2)
+        scores = sums.right @ formal
         robust = np.sum(scores**2, axis=0) * blocks / (blocks - 1)
         variance = np.diag(formal) * max(self.misfit, 1.0)
         raised = np.maximum(variance, robust)

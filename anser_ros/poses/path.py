@@ -90,6 +90,22 @@ class OpticalPath:
         matrices = np.asarray(Rotation.from_quat(turn).as_matrix()).reshape(-1, 3, 3)
         return values[:, :3], matrices, velocity, valid
 
+    def jitter(self, lever: Array) -> float:
+        """Return the rms, m a coordinate, by which a point (3,) of the body leaves its own course.
+
+        The course is the cubic through the two poses before and the two after; a hand's motion
+        leaves it by some micrometres.
+        """
+        place, turn, _, _ = self.at(self.knots)
+        point, time = place + turn @ lever, self.knots
+        near = np.stack([time[:-4], time[1:-3], time[3:-1], time[4:]]) - time[2:-2]
+        weight = np.stack([_share_at_zero(near, k) for k in range(4)])
+        about = np.stack([point[:-4], point[1:-3], point[3:-1], point[4:]])
+        off = point[2:-2] - np.einsum('kn,kni->ni', weight, about)
+        whole = near[3] - near[0] < 4 * self.longest_gap
+        size = off[whole] / np.sqrt(1 + np.sum(weight**2, axis=0))[whole, None]
+        return float(np.sqrt(np.mean(size**2))) if size.size else 0.0
+
     def filtered(self, tau: float, two_sided: bool = False) -> 'OpticalPath':
         """Return the path behind a first-order low pass with a time constant, s.
 
@@ -110,6 +126,12 @@ class OpticalPath:
         spline = CubicHermiteSpline(grid, passed, np.gradient(passed, grid, axis=0))
         gaps = _Gaps(self.knots, self.longest_gap)
         return _FilteredPath(grid, self.longest_gap, self.is_at_rest, spline, gaps)
+
+
+def _share_at_zero(nodes: Array, k: int) -> Array:
+    """Lagrange's weight of node k of nodes (4, n) at zero."""
+    others = [j for j in range(4) if j != k]
+    return np.asarray(np.prod([-nodes[j] / (nodes[k] - nodes[j]) for j in others], axis=0))
 
 
 @dataclass(frozen=True)

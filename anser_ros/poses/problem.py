@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.diagnosis.scoring import BlockSums
 from anser_ros.effects.term import Term
-from anser_ros.poses.effect import PoseSetting, PoseView, effect_of
+from anser_ros.poses.effect import PoseSetting, PoseView, Role, effect_of, is_of
 from anser_ros.poses.effects.hand_eye import FrameTerm, Mount, OpticalFrame
 from anser_ros.poses.path import OpticalPath
 from anser_ros.poses.sequence import PoseSequence
@@ -17,6 +17,10 @@ from anser_ros.poses.sequence import PoseSequence
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Ints = NDArray[np.int64]
+
+FILTER_STEP = 0.05
+"""Share of a filter's time constant by which it is changed for differences. Smaller meets the
+filter's grid; larger, its curvature."""
 
 
 @dataclass(frozen=True)
@@ -205,8 +209,17 @@ class PoseState:
         squares = np.mean(every**2, axis=0)
         return float(np.sqrt(squares[:3].sum())), float(np.sqrt(squares[3:].sum()))
 
-    def sums(self, terms: Sequence[Term] | None = None, in_space: bool = False) -> BlockSums:
-        """Return normal equations of the terms' parameters, block by block."""
+    def sums(
+        self,
+        terms: Sequence[Term] | None = None,
+        in_space: bool = False,
+        filter_slopes: bool = False,
+    ) -> BlockSums:
+        """Return normal equations of the terms' parameters, block by block.
+
+        With ``filter_slopes`` time constants of filters, which have no slopes of their own, count
+        by differences; otherwise they are held.
+        """
         wanted = self.terms if terms is None else tuple(terms)
         sizes = [term.theta.size for term in wanted]
         edges = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
@@ -215,10 +228,14 @@ class PoseState:
         total = int(edges[-1])
         normal = np.zeros((numbers.size, total, total))
         right, squares = np.zeros((numbers.size, total)), np.zeros(numbers.size)
-        for part, label in zip(self.parts, labels, strict=True):
+        filters = [t for t in wanted if is_of(t, Role.FILTER)] if filter_slopes else []
+        turned = {t.seat: self._differences(t) for t in filters}
+        for i, (part, label) in enumerate(zip(self.parts, labels, strict=True)):
             columns = np.zeros((part.residual.shape[0], 6, total))
             for term, a, b in zip(wanted, edges[:-1], edges[1:], strict=True):
                 slope = effect_of(term).slopes(term, part.view)
+                if term.seat in turned:
+                    slope = turned[term.seat][i]
                 if slope is not None:
                     columns[:, :, a:b] = slope
             white = part.white
@@ -231,3 +248,16 @@ class PoseState:
                 right[row] += flat.T @ rest
                 squares[row] += rest @ rest
         return BlockSums(normal, right, squares)
+
+    def _differences(self, term: Term) -> list[Array]:
+        """Slopes (n, 6, 1) of predicted less measured poses by a filter's time constant."""
+        step = FILTER_STEP * term.theta
+        ends = [
+            self.problem.state([t.with_theta(t.theta + way * step) if t is term else t
+                                for t in self.terms]).parts
+            for way in (1, -1)
+        ]  # fmt: skip
+        return [
+            -((more.residual - less.residual) / (2 * step[0]))[:, :, None]
+            for more, less in zip(*ends, strict=True)
+        ]

@@ -25,8 +25,10 @@ Array = NDArray[np.float64]
 POSES_A_PARAMETER = 6
 """Poses that a parameter needs: neighbours in time are hardly new. More leave metal unnamed on a
 hundred poses that a slow tracker gives in a minute; blocks judge what fewer would do."""
+LAST_STEP = 1.02  # factor of a time constant about which what is left is a parabola
 SMOOTH_STEPS = 2.0
-"""Intervals of the reference up to which a filter may only smooth its noise. Fewer call smoothing
+"""Intervals of the reference up to which a filter may only smooth its noise, where it takes off no
+more than that noise. Fewer call smoothing
 a lag; more take a lag for smoothing. How the value was chosen is not recorded."""
 MOST_EFFECTS = 6  # effects in force after which the search ends: more would be stand-ins
 FULL_FITS = 3  # candidates fitted in full in each round, which takes most of the time
@@ -233,9 +235,8 @@ def _with_lag(
     ]
     trial = _finest_lag(min(trials, key=lambda t: t.state.sum_of_squares))
     term = trial.terms[-1]
-    # A filter over several poses of the reference takes off more than their noise.
     interval = float(np.median(np.diff(fit.state.problem.path.knots)))
-    noisy = float(term.theta[0]) < SMOOTH_STEPS * interval
+    noisy = float(term.theta[0]) < SMOOTH_STEPS * interval and _is_smoothing(fit, trial)
     widths = [term.with_theta(factor * term.theta) for factor in (0.5, 1.0, 2.0) if noisy]
     rivals = [fit_poses(fit.state.problem, [*fit.terms, effect_of(t).rival(t)], 3) for t in widths]
     best = min([fit, *rivals], key=lambda f: f.held_out())
@@ -250,6 +251,17 @@ def _with_lag(
         refused.append((term.label, 'not all sensors of the tracker show it'))
         return None, left
     return trial, left
+
+
+def _is_smoothing(before: PoseFit, after: PoseFit) -> bool:
+    """Whether a filter takes off no more than a smoother reference can: the noise of its poses."""
+    path, taken, noise = before.state.problem.path, 0.0, 0.0
+    for old, new in zip(before.state.parts, after.state.parts, strict=True):
+        both = old.used & new.used
+        squares = [np.sum(part.residual[both, :3] ** 2) for part in (old, new)]
+        taken += float(squares[0] - squares[1])
+        noise += 3 * np.count_nonzero(both) * path.jitter(old.view.lever) ** 2
+    return taken < noise
 
 
 def _all_gain(before: PoseFit, after: PoseFit) -> bool:
@@ -278,19 +290,27 @@ def _gain(before: PoseFit, after: PoseFit, term: Term) -> float:
 
 
 def _finest_lag(fit: PoseFit) -> PoseFit:
-    """The fit at the time constant that leaves least, by smaller and smaller steps."""
+    """The fit at the time constant that leaves least: ever smaller steps, then a parabola."""
     best = fit
-    for factor in (1.4, 1.4, 1.2, 1.1, 1.05, 1.02):
+    for factor in (1.4, 1.4, 1.2, 1.1, 1.05, LAST_STEP):
         for direction in (factor, 1 / factor):
-            terms = [
-                t.with_theta(t.theta * direction) if is_of(t, Role.FILTER) else t
-                for t in best.terms
-            ]
-            trial = fit_poses(best.state.problem, terms, 3)
+            trial = _slower(best, direction)
             if trial.state.sum_of_squares < best.state.sum_of_squares:
                 best = trial
                 break
-    return best
+    less, more = (_slower(best, way).state.sum_of_squares for way in (1 / LAST_STEP, LAST_STEP))
+    bend = less + more - 2 * best.state.sum_of_squares
+    if bend <= 0:
+        return best
+    shift = float(np.clip(0.5 * (less - more) / bend, -1.0, 1.0))
+    trial = _slower(best, LAST_STEP**shift)
+    return min(best, trial, key=lambda one: one.state.sum_of_squares)
+
+
+def _slower(fit: PoseFit, factor: float) -> PoseFit:
+    """The fit with time constants so many times as long, and all else fitted again."""
+    terms = [t.with_theta(factor * t.theta) if is_of(t, Role.FILTER) else t for t in fit.terms]
+    return fit_poses(fit.state.problem, terms, 3)
 
 
 def _one_scale(fit: PoseFit) -> bool:
