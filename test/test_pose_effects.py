@@ -1,0 +1,88 @@
+"""Single parts of the diagnosis of poses, each against what it has to be by definition."""
+
+import numpy as np
+import pytest
+from pose_world import World
+from scipy.spatial.transform import Rotation
+
+from anser_ros.field.model import EffectRecord
+from anser_ros.physics.pose_track import PoseTrack
+from anser_ros.poses.effect import PoseSetting
+from anser_ros.poses.effects.clock import PoseClockRate, one_clock
+from anser_ros.poses.effects.field_distortion import FieldDistortion
+from anser_ros.poses.effects.noise import power_law
+from anser_ros.poses.effects.stamps import stamp_step
+from anser_ros.poses.path import OpticalPath
+
+SETTING = PoseSetting(('sensor_0', 'sensor_1'), 40.0, np.zeros(3), 0.06)
+
+
+def test_the_clock_undoes_a_rate_exactly():
+    true = np.linspace(0, 40, 9)
+    stamps = true + 2.5e-3 * (true - 20)
+    term = PoseClockRate().sites(SETTING)[0].with_theta(np.array([2.5]))
+    np.testing.assert_allclose(PoseClockRate().clock(term, 'sensor_0', stamps), true, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('offset_s', 'names'),
+    [
+        (0.0, ['clock_rate']),  # agree at the middle
+        (0.02, ['clock_rate']),  # agree at the start: 20 s at 1000 ppm
+        (0.008, ['time_offset', 'clock_rate']),
+        (-0.02, ['time_offset', 'clock_rate']),
+    ],
+)
+def test_clocks_that_were_set_alike_have_no_offset_beside_their_rate(offset_s, names):
+    rate = EffectRecord('clock_rate', {'rate_ppm': 1000.0, 'middle_s': 20.0}, {})
+    offset = EffectRecord('time_offset', {'offset_s': offset_s}, {})
+    found = one_clock([offset, rate], 40.0)
+    assert [r.name for r in found] == names
+    assert found[-1].parameters['offset_s'] == offset_s
+
+
+def test_a_poll_slower_than_its_tracker_is_told_by_poses_that_share_a_stamp():
+    taken = np.arange(0, 20, 1 / 92)
+    assert stamp_step(np.ceil(taken / 0.016) * 0.016) == pytest.approx(0.016)
+    assert stamp_step(np.arange(0, 20, 0.016)) == 0.0  # the tracker's own rate
+
+
+def test_a_path_knows_the_noise_of_its_poses_at_a_point_of_the_body():
+    rng, time = np.random.default_rng(4), np.cumsum(np.full(2000, 0.03))
+    place, turn = World(5, duration=time[-1]).body(time)
+    place = place + 2e-4 * rng.normal(size=place.shape)
+    turn = Rotation.from_rotvec(2e-3 * rng.normal(size=place.shape)) * turn
+    path = OpticalPath.through(PoseTrack(time, place, turn.as_quat()))
+    lever = np.array([0.0, 0.1, 0.0])
+    # A turn about two of three axes moves the point.
+    expected = np.sqrt(2e-4**2 + (2e-3 * 0.1) ** 2 * 2 / 3)
+    assert path.jitter(np.zeros(3)) == pytest.approx(2e-4, rel=0.05)
+    assert path.jitter(lever) == pytest.approx(expected, rel=0.05)
+
+
+def test_a_map_of_one_sensor_may_shift_it_and_one_of_all_may_not():
+    effect, place = FieldDistortion(), np.array([[0.01, -0.02, 0.03], [0.0, 0.0, 0.0]])
+    own, every = effect.at(SETTING, 2, 'sensor_1'), effect.at(SETTING, 2, None)
+    assert own.theta.size == every.theta.size + 3 == 30
+    shift = own.with_theta(np.r_[1.0, -2.0, 3.0, np.zeros(27)])
+    np.testing.assert_allclose(effect.shift(shift, place), [[1e-3, -2e-3, 3e-3]] * 2)
+    record = effect.record(shift, np.eye(30))
+    assert record.parameters['strain'] == 0.0  # a shift strains nothing
+    again = effect.term(record)
+    assert again.site == own.site and np.array_equal(again.theta, shift.theta)
+
+
+def test_the_exponent_of_noise_is_found_with_an_honest_sigma():
+    # Samples so far apart that neighbours lie at quite other distances.
+    found = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        distance = 0.3 + 0.1 * np.sin(np.arange(700) * 0.7 + rng.uniform(0, 6))
+        noise = (distance / 0.3)[:, None] ** 4 * rng.normal(0, 3e-4, (700, 2))
+        second = noise[1:-1] - 0.5 * (noise[:-2] + noise[2:])
+        about = np.stack([distance[:-2], distance[1:-1], distance[2:]], axis=1)
+        exponent, sigma, gain = power_law(np.sum(second**2, axis=1) / 3, about)
+        assert gain > 25
+        found.append((exponent - 4) / sigma)
+    assert 0.4 < np.sqrt(np.mean(np.square(found))) < 1.6
+    assert abs(np.mean(found)) < 0.9
