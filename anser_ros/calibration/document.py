@@ -70,6 +70,7 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
         'nominal_flux_rmse_t': nominal,
         'effects': [_effect(record) for record in (*scan.corrections, *scan.tellings)],
         'unobservable': [] if scan.survey is None else list(untold_words(scan.survey)),
+        'shift_sigma_m': calibration.model.shift_sigma_m,
         'contradictions': list(calibration.contradictions),
         'optical_noise': None if scan.survey is None else _optical(scan.survey.optical),
     }
