@@ -8,9 +8,9 @@ import pytest
 from tracking_world import certain_model
 
 from anser_ros.integrity.ageing import ModelAge
-from anser_ros.integrity.withheld import REFERENCES_DOUBTFUL, REFERENCES_LOST, STATES, code_of
-from anser_ros.integrity.withheld import state_of as state_of_code
 from anser_ros.physics.volume import TrackedVolume
+from anser_ros.pose_states import OF_MODEL, REFERENCES_DOUBTFUL, REFERENCES_LOST, code_of
+from anser_ros.pose_states import state_of as state_of_code
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import load_session
@@ -73,8 +73,8 @@ def test_what_rests_keeps_its_certainty_until_it_is_given_up():
 
 
 def test_states_and_codes():
-    assert [state_of_code(code_of(state)) for state in ('', *STATES)] == ['', *STATES]
-    assert state_of_code(999) == STATES[-1]
+    assert [state_of_code(code_of(state)) for state in ('', *OF_MODEL)] == ['', *OF_MODEL]
+    assert state_of_code(999) == OF_MODEL[-1]
     assert code_of(REFERENCES_DOUBTFUL) != code_of(REFERENCES_LOST)
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from anser_ros.cli.main import main
 from anser_ros.errors import ParameterError
+from anser_ros.pose_states import OK
 from anser_ros.sessions.comparison import (
     FEWEST_BLOCKS,
     compare_errors,
@@ -24,7 +25,6 @@ from anser_ros.sessions.pose_table import (
     write_errors,
     write_poses,
 )
-from anser_ros.tracking.estimate import OK
 
 STEP_NS = 40_000_000
 FRAMES = 750

@@ -17,8 +17,8 @@ from anser_ros.cli.main import main
 from anser_ros.cli.supervisor import Supervisor, tail
 from anser_ros.nodes.output_parts.traces import OpticalTrace, PoseTrace, Traces, targets_of
 from anser_ros.nodes.streams.backlog import CATCH_UP_S
+from anser_ros.pose_states import OK, STATES
 from anser_ros.stamps import NANO
-from anser_ros.tracking.estimate import OK, STATES
 from anser_ros.wire.bag import MessageDecoder, Salvage, iter_messages
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import parse_setup, topic_of

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from anser_ros.cli import evaluation_figures as figures
+from anser_ros.pose_states import OK
 from anser_ros.sessions.evaluation import Evaluation
 from anser_ros.sessions.evaluation_document import to_document
 from anser_ros.sessions.pose_errors import PoseSeries
-from anser_ros.tracking.estimate import OK
 
 FRAMES = 200
 

@@ -11,10 +11,10 @@ from anser_ros.field.model import EffectRecord, from_document, to_document
 from anser_ros.field.nominal import nominal_model
 from anser_ros.field.reference_readings import ReferenceReadings
 from anser_ros.fingerprint import fingerprint_of
-from anser_ros.integrity.withheld import code_of
 from anser_ros.nodes.tracker_parts.model_in_force import ModelInForce
 from anser_ros.nodes.tracker_parts.model_intake import GivenModel
 from anser_ros.physics.volume import TrackedVolume
+from anser_ros.pose_states import code_of
 from anser_ros.sessions.starting_model import check_emitters, is_nominal, made_for
 from anser_ros.wire.model_error import ModelError, decode_model_error, encode_model_error
 from anser_ros.wire.points import DipolePoints

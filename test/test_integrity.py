@@ -7,11 +7,11 @@ import pytest
 from tracked_tool import CHANNELS, MODEL, STEP_NS, TOOL, path
 from tracking_world import NOISE_T, fluxes, random_pose
 
+from anser_ros import pose_states as states
 from anser_ros.errors import TrackingError
 from anser_ros.frames.intake import Intake
 from anser_ros.integrity.continuity import Continuity, MotionBounds, Place
 from anser_ros.integrity.freshness import Freshness
-from anser_ros.tracking import estimate as states
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.rotations import rotation_of_vector
 from anser_ros.tracking.tracker import Tracker

@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 from anser_ros.assessment.pivot import PivotLimits, fit_pivot
 from anser_ros.cli.main import run_verb
 from anser_ros.errors import FitError, ParameterError, SetupError
+from anser_ros.pose_states import OK
 from anser_ros.poses.sequence import sequence_of
-from anser_ros.tracking.estimate import OK, PoseEstimate, no_pose
+from anser_ros.tracking.estimate import PoseEstimate, no_pose
 from anser_ros.tracking.tip import Tip
 from anser_ros.wire.setup import dump_setup, parse_setup
 from anser_ros.wire.setup_tips import TipSpec, read_tips, with_tips

@@ -11,8 +11,8 @@ from refit_rig import HEAD, PATCH_COILS, STEP_NS, Rig, setup_text
 from refit_world import anser_world, metal_block
 
 from anser_ros.errors import FitError, FrameError, ModelFileError, ParameterError
-from anser_ros.integrity.withheld import OTHER_MODEL, REFERENCES_LOST, code_of
 from anser_ros.nodes.runtime.diagnostics import Level
+from anser_ros.pose_states import OTHER_MODEL, REFERENCES_LOST, code_of
 from anser_ros.refit.result import Metal
 from anser_ros.sessions.model_file import load_model
 from anser_ros.stamps import stamp_of

@@ -10,8 +10,8 @@ from refit_rig import Rig, setup_text
 from refit_world import anser_world
 
 from anser_ros.errors import FitError
-from anser_ros.integrity.withheld import REFERENCES_LOST, code_of
 from anser_ros.nodes.runtime.diagnostics import Level
+from anser_ros.pose_states import REFERENCES_LOST, code_of
 from anser_ros.refit import tables
 from anser_ros.sessions.model_file import save_model
 from anser_ros.wire.setup import parse_setup

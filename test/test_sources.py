@@ -30,9 +30,9 @@ from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable, clusters_of
 from anser_ros.physics.tracks import loop_field
 from anser_ros.physics.volume import TrackedVolume
+from anser_ros.pose_states import OK
 from anser_ros.sessions.starting_model import with_new_survey
 from anser_ros.settings import Accuracy
-from anser_ros.tracking.estimate import OK
 from anser_ros.tracking.source_track import seen_from
 from anser_ros.tracking.tracker import Tracker, TrackerSettings
 from anser_ros.wire.config_folder import read_config

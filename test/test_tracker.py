@@ -7,12 +7,12 @@ import pytest
 from tracked_tool import CHANNELS, MODEL, STEP_NS, TOOL, one_frame, path
 from tracking_world import NOISE_T, anser_board, fluxes, random_pose, triaxial_tool
 
+from anser_ros import pose_states as states
 from anser_ros.field.nominal import nominal_model
 from anser_ros.metal.sphere import sphere_polarisability
 from anser_ros.physics.board import build_board
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
-from anser_ros.tracking import estimate as states
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 

@@ -8,9 +8,9 @@ import pytest
 from tracked_tool import CHANNELS, MODEL, STEP_NS, TOOL, one_frame
 from tracking_world import NOISE_T, fluxes, random_pose
 
+from anser_ros import pose_states as states
 from anser_ros.errors import TrackingError
 from anser_ros.field.model import EffectRecord
-from anser_ros.tracking import estimate as states
 from anser_ros.tracking.estimate import NO_GATE, NoiseScale, TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.api.model import Model
+from anser_ros.pose_states import OK
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.evaluation_document import to_document
 from anser_ros.sessions.pose_errors import PoseSeries
@@ -66,7 +67,7 @@ class TrackedPoses:
     @property
     def ok(self) -> NDArray[np.bool_]:
         """Return the mask (F,) of the frames that have a pose."""
-        return np.asarray(self.state == 'ok')
+        return np.asarray(self.state == OK)
 
 
 @dataclass(frozen=True)

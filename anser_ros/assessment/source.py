@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import AnserError, BagError
+from anser_ros.pose_states import OK
 from anser_ros.poses.importing import import_poses
 from anser_ros.poses.recording import read_pose_session
 from anser_ros.poses.sequence import PoseSequence, PoseSession, sequence_of
@@ -18,7 +19,6 @@ from anser_ros.sessions.plausibility import check_positions
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for
 from anser_ros.stamps import NANO
-from anser_ros.tracking.estimate import OK
 from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages
 from anser_ros.wire.pose_topics import ENDING, OPTICAL, optical_topic
 from anser_ros.wire.setup import Setup, parse_setup, topic_of

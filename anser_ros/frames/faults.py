@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros import pose_states as states
 from anser_ros.physics.sensor import LARGEST_FLUX_T
 
 
@@ -39,14 +40,14 @@ NOT_FINITE_CODE, ABSURD_CODE = 6, 7
 STUCK_CODE = 8
 """Code of what earlier readings say: this one repeats one of them."""
 
-MISSING = Fault('missing', 'stale', 'its channel is not in the frame')
-SATURATED = Fault('saturated', 'saturated', 'flagged saturated by the acquisition')
-STALE = Fault('stale', 'stale', 'flagged stale by the acquisition')
-DROPPED = Fault('dropped', 'dropped', 'flagged dropped by the acquisition')
-FLAGGED = Fault('flagged', 'no_signal', 'flagged by the acquisition with an unknown bit')
-NOT_FINITE = Fault('not_finite', 'no_signal', 'the fluxes are not finite')
-ABSURD = Fault('absurd', 'no_signal', f'fluxes beyond {LARGEST_FLUX_T:g} T are absurd')
-STUCK = Fault('stuck', 'stale', 'stuck: the same reading as before')
+MISSING = Fault('missing', states.STALE, 'its channel is not in the frame')
+SATURATED = Fault('saturated', states.SATURATED, 'flagged saturated by the acquisition')
+STALE = Fault('stale', states.STALE, 'flagged stale by the acquisition')
+DROPPED = Fault('dropped', states.DROPPED, 'flagged dropped by the acquisition')
+FLAGGED = Fault('flagged', states.NO_SIGNAL, 'flagged by the acquisition with an unknown bit')
+NOT_FINITE = Fault('not_finite', states.NO_SIGNAL, 'the fluxes are not finite')
+ABSURD = Fault('absurd', states.NO_SIGNAL, f'fluxes beyond {LARGEST_FLUX_T:g} T are absurd')
+STUCK = Fault('stuck', states.STALE, 'stuck: the same reading as before')
 
 FAULTS: tuple[Fault | None, ...] = (
     None, MISSING, SATURATED, STALE, DROPPED, FLAGGED, NOT_FINITE, ABSURD, STUCK,

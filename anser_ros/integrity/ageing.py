@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.withheld import REFERENCES_LOST, Withheld
 from anser_ros.physics.volume import TrackedVolume
+from anser_ros.pose_states import REFERENCES_LOST, Withheld
 from anser_ros.stamps import NANO
 
 SPEED_S = 0.3

@@ -14,10 +14,10 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
+from anser_ros import pose_states as states
 from anser_ros.errors import AnserError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
-from anser_ros.integrity import withheld as why
 from anser_ros.nodes.field_model_parts import refit_status
 from anser_ros.nodes.field_model_parts.field_model_parameters import FieldModelParameters
 from anser_ros.nodes.field_model_parts.metal_view import MetalView
@@ -200,11 +200,11 @@ class FieldModelNode(AnserNode):
         """
         self._told = follows, awaits, *_ = self._state
         if self._unfit or self._place.misplaced:
-            withheld = why.OTHER_MODEL
+            withheld = states.OTHER_MODEL
         elif awaits:
-            withheld = why.REFERENCES_LOST
+            withheld = states.REFERENCES_LOST
         elif not withheld and self._is_uncalibrated:
-            withheld = why.UNCALIBRATED
+            withheld = states.UNCALIBRATED
         self._stamp_ns = stamp_ns if stamp_ns != self._stamp_ns else stamp_ns + 1
         # A model that is about to be judged lets trackers wait for the verdict on their frame.
         self._output.publish(model, self._frame_id, self._stamp_ns, follows or awaits, withheld)
@@ -282,7 +282,7 @@ class FieldModelNode(AnserNode):
 
     def _serve_start(self, base: FieldModel) -> None:
         """Serve a model that is no answer of the references: trackers wait for the next one."""
-        state = why.REFERENCES_LOST if self._follows else ''
+        state = states.REFERENCES_LOST if self._follows else ''
         self._serve(base, self.get_clock().now().nanoseconds, state)
 
     # Services -----------------------------------------------------------------------------
@@ -344,11 +344,13 @@ class FieldModelNode(AnserNode):
         values: dict[str, object] = {'last_refusal': self._trouble.last}
         said = said_of(self._sources)
         if said:
-            return Status('', Level.ERROR, f'{why.TWO_SOURCES}: {said}', values)
+            return Status('', Level.ERROR, f'{states.TWO_SOURCES}: {said}', values)
         if self._unfit:
-            return Status('', Level.ERROR, f'{why.OTHER_MODEL}: {self._trouble.last}', values)
+            return Status('', Level.ERROR, f'{states.OTHER_MODEL}: {self._trouble.last}', values)
         if self._place.misplaced:
-            return Status('', Level.ERROR, f'{why.OTHER_MODEL}: {self._place.misplaced}', values)
+            return Status(
+                '', Level.ERROR, f'{states.OTHER_MODEL}: {self._place.misplaced}', values
+            )
         if model is None:
             return Status('', Level.WARN, self._trouble.last or 'no setup yet', values)
         values['fingerprint'] = '' if self._base is None else self._base.fingerprint
@@ -357,7 +359,7 @@ class FieldModelNode(AnserNode):
         values['refit_time_s'] = self._refit.update_s
         activity = self._activity(values)
         if self._is_uncalibrated:
-            activity = f'{why.UNCALIBRATED}: calibrate, or set allow_uncalibrated; {activity}'
+            activity = f'{states.UNCALIBRATED}: calibrate, or set allow_uncalibrated; {activity}'
         dead = '' if self._frames is None else ', '.join(self._frames.dead)
         values['dead_emitters'] = dead
         if dead:
@@ -366,10 +368,10 @@ class FieldModelNode(AnserNode):
         if trouble:
             return Status('', Level.WARN, f'{activity}; lately: {trouble}', values)
         if self._place.awaits:
-            return Status('', Level.WARN, f'{why.REFERENCES_LOST}: none heard yet', values)
+            return Status('', Level.WARN, f'{states.REFERENCES_LOST}: none heard yet', values)
         silent_s, setup = time.monotonic() - self._heard_s, self._setup
         if setup is not None and self._follows and silent_s > setup.refit.references_age_s:
-            said = f'{why.REFERENCES_LOST}: no reference fluxes for {silent_s:.1f} s'
+            said = f'{states.REFERENCES_LOST}: no reference fluxes for {silent_s:.1f} s'
             return Status('', Level.ERROR, said, values)
         is_troubled = values.get('refit_state') in refit_status.TROUBLED
         is_troubled |= self._refit.is_awaited and self._follows

@@ -16,7 +16,7 @@ from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
 from anser_ros.nodes.runtime.parameters import parameter
 from anser_ros.nodes.tracker_parts.tracker_parameters import TrackerParameters
-from anser_ros.tracking.estimate import OK, STALE
+from anser_ros.pose_states import OK, STALE
 from anser_ros.wire import igtl
 from anser_ros.wire.setup import Setup, parse_setup, topic_of
 from anser_ros.wire.setup_tips import tip_name

@@ -15,7 +15,6 @@ from std_msgs.msg import String
 from anser_ros.errors import AnserError
 from anser_ros.field.model import FieldModel
 from anser_ros.integrity.ageing import Standing
-from anser_ros.integrity.withheld import TWO_SOURCES, Withheld
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import Trouble
 from anser_ros.nodes.runtime.handover import HandedFlux
@@ -40,11 +39,12 @@ from anser_ros.nodes.tracker_parts.tracker_parameters import (
     settings_of,
     tips_of_file,
 )
+from anser_ros.pose_states import OK, TWO_SOURCES, Withheld
 from anser_ros.sessions.session import sensor_table
 from anser_ros.sessions.starting_model import check_emitters, model_of
 from anser_ros.sessions.tracker_settings import settings_for
 from anser_ros.stamps import SECOND_NS
-from anser_ros.tracking.estimate import OK, USUAL_GATE
+from anser_ros.tracking.estimate import USUAL_GATE
 from anser_ros.tracking.tip import Tip
 from anser_ros.tracking.tracker import Tracker
 from anser_ros.tracking.warm_up import warm_up

@@ -14,7 +14,6 @@ from std_msgs.msg import String
 
 from anser_ros.errors import AnserError
 from anser_ros.field.model import EffectRecord
-from anser_ros.integrity.withheld import TWO_SOURCES
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
 from anser_ros.nodes.runtime.parameters import parameter
@@ -30,6 +29,7 @@ from anser_ros.nodes.watcher_parts.sighting_words import (
     values_of,
     words_of,
 )
+from anser_ros.pose_states import TWO_SOURCES
 from anser_ros.poses.live_look import PoseSighting, PoseWatch
 from anser_ros.poses.live_window import PoseWindow
 from anser_ros.poses.sequence import PoseSession

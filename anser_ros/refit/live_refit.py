@@ -18,9 +18,9 @@ from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
 from anser_ros.integrity.freshness import Freshness
-from anser_ros.integrity.withheld import REFERENCES_DOUBTFUL
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.volume import TrackedVolume
+from anser_ros.pose_states import REFERENCES_DOUBTFUL
 from anser_ros.refit import health
 from anser_ros.refit import tables as refit_tables
 from anser_ros.refit.agreement import distance_of, evidence_without, left_out

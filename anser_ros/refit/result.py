@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.withheld import REFERENCES_DOUBTFUL, REFERENCES_LOST
+from anser_ros.pose_states import REFERENCES_DOUBTFUL, REFERENCES_LOST
 from anser_ros.refit import health
 from anser_ros.refit.evidence import FrameEvidence
 from anser_ros.refit.health import ReferenceHealth

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError
+from anser_ros.pose_states import OK
 from anser_ros.sessions.pose_table import (
     BODIES_FILE,
     BODY_COLUMNS,
@@ -21,7 +22,6 @@ from anser_ros.sessions.pose_table import (
     POSE_COLUMNS,
     POSES_FILE,
 )
-from anser_ros.tracking.estimate import OK
 
 Array = NDArray[np.float64]
 Key = tuple[int, str]

@@ -8,7 +8,7 @@ import numpy as np
 
 from anser_ros.errors import BagError, FitError
 from anser_ros.integrity.ageing import ModelAge, Standing
-from anser_ros.integrity.withheld import REFERENCES_LOST, Withheld
+from anser_ros.pose_states import OK, REFERENCES_LOST, Withheld
 from anser_ros.refit.baseline import check_enough
 from anser_ros.refit.change import Pace
 from anser_ros.refit.live_refit import LiveRefit
@@ -21,7 +21,7 @@ from anser_ros.sessions.prepared import PreparedSession
 from anser_ros.sessions.session import tracking_noise
 from anser_ros.sessions.volume import stated_volume
 from anser_ros.stamps import NANO
-from anser_ros.tracking.estimate import OK, PoseEstimate
+from anser_ros.tracking.estimate import PoseEstimate
 
 
 @dataclass

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.physics.angles import axis_angles, rotation_angles
-from anser_ros.tracking.estimate import OK, PoseEstimate
+from anser_ros.pose_states import OK
+from anser_ros.tracking.estimate import PoseEstimate
 
 Array = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from typing import Any
 
 from scipy.spatial.transform import Rotation
 
+from anser_ros.pose_states import OK
 from anser_ros.sessions.evaluation import Evaluation
 from anser_ros.sessions.pose_errors import PoseSeries
-from anser_ros.tracking.estimate import OK
 
 POSE_COLUMNS = (
     'stamp_ns', 'sensor', 'x_m', 'y_m', 'z_m', 'ax', 'ay', 'az', 'sigma_position_m', 'residual_t',

@@ -17,11 +17,12 @@ from anser_ros.diagnosis.search import SearchSettings
 from anser_ros.effects.term import Term
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel
+from anser_ros.pose_states import OK
 from anser_ros.sessions.diagnosis import problem_of, spread_of
 from anser_ros.sessions.prepared import PreparedSession, correct
 from anser_ros.sessions.session import Session
 from anser_ros.stamps import NANO
-from anser_ros.tracking.estimate import NO_GATE, OK, TrackerSettings
+from anser_ros.tracking.estimate import NO_GATE, TrackerSettings
 from anser_ros.tracking.tracker import Tracker
 
 Array = NDArray[np.float64]

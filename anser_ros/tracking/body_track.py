@@ -7,8 +7,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros import pose_states as states
 from anser_ros.stamps import NANO
-from anser_ros.tracking import estimate as states
 from anser_ros.tracking.body_descent import step_to_coils
 from anser_ros.tracking.coil_track import (
     MOST_STEPS,

@@ -8,8 +8,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros import pose_states as states
 from anser_ros.stamps import NANO
-from anser_ros.tracking import estimate as states
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.seed import solve_cold
 from anser_ros.tracking.solve import CoilSolution, solve_coil, whitening_of

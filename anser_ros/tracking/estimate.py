@@ -1,4 +1,4 @@
-"""Defines what tracking reports, and what it is told: states, pose estimates, settings."""
+"""Defines the settings of tracking, and the pose estimates that it gives."""
 
 import math
 from dataclasses import dataclass, field
@@ -7,31 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
-from anser_ros.frames import faults
-from anser_ros.integrity import verdict, withheld
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.settings import Accuracy, ToolSettings
 from anser_ros.tracking.uncertainty import ROLL_VARIANCE
 
 Array = NDArray[np.float64]
-
-OK = 'ok'
-NO_MODEL = 'no_model'
-NO_SIGNAL = faults.ABSURD.state
-RESIDUAL = 'residual'
-OUTSIDE_VOLUME = 'outside_volume'
-AMBIGUOUS = 'ambiguous'
-STALE = faults.STALE.state
-SATURATED = faults.SATURATED.state
-DROPPED = faults.DROPPED.state
-INCONSISTENT = verdict.INCONSISTENT
-UNCONFIRMED = verdict.UNCONFIRMED
-MODEL_DOUBTFUL = verdict.MODEL_DOUBTFUL
-STATES = (
-    OK, NO_MODEL, NO_SIGNAL, RESIDUAL, OUTSIDE_VOLUME, AMBIGUOUS, STALE, SATURATED, DROPPED,
-    *withheld.STATES, withheld.TWO_SOURCES,
-    INCONSISTENT, UNCONFIRMED, MODEL_DOUBTFUL,
-)  # fmt: skip
 
 USUAL_GATE = 4.0
 """Largest residual of a pose in units of the expected one, unless a setting says another. Smaller,
@@ -148,7 +128,7 @@ class PoseEstimate:
     stamp_ns : int
         The flux message's stamp.
     state : str
-        One of `STATES`; the pose may only be used when it is ``ok``.
+        One of `anser_ros.pose_states.STATES`; the pose may only be used when it is ``ok``.
     position : ndarray, shape (3,)
         m, frame fg; NaN where nothing was solved.
     axis : ndarray, shape (3,)

@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros import pose_states as states
 from anser_ros.integrity import rigidity
 from anser_ros.integrity.continuity import Continuity, MotionBounds, Place
 from anser_ros.integrity.model_record import ModelRecord
 from anser_ros.integrity.rigidity import SurveyErrors
 from anser_ros.stamps import NANO
-from anser_ros.tracking import estimate as states
 from anser_ros.tracking.body_track import BodyResult
 from anser_ros.tracking.coil_track import CoilResult
 from anser_ros.tracking.estimate import PoseEstimate, TrackerSettings

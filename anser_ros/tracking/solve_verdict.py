@@ -11,7 +11,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.tracking import estimate as states
+from anser_ros import pose_states as states
 from anser_ros.tracking.estimate import NoiseScale, TrackerSettings
 from anser_ros.tracking.solve_context import SolveContext
 from anser_ros.tracking.uncertainty import chi2_limit

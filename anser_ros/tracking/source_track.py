@@ -13,10 +13,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros import pose_states as states
 from anser_ros.field.symmetry import SymmetryAxis
 from anser_ros.physics.dipole import field_basis
 from anser_ros.stamps import NANO
-from anser_ros.tracking import estimate as states
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.rigid import BodyCoils, BodySolution, common_factor, solve_body
 from anser_ros.tracking.rotations import nearest_rotation, rotation_of_vector

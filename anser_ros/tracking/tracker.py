@@ -12,16 +12,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros import pose_states as states
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import TrackingError
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.frames.faults import FAULTS, GOOD, STUCK_CODE, value_codes
 from anser_ros.frames.intake import BACK, Frame, Intake
 from anser_ros.integrity.freshness import Freshness
-from anser_ros.integrity.withheld import Withheld
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.pose_states import Withheld
 from anser_ros.stamps import NANO
-from anser_ros.tracking import estimate as states
 from anser_ros.tracking.body_track import BodyResult, BodyTrack, track_body
 from anser_ros.tracking.coil_track import CoilResult, CoilTrack, prepare, track_coil
 from anser_ros.tracking.emitters import FEWEST_EMITTERS, ReducedScene, without_dead

@@ -3,10 +3,10 @@
 from sensor_msgs.msg import PointCloud2
 
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.withheld import code_of
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode
 from anser_ros.nodes.streams.model_clouds import ModelWriter
+from anser_ros.pose_states import code_of
 
 
 class ModelOutput(ModelWriter):

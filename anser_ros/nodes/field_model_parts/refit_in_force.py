@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame
-from anser_ros.integrity.withheld import REFERENCES_LOST
 from anser_ros.nodes.field_model_parts.moving_coils import MovingCoils
 from anser_ros.nodes.field_model_parts.refit_start import RefitStart
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.pose_states import REFERENCES_LOST
 from anser_ros.refit.change import Pace
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.result import RefitResult

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 from anser_ros.field.model import FieldModel
 from anser_ros.integrity.ageing import ModelAge, Standing
-from anser_ros.integrity.withheld import OTHER_MODEL, REFERENCES_LOST, UNCALIBRATED, Withheld
 from anser_ros.nodes.tracker_parts.model_intake import GivenModel
 from anser_ros.physics.volume import TrackedVolume
+from anser_ros.pose_states import OTHER_MODEL, REFERENCES_LOST, UNCALIBRATED, Withheld
 from anser_ros.wire.setup import Setup
 
 REASONS = {REFERENCES_LOST: 'no references heard yet, or too few'}

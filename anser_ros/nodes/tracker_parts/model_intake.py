@@ -7,8 +7,8 @@ from sensor_msgs.msg import PointCloud2
 
 from anser_ros.errors import LayoutError
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.withheld import state_of
 from anser_ros.nodes.streams.model_clouds import read_dipoles, read_error
+from anser_ros.pose_states import state_of
 from anser_ros.stamps import stamp_of
 from anser_ros.wire.model_error import ModelError
 from anser_ros.wire.points import DipolePoints

@@ -10,8 +10,9 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformS
 
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import Level, Status
+from anser_ros.pose_states import OK, STALE
 from anser_ros.stamps import SECOND_NS, is_live
-from anser_ros.tracking.estimate import OK, STALE, PoseEstimate
+from anser_ros.tracking.estimate import PoseEstimate
 from anser_ros.tracking.rotations import quaternion_of_axis, quaternion_of_rotation
 from anser_ros.wire.setup import topic_of
 
