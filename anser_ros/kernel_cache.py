@@ -2,7 +2,8 @@
 
 Numba keeps what it has compiled beside the source files, or in the user's cache. With an empty
 cache every process compiles all that it needs, processes that start together each the same. So one
-of them compiles everything under a lock, tells how far it is, and leaves a mark when all is there.
+of them compiles everything under a lock, reports its progress, and leaves a mark when all kernels
+are there.
 """
 
 import contextlib

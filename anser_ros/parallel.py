@@ -1,8 +1,8 @@
 """Shares independent pieces of work among threads.
 
-What is worked out does not depend on who does it: the pieces are the same for any number of
+Results do not depend on the thread that computes them: the pieces are the same for any number of
 threads, and their results are taken in the pieces' order. So a result is the same, bit by bit, on
-any machine. It pays where the pieces are compiled code or large arrays, which let other threads
+any machine. Threads help if the pieces are compiled code or large arrays, which let other threads
 run meanwhile.
 """
 
@@ -29,7 +29,7 @@ def cores() -> int:
 def shared_among(count: int) -> Iterator[None]:
     """Share work among so many threads for as long as the context lasts.
 
-    Elsewhere one thread does it: the cores of nodes are the other nodes' too.
+    Otherwise one thread does all the work, because nodes share their cores with other nodes.
     """
     before, _Workers.count = _Workers.count, max(1, count)
     try:
@@ -52,7 +52,7 @@ def _threads(count: int) -> ThreadPoolExecutor:
 def in_order(work: Callable[[Piece], Result], pieces: Iterable[Piece]) -> list[Result]:
     """Return the results of all pieces, in their order.
 
-    Pieces that share out work themselves do it alone.
+    Work inside a piece is not divided again.
     """
     whole = list(pieces)
     if _Workers.count == 1 or len(whole) < 2 or getattr(_THIS, 'is_busy', False):

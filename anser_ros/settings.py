@@ -1,9 +1,9 @@
 """Defines what an installation may state about itself: its accuracy, and how the refit follows.
 
-Every value has one name and one default, and both stand here. The name is the key in the setup
-document's sections ``accuracy`` and ``refit``, the parameter of a node, and the name in
-``--set NAME=VALUE`` of a command. An option or a node's parameter goes before the setup document,
-and the document before the default.
+Every value has one name and one default, and both are defined here. The name is the key in the
+setup document's sections ``accuracy`` and ``refit``, the parameter of a node, and the name in
+``--set NAME=VALUE`` of a command. An option or a node's parameter takes precedence over the setup
+document, and the document over the default.
 """
 
 import math
@@ -44,9 +44,9 @@ class Accuracy:
     """Says how accurate an installation's instruments are: one standard deviation of each error.
 
     The defaults are those of the Anser sessions that this package was developed on: their noise
-    and jitter, and the accuracy that their survey of the reference sensors states. A value that
-    is too small makes what it describes look like an effect or like metal; one that is too large
-    hides such effects and makes poses less certain than they are.
+    and jitter, and the accuracy that their survey of the reference sensors states. If a value is
+    too small, ordinary errors look like an effect or like metal; if it is too large, such effects
+    are hidden and poses have too large a sigma.
 
     Raises
     ------

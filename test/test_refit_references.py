@@ -5,7 +5,7 @@ import pytest
 from refit_frames import HEAD, STEP_NS, errors, run
 from refit_world import anser_world
 
-from anser_ros.integrity.withheld import REFERENCES_DOUBTFUL
+from anser_ros.pose_states import REFERENCES_DOUBTFUL
 from anser_ros.refit.live_refit import LiveRefit
 
 # The refit that all share takes some five seconds to work out.

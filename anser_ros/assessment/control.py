@@ -1,11 +1,11 @@
 """Compares repeated assessments with control limits: pass, note, alert or fail.
 
-A figure's limits are those of Shewhart's chart of individual values: the mean of earlier
-sessions, and multiples of the deviation that neighbouring sessions show (the mean of their
-differences over 1.128). The multiples are those of two and three deviations of a known law, made
-larger for what few sessions leave unknown (Student's t) and for the number of figures that are
-watched (Bonferroni), so that a session in order is a note once in 22 times and an alert once in
-370. A tolerance that is stated is a limit of its own.
+A figure's limits are those of Shewhart's chart of individual values: the mean of earlier sessions,
+and multiples of the deviation that neighbouring sessions show (the mean of their differences over
+1.128). The multiples are those of two and three deviations of a known law, made larger to allow
+for few sessions (Student's t) and for the number of figures that are watched (Bonferroni), so that
+a session in control is a note once in 22 times and an alert once in 370. A stated tolerance is a
+separate limit.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,8 +1,8 @@
 """Finds error and latency of a moving tool by its speed, against a moving reference.
 
-Hand-eye gives the two frames and the offset of the clocks. What is late about a pose moves it back
-along its own velocity, so the error along the velocity over the speed is a time: the latency that
-is left beside the common offset, for each group of speeds.
+Hand-eye gives the two frames and the offset of the clocks. A late pose is displaced backwards
+along its velocity, so the error along the velocity divided by the speed is a time: the latency
+that remains beside the common offset, for each group of speeds.
 """
 
 from dataclasses import dataclass

@@ -132,8 +132,8 @@ def point_to_point(
 def standing_alone(place: Array, true: Array) -> tuple[int, float, float] | None:
     """Return the one point that a rigid fit is much better without, and what both fits leave.
 
-    A marker seen in its other solution does that, or a tip that was not in its divot; None where
-    no single point does, or there are too few to tell.
+    Causes are a marker found in its second solution, or a tip that was not in its divot. Returns
+    None if no single point stands alone, or if there are too few points.
     """
     count = len(place)
     if count < FEWEST_TO_TELL:

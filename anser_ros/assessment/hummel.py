@@ -2,8 +2,8 @@
 
 Hummel et al., "Design and application of an assessment protocol for electromagnetic tracking
 systems", Med. Phys. 32 (2005); the small volume of Maier-Hein et al., Med. Phys. 39 (2012).
-Orders, descriptions and statistics are those of MITK's HummelProtocolEvaluation, so that figures
-compare.
+Orders, descriptions and statistics are those of MITK's HummelProtocolEvaluation, so that the
+figures can be compared.
 """
 
 from collections.abc import Sequence
@@ -162,8 +162,9 @@ def distance_errors(place: Array, grid: Grid, rng: np.random.Generator) -> dict[
     """Return errors of the protocol's distances, by MITK's names, up to the board's length.
 
     MITK gives 15 cm, 30 cm and accumulated distances for the standard volume alone; here every
-    board has those that fit. Intervals draw lines of holes again: along one, errors hang together.
-    Where neighbouring lines have alike errors (`lines_alike`), strips of the board are drawn too.
+    board has those that fit. Intervals resample whole lines of holes, because errors along a line
+    are correlated. If those of neighbouring lines are correlated too (`lines_alike`), strips of
+    the board are also resampled.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Computes statistics of errors, and 95 % intervals that know which errors hang together.
 
-Errors that share points or moments are not independent: whole clusters are drawn again (cluster
-bootstrap), and of distances between points the points (vertex bootstrap of Snijders and Borgatti,
-Connections 22, 1999).
+Errors that share points or moments are not independent: whole clusters are resampled (cluster
+bootstrap), and for distances between points, the points (vertex bootstrap of Snijders and
+Borgatti, Connections 22, 1999).
 """
 
 from collections.abc import Mapping, Sequence

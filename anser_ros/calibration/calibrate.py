@@ -229,8 +229,8 @@ def best_damped(
 ) -> tuple[LayoutCandidate, HeldOut]:
     """Return the winner with a neighbouring damping, where its folds ask for that.
 
-    Layouts were compared at poses that a rich layer corrected, which are less exact than those of
-    the winner itself: it can do with less damping.
+    Layouts were compared at poses that a rich layer corrected. Those of the winner itself are more
+    exact, so that it may need less damping.
     """
     for direction in (-1, 1):
         start, index = candidate.damping, DAMPINGS.index(candidate.damping) + direction

@@ -1,9 +1,9 @@
 """Places the drawn coils where they lie: each is shifted, turned and scaled as fluxes ask.
 
 A board's coils are etched, glued and soldered a fraction of a millimetre beside their drawing, and
-near them that is most of what a drawing misses. Six coordinates and a complex gain per coil are
-told by far fewer readings than free moments are, and what they leave is so small that moments
-which are pulled to the coils so placed hold below a scan and beside it too.
+near them that is most of what a drawing misses. Far fewer readings determine six coordinates and a
+complex gain per coil than free moments. The residual is so small that moments which are damped
+towards these coils are valid below and beside a scan too.
 """
 
 from collections.abc import Callable, Sequence

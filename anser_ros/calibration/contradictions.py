@@ -1,8 +1,8 @@
 """Finds sessions of one tool that tell different things of its sensors.
 
-Every session gets parameters of its own, beside the field that all share, about the joint
-estimate: what two sessions then say of a sensor must differ by no more than is uncertain of it.
-Clocks are left out: an optical tracker that was started anew has another offset by right.
+Every session gets its own parameters about the joint estimate, beside the field that all share.
+The values that two sessions give for a sensor must agree within their uncertainty. Clocks are left
+out, because an optical tracker that was restarted legitimately has another offset.
 """
 
 from collections.abc import Callable, Sequence

@@ -93,7 +93,8 @@ def stretches(time: Array) -> NDArray[np.int64]:
 def unsteady_references(reference: Measurements) -> Mask:
     """Return which frames' references differ from their steady readings, shape (F,).
 
-    The noise is that of differences between frames; steady is what most stretches agree on.
+    The noise is that of differences between frames; the steady readings are those on which most
+    stretches agree.
     """
     good = reference.valid.all(axis=0)
     bins = stretches(reference.time)

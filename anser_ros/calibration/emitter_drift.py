@@ -35,7 +35,7 @@ take metal for a drift, and more would miss a drift beside a little of anything 
 def emitter_strength(reference: Measurements) -> ComplexArray:
     """Return each emitter's strength relative to its median over a scan, shape (F, K), complex.
 
-    It is one for emitters that do not drift, and for all where too few references tell.
+    It is one for emitters that do not drift, and for all emitters if there are too few references.
 
     Parameters
     ----------

@@ -10,10 +10,10 @@ blocks that took no part in that choice decide whether the map helps; if not, it
 The error that is reported is that of a third set of blocks, which took part neither in the choice
 nor in that decision nor in the fit.
 
-Points of two frames are registered first, by every fit anew from its own points, so that no place
-helps to align what it judges. Where such places lie in a plane, the error across it is told apart
-and not corrected: whatever flattens the points brings them nearer to the plane, and tells nothing
-of what lies above it.
+Points of two frames are registered first. Every fit does this with its own points, so that no
+point takes part in the alignment that it tests. If such points lie in a plane, the error across it
+is reported separately and not corrected: a map that flattens the points brings them nearer to the
+plane, but is meaningless above it.
 """
 
 from collections.abc import Sequence
@@ -251,8 +251,7 @@ def _shapes(places: Array) -> list[Shape]:
 class _HeldOut:
     """Square errors of every shape in folds that its fit has not seen, worked out when asked for.
 
-    A set of folds is what is *known*: what is chosen or decided with it takes nothing from the
-    others.
+    A set of folds is *known*: choices and decisions with it use nothing of the other folds.
     """
 
     def __init__(self, points: _Pairs, shapes: Sequence[Shape]) -> None:

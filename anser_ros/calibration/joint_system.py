@@ -1,12 +1,11 @@
 """Sums normal equations of a field and of the sensors' parameters, with every pose marginalised.
 
 All of a frame's readings share the error of its optical pose, along six known directions J. With
-flux noise sigma and the covariance S of the pose the readings have the covariance
-``sigma^2 I + J S J^T``, whose inverse takes a 6 x 6 matrix a frame (Golub and Van Loan, Matrix
-Computations, section 2.1.4). Field and parameters are weighed with it together, so that what a
-pose, the field and a parameter explain alike is shared out as it should be, in one solution. To
-keep the system small the field is written in the modes of a rich layer of dipoles that the
-readings can tell at all.
+flux noise sigma and the covariance S of the pose the readings have the covariance ``sigma^2 I + J
+S J^T``, whose inverse takes a 6 x 6 matrix a frame (Golub and Van Loan, Matrix Computations,
+section 2.1.4). Field and parameters are weighed with it together, so that one solution divides
+correctly what a pose, the field and a parameter could each explain. To keep the system small the
+field is written in those modes of a rich layer of dipoles that the readings determine.
 """
 
 from collections.abc import Sequence

@@ -73,7 +73,7 @@ def lowest_height(measurements: Sequence[Measurements], generator: Generator) ->
 def rich_layout(measurements: Sequence[Measurements], generator: Generator) -> Layout:
     """Return a layer that is fine enough for the lowest sensor.
 
-    Where that would take more than `RICH_MOST` dipoles along a side, the layer is smaller.
+    If that needs more than `RICH_MOST` dipoles along a side, the layer is smaller.
     """
     width = 2.0 * float(generator.half_extent.max())
     spacing = RICH_SPACING * lowest_height(measurements, generator)

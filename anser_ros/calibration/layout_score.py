@@ -68,7 +68,8 @@ class LayoutCandidate:
 class _BodyReadings:
     """One body's readings at corrected poses with what the score of each fold needs.
 
-    ``back`` (F, S, 2K) is what the correction of the pose took off each reading, T.
+    ``back`` (F, S, 2K) is the part that the correction of the pose subtracted from each reading,
+    T.
     """
 
     corrected: Measurements
@@ -145,7 +146,7 @@ class LayoutScorer:
     ) -> LayoutCandidate:
         """Return the held-out score of a layout for every damping, with the best one.
 
-        Dipoles that may move are moved anew for each fold by the data of the other folds.
+        Movable dipoles are fitted again for each fold, to the data of the other folds.
 
         Parameters
         ----------

@@ -4,7 +4,7 @@ Each optical pose is wrong by a few hundredths of a millimetre, and all sensors 
 emitters share that error along six known directions. The fit therefore alternates between (a) the
 most probable pose of every frame, from all its readings and the prior of the pose, and (b) damped
 least squares of the moments at those poses, which is the article's equation (6) with one matrix
-and a right-hand side for every phasor component. Both steps lower the same sum of squares (block
+and a right-hand side for every phasor component. Both steps reduce the same sum of squares (block
 coordinate descent on the joint posterior). Readings that no pose explains lose weight (Huber,
 Robust Statistics). Only the triangular factor of the rows so far is kept (Golub and Van Loan,
 section 5.3), so that millions of rows take no more memory than one block.

@@ -74,7 +74,7 @@ def estimate_noise(
 ) -> OpticalNoise:
     """Estimate the jitter from the poses' most probable steps.
 
-    The squares of the steps are divided by how many of them the fluxes determined at all (MacKay,
+    The squares of the steps are divided by the number of steps that the fluxes determined (MacKay,
     Bayesian interpolation, Neural Computation 1992): a single coil does not see every direction.
 
     Parameters

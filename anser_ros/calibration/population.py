@@ -2,8 +2,9 @@
 
 The likelihood of the parameters is Gaussian about the present estimate. A population's values are
 random with one width, which is the one that makes the data most probable (empirical Bayes; MacKay,
-Bayesian interpolation, Neural Computation 1992). A kind of error is kept when that probability is
-larger with it than without. A channel far outside its population is taken out and stands alone.
+Bayesian interpolation, Neural Computation 1992). A kind of error is kept if that probability is
+larger with it than without. A channel far outside its population is removed from it and treated
+separately.
 """
 
 from collections.abc import Sequence
@@ -150,8 +151,8 @@ class Population:
         """Weigh gains with what sensors at one place have in common, as much as the data say.
 
         The prior covariance of the gains at a place is ``a + b`` on its diagonal and ``a`` beside
-        it; both are those of most probable data (expectation and maximisation by turns). Channels
-        that stand alone have no part in it.
+        it; both are those that make the data most probable (expectation maximisation). Channels
+        that are treated separately are not included.
         """
         places = [
             rows for rows in self.parameters.gains_at_one_place()
@@ -236,8 +237,9 @@ class Population:
     def fixed(self, likelihood: Likelihood) -> tuple[str, ...]:
         """Return the kinds that the data do not tell: they stay at zero.
 
-        What field and, say, a lever arm explain alike would else be shared out by the field's
-        prior, which knows nothing of tools; and a population's width is found from its values.
+        Otherwise the field's prior, which does not know the tools, would divide what the field
+        and, say, a lever arm could both explain; and the width of a population is found from its
+        values.
         """
         return tuple(self.untold(likelihood))
 

@@ -1,8 +1,8 @@
 """Takes the drawn board as a prior: its field as the moments of any set of dipoles.
 
-The damping pulls a fit towards these moments instead of zero, so that what the data do not
-determine stays as drawn. The drawing is first scaled by one complex gain per emitter, because the
-scale of the drive current, and most of the effect of a large metal sheet, is such a factor.
+The damping pulls a fit towards these moments instead of zero, so that moments which the data do
+not determine stay as drawn. The drawing is first scaled by one complex gain per emitter, because
+the scale of the drive current, and most of the effect of a large metal sheet, is such a factor.
 """
 
 from collections.abc import Sequence

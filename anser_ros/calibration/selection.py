@@ -2,7 +2,7 @@
 
 The search goes from coarse to fine layers and then varies their size, their depth and the kind of
 the dipoles. Its result, dipoles that are moved and overlapping regions are the finalists, among
-which a fit from the start decides (`fit_scan`).
+which a complete fit decides (`fit_scan`).
 """
 
 from collections.abc import Callable, Sequence

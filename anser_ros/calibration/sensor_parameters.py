@@ -117,7 +117,8 @@ class Survey:
 def has_turned(measurements: Measurements) -> bool:
     """Return whether a body turned about two axes at least by enough to tell its lever arm.
 
-    A shift of all sensors of a body that does not turn is a shift of the field.
+    If a body does not turn, a shift of all its sensors cannot be distinguished from a shift of the
+    field.
     """
     rotation = measurements.rotation[measurements.has_pose]
     if len(rotation) < 2:

@@ -1,8 +1,8 @@
 """Runs one command on many sessions with Dask: on this machine's cores, or on a cluster.
 
 A worker runs the code of the command itself, one session at a time. The scheduler gives the
-session of a worker that dies to another one; what a session left is in its folder and in the
-summary, which is written anew whenever one is done.
+session of a worker that dies to another one. A session's results are in its folder and in the
+summary, which is rewritten whenever one is done.
 """
 
 import argparse

@@ -146,7 +146,7 @@ def draw(
 ) -> None:
     """Draw the differences of each name's errors and shares of poses with their intervals.
 
-    Left of zero the second is better in its errors, and right of it in its poses.
+    Left of zero the second evaluation has smaller errors, and right of zero more poses.
     """
     names = list(shares)
     figure, panels = plt.subplots(

@@ -13,7 +13,7 @@ MOST_CHARACTERS = 400
 def verdict(document: dict[str, Any]) -> str:
     """Say in one short paragraph what was found and what stays unexplained.
 
-    Effects are named with their parameters where there is room, else by their names alone.
+    Effects are named with their parameters if there is room, otherwise without.
     """
     effects = document['effects']
     for named in (_with_values, _by_name):

@@ -138,7 +138,7 @@ def by_coil(evaluation: Evaluation) -> Figure:
 def against_sigma(evaluation: Evaluation, jitter_m: float = 0.0) -> Figure:
     """Draw the errors against the sigma told, and how many lie within a multiple of it.
 
-    ``jitter_m``, the optical tracker's own error a component, m, is a part of what is expected.
+    ``jitter_m``, the optical tracker's own error per component, m, is part of the expected error.
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 4.2), layout='constrained')
     low, high = np.inf, 0.0

@@ -24,8 +24,8 @@ TRACKERS = ('ungated', 'before', 'after')
 def verdict(truth: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> str:
     """Return how right a diagnosis is; empty for a clean run that was found clean.
 
-    An effect that the diagnosis knows must be named, at its place, with nothing else. One that it
-    does not know must leave something unexplained: all of it, or a part beside other names.
+    An effect that the diagnosis knows must be named, at its site, and nothing else. One that it
+    does not know must be reported as unexplained: completely, or in part beside other names.
 
     Parameters
     ----------
@@ -83,8 +83,8 @@ def parameter_errors(truth: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> 
 def second_run(session: Session, corrected: FieldModel, known: FieldModel) -> dict[str, Any]:
     """Return each tracker's live errors over all sensors and bodies, and its share of poses.
 
-    A tracker with a wrong model withholds the poses that its gate catches, so that its error is to
-    be read together with its share of frames with a pose; `ungated` has those poses as well.
+    A tracker with a wrong model withholds the poses that its gate catches, so that its error must
+    be judged together with its share of frames with a pose; `ungated` has those poses as well.
     """
     figures = {}
     for name, namespace, model in (

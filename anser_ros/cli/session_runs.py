@@ -1,6 +1,6 @@
 """Runs one command on each of several sessions: what is done with one, and what it left.
 
-Each session has a folder of its own; one that fails is an outcome as the others are.
+Each session has its own folder; one that fails has an outcome like the others.
 """
 
 import argparse

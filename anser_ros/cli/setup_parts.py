@@ -102,7 +102,7 @@ def coil_of(name: str, text: str) -> Document:
 def sensor_of(text: str, body: str = '') -> Document:
     """Return a sensor of ``channel, name, body, x, y, z, axis[, length]``, mm; see `axis_of`.
 
-    Where a ``body`` is given it does not stand in the text.
+    If a ``body`` is given, the text does not contain one.
     """
     cells = [cell.strip() for cell in text.split(',')]
     if body:

@@ -17,7 +17,7 @@ def taken_from_others(fit: Fit) -> float:
     """Return what a new fluctuation's freedom takes off that is another effect's, unexplained so
     far.
 
-    Along each of its columns per frame loses one value's share of whatever stays.
+    For each of its columns, every frame loses the share of one value in the remaining residual.
     """
     return FROM_OTHERS * fit.newest.effect.freedom(fit.newest) * max(misfit(fit) - 1.0, 0.0)
 
@@ -25,7 +25,7 @@ def taken_from_others(fit: Fit) -> float:
 def choose(fitted: Sequence[tuple[float, Fit]]) -> tuple[float, Fit]:
     """Return the best fit, or a simpler one that is as good within what its parameters could gain.
 
-    Where several leave nothing but noise, the simplest is the explanation.
+    If several leave nothing but noise, the simplest is chosen.
     """
     gain, best = max(fitted, key=lambda pair: pair[0])
     newest = best.newest

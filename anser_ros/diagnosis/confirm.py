@@ -1,9 +1,9 @@
 """Tests whether an effect is the same in all parts of the data, as a real one must be.
 
-What an unknown effect leaves is often picked up by some known one, with parameters that are
-different from one part of the data to the next. So each effect is fitted again in parts of the
-time and emitter by emitter, and the power that those fits take off besides is set against the
-power that the effect itself takes off.
+A known effect often absorbs part of an unknown one, with parameters that differ from one part of
+the data to the next. So each effect is fitted again in parts of the time and emitter by emitter,
+and the additional power that those fits remove is compared with the power that the effect itself
+removes.
 """
 
 from collections.abc import Callable, Sequence
@@ -150,8 +150,8 @@ def _plausible(fit: Fit, term: Term) -> bool:
 def _stays(state: State, columns: Sequence[Array | None], noise: float, expected: float) -> float:
     """Power beyond the noise in the cells that a term changes, less what cells have in common.
 
-    A cell is what one channel reads of one emitter; ``expected`` is the variance up to which
-    nothing counts that an effect on everything leaves.
+    A cell is one channel's readings of one emitter; ``expected`` is the variance below which the
+    residual of an effect on all cells is ignored.
     """
     own, rest, counts = [], [], []
     for part, column in zip(state.parts, columns, strict=True):

@@ -20,7 +20,7 @@ def corrected_model(
 ) -> FieldModel:
     """Bake field effects into the dipoles and list all effects.
 
-    Metal that moves is not baked in: where it is, the live refit finds from the references.
+    Metal that moves is not included: the live refit finds its place from the references.
     """
     dipoles = Dipoles(model.positions, model.directions, model.moments)
     light = lit(terms, fields.illumination)

@@ -1,21 +1,21 @@
 """Holds the numbers by which explanations are accepted, compared and named.
 
-Three currencies are compared here, and all count in the whitened sum of squares, where noise
-and the field model's own error, as large as they are expected, have a mean of one per value (noise
-alone has less):
+Three measures are compared here. All are in units of the whitened sum of squares, in which noise
+and the field model's own error, if they are as large as expected, have a mean of one per value
+(noise alone has less):
 
 - the *gain* of an effect, what it takes off the cross-validated sum of squares of blocks of time
   that took no part in fitting it;
 - the gain of a fluctuation, what -2 log marginal likelihood falls by;
 - the *power* of an effect, what it takes off the sum of squares of the data it was fitted to.
 
-Gains are judged in units of the *misfit*, the mean square of the residuals that stay: among large
-unexplained residuals a gain must be larger by as much to mean anything.
+Gains are judged in units of the *misfit*, the mean square of the remaining residuals: among large
+unexplained residuals a gain must be larger in proportion to be significant.
 
-What an explanation's parameters cost is declared by its effect (`Effect.complexity`), and so is
-the share of its power that its model may miss (`Effect.inexact`). Schwarz's penalty as the price
-of a fluctuation, and the spread by noise for `as_good`, named the few cases that were tried alike
-and none better (`docs/log.md`).
+An effect declares the cost of its parameters (`Effect.complexity`), and the share of its power
+that its model may miss (`Effect.inexact`). Schwarz's penalty as the price of a fluctuation, and
+the spread by noise for `as_good`, named the few cases that were tried the same way and none better
+(`docs/log.md`).
 
 Unless a number says otherwise, it was chosen by hand on injected effects with seeds below 100
 (`test/injection.py`); cases of later seeds that led to a rule are named in `docs/log.md`.

@@ -1,8 +1,9 @@
 """Tells what metal does at rest by how it moves, for a field that was learnt with it nearby.
 
-While it moves, tools and references see the metal where it is, less the metal where it rested.
-Body and path are fitted to that as to any metal that moves; a path starts straight away from where
-it is strongest, as far along as the references' change tells, and the best of several is refined.
+While it moves, tools and references sense the difference between the metal at its present place
+and at its place of rest. Body and path are fitted to that difference as to any moving metal. A
+path starts straight away from where the metal is strongest, with the progress taken from the
+change of the references, and the best of several is refined.
 """
 
 from collections.abc import Iterator

@@ -140,8 +140,8 @@ def fit_terms(
 def _covariance(state: State, sums: BlockSums, prior: Array) -> Array:
     """Covariance of all parameters, honest about errors that are alike within a block of time.
 
-    The formal one is scaled by the misfit; where the blocks' scores scatter more than it says
-    (White's sandwich with blocks as clusters), a parameter's variance is raised to that.
+    The formal one is scaled by the misfit; where the blocks' scores scatter more than it predicts
+    (White's sandwich with blocks as clusters), a parameter's variance is raised accordingly.
     """
     formal = sums.solve(prior)[1]
     blocks = max(sums.squares.size, 2)

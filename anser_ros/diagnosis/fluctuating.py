@@ -1,8 +1,9 @@
 """Finds how much a parameter fluctuates from frame to frame, and what that explains.
 
 Each frame's parameters are a draw from a normal distribution about zero. Its spread is found by
-expectation-maximisation; the gain is that of -2 log marginal likelihood, so the freedom is paid
-for, and compares with what a constant effect takes off the held-out sum of squares.
+expectation-maximisation; the gain is that of -2 log marginal likelihood, which includes the cost
+of this freedom, and can be compared with the reduction of the held-out sum of squares by a
+constant effect.
 """
 
 from collections.abc import Sequence
@@ -64,7 +65,7 @@ def gain_of(found: Open, spread: Array) -> float:
 def fluctuation_of(state: State, term: Term) -> tuple[float, Term] | None:
     """Return the gain of a fluctuation at its likeliest spread, and the term with it.
 
-    None for other effects, and where no spread gains anything.
+    None for other effects, and if no spread improves the fit.
     """
     free, found = term.effect.opened(term), opened(state, term)
     if free is None or found is None:

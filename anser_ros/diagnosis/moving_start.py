@@ -31,7 +31,7 @@ def moving_starts(
     """Return expected gain and start values of effects that are another one at a place for each
     block.
 
-    None where one place for all the session explains as much.
+    None if one place for the whole session explains as much.
 
     Parameters
     ----------

@@ -103,7 +103,7 @@ def without_outliers(problem: Problem, state: State) -> Problem:
 def outlying_share(before: Problem, after: Problem) -> tuple[float, list[int]]:
     """Return the share of frames that lost a reading, and the channels that lost most of them.
 
-    The list is empty where whole frames are out.
+    The list is empty if whole frames are outliers.
     """
     lost_frames, frames = 0, 0
     by_channel: dict[int, int] = {}

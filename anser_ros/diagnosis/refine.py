@@ -1,8 +1,8 @@
 """Fits all effects jointly, metal as richly shaped as the data can tell.
 
-A simple body has few parameters; a real one has more, which a prior holds small: how small is
-chosen by what predicts held-out blocks best. Place and couplings are fitted together, so a place
-is as uncertain as the body's shape leaves it.
+A simple body has few parameters; a real one has more, which a prior keeps small. The width of the
+prior is the one that predicts held-out blocks best. Place and couplings are fitted together, so
+the uncertainty of a place includes that of the body's shape.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
 """Combines a metal's couplings into those that the data tell, of the size that predicts them best.
 
-Metal has many more couplings than any data tell. Those combinations of them that the data tell
-most about are its modes; how large a prior lets them be is chosen on held-out blocks of time.
+Metal has many more couplings than any data can determine. The combinations that the data determine
+best are its modes; the width of their prior is chosen on held-out blocks of time.
 """
 
 from collections.abc import Callable, Sequence
@@ -123,7 +123,7 @@ def thinned(state: State, blocks: NDArray[np.int64]) -> State:
 def _information(state: State, unit: Unit, count: int) -> Array:
     """Of single couplings, (c, c), from half of the frames.
 
-    Only the in-phase half of the columns is used: the other half is the same, turned.
+    Only the in-phase half of the columns is used: the other half is the same, rotated in phase.
     """
     normal = np.zeros((count, count))
     for part in state.parts:

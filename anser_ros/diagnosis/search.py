@@ -3,8 +3,8 @@ out.
 
 Every candidate is first scored by its linear columns (a score test beside the effects in force).
 The best ones are fitted in full, and the best of these is taken, or a simpler one that is as good.
-What others explain away is removed at the end. The numbers by which this is decided are in
-`anser_ros.diagnosis.decisions`.
+Effects that others have made superfluous are removed at the end. The numbers by which this is
+decided are in `anser_ros.diagnosis.decisions`.
 """
 
 from collections.abc import Callable, Sequence
@@ -330,7 +330,8 @@ def _wald(fit: Fit, index: int) -> float:
 def _replace(fitter: Fitter, search: Search) -> None:
     """Take a simpler effect for an earlier one where, beside the newest, it is as good.
 
-    What was taken while much was unexplained may have won by parameters that took up another's.
+    An effect that was taken while much was unexplained may have been chosen because its parameters
+    absorbed part of another effect.
     """
     for term in search.fit.terms[:-1]:
         if term.effect.family is not Family.STEADY:

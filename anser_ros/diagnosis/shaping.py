@@ -66,8 +66,8 @@ class Shaping:
     def _bodied(self, fit: Fit, index: int, first: BodyTerm) -> Fit:
         """The fit with a richer body.
 
-        A simple body in place of an extended one may have gone astray: where it started counts
-        too.
+        A simple body fitted in place of an extended one may have converged to a wrong place, so
+        its start is tried too.
         """
         if first.richness is not None:
             return self.shaped_as(fit, index, first, [first.kind]) or fit

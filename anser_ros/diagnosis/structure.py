@@ -92,7 +92,7 @@ def noise_t(state: State) -> float:
     directions.
 
     Along those six directions of a frame the residual is as large as the jitter's prior allows,
-    whatever the noise; they are taken off the count.
+    whatever the noise; they are not counted.
     """
     tools = _tools(state)
     count = sum(part.count for part in tools)

@@ -1,7 +1,8 @@
 """Tests whether grown residuals are noise: alike in all frames, readings and sizes, and normal.
 
 Hum, a common disturbance, rounding or a gain that rattles raise the residual's spread as noise
-does. Noise has no memory, is nobody else's, does not grow with the reading, and is normal.
+does. Noise is uncorrelated in time and between readings, does not grow with the reading, and is
+normally distributed.
 """
 
 from dataclasses import dataclass

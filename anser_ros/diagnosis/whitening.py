@@ -1,8 +1,8 @@
 """Scales residuals by what they may be: noise everywhere, pose jitter along six directions.
 
-An optical pose that is a little off moves all channels and emitters of its frame together, along
-the six columns of the frame's pose Jacobian. Taking that known freedom out lowers the floor
-several times, and shows what plain residuals hide.
+A slightly wrong optical pose changes all channels and emitters of its frame together, along the
+six columns of the frame's pose Jacobian. Removing these known directions lowers the floor several
+times, and reveals what plain residuals hide.
 """
 
 from dataclasses import dataclass, field

@@ -1,7 +1,7 @@
 """Defines the term of metal whose body is a sum of modes, and which the search refines.
 
-A simple body has few modes; a real one has more, and the data say which (`with_body`). Metal whose
-answer changes with time has a course besides, which may be refined as well (`freer`).
+A simple body has few modes; a real one has more, which are chosen from the data (`with_body`).
+Metal whose response changes with time also has a course, which may be refined as well (`freer`).
 """
 
 from dataclasses import dataclass, replace

@@ -25,7 +25,7 @@ from anser_ros.field.model import EffectRecord
 class CoilCrosstalk(Effect[Term]):
     """Theta is the real and imaginary share of a one-way leak, or one real share both ways.
 
-    The tone of the second coil is read with a share of the first one's field.
+    Readings at the second coil's frequency contain a share of the first one's field.
     """
 
     name = 'coil_crosstalk'

@@ -2,7 +2,7 @@
 
 The forward chain is ``flux = compress(C T (field) + offset)`` with C mixing channels and T mixing
 emitters; it is undone from the outside in. Effects on the field are in the model's dipoles
-already, and what can't be corrected is passed over.
+already, and effects that cannot be corrected are skipped.
 """
 
 from collections.abc import Sequence
@@ -126,7 +126,7 @@ class Correction:
     def gain_changes(self) -> Array | None:
         """Return changes of gains since the model was made that sensors may share, shape (G, S).
 
-        Relative, one standard deviation each; None where no effect tells of any.
+        Relative, one standard deviation each; None if no effect contains any.
         """
         told = [term.effect.gain_changes(term, self.surveyed) for term in self.terms]
         known = [changes for changes in told if changes is not None]
@@ -197,8 +197,7 @@ class Correction:
     ) -> ComplexArray:
         """Fixed point of ``x = measured - (compress(x) - x)``: the loss is a small part of x.
 
-        Where it would be more than half of x the channel is beyond what can be undone, and what is
-        put back is held at that.
+        A correction of more than half of x cannot be trusted, and is limited to that.
         """
         x = measured
         for _ in range(DECOMPRESSION_STEPS):

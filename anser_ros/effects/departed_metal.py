@@ -1,8 +1,8 @@
 """Models metal that rested near while a field was learnt, and moves: what its moving changes.
 
-The learnt field has the metal at rest in it, and so have the references' steady readings. What is
-left is the field of the metal where it is, less that of the same metal where it rested: so its
-moving tells what it does at rest.
+The fitted field contains the metal at rest, and so do the references' steady readings. The
+residual is the field of the metal at its present place, less that of the same metal at its place
+of rest, so the motion determines its field at rest.
 """
 
 from dataclasses import dataclass, fields, replace

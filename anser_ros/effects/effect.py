@@ -6,12 +6,12 @@ The measurement chain that an effect may change runs in this order::
 
 An effect overrides the stages at which it acts, and gives the derivative of the predicted flux by
 its own parameters. Its forward stages are also what undoes it live
-(`anser_ros.effects.correction`). It also declares what the search for effects needs to know of
-it (`anser_ros.diagnosis`): its family, what it is a rival of, what its parameters cost, how it is
-refined, what a reference sensor's survey may make of it. Nothing outside this package asks for
-an effect's name or class, or imports its module, except what `test/test_effect_names.py` lists
-with reasons: the stages of the diagnosis that see an effect without the search and so make its
-term themselves, and code that speaks of effects without these classes.
+(`anser_ros.effects.correction`). It also declares what the search for effects needs to know of it
+(`anser_ros.diagnosis`): its family, its rivals, the cost of its parameters, how it is refined, and
+what errors of a reference sensor's survey add to it. Nothing outside this package refers to an
+effect's name or class, or imports its module, except what `test/test_effect_names.py` lists with
+reasons: the stages of the diagnosis that see an effect without the search and so make its term
+themselves, and code that speaks of effects without these classes.
 """
 
 from collections.abc import Mapping, Sequence

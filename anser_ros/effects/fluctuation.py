@@ -1,9 +1,9 @@
 """Lets another effect's parameters change from one frame to the next.
 
 A parameter that steps, swings or rattles has no curve to fit. It is a random number per frame,
-with a spread found from the data, and what it does to a frame is left open along the columns of
-the effect that is constant otherwise, as the optical jitter is. A fluctuation costs one spread per
-column however it goes, explains nothing but what those columns can, and hides nothing else.
+with a spread estimated from the data. Its influence on a frame is free along the columns of the
+corresponding constant effect, as that of the optical jitter is. A fluctuation costs one spread per
+column whatever its course, and explains and hides only what those columns can.
 """
 
 from collections.abc import Mapping, Sequence

@@ -54,7 +54,7 @@ class StraightPath:
     """Leads straight on; its parameters are start and end (m), start and end time (s), ease.
 
     The centre rests, goes straight from start to end between the two times, and rests. An ease of
-    0 is even speed, of 1 a smooth step.
+    0 is constant speed, of 1 a smooth step.
     """
 
     count: int = 9

@@ -270,8 +270,8 @@ def _time_sigma(
 ) -> tuple[float, float]:
     """Standard deviation of the times when the way begins and ends, s.
 
-    On a free path a body has left its first place for certain only where it is farther from it
-    than it is known to be anywhere.
+    On a free path a body has certainly left its first place only when its distance from it exceeds
+    the uncertainty of its place.
     """
     knots = term.path.knots
     if not knots:

@@ -18,8 +18,8 @@ from anser_ros.physics.pose_track import PoseTrack
 class OpticalScale(Effect[Term]):
     """Theta is the scale less one, and times it the point of fg that stays where it is (m).
 
-    Optical positions are ``p (1 + e) - c``; a scale comes about the tracker's own origin, which is
-    anywhere, so the shift ``c`` is free.
+    Optical positions are ``p (1 + e) - c``; the scale applies about the tracker's own origin,
+    which may be anywhere, so the shift ``c`` is free.
     """
 
     name = 'optical_scale'

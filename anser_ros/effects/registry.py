@@ -1,6 +1,6 @@
 """Finds all effects by looking: a module in this package that defines `EFFECTS` is one.
 
-Adding an effect means adding its file; nothing else needs to know.
+To add an effect, add its file; nothing else has to change.
 """
 
 import importlib

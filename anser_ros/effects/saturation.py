@@ -1,8 +1,8 @@
 """A channel compresses large signals.
 
-The amplifier sees the sum of all tones, v(t), and gives fs tanh(v / fs), or its first two terms
-v - v^3 / (3 fs^2). The cube takes ``(S / 2 - |V_k|^2 / 4) / fs^2`` of tone k away, where S is the
-sum of the squared amplitudes of all tones, of independent phases: the other tones count twice.
+The amplifier sees the sum of all tones, v(t), and gives fs tanh(v / fs), or its first two terms v
+- v^3 / (3 fs^2). The cube reduces tone k by ``(S / 2 - |V_k|^2 / 4) / fs^2``, where S is the sum
+of the squared amplitudes of all tones, of independent phases: the other tones count twice.
 
 What the amplifier sees is either the flux, as behind an integrator, or the voltage that it
 induces, in which a tone counts in proportion to its frequency.

@@ -77,7 +77,7 @@ that is off is named by itself."""
 class SensorSpread(Effect[SpreadTerm]):
     """Is found by a calibration, which has every channel in many poses; a model carries it.
 
-    A diagnosis finds gains that sensors at one place share.
+    A diagnosis estimates which gains the sensors at one place share.
     """
 
     family = Family.SEEN
@@ -181,8 +181,9 @@ class SensorGainSpread(SensorSpread):
     def gain_changes(self, term: SpreadTerm, sensors: SensorTable) -> Array | None:
         """Return a change for each place; sensors at one place have their gains in common.
 
-        How far a gain moves until the next session, one session cannot tell. What it differs by
-        among sensors of a kind is its natural size: the axes of one chip go up and down together.
+        One session cannot show how far a gain changes until the next. The differences among
+        sensors of a kind give the natural size of such a change; the axes of one chip change
+        together.
         """
         if term.shared < LEAST_SHARED:
             return None

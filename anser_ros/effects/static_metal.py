@@ -80,7 +80,7 @@ def places(apparatus: Apparatus) -> Array:
 class StaticMetal(Effect[Term]):
     """Theta is the centre (m), then real and imaginary parts of a simple body's modes.
 
-    What the body is besides belongs to its remainder (`anser_ros.effects.metal_remainder`).
+    The rest of the body's response belongs to its remainder (`anser_ros.effects.metal_remainder`).
     """
 
     name = 'static_metal'

@@ -58,7 +58,7 @@ class Held:
 class Term:
     """Holds an effect at one site (a channel, a coil, a body, ...) with values of its parameters.
 
-    An effect that needs to know more than a site says defines a subclass with more fields.
+    An effect that needs more data than a site defines a subclass with more fields.
 
     Attributes
     ----------

@@ -1,6 +1,6 @@
 """Plugs in wrong sockets: channels or emitters exchanged, and channels that hear nothing.
 
-None has a parameter to fit; they are seen before the search (`anser_ros.diagnosis.wiring`).
+None has a parameter to fit; they are found before the search (`anser_ros.diagnosis.wiring`).
 """
 
 from collections.abc import Mapping

@@ -1,7 +1,7 @@
 """Compares the refit's error by number of references with simpler methods.
 
 All methods have the same references and start from the same calibrated model: the frozen model,
-free dipoles for every emitter (`refit.free`), and the shared polarisability. No gate refuses a
+free dipoles for every emitter (`refit.free`), and the shared polarisability. No gate withholds a
 pose here, so that wrong poses count as such.
 """
 
@@ -55,7 +55,7 @@ class AblationRow:
 def spread_out(references: SensorTable, count: int) -> NDArray[np.int64]:
     """Return the rows of some references, each as far as possible from those before it.
 
-    Coils at the place of another one come last, the one with the most different axis first.
+    Coils at the place of another one come last, in the order of how different their axes are.
     """
     chosen = [0]
     while len(chosen) < min(count, len(references)):

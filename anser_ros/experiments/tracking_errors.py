@@ -68,7 +68,7 @@ def statistics(errors: Array) -> dict[str, float]:
 def track(session: Session, model: FieldModel, in_phase: bool = False) -> dict[str, SensorErrors]:
     """Track a session and return the errors by the last part of a sensor's name, in capitals.
 
-    As in the article every solution counts, even if a tracker would refuse its residual.
+    As in the article every solution counts, even if a tracker would withhold it for its residual.
     """
     evaluation = track_session(session, model, in_phase=in_phase)
     out = {}

@@ -60,8 +60,8 @@ class Measurements:
     def is_followed(self) -> bool:
         """Return whether the optical tracker followed the body, so that clocks can be told.
 
-        A recording of a pose at each point where the tool rested says nothing of its clock, and
-        shows each place once.
+        A recording with one pose for each point of rest contains no information about clocks, and
+        each place once.
         """
         if self.track is None or self.track.time.size < 2:
             return False

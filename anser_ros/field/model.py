@@ -259,7 +259,7 @@ def _made_for(item: Any) -> Identity | None:
 def from_document(document: Any) -> FieldModel:
     """Return the field model that a document of plain data holds.
 
-    A document of an earlier version, without fingerprints, is taken as it is.
+    A document of an earlier version, without fingerprints, is accepted unchecked.
 
     Raises
     ------

@@ -4,8 +4,8 @@ dipoles.
 A flat coil has the field of a magnetised sheet over its area. A few vertical dipoles on that area
 represent the sheet, as the nodes of a quadrature represent an integral; two horizontal dipoles in
 the middle represent the feed-throughs and the distance between the layers. The model needs no
-measurement, and it is as good as the drawing: a real board's copper lies fractions of a millimetre
-elsewhere and the gains of its coils differ. The model carries this uncertainty as modes.
+measurement, and is as accurate as the drawing: a real board's copper is displaced by fractions of
+a millimetre and the gains of its coils differ. The model carries this uncertainty as modes.
 """
 
 from dataclasses import dataclass

@@ -1,6 +1,6 @@
 """Lists why a reading must not be used: every fault with its name, its state and its reason.
 
-A reading is what one sensor hears of all emitters in one frame. Its first fault in the order of
+A reading is one sensor's fluxes of all emitters in one frame. Its first fault in the order of
 `FAULTS` counts. The flag bits are those of `wire.points`.
 """
 

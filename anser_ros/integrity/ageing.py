@@ -1,8 +1,8 @@
 """Ages a model that followed the references while they are silent, and then gives it up.
 
-Metal goes on moving when nobody tells of it any more. So the model in force becomes less certain
-from frame to frame, by what the metal made of the field while it was still seen, and past a bound
-it is no model of the field at all.
+Metal continues to move when no references report it. So the uncertainty of the model in force
+grows from frame to frame, by the change of the field while the metal was still observed. Beyond a
+bound it no longer describes the field.
 """
 
 import math

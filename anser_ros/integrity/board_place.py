@@ -1,9 +1,10 @@
 """Judges whether a field model lies where the reference sensors say that the board is.
 
-A model that lies beside its board as a whole gives poses that are as far off, and no residual of
-a tool shows it: every field of the model is a field of the board, a little elsewhere. References
-have stated places. They and the model both see the drawn board, with the same errors of its coils;
-how far the model's board lies from that of the references is what is left between the two.
+A model that is displaced from its board as a whole displaces all poses by as much, and no residual
+of a tool shows it: every field of the model is a field of the board, slightly shifted. References
+have stated places. They and the model are both compared with the drawn board, with the same errors
+of its coils; the remaining difference is the displacement of the model's board from that of the
+references.
 """
 
 from dataclasses import dataclass
@@ -211,7 +212,7 @@ def _solved(
 ) -> tuple[Array, Array, float]:
     """Estimate (n,), covariance, and misfit of the typical reference, for a prior of one.
 
-    What does not fit has less say.
+    Readings that do not fit get less weight.
     """
     prior = np.ones(references[0].shape[2])
     weights = [np.ones(len(references[0])), np.ones(len(model[0]))]

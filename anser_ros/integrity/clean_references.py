@@ -1,9 +1,9 @@
 """Judges whether reference readings are those of a field without metal.
 
-A baseline is what all later readings are compared with: metal that lay there when it was taken is
-part of the field for ever, and no refit sees it. So a baseline has to agree with what is known of
-the references from elsewhere: the readings when the model was calibrated, or else the drawing of
-the board. The strength of an emitter may have changed, and single sensors may be bad.
+A baseline is what all later readings are compared with: metal that was present when it was taken
+becomes part of the field for good, and no refit detects it. So a baseline has to agree with
+independent knowledge of the references: their readings when the model was calibrated, or else the
+drawing of the board. The strength of an emitter may have changed, and single sensors may be bad.
 """
 
 import numpy as np
@@ -166,7 +166,8 @@ def check_as_drawn(
 ) -> None:
     """Refuse readings that the drawn board, its tolerances and the survey do not explain.
 
-    It sees much metal only: a plate near the board, not a hand's breadth of it at the side.
+    It detects only large amounts of metal: a plate near the board, but not a piece of a hand's
+    breadth at the side.
 
     Parameters
     ----------

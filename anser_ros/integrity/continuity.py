@@ -1,9 +1,9 @@
 """Follows poses through time: how far a sensor or body may have moved, and when a track begins.
 
-A single residual that passes the gate proves little when most of its neighbours in time do not:
-of wrong poses a few pass by chance. So after refusals a pose needs others before it that are
-consistent with it. Points that were recorded one by one, further apart than `STREAM_GAP_S`, have
-no neighbours in time, and each is judged alone.
+A single residual that passes the gate proves little when most of its neighbours in time do not: a
+few wrong poses pass by chance. So after withheld poses a pose needs consistent ones before it.
+Points that were recorded one by one, further apart than `STREAM_GAP_S`, have no neighbours in
+time, and each is judged alone.
 """
 
 import math

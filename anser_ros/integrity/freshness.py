@@ -1,12 +1,12 @@
 """Judges whether a channel's readings are new: a reading without new noise is an old one.
 
 Each reading is compared with the channel's own readings of the last seconds. Two explanations
-compete: *new*, the difference holds the noise of two readings; *stuck*, it holds rounding alone,
-or, since a flux is a voltage over a measured current, the noise of the current too. The logarithm
-of the odds is summed over frames that follow one another with the same distance in time; odds of
-``exp(h)`` come about by chance with a probability of ``exp(-h)`` at most (Ville's inequality),
-however many emitters there are and however long the run is. So with eight emitters one exact
-repetition will do, and one emitter needs a few.
+compete: *new*, the difference contains the noise of two readings; *stuck*, it contains rounding
+alone or, because a flux is a voltage divided by a measured current, also the noise of the current.
+The logarithm of the odds is summed over frames that follow one another with the same distance in
+time; odds of ``exp(h)`` come about by chance with a probability of ``exp(-h)`` at most (Ville's
+inequality), however many emitters there are and however long the run is. So with eight emitters
+one exact repetition is enough, and one emitter needs a few.
 """
 
 import math

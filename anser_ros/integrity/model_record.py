@@ -1,8 +1,8 @@
 """Judges whether the field model still fits what all sensors measure.
 
-One sensor's residual may be bad for many reasons. When nearly all sensors' are for seconds, the
-model is of another board, out of date, or scaled wrong, and the few poses that pass the gate are
-wrong by as much as the gate lets through.
+One sensor's residual may be bad for many reasons. When nearly all sensors have bad residuals for
+seconds, the model belongs to another board, is out of date, or has a wrong scale, and the few
+poses that pass the gate are wrong by as much as the gate allows.
 """
 
 import math

@@ -1,13 +1,13 @@
 """Judges what the coils of a rigid body say of each other.
 
-A body's pose says where each of its coils is, and each coil says so itself. The two may differ by
-their errors, by what the body's survey has wrong, and by what the coil's gain has wrong; a coil
-that differs by more is somewhere else, or another coil.
+A body's pose predicts the place of each of its coils, and each coil has its own pose. The two may
+differ by their errors, by the errors of the body's survey, and by the effect of an error of the
+coil's gain. A coil that differs by more is in another place, or is another coil.
 
 A coil that took part in the body's solve shares its noise with it: the difference of an estimate
 and one that makes better use of the same data has the *difference* of their covariances (Hausman,
-Econometrica 1978), which the coil's own bounds from above. A coil that was left out shares
-nothing, and the covariances add up.
+Econometrica 1978), which the coil's own bounds from above. A coil that was left out shares no
+noise with the body, and the covariances add up.
 """
 
 import math

@@ -1,10 +1,11 @@
 """Tells whether a topic has one sender, by the numbers that each sender gives its messages.
 
-The middleware numbers what a publisher sends, 1, 2, 3, but does not say who it was. Messages that
-continue one run of numbers are one stream; a second run is a second sender, known by its first
-message. How many publishers the graph knows tells a loss from another run, and ends what was said
-by a sender that has gone. A sender that crashed stays in the graph for some time: it does not
-count once it has been silent, unless what it said holds until it says otherwise.
+The middleware numbers the messages of a publisher, 1, 2, 3, but does not identify the publisher.
+Messages that continue one sequence are one stream; a second sequence is a second sender,
+recognised by its first message. The number of publishers that the graph knows distinguishes a lost
+message from another sequence, and shows when a sender has gone. A sender that crashed stays in the
+graph for some time: it does not count once it has been silent, unless its last message holds until
+it is replaced.
 """
 
 from collections.abc import Hashable
@@ -102,8 +103,9 @@ class Senders:
     def _drop_silent(self, now_s: float) -> None:
         """Drop the runs that have ended.
 
-        What lasts outlives its sender's silence. Once one of several senders has gone, it can't be
-        told which, so what they said stays until it is forgotten and asked for anew.
+        A lasting message outlives its sender's silence. When one of several senders has gone, it
+        is unknown which, so their messages stay in force until they are forgotten and requested
+        again.
         """
         self._runs = [
             run for run in self._runs if now_s - run.heard_s < SILENT_S or run.lasting is not None

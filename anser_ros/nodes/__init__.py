@@ -1,5 +1,5 @@
 """Holds the ROS 2 nodes: the only place that knows rclpy and the message packages.
 
-A file here is a program; what it is made of stands in the room NODE_parts, what every node runs in
-in ``runtime``, and what several nodes receive or send in ``streams``.
+Each file here is a program. Its parts are in the room NODE_parts; ``runtime`` holds what every
+node runs in, and ``streams`` what several nodes receive or send.
 """

@@ -1,7 +1,7 @@
 """Turns samples of a control unit's serial port into fluxes.
 
-Three threads, and none waits for another: the port's reads and queues, this node's worker
-demodulates and publishes, the executor serves parameters and diagnostics.
+It has three threads, none of which waits for another: the port's thread reads and queues, this
+node's worker demodulates and publishes, and the executor serves parameters and diagnostics.
 """
 
 import sys
@@ -179,8 +179,8 @@ class Acquisition(AnserNode):
     def _wake_after(self, port: ControlUnitPort) -> int:
         """Blocks after which to go on: those of a window, the last of many apart.
 
-        While that one is on its way the others are worked off, and the last window is demodulated
-        once more: a processor that has slept does what it did a moment ago in a third of the time.
+        While that one is on its way the others are processed, and the last window is demodulated
+        once more: this keeps the processor awake, which then needs a third of the time.
         """
         if self._stream is None:
             return 1

@@ -201,8 +201,8 @@ class CuSimulator(AnserNode):
     def _step(self) -> None:
         """Send what is due. The next stretch is worked out before its time, so nothing is late.
 
-        Where it is late all the same, on a busy machine, commands wait until the samples before
-        them are there, and answers follow these: the host dates samples by the answers.
+        If it is late nevertheless, on a busy machine, commands wait until the samples before them
+        have been sent, and answers follow these, because the host dates samples by the answers.
         """
         unit = self._unit
         now_s = self._elapsed_s()

@@ -41,7 +41,7 @@ class DashboardParameters:
 class Dashboard(AnserNode):
     """Serves the live view to browsers.
 
-    It only listens; what is clicked goes to services and to commands.
+    It only subscribes; its buttons call services and run commands.
     """
 
     NAME = 'dashboard'

@@ -161,8 +161,8 @@ class FieldModelNode(AnserNode):
     def _update(self, frame: Frame) -> None:
         """Let the model follow the references, not more often than wanted.
 
-        Every frame is answered by the model in force for it, even where that is as before: so the
-        tracker knows what to track a frame with, and gives the poses that are found offline.
+        Every frame is answered with the model in force for it, even if that is unchanged: so the
+        tracker knows the model for each frame, and gives the same poses as offline.
         """
         result, model = self._refit.follow(frame), self._model
         if result is None:
@@ -196,7 +196,7 @@ class FieldModelNode(AnserNode):
         """Put a model in force under a stamp that the last one did not have.
 
         The model of a frame of readings has their stamp, which may be of another day. ``withheld``
-        is the state for which trackers are to give no pose, or not for long.
+        is the state for which trackers should publish no poses, at once or soon.
         """
         self._told = follows, awaits, *_ = self._state
         if self._unfit or self._place.misplaced:

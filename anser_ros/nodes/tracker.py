@@ -1,6 +1,7 @@
 """Turns fluxes into poses of every tool sensor and rigid body, with covariance, state and reason.
 
-A pose is published only while its state is ``ok``; why it is not stands in ``/diagnostics``.
+A pose is published only in the state ``ok``; ``/diagnostics`` gives the reason for any other
+state.
 """
 
 import sys
@@ -370,7 +371,7 @@ class TrackerNode(AnserNode):
     def _ready_for(self) -> str:
         """Digest of the setup that no pose will be lost of: all listeners and the model are there.
 
-        Who starts to send fluxes (a replay) reads it in ``/diagnostics``.
+        A sender of fluxes (a replay) reads it in ``/diagnostics`` before it starts.
         """
         tracker = self._tracker
         if tracker is None or tracker.model is None:

@@ -97,9 +97,9 @@ class Task:
 class Watcher(AnserNode):
     """Subscribes to fluxes and optical poses, and publishes ``/diagnostics`` alone.
 
-    Where topics of tracked poses are named, it takes these and a reference's, and no fluxes.
-    The diagnosis runs in a thread of its own; after each look it rests until its share of the
-    processor is kept.
+    If topics of tracked poses are named, it uses these and a reference's, and no fluxes. The
+    diagnosis runs in a separate thread, which pauses after each run to keep to its share of the
+    processor.
     """
 
     NAME = 'watcher'

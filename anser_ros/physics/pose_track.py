@@ -54,9 +54,9 @@ class PoseTrack:
         """Interpolate the poses at other times.
 
         Positions are interpolated along the chord between two poses, rotations along the great
-        arc, and both are bent as the velocity changes there: a hand's path lies outside its
-        chords, and a field that was learnt along chords is too small by a part in ten thousand.
-        Where a track is too slow or too short to tell its curvature, the chord is kept.
+        arc, and both are curved as the velocity changes there: a hand's path lies outside its
+        chords, and a field that was fitted along chords is too small by a part in ten thousand. If
+        a track is too slow or too short to determine its curvature, the chord is used.
 
         Parameters
         ----------
@@ -132,7 +132,8 @@ class _Bend:
     """How far a path lies beside the chords between its samples, by its acceleration there.
 
     Over an interval h, at the fraction u of the way, that is ``-u (1 - u) h^2 / 2`` times the
-    acceleration, which is told by how the velocity after the interval differs from that before.
+    acceleration, which follows from the difference between the velocities after and before the
+    interval.
 
     Parameters
     ----------

@@ -104,7 +104,7 @@ class SensorTable:
 def clusters_of(sensors: SensorTable) -> list[NDArray[np.int64]]:
     """Return the rows of the sensors of each body that share a centre; most often one, or three.
 
-    The first row of a table that is left opens a cluster of those near it.
+    The first remaining row of a table starts a cluster of those near it.
     """
     groups = []
     for body in dict.fromkeys(sensors.body):

@@ -1,7 +1,7 @@
 """Defines the tracked volume: the box over the board in which tools are tracked.
 
-The refit makes the field right in it, and the tracker gives poses in it. The setup document states
-it (key ``volume``); where it does not, it follows from the board's size, see `over_board`.
+The refit corrects the field in it, and the tracker gives poses in it. The setup document states it
+(key ``volume``); otherwise it follows from the board's size, see `over_board`.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class TrackedVolume:
     """Describes a box, m, frame fg; the default is the tracker's box over an Anser board.
 
     It is what `over_board` and `with_fringe` make of the demo's board (`test/test_setup.py`), for
-    setups whose board nobody can draw.
+    setups whose board cannot be drawn.
 
     Attributes
     ----------

@@ -163,7 +163,7 @@ def _is_mount(term: Term) -> bool:
 def _registered(frames: PoseFit, unseen: PoseProblem) -> HeldOutErrors:
     """What registering the places of each sensor alone leaves, with no lever arm.
 
-    Turns are those of a mount, which no place tells.
+    The rotations are those of a mount, which positions do not determine.
     """
     after, squares = unseen.state(frames.terms), {}
     for fitted, part in zip(frames.state.parts, after.parts, strict=True):
@@ -304,7 +304,7 @@ def _told(part: PosePart) -> Array:
 def lever_blur(part: PosePart, jitter_rad: float) -> Array:
     """Return by which share (3,) the reference's own jitter of orientation shrinks a lever arm.
 
-    Turns that are known with an error make a lever arm too small by the error's share of their
+    Errors of the measured rotations make a lever arm too small by their share of the rotations'
     variance, whatever its formal uncertainty.
     """
     told = _told(part)

@@ -71,8 +71,8 @@ class PoseFit:
         """Return the covariance of all parameters, honest about errors alike within a block of
         time.
 
-        The formal one is scaled by the misfit; where blocks scatter more than it says (White's
-        sandwich with blocks as clusters), a parameter's variance is raised to that.
+        The formal one is scaled by the misfit; where blocks scatter more than it predicts (White's
+        sandwich with blocks as clusters), a parameter's variance is raised accordingly.
         """
         filtered = any(is_of(term, Role.FILTER) for term in self.terms)
         sums = self.state.sums(filter_slopes=True) if filtered else self.sums

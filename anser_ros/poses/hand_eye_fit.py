@@ -1,7 +1,8 @@
 """Calibrates hand-eye: registration, lever arm, mount and clocks of two streams, jointly.
 
-The first stage of a diagnosis of poses, alone: the two frames, the offset and the rate of the
-clocks, robustly, with uncertainties, and in words what the motion does not determine.
+This is the first stage of a diagnosis of poses, by itself: the two frames, the offset and the rate
+of the clocks, estimated robustly, with uncertainties, and a statement of what the motion does not
+determine.
 """
 
 from collections.abc import Callable

@@ -1,8 +1,8 @@
 """Makes one session of tracked and optical poses, from files of any known form.
 
-Times of receipt (the host's counter) are taken as they stand. A device's own counter is put on
-the host's axis by the smallest delay, or begins at zero where a form has no host's time; where it
-restarts, it goes on from where it was.
+Times of receipt (the host's counter) are taken as they stand. A device's own counter is put on the
+host's axis by the smallest delay, or begins at zero if a form has no host's time; after a restart,
+it continues from its last value.
 """
 
 from collections.abc import Mapping, Sequence

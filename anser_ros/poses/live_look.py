@@ -1,7 +1,7 @@
 """Tells what the last seconds of running trackers of poses show: the diagnosis, and what changed.
 
 A diagnosis of a recording takes the two frames as they are. Live they are known from earlier, so
-that a camera that was pushed, or a sensor that came loose, is told from what was there before.
+that a camera that was pushed, or a sensor that came loose, is recognised by comparison.
 """
 
 from collections.abc import Sequence

@@ -74,7 +74,7 @@ class OpticalPath:
         """Return positions (n, 3), rotations (n, 3, 3), velocities (n, 6) in the optical frame,
         validity.
 
-        What is not valid is at the nearest pose, at rest.
+        Times without a valid path get the nearest pose, at rest.
         """
         inside = np.clip(time, self.knots[0], self.knots[-1])
         right = np.clip(np.searchsorted(self.knots, inside, side='left'), 1, self.knots.size - 1)

@@ -1,8 +1,8 @@
 """Searches which effects a session of poses shows: each must pay on blocks that it has not seen.
 
 The currencies and prices are those of `anser_ros.diagnosis.decisions`: gains in the whitened sum
-of squares, cross-validated over blocks of time, and for what depends on place over blocks of
-space as well, since neighbours in time flatter a map.
+of squares, cross-validated over blocks of time, and for effects that depend on place also over
+blocks of space, because a map looks too good on neighbours in time.
 """
 
 from collections.abc import Callable, Sequence

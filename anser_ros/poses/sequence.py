@@ -133,7 +133,7 @@ def leaps(poses: PoseSequence) -> Mask:
     """Return the mask (n,) of single poses, or a few, that leap away from those before and after
     them.
 
-    A marker seen in its other solution does: it is far off between two poses that agree.
+    A marker found in its second solution does this: it is far away between two poses that agree.
     """
     away = np.zeros(poses.size, dtype=bool)
     for _ in range(LONGEST_LEAP):

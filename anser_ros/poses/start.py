@@ -293,7 +293,7 @@ def _frames(problem: PoseProblem, offset: float, is_one_frame: bool) -> list[Arr
 def first_cost(fit: PoseFit) -> float:
     """Return the median misfit of a sensor's poses, m, on average over the sensors.
 
-    An angle counts as what it moves at a hand's breadth, 0.1 m.
+    An angle counts as the displacement that it causes at 0.1 m, a hand's breadth.
     """
     total = 0.0
     for part in fit.state.parts:

@@ -46,8 +46,8 @@ def evidence_without(
 ) -> tuple[Array, list[Array]]:
     """Return the evidence without the first of some coils, the first two, and so on to all Q.
 
-    By the rules of the conditional normal distribution no matrix is decomposed again. The evidence
-    is told by the most likely strengths: it changes as the likelihood of these does.
+    By the rules of the conditional normal distribution no matrix is decomposed again. The change
+    of the evidence is taken from the likelihood of the most likely strengths.
 
     Parameters
     ----------

@@ -240,8 +240,8 @@ class Assembly:
         """Return an error for as long as that of the best hypothesis is being worked out.
 
         It is that of the hypothesis before, as large as the strength may be now, and the whole
-        difference between the two, in any direction. Where there is none before, all of the change
-        may be wrong.
+        difference between the two, in any direction. If there is no previous hypothesis, all of
+        the change may be wrong.
         """
         last = self._last
         if last is None or not last.holds(change):

@@ -83,9 +83,9 @@ class ReadingWindow:
         """Return the mean reading, as `mean` does, of readings that do not change.
 
         The window is judged as a whole, its last third against its first, so that a drift too slow
-        to show from one frame to the next is noticed: metal that creeps must not enter a baseline.
-        `change.Average` asks another question, whether the newest frame still belongs to a mean,
-        and must answer it at once. So the two have tests of their own.
+        to show from one frame to the next is noticed: slowly moving metal must not enter a
+        baseline. `change.Average` asks another question, whether the newest frame still belongs to
+        a mean, and must answer it at once. So the two have tests of their own.
 
         Raises
         ------

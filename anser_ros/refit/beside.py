@@ -1,8 +1,8 @@
 """Works out what takes longer than a frame may beside the frames, by one thread of the process.
 
-A result comes into use at a fixed time after it was asked for, told by the stamps of the frames:
-so what the refit says does not depend on how busy the machine is, and a recording gives what was
-said live. Only where the thread has not finished by then is it waited for.
+A result comes into use at a fixed time after it was requested, measured by the stamps of the
+frames: so the refit's results do not depend on how busy the machine is, and a recording gives the
+live results. If the thread has not finished by then, the refit waits for it.
 """
 
 from collections.abc import Callable

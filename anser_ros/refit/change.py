@@ -95,11 +95,11 @@ class NoiseLevel:
 class Average:
     """Keeps the running mean of the readings over the frames in which they do not change.
 
-    Each new frame is held against the mean so far, with the noise that is expected of their
-    difference, and the mean begins anew at the first frame that is off: a change must be followed
-    without delay, and a drift that hides in the noise is followed too, late by about `longest`
-    frames. A baseline may contain no drift at all, so `baseline.ReadingWindow.still_mean` judges a
-    whole window in hindsight.
+    Each new frame is compared with the mean so far, given the noise expected of their difference,
+    and the mean starts again at the first frame that deviates: a change must be followed without
+    delay. A drift below the noise is followed too, late by about `longest` frames. A baseline may
+    contain no drift at all, so `baseline.ReadingWindow.still_mean` judges a whole window in
+    hindsight.
 
     Attributes
     ----------

@@ -2,14 +2,14 @@
 
 A *cloud* fills a part of space with point sources of independent polarisability, each of a
 variance proportional to the volume it stands for: the prior is then white in space and does not
-depend on how finely that part is sampled. The one thing that a cloud asserts is that no metal is
+depend on how finely that part is sampled. The only thing that a cloud asserts is that no metal is
 nearer than its *standoff*: the distance from the board for clouds below it, from the tracked
-volume for clouds around it. Which standoff is right is told by the evidence, frame by frame (see
+volume for clouds around it. The evidence decides, frame by frame, which standoff is right (see
 `refit.posterior`).
 
 A *compact body* is a small cloud, a ball of sources at one place: the hypothesis of one piece of
-metal beside or over the tracked volume. Where the board is and what its tracked volume is, all
-clouds learn from the `Region`.
+metal beside or over the tracked volume. All clouds take the place of the board and its tracked
+volume from the `Region`.
 
 The frame ``fg`` has its board at z = 0 with z up towards the patient, so "below" is z < 0.
 """
@@ -114,7 +114,8 @@ def below(region: Region, standoff: float) -> Cloud:
 def overhead(region: Region, standoff: float) -> Cloud:
     """Return sources beside and over the tracked volume, at least ``standoff`` away from it.
 
-    Shells of growing thickness, each on a lattice as fine as the distance to the volume asks for.
+    Shells of growing thickness, each on a lattice whose spacing depends on the distance to the
+    volume.
     """
     positions, volumes = [], []
     inner, reach = standoff, standoff + 1.2 * region.half
@@ -157,9 +158,9 @@ def _centred(reach: float, spacing: float) -> Array:
 def bodies(region: Region) -> tuple[Cloud, ...]:
     """Return compact bodies on a lattice around and in the outer part of the tracked volume.
 
-    A cloud over a whole region expects as much metal everywhere; one piece of metal beside or over
-    the volume is told far better by a ball of sources where it is. Below the board the layers do
-    as well.
+    A cloud over a whole region expects as much metal everywhere; a ball of sources at its place
+    describes one piece of metal beside or over the volume far better. Below the board the layers
+    are equally good.
     """
     half = region.half
     side = BODY_SPACING * (np.arange(8) - 3.5)

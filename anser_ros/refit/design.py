@@ -1,10 +1,10 @@
 """Finds where reference coils tell most: the expected error of poses over a family of metals.
 
-For metal of a known kind and strength everything is Gaussian, so what any choice of coils would
-leave unknown follows before a coil is glued on: the posterior covariance of the metal's
-coordinates (`refit.reduced`), as poses feel them. Coils are chosen one after the other, each the
-one that leaves least, and are then exchanged while that helps (Fedorov, Theory of Optimal
-Experiments, 1972).
+For metal of a known kind and strength everything is Gaussian, so the remaining uncertainty with
+any choice of coils follows before a coil is glued on: the posterior covariance of the metal's
+coordinates (`refit.reduced`), weighted by their effect on poses. Coils are chosen one after the
+other, each the one that leaves the least uncertainty, and are then exchanged while that helps
+(Fedorov, Theory of Optimal Experiments, 1972).
 """
 
 from collections.abc import Sequence

@@ -1,6 +1,6 @@
 """Weighs strengths that a hypothesis may have, and what one frame of readings says about each.
 
-The strength is the variance that metal gives a reading. It is unknown, so the evidence of a
+The strength is the variance of a reading caused by metal. It is unknown, so the evidence of a
 hypothesis is its likelihood summed over a grid of strengths; those of the real and of the
 imaginary part are independent of each other.
 """

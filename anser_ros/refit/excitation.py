@@ -1,8 +1,8 @@
 """Computes the emitters' field below and around the board, which drives the metal there.
 
-A calibrated model is fitted where tools are, over the board. Carried on to below the board it is
-off by tens of percent near the coils, while the coils' drawing gives that field to a percent. So
-the drawing is used where there is one, with strength and phase taken from the calibrated model.
+A calibrated model is fitted where tools are, over the board. Extrapolated below the board it is
+wrong by tens of percent near the coils, while the coils' drawing gives that field to a percent. So
+the drawing is used if there is one, with strength and phase taken from the calibrated model.
 """
 
 from collections.abc import Callable

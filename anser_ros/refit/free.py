@@ -1,9 +1,9 @@
 """Fits free dipoles, a separate set for every emitter, as a rival of the shared polarisability.
 
-This is what a refit without the physics of metal does: each emitter's change is fitted by sources
-of its own, with nothing in common but where they may be. Clouds, noise, evidence for standoff and
-strength, and the layer that carries the result are those of the refit, so what differs between the
-two is the shared polarisability alone. It exists for the ablation.
+This is a refit without the physics of metal: each emitter's change is fitted by separate sources,
+which have only their possible places in common. Clouds, noise, evidence for standoff and strength,
+and the layer that carries the result are those of the refit, so the two differ only in the shared
+polarisability. It exists for the ablation.
 """
 
 from dataclasses import replace

@@ -2,7 +2,7 @@
 
 A reference that is dead, moved, saturated or unplugged changes alone; metal changes many readings
 at once, in the proportions that the emitters' fields have at one place. So "coil s is at fault" is
-one more hypothesis, with its readings of any size and the metal told by the others alone, and its
+one more hypothesis, with readings of any size, while the others alone determine the metal, and its
 odds against "all is well" come from the same evidence. A coil that is left out is watched, and
 returns when it has agreed with the others for a while.
 """
@@ -177,8 +177,8 @@ class ReferenceWatch:
     def note(self, readable: NDArray[np.bool_], reasons: list[str], least: int = 0) -> None:
         """Exclude unreadable coils, whose waiting time starts again with every such frame.
 
-        Where fewer than `least` can be read, samples were lost and no coil is at fault: with the
-        next frame all is as it was before.
+        If fewer than `least` can be read, samples were lost and no coil is at fault: the next
+        frame continues as before.
         """
         if self._before is not None:
             self.excluded, self.reason, self._good = self._before
@@ -219,8 +219,8 @@ class ReferenceWatch:
         """Return the coils in use whose fault is worth computing, often none; for `find_faults`.
 
         Coils that are far from what the others predict are suspected one by one; several that are
-        wrong at once hide each other, so those whose readings stand out are suspected together.
-        A suspicion that was just dismissed is taken up again when it has grown, or after a while.
+        wrong at once hide each other, so those whose readings stand out are suspected together. A
+        suspicion that was just dismissed is tested again when it has grown, or after a while.
 
         Parameters
         ----------

@@ -1,11 +1,11 @@
 """Finds readings that jump: metal moves steadily and changes all references, faults do neither.
 
-One reference that is wrong contradicts the others. Where many go wrong at one moment, they outvote
-the good ones, and in what they read from then on they may look like metal. The moment itself tells
-them apart: each reading is held against what it was on its way to, and what is left of all of them
-is judged at once, either as metal, which must be in the proportions that the emitters' fields have
-somewhere and cannot have come far since the last frame, or as coils that jumped, each by itself,
-beside others that did not.
+One wrong reference contradicts the others. If many fail at one moment, they outvote the good ones,
+and their later readings may look like metal. The moment itself distinguishes the two: each reading
+is compared with its predicted course, and all deviations are judged together. They are explained
+either by metal, which must have the proportions of the emitters' fields at some place and cannot
+have moved far since the last frame, or by coils that jumped independently, beside others that did
+not.
 """
 
 import math

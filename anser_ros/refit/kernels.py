@@ -1,8 +1,8 @@
 """Compiles the products of every frame: each table is read once, in single precision.
 
-A frame's time goes into waiting for the tables, not into arithmetic. Single precision is 1e-7 of a
-reading that is at most 1e6 noise deviations. Sums may be reordered, so that they go through vector
-registers; infinities and NaN keep their meaning.
+The time of a frame is spent on loading the tables, not on arithmetic. Single precision is 1e-7 of
+a reading that is at most 1e6 noise deviations. Sums may be reordered, so that they go through
+vector registers; infinities and NaN keep their meaning.
 """
 
 import math

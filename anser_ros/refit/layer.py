@@ -1,12 +1,12 @@
 """Finds the equivalent layer: few dipoles that make the field of any cloud in the tracked volume.
 
 A *layer* is a regular grid of dipoles on or below the board, or on a box around the volume; it
-takes the place of a cloud's many sources, whose field it reproduces where tools are.
-A field whose sources are all below a plane is also the field of dipoles on that plane (the
-equivalent layer of potential theory; Blakely, Potential Theory in Gravity and Magnetic
-Applications, chapter 3). So the refitted model keeps its size however fine the clouds are. Where
-the calibrated model is such a layer itself, its own dipoles take the change and the model does not
-grow at all. Metal beside or over the volume needs dipoles beside and over it.
+takes the place of a cloud's many sources, whose field it reproduces where tools are. A field whose
+sources are all below a plane is also the field of dipoles on that plane (the equivalent layer of
+potential theory; Blakely, Potential Theory in Gravity and Magnetic Applications, chapter 3). So
+the refitted model keeps its size however fine the clouds are. If the calibrated model is such a
+layer itself, its own dipoles represent the change and the model does not grow at all. Metal beside
+or over the volume needs dipoles beside and over it.
 """
 
 import math

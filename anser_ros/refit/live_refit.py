@@ -2,8 +2,7 @@
 
 The calibrated model is kept; what is refitted is the change since a distortion-free baseline. All
 emitters illuminate the same metal, so one polarisability per source explains all of them, and a
-few dozen readings determine the change of the whole field. `docs/refit.md` tells the method with
-its figures, and what was tried and left.
+few dozen readings determine the change of the whole field. See `docs/refit.md`.
 """
 
 import math
@@ -357,7 +356,7 @@ class LiveRefit:
     def witnessed(self, readings: Sequence[ToolReading]) -> None:
         """Take in what tools read in the last frame, after its poses have been given.
 
-        So the poses of the next frame know of it, and no reading counts twice.
+        So it is used for the poses of the next frame, and no reading counts twice.
         """
         if self._witness is None:
             return

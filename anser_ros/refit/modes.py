@@ -2,7 +2,7 @@
 
 A *mode* is one direction in which the refitted model may be wrong: a set of moments whose field
 has the size of one standard deviation. Modes are independent of each other. They are the principal
-directions of random draws of the posterior's error; what they leave is told by one number.
+directions of random draws of the posterior's error; one number states the remainder.
 """
 
 import math

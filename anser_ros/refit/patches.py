@@ -1,8 +1,8 @@
 """Places reference coils on patches that move: their baseline follows from their pose.
 
-Such a coil has no recorded baseline. What it should read without metal is the calibrated model's
-flux where a tracker says that it is, and the tracker's error becomes noise of that reading, far
-above a fixed coil's. It still tells of strong metal from where no fixed coil can be.
+Such a coil has no recorded baseline. Its expected reading without metal is the calibrated model's
+flux at its tracked pose, and the tracker's error becomes noise of that reading, far above a fixed
+coil's. It still senses strong metal from places where no fixed coil can be.
 """
 
 from dataclasses import dataclass

@@ -1,18 +1,18 @@
 """Keeps the bank of hypotheses: their evidence, and the field's change under each of them.
 
 Every cloud's hypothesis is a Gaussian of the readings, ``y ~ N(0, a C + s^2 N)``: metal of a total
-strength ``a`` as the cloud has it, the survey's errors in proportion, and noise. In the
+strength ``a`` distributed as in the cloud, the survey's errors in proportion, and noise. In the
 eigenvectors of C (whitened by N) all of it is diagonal, so the evidence of any strength costs a
 sum, and the strength is integrated over a grid instead of being chosen (MacKay, Neural Computation
 4 (1992) 415). In-phase and quadrature parts share the geometry and have a strength each.
-Hypothesis 0 is that nothing has changed. The *bank* holds all hypotheses, each with what is worked
-out for it in advance, so that one pass over the readings of a frame gives the evidence of each. A
-*slot* of the bank is an empty place in which a compact body can be put later (`refit.slots`).
-`refit.agreement` compares coils with each other by the same tables, and `refit.modes` tells how
-uncertain the change of the field is.
+Hypothesis 0 is that nothing has changed. The *bank* holds all hypotheses with the matrices that
+are computed for them in advance, so that one pass over the readings of a frame gives the evidence
+of each. A *slot* of the bank is an empty place in which a compact body can be put later
+(`refit.slots`). `refit.agreement` compares coils with each other by the same tables, and
+`refit.modes` gives the uncertainty of the change of the field.
 
-N is white noise plus the drift of the emitters: a coil whose current reading is a little off shows
-in all references in proportion to their baseline, which is nothing that metal does.
+N is white noise plus the drift of the emitters: an error of an emitter's measured current changes
+all references in proportion to their baseline, which metal does not.
 
 Readings are in units of the nominal noise throughout this module.
 """

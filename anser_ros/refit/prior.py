@@ -32,9 +32,9 @@ itself uncertain, by a tenth with 48; more cost memory and the start of the refi
 class Response:
     """Holds the prior of a source's polarisability tensor, as variances of its independent parts.
 
-    A compact piece answers alike in all directions. A flat piece answers across its face only,
-    and pieces that touch drive each other: in recordings, metal below a board answers differently
-    along the board's normal, plates in yet other ways.
+    A compact piece responds equally in all directions. A flat piece responds only across its face,
+    and pieces that touch drive each other: in recordings, metal below a board responds differently
+    along the board's normal, and plates in yet other ways.
 
     Attributes
     ----------

@@ -1,8 +1,8 @@
 """Reduces a hypothesis' metal to few numbers: the directions in which poses feel it.
 
 The field of a cloud's thousands of sources, as the layer makes it in the tracked volume, has some
-tens of directions that matter to poses. Coordinates along them have unit variance for metal of
-unit strength, so a posterior over metal is a mean and a small covariance matrix, which readings of
+tens of directions that affect poses. Coordinates along them have unit variance for metal of unit
+strength, so a posterior over metal is a mean and a small covariance matrix, which readings of
 coils that move can update frame by frame. The directions are those of a randomised singular value
 decomposition (Halko, Martinsson & Tropp, SIAM Review 53 (2011) 217).
 """

@@ -1,9 +1,9 @@
 """Predicts what reference coils read of sources, and what errors of their survey do.
 
-A surveyed coil is a little elsewhere, points a little elsewhere and has a little other gain than
-the table says. Without metal that is part of its baseline and cancels; of the change that metal
-makes it leaves an error proportional to the change. To first order it is the reading of a few
-displaced, turned and scaled copies of the coil (`survey_variants`).
+A surveyed coil differs slightly from the table in place, direction and gain. Without metal this is
+part of its baseline and cancels; in the change caused by metal it leaves an error proportional to
+the change. To first order it is the reading of a few displaced, turned and scaled copies of the
+coil (`survey_variants`).
 """
 
 from collections.abc import Iterator

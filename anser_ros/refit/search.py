@@ -1,8 +1,8 @@
 """Searches hundreds of places cheaply for the compact bodies that merit a full hypothesis.
 
 A body's readings lie in a few directions of the space of readings. With them alone, and one
-variance for all that they leave, its evidence costs a hundredth of the full one; the best few
-places are then judged in full beside the clouds (see `refit.posterior`).
+variance for the remainder, its evidence costs a hundredth of the full one; the best few places are
+then evaluated in full beside the clouds (see `refit.posterior`).
 """
 
 from dataclasses import dataclass, field

@@ -71,8 +71,8 @@ class BodySlots:
     def fill(self, readings: Array, noise: float, stamp_ns: int) -> None:
         """Take in one frame; every few frames a body may be replaced by a better one.
 
-        The chosen body's hypothesis is worked out beside the frames, and takes its slot with a
-        later one.
+        The chosen body's hypothesis is computed beside the frames, and takes its slot in a later
+        frame.
 
         Parameters
         ----------

@@ -2,9 +2,10 @@
 else.
 
 The readings of a tool's coils are compared at the pose that was found for it. The pose is free, so
-what a step or turn of the tool would make of them says nothing (`ToolRows.pose`). What is wrong
-with the coils themselves (gain, place and axis) is the same in every frame, and `CoilErrors`
-learns it from what no metal explains: a wrong gain must not be taken for metal.
+the directions in which a translation or rotation of the tool would change them carry no
+information (`ToolRows.pose`). The errors of the coils themselves (gain, place and axis) are the
+same in every frame, and `CoilErrors` estimates them from the part that no metal explains: a wrong
+gain must not be taken for metal.
 """
 
 from dataclasses import dataclass

@@ -1,15 +1,14 @@
 """Takes tools as witnesses of metal: what their coils contradict updates what references leave
 open.
 
-The references tell a hypothesis' metal with an error that is known (`refit.posterior`). A tool
-that wanders through the field sees this error: of the readings of its coils a pose takes six
-numbers, and all others are left. They enter a Kalman filter over the coordinates of the error
+The references determine a hypothesis' metal with a known error (`refit.posterior`). A tool that
+moves through the field senses this error: a pose takes six numbers of the readings of its coils,
+and all others remain. They enter a Kalman filter over the coordinates of the error
 (`refit.reduced`), one filter per hypothesis, after the poses of their frame have been given: the
 next frame's poses are then independent of them, and nothing is counted twice.
 
-Metal moves slowly, and with it the error that the references make of it. So the error is a
-stationary process that is remembered for `MEMORY_S`; the references of every frame say anew how
-large it can be.
+Metal moves slowly, and so does the error of its estimate. So the error is a stationary process
+with a memory of `MEMORY_S`; the references of every frame bound its size anew.
 """
 
 import math
@@ -153,7 +152,8 @@ class Witness:
     def modes(self, bank: Bank, h: int, count: int) -> PosteriorModes:
         """Return the principal modes of a hypothesis' error after the tools' readings.
 
-        They are those that are felt where tools were last, and what they leave is told there.
+        They are those with the largest effect at the tools' last places, and the remainder is
+        stated for these places.
         """
         state = self._filters[bank.prior(h).name]
         reduced = self._reduced_of(bank, h)
@@ -277,7 +277,8 @@ def _whitened(factor: Floats, rows: Floats, values: Floats) -> tuple[Array, Arra
 def _kalman(state: _Filter, part: int, factor: Floats, rows: Floats, values: Floats) -> float:
     """Update one part of a filter with readings; return their log likelihood.
 
-    Readings that contradict hypothesis and tool by more than `ODD` count as much less as they do.
+    Readings that contradict hypothesis and tool by more than `ODD` get a weight that is smaller in
+    proportion.
     """
     a, z = _whitened(factor, rows, values)
     mean, covariance = state.mean[:, part], state.covariance[part]

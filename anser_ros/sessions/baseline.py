@@ -85,9 +85,9 @@ def check_clean(
 ) -> None:
     """Raise `FitError` when references do not read what they do without metal.
 
-    What they should read is what they did when the model was calibrated, else what the drawing
-    says; and they and the model must have the board at one place. A model that has metal in it by
-    a diagnosis, and no readings from then, says nothing.
+    The expected readings are those at the calibration, or else those of the drawing; references
+    and model must also agree about the place of the board. A model that contains metal found by a
+    diagnosis, and no such readings, is not compared.
 
     Parameters
     ----------

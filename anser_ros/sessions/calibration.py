@@ -63,9 +63,9 @@ def calibrate_sessions(
 ) -> Calibration:
     """Calibrate on all tool sensors of the sessions.
 
-    Reference sensors are left out: their survey is less accurate than the field model becomes.
-    How accurate fluxes and poses are is what the first session's setup states. What the references
-    of the first session that has them read is kept with the model, for baselines to be compared.
+    Reference sensors are left out: their survey is less accurate than the field model becomes. The
+    first session's setup states how accurate fluxes and poses are. What the references of the
+    first session that has them read is kept with the model, for baselines to be compared.
     """
     setup, drifts = sessions[0].setup, []
     if options.estimate:

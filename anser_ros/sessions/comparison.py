@@ -1,7 +1,7 @@
 """Compares two evaluations of the same frames: errors and shares with a pose, with intervals.
 
-Frames of one moment share what made their errors, so whole stretches of time are resampled (the
-moving-block idea of Künsch, Annals of Statistics 17, 1989), all coils of a stretch together.
+Frames close in time share the causes of their errors, so whole stretches of time are resampled
+(the moving-block idea of Künsch, Annals of Statistics 17, 1989), all coils of a stretch together.
 """
 
 import csv
@@ -167,7 +167,8 @@ def compare_errors(
 ) -> dict[str, Compared]:
     """Compare two evaluations by name; errors of one kind by stamp and name.
 
-    A name without a frame in which both have an error has no pairs, and counts what one has alone.
+    A name without a frame in which both have an error has no pairs, only counts of errors that one
+    of them has alone.
     """
     return {name: _compare(first, second, name, rng) for name in _names(first, second)}
 

@@ -1,8 +1,8 @@
 """Finds units and order in which optical poses and fluxes were written, by what the fluxes tell.
 
-Poses predict the fluxes of the drawn board. Where they do not as they stand, and do when they are
-read in another unit or another order, that is how they were written. Where neither fits (an
-optical frame that is not the board's, a board that can't be drawn), nothing is said.
+Poses predict the fluxes of the drawn board. If they do not fit as they are, but fit when read in
+another unit or another order, they were written in that convention. If nothing fits (an optical
+frame that is not the board's, a board that cannot be drawn), nothing is reported.
 """
 
 from dataclasses import dataclass

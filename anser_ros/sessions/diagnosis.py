@@ -2,8 +2,7 @@
 
 The stages are `prepare`, `correct`, `problem_of`, `anser_ros.diagnosis.diagnose.diagnose` (which
 screens, searches, confirms and concludes), `held_out_part` and `track_held_out`; each can be
-called alone, and `diagnose_session` runs all of them. What they give is written by
-`diagnosis_document`.
+called alone, and `diagnose_session` runs all of them. `diagnosis_document` writes their results.
 """
 
 from collections.abc import Callable
@@ -174,8 +173,8 @@ def track_held_out(
 ) -> tuple[TrackingErrors, TrackingErrors]:
     """Track the held-out part with the model as it was, and with the effects that were found.
 
-    The second time the model follows the references where only these can tell what an effect does
-    live: metal that moves, and an emitter whose strength has no course of its own.
+    The second time the model follows the references if only these can determine an effect live:
+    metal that moves, and an emitter whose strength has no course of its own.
 
     Parameters
     ----------

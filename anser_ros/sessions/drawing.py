@@ -43,7 +43,7 @@ class Drawing:
     def model(self) -> FieldModel | None:
         """Return the nominal model, made when it is first asked for, which takes about a second.
 
-        None also where dipoles do not reach the accuracy that is asked of it.
+        None also if dipoles do not reach the required accuracy.
         """
         try:
             return None if self.board is None else nominal_model(self.board)

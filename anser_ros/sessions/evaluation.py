@@ -1,7 +1,7 @@
 """Evaluates a recorded session: tracks its poses, and compares them with the optical ones.
 
 The stages are `prepare`, `track` and `compare`; each can be called alone, and `track_session` runs
-all of them. What they give is written by `evaluation_document` and `pose_table`.
+all of them. `evaluation_document` and `pose_table` write their results.
 """
 
 from dataclasses import dataclass, field

@@ -39,7 +39,7 @@ def parse_patches(entries: Sequence[str]) -> dict[str, str]:
 class PatchFollower:
     """Runs a refit with the coils of patches, whose poses lie in the session's own bag.
 
-    The live node works a refit for new places out beside its callbacks and goes on without the
+    The live node computes a refit for new places beside its callbacks and continues without the
     patches meanwhile; here that takes no time.
 
     Parameters

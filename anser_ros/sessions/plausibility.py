@@ -1,6 +1,6 @@
 """Judges whether a recording can be what its units, clocks and poses say, before it is used.
 
-Every check speaks on evidence only, and names it; what the data can't decide passes.
+Every check refuses on evidence only, and names it; what the data cannot decide passes.
 """
 
 from collections.abc import Mapping

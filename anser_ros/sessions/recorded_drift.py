@@ -1,7 +1,7 @@
 """Dates drifts of emitters, whose course holds only on the session that they were found on.
 
 A diagnosis notes that session in the drift's evidence, by its first stamp, so that a later
-evaluation can tell whether it tracks the same session.
+evaluation can determine whether it tracks the same session.
 """
 
 from dataclasses import replace

@@ -95,8 +95,8 @@ def overload(path: str | os.PathLike[str]) -> list[str]:
 def kept_share(session: Session) -> float:
     """Return the share of frames with tool readings, which is 1 where no window is missing.
 
-    How many there should be follows from the median time between two frames; of several tools the
-    best counts.
+    Their expected number follows from the median time between two frames; the tool with the
+    largest share counts.
     """
     shares = [0.0]
     for tool in session.tools:

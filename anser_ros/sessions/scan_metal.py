@@ -1,9 +1,9 @@
 """Takes metal that moved during a scan, and rested near it before and after, off the scan.
 
-Frames in which it moves are left out of a calibration, but a field that is learnt from the others
-has the resting metal in it. How it moves tells what it does at rest
-(`anser_ros.diagnosis.departure`); that is taken off the scan's fluxes, and the field is fitted
-again.
+Frames in which it moves are left out of a calibration, but a field that is fitted to the others
+contains the resting metal. Its motion determines its field at rest
+(`anser_ros.diagnosis.departure`), which is subtracted from the scan's fluxes; then the field is
+fitted again.
 """
 
 from collections.abc import Callable, Sequence

@@ -84,7 +84,7 @@ def sensor_table(specs: tuple[SensorSpec, ...]) -> SensorTable:
 def measured_noise(setup: Setup) -> float:
     """Return the noise of the fluxes' components that the acquisition measured with the setup, T.
 
-    It is 0 where the setup tells none, and where ``flux_noise_t`` is stated, which goes before.
+    It is 0 if the setup contains none, and if ``flux_noise_t`` is stated, which takes precedence.
     """
     if 'flux_noise_t' in setup.stated:
         return 0.0
@@ -102,7 +102,7 @@ def stamp_sigma(setup: Setup) -> float:
     """Return the error of the fluxes' stamps, s: what is stated, else what the acquisition
     measured.
 
-    Where the setup tells neither, it is the default of `anser_ros.settings.Accuracy`.
+    If the setup has neither, it is the default of `anser_ros.settings.Accuracy`.
     """
     told = setup.extra.get('stamp_sigma_s', -1.0)
     is_number = isinstance(told, (int, float)) and not isinstance(told, bool)
@@ -190,7 +190,7 @@ def load_session(path: str | os.PathLike[str]) -> Session:
     """Read a bag as a session that is plausible.
 
     Poses of an optical tracker that stood still while the tool moved are left out; `Session.lost`
-    says so.
+    reports this.
 
     Raises
     ------

@@ -80,7 +80,7 @@ def model_for(
 ) -> FieldModel:
     """Return the model that ``name`` stands for: a file's path, or ``nominal``.
 
-    ``snapshot`` says whether a snapshot of a refit will do, which is no calibration, and
+    ``snapshot`` is whether a snapshot of a refit, which is no calibration, is accepted, and
     ``resurveyed`` names bodies whose sensors are the same, surveyed anew.
 
     Raises
@@ -113,8 +113,8 @@ def made_for(model: FieldModel, setup: Setup) -> FieldModel:
 def with_new_survey(model: FieldModel, setup: Setup, bodies: Sequence[str]) -> FieldModel:
     """Return the model for bodies whose sensors are the same, but surveyed anew.
 
-    What a model knows of channels, such as their gains, still holds. Places and axes of sensors
-    are now as the new survey has them: effects that corrected the old one fall away.
+    The model's corrections of channels, such as their gains, still hold. Places and axes of
+    sensors are now those of the new survey: effects that corrected the old one are removed.
 
     Raises
     ------
@@ -143,8 +143,8 @@ def with_new_survey(model: FieldModel, setup: Setup, bodies: Sequence[str]) -> F
 def check_made_for(model: FieldModel, setup: Setup, where: str) -> None:
     """Raise `ModelFileError` when a model is of another board, or its effects of other sensors.
 
-    A tool that the model says nothing of may be another one than it was calibrated with. A model
-    that does not tell what it was made for passes.
+    A tool that the model does not mention may be another one than it was calibrated with. A model
+    that does not state what it was made for passes.
     """
     made, now = model.made_for, setup.identity
     if made is None:

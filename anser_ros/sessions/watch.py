@@ -1,7 +1,7 @@
 """Diagnoses the last seconds lightly: whether the model lacks anything, and what.
 
-A look costs little while all is well, and while what was found last still explains what is seen;
-only something new starts a search.
+A check costs little while the residual is as expected, and while the last findings still explain
+it; only a change starts a search.
 """
 
 from collections.abc import Callable

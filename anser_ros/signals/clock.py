@@ -61,8 +61,8 @@ class SampleClock:
     """Converts sample numbers of a stream to host time.
 
     Samples come from one oscillator, so between a sample's number and the host's time lies a
-    straight line: its slope is within 100 ppm of the nominal one, and no arrival lies below it.
-    It is estimated by `Envelope`. What could break it is looked for in each arrival:
+    straight line: its slope is within 100 ppm of the nominal one, and no arrival lies below it. It
+    is estimated by `Envelope`. Each arrival is checked for what would contradict it:
 
     - one that comes earlier than it could refutes the line, and a new one begins;
     - while all arrivals come later than `LARGEST_LATENESS_S`, either the line to the host is late
@@ -145,8 +145,8 @@ class SampleClock:
     def bound(self, sample: float, sent_ns: int) -> None:
         """Take in that a sample was not yet taken when a command was sent that is now answered.
 
-        The answer has taken the same way as the samples: where they come late because the line is,
-        it does too, and where the device lost time, it is quick and shows that.
+        The answer takes the same way as the samples: if they come late because the line is late,
+        so does the answer; if the device lost time, the answer is quick.
 
         Parameters
         ----------

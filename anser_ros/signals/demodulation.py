@@ -5,8 +5,8 @@ A window of samples x(t) of one channel is modelled as
     x(t) = sum_k Re[(P_k + Q_k t) exp(+j w_k t)] + c_0 + c_1 t (+ mains harmonics) + white noise
 
 with t = 0 in the middle of the window. P_k is the phasor and Q_k its rate of change: all
-amplitudes of a moving coil change within the window, and a fit without Q_k takes that change for
-other tones. The model is linear, so that its pseudo-inverse is computed once and a window costs
+amplitudes of a moving coil change within the window, and a fit without Q_k attributes that change
+to other tones. The model is linear, so that its pseudo-inverse is computed once and a window costs
 one matrix product (Kay, Fundamentals of Statistical Signal Processing I, section 4.3). Windows
 that are too short to determine Q_k are fitted without; the bias by known rates is linear as well.
 """

@@ -76,7 +76,7 @@ class Envelope:
 def _slope_below(points: Sequence[tuple[float, float]]) -> float:
     """Return the most probable slope of the line below points, with `_TYPICAL_SHARE` as prior.
 
-    Two points determine a line; the distances of the next ones above it tell how certain it is.
+    Two points determine a line; the distances of the next ones above it show how certain it is.
     """
     slope = _hull_slope(points)
     above = sorted(y - slope * x for x, y in points)

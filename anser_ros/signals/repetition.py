@@ -1,10 +1,10 @@
 """Finds repeated samples: a column whose newest samples equal, bit for bit, what it said before.
 
 Fresh samples carry new noise, so that a long run of them never equals an earlier one. How long a
-run must be follows from the noise that a column is seen to have: at the lag at which its tones
-return most nearly, two fresh samples coincide with a probability q, which is counted, and a run of
-n of them with q^n. A column in n samples of which there is too little chance proves nothing, and
-is called noiseless: of what never changes, new and old cannot be told apart.
+run must be follows from the observed noise of a column: at the lag at which its tones return most
+nearly, two fresh samples coincide with a probability q, which is counted, and a run of n of them
+with q^n. A column whose n samples contain too little randomness proves nothing, and is called
+noiseless: if nothing changes, new and old samples cannot be distinguished.
 """
 
 from __future__ import annotations
@@ -157,7 +157,8 @@ class RepetitionWatch:
     def ages(self, first: int) -> NDArray[np.int64]:
         """Return how old the samples from a position on are, shape (C,), samples.
 
-        It is 0 for a column whose samples are all new, and else how long before it said the same.
+        It is 0 for a column whose samples are all new, otherwise the time since it had the same
+        samples.
         """
         self._search()
         return np.where(self._until > first, self._age, 0)

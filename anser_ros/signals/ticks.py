@@ -28,7 +28,7 @@ _WRAP = 2**32
 class TickCheck:
     """Compares the advance of ticks with that of samples while no block is missing.
 
-    The stamps hang on the samples; ticks only confirm how many blocks were lost.
+    The stamps follow from the samples; ticks only confirm how many blocks were lost.
 
     Parameters
     ----------

@@ -75,7 +75,7 @@ class WindowCutter:
 
     Lost blocks leave a hole of the right length, so that the windows keep their grid. A window
     with less than half of its samples counts as lost. A sequence number that does not fit the
-    device's ticks begins a new stream, and so does one that was there before with other samples.
+    device's ticks begins a new stream, and so does one that was already used with other samples.
 
     Parameters
     ----------
@@ -175,8 +175,8 @@ class WindowCutter:
         """Return the number of blocks lost before this one; -1 for a block that came before.
 
         Sequence number and ticks must agree on the size of a hole; otherwise the device has
-        started a new stream, and its first blocks were lost. A block that came before has the
-        samples that it had then, or fills a hole too late.
+        started a new stream, and its first blocks were lost. A repeated block has the same samples
+        as before, or fills a hole too late.
         """
         if self._expected is None or sequence == self._expected:
             return 0

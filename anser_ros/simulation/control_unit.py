@@ -1,6 +1,6 @@
 """Simulates a control unit that turns the bytes of commands into the bytes of records.
 
-It has no clock: its owner tells it how many samples of time have passed.
+It has no clock: its owner passes it the elapsed time as a number of samples.
 """
 
 from __future__ import annotations

@@ -106,9 +106,9 @@ def carried_on(position, old_position, axis, old_axis, steps):  # type: ignore[n
 class CoilTrack:
     """Remembers one sensor: its last good pose, its noise scale, the model error near it.
 
-    While no pose is good, ``suspect`` is the best bad one. It tells whether anything has changed,
+    While no pose is good, ``suspect`` is the best bad one. It shows whether anything has changed,
     so that the costly scan need not run in every frame of a long distortion; it never becomes a
-    pose without a scan that confirms it.
+    pose unless a scan confirms it.
     """
 
     good: CoilSolution | None = None
@@ -165,7 +165,7 @@ class _CoilFrame:
 class CoilResult:
     """Holds an estimate with its solution and the errors reckoned with (None: not solved).
 
-    ``heard`` says of a coil that nothing was solved for that its fluxes are good all the same.
+    ``heard`` is whether the fluxes of a coil are good although nothing was solved for it.
     """
 
     estimate: PoseEstimate
@@ -201,7 +201,7 @@ def prepare(
 ) -> None:
     """Look up the model's error where all sensors are expected, before they are tracked.
 
-    At once it costs a third of what it does one by one.
+    For all coils together this takes a third of the time.
     """
     if context.modes is None:
         return

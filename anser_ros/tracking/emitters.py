@@ -1,7 +1,7 @@
 """Goes on tracking with the emitters that are left when others have died.
 
 An emitter of which no sensor has a flux (not finite, or exactly zero) has no part in the solve: it
-has no weight, and the covariance grows by what it would have told.
+has no weight, and the covariance grows accordingly.
 """
 
 from dataclasses import dataclass, replace

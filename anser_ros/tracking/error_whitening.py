@@ -66,8 +66,8 @@ def _fill_spacing(positions, spacing):  # type: ignore[no-untyped-def]
 def source_spacing(positions: Array, floor_m: float) -> Array:
     """Return how far dipoles where tools may be are from their neighbours, m, shape (N,).
 
-    Dipoles that stand for metal say nothing about the field between themselves and others of
-    their kind. Those lower than ``floor_m`` are below all tools and get 0.
+    Dipoles that stand for metal do not determine the field between themselves and others of their
+    kind. Those lower than ``floor_m`` are below all tools and get 0.
     """
     spacing = np.empty(len(positions))
     _fill_spacing(np.ascontiguousarray(positions), spacing)

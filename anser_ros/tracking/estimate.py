@@ -105,8 +105,8 @@ class TrackerSettings:
         """Return the chi-square by which a rival must be worse, ``ratio`` being the residual power
         per freedom.
 
-        A misfit takes part in it as noise would; without a gate the best of poses that all fit
-        badly is taken.
+        A misfit counts as noise would; without a gate the best of several badly fitting poses is
+        taken.
         """
         if not self.has_gate and ratio > USUAL_GATE**2:
             return -math.inf

@@ -1,7 +1,7 @@
 """Judges a frame's poses by each other and by the frames before, before any is given out.
 
-Each pose has passed its own frame's gate. Here a coil has to agree with its body, a pose with
-where it came from, and the model with most of what is measured; see `anser_ros.integrity`.
+Each pose has passed its own frame's gate. Here a coil has to agree with its body, a pose with its
+course, and the model with most of the readings; see `anser_ros.integrity`.
 """
 
 import math
@@ -117,8 +117,8 @@ class Judgement:
 def _judge_coils(found: Estimates, body: RigidBody, settings: TrackerSettings) -> None:
     """Withhold, in ``found``, the poses of coils that contradict their body.
 
-    Where all coils together fit the model in no pose, also with those left out that disagree most,
-    nobody knows which of them are right: a smooth distortion can look like a pose to each.
+    If all coils together fit the model in no pose, even without those that disagree most, it is
+    unknown which of them are right: a smooth distortion can look like a pose to each.
     """
     estimate, fit = body.result.estimate, body.result.fit
     members = [i for i, row in enumerate(body.rows.tolist()) if found[row].state == states.OK]

@@ -1,9 +1,9 @@
 """Turns rotations between matrices and vectors, and sets the roll of a pose that has only an axis.
 
-What is here of scipy's ``Rotation`` is here again for its speed: trackers turn one rotation at a
-time, several times per pose and frame. One call takes 5 to 9 us
-here, and in scipy 1.17 11 us from a vector or a quaternion and 58 us from a matrix, which it makes
-orthogonal first. Whole tracks are turned by scipy.
+These functions of scipy's ``Rotation`` are repeated here for speed: trackers convert one rotation
+at a time, several times per pose and frame. One call takes 5 to 9 us here, and in scipy 1.17 11 us
+from a vector or a quaternion and 58 us from a matrix, which it makes orthogonal first. Whole
+tracks are turned by scipy.
 """
 
 import math

@@ -4,7 +4,7 @@ few.
 For a given position the fluxes are linear in the axis, ``y = B^T n`` with the emitters' fields as
 columns of B. With ``B B^T = L L^T`` the unexplained power at a grid point is ``|y|^2 - |c|^2``,
 ``c = L^-1 B y``, and the axis is ``L^-T c``: one small product per point. That a true axis has
-length one is a constraint that tells positions apart; its price is added to second order.
+length one is a constraint that distinguishes positions; its cost is added to second order.
 """
 
 import math

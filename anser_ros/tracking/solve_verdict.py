@@ -1,8 +1,9 @@
 """Gives the verdict on one pose solve, the same for a coil, a body and a source.
 
-A solve is judged by itself here: does its residual pass the gate, is the pose in the volume, did
-the descent end, is the pose certain enough, does no other pose explain the fluxes as well. What
-coils and frames say of each other is judged afterwards, in `anser_ros.tracking.judgement`.
+A solve is judged by itself here: whether its residual passes the gate, whether the pose is in the
+volume, whether the descent converged, whether the pose is certain enough, and whether another pose
+explains the fluxes equally well. Coils and frames are compared with each other afterwards, in
+`anser_ros.tracking.judgement`.
 """
 
 import math

@@ -1,9 +1,9 @@
 """Tracks where an axisymmetric source is, seen from a body with many sensors.
 
 A field that is the same all around its axis leaves one of a body's six degrees of freedom open:
-the turn about that axis. What the sensors do tell, jointly, is where the source is in the body's
-frame and where its axis points. That is five numbers, as a coil's pose has; a magnet before an
-array of magnetometers is tracked so, by reciprocity.
+the turn about that axis. Jointly, the sensors determine the place of the source in the body's
+frame and the direction of its axis. These are five numbers, like a coil's pose; by reciprocity, a
+magnet in front of an array of magnetometers is tracked in this way.
 """
 
 import math
@@ -161,7 +161,7 @@ class SourceFrame:
         """Return the pose turned about the axis to where its coils are nearest to the volume's
         middle.
 
-        That is the rule by which the turn that nobody sees is written.
+        This rule fixes the rotation that cannot be observed.
         """
         axis, box = self.axis.direction, self.settings.box
         wanted = (np.array(box.low) + np.array(box.high)) / 2.0 - self.axis.point

@@ -294,7 +294,7 @@ class Tracker:
     ) -> Iterator[PoseEstimate]:
         """Yield the poses of fluxes (S, K) whose readings are good or bad by ``codes`` (S,).
 
-        None is given out before all are known, for they are judged by each other.
+        None is published before all are known, because they are compared with each other.
         """
         values = flux.view(np.float64)
         coils = self._solved_coils(stamp_ns, values, codes, context)

@@ -1,6 +1,6 @@
 """Computes how well a pose is known, and whether its residual is what the noise allows.
 
-A pose is wrong by the flux noise and by what is wrong with the field model. Both enter the
+The error of a pose comes from the flux noise and from the error of the field model. Both enter the
 whitening, so the inverse of the whitened normal matrix is the covariance. Roll about a coil's axis
 is not observable: the rotation covariance is that of the tilt plus ``roll_variance a a^T``.
 """
@@ -32,7 +32,7 @@ def chi2_limit(degrees_of_freedom: int, probability: float) -> float:
 def bounded_inverse(information):  # type: ignore[no-untyped-def]
     """Return the covariance of a symmetric, positive semidefinite information matrix.
 
-    Directions that it says next to nothing of are held to `UNKNOWN_VARIANCE`.
+    Directions that it hardly determines get `UNKNOWN_VARIANCE`.
     """
     n = information.shape[0]
     scale = np.empty(n)

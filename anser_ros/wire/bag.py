@@ -1,8 +1,8 @@
 """Reads MCAP bags without ROS: raw messages for replay, and whole sessions as arrays.
 
 A bag that is complete is read through its index, in the order of its log times. A bag that was cut
-(a crash, a full disk) has no index: it is read chunk by chunk as far as it goes, every chunk
-that is whole is kept, and `Bag.lost` says in words what is gone.
+(a crash, a full disk) has no index: it is read chunk by chunk as far as it goes, every complete
+chunk is kept, and `Bag.lost` states in words what is lost.
 """
 
 import io

@@ -104,7 +104,7 @@ def told(folder: Path) -> dict[str, Any]:
     """Return what a bag's ``metadata.yaml`` tells: ``duration_s``, ``messages``, ``closed``; {}
     without.
 
-    A bag that was not closed holds more than that: its readers don't look here.
+    A bag that was not closed may hold more than that; its readers do not use this file.
     """
     try:
         document = read_yaml((folder / 'metadata.yaml').read_text('utf-8'))

@@ -1,7 +1,7 @@
 """Writes MCAP bags that survive a crash and a full disk, with or without ROS.
 
-What was written up to the last flush stays whole whatever happens: a flush ends a chunk and hands
-all of it to the system in one go, and a write that fails is taken back. So that even a full disk
+Whatever happens, the data up to the last flush stay readable: a flush ends a chunk and hands all
+of it to the system in one go, and a write that fails is taken back. So that even a full disk
 leaves a bag with an index, a file without a name keeps the space for it.
 """
 

@@ -148,7 +148,7 @@ def cloud_bytes(
 def cloud_head(data: bytes) -> tuple[int, int, int]:
     """Return height, width and number of fields of a serialised ``sensor_msgs/PointCloud2``.
 
-    Nothing behind them is looked at, so that the size of a message costs nothing.
+    Nothing after them is read, so that the time does not depend on the size of a message.
 
     Raises
     ------

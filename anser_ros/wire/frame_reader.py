@@ -40,9 +40,9 @@ class FrameReader:
 
     After a header or CRC that is wrong the search goes on one byte behind that record's magic, so
     a good record inside or right behind a damaged one is never lost. Bytes are copied only while a
-    record is incomplete; sample blocks are views into the received bytes. Once a hello told the
-    block size, no longer payload is waited for, so that a forged length cannot hold back the
-    records behind it.
+    record is incomplete; sample blocks are views into the received bytes. Once a hello has stated
+    the block size, the reader does not wait for a longer payload, so that a forged length cannot
+    hold back the records behind it.
 
     Parameters
     ----------

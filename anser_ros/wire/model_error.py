@@ -3,13 +3,13 @@
 A point for every dipole that a mode moves: ``mode`` and ``dipole`` uint16, ``flux_error`` float32
 (T: what the model leaves unexplained) and ``follows`` uint32 (1 while every frame of
 ``reference/flux`` is answered by a model of its stamp) and ``withheld`` uint32 (0, or the code of
-the state for which no pose may be given), all three the same in all points; then
-``m<k>_re``, ``m<k>_im`` float32 (A m^2), and, again the same in all points, ``fingerprint`` uint32
-(of the model that the served one was made from; 0 where nobody tells) and ``effects`` uint32 (of
-its effects, how many a receiver has to undo). The moments are wrong by the sum of all modes, each
-times an independent unit normal number. The message has the stamp of the ``field_model`` message
-that it belongs to, and holds for later models of that size until there is another one: the
-uncertainty changes less often than the field. A receiver that does without it still has the field.
+the state for which no pose may be given), all three the same in all points; then ``m<k>_re``,
+``m<k>_im`` float32 (A m^2), and, again the same in all points, ``fingerprint`` uint32 (of the
+model that the served one was made from; 0 if unknown) and ``effects`` uint32 (of its effects, how
+many a receiver has to undo). The moments are wrong by the sum of all modes, each times an
+independent unit normal number. The message has the stamp of the ``field_model`` message that it
+belongs to, and holds for later models of that size until there is another one: the uncertainty
+changes less often than the field. A receiver that ignores this message still has the field.
 """
 
 from collections.abc import Sequence
@@ -37,9 +37,9 @@ class ModelError:
     """Holds the unexplained flux (T) and modes (R, N, K), complex, A m^2; R may be 0.
 
     ``follows`` says whether the model follows the references: each of their frames has its own.
-    ``withheld`` is 0, or the code of the state for which the server wants no pose to be given.
-    ``fingerprint`` is that of the model that the served one was made from, empty where it is not
-    told, and ``effects`` how many of its effects whoever uses it has to undo.
+    ``withheld`` is 0, or the code of the state for which the server withholds all poses.
+    ``fingerprint`` is that of the model that the served one was made from, empty if unknown, and
+    ``effects`` the number of its effects that a receiver has to undo.
     """
 
     flux_error_t: float

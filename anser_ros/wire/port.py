@@ -181,7 +181,7 @@ class ControlUnitPort:
     def send(self, command: Payload) -> int:
         """Queue a command for the reader thread to write; returns its tag.
 
-        It is lost when the port closes before; whoever sends it watches for the reply.
+        It is lost if the port closes first; the sender watches for the reply.
         """
         self._tag = self._tag % 0xFFFF + 1
         self._commands.append((self._tag, self._protocol.encode(command, self._tag)))

@@ -1,9 +1,8 @@
 """Lists the serial protocols of control units that a port can speak.
 
-A protocol turns bytes into records and commands into bytes. The records (`records.Hello`,
-`SampleBlock`, `DeviceStatus`, `Reply`) are what the rest of the package knows of any control unit:
-another unit's reader translates what it receives into them. Everything above the port stays as
-it is.
+A protocol turns bytes into records and commands into bytes. The rest of the package knows a
+control unit only by its records (`records.Hello`, `SampleBlock`, `DeviceStatus`, `Reply`): another
+unit's reader translates the received bytes into them. Everything above the port stays the same.
 """
 
 from collections.abc import Callable
@@ -31,7 +30,7 @@ class RecordReader(Protocol):
         """Take bytes as they come and return the records that they complete.
 
         It must not raise, whatever the bytes are: an exception closes the port, which is opened
-        again. What cannot be read is counted, and its reason kept in ``last_refusal``.
+        again. Bytes that cannot be read are counted, and the reason is kept in ``last_refusal``.
         """
 
     def reset(self) -> None:

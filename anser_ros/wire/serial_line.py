@@ -56,9 +56,9 @@ def cause_of(error: BaseException) -> str:
 def receiver_of(port: serial.SerialBase) -> Callable[[], bytes]:
     """Return a function that waits for bytes and takes all there are; empty when time is over.
 
-    pyserial's own read costs several system calls and a byte of its own for every wake-up, which
-    at a thousand blocks a second is most of the work. Where there is a descriptor, two will do.
-    A terminal hands out four kilobytes at a time; all that is there is taken before any of it is
+    pyserial's own read costs several system calls and an extra byte for every wake-up, which at a
+    thousand blocks a second is most of the work. With a file descriptor, two calls are enough. A
+    terminal hands out four kilobytes at a time; all that is there is taken before any of it is
     looked at, so that nothing waits for the work on what came before it.
     """
     try:

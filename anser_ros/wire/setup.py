@@ -1,7 +1,8 @@
 """Reads the setup document (`anser_setup/1`): which coils drive, which listen, and where they are.
 
-The YAML text travels in every bag and on the latched topic ``setup``. Sensor positions and axes
-are given in the frame of the sensor's body; the body ``fg`` is the field generator itself.
+The YAML text is contained in every bag and published on the latched topic ``setup``. Sensor
+positions and axes are given in the frame of the sensor's body; the body ``fg`` is the field
+generator itself.
 """
 
 import difflib
@@ -82,8 +83,8 @@ class Setup:
     """Holds a validated setup document.
 
     ``volume`` holds the corners, low and high (m, frame fg), of the box in which tools are
-    tracked; None where the document leaves it to the board's size. ``tips`` holds the tips of
-    tools, by body.
+    tracked; None if the document leaves it to the board's size. ``tips`` holds the tips of tools,
+    by body.
     """
 
     frame_id: str
@@ -298,9 +299,9 @@ def parse_setup(text: str) -> Setup:
 
     Two sections are optional: ``accuracy`` states how accurate the instruments are and ``refit``
     how the live refit follows. Their keys, with units and defaults, are the fields of
-    `anser_ros.settings.Accuracy` and `anser_ros.settings.RefitSettings`; what is not stated has
-    its default. ``fingerprint`` is for other readers and is worked out anew. Any other key is kept
-    in ``extra``, unless it is nearly one of these.
+    `anser_ros.settings.Accuracy` and `anser_ros.settings.RefitSettings`; a value that is not
+    stated has its default. ``fingerprint`` is for other readers and is computed again. Any other
+    key is kept in ``extra``; one that looks like a misspelling is refused.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """Takes values of a setup document whole, or refuses them with their place in the document.
 
-All functions raise `SetupError` with one line that says where the value stands and what it is.
+All functions raise `SetupError` with one line that names the value and its place.
 """
 
 import math

@@ -27,7 +27,7 @@ class StreamControl:
 
     The order is: hello, right tones, start, samples. Each command is repeated every half second
     until the control unit does what it asks; a refusal is kept as text and not repeated. Samples
-    that come before the reply to the start were left over in some buffer.
+    that arrive before the reply to the start command are left over from a buffer.
 
     Parameters
     ----------

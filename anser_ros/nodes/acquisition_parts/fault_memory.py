@@ -34,8 +34,8 @@ MOST = 3
 class RecentFaults:
     """Remembers which counters rose, and says so for some seconds.
 
-    What was counted before the first look, while a connection began in the middle of a record,
-    is no news.
+    Faults counted before the first check, while a connection began in the middle of a record, are
+    ignored.
     """
 
     def __init__(self) -> None:

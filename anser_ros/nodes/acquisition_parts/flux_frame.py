@@ -72,8 +72,7 @@ class _Waiting:
 class WaitingFrames:
     """Holds frames until a block that was in time has confirmed their stamps.
 
-    On a line that is in time no frame waits. One that nothing confirms for `PATIENCE_NS` is
-    withheld.
+    On a punctual line no frame waits. A frame that nothing confirms for `PATIENCE_NS` is withheld.
 
     Parameters
     ----------

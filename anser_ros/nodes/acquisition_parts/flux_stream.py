@@ -125,8 +125,8 @@ class FluxStream:
     def push(self, block: SampleBlock, arrival_ns: int, *, skips: bool = False) -> list[FluxFrame]:
         """Take a block and return the frames that are complete and whose stamps are good.
 
-        A frame may wait for its stamp, and be withheld; see `WaitingFrames`. Where it ``skips``,
-        a window that is complete gives way to newer ones: it is counted and no more.
+        A frame may wait for its stamp, and be withheld; see `WaitingFrames`. If it ``skips``, a
+        complete window is only counted, in favour of newer ones.
         """
         if block.codes.shape[1] != self._cutter.columns:
             return []

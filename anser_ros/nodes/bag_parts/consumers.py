@@ -1,10 +1,10 @@
 """Tells when the nodes that listen have caught up, for a replay without a clock of its own.
 
-DDS confirms what a listener's queue has taken, not what its callbacks have worked off. But every
-node answers parameter requests from the same executor that runs its callbacks, and runs those
-first: an answer to a request that was sent after a message says that the message was handled.
-Of several that wait on one topic it may have handled only the first, so who publishes asks after
-each of them.
+DDS confirms the messages that a listener's queue has taken, not those that its callbacks have
+processed. But every node answers parameter requests from the same executor that runs its
+callbacks, and runs those first: an answer to a request that was sent after a message says that the
+message was handled. If several messages wait on one topic it may have handled only the first, so
+the publisher asks after each of them.
 """
 
 import threading

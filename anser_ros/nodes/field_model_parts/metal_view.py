@@ -64,7 +64,7 @@ def centroid_message(metal: Metal, frame_id: str, stamp_ns: int) -> PointStamped
 def metal_markers(metal: Metal | None, frame_id: str, stamp_ns: int) -> MarkerArray:
     """Return spheres as large as the space they stand for, and one at the centroid.
 
-    Without metal, what was shown before is taken away.
+    Without metal, the markers shown before are deleted.
     """
     if metal is None:
         gone = _marker(frame_id, stamp_ns, 0)

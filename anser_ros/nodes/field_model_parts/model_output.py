@@ -25,7 +25,7 @@ class ModelOutput(ModelWriter):
     ) -> None:
         """Publish a model, and its uncertainty where that is news.
 
-        The uncertainty goes first, so that a receiver has both when the model comes.
+        The uncertainty is published first, so that a receiver has both when the model arrives.
         """
         error = self.new_error(model, frame_id, stamp_ns, follows, code_of(withheld))
         dipoles = self.dipoles(model, frame_id, stamp_ns)

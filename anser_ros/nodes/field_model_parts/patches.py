@@ -1,7 +1,8 @@
 """Follows reference coils on patches that move: poses from a topic, fluxes among the tools'.
 
-A patch is a body of the setup whose pose somebody else tracks. Its coils join the fixed references
-for as long as pose and flux are fresh; where one is missing, they are left out and said to be.
+A patch is a body of the setup whose pose another tracker measures. Its coils join the fixed
+references for as long as pose and flux are fresh; where one is missing, they are left out, and
+reported.
 """
 
 from concurrent.futures import Future, ThreadPoolExecutor

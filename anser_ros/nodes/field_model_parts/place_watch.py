@@ -74,8 +74,8 @@ class PlaceWatch:
     def look(self, frame: Frame, window: ReadingWindow) -> bool:
         """Return whether the verdict is another one after a frame, or the first.
 
-        The first frame with enough readings tells; after that a model that was found to lie aside
-        is asked again with every whole window.
+        The first frame with enough readings decides; after that a model that was found to be
+        displaced is checked again with every whole window.
         """
         is_first, self._has_heard = self.is_open, True
         if self._place is None or (self._has_looked and not (self.misplaced and window.full)):

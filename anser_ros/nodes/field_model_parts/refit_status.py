@@ -48,8 +48,8 @@ def refit_values(result: RefitResult | None) -> dict[str, object]:
 def refit_words(result: RefitResult | None, refused: str = '', making: str = '') -> str:
     """Return what the refit did in this frame, and why where something was in its way.
 
-    ``refused`` is why a baseline that was asked for since then is none, ``making`` how far the
-    refit to another one is.
+    ``refused`` is why a baseline that was requested since then is not in force, ``making`` the
+    progress of the refit to another one.
     """
     words = f'; a new baseline was refused: {refused}' if refused else ''
     words += f'; the next {making}' if making else ''

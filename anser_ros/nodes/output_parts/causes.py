@@ -1,6 +1,6 @@
 """Tells why things are as they are, in the words of the nodes' diagnostics, the gravest first.
 
-A service answers with the same words, as both come from the node that knows.
+A service answers with the same words, because both come from the node concerned.
 """
 
 from collections.abc import Mapping

@@ -1,7 +1,7 @@
 """Looks at topics now and then: between two looks a message costs no Python.
 
-An executor runs Python for each message. A display that is renewed a few times a second needs
-only the newest one: the middleware keeps as many as the depth says, and they are taken together.
+An executor runs Python for each message. A display that is updated a few times a second needs only
+the newest one: the middleware keeps as many as the queue is deep, and they are taken together.
 """
 
 from collections.abc import Callable

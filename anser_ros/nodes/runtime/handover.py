@@ -1,7 +1,7 @@
 """Hands frames and models from node to node in one process: as objects, without the middleware.
 
-What is handed over is published all the same, for the recorder and everybody else. A node that
-gets a topic so has no subscription to it: it would do everything twice.
+A message that is handed over is also published, for the recorder and all other subscribers. A node
+that receives a topic in this way has no subscription to it: it would process everything twice.
 """
 
 import math
@@ -91,8 +91,8 @@ class Aside:
 class Handover:
     """Keeps the topics that nodes of this process offer each other, by their full names.
 
-    Who gives frames says when there is a pause before the next: what the nodes say of themselves
-    is put off until then, so that no pose waits for it.
+    The node that hands over frames reports when there is a pause before the next: diagnostics are
+    put off until then, so that no pose waits for them.
     """
 
     def __init__(self) -> None:
@@ -105,7 +105,7 @@ class Handover:
     def offer(self, topic: str, *, lasts: bool = False) -> None:
         """Promise to give what is published on a topic.
 
-        Who takes it later gets the last one at once where it ``lasts``.
+        A receiver that registers later gets the last one at once if it ``lasts``.
         """
         self._offered[topic] = lasts
 

@@ -238,7 +238,8 @@ class AnserNode(Node):
     ):
         """Subscribe as rclpy does, with the callback guarded, and what is too large refused.
 
-        What a node of this process hands over goes to ``handed``, by default the callback too.
+        An object handed over by a node of this process goes to ``handed``, by default to the
+        callback.
         """
         bounded = incoming.is_bounded(msg_type) and not options.get('raw', False)
 

@@ -20,7 +20,7 @@ WILDCARDS = ('*', '**')
 def _documents(arguments: Sequence[str]) -> Iterator[tuple[str, Any]]:
     """Yield the path and content of each parameter file among a process's arguments.
 
-    What cannot be read or is no YAML is left out: rclpy refuses it.
+    Files that cannot be read or are not YAML are left out: rclpy refuses them.
     """
     for option, value in itertools.pairwise(arguments):
         if option != OPTION:
@@ -35,8 +35,8 @@ def _documents(arguments: Sequence[str]) -> Iterator[tuple[str, Any]]:
 def complaints(arguments: Sequence[str], node: str) -> list[str]:
     """Return one line for each parameter file without a section for a node.
 
-    rclpy drops such a file without a word, and the node runs with its defaults. A file that is
-    none is left to rclpy, which refuses it.
+    rclpy ignores such a file silently, and the node runs with its defaults. A file that is not a
+    parameter file is left to rclpy, which refuses it.
 
     Parameters
     ----------

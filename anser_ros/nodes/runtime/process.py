@@ -93,8 +93,7 @@ def main(
 def _choose_profile() -> None:
     """Let the middleware announce nodes more often, and give back the memory of messages.
 
-    The first is so that nodes find each other at once, the second so that a huge message leaves
-    nothing behind.
+    The first lets nodes find each other at once, the second releases the memory of a huge message.
     """
     if not any(os.environ.get(variable) for variable in PROFILE_VARIABLES):
         os.environ[PROFILE_VARIABLES[0]] = str(config_path(PROFILES))
@@ -140,7 +139,8 @@ def _meant_for(
 ) -> tuple[list[str], dict[str, list[str]]]:
     """Split off the parameters of one node among several, ``-p NODE:NAME:=VALUE``.
 
-    ROS has this too, but finds no node so that is in a namespace, and drops the value.
+    ROS can do this too, but does not find a node in a namespace in this way, and ignores the
+    value.
     """
     common, meant = [], {node.NAME: ['--ros-args'] for node in classes}
     left = iter(arguments)
@@ -180,9 +180,9 @@ class _Signals:
     """Catches SIGINT and SIGTERM from now on.
 
     rclpy's own handlers end the context at once, so that a node could neither close its files
-    in order nor say its last word in ``/diagnostics``. A node that is still being made is given
-    up on the spot; one whose main thread does not get round to noticing, for a kernel is being
-    compiled, is ended by a thread that does.
+    properly nor publish its last diagnostics. A node that is still being constructed is abandoned
+    at once; one whose main thread cannot react, because a kernel is being compiled, is ended by
+    another thread.
     """
 
     def __init__(self) -> None:

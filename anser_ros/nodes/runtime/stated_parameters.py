@@ -1,7 +1,7 @@
 """Makes node parameters of `anser_ros.settings`, whose values the setup document may state too.
 
-A parameter that is 0, its default, leaves the value to the setup document; any other goes before
-it. The names, ranges and meanings are those of `anser_ros.settings.VALUES`.
+A parameter that is 0, its default, leaves the value to the setup document; any other value takes
+precedence. The names, ranges and meanings are those of `anser_ros.settings.VALUES`.
 """
 
 import dataclasses

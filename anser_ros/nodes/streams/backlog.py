@@ -1,8 +1,8 @@
 """Tells when a node has fallen behind what it receives, so far that it won't catch up by itself.
 
-Poses that are late by several windows are of no use to anybody who steers by them, so a node that
-is slower than its input drops what waits and takes the newest. One that only paused is left to
-catch up: it loses nothing.
+Poses that are late by several windows are useless for guidance, so a node that is slower than its
+input discards the waiting messages and takes the newest. A node that only paused may catch up, and
+loses nothing.
 """
 
 from collections import deque
@@ -41,7 +41,7 @@ class Backlog:
     def arrived(self, received_ns: int, stamp_ns: int) -> None:
         """Note when the middleware received the message that is worked on next, and its stamp.
 
-        Messages that come in a burst are no faster than their stamps.
+        A burst of messages does not count as faster than its stamps.
         """
         last, self._last = self._last, (received_ns, stamp_ns)
         if last[0]:

@@ -1,6 +1,6 @@
 """Reads flux messages into arrays; what is no flux message of the setup is refused and counted.
 
-What a frame says beyond its layout is judged by `frames.intake`.
+The contents of a frame, beyond its layout, are judged by `frames.intake`.
 """
 
 from sensor_msgs.msg import PointCloud2

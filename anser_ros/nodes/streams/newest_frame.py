@@ -89,7 +89,7 @@ def newest_of(
 def take_waiting(subscription: Any) -> list[Any]:
     """Return messages, as bytes and with their information, that wait in a queue, oldest first.
 
-    They leave the queue so.
+    This removes them from the queue.
     """
     taken = []
     with subscription.handle:

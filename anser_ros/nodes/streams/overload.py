@@ -6,8 +6,8 @@ import os
 def too_slow(skipped: int, worked: int) -> str:
     """Return what part of the windows since the last look gave way to newer ones; empty for none.
 
-    The load is the system's own mean over the last minute, in processes that want a core; of how
-    many cores there are.
+    The load is the system's own mean over the last minute, in processes that need a core; the
+    number of cores is given with it.
     """
     if not skipped:
         return ''

@@ -4,7 +4,7 @@ The graph shows who subscribes to the fluxes and to the poses that the setup pro
 the nodes that work on fluxes are running. ``/diagnostics`` tells whether the tracker has the
 setup, its model, and everybody connected who wants its poses (``ready_for``), how many those are
 (``pose_listeners``: it may not know yet whom the replay knows), and that its model is the one that
-``field_model`` serves. Who begins to listen later than that can't be waited for.
+``field_model`` serves. A subscriber that starts later than that cannot be waited for.
 """
 
 import hashlib

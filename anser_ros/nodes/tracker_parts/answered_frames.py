@@ -2,8 +2,8 @@
 
 A server that follows the references answers each of their frames by a model with its stamp. A tool
 frame is tracked with the model of its own stamp, or the newest before it, so it waits for the
-answer: a few milliseconds, and never longer than it may. That makes live poses those that are
-found offline. Where nobody answers, no frame waits.
+answer: a few milliseconds, and never longer than it may. So live poses are the same as offline. If
+there is no such server, no frame waits.
 """
 
 import math
@@ -69,7 +69,7 @@ class AnsweredFrames(Generic[Model, Frame]):
     def add_frame(self, stamp_ns: int, frame: Frame, now_s: float, longest_wait_s: float) -> None:
         """Take a frame, and track it once its model is there, at most so much later.
 
-        One that is not to wait, with 0, is not late.
+        A frame that should not wait, with 0, is not late.
         """
         until_s = now_s + longest_wait_s if longest_wait_s > 0 else NOT_AT_ALL
         self._frames.append((stamp_ns, frame, until_s))

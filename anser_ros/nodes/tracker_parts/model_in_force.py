@@ -80,7 +80,7 @@ class ModelInForce:
     def _difference(self, given: GivenModel) -> str:
         """In what the published model is not the one whose effects are undone; empty where it is.
 
-        What tells no fingerprint passes: there is nothing to compare.
+        A model without a fingerprint passes: there is nothing to compare.
         """
         error, own = given.error, self._file_model
         if error is None or not error.fingerprint:

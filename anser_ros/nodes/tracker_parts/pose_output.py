@@ -106,7 +106,8 @@ class PoseTopic:
     def publish_covariance(self) -> None:
         """Publish the good pose just taken once more, with its covariance.
 
-        A step of its own, so that no sensor's plain pose waits for what else is made of another's.
+        This is a separate step, so that no sensor's plain pose waits for the other messages of
+        another sensor.
         """
         if self.estimate is None or self.estimate.state != OK:
             return

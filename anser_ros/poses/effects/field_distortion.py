@@ -130,7 +130,7 @@ class FieldDistortion(PoseEffect):
     def shift_and_variance(self, term: Term, position: Array, sigma: Array) -> tuple[Array, Array]:
         """Return what is added to positions (n, 3), m, and its variance per coordinate (n,), m^2.
 
-        The parameters' standard deviations ``sigma``, mm, are taken for independent.
+        The parameters' standard deviations ``sigma``, mm, are taken as independent.
         """
         moved = self._derivative(term, position)
         spread = np.broadcast_to(sigma, term.theta.shape)

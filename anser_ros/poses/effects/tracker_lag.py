@@ -22,8 +22,8 @@ delay, beyond a quarter nobody would work with the tracker."""
 class TrackerLag(PoseEffect):
     """Theta is the time constant, s, of a first-order low pass on position and rotation.
 
-    A filter's first order is a delay, so only what it rounds off tells it from one: it has no
-    slopes of its own, and is tried at some time constants beside a free time offset.
+    To first order a filter is a delay, so only its smoothing distinguishes it from one: it has no
+    slopes of its own, and is tried at several time constants beside a free time offset.
     """
 
     name = 'tracker_lag'
