@@ -35,7 +35,8 @@ def test_the_names_in_the_recipes_are_those_of_the_code():
         'wire/protocols.py': ('RecordReader', 'PROTOCOLS'),
         'cli/commands.py': ('NODES', 'OFFLINE'),
         'physics/board.py': ('KINDS',),
-        'tracking/estimate.py': ('STATES', 'TrackerSettings'),
+        'pose_states.py': ('STATES',),
+        'tracking/estimate.py': ('TrackerSettings',),
         'cli/measured.py': ('RECIPES',),
         'tracking/solve_verdict.py': ('verdict',),
     }.items():
