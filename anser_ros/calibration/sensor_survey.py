@@ -76,6 +76,9 @@ later steps find their own. Smaller holds the first steps to a poor drawing; lar
 take up what is the sensors'. Its choice is not recorded."""
 LEAST_FIELD_WIDTH = 1e-3
 """Least such width: no board is made more exactly than that."""
+FEWEST_READINGS = 7.0
+"""Readings for each mode of the field from which on sensors are looked at although there are fewer
+poses than modes. Nine coils on 75 poses, 6 a mode, had a clock 7 ms off with no doubt about it."""
 FIT_NOISE = 10.0
 """Noise of the first step as a multiple of the fluxes' own."""
 
@@ -160,8 +163,10 @@ class SensorSurveyor:
         total = COARSE_STEPS + 3 * FINE_STEPS
         tools = self._tools(COARSE_ROWS)
         self._start(tools)
-        # With fewer poses than modes of the field, errors of any size would seem certain.
-        if sum(len(tool.weights) for tool in tools) < self.modes.size.size:
+        # With too few to tell noise from modes of the field, errors of any size seem certain.
+        poses, modes = sum(len(tool.weights) for tool in tools), self.modes.size.size
+        readings = sum(int(m.usable.sum()) for m in self.measured)
+        if poses < modes and readings < FEWEST_READINGS * modes:
             self.parameters = self.parameters.fixed()
             self.population = Population(self.parameters)
             self.values = np.zeros(0)
