@@ -5,9 +5,10 @@ from typing import Any
 import numpy as np
 
 from anser_ros.calibration.factors import as_real
-from anser_ros.calibration.held_out import rms
+from anser_ros.calibration.held_out import HeldOut, rms
 from anser_ros.calibration.moments import MomentFit
 from anser_ros.calibration.optical_noise import OpticalNoise
+from anser_ros.calibration.requirements import FEWEST_FRAMES
 from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.survey_records import untold_words
 from anser_ros.field.model import EffectRecord
@@ -49,6 +50,7 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
             'fit_noise_t': calibration.fit.noise_t,
             'outlier_fraction': _outlier_fraction(calibration.fit),
         },
+        **_by_pose(held_out),
         'choice': {
             'layout': calibration.layout.describe(),
             'damping': calibration.damping,
@@ -73,6 +75,22 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
         'shift_sigma_m': calibration.model.shift_sigma_m,
         'contradictions': list(calibration.contradictions),
         'optical_noise': None if scan.survey is None else _optical(scan.survey.optical),
+    }
+
+
+def _by_pose(held_out: HeldOut) -> dict[str, Any]:
+    """Errors of single poses, where so few were recorded that each is worth a look."""
+    if len(held_out.place) >= FEWEST_FRAMES:
+        return {}
+    order = np.lexsort(held_out.place.T)
+    return {
+        'heldout_by_pose': [
+            {
+                'position_m': held_out.place[k].tolist(),
+                'flux_rmse_t': float(held_out.frame_rmse_t[k]),
+            }
+            for k in order
+        ]
     }
 
 

@@ -46,6 +46,10 @@ class HeldOut:
         phasor component, with the noise subtracted.
     n_dipoles : int
         Number of dipoles of the model that was tested.
+    place : ndarray, shape (F, 3)
+        Where each frame's body was, m, frame fg.
+    frame_rmse_t : ndarray, shape (F,)
+        Root mean square magnitude of each frame's ``error``, T.
     """
 
     error: ComplexArray
@@ -55,6 +59,8 @@ class HeldOut:
     flux_noise_t: float
     flux_error_t: float
     n_dipoles: int
+    place: Array
+    frame_rmse_t: Array
 
     @property
     def score_t(self) -> float:
@@ -101,19 +107,25 @@ def predict_held_out(
     noise = min(part.fit.noise_t for _, part in fits) if noise_t is None else noise_t
     quadrature = min(part.fit.quadrature_noise_t for _, part in fits)
     flux_noise = min(noise, quadrature if flux_noise_t is None else flux_noise_t)
-    tally = _Tally(noise, flux_noise, accuracy, len(fits[0][1].dipoles))
+    tally = HeldOutTally(noise, flux_noise, accuracy, len(fits[0][1].dipoles))
     for fold, part_fit in fits:
         for m, f in zip(measurements, folds, strict=True):
             test = with_pose(m.frames(f == fold))
             for block in frame_blocks(len(test.time), len(test.sensors)):
                 part = test.frames(block)
                 terms = pose_terms(part, part_fit.dipoles, part_fit.fit.moments)
-                tally.add(terms, usable_weights(part))
+                tally.add(terms, usable_weights(part), part.position)
     return tally.result()
 
 
-class _Tally:
-    """Gathers held-out residuals of all folds and sums them up."""
+class HeldOutTally:
+    """Gathers held-out residuals of all folds and sums them up.
+
+    Parameters
+    ----------
+    noise_t, flux_noise_t, accuracy, n_dipoles
+        As in `HeldOut` and for `predict_held_out`.
+    """
 
     def __init__(
         self, noise_t: float, flux_noise_t: float, accuracy: Accuracy, n_dipoles: int
@@ -124,8 +136,11 @@ class _Tally:
         self.left: list[ComplexArray] = []
         self.chi: list[Array] = []
         self.excess: list[Array] = []
+        self.place: list[Array] = []
+        self.frame_power: list[Array] = []
 
-    def add(self, terms: PoseTerms, weights: Array) -> None:
+    def add(self, terms: PoseTerms, weights: Array, place: Array) -> None:
+        """Take in frames with weights (F, S) of their readings, and places (F, 3), m."""
         if terms.residual.shape[0] == 0:
             return
         white = PoseWhitener(terms.slope, weights, self.noise_t, self.precision)
@@ -133,9 +148,14 @@ class _Tally:
         self.error.append(_complex_rows(terms.residual, used))
         self.left.append(_complex_rows(white.left_over(terms.residual), used))
         self.chi.append(white.chi_square(terms.residual))
+        emitters = terms.residual.shape[2] / 2.0
+        power = (terms.residual**2).sum(axis=2) * used / emitters
+        self.place.append(place)
+        self.frame_power.append(power.sum(axis=1) / np.maximum(used.sum(axis=1), 1))
         self.excess.append(white.excess_power(terms.residual, self.flux_noise_t))
 
     def result(self) -> HeldOut:
+        """Return the figures of all frames that were taken in."""
         error, left = np.concatenate(self.error), np.concatenate(self.left)
         components = 2 * error.size
         # The median leaves out outliers and the frames beyond the edge of what was fitted.
@@ -148,6 +168,8 @@ class _Tally:
             flux_noise_t=self.flux_noise_t,
             flux_error_t=float(np.sqrt(max(excess, 0.0))),
             n_dipoles=self.n_dipoles,
+            place=np.concatenate(self.place),
+            frame_rmse_t=np.sqrt(np.concatenate(self.frame_power)),
         )
 
 

@@ -57,9 +57,10 @@ class Layout:
 
     Attributes
     ----------
-    kind : {'layer', 'layer_xyz', 'coils', 'coaxial', 'drawing'}
+    kind : {'layer', 'layer_xyz', 'coils', 'coaxial', 'drawing', 'free'}
         A layer of z-dipoles, a layer of dipoles with three free components, z-dipoles on the
-        coils, dipoles along an axis of its own for each coil, or those of the drawn coils.
+        coils, dipoles along an axis of its own for each coil, those of the drawn coils, or some
+        about each coil and ``count`` beside them, each where the data put it.
     count : int
         Number of dipoles along a side of the layer, of each coil, along each axis, or in all.
     extension : float
@@ -89,6 +90,11 @@ class Layout:
         drawn += ', in overlapping regions' if self.local else ''
         if self.kind == 'coaxial':
             return f'{self.count} on an axis of its own for every emitter, place and axis free'
+        if self.kind == 'free':
+            return (
+                f'three-component dipoles at 7 places about every emitter, place free, and at '
+                f'{self.count} beside them'
+            )
         if self.kind == 'drawing':
             return f'{self.count} of the drawn coils, each coil placed where it fits, pulled to it'
         if self.kind == 'coils':

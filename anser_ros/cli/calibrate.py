@@ -14,6 +14,7 @@ from anser_ros.calibration.document import to_document
 from anser_ros.calibration.layouts import Layout
 from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.sensor_parameters import EXTRA_KINDS, KINDS
+from anser_ros.calibration.still import STILL_ONLY
 from anser_ros.cli.calibration_figure import draw_choice, draw_populations
 from anser_ros.cli.output import Result, check_file, loss_notes, make_folder, say
 from anser_ros.cli.populations import population_table, populations
@@ -25,6 +26,10 @@ from anser_ros.sessions.calibration import calibrate_sessions, check_same_board
 from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.session import load_session
 
+NAMED_KINDS = (*EXTRA_KINDS, *STILL_ONLY)
+"""Kinds of errors that are looked for only when they are named."""
+MOST_LISTED = 40
+"""Entries of a list that are shown; of more, their number is."""
 LONG = ('values', 'uncertainty', 'axes')
 """Parameters of a population that are tables, which are shown by themselves."""
 
@@ -62,7 +67,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         '--estimate', type=_kinds, default=KINDS, metavar='LIST',
         help='find these of sensors and clock together with the field, where the scan speaks for '
         f'them; "none" takes all as the setup says; by default {",".join(KINDS)}; '
-        f'{",".join(EXTRA_KINDS)} only when named',
+        f'{",".join(NAMED_KINDS)} only when named',
     )  # fmt: skip
     parser.add_argument(
         '--damping', type=float, help='damping of the moments; chosen by held-out error by default'
@@ -81,12 +86,10 @@ def _kinds(text: str) -> tuple[str, ...]:
     if text == 'none':
         return ()
     kinds = tuple(part for part in text.split(',') if part)
-    known = (*KINDS, *EXTRA_KINDS)
+    known = (*KINDS, *NAMED_KINDS)
     unknown = [kind for kind in kinds if kind not in known]
     if unknown or not kinds:
-        raise argparse.ArgumentTypeError(
-            f'must be among {",".join((*KINDS, *EXTRA_KINDS))}, got {text!r}'
-        )
+        raise argparse.ArgumentTypeError(f'must be among {",".join(known)}, got {text!r}')
     return kinds
 
 
@@ -188,6 +191,8 @@ def _populations(calibration: Calibration) -> Iterator[Table]:
 
 
 def _short(value: Any) -> str:
+    if isinstance(value, list) and len(value) > MOST_LISTED:
+        return f'{len(value)} of them'
     if isinstance(value, list):
         return '[' + ' '.join(_short(v) for v in value) + ']'
     return f'{value:.5g}' if isinstance(value, float) else str(value)

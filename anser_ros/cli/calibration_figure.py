@@ -12,7 +12,11 @@ from anser_ros.cli.populations import population_figure
 
 
 def draw_choice(calibration: Calibration, path: Path) -> None:
-    """Draw held-out errors by the number of dipoles, and by damping for the six best layouts."""
+    """Draw held-out errors by the number of dipoles, and by damping for the six best layouts;
+    nothing is drawn where no layouts were compared.
+    """
+    if not calibration.candidates:
+        return
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 5.4), layout='constrained')
     for mark, name, chosen in (
         ('o', 'placed', lambda layout: not layout.moved),

@@ -11,7 +11,9 @@ from anser_ros.calibration.calibrate import Options, fit_scan, survey
 from anser_ros.calibration.disturbances import outside, spans_of, unsteady_references
 from anser_ros.calibration.emitter_drift import at_strength, emitter_strength
 from anser_ros.calibration.layouts import Generator
+from anser_ros.calibration.requirements import FEWEST_FRAMES, FEWEST_POSES, MANY_SENSORS
 from anser_ros.calibration.result import Calibration, Scan
+from anser_ros.calibration.still import STILL_ONLY, calibrate_still, is_still
 from anser_ros.calibration.survey_records import drift_tellings
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
@@ -76,6 +78,17 @@ def calibrate_sessions(
     names = [Path(session.path).name for session in sessions for _ in session.tools]
     options = replace(options, accuracy=setup.accuracy)
     generator, nominal = generator_of(setup), Drawing.of(setup).model
+    if options.estimate and options.layout is None and nominal is None and is_still(measurements):
+        still = calibrate_still(
+            measurements[0], names[0], generator, setup.emitter_names, setup.frequencies_hz,
+            options.estimate, options.accuracy, progress,
+        )  # fmt: skip
+        return _for_sessions(still, sessions)
+    if not {*options.estimate}.isdisjoint(STILL_ONLY):
+        raise FitError(
+            f'{", ".join(STILL_ONLY)}: told only by {FEWEST_POSES} to {FEWEST_FRAMES - 1} poses '
+            f'of one body with at least {MANY_SENSORS} sensors, over emitters without a drawing'
+        )
     steady = [_steady(session, tool) for session in sessions for tool in session.tools]
     scan = survey(measurements, generator, options, nominal, progress, steady)
     scan = replace(scan, tellings=(*scan.tellings, *drifts))
@@ -90,6 +103,11 @@ def calibrate_sessions(
     bare = without_resting_metal(sessions, calibration, progress)
     if bare is not None:
         calibration = fitted(bare, replace(options, layout=calibration.layout))
+    return _for_sessions(calibration, sessions)
+
+
+def _for_sessions(calibration: Calibration, sessions: list[Session]) -> Calibration:
+    """A calibration whose model knows its sessions' setups, and what the references read."""
     model = calibration.model
     for session in sessions:
         model = made_for(model, session.setup)

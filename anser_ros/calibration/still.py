@@ -1,0 +1,233 @@
+"""Calibrates emitters without a drawing with few poses of a body of many sensors.
+
+A plate of a hundred three-axis sensors laid at four heights has more readings than many a scan,
+but nothing that a scan has: no poses to average over, and each sensor saw as many places as there
+are poses. Field, sensors, poses and a bend of the plate are found jointly (`still_fit`). The
+held-out error is that of each pose foretold, where it is stated to be, by all the others: field,
+sensors, noise and what is chosen come from those alone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.calibration.dipole_sites import basis_rows
+from anser_ros.calibration.factors import as_complex
+from anser_ros.calibration.held_out import HeldOut, HeldOutTally
+from anser_ros.calibration.layout_score import LayoutCandidate
+from anser_ros.calibration.layouts import Generator, Layout
+from anser_ros.calibration.moments import MomentFit, Progress
+from anser_ros.calibration.optical_noise import OpticalNoise
+from anser_ros.calibration.population import Posterior
+from anser_ros.calibration.pose_correction import pose_terms
+from anser_ros.calibration.readings import usable_weights, with_pose
+from anser_ros.calibration.requirements import (
+    FEWEST_FRAMES,
+    FEWEST_POSES,
+    MANY_SENSORS,
+    check_measurements,
+)
+from anser_ros.calibration.result import Calibration, Scan, provenance, residuals
+from anser_ros.calibration.sensor_parameters import SensorParameters, Survey
+from anser_ros.calibration.still_fit import STEPS, StillFit, StillFitter
+from anser_ros.calibration.still_model import POSE, StillModel
+from anser_ros.calibration.survey_records import corrections
+from anser_ros.calibration.survey_result import SurveyResult
+from anser_ros.field.measurements import Measurements
+from anser_ros.field.model import EffectRecord, FieldModel
+from anser_ros.settings import Accuracy
+
+Array = NDArray[np.float64]
+
+STILL_KINDS = ('gains', 'axes', 'bend')
+"""Kinds of errors that few poses of many sensors tell."""
+STILL_ONLY = ('bend',)
+"""Those of them that nothing else tells."""
+POPULATIONS = ('gains', 'axes')
+"""Those of them that every sensor has a value of."""
+
+
+def is_still(measurements: Sequence[Measurements]) -> bool:
+    """Return whether there are few poses of one body with many sensors, and no more."""
+    frames = sum(int(m.usable.any(axis=1).sum()) for m in measurements)
+    many = len(measurements) == 1 and len(measurements[0].sensors) >= MANY_SENSORS
+    return many and FEWEST_POSES <= frames < FEWEST_FRAMES
+
+
+def calibrate_still(
+    measurements: Measurements,
+    name: str,
+    generator: Generator,
+    emitters: tuple[str, ...],
+    frequencies_hz: tuple[float, ...],
+    kinds: Sequence[str],
+    accuracy: Accuracy,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Fit field, sensors, poses and bends of a body's frames.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        Frames of one body, with poses.
+    name : str
+        Of the session.
+    generator : Generator
+        Rough places of the emitters.
+    emitters, frequencies_hz : tuple, length K
+        Names of the emitters, and their frequencies, Hz.
+    kinds : sequence of str
+        What is looked for, of `STILL_KINDS`; others are left as the setup says.
+    accuracy : Accuracy
+        Noise to begin with, and errors of the poses.
+    progress : callable, optional
+        Called with the name of the stage and its finished fraction.
+
+    Raises
+    ------
+    FitError
+        When the readings lie in one plane, or are all zero.
+    """
+    check_measurements([measurements], 1, field_alone=True)
+    posed = with_pose(measurements)
+    looked_for = tuple(kind for kind in STILL_KINDS if kind in kinds)
+
+    def fitted(part: Measurements) -> StillFit:
+        return StillFitter(part, generator.centres, looked_for, accuracy).fit()
+
+    frames = np.arange(len(posed.time))
+    folds = []
+    for frame in frames:
+        if progress is not None:
+            progress('each pose from the others', frame / (len(frames) + 1.0))
+        folds.append(fitted(posed.frames(frames != frame)))
+    fit = fitted(posed)
+    held_out = _held_out(posed, folds, accuracy)
+    scan = _scan(posed, len(measurements.time), fit, accuracy)
+    moments = _moments(posed, fit)
+    layout = Layout('free', fit.beside, 1.0, 0.0)
+    model = FieldModel(
+        positions=fit.sites.positions,
+        directions=fit.sites.directions,
+        moments=moments,
+        emitters=emitters,
+        frequencies_hz=frequencies_hz,
+        flux_error_t=held_out.flux_error_t,
+        effects=scan.corrections,
+    )
+    calibration = Calibration(
+        model, _moment_fit(scan, fit, moments), held_out, None, (),
+        LayoutCandidate(layout, fit.sites, 0.0, held_out.score_t, ()), layout, 0.0,
+        int(posed.usable.sum()), residuals(scan.measurements, model), scan,
+    )  # fmt: skip
+    return replace(calibration, model=replace(model, provenance=provenance(calibration, [name])))
+
+
+def _moments(measured: Measurements, fit: StillFit) -> NDArray[np.complex128]:
+    found = fit.unknowns.moments
+    return as_complex(found) if StillModel.has_quadrature(measured) else found.astype(complex)
+
+
+def _columns(fit: StillFit) -> tuple[tuple[str, slice], ...]:
+    """Which columns of the sensors' unknowns are gains, and which are tilts of the axes."""
+    gains = fit.unknowns.sensors.shape[1] - 2
+    return ('gains', slice(0, gains)), ('axes', slice(gains, None))
+
+
+def _parameters(measured: Measurements, fit: StillFit) -> tuple[SensorParameters, Array, Array]:
+    """The sensors' errors as parameters of a survey: their values and standard deviations."""
+    parameters = SensorParameters([measured], POPULATIONS)
+    values, sigma = np.zeros(len(parameters)), np.zeros(len(parameters))
+    for kind, columns in _columns(fit):
+        own = fit.unknowns.sensors[:, columns]
+        rows = parameters.rows(kind).reshape(len(own), -1)[:, : own.shape[1]]
+        values[rows], sigma[rows] = own, fit.sensor_sigma[:, columns]
+    return parameters, values, sigma
+
+
+def _survey(measured: Measurements, fit: StillFit) -> Survey:
+    parameters, values, _ = _parameters(measured, fit)
+    return parameters.survey(measured.body, values)
+
+
+def _held_out(posed: Measurements, folds: Sequence[StillFit], accuracy: Accuracy) -> HeldOut:
+    """Sum up each frame's residual, its sensors and its field as the other frames tell them."""
+    noise = min(fit.widths.noise_t for fit in folds)
+    tally = HeldOutTally(noise, noise, accuracy, max(len(fit.sites) for fit in folds))
+    for frame, fit in enumerate(folds):
+        part = posed.frames(np.array([frame]))
+        sound = _survey(part, fit).apply(part)
+        terms = pose_terms(sound, fit.sites, _moments(posed, fit))
+        tally.add(terms, usable_weights(sound), sound.position)
+    return tally.result()
+
+
+def _scan(posed: Measurements, frames: int, fit: StillFit, accuracy: Accuracy) -> Scan:
+    """The frames as sound sensors on a flat body would have given them, and what was not sound;
+    ``frames`` are those of the session, without a pose too.
+    """
+    parameters, values, sigma = _parameters(posed, fit)
+    width = np.zeros(len(parameters))
+    for kind, columns in _columns(fit):
+        found = fit.widths.sensors[columns]
+        rows = parameters.rows(kind).reshape(len(posed.sensors), -1)
+        width[rows[:, : len(found)]] = found
+    offsets = fit.unknowns.frames[:, :POSE]
+    poses = OpticalNoise(
+        float(np.sqrt(np.mean(offsets[:, :3] ** 2))),
+        float(np.sqrt(np.mean(offsets[:, 3:] ** 2))),
+        float(len(offsets)),
+    )
+    every = np.ones(frames, dtype=bool)
+    evidence = {kind: gain for kind, gain in fit.evidence.items() if kind in POPULATIONS}
+    result = SurveyResult(
+        parameters,
+        Posterior(values, width, np.diag(sigma**2), fit.log_evidence),
+        tuple(kind for kind in POPULATIONS if kind not in evidence),
+        evidence, fit.widths.noise_t, poses, {kind: np.zeros(0, np.int64) for kind in POPULATIONS},
+        (every,), (every,), 0.0, {},
+    )  # fmt: skip
+    model = StillModel(posed, StillModel.has_quadrature(posed))
+    flat = model.sound(fit.unknowns, fit.sites)
+    sound = result.survey(posed.body).apply(flat)
+    return Scan((sound,), accuracy, corrections(result), _bends(posed, fit), result)
+
+
+def _bends(posed: Measurements, fit: StillFit) -> tuple[EffectRecord, ...]:
+    """The bend of the body in each frame, as one telling: another session's is another."""
+    if 'bend' not in fit.evidence:
+        return ()
+    model = StillModel(posed, StillModel.has_quadrature(posed))
+    assert model.bend is not None
+    shift, _ = model.bend.shape(fit.unknowns.frames[:, POSE:])
+    lift = shift @ model.bend.normal
+    return (
+        EffectRecord(
+            'body_bend',
+            {
+                'body': posed.body,
+                'rms_m': np.sqrt(np.mean(lift**2, axis=1)).tolist(),
+                'largest_m': float(np.abs(lift).max()),
+            },
+            {},
+            {'log_probability': fit.evidence['bend']},
+        ),
+    )
+
+
+def _moment_fit(scan: Scan, fit: StillFit, moments: NDArray[np.complex128]) -> MomentFit:
+    basis = basis_rows(scan.measurements[0], fit.sites)
+    size = np.linalg.svd(basis / np.linalg.norm(basis, axis=0), compute_uv=False)
+    return MomentFit(
+        moments=moments,
+        measurements=scan.measurements,
+        weights=(fit.weights,),
+        noise_t=fit.widths.noise_t,
+        quadrature_noise_t=fit.widths.noise_t,
+        rank=int((size > size[0] * len(basis) * np.finfo(float).eps).sum()),
+        freedom=fit.freedom,
+        condition=float(size[0] / max(size[-1], np.finfo(float).tiny)),
+        alternations=STEPS,
+    )

@@ -1,0 +1,197 @@
+"""Few poses of a plate with many three-axis sensors: field, sensors, poses and bend (simulated).
+
+Three emitters without a drawing make constant fields, and a piece of iron beside the plate one of
+its own. Whatever is found is compared with what was put in.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from anser_ros.calibration.dipole_sites import DipoleSites
+from anser_ros.calibration.document import to_document
+from anser_ros.calibration.layouts import Generator
+from anser_ros.calibration.smooth_bend import SmoothBend
+from anser_ros.calibration.still import calibrate_still, is_still
+from anser_ros.calibration.still_fit import StillFitter
+from anser_ros.calibration.still_model import POSE, StillModel, StillUnknowns
+from anser_ros.errors import FitError
+from anser_ros.field.measurements import Measurements
+from anser_ros.physics.dipole import dipole_field
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.tangent import tilted
+from anser_ros.settings import Accuracy
+
+CENTRES = np.array([[-0.08, 0.02, 0.0], [0.09, -0.01, 0.0], [0.0, 0.1, 0.0]])
+DIRECTIONS = np.array([[0.0, 0.2, 0.98], [0.6, 0.0, 0.8], [0.0, -0.6, 0.8]])
+IRON_AM2 = np.array([[0.3, 0.1, 0.2], [-0.1, 0.3, 0.1], [0.2, 0.2, -0.2]])
+STRENGTH_AM2 = 60.0
+IRON_M = np.array([0.13, 0.05, 0.3])
+NOISE_T = 1e-6
+HEIGHTS_M = np.array([0.24, 0.27, 0.3, 0.33])
+KINDS = ('gains', 'axes', 'bend')
+STATED = Accuracy(flux_noise_t=1e-5, optical_position_m=1e-3, optical_rotation_rad=5e-3)
+
+
+def plate(per_side=5):
+    """A square of three-axis sensors, 4 cm apart."""
+    steps = 0.04 * (np.arange(per_side) - (per_side - 1) / 2)
+    grid = np.array([[x, y, 0.0] for x in steps for y in steps])
+    count = 3 * len(grid)
+    return SensorTable(
+        np.arange(count), tuple(f's{k}' for k in range(count)), ('plate',) * count,
+        np.repeat(grid, 3, axis=0), np.tile(np.eye(3), (len(grid), 1)), np.zeros(count),
+    )  # fmt: skip
+
+
+def field(points, emitter, iron):
+    """Field (P, 3), T, of one emitter, a magnet of some size, and of the iron that it drives."""
+    half = 0.02 * DIRECTIONS[emitter]
+    places = np.array([CENTRES[emitter] - half, CENTRES[emitter] + half])
+    along, moments = np.tile(DIRECTIONS[emitter], (2, 1)), np.full((2, 1), STRENGTH_AM2 + 0j)
+    if iron:
+        size = np.linalg.norm(IRON_AM2[emitter])
+        places, along = np.vstack([places, IRON_M]), np.vstack([along, IRON_AM2[emitter] / size])
+        moments = np.vstack([moments, [[size + 0j]]])
+    return dipole_field(points, places, along, moments)[..., 0].real
+
+
+def recorded(seed, *, gain=0.02, tilt=0.03, bend=5e-4, iron=True, turn=2e-3, per_side=5):
+    """The plate's frames with these errors, and what they were."""
+    rng = np.random.default_rng(seed)
+    sensors, frames = plate(per_side), len(HEIGHTS_M)
+    gains = 1.0 + gain * rng.normal(size=len(sensors))
+    tilts = tilt * rng.normal(size=(len(sensors), 2))
+    shape = SmoothBend.of(sensors)
+    terms = bend * rng.normal(size=(frames, shape.terms))
+    shift, turned = shape.shape(terms)
+    axes = tilted(sensors.axis, tilts)[None] + np.zeros((frames, 1, 1))
+    axes = axes + np.cross(turned, axes)
+    stated = np.column_stack([np.zeros((frames, 2)), HEIGHTS_M])
+    true = stated + 5e-4 * rng.normal(size=(frames, 3))
+    rotation = Rotation.from_rotvec(turn * rng.normal(size=(frames, 3))).as_matrix()
+    points = np.einsum('fij,fsj->fsi', rotation, sensors.position + shift) + true[:, None]
+    axes = np.einsum('fij,fsj->fsi', rotation, axes)
+    fields = [field(points.reshape(-1, 3), k, iron).reshape(axes.shape) for k in range(3)]
+    flux = np.stack([np.einsum('psi,psi->ps', axes, one) for one in fields], axis=2)
+    flux = gains[:, None] * flux + NOISE_T * rng.normal(size=flux.shape)
+    valid = np.ones(flux.shape[:2], dtype=bool)
+    measured = Measurements(
+        'plate', sensors, np.arange(float(frames)), flux.astype(complex), valid,
+        np.zeros(valid.shape, np.int64), stated, np.tile(np.eye(3), (frames, 1, 1)),
+        np.ones(frames, dtype=bool),
+    )  # fmt: skip
+    return measured, gains, tilts
+
+
+def calibrated(measured, kinds):
+    generator = Generator(CENTRES + [[0.01, -0.01, 0.0]], np.zeros(3), 0.1)
+    return calibrate_still(
+        measured, 'made.mcap', generator, ('a', 'b', 'c'), (1.0, 2.0, 3.0), kinds, STATED
+    )
+
+
+class TestModel:
+    @pytest.mark.parametrize('is_complex', [False, True])
+    def test_columns_are_the_derivatives_of_the_fluxes(self, is_complex):
+        rng = np.random.default_rng(3)
+        measured, _, _ = recorded(1)
+        sites = DipoleSites(np.repeat(CENTRES, 3, axis=0), np.tile(np.eye(3), (3, 1)))
+        model = StillModel(measured, is_complex)
+        nothing = model.nothing(9)
+        now = StillUnknowns(
+            50.0 * rng.normal(size=nothing.moments.shape),
+            1e-5 * rng.normal(size=nothing.frames.shape),
+            np.zeros_like(nothing.sensors),
+        )
+        columns = model.columns(now, sites, 1)
+        for term in range(nothing.frames.shape[1]):
+            step = np.zeros_like(now.frames)
+            step[1, term] = 1e-7
+            ends = [
+                model.flux(replace(now, frames=now.frames + sign * step), sites)
+                for sign in (-1.0, 1.0)
+            ]
+            slope = (ends[1] - ends[0])[1] / 2e-7
+            given = columns.frames[:, :, 1, term]
+            np.testing.assert_allclose(given, slope, atol=3e-3 * np.abs(slope).max())
+        for own in range(nothing.sensors.shape[1]):
+            step = np.zeros_like(now.sensors)
+            step[:, own] = 1e-6
+            ends = [
+                model.flux(replace(now, sensors=now.sensors + sign * step), sites)
+                for sign in (-1.0, 1.0)
+            ]
+            slope = ((ends[1] - ends[0]) / 2e-6).transpose(1, 2, 0).reshape(len(step), -1)
+            np.testing.assert_allclose(
+                columns.own[:, :, own], slope, atol=3e-3 * np.abs(slope).max()
+            )
+
+        for j in range(3):
+            step = np.zeros((9, 3))
+            step[-3:, j] = 1e-6
+            ends = [
+                model.flux(now, replace(sites, positions=sites.positions + sign * step))
+                for sign in (-1.0, 1.0)
+            ]
+            slope = ((ends[1] - ends[0]) / 2e-6).transpose(1, 2, 0).reshape(len(now.sensors), -1)
+            given = columns.places[:, :, j]
+            np.testing.assert_allclose(given, slope, atol=1e-6 * np.abs(slope).max())
+
+    def test_a_thick_body_does_not_bend(self):
+        sensors = plate()
+        thick = sensors.position + np.outer(np.arange(len(sensors)) % 2, [0.0, 0.0, 0.05])
+        assert SmoothBend.of(sensors.with_geometry(thick)) is None
+
+
+class TestFit:
+    def test_what_was_put_in_is_found(self):
+        measured, gains, tilts = recorded(11)
+        fit = StillFitter(measured, CENTRES, KINDS, STATED).fit()
+        assert set(fit.evidence) == set(KINDS)
+        assert 0.5 * NOISE_T < fit.widths.noise_t < 2.5 * NOISE_T
+        found = fit.unknowns.sensors
+        true = np.column_stack([gains - 1.0, tilts])
+        print(
+            np.corrcoef(found.T, true.T).round(3)[:3, 3:],
+            np.sqrt((((found - true) / fit.sensor_sigma) ** 2).mean(0)),
+            fit.widths,
+            fit.beside,
+            fit.sites.positions[63::3],
+        )
+        assert fit.widths.sensors[0] == pytest.approx(0.02, rel=0.25)
+        assert fit.widths.sensors[1] == pytest.approx(0.03, rel=0.25)
+        assert fit.widths.frames[POSE] == pytest.approx(5e-4, rel=0.4)
+        beside = fit.sites.positions[-3 * fit.beside :: 3]
+        assert fit.beside and np.linalg.norm(beside - IRON_M, axis=1).min() < 0.02
+
+    def test_a_sound_plate_has_nothing(self):
+        measured, _, _ = recorded(12, gain=0.0, tilt=0.0, bend=0.0, iron=False)
+        fit = StillFitter(measured, CENTRES, KINDS, STATED).fit()
+        assert fit.evidence == {} and not fit.unknowns.sensors.any()
+        assert fit.beside == 0
+
+    def test_zeros_are_refused(self):
+        measured, _, _ = recorded(13)
+        with pytest.raises(FitError, match='all fluxes are zero'):
+            StillFitter(replace(measured, flux=0.0 * measured.flux), CENTRES, KINDS, STATED)
+
+
+@pytest.mark.long
+def test_a_pose_that_took_no_part_is_foretold():
+    measured, gains, _ = recorded(21, iron=False, bend=0.0, per_side=4)
+    assert is_still([measured]) and not is_still([measured, measured])
+    found, plain = calibrated(measured, KINDS[:2]), calibrated(measured, ())
+    document = to_document(found)
+    assert document['heldout_flux_rmse_t'] < 0.6 * to_document(plain)['heldout_flux_rmse_t']
+    poses = document['heldout_by_pose']
+    assert [pose['position_m'][2] for pose in poses] == HEIGHTS_M.tolist()
+    mean = np.sqrt(np.mean([pose['flux_rmse_t'] ** 2 for pose in poses]))
+    assert mean == pytest.approx(document['heldout_flux_rmse_t'])
+    names = [effect['name'] for effect in document['effects']]
+    assert names == ['sensor_gain_spread', 'sensor_axis_spread']
+    assert found.model.effects[0].parameters['spread'] == pytest.approx(gains.std(), rel=0.25)
+    # The model that is written explains the sensors so corrected.
+    assert found.residuals.rmse_t < 0.2 * plain.residuals.rmse_t
