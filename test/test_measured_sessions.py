@@ -1,5 +1,7 @@
 """Sessions of measured data: what was measured stands in the bag, in the layout of sessions."""
 
+import itertools
+import json
 import os
 from pathlib import Path
 
@@ -9,11 +11,9 @@ from test_measured_hpi import COIL, MOMENT, helmet
 
 from anser_ros.cli import measured
 from anser_ros.cli.main import main
-from anser_ros.errors import BagError
-from anser_ros.measured import hpi_session, navion_session
+from anser_ros.errors import BagError, FitError
+from anser_ros.measured import hpi_session, navion
 from anser_ros.measured.hpi_coils import HpiData
-from anser_ros.measured.navion_data import NavionData, load
-from anser_ros.measured.navion_plate import PlateData
 from anser_ros.measured.session_file import write_frames
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
@@ -27,14 +27,6 @@ COILS = tuple(Coil(f'c{k}', (0.1 * k, 0.0, 0.0), 0.0, 1.0 + k) for k in range(3)
 @pytest.fixture
 def rng():
     return np.random.default_rng(7)
-
-
-def plate_data(rng):
-    """Two heights of 2 x 2 sensors."""
-    grid = np.array([[x, y, 0.0] for x in (-0.1, 0.1) for y in (-0.1, 0.1)])
-    field = rng.normal(scale=1e-3, size=(2, 3, 4, 3))
-    coils = PlateData(np.array([-0.05, 0.05]), grid, field)
-    return NavionData((0, 3), coils, np.zeros((2, 8, 4, 3)), np.zeros((8, 3)), np.zeros((2, 4, 3)))
 
 
 class TestFrames:
@@ -58,39 +50,71 @@ class TestFrames:
             write_frames(path, setup, [10], flux)
 
 
-@pytest.mark.long
+def write_plate(folder, rng, signs):
+    """Two heights of 2 x 2 sensors under combinations of currents, and a state without; mT."""
+    field = rng.normal(size=(2, 3, 4, 3))
+    lines = ['plane,sensor,state,x_m,y_m,z_m,I0_A,I1_A,I2_A,Bx_mT,By_mT,Bz_mT']
+    for plane, z in enumerate((-0.05, 0.05)):
+        for sensor, (x, y) in enumerate((x, y) for x in (-0.1, 0.1) for y in (-0.1, 0.1)):
+            for state, sign in enumerate((*signs, (0, 0, 0))):
+                reading = np.array(sign) @ field[plane, :, sensor] + [0.1, 0.2, 0.3]
+                numbers = (x, y, z, *(35.0 * np.array(sign)), *reading)
+                lines.append(
+                    f'{plane},{sensor},{state},' + ','.join(map(repr, map(float, numbers)))
+                )
+    folder.mkdir()
+    (folder / 'navion_steady.csv').write_text('\n'.join(lines))
+    return 1e-3 * field
+
+
 class TestNavion:
-    EMITTER = Emitter('electromagnet', {'current_a': 35.0}, COILS)
+    SIGNS = tuple(itertools.product((-1, 1), repeat=3))
 
     def test_the_plate_is_a_tool_of_many_channels(self, tmp_path, rng):
-        data, path = plate_data(rng), tmp_path / 'plate.mcap'
-        navion_session.write_plate(data, self.EMITTER, path)
+        field = write_plate(tmp_path / 'data', rng, self.SIGNS)
+        (path,) = navion.write_sessions(tmp_path / 'data', tmp_path / 'bags')
         (tool,) = load_session(path).tools
         assert tool.flux.shape == (2, 12, 3)
-        # The reading of coil 2 by axis y of sensor 3 at the second height.
+        # The reading of coil 2 by axis y of sensor 3 at the second height, without the offset.
         row = tool.sensors.name.index('plate/s3/y')
-        assert tool.flux[1, row, 2].real == pytest.approx(data.coils.field_t[1, 2, 3, 1], rel=1e-6)
+        assert tool.flux[1, row, 2].real == pytest.approx(field[1, 2, 3, 1], rel=1e-6)
         centres, axes = tool.placed()
         # Above the magnets, which are towards the data set's +y.
         np.testing.assert_allclose(centres[1, row], [0.1, 0.05, 0.19], atol=1e-12)
         np.testing.assert_allclose(axes[1, row], [0.0, 0.0, -1.0], atol=1e-12)
 
-    def test_one_sensor_visits_all_places(self, tmp_path, rng):
-        data, path = plate_data(rng), tmp_path / 'sensor.mcap'
-        navion_session.write_sensor(data, self.EMITTER, path)
-        (tool,) = load_session(path).tools
-        assert tool.flux.shape == (8, 3, 3) and tool.has_pose.all()
-        np.testing.assert_allclose(tool.position[6], [0.1, 0.05, 0.39])
-        np.testing.assert_allclose(tool.flux[6].real, data.coils.field_t[1, :, 2].T, rtol=1e-6)
+    def test_what_is_missing_is_named(self, tmp_path, rng):
+        with pytest.raises(FitError, match=r'no such file: .*navion_steady\.csv'):
+            navion.read(tmp_path)
+        write_plate(tmp_path / 'few', rng, self.SIGNS[:-2])
+        with pytest.raises(FitError, match='not all combinations of both signs'):
+            navion.read(tmp_path / 'few')
+        write_plate(tmp_path / 'cut', rng, self.SIGNS)
+        path = tmp_path / 'cut' / 'navion_steady.csv'
+        path.write_text('\n'.join(path.read_text().splitlines()[:-2]))
+        with pytest.raises(FitError, match='63 rows, expected 64'):
+            navion.read(tmp_path / 'cut')
 
     @pytest.mark.skipif(not NAVION.is_dir(), reason='no shared measured data')
     def test_the_real_data(self, tmp_path):
-        paths = navion_session.write_sessions(NAVION, tmp_path / 'bags')
-        assert [path.name for path in paths] == ['navion_plate.mcap', 'navion_sensor.mcap']
-        data = load(NAVION)
-        (tool,) = load_session(paths[1]).tools
-        assert tool.time.size == 4 * 121
-        assert np.abs(tool.flux).max() == pytest.approx(np.abs(data.coils.field_t).max(), rel=1e-6)
+        (path,) = navion.write_sessions(NAVION, tmp_path / 'bags')
+        (tool,) = load_session(path).tools
+        assert tool.flux.shape == (4, 363, 3) and tool.has_pose.all()
+        assert 5e-3 < np.sqrt(np.mean(tool.flux.real**2)) < 10e-3
+
+    def test_rows_are_of_all_and_of_inner_heights(self, tmp_path):
+        for kind, errors in (('plain', (4e-4, 3e-4, 5e-4)), ('full', (2e-4, 5e-5, 1e-4))):
+            poses = [
+                {'position_m': [0.0, y, 0.3], 'flux_rmse_t': error}
+                for y, error in zip((-0.1, 0.0, 0.1), errors, strict=True)
+            ]
+            (tmp_path / kind).mkdir()
+            text = json.dumps({'heldout_by_pose': poses})
+            (tmp_path / kind / 'calibration.json').write_text(text)
+        every, inner = navion.rows([], tmp_path)
+        assert inner.before == pytest.approx(0.3) and inner.after == pytest.approx(0.05)
+        assert inner.met and not every.met
+        assert every.after == pytest.approx(np.sqrt((0.2**2 + 0.05**2 + 0.1**2) / 3))
 
 
 class TestHpi:

@@ -27,17 +27,10 @@ from anser_ros.measured import (
     magnet_patch,
     magnet_step,
     navion,
-    navion_report,
-    navion_session,
 )
 from anser_ros.measured.recipe import Recipe
 
 Study = Callable[[Path], tuple[list[ReportRow], str]]
-
-
-def _navion(folder: Path) -> tuple[list[ReportRow], str]:
-    analysis = navion_report.analyse(folder)
-    return navion.rows(analysis, folder), navion_report.tables(analysis)
 
 
 def _magnet_step(folder: Path) -> tuple[list[ReportRow], str]:
@@ -56,16 +49,16 @@ def _anser_board(folder: Path) -> tuple[list[ReportRow], str]:
 
 
 STUDIES: dict[str, Study] = {
-    navion.NAME: _navion,
     magnet_step.NAME: _magnet_step,
     hpi_coils.NAME: _hpi_coils,
     anser_board.NAME: _anser_board,
 }
 """Analysis of each data set without a recipe: rows of its figures, text of its candidates."""
-RECIPES: dict[str, Recipe] = {recipe.name: recipe for recipe in (magnet_patch.RECIPE,)}
+RECIPES: dict[str, Recipe] = {
+    recipe.name: recipe for recipe in (navion.RECIPE, magnet_patch.RECIPE)
+}
 """Data sets that the shipped commands are run on."""
 SESSIONS: dict[str, Callable[[Path, Path], list[Path]]] = {
-    navion.NAME: navion_session.write_sessions,
     **{name: recipe.write_sessions for name, recipe in RECIPES.items()},
     hpi_coils.NAME: hpi_session.write_sessions,
 }
