@@ -115,6 +115,7 @@ def calibrate_still(
         emitters=emitters,
         frequencies_hz=frequencies_hz,
         flux_error_t=held_out.flux_error_t,
+        shift_sigma_m=0.0 if scan.survey is None else scan.survey.shift_sigma_m,
         effects=scan.corrections,
     )
     calibration = Calibration(
@@ -187,7 +188,7 @@ def _scan(posed: Measurements, frames: int, fit: StillFit, accuracy: Accuracy) -
         Posterior(values, width, np.diag(sigma**2), fit.log_evidence),
         tuple(kind for kind in POPULATIONS if kind not in evidence),
         evidence, fit.widths.noise_t, poses, {kind: np.zeros(0, np.int64) for kind in POPULATIONS},
-        (every,), (every,), 0.0, {},
+        (every,), (every,), 0.0, {}, accuracy.optical_position_m / np.sqrt(len(offsets)),
     )  # fmt: skip
     model = StillModel(posed, StillModel.has_quadrature(posed))
     flat = model.sound(fit.unknowns, fit.sites)
