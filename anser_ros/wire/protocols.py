@@ -49,7 +49,7 @@ class SerialProtocol:
     make_reader : callable
         Returns a new `RecordReader`.
     encode : callable
-        Bytes of a command (`frames.Identify`, `SetFrequencies`, `Start`, `Stop`) with a tag that
+        Bytes of a command (`records.Identify`, `SetFrequencies`, `Start`, `Stop`) with a tag that
         its reply repeats. A command that the unit does not have is no bytes.
     """
 
