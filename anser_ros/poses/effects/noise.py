@@ -43,16 +43,23 @@ def jitter(sensing: Sensing) -> tuple[Array, Array]:
     residual = sensing.residual[rows, :3]
     if rows.size < 3:
         return np.zeros(0), np.zeros((0, 3))
+    along = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-9)
+    if sensing.stamp_s > 0:
+        # Neighbours move another way, and errors of their stamps lie along theirs.
+        residual = _across(residual, along)
     second = residual[1:-1] - 0.5 * (residual[:-2] + residual[2:])
-    speed = np.linalg.norm(velocity[1:-1], axis=1, keepdims=True)
-    along = velocity[1:-1] / np.maximum(speed, 1e-9)
-    second = second - np.sum(second * along, axis=1, keepdims=True) * along
+    second = _across(second, along[1:-1])
     usual = float(np.median(np.diff(time)))
     near = time[2:] - time[:-2] < max(NEAR_S, NEAR_STEPS * usual)
     square = np.sum(second**2, axis=1) / (1.5 * 2)
     distance = np.linalg.norm(sensing.view.measured[rows], axis=1)
     about = np.stack([distance[:-2], distance[1:-1], distance[2:]], axis=1)
     return square[near], about[near]
+
+
+def _across(vectors: Array, along: Array) -> Array:
+    """Vectors (n, 3) without their part along unit vectors (n, 3)."""
+    return np.asarray(vectors - np.sum(vectors * along, axis=1, keepdims=True) * along)
 
 
 def power_law(square: Array, distance: Array) -> tuple[float, float, float]:
