@@ -31,6 +31,12 @@ from anser_ros.poses.diagnosis import PoseDiagnosis, diagnose_poses  # noqa: E40
 REPORTED = (301,)
 MIDDLE = np.array([0.05, 0.02, -0.3])
 TARGET, HONEST = 0.95, (0.8, 1.3)
+WIDE = {
+    'stale_poses.fraction': 'repeats are counted, and fall on every n-th pose',
+    'quantised_stamps.step_s': 'stamps lie on the grid exactly',
+    'excess_noise.factor': 'the sigma is a tenth: sensors of one kind differ',
+}
+"""Parameters whose sigma is meant to be wider than the error in a simulation, and why."""
 
 Truth = Mapping[str, tuple[str, float] | None]
 """By the name of an effect its parameter and true value, or None where only the name is judged."""
@@ -309,6 +315,13 @@ def summary(outcomes: Sequence[tuple[str, float, Outcome]]) -> Iterator[dict[str
     for key, values in errors.items():
         if len(values) > 1:
             size = float(np.sqrt(np.mean(np.square(values))))
+            if key in WIDE:
+                yield {
+                    'name': f'poses: {key}, rms of error over sigma ({WIDE[key]})',
+                    'value': size, 'unit': f'of {len(values)}', 'target': 'at most 1.3',
+                    'met': bool(size <= HONEST[1]),
+                }  # fmt: skip
+                continue
             yield {
                 'name': f'poses: {key}, rms of error over sigma', 'value': size,
                 'unit': f'of {len(values)}', 'target': '0.8 to 1.3',
