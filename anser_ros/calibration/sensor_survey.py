@@ -7,7 +7,7 @@ residuals, and frames that no step explains are left out (`disturbances`).
 
 Values that the data cannot determine follow a rule. A gain that all sensors share is attributed to
 the emitters: the mean of the gains is one. A shift that all sensors of a body share is its lever
-arm: the median of their places is zero. The frame is the optical tracker's, and so is that of the
+arm: the mean of their places is zero. The frame is the optical tracker's, and so is that of the
 body: a rotation that all axes share is part of their tilts. If a scan does not turn the tool, a
 shift of all sensors is one of the field, which the drawing fixes.
 """
@@ -71,9 +71,8 @@ FREE_POSE = np.repeat([1.0 / 0.02**2, 1.0 / 0.1**2], 3)
 """Precision of a pose that is to follow the fluxes, 1/m^2 and 1/rad^2: a prior of 2 cm and 0.1 rad
 holds only what they do not tell."""
 FIELD_WIDTH = 0.3
-"""Prior width of the field's deviation from the drawing, relative to the flux, to begin with;
-later steps find their own. Smaller holds the first steps to a poor drawing; larger lets the field
-take up what is the sensors'. Its choice is not recorded."""
+"""Prior width of the field's deviation from the drawing, relative to the flux, to begin with.
+Smaller holds the first steps to a poor drawing; larger lets it take up what is the sensors'."""
 LEAST_FIELD_WIDTH = 1e-3
 """Least such width: no board is made more exactly than that."""
 FEWEST_READINGS = 7.0
@@ -166,7 +165,8 @@ class SensorSurveyor:
         # With too few to tell noise from modes of the field, errors of any size seem certain.
         poses, modes = sum(len(tool.weights) for tool in tools), self.modes.size.size
         readings = sum(int(m.usable.sum()) for m in self.measured)
-        if poses < modes and readings < FEWEST_READINGS * modes:
+        path = any(m.is_followed for m in self.measured)  # its neighbouring poses are alike
+        if path and poses < modes and readings < FEWEST_READINGS * modes:
             self.parameters = self.parameters.fixed()
             self.population = Population(self.parameters)
             self.values = np.zeros(0)
@@ -295,8 +295,8 @@ class SensorSurveyor:
         # known where they are weighed against the optical poses: else what the model misses is
         # made good by a shift of the field and of the tool, which no single frame contradicts.
         # The median, for a sensor that changes on the way scatters its own parameters alone.
-        stretches = len(rest.scores)
-        power = (rest.scores**2).sum(axis=0) * stretches / max(stretches - 1, 1)
+        count = len(rest.scores)
+        power = (rest.scores**2).sum(axis=0) * count / max(count - 1, 1)
         size = np.maximum(np.diag(rest.information), 1e-300)
         told = np.median(power / size) if len(size) else 1.0
         before = self.inflation
