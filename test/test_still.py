@@ -147,6 +147,7 @@ class TestModel:
 
 
 class TestFit:
+    @pytest.mark.long
     def test_what_was_put_in_is_found(self):
         measured, gains, tilts = recorded(11)
         fit = StillFitter(measured, CENTRES, KINDS, STATED).fit()
