@@ -28,7 +28,7 @@ from anser_ros.measured import anser_board
 
 @pytest.fixture(scope='module')
 def recordings(tmp_path_factory):
-    return simulate_recordings(tmp_path_factory.mktemp('recordings'), seed=3, share=0.36)
+    return simulate_recordings(tmp_path_factory.mktemp('recordings'), seed=3, share=0.3)
 
 
 @pytest.fixture(scope='module')
