@@ -305,7 +305,7 @@ class TestControl:
         code, words = session(11, 2e-4, '--limit', 'speed=1')
         assert code == 2 and "no figure 'speed'" in words
         (history / 'z.json').write_text('{}')
-        assert 'no entry of a history' in session(12, 2e-4)[1]
+        assert 'not an entry of a history' in session(12, 2e-4)[1]
 
 
 class TestCommand:

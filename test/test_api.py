@@ -138,7 +138,7 @@ class TestWriteSession:
     def test_a_bag_is_replaced_only_when_asked(self, tmp_path):
         path, times, flux = tmp_path / 'a.mcap', np.arange(3), np.zeros((3, 2, 2))
         write_session(path, SETUP, times, flux)
-        with pytest.raises(BagError, match='is there already'):
+        with pytest.raises(BagError, match='already exists'):
             write_session(path, SETUP, times, flux)
         write_session(path, SETUP, times[:2], flux[:2], overwrite=True)
         assert load_session(path).tools[0].time.size == 2

@@ -48,7 +48,7 @@ class TestSession:
 
     def test_refuses_to_write_over_a_bag(self, tmp_path):
         SessionWriter(tmp_path / 'a.mcap').close()
-        with pytest.raises(BagError, match='is there already'):
+        with pytest.raises(BagError, match='already exists'):
             SessionWriter(tmp_path / 'a.mcap')
 
     def test_refuses_a_folder_that_is_none(self, tmp_path):

@@ -323,7 +323,7 @@ def test_poses_are_read_from_their_bytes(frame):
     stamp_s, values = read_pose(bytes(serialize_message(message)))
     assert stamp_s == 12.5
     assert values.tolist() == [0, 3, 0, 0, 0, 0, 1]
-    with pytest.raises(ValueError, match='no pose'):
+    with pytest.raises(ValueError, match='not a pose'):
         read_pose(bytes(serialize_message(message))[:-8])
 
 

@@ -157,3 +157,10 @@ def test_the_glossary_has_the_words_of_the_code():
         'held out', 'effect', 'remainder', 'fluctuation', 'standoff', 'slot', 'bank', 'apparatus',
     }  # fmt: skip
     assert asked <= set(words)
+
+
+def test_no_page_has_the_marks_of_a_merge():
+    pages = [*REPO.glob('docs/**/*.md'), *REPO.glob('*.md'), *REPO.glob('*.rst')]
+    assert len(pages) > 30
+    for page in pages:
+        assert not re.search('^(<{7}|>{7})', page.read_text(encoding='utf-8'), re.M), page

@@ -235,7 +235,7 @@ def test_a_setup_document_can_be_added_and_a_wrong_name_is_said(tmp_path, moving
     assert '/anser/tool/flux would have' in capsys.readouterr().err
     assert not (tmp_path / 'o.mcap').exists()
     assert main(command) == 2
-    assert 'is there already' in capsys.readouterr().err
+    assert 'already exists' in capsys.readouterr().err
     for name, content, said in (
         ('x.db3', b'SQLite format 3\0' + bytes(200), 'not a bag in sqlite3'),
         ('x.db3.zstd', b'nothing', 'cannot be unpacked'),

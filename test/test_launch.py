@@ -77,7 +77,7 @@ def test_a_node_that_refuses_its_parameters_ends_the_launch(namespace):
         ('/anser/trakcer: {ros__parameters: {gate: 3.0}}', 'no node /anser/trakcer, is tracker'),
         ('gate: 3.0', 'no section with ros__parameters'),
         ('- 1', 'no section with ros__parameters'),
-        ('a: [', 'no YAML'),
+        ('a: [', 'not YAML'),
     ],
 )
 def test_a_file_that_would_leave_all_at_their_defaults_is_refused(tmp_path, text, said):

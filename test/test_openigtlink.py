@@ -147,7 +147,7 @@ class TestServer:
             port = taken.getsockname()[1]
             process = start('openigtlink', '--ros-args', '-p', f'port:={port}')
             assert process.popen.wait(20) == 2
-            assert f'can not listen on 127.0.0.1:{port}: Address already' in process.output
+            assert f'cannot listen on 127.0.0.1:{port}: Address already' in process.output
             assert 'Traceback' not in process.output
             with pytest.raises(PortError, match='Address already in use'):
                 IgtlServer('127.0.0.1', port, answer)

@@ -135,7 +135,7 @@ def test_a_file_of_no_known_form_is_refused_in_a_line(tmp_path, text, capsys):
 @pytest.mark.parametrize(
     ('rows', 'said'),
     [
-        (('1,2,3',), 'not one whole pose'),
+        (('1,2,3',), 'no complete pose'),
         (('inf,1,2,3,0,0,0,1',), 'no pose has a time'),
         (('-5,1,2,3,0,0,0,1',), 'no stamps of a bag'),
         (('99999999999999999999999,1,2,3,0,0,0,1',), 'no stamps of a bag'),

@@ -224,7 +224,7 @@ def test_a_model_beside_its_board_gives_no_poses_until_the_references_agree(make
     aside = rig.world.model.flux(there, table.axis, table.length)
     here = rig.world.model.flux(table.position, table.axis, table.length)
     rig.node._on_setup(String(data=setup_text(rig.world)))
-    assert rig.node.status().message == f'{REFERENCES_LOST}: none heard yet'
+    assert rig.node.status().message == f'{REFERENCES_LOST}: no reference fluxes yet'
     assert codes == [], 'the model was withheld from the beginning'
     rig.say(aside - here)
     state = rig.node.status()
@@ -336,7 +336,7 @@ def test_what_is_no_patch_is_refused(make):
     patches = Patches(anser_world().references.select([0]), np.empty((0, 8), complex), 'fg')
     with pytest.raises(FrameError, match="in 'camera', not 'fg'"):
         patches.take_pose('fg', pose_message(1, [0, 0, 0], 'camera'))
-    with pytest.raises(FrameError, match='is no pose'):
+    with pytest.raises(FrameError, match='is not finite'):
         patches.take_pose('fg', pose_message(1, [np.nan, 0, 0]))
 
 

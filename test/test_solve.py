@@ -189,7 +189,7 @@ def test_refusals():
     good = (MODEL.positions, MODEL.directions, MODEL.moments)
     with pytest.raises(TrackingError, match='needs positions and directions'):
         RealField.of(good[0][:, :2], good[1], good[2])
-    with pytest.raises(TrackingError, match='can not have moments'):
+    with pytest.raises(TrackingError, match='cannot have moments'):
         RealField.of(good[0], good[1], good[2][:5])
     with pytest.raises(TrackingError, match='must be finite'):
         RealField.of(good[0] * np.nan, good[1], good[2])

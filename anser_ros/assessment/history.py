@@ -85,9 +85,9 @@ def _entries(folder: Path, found: Assessment) -> list[dict[str, Any]]:
             same = (entry['protocol'], entry['body']) == (found.protocol, found.body)
             complete = {'start_ns', 'figures', 'states'} <= entry.keys()
         except (ValueError, KeyError, TypeError) as error:
-            raise ParameterError(f'{path}: no entry of a history') from error
+            raise ParameterError(f'{path}: not an entry of a history') from error
         if not (wanted and complete):
-            raise ParameterError(f'{path}: no entry of a history, {SCHEMA}')
+            raise ParameterError(f'{path}: not an entry of a history, {SCHEMA}')
         if same:
             entries.append(entry)
     return sorted(entries, key=lambda entry: int(entry['start_ns']))

@@ -61,7 +61,7 @@ def work(args: argparse.Namespace, tell: Callable[[str], None]) -> Result:
         Is told what has been reached, in words.
     """
     if args.poses:
-        return diagnose_pose_session(args)
+        return diagnose_pose_session(args, tell)
     need_model(args)
     session = load_session(args.session).with_stated(stated_values(args))
     model = model_for(args.model, session, snapshot=True, resurveyed=args.resurveyed)

@@ -33,7 +33,7 @@ def check_file(path: Path) -> None:
 def check_new_file(path: Path) -> None:
     """Check as `check_file` does a file that must not be there yet, as a bag must not."""
     if path.exists():
-        raise ParameterError(f'{path}: is there already')
+        raise ParameterError(f'{path}: already exists')
     make_folder(path.parent)
 
 

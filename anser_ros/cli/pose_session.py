@@ -3,6 +3,7 @@
 import argparse
 import csv
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -56,9 +57,9 @@ def load_poses(path: Path | str, args: argparse.Namespace) -> PoseSession:
     return read_pose_session(path, topics or None, args.optical)
 
 
-def diagnose_pose_session(args: argparse.Namespace) -> Result:
-    """Diagnose a session of poses into the folder of the arguments."""
-    found, document = _found(args)
+def diagnose_pose_session(args: argparse.Namespace, tell: Callable[[str], None]) -> Result:
+    """Diagnose a session of poses into the folder of the arguments, and tell the stages."""
+    found, document = _found(args, tell)
     model = yaml.safe_dump(to_model(found), sort_keys=False)
     (args.out / 'model.yaml').write_text(model, encoding='utf-8')
     page = render_poses(found, document, str(args.session))
@@ -67,18 +68,20 @@ def diagnose_pose_session(args: argparse.Namespace) -> Result:
     return _result(args, found, document, document, files)
 
 
-def evaluate_pose_session(args: argparse.Namespace) -> Result:
-    """Tell the errors of a session of poses, into the folder of the arguments."""
-    found, diagnosis = _found(args)
+def evaluate_pose_session(args: argparse.Namespace, tell: Callable[[str], None]) -> Result:
+    """Tell the errors of a session of poses, into the folder of the arguments, and the stages."""
+    found, diagnosis = _found(args, tell)
     document = _evaluation(found, diagnosis)
     _write_poses(args.out / 'poses.csv', found)
     return _result(args, found, document, diagnosis, ('evaluation.json', 'poses.csv'))
 
 
-def _found(args: argparse.Namespace) -> tuple[PoseDiagnosis, dict[str, Any]]:
+def _found(
+    args: argparse.Namespace, tell: Callable[[str], None]
+) -> tuple[PoseDiagnosis, dict[str, Any]]:
     session = load_poses(args.session, args)
     make_folder(args.out)
-    found = diagnose_poses(session)
+    found = diagnose_poses(session, tell)
     return found, to_document(found)
 
 

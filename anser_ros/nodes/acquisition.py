@@ -89,9 +89,8 @@ class Acquisition(AnserNode):
         self.offer(self._tool_publisher)
         self.offer(self._reference_publisher)
         self._cloud = FluxCloud(self._setup.frame_id)
-        self._control = StreamControl(
-            self._setup.frequencies_hz, set_frequencies=table.set_frequencies
-        )
+        may_set = table.set_frequencies and PROTOCOLS[table.protocol].sets_tones
+        self._control = StreamControl(self._setup.frequencies_hz, set_frequencies=may_set)
         self._hello: Hello | None = None
         self._device: DeviceStatus | None = None
         self._stream: FluxStream | None = None
@@ -364,7 +363,7 @@ class Acquisition(AnserNode):
             return Level.ERROR, '; '.join(filter(None, words))
         frames = interval.frames
         if interval.repeats == frames and max(frames, interval.duplicates) > 0:
-            return Level.ERROR, 'the control unit repeats itself'
+            return Level.ERROR, 'the control unit sends the same samples again'
         troubles = [(self._faults.level, self._faults.words)] if self._faults.words else []
         slow = too_slow(interval.skipped, frames)
         if slow:

@@ -368,7 +368,9 @@ class FieldModelNode(AnserNode):
         if trouble:
             return Status('', Level.WARN, f'{activity}; lately: {trouble}', values)
         if self._place.awaits:
-            return Status('', Level.WARN, f'{states.REFERENCES_LOST}: none heard yet', values)
+            return Status(
+                '', Level.WARN, f'{states.REFERENCES_LOST}: no reference fluxes yet', values
+            )
         silent_s, setup = time.monotonic() - self._heard_s, self._setup
         if setup is not None and self._follows and silent_s > setup.refit.references_age_s:
             said = f'{states.REFERENCES_LOST}: no reference fluxes for {silent_s:.1f} s'

@@ -133,7 +133,7 @@ class OpenIGTLink(AnserNode):
         position = (point.x, point.y, point.z)
         quaternion = (turn.x, turn.y, turn.z, turn.w)
         if not all(map(math.isfinite, position + quaternion)) or not any(quaternion):
-            self.warn('poses_refused', f'{name}: a pose that is not one')
+            self.warn('poses_refused', f'{name}: an invalid pose')
             return
         now_s = self._last_pose_s[name] = time.monotonic()
         stamp_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec

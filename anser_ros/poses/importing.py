@@ -153,7 +153,7 @@ def _session(path: str, pieces: Sequence[tuple[str, Array, Array, Array]]) -> Po
     # A file of optical poses alone is somebody's tracker too.
     reference = sequences.pop(REFERENCE, None) if len(sequences) > 1 else None
     if not any(poses.size for poses in sequences.values()):
-        raise ParameterError(f'{path}: not one whole pose with a time')
+        raise ParameterError(f'{path}: no complete pose with a time')
     # A bag's stamp of zero means none.
     start_ns = max(round(start * 1e9), 1_000_000_000)
     return PoseSession(path, start_ns, sequences, reference)

@@ -341,7 +341,7 @@ class LiveRefit:
             )
         elif moving and typical > POOR:
             state = POOR_FIT
-            reason = f'readings are {np.sqrt(typical):.1f} times as far off as they should be'
+            reason = f'readings deviate {np.sqrt(typical):.1f} times as much as expected'
         known = dict(zip(bank.names, weights.tolist(), strict=True))
         metal = (lambda: locate_metal(bank, seen, weights, unit)) if moving else None
         return self._finish(

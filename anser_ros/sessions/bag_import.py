@@ -117,7 +117,7 @@ def import_bag(
     if missing or not written:
         out.unlink()
         what = f'no topic {", ".join(missing)}; there are: {", ".join(sorted(seen))}'
-        raise BagError(f'{os.fspath(path)}: {what if missing else "not one message can be read"}')
+        raise BagError(f'{os.fspath(path)}: {what if missing else "no message can be read"}')
     return ImportedBag(dict(written), dict(left_out), salvage.lost)
 
 

@@ -114,7 +114,7 @@ class _Import:
                 else:
                     self._add_poses(_mapping(entry, what), what, is_tracked=key == 'tracked')
         if not self._entries:
-            raise ParameterError('the tables have not one whole row')
+            raise ParameterError('the tables have no complete row')
         if self._setup is None:
             names = {kind: self._names_of(kind) for kind in (TRACKED, OPTICAL)}
             body = names[OPTICAL][0] if names[OPTICAL] else 'body'

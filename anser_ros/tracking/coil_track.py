@@ -277,7 +277,7 @@ def track_coil(
             no_pose(name, stamp_ns, states.NO_SIGNAL, context.model_id, reason), None
         )
     if context.readings < UNKNOWNS:
-        reason = f'{context.readings} readings do not tell the {UNKNOWNS} numbers of a pose'
+        reason = f'{context.readings} readings are too few for the {UNKNOWNS} unknowns of a pose'
         unknown = no_pose(name, stamp_ns, states.AMBIGUOUS, context.model_id, reason)
         return CoilResult(unknown, None, heard=True)
     frame = _CoilFrame(name, length, stamp_ns, flux, context, settings)

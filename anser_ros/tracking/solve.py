@@ -65,7 +65,7 @@ class RealField:
                 f'got {r.shape}, {u.shape} and {m.shape}'
             )
         if m.shape[0] != r.shape[0] or m.shape[0] == 0 or m.shape[1] == 0:
-            raise TrackingError(f'{r.shape[0]} dipoles can not have moments of shape {m.shape}')
+            raise TrackingError(f'{r.shape[0]} dipoles cannot have moments of shape {m.shape}')
         if not (np.isfinite(r).all() and np.isfinite(u).all() and np.isfinite(m).all()):
             raise TrackingError('a field model must be finite')
         return cls(r, u, m.view(np.float64))

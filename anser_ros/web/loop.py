@@ -252,7 +252,7 @@ class CorrectionLoop:
         await self._exchange(await self._chain.model_files(), last.before)
         self._loaded.pop()
         self._chain.mark('undone')
-        return 'the model of before is in force again'
+        return 'the previous model is in force again'
 
     async def _exchange(self, present: Mapping[str, str], wanted: Mapping[str, str]) -> None:
         """Give the nodes other models; where one refuses, all keep what they had."""

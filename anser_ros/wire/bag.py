@@ -164,7 +164,7 @@ def iter_messages(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[Ra
     Raises
     ------
     BagError
-        When there is no such file, it is no MCAP file, or not one message can be read.
+        When there is no such file, it is no MCAP file, or no message can be read.
     """
     name = bag_file(path)
     with open(name, 'rb') as stream:
@@ -192,7 +192,7 @@ def iter_messages(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[Ra
             count += 1
             yield message
         if count == 0:
-            raise BagError(f'{name}: not one message can be read ({salvage.lost or "empty bag"})')
+            raise BagError(f'{name}: no message can be read ({salvage.lost or "empty bag"})')
 
 
 class MessageDecoder:

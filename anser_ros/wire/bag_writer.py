@@ -106,7 +106,7 @@ class BagWriter(_Closing):
                 raw = open(self.path, 'xb', buffering=0)  # type: ignore[assignment]  # noqa: SIM115
                 self._reserve = self._keep_space(raw)
         except FileExistsError as error:
-            raise BagError(f'{self.path}: is there already') from error
+            raise BagError(f'{self.path}: already exists') from error
         except OSError as error:
             raise BagError(f'{self.path}: {error.strerror}') from error
         assert raw is not None

@@ -12,7 +12,7 @@ from typing import Protocol
 from anser_ros.errors import PortError
 from anser_ros.wire.frame_reader import FrameReader
 from anser_ros.wire.frames import encode
-from anser_ros.wire.records import Hello, Payload, Record, check_hello
+from anser_ros.wire.records import Hello, Payload, Record, SetFrequencies, check_hello
 
 
 class RecordReader(Protocol):
@@ -55,6 +55,11 @@ class SerialProtocol:
 
     make_reader: Callable[[], RecordReader]
     encode: Callable[[Payload, int], bytes]
+
+    @property
+    def sets_tones(self) -> bool:
+        """Return whether the host can change the unit's tones."""
+        return bool(self.encode(SetFrequencies((1.0,)), 1))
 
 
 def records_of(reader: RecordReader, data: bytes) -> list[Record]:

@@ -71,7 +71,9 @@ def parse_tips(item: Any) -> dict[str, TipSpec]:
         )
         values = np.linalg.eigvalsh(spec.covariance)
         if values[0] < NOT_NEGATIVE * max(values[-1], 1e-30):
-            raise SetupError(f'setup: {where}.covariance_m2 is none: a variance is negative')
+            raise SetupError(
+                f'setup: {where}.covariance_m2 is not a covariance: a variance is negative'
+            )
         tips[str(body)] = spec
     return tips
 

@@ -195,7 +195,7 @@ class Trial:
         found['tables'] = self._tables()
         self._picture('')
         self._click('Undo')
-        page.get_by_text('the model of before is in force again').wait_for()
+        page.get_by_text('the previous model is in force again').wait_for()
         found['tracked_again_after_undo_s'] = self._tracked_again_s()
         found['after_undo'] = page.locator('.bar .pill').inner_text()
         live = found['tables']['live, last 10 s']

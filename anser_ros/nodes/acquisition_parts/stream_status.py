@@ -74,7 +74,7 @@ def _stuck(stream: FluxStream, flags: np.ndarray, staleness: Staleness) -> list[
 def _why_stale(staleness: Staleness | None, row: int) -> str:
     """What a stale sensor does; empty where it is constant."""
     if staleness is not None and staleness.age_s[row] > 0:
-        return f'repeats what it said {staleness.age_s[row]:.2g} s ago'
+        return f'repeats its samples of {staleness.age_s[row]:.2g} s ago'
     if staleness is not None and staleness.noiseless[row]:
         return 'has no noise that tells new samples from old'
     return ''

@@ -69,7 +69,9 @@ class Patches(PatchCoils):
         position = np.array([p.x, p.y, p.z])
         norm = float(np.linalg.norm(quaternion))
         if not np.isfinite(position).all() or not abs(norm - 1.0) < 1e-2:
-            raise FrameError(f'the pose of {body} is no pose')
+            raise FrameError(
+                f'the pose of {body} is not finite, or its quaternion has no unit length'
+            )
         self.put(body, stamp_of(message), position, rotation_of_quaternion(quaternion / norm))
 
     def moved_refit(self, refit: LiveRefit, stamp_ns: int) -> LiveRefit | None:

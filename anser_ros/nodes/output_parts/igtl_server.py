@@ -179,7 +179,7 @@ class IgtlServer:
         try:
             self._listener = socket.create_server((host, port))
         except OSError as error:
-            raise PortError(f'can not listen on {host}:{port}: {error.strerror}') from error
+            raise PortError(f'cannot listen on {host}:{port}: {error.strerror}') from error
         self.port: int = self._listener.getsockname()[1]
         self._listener.settimeout(POLL_S)
         self._clients: list[_Client] = []

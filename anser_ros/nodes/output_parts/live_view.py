@@ -43,7 +43,7 @@ def read_pose(data: bytes) -> tuple[float, Array]:
     # Doubles lie at multiples of eight, counted from behind the four bytes of the header.
     offset = 4 + 8 * math.ceil((12 + length) / 8)
     if (len(data) - offset) // 8 not in (POSE, POSE + COVARIANCE):
-        raise ValueError(f'{len(data)} bytes are no pose')
+        raise ValueError(f'{len(data)} bytes are not a pose message')
     count = (len(data) - offset) // 8
     return sec + 1e-9 * nanosec, np.frombuffer(data, f'{order}f8', count, offset).astype(float)
 

@@ -80,7 +80,7 @@ def checked(name: str, nodes: Collection[str]) -> str:
     try:
         document = read_yaml(read_config(name))
     except (ValueError, yaml.YAMLError) as error:
-        raise ParameterError(f'{path}: no YAML: {" ".join(str(error).split())}') from error
+        raise ParameterError(f'{path}: not YAML: {" ".join(str(error).split())}') from error
     keys = [key for key, _ in _sections(document)]
     if not keys:
         raise ParameterError(f'{path}: no section with {LEAF}')

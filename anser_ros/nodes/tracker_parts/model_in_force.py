@@ -106,5 +106,5 @@ class ModelInForce:
         if standing.model is None:
             standing = replace(standing, model=self.field)
         if state and state != REFERENCES_LOST:
-            return Standing(standing.model, Withheld(state, 'field_model says so'))
+            return Standing(standing.model, Withheld(state, 'reported by field_model'))
         return standing
