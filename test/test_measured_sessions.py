@@ -46,7 +46,7 @@ class TestFrames:
         np.testing.assert_allclose(session.reference.flux[:, 0], flux[:, 0], rtol=1e-6)
         np.testing.assert_allclose(tool.position, place)
         assert session.setup.sensors[0] == sensors[0]
-        with pytest.raises(BagError, match='there already'):
+        with pytest.raises(BagError, match='already exists'):
             write_frames(path, setup, [10], flux)
 
 
