@@ -21,6 +21,18 @@ class DipoleSites:
     def __len__(self) -> int:
         return int(self.positions.shape[0])
 
+    @staticmethod
+    def of_any_direction(places: Array) -> 'DipoleSites':
+        """Return three dipoles, along x, y and z, at each of P places (P, 3), m."""
+        return DipoleSites(np.repeat(places, 3, axis=0), np.tile(np.eye(3), (len(places), 1)))
+
+    def joined(self, other: 'DipoleSites') -> 'DipoleSites':
+        """Return these dipoles, then the others."""
+        return DipoleSites(
+            np.concatenate([self.positions, other.positions]),
+            np.concatenate([self.directions, other.directions]),
+        )
+
 
 def basis_rows(measurements: Measurements, dipoles: DipoleSites) -> Array:
     """Return the article's matrix M for all readings, shape (F S, N), T / (A m^2).

@@ -128,9 +128,7 @@ def place(layout: Layout, generator: Generator) -> DipoleSites:
     positions[:, 2] = middle[2] - layout.depth_m
     if layout.kind == 'layer':
         return DipoleSites(positions, np.tile(UNIT_Z, (positions.shape[0], 1)))
-    return DipoleSites(
-        np.repeat(positions, 3, axis=0), np.tile(np.eye(3), (positions.shape[0], 1))
-    )
+    return DipoleSites.of_any_direction(positions)
 
 
 def _on_coils(layout: Layout, generator: Generator) -> DipoleSites:

@@ -32,7 +32,7 @@ from anser_ros.calibration.requirements import (
 from anser_ros.calibration.result import Calibration, Scan, provenance, residuals
 from anser_ros.calibration.sensor_parameters import SensorParameters, Survey
 from anser_ros.calibration.still_fit import STEPS, StillFit, StillFitter
-from anser_ros.calibration.still_model import POSE, StillModel
+from anser_ros.calibration.still_model import POSE
 from anser_ros.calibration.survey_records import corrections
 from anser_ros.calibration.survey_result import SurveyResult
 from anser_ros.field.measurements import Measurements
@@ -106,7 +106,7 @@ def calibrate_still(
     fit = fitted(posed)
     held_out = _held_out(posed, folds, accuracy)
     scan = _scan(posed, len(measurements.time), fit, accuracy)
-    moments = _moments(posed, fit)
+    moments = _moments(fit)
     layout = Layout('free', fit.beside, 1.0, 0.0)
     model = FieldModel(
         positions=fit.sites.positions,
@@ -126,14 +126,14 @@ def calibrate_still(
     return replace(calibration, model=replace(model, provenance=provenance(calibration, [name])))
 
 
-def _moments(measured: Measurements, fit: StillFit) -> NDArray[np.complex128]:
+def _moments(fit: StillFit) -> NDArray[np.complex128]:
     found = fit.unknowns.moments
-    return as_complex(found) if StillModel.has_quadrature(measured) else found.astype(complex)
+    return as_complex(found) if fit.model.is_complex else found.astype(complex)
 
 
 def _columns(fit: StillFit) -> tuple[tuple[str, slice], ...]:
     """Which columns of the sensors' unknowns are gains, and which are tilts of the axes."""
-    gains = fit.unknowns.sensors.shape[1] - 2
+    gains = fit.model.gains
     return ('gains', slice(0, gains)), ('axes', slice(gains, None))
 
 
@@ -160,7 +160,7 @@ def _held_out(posed: Measurements, folds: Sequence[StillFit], accuracy: Accuracy
     for frame, fit in enumerate(folds):
         part = posed.frames(np.array([frame]))
         sound = _survey(part, fit).apply(part)
-        terms = pose_terms(sound, fit.sites, _moments(posed, fit))
+        terms = pose_terms(sound, fit.sites, _moments(fit))
         tally.add(terms, usable_weights(sound), sound.position)
     return tally.result()
 
@@ -190,25 +190,23 @@ def _scan(posed: Measurements, frames: int, fit: StillFit, accuracy: Accuracy) -
         evidence, fit.widths.noise_t, poses, {kind: np.zeros(0, np.int64) for kind in POPULATIONS},
         (every,), (every,), 0.0, {}, accuracy.optical_position_m / np.sqrt(len(offsets)),
     )  # fmt: skip
-    model = StillModel(posed, StillModel.has_quadrature(posed))
-    flat = model.sound(fit.unknowns, fit.sites)
+    flat = fit.model.sound(fit.unknowns, fit.sites)
     sound = result.survey(posed.body).apply(flat)
-    return Scan((sound,), accuracy, corrections(result), _bends(posed, fit), result)
+    return Scan((sound,), accuracy, corrections(result), _bends(fit), result)
 
 
-def _bends(posed: Measurements, fit: StillFit) -> tuple[EffectRecord, ...]:
+def _bends(fit: StillFit) -> tuple[EffectRecord, ...]:
     """The bend of the body in each frame, as one telling: another session's is another."""
     if 'bend' not in fit.evidence:
         return ()
-    model = StillModel(posed, StillModel.has_quadrature(posed))
-    assert model.bend is not None
-    shift, _ = model.bend.shape(fit.unknowns.frames[:, POSE:])
-    lift = shift @ model.bend.normal
+    bend = fit.model.bend
+    assert bend is not None
+    lift = bend.shape(fit.unknowns.frames[:, POSE:])[0] @ bend.normal
     return (
         EffectRecord(
             'body_bend',
             {
-                'body': posed.body,
+                'body': fit.model.measured.body,
                 'rms_m': np.sqrt(np.mean(lift**2, axis=1)).tolist(),
                 'largest_m': float(np.abs(lift).max()),
             },

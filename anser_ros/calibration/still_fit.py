@@ -60,6 +60,8 @@ class StillFit:
 
     Attributes
     ----------
+    model : StillModel
+        Of the frames that were fitted.
     sites : DipoleSites
         N dipoles: seven places an emitter, then the free ones, three directions each.
     beside : int
@@ -79,6 +81,7 @@ class StillFit:
         Log evidence that each kind of error added to those before it.
     """
 
+    model: StillModel
     sites: DipoleSites
     beside: int
     unknowns: StillUnknowns
@@ -133,7 +136,7 @@ class StillFitter:
         step = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
         places = found[:, None] + SPREAD * away[:, None, None] * step
         width = self.flux_rms * away**3 / DIPOLE_CONSTANT
-        return _of_any_direction(places.reshape(-1, 3)), np.repeat(width, 3 * len(step))
+        return DipoleSites.of_any_direction(places.reshape(-1, 3)), np.repeat(width, 3 * len(step))
 
     def fit(self) -> StillFit:
         """Return the fit with the noise, the kinds and the dipoles that the readings ask for."""
@@ -155,7 +158,7 @@ class StillFitter:
             if found is None:
                 break
             place, width = found
-            sites = _joined(best.sites, _of_any_direction(place[None]))
+            sites = best.sites.joined(DipoleSites.of_any_direction(place[None]))
             widths = replace(best.widths, moments=np.append(best.widths.moments, [width] * 3))
             more = self._solve(sites, best.beside + 1, widths)
             if more.log_evidence < best.log_evidence + DIPOLE_PAYS:
@@ -189,7 +192,7 @@ class StillFitter:
                 widths = self._learnt(system, beside)
         told = 1.0 - system.moment_variance / widths.moments[:, None] ** 2
         return StillFit(
-            sites, beside, now, np.sqrt(system.sensor_variance), widths, weights,
+            model, sites, beside, now, np.sqrt(system.sensor_variance), widths, weights,
             float(told.sum(axis=0).mean()), system.log_evidence(model.usable), {},
         )  # fmt: skip
 
@@ -205,7 +208,7 @@ class StillFitter:
         around = DipoleSites(
             sites.positions[: -3 * len(steps)], sites.directions[: -3 * len(steps)]
         )
-        return _joined(around, _of_any_direction(moved))
+        return around.joined(DipoleSites.of_any_direction(moved))
 
     def _learnt(self, system: StillSystem, beside: int) -> StillWidths:
         """Widths of the populations as their values spread, each kind's and each free dipole's."""
@@ -284,19 +287,7 @@ class StillFitter:
         found = []
         for first in range(0, len(places), AT_ONCE):
             own = slice(first, first + AT_ONCE)
-            rows = self.model.rows(fit.unknowns, _of_any_direction(places[own]))
+            rows = self.model.rows(fit.unknowns, DipoleSites.of_any_direction(places[own]))
             basis = rows.transpose(1, 0, 2) * (1.0 + fit.unknowns.sensors[:, :1, None])
             found.append(system.gains(np.ascontiguousarray(basis), sizes[:, own]))
         return np.concatenate(found, axis=1)
-
-
-def _of_any_direction(places: Array) -> DipoleSites:
-    """Three dipoles, along x, y and z, at each of P places (P, 3)."""
-    return DipoleSites(np.repeat(places, 3, axis=0), np.tile(np.eye(3), (len(places), 1)))
-
-
-def _joined(one: DipoleSites, other: DipoleSites) -> DipoleSites:
-    return DipoleSites(
-        np.concatenate([one.positions, other.positions]),
-        np.concatenate([one.directions, other.directions]),
-    )

@@ -345,12 +345,9 @@ class FieldModelNode(AnserNode):
         said = said_of(self._sources)
         if said:
             return Status('', Level.ERROR, f'{states.TWO_SOURCES}: {said}', values)
-        if self._unfit:
-            return Status('', Level.ERROR, f'{states.OTHER_MODEL}: {self._trouble.last}', values)
-        if self._place.misplaced:
-            return Status(
-                '', Level.ERROR, f'{states.OTHER_MODEL}: {self._place.misplaced}', values
-            )
+        if self._unfit or self._place.misplaced:
+            why = self._trouble.last if self._unfit else self._place.misplaced
+            return Status('', Level.ERROR, f'{states.OTHER_MODEL}: {why}', values)
         if model is None:
             return Status('', Level.WARN, self._trouble.last or 'no setup yet', values)
         values['fingerprint'] = '' if self._base is None else self._base.fingerprint
@@ -367,14 +364,12 @@ class FieldModelNode(AnserNode):
         trouble = self._trouble.recent(time.monotonic())
         if trouble:
             return Status('', Level.WARN, f'{activity}; lately: {trouble}', values)
+        lost = f'{states.REFERENCES_LOST}: no reference fluxes'
         if self._place.awaits:
-            return Status(
-                '', Level.WARN, f'{states.REFERENCES_LOST}: no reference fluxes yet', values
-            )
+            return Status('', Level.WARN, f'{lost} yet', values)
         silent_s, setup = time.monotonic() - self._heard_s, self._setup
         if setup is not None and self._follows and silent_s > setup.refit.references_age_s:
-            said = f'{states.REFERENCES_LOST}: no reference fluxes for {silent_s:.1f} s'
-            return Status('', Level.ERROR, said, values)
+            return Status('', Level.ERROR, f'{lost} for {silent_s:.1f} s', values)
         is_troubled = values.get('refit_state') in refit_status.TROUBLED
         is_troubled |= self._refit.is_awaited and self._follows
         is_troubled |= bool(self._no_baseline and self.parameters.refit)

@@ -19,6 +19,7 @@ from anser_ros.refit.evidence import FrameEvidence, log_sum
 from anser_ros.refit.posterior import Bank
 
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
 OK = 'ok'
 FLAGGED = 'flagged'
@@ -198,6 +199,11 @@ class ReferenceWatch:
         """Take a coil for sound again whose readings have jumped back; it waits as others do."""
         if self.excluded[coil] and self.reason[coil] == DISAGREES:
             self.reason[coil], self._good[coil] = RECOVERING, 0
+
+    def without_excluded(self, flux: ComplexArray) -> ComplexArray:
+        """Return fluxes (S, K) with NaN for excluded coils; the same array if there are none."""
+        out = self.excluded
+        return np.where(out[:, None], np.nan, flux) if out.any() else flux
 
     @property
     def is_outvoted(self) -> bool:

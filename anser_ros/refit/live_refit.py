@@ -217,7 +217,7 @@ class LiveRefit:
         readable, reasons = self._baseline_check.read(frame, baseline)
         self._watch.note(readable, reasons, self.settings.min_references)
         usable = ordered if readable.all() else np.where(readable[:, None], ordered, np.nan)
-        level = self._noise.update(np.where(self._in_use()[:, None], usable, np.nan))
+        level = self._noise.update(self._watch.without_excluded(usable))
         clean = self.baseline if baseline is None else baseline
         self._look_for_jumps(stamp_ns, usable - clean, level)
         if np.count_nonzero(self._in_use()) < self.settings.min_references:
@@ -226,8 +226,7 @@ class LiveRefit:
         if baseline is not None:
             # What is averaged is the change; the baseline moves with the coil.
             ordered = ordered - baseline + self.baseline
-        out = self._watch.excluded
-        used = np.where(out[:, None], np.nan, ordered) if out.any() else ordered
+        used = self._watch.without_excluded(ordered)
         mean, frames = self._average.update(used, level * self.settings.accuracy.flux_noise_t)
         if used is not ordered:
             mean = np.where(np.isfinite(mean), mean, ordered)
