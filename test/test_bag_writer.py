@@ -14,6 +14,8 @@ from anser_ros.errors import BagError
 from anser_ros.wire import cdr
 from anser_ros.wire.bag_metadata import BagRecord, TopicRecord, qos_profile, write_metadata
 from anser_ros.wire.bag_writer import BagWriter, SessionWriter
+from anser_ros.wire.points import STALE, decode_flux
+from anser_ros.wire.setup import SensorSpec
 
 FIELDS = [('x', 0, 7, 1), ('channel', 4, 4, 1), ('flags', 6, 4, 1)]
 STAMP_NS = 1_750_000_000_123_456_789
@@ -45,6 +47,31 @@ class TestSession:
         assert [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields] == FIELDS
         assert (cloud.point_step, cloud.row_step, bytes(cloud.data)) == (8, 16, data)
         assert messages['/optical/tool_a/pose'][1].pose.position.y == 0.2
+
+    def test_a_sensor_without_a_reading_is_stale_and_an_emitter_without_current_is_not(
+        self, tmp_path
+    ):
+        sensors = [SensorSpec(c, f's/{c}', 'tool', (0, 0, 0), (0, 0, 1), 0.0) for c in (3, 1, 2)]
+        fixed = SensorSpec(7, 'r/7', 'fg', (0.1, 0.2, 0.3), (1.0, 0.0, 0.0), 0.0)
+        flux = np.full((4, 3), 1e-6 + 1e-7j)
+        flux[:3, 1] = np.nan  # the emitter
+        flux[1, 2] = flux[3] = np.nan  # one reading, and all of the reference's
+        path = tmp_path / 'a.mcap'
+        with SessionWriter(path) as session:
+            session.write_readings([*sensors, fixed], STAMP_NS, flux)
+        points = {
+            topic: decode_flux(
+                [(f.name, f.offset, f.datatype, f.count) for f in cloud.fields],
+                cloud.point_step, cloud.width, bytes(cloud.data),
+            )
+            for topic, _, cloud in decoded(path)
+        }  # fmt: skip
+        tools, references = points['/anser/tool/flux'], points['/anser/reference/flux']
+        assert tools.channel.tolist() == [3, 1, 2]
+        assert tools.flags.tolist() == [0, STALE, 0]
+        assert np.isnan(tools.position).all()
+        assert references.flags.tolist() == [STALE]
+        np.testing.assert_allclose(references.position[0], fixed.position_m, rtol=1e-6)
 
     def test_refuses_to_write_over_a_bag(self, tmp_path):
         SessionWriter(tmp_path / 'a.mcap').close()

@@ -12,15 +12,11 @@ from anser_ros.api.setup import SetupSource, load_setup
 from anser_ros.errors import ParameterError
 from anser_ros.stamps import NANO
 from anser_ros.wire.bag_writer import SessionWriter
-from anser_ros.wire.points import FluxPoints, encode_flux
 from anser_ros.wire.pose_topics import optical_topic
-from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup, dump_setup
+from anser_ros.wire.quaternion import unit_quaternions
+from anser_ros.wire.setup import Setup, dump_setup
 
 Array = NDArray[np.float64]
-
-QUATERNION_TOLERANCE = 1e-3
-"""How far the length of a quaternion may be from 1. A larger error is no rounding but a mistake,
-such as angles in the place of a quaternion; whoever reads the bag refuses 1e-2."""
 
 
 def write_session(
@@ -46,7 +42,9 @@ def write_session(
     flux : array_like, shape (F, S, K), complex
         Flux density along each coil's axis, T at nominal current: S sensors in the order of
         ``setup.sensors`` (reference sensors among them), K emitters in the order of the setup's
-        coils. NaN where there is no reading. The bag stores single precision.
+        coils. NaN where there is no reading: the sensor is flagged stale, unless the emitter is
+        NaN for all tools' sensors, or for all references, and so had no current. The bag stores
+        single precision.
     poses : mapping of str to (times, positions, quaternions), optional
         Optical poses of bodies: times (M,) in s on the origin of ``times``, positions (M, 3) of
         the body's origin in fg in m, unit quaternions x y z w (M, 4) from body to fg. Their rate
@@ -106,11 +104,8 @@ def write_session(
         Path(path).unlink(missing_ok=True)
     with SessionWriter(Path(path), checked.frame_id) as writer:
         writer.write_setup(dump_setup(checked), stamps[0])
-        for topic, specs in _flux_topics(checked):
-            rows = [checked.sensors.index(spec) for spec in specs]
-            for stamp, frame in zip(stamps, values[:, rows], strict=True):
-                fields, step, data = encode_flux(_points(specs, frame))
-                writer.write_flux(topic, stamp, fields, step, len(specs), data)
+        for stamp, frame in zip(stamps, values, strict=True):
+            writer.write_readings(checked.sensors, stamp, frame)
         for body, (_, position, quaternion) in tracks.items():
             topic = optical_topic(body)
             listed = zip(pose_stamps[body], position.tolist(), quaternion.tolist(), strict=True)
@@ -155,30 +150,10 @@ def _checked_poses(
                 f'poses of {body} need positions ({seconds.size}, 3) and quaternions '
                 f'({seconds.size}, 4), got {position.shape} and {quaternion.shape}'
             )
-        lengths = np.linalg.norm(quaternion, axis=1)
-        if not (np.isfinite(position).all() and (abs(lengths - 1) < QUATERNION_TOLERANCE).all()):
+        quaternion = unit_quaternions(quaternion)
+        if not (np.isfinite(position).all() and np.isfinite(quaternion).all()):
             raise ParameterError(
                 f'poses of {body} must be finite, with quaternions of unit length'
             )
         checked[body] = (seconds, position, quaternion)
     return checked
-
-
-def _flux_topics(setup: Setup) -> list[tuple[str, tuple[SensorSpec, ...]]]:
-    topics = [
-        ('/anser/tool/flux', setup.tool_sensors),
-        ('/anser/reference/flux', setup.reference_sensors),
-    ]
-    return [(topic, specs) for topic, specs in topics if specs]
-
-
-def _points(specs: tuple[SensorSpec, ...], flux: NDArray[np.complex128]) -> FluxPoints:
-    """One frame's cloud; the place of a sensor that moves is not known to it."""
-    fixed = np.array([spec.body == FIELD_GENERATOR for spec in specs])[:, None]
-    return FluxPoints(
-        channel=np.array([spec.channel for spec in specs]),
-        flags=np.zeros(len(specs), dtype=np.int64),
-        flux=flux,
-        position=np.where(fixed, [spec.position_m for spec in specs], np.nan),
-        axis=np.where(fixed, [spec.axis for spec in specs], np.nan),
-    )

@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.wire.bag_writer import SessionWriter
-from anser_ros.wire.points import FluxPoints, encode_flux
 from anser_ros.wire.pose_topics import optical_topic
-from anser_ros.wire.setup import SensorSpec, Setup, Vector, dump_setup
+from anser_ros.wire.setup import Setup, Vector, dump_setup
 
 Array = NDArray[np.float64]
 
@@ -44,17 +43,10 @@ def write_frames(
     BagError
         When the file exists already.
     """
-    groups = [('tool', setup.tool_sensors), ('reference', setup.reference_sensors)]
     with SessionWriter(path) as writer:
         writer.write_setup(dump_setup(setup), int(stamp_ns[0]))
         for frame, stamp in enumerate(stamp_ns):
-            for name, sensors in groups:
-                if sensors:
-                    rows = [row for row, s in enumerate(setup.sensors) if s in sensors]
-                    cloud = _cloud(sensors, flux[frame, rows], fixed=name == 'reference')
-                    fields, step, data = encode_flux(cloud)
-                    topic = f'/anser/{name}/flux'
-                    writer.write_flux(topic, int(stamp), fields, step, len(rows), data)
+            writer.write_readings(setup.sensors, int(stamp), flux[frame])
             for body, (position, quaternion) in (poses or {}).items():
                 writer.write_pose(
                     optical_topic(body),
@@ -62,18 +54,3 @@ def write_frames(
                     position[frame].tolist(),
                     quaternion[frame].tolist(),
                 )
-
-
-def _cloud(
-    sensors: Sequence[SensorSpec], flux: NDArray[np.complex128], *, fixed: bool
-) -> FluxPoints:
-    position = np.array([s.position_m for s in sensors])
-    axis = np.array([s.axis for s in sensors])
-    nothing = np.full(position.shape, np.nan)
-    return FluxPoints(
-        channel=np.array([s.channel for s in sensors], dtype=np.int64),
-        flags=np.zeros(len(sensors), dtype=np.int64),
-        flux=np.asarray(flux, dtype=np.complex128),
-        position=position if fixed else nothing,
-        axis=axis if fixed else nothing,
-    )

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from anser_ros.sessions.session import Session, session_of
 from anser_ros.stamps import JUMP_NS, NANO
 from anser_ros.wire.points import FluxPoints
+from anser_ros.wire.quaternion import unit_quaternions
 from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes
 from anser_ros.wire.setup import Setup
 
@@ -72,15 +73,15 @@ class SlidingWindow:
 
     def take_pose(self, body: str, stamp_ns: int, pose: Sequence[float]) -> None:
         """Keep an optical pose (x y z in m, quaternion x y z w), unless it is late or no pose."""
-        values = np.asarray(pose, dtype=np.float64)
-        if not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1.0) > 1e-3:
+        values = (*pose[:3], *unit_quaternions(pose[3:]).tolist())
+        if not np.isfinite(values).all():
             return
         rows = self._poses.setdefault(body, deque())
         if rows and stamp_ns <= rows[-1][0]:
             if stamp_ns > rows[-1][0] - JUMP_NS:
                 return  # late or twice
             rows.clear()
-        rows.append((stamp_ns, tuple(values.tolist())))
+        rows.append((stamp_ns, values))
         # The poses' clock may be ahead of the fluxes'.
         while rows[0][0] < stamp_ns - self._length_ns - MARGIN_NS:
             rows.popleft()

@@ -5,7 +5,7 @@ The document names the files, their columns, units, the order of quaternions and
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError
 from anser_ros.sessions.tables import NumberTable, read_table
-from anser_ros.wire.bag_writer import SessionWriter
-from anser_ros.wire.points import STALE, FluxPoints, encode_flux
+from anser_ros.wire.bag_writer import FLUX_TOPICS, SessionWriter
 from anser_ros.wire.pose_topics import (
     ENDING,
     OPTICAL,
@@ -26,6 +25,7 @@ from anser_ros.wire.pose_topics import (
     pose_setup,
     tracked_topic,
 )
+from anser_ros.wire.quaternion import unit_quaternions
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup, parse_setup
 from anser_ros.wire.setup_values import read_name
 from anser_ros.wire.yaml_text import read_yaml
@@ -39,8 +39,6 @@ LENGTH_M = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}
 """Metres in a unit of length."""
 ORDERS = {'xyzw': (0, 1, 2, 3), 'wxyz': (1, 2, 3, 0)}
 """Where x, y, z, w stand in a quaternion of that order."""
-UNIT_NORM = 0.01
-"""Most that a quaternion's length may differ from 1, as where bags are read."""
 
 Array = NDArray[Any]
 
@@ -184,24 +182,11 @@ class _Import:
             flux = np.stack([_phasors(table, columns[n], emitters, n) for n in names], axis=1)
         flux = scale * np.asarray(flux, dtype=np.complex128)
         sensors = [by_name[name] for name in names]
-        for topic, fixed in (('tool', False), ('reference', True)):
-            rows = [i for i, s in enumerate(sensors) if (s.body == FIELD_GENERATOR) == fixed]
-            if rows:
-                self._put_fluxes(topic, [sensors[i] for i in rows], flux[:, rows], stamps, fixed)
-
-    def _put_fluxes(
-        self, topic: str, sensors: list[SensorSpec], flux: Array, stamps: list[int], fixed: bool
-    ) -> None:
-        channel = np.array([s.channel for s in sensors], dtype=np.int64)
-        nothing = np.full((len(sensors), 3), np.nan)
-        place = np.array([s.position_m for s in sensors]) if fixed else nothing
-        axis = np.array([s.axis for s in sensors]) if fixed else nothing
         for stamp, values in zip(stamps, flux, strict=True):
-            lacking = ~np.isfinite(values).all(axis=1)
-            flags = np.where(lacking, STALE, 0)
-            points = FluxPoints(channel, flags, values, place, axis)
-            self._entries.append((stamp, _flux_putter(f'/anser/{topic}/flux', stamp, points)))
-        self._messages[f'/anser/{topic}/flux'] += len(stamps)
+            self._entries.append((stamp, _flux_putter(sensors, stamp, values)))
+        for topic, fixed in FLUX_TOPICS.items():
+            if any((s.body == FIELD_GENERATOR) == fixed for s in sensors):
+                self._messages[topic] += len(stamps)
 
     def _add_poses(self, entry: Mapping[str, Any], what: str, *, is_tracked: bool) -> None:
         key = 'sensor' if is_tracked else 'body'
@@ -222,19 +207,20 @@ class _Import:
             table.columns(entry.get('quaternion'), 4, f'{what}: quaternion'), table, 'quaternion'
         )[:, ORDERS[order]]
         good = np.isfinite(position).all(axis=1) & np.isfinite(quaternion).all(axis=1)
-        length = np.linalg.norm(quaternion, axis=1)
-        if (np.abs(length[good] - 1.0) > UNIT_NORM).any():
+        quaternion[good] = unit_quaternions(quaternion[good])
+        if not np.isfinite(quaternion[good]).all():
             raise ParameterError(f'{table.path}: quaternions are not of unit length')
         for row in np.flatnonzero(good).tolist():
-            put = _pose_putter(topic, stamps[row], position[row], quaternion[row] / length[row])
+            put = _pose_putter(topic, stamps[row], position[row], quaternion[row])
             self._entries.append((stamps[row], put))
         self._messages[topic] += int(good.sum())
 
 
-def _flux_putter(topic: str, stamp: int, points: FluxPoints) -> Callable[[SessionWriter], None]:
+def _flux_putter(
+    sensors: Sequence[SensorSpec], stamp: int, flux: Array
+) -> Callable[[SessionWriter], None]:
     def put(writer: SessionWriter) -> None:
-        fields, step, data = encode_flux(points)
-        writer.write_flux(topic, stamp, fields, step, len(points.channel), data)
+        writer.write_readings(sensors, stamp, flux)
 
     return put
 

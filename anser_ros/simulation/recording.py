@@ -15,9 +15,8 @@ from anser_ros.simulation.motion import Pose
 from anser_ros.simulation.world import World
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.bag_writer import SessionWriter
-from anser_ros.wire.points import FluxPoints, encode_flux
 from anser_ros.wire.pose_topics import optical_topic
-from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, dump_setup
+from anser_ros.wire.setup import dump_setup
 
 Array = NDArray[np.float64]
 START_NS = 1_700_000_000 * SECOND_NS
@@ -87,19 +86,6 @@ class GridScan:
         return position, np.asarray(rotation)
 
 
-def _cloud(sensors: tuple[SensorSpec, ...], flux: NDArray[np.complex128]) -> FluxPoints:
-    moves = np.array([sensor.body != FIELD_GENERATOR for sensor in sensors])[:, None]
-    position = np.array([sensor.position_m for sensor in sensors])
-    axis = np.array([sensor.axis for sensor in sensors])
-    return FluxPoints(
-        channel=np.array([sensor.channel for sensor in sensors]),
-        flags=np.zeros(len(sensors), dtype=np.int64),
-        flux=flux,
-        position=np.where(moves, np.nan, position),
-        axis=np.where(moves, np.nan, axis),
-    )
-
-
 def _jittered(pose: Pose, errors: Errors, rng: np.random.Generator) -> tuple[Array, Array]:
     """Return a pose as an optical tracker reports it: position (m) and quaternion x y z w."""
     position = pose[0] + rng.normal(scale=errors.optical_jitter_m, size=3)
@@ -142,9 +128,6 @@ def record(
     BagError
         When the file exists or cannot be written.
     """
-    sensors = world.setup.sensors
-    tool_rows = np.array([s.body != FIELD_GENERATOR for s in sensors])
-    groups = (('tool', tool_rows), ('reference', ~tool_rows))
     stamps = {(START_NS + round(i / rate_hz * SECOND_NS), i / rate_hz) for i in range(frames)}
     with SessionWriter(path) as writer:
         writer.write_setup(dump_setup(world.setup), START_NS)
@@ -159,12 +142,7 @@ def record(
             flux = world.flux(time)
             noise = rng.normal(scale=errors.flux_noise_t, size=(*flux.shape, 2))
             flux = flux + noise[..., 0] + 1j * noise[..., 1]
-            for name, rows in groups:
-                if rows.any():
-                    listed = tuple(s for s, keep in zip(sensors, rows, strict=True) if keep)
-                    fields, step, data = encode_flux(_cloud(listed, flux[rows]))
-                    topic = f'/anser/{name}/flux'
-                    writer.write_flux(topic, stamp, fields, step, len(listed), data)
+            writer.write_readings(world.setup.sensors, stamp, flux)
 
 
 def _optical_times(

@@ -25,6 +25,7 @@ from anser_ros.errors import BagError, LayoutError, SetupError
 from anser_ros.stamps import stamp_of
 from anser_ros.wire.points import STALE, FluxPoints, decode_flux
 from anser_ros.wire.pose_topics import optical_stem
+from anser_ros.wire.quaternion import unit_quaternions
 from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes
 from anser_ros.wire.setup import parse_setup
 
@@ -260,9 +261,8 @@ class _Collector:
     def _add_pose(self, raw: RawMessage) -> None:
         message = self.decoder.decode(raw)
         p, q = message.pose.position, message.pose.orientation
-        values = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
-        norm = float(np.linalg.norm(values[3:]))
-        if not np.isfinite(values).all() or abs(norm - 1.0) > 1e-2:
+        values = (p.x, p.y, p.z, *unit_quaternions((q.x, q.y, q.z, q.w)).tolist())
+        if not np.isfinite(values).all():
             raise LayoutError('a pose with values not finite or a quaternion not of unit length')
         body = optical_stem(raw.topic)
         self.poses.setdefault(body, []).append((stamp_of(message), values))
@@ -296,8 +296,7 @@ class _Collector:
             unique = dict(rows)
             stamps = np.array(sorted(unique), dtype=np.int64)
             values = np.array([unique[stamp] for stamp in stamps.tolist()])
-            quaternion = values[:, 3:] / np.linalg.norm(values[:, 3:], axis=1, keepdims=True)
-            streams[body] = PoseStream(stamps, values[:, :3], quaternion)
+            streams[body] = PoseStream(stamps, values[:, :3], values[:, 3:])
         return streams
 
 

@@ -13,13 +13,16 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
 
+import numpy as np
 from mcap.well_known import Profile, SchemaEncoding
 from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
 
 from anser_ros.errors import BagError
 from anser_ros.wire import cdr
 from anser_ros.wire.bag_metadata import BagRecord, TopicRecord, plain_yaml, qos_profile
-from anser_ros.wire.points import PointFieldTuple
+from anser_ros.wire.points import STALE, FluxPoints, PointFieldTuple, encode_flux
+from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec
 
 CHUNK_BYTES = 256 * 1024
 """Size of a chunk, bytes. A recording that is cut off loses at most its last chunk; smaller chunks
@@ -27,6 +30,8 @@ make larger files."""
 RESERVE_BYTES = 1024 * 1024
 """Disk space that is reserved at the start, bytes, for the end of a recording on a full disk."""
 LIBRARY = 'anser_ros'
+FLUX_TOPICS = {'/anser/tool/flux': False, '/anser/reference/flux': True}
+"""Topics of a session's fluxes, and whether their sensors are fixed to the field generator."""
 
 
 class _Segments:
@@ -236,10 +241,31 @@ class SessionWriter(_Closing):
         self._frame_id = frame_id
         self._channels: dict[str, int] = {}
 
-    def write_setup(self, text: str, stamp_ns: int, topic: str = '/anser/setup') -> None:
+    def write_setup(self, text: str, stamp_ns: int) -> None:
         """Write the setup document."""
-        channel = self._channel(topic, 'std_msgs/msg/String', latched=True)
+        channel = self._channel('/anser/setup', 'std_msgs/msg/String', latched=True)
         self._bag.write(channel, stamp_ns, cdr.string_bytes(text))
+
+    def write_readings(
+        self, sensors: Sequence[SensorSpec], stamp_ns: int, flux: NDArray[np.complex128]
+    ) -> None:
+        """Write one window: a message of the tools' sensors and one of the references, if any.
+
+        Parameters
+        ----------
+        sensors : sequence of SensorSpec
+            The S sensors that the window is of.
+        stamp_ns : int
+            Its middle.
+        flux : ndarray, shape (S, K), complex
+            T; NaN where there is no reading, and for emitters without current.
+        """
+        for topic, fixed in FLUX_TOPICS.items():
+            rows = [i for i, s in enumerate(sensors) if (s.body == FIELD_GENERATOR) == fixed]
+            if rows:
+                points = _points([sensors[i] for i in rows], flux[rows], fixed)
+                fields, step, data = encode_flux(points)
+                self.write_flux(topic, stamp_ns, fields, step, len(rows), data)
 
     def write_flux(
         self,
@@ -278,3 +304,22 @@ class SessionWriter(_Closing):
             definition = cdr.DEFINITIONS[type_name]
             self._channels[topic] = self._bag.add_topic(topic, type_name, definition, qos)
         return self._channels[topic]
+
+
+def _points(
+    sensors: Sequence[SensorSpec], flux: NDArray[np.complex128], fixed: bool
+) -> FluxPoints:
+    """One window's cloud; a sensor lacks its reading where it has none of an emitter in force.
+
+    The place of a sensor that moves is not known to its fluxes.
+    """
+    known = np.isfinite(flux)
+    lacks = (known != known.any(axis=0)).any(axis=1) | ~known.any()
+    nothing = np.full((len(sensors), 3), np.nan)
+    return FluxPoints(
+        channel=np.array([sensor.channel for sensor in sensors]),
+        flags=np.where(lacks, STALE, 0),
+        flux=flux,
+        position=np.array([sensor.position_m for sensor in sensors]) if fixed else nothing,
+        axis=np.array([sensor.axis for sensor in sensors]) if fixed else nothing,
+    )

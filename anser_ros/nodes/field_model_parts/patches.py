@@ -18,6 +18,7 @@ from anser_ros.refit.patches import PatchCoils
 from anser_ros.settings import RefitSettings
 from anser_ros.stamps import stamp_of
 from anser_ros.tracking.rotations import rotation_of_quaternion
+from anser_ros.wire.quaternion import unit_quaternions
 
 ComplexArray = NDArray[np.complex128]
 
@@ -65,14 +66,13 @@ class Patches(PatchCoils):
                 f'the pose of {body} is in {message.header.frame_id!r}, not {self._frame_id!r}'
             )
         p, q = message.pose.position, message.pose.orientation
-        quaternion = np.array([q.x, q.y, q.z, q.w])
+        quaternion = unit_quaternions((q.x, q.y, q.z, q.w))
         position = np.array([p.x, p.y, p.z])
-        norm = float(np.linalg.norm(quaternion))
-        if not np.isfinite(position).all() or not abs(norm - 1.0) < 1e-2:
+        if not (np.isfinite(position).all() and np.isfinite(quaternion).all()):
             raise FrameError(
                 f'the pose of {body} is not finite, or its quaternion has no unit length'
             )
-        self.put(body, stamp_of(message), position, rotation_of_quaternion(quaternion / norm))
+        self.put(body, stamp_of(message), position, rotation_of_quaternion(quaternion))
 
     def moved_refit(self, refit: LiveRefit, stamp_ns: int) -> LiveRefit | None:
         """Return a refit for where the patches are now, when it is needed and has been worked out.
