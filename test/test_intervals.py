@@ -34,7 +34,7 @@ def test_intervals_of_clusters_hold_the_truth():
         clusters = np.repeat(np.arange(20), 10)
         values = 3.0 + rng.normal(size=20)[clusters] + rng.normal(size=200)
         for box, labels, count in ((hits, clusters, 20), (narrow, np.arange(200), 200)):
-            found = summarised(values, cluster_weights(labels, rng, 300), count)['Mean']
+            found = summarised(values, cluster_weights(labels, rng), count)['Mean']
             box.append(found.low < 3.0 < found.high)
     assert 0.86 < np.mean(hits) <= 1.0
     assert np.mean(narrow) < 0.75

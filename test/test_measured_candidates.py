@@ -37,7 +37,7 @@ def test_finds_the_effects_that_are_there():
 def test_clean_data_choose_nothing():
     rng = np.random.default_rng(3)
     columns = dict.fromkeys('abcdef', 2)
-    search = grow(tuple(columns), regression({'a': 0.0}, columns, 1.0, rng), clear=3.0)
+    search = grow(tuple(columns), regression({'a': 0.0}, columns, 1.0, rng))
     assert search.chosen == ()
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from calibration_world import NOISE_T, scene
 
+from anser_ros.calibration import selection
 from anser_ros.calibration.blocks import FOLDS, fold_of_frames
 from anser_ros.calibration.calibrate import Options, best_damped, fit_scan, survey
 from anser_ros.calibration.error_map import FEWEST_POINTS, IDENTITY, learn_error_map
@@ -139,8 +140,9 @@ def test_the_choice_is_neither_too_coarse_nor_undamped(world):
 
 
 @pytest.mark.long
-def test_selection_finds_a_prior_and_is_deterministic(world):
-    thin = thin_frames([world.measurements], 300)
+def test_selection_finds_a_prior_and_is_deterministic(world, monkeypatch):
+    monkeypatch.setattr(selection, 'MOST_ROWS', 300)
+    thin = thin_frames([world.measurements])
     folds = fold_of_frames([m.position for m in thin])
     board = DrawnBoard(drawn(world, 0.9), thin)
     runs = [choose_layout(thin, folds, world.generator, Accuracy(), drawn=board) for _ in range(2)]
@@ -149,8 +151,9 @@ def test_selection_finds_a_prior_and_is_deterministic(world):
     assert len(runs[0].candidates) > 10
 
 
-def test_thinning_is_even_and_bounded(world):
-    thin = thin_frames([world.measurements, world.measurements], 200)
+def test_thinning_is_even_and_bounded(world, monkeypatch):
+    monkeypatch.setattr(selection, 'MOST_ROWS', 200)
+    thin = thin_frames([world.measurements, world.measurements])
     assert sum(m.flux.shape[0] * m.flux.shape[1] for m in thin) <= 212
     assert (np.diff(thin[0].time) == thin[0].time[1]).all()
 

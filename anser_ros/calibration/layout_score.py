@@ -142,7 +142,6 @@ class LayoutScorer:
         layout: Layout,
         dipoles: DipoleSites,
         drawn: DrawnBoard | None = None,
-        dampings: Sequence[float] = DAMPINGS,
     ) -> LayoutCandidate:
         """Return the held-out score of a layout for every damping, with the best one.
 
@@ -156,21 +155,19 @@ class LayoutScorer:
             Its dipoles as placed.
         drawn : DrawnBoard, optional
             The drawn board, for layouts pulled towards it.
-        dampings : sequence of float
-            The dampings to try.
         """
         prior = prior_of(layout, dipoles, drawn)
         same = None if layout.moved else self._tables(dipoles)
 
         def scored(fold: int) -> tuple[Array, float]:
-            chi, count = np.zeros(len(dampings)), 0.0
+            chi, count = np.zeros(len(DAMPINGS)), 0.0
             sites, moments_prior = dipoles, prior
             if layout.moved:
                 sites, moments_prior = self._moved_without(fold, dipoles, prior, layout, drawn)
             matrices, grams = same or self._tables(sites)
             start = None if moments_prior is None else as_real(moments_prior) / self.noise_t
             total = sum(gram for other, gram in grams.items() if other != fold)
-            moments = _ridge(np.asarray(total), len(sites), dampings, start)
+            moments = _ridge(np.asarray(total), len(sites), start)
             for body, matrix in zip(self._bodies, matrices, strict=True):
                 if fold not in body.whiteners:
                     continue
@@ -182,8 +179,8 @@ class LayoutScorer:
         chi = np.sum([part for part, _ in parts], axis=0)
         scores = self.noise_t * np.sqrt(chi / sum(count for _, count in parts))
         best = int(np.argmin(scores))
-        curve = tuple(zip(map(float, dampings), map(float, scores), strict=True))
-        return LayoutCandidate(layout, dipoles, float(dampings[best]), float(scores[best]), curve)
+        curve = tuple(zip(DAMPINGS, map(float, scores), strict=True))
+        return LayoutCandidate(layout, dipoles, DAMPINGS[best], float(scores[best]), curve)
 
     def _tables(self, dipoles: DipoleSites) -> tuple[list[Array], dict[int, Array]]:
         matrices = [basis_rows(body.corrected, dipoles) for body in self._bodies]
@@ -239,7 +236,7 @@ class LayoutScorer:
         return np.array(sums), float(body.weights[mask].sum()) * target.shape[2]
 
 
-def _ridge(gram: Array, unknowns: int, dampings: Sequence[float], prior: Array | None) -> Array:
+def _ridge(gram: Array, unknowns: int, prior: Array | None) -> Array:
     """Return damped solutions (D, N, M) from a Gram matrix of columns and right-hand sides."""
     scale = np.sqrt(np.maximum(np.diag(gram)[:unknowns], 0.0))
     scale[scale == 0.0] = 1.0
@@ -249,7 +246,7 @@ def _ridge(gram: Array, unknowns: int, dampings: Sequence[float], prior: Array |
         right = right - normal @ (prior * scale[:, None])
     values, vectors = np.linalg.eigh(normal)
     projected = vectors.T @ right
-    least = (np.asarray(dampings) ** 2)[:, None] * values[-1]
+    least = (np.asarray(DAMPINGS) ** 2)[:, None] * values[-1]
     steps = vectors @ (projected / (np.maximum(values, 0.0) + least)[:, :, None])
     out = steps / scale[:, None]
     return np.asarray(out if prior is None else out + prior)

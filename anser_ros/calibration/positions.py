@@ -26,6 +26,9 @@ MOST_STEPS = 15
 """Largest number of Levenberg-Marquardt steps; it bounds the time of a fit that creeps."""
 MOST_TRIALS = 6
 """Trials of a step, each with five times the damping of the one before, before the search ends."""
+LONGEST_MOVE_M = 0.01
+"""Longest step of a dipole, m: small beside the distance of sensors from the dipoles, so that the
+linearisation holds. Smaller takes more steps; larger, and a step may raise the residual."""
 CONVERGED = 1e-3
 """Relative fall of the sum of squares below which another step is not worth its time."""
 
@@ -113,9 +116,6 @@ class PositionFitter:
         Tikhonov's parameter of the moments, as for `MomentFitter`.
     prior : ndarray, shape (N, K), complex, optional
         Moments towards which the damping pulls, A m^2; zero by default.
-    longest_move_m : float
-        Longest step of one dipole, m; a centimetre is small beside the distance of sensors from
-        the dipoles, so that the linearisation holds.
     """
 
     def __init__(
@@ -125,14 +125,13 @@ class PositionFitter:
         dipoles: DipoleSites,
         damping: float,
         prior: ComplexArray | None = None,
-        longest_move_m: float = 0.01,
     ) -> None:
         self.blocks = [
             _rows(m.frames(block), w[block])
             for m, w in zip(measurements, weights, strict=True)
             for block in frame_blocks(len(m.time), len(m.sensors), BLOCK_ROWS // 4)
         ]
-        self.dipoles, self.damping, self.longest = dipoles, damping, longest_move_m
+        self.dipoles, self.damping = dipoles, damping
         parts = self.blocks[0][4].shape[1]
         self.prior = np.zeros((len(dipoles), parts)) if prior is None else as_real(prior)
         self.count = sum(float((b[3] ** 2).sum()) for b in self.blocks) * parts
@@ -221,7 +220,7 @@ class PositionFitter:
             normal + np.diag(strength * np.maximum(diagonal, floor) + floor), gradient
         ).reshape(-1, 3)
         size = np.linalg.norm(step, axis=1, keepdims=True)
-        step *= np.minimum(1.0, self.longest / np.maximum(size, 1e-12))
+        step *= np.minimum(1.0, LONGEST_MOVE_M / np.maximum(size, 1e-12))
         return DipoleSites(dipoles.positions + step, dipoles.directions)
 
 

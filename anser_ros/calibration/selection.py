@@ -89,12 +89,10 @@ class Selection:
     reference: MomentFit
 
 
-def thin_frames(
-    measurements: Sequence[Measurements], most_rows: int = MOST_ROWS
-) -> list[Measurements]:
-    """Return every n-th frame with the smallest n that leaves about ``most_rows`` readings."""
+def thin_frames(measurements: Sequence[Measurements]) -> list[Measurements]:
+    """Return every n-th frame with the smallest n that leaves about `MOST_ROWS` readings."""
     rows = sum(m.flux.shape[0] * m.flux.shape[1] for m in measurements)
-    step = max(1, -(-rows // most_rows))
+    step = max(1, -(-rows // MOST_ROWS))
     return [m.frames(np.arange(0, len(m.time), step)) for m in measurements]
 
 

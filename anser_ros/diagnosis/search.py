@@ -38,31 +38,21 @@ class SearchSettings:
 
     Attributes
     ----------
-    folds : int
-        Of the cross-validation over time blocks: with four, three quarters of the blocks predict
-        the rest; more folds predict little better and take longer.
     most_effects : int
         Effects that are looked for; a session with more than this many is not understood.
     finalists : int
         Candidates that are fitted in full in a round, which is what a round's time goes into.
-    least_gain, gain_per_parameter, least_share, least_share_beside_metal : float
-        What an effect must gain (`anser_ros.diagnosis.decisions`).
     iterations : int
         Most steps of a fit; most settle in fewer.
     """
 
-    folds: int = decisions.FOLDS
     most_effects: int = 6
     finalists: int = 7
-    least_gain: float = decisions.LEAST_GAIN
-    gain_per_parameter: float = decisions.PER_PARAMETER
-    least_share: float = decisions.LEAST_SHARE
-    least_share_beside_metal: float = decisions.LEAST_SHARE_BESIDE_METAL
     iterations: int = 8
 
     def fitter(self, problem: Problem, blocks: NDArray[np.int64]) -> Fitter:
         """Return what fits effects on some blocks of a problem with these settings."""
-        return Fitter(problem, blocks, self.folds, self.iterations)
+        return Fitter(problem, blocks, decisions.FOLDS, self.iterations)
 
 
 @dataclass(frozen=True)
@@ -134,19 +124,19 @@ def search_effects(
         search.fit = found
         say(f'{found.newest.label}: misfit {misfit(found):.4g}')
         _replace(fitter, search)
-        _thin_out(fitter, search, how)
+        _thin_out(fitter, search)
         noise = noise_scale(search.fit.state) ** 2
         if len(doubtful(problem, search.fit, noise)) >= decisions.MOST_DOUBTFUL:
             break
     return search
 
 
-def worth(gain: float, parameters: int, fit: Fit, how: SearchSettings) -> bool:
+def worth(gain: float, parameters: int, fit: Fit) -> bool:
     """Return whether a gain pays for its parameters, with this fit left."""
     left = max(misfit(fit), 1.0)
     metal = any(term.effect.family.is_metal for term in fit.terms)
-    share = how.least_share_beside_metal if metal else how.least_share
-    least = how.least_gain + how.gain_per_parameter * parameters + share * fit.state.count
+    share = decisions.LEAST_SHARE_BESIDE_METAL if metal else decisions.LEAST_SHARE
+    least = decisions.LEAST_GAIN + decisions.PER_PARAMETER * parameters + share * fit.state.count
     return gain > least * left
 
 
@@ -173,7 +163,7 @@ class _Round:
                 search.metal_gain = max(search.metal_gain, metal[0])
                 return shaped
         term = best.newest
-        if not worth(gain, term.complexity, best, self._how):
+        if not worth(gain, term.complexity, best):
             return None
         if term.effect.family.is_metal:
             if gain < decisions.REMNANT * search.metal_gain:
@@ -198,7 +188,7 @@ class _Round:
         fitter, scorer, before = self._fitter, self._scorer, self._before
         scored = _scored(fitter.problem, scorer)
         table = [Candidate(t, s.solution.size, scorer.held_out - s.held_out) for t, s in scored]
-        fluctuations = _fluctuating(fitter.problem, before, self._how)
+        fluctuations = _fluctuating(fitter.problem, before)
         table += [Candidate(t, t.complexity, g) for g, t in fluctuations]
         starts = _finalists(scored, scorer, self._how)
         starts += moving_starts(fitter.problem, scored, scorer, fitter.blocks)
@@ -248,12 +238,12 @@ def _metal_beside(
     return max(metals, key=lambda pair: pair[0], default=None)
 
 
-def _fluctuating(problem: Problem, before: Fit, how: SearchSettings) -> list[tuple[float, Term]]:
+def _fluctuating(problem: Problem, before: Fit) -> list[tuple[float, Term]]:
     """The fluctuations that explain most of what is there to explain."""
     count = before.state.count
     excess = before.state.sum_of_squares - count
     least = max(
-        how.least_gain, decisions.LEAST_OF_EXCESS * excess, decisions.LEAST_OF_NOISE * count
+        decisions.LEAST_GAIN, decisions.LEAST_OF_EXCESS * excess, decisions.LEAST_OF_NOISE * count
     )
     found = []
     for effect in all_effects().values():
@@ -305,7 +295,7 @@ def _finalists(
     for term, score in scored:
         gain = scorer.held_out - score.held_out
         name = term.effect.name
-        if len(out) >= how.finalists or gain < how.least_gain:
+        if len(out) >= how.finalists or gain < decisions.LEAST_GAIN:
             break
         if count.get(name, 0) >= decisions.SITES_PER_EFFECT:
             continue
@@ -350,18 +340,18 @@ def _replace(fitter: Fitter, search: Search) -> None:
                 break
 
 
-def _thin_out(fitter: Fitter, search: Search, how: SearchSettings) -> None:
+def _thin_out(fitter: Fitter, search: Search) -> None:
     """Remove effects that the others explain away."""
     while len(search.fit.terms) > 1:
         full = fitter.held_out(search.fit)
         for index, term in enumerate(search.fit.terms):
             fixed = term.effect.family in (Family.REMAINDER, Family.SEEN)
-            if fixed or term is search.fit.newest or _is_plain(search.fit, index, how):
+            if fixed or term is search.fit.newest or _is_plain(search.fit, index):
                 continue
             rest = [t for t in search.fit.terms if t is not term]
             without = settled(fitter, rest)
             gain = fitter.held_out(without) - full
-            if not worth(gain, term.complexity, search.fit, how):
+            if not worth(gain, term.complexity, search.fit):
                 search.removed.append(term)
                 search.fit = without
                 break
@@ -369,7 +359,7 @@ def _thin_out(fitter: Fitter, search: Search, how: SearchSettings) -> None:
             return
 
 
-def _is_plain(fit: Fit, index: int, how: SearchSettings) -> bool:
+def _is_plain(fit: Fit, index: int) -> bool:
     """Whether the parameters of a term show by themselves that it is needed."""
     size = fit.terms[index].theta.size
-    return size > 0 and worth(_wald(fit, index) / decisions.PLAIN_TO_SEE, size, fit, how)
+    return size > 0 and worth(_wald(fit, index) / decisions.PLAIN_TO_SEE, size, fit)

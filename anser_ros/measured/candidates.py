@@ -70,8 +70,8 @@ def _compare(
     )
 
 
-def _pays(trial: CandidateTrial, clear: float) -> bool:
-    return trial.change < -WORTH and trial.change < -clear * trial.scatter
+def _pays(trial: CandidateTrial) -> bool:
+    return trial.change < -WORTH and trial.change < -CLEAR * trial.scatter
 
 
 def _simplest(
@@ -87,7 +87,6 @@ def grow(
     names: Sequence[str],
     score: Score,
     sizes: Mapping[str, int] | None = None,
-    clear: float = CLEAR,
 ) -> CandidateSearch:
     """Add effects one at a time while they pay on held-out blocks; drop what became idle.
 
@@ -99,8 +98,6 @@ def grow(
         From a tuple of names to the mean squared residual of each held-out block, shape (B,).
     sizes : mapping, optional
         Number of parameters of each candidate: decides between those that score alike.
-    clear : float
-        Standard errors by which a gain must differ from zero.
 
     Returns
     -------
@@ -117,7 +114,7 @@ def grow(
             if name not in chosen
             for loss in (score((*chosen, name)),)
         ]
-        paying = [item for item in tried if _pays(item[0], clear)]
+        paying = [item for item in tried if _pays(item[0])]
         best = _simplest(paying, sizes or {}) if paying else None
         trials += [
             _compare(t.before, t.name, power, loss, best is not None and t is best[0])
@@ -143,15 +140,15 @@ def _prune(
     return chosen, power
 
 
-def search_text(title: str, search: CandidateSearch, unit: str, scale: float = 1.0) -> str:
+def search_text(title: str, search: CandidateSearch, unit: str) -> str:
     """Return every candidate and its held-out score, as text."""
     lines = [
-        f'{title}: held-out residual {scale * search.start:.4g} {unit} at the start, '
-        f'{scale * search.end:.4g} {unit} with {", ".join(search.chosen) or "nothing"}',
+        f'{title}: held-out residual {search.start:.4g} {unit} at the start, '
+        f'{search.end:.4g} {unit} with {", ".join(search.chosen) or "nothing"}',
         f'  {"candidate":<28} {"held-out, " + unit:>16} {"ln power":>9} {"+-":>6}  on top of',
     ]
     lines += [
-        f'  {trial.name:<28} {scale * trial.score:16.4g} {trial.change:+9.3f} '
+        f'  {trial.name:<28} {trial.score:16.4g} {trial.change:+9.3f} '
         f'{trial.scatter:6.3f}  {", ".join(trial.before) or "-"}'
         f'{"  <- chosen" if trial.chosen else ""}'
         for trial in search.trials

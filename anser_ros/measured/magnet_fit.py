@@ -50,8 +50,6 @@ class MagnetFit:
         Their standard deviations, same layout.
     noise_t : float
         Rms residual of a reading that no pose jitter explains, T, degrees of freedom counted.
-    search : CandidateSearch or None
-        The choice of the effects, when there was one.
     """
 
     source: Source
@@ -59,7 +57,6 @@ class MagnetFit:
     found: Parameters
     sigma: Parameters
     noise_t: float
-    search: CandidateSearch | None = None
 
     def predict(self, recording: Recording) -> Array:
         """Return the predicted readings, shape (F, S, 3), T."""

@@ -21,6 +21,9 @@ HEAVY = 4.0
 usual compromise between the mean (infinite) and a distribution without one (1). Smaller gives far
 poses less weight and costs precision where the errors are normal; larger lets a few bad poses move
 the frames."""
+REWEIGHTINGS = 5
+"""Fits of a robust fit after the first, each with the weights of the one before. Fewer leave bad
+poses some of their first weight; more cost a fit each and change weights by little."""
 STANDS_OUT, FAR_OUT = 7.0, 25.0
 """Distances of a pose from its prediction, in robust spreads of a coordinate, from which it stands
 out: where few do, and where many do. Three normal coordinates reach the first once in 1e10; what
@@ -130,11 +133,11 @@ def _rebased(terms: Sequence[Term]) -> list[Term]:
     return [t.rebased() if isinstance(t, FrameTerm) else t for t in terms]
 
 
-def robust_fit(problem: PoseProblem, terms: Sequence[Term], rounds: int = 5) -> PoseFit:
+def robust_fit(problem: PoseProblem, terms: Sequence[Term]) -> PoseFit:
     """Fit with poses weighted by how far they are off, and with the spread that they show."""
     problem = replace(problem, noise=tuple(_spread(p) for p in problem.state(terms).parts))
     fit = fit_poses(problem, terms, 4)
-    for _ in range(rounds):
+    for _ in range(REWEIGHTINGS):
         parts = fit.state.parts
         noise = tuple(_spread(part) for part in parts)
         weight = tuple(

@@ -13,6 +13,7 @@ from anser_ros.stamps import NANO, stamp_of
 from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.pose_topics import (
+    BODY,
     ENDING,
     OPTICAL,
     TRACKED,
@@ -90,7 +91,7 @@ def _only_optical(path: str, topics: list[str]) -> str | None:
     return found[0] if found else None
 
 
-def write_pose_session(path: Path, session: PoseSession, body: str = 'body') -> None:
+def write_pose_session(path: Path, session: PoseSession) -> None:
     """Write a session of poses as a bag; where a device had no pose, values are NaN.
 
     Raises
@@ -100,7 +101,7 @@ def write_pose_session(path: Path, session: PoseSession, body: str = 'body') -> 
     """
     sequences = [(tracked_topic(n), s) for n, s in session.sensors.items()]
     if session.reference is not None:
-        sequences.append((optical_topic(body), session.reference))
+        sequences.append((optical_topic(BODY), session.reference))
     messages: list[tuple[int, str, list[float], list[float]]] = []
     for topic, poses in sequences:
         stamp = session.start_ns + np.round(poses.time / NANO).astype(np.int64)
@@ -115,7 +116,7 @@ def write_pose_session(path: Path, session: PoseSession, body: str = 'body') -> 
             messages.append((late, topic, [np.nan] * 3, [np.nan] * 4))
     messages.sort(key=lambda message: message[0])
     with SessionWriter(path, frame_id='tracker') as writer:
-        setup = pose_setup(session.sensors, body)
+        setup = pose_setup(session.sensors, BODY)
         writer.write_setup(setup, messages[0][0] if messages else session.start_ns)
         for stamp_of, topic, position, quaternion in messages:
             writer.write_pose(topic, stamp_of, position, quaternion)

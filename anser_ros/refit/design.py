@@ -183,9 +183,7 @@ def _gains(metals: Sequence[StatedMetal], coils: Sequence[int], k: int) -> Array
     return total / len(metals)
 
 
-def choose(
-    metals: Sequence[StatedMetal], count: int, k: int, exchange: bool = True
-) -> list[Design]:
+def choose(metals: Sequence[StatedMetal], count: int, k: int) -> list[Design]:
     """Return the best choices of 1 to ``count`` coils, each one found from the one before.
 
     Parameters
@@ -195,15 +193,13 @@ def choose(
         At most the number of candidates.
     k : int
         Readings of a coil.
-    exchange : bool
-        Whether coils of the last choice are exchanged for better ones.
     """
     coils: list[int] = []
     designs = []
     while len(coils) < count:
         coils.append(int(_gains(metals, coils, k).argmax()))
         designs.append(Design(tuple(coils), expected_errors(metals, coils, k)))
-    for _ in range(MOST_EXCHANGES if exchange else 0):
+    for _ in range(MOST_EXCHANGES):
         before = tuple(coils)
         for i in range(len(coils)):
             others = coils[:i] + coils[i + 1 :]

@@ -34,8 +34,6 @@ class FreeDipoles:
     baseline : ndarray, shape (S, K), complex
     drawing : callable, optional
         Only says where the board is.
-    accuracy : Accuracy, optional
-        Of the references and their readings.
     """
 
     def __init__(
@@ -44,9 +42,8 @@ class FreeDipoles:
         references: SensorTable,
         baseline: ComplexArray,
         drawing: FieldFunction | None = None,
-        accuracy: Accuracy | None = None,
     ) -> None:
-        accuracy = accuracy or Accuracy()
+        accuracy = Accuracy()
         excitation, region = excitation_for(model, drawing)
         clouds = [cloud for cloud in default_clouds(region) if not cloud.overhead]
         self.model, self.baseline, self._noise = model, baseline, accuracy.flux_noise_t

@@ -18,6 +18,7 @@ from anser_ros.errors import ParameterError
 from anser_ros.sessions.tables import NumberTable, read_table
 from anser_ros.wire.bag_writer import FLUX_TOPICS, SessionWriter
 from anser_ros.wire.pose_topics import (
+    BODY,
     ENDING,
     OPTICAL,
     TRACKED,
@@ -115,7 +116,7 @@ class _Import:
             raise ParameterError('the tables have no complete row')
         if self._setup is None:
             names = {kind: self._names_of(kind) for kind in (TRACKED, OPTICAL)}
-            body = names[OPTICAL][0] if names[OPTICAL] else 'body'
+            body = names[OPTICAL][0] if names[OPTICAL] else BODY
             self._setup_text = pose_setup(names[TRACKED], body)
 
     def _names_of(self, kind: str) -> list[str]:

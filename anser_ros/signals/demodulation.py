@@ -25,6 +25,9 @@ SHORTEST_WINDOW_S = 0.005
 LONGEST_WINDOW_S = 0.05
 """Longest window, s. A tool at 0.2 m/s moves 1 cm meanwhile, and its phasors no longer change
 linearly."""
+MAINS_HARMONICS = 5
+"""Harmonics of the mains that are fitted beside the tones: rectifiers make odd ones, weaker the
+higher. Fewer leave hum in the noise; more cost window length where tones are near."""
 _RANK_TOLERANCE = 1e-6
 """Singular values below this fraction of the largest are left out. What the window determines lies
 far above it, and rounding far below."""
@@ -85,9 +88,8 @@ class Demodulator:
     window_samples : int
         Samples in a window, 5 to 50 ms of them.
     mains_hz : float, optional
-        Fundamental of the mains whose harmonics are fitted as well.
-    mains_harmonics : int
-        Number of these harmonics; one that falls on a tone is left out.
+        Fundamental of the mains, of which `MAINS_HARMONICS` are fitted as well; one that falls on
+        a tone is left out.
     follow_motion : bool, optional
         Whether the phasors' rates of change are fitted. By default they are where that does not
         double the variance of the phasors (from 10 ms on with tones 170 Hz apart).
@@ -105,7 +107,6 @@ class Demodulator:
         window_samples: int,
         *,
         mains_hz: float | None = None,
-        mains_harmonics: int = 5,
         follow_motion: bool | None = None,
     ) -> None:
         tones = np.asarray(frequencies_hz, float)
@@ -118,7 +119,7 @@ class Demodulator:
         self.window_s = length_s
         self._times_s = _times_s(sample_rate_hz, window_samples)
         self._bias: NDArray[np.float64] | None = None
-        harmonics = _kept_harmonics(mains_hz, mains_harmonics, tones, sample_rate_hz, length_s)
+        harmonics = _kept_harmonics(mains_hz, tones, sample_rate_hz, length_s)
 
         def prepare(motion: bool, worst: float) -> None:
             self._design = _design_matrix(sample_rate_hz, window_samples, tones, harmonics, motion)
@@ -200,14 +201,13 @@ def _smallest_spacing(tones: NDArray[np.float64]) -> float:
 
 def _kept_harmonics(
     mains_hz: float | None,
-    count: int,
     tones: NDArray[np.float64],
     sample_rate_hz: float,
     length_s: float,
 ) -> NDArray[np.float64]:
     if mains_hz is None:
         return np.empty(0)
-    harmonics = mains_hz * np.arange(1, count + 1)
+    harmonics = mains_hz * np.arange(1, MAINS_HARMONICS + 1)
     apart = np.abs(harmonics[:, None] - tones).min(axis=1) > 1 / length_s
     kept: NDArray[np.float64] = harmonics[apart & (harmonics < sample_rate_hz / 2)]
     return kept

@@ -23,6 +23,11 @@ from numpy.typing import NDArray
 from anser_ros.errors import ParameterError
 from anser_ros.signals.demodulation import ToneFit
 
+LEAST_CURRENT = 0.05
+"""Fraction of the nominal current below which an emitter counts as not driven; its fluxes would be
+divided by a current of noise. Smaller, and an idle emitter has fluxes of noise; larger, and a weak
+one is taken for dead."""
+
 
 @dataclass(frozen=True)
 class FluxWindow:
@@ -72,9 +77,6 @@ class FluxConverter:
         Peak currents that the fluxes are given for, A.
     current_delay_s : float
         Delay of the channel of the currents, s.
-    least_current : float
-        Fraction of the nominal current below which an emitter counts as not driven. It must be
-        above the noise of the current channel; a flux is divided by the current.
 
     Raises
     ------
@@ -94,7 +96,6 @@ class FluxConverter:
         amperes_per_code: float,
         nominal_currents_a: NDArray[np.float64],
         current_delay_s: float = 0.0,
-        least_current: float = 0.05,
     ) -> None:
         if not np.all(np.isfinite(area_m2) & (area_m2 != 0)):
             raise ParameterError('the effective area of a channel is zero or not finite')
@@ -107,7 +108,6 @@ class FluxConverter:
         self._current_column = current_column
         self._amperes_per_code = amperes_per_code * np.exp(1j * omega * current_delay_s)
         self._nominal_a = nominal_currents_a
-        self._least = least_current
 
     def convert(
         self, fit: ToneFit, flux_rates: NDArray[np.complex128] | None = None
@@ -125,7 +125,7 @@ class FluxConverter:
         current = fit.phasors[self._current_column] * self._amperes_per_code
         current_sigma = fit.sigma[self._current_column] * np.abs(self._amperes_per_code)
         magnitude = np.abs(current)
-        driven = magnitude > self._least * self._nominal_a
+        driven = magnitude > LEAST_CURRENT * self._nominal_a
         reference = np.full(current.shape, complex(np.nan, np.nan))
         reference[driven] = self._nominal_a[driven] / current[driven]
         to_flux = self._tesla_per_code * reference

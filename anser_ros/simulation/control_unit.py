@@ -35,6 +35,8 @@ from anser_ros.wire.records import (
     Stop,
 )
 
+NAME = 'anser_ros simulated control unit'
+"""Name by which the device introduces itself."""
 TICK_HZ = 1e6
 """Rate of the device's timestamp counter, Hz: microseconds, as usual in microcontrollers."""
 BLOCK_SAMPLES = 40
@@ -78,8 +80,6 @@ class ControlUnit:
         Changes of the signals.
     seed : int
         Seed of the noise.
-    name : str
-        Name by which the device introduces itself.
     """
 
     def __init__(
@@ -91,7 +91,6 @@ class ControlUnit:
         block_samples: int = BLOCK_SAMPLES,
         effects: Sequence[RawEffect] = (),
         seed: int = 0,
-        name: str = 'anser_ros simulated control unit',
     ) -> None:
         front = front_end or FrontEnd()
         nominal_a = float(world.setup.emitter.geometry.get('current_a', 0.25))
@@ -99,7 +98,7 @@ class ControlUnit:
         self._sampler = Sampler(
             world, calibration, front, nominal_a, effects=self._effects, seed=seed
         )
-        self._hello = _hello(world, front, block_samples, nominal_a, name)
+        self._hello = _hello(world, front, block_samples, nominal_a)
         self._reader = FrameReader()
         self._sample = 0
         self._stream_begin = 0
@@ -237,15 +236,13 @@ class ControlUnit:
         return Piece(encode(payload))
 
 
-def _hello(
-    world: World, front: FrontEnd, block_samples: int, nominal_a: float, name: str
-) -> Hello:
+def _hello(world: World, front: FrontEnd, block_samples: int, nominal_a: float) -> Hello:
     numbers = [sensor.channel for sensor in world.sensors]
     channels = [Channel(n, ChannelKind.SENSE, front.full_scale_v) for n in numbers]
     current = Channel(max(numbers) + 1, ChannelKind.CURRENT, front.full_scale_a)
     tones = world.setup.frequencies_hz
     return Hello(
-        name,
+        NAME,
         front.sample_rate_hz,
         TICK_HZ,
         block_samples,

@@ -20,6 +20,12 @@ and poses are lost to the model's own small errors; larger, and distorted poses 
 NO_GATE = 1e6
 """A gate of so much or more is no gate: no pose is refused for what it contradicts."""
 
+MEMORY_FRAMES = 100.0
+"""Good frames over which the noise is averaged, 2 s at 50 Hz: it is then known to a tenth with one
+coil of eight emitters. Fewer follow the noise of single frames; more are late when it changes."""
+PRIOR_FRAMES = 8.0
+"""Frames for which the stated noise counts at the start. Fewer let the first frame decide; more
+keep a wrong statement for longer."""
 HIDDEN = 20.0 / 11.0
 """Power of a distortion that goes into the pose over the power that stays in the residual. A
 smooth distortion looks more like a pose than like anything else: of a coil with eight emitters the
@@ -189,14 +195,12 @@ def no_pose(name: str, stamp_ns: int, state: str, model_id: str, reason: str) ->
 class NoiseScale:
     """Estimates residual power over its expectation as frames pass: 1 when the noise is as told.
 
-    An exponential mean over about ``memory`` good frames; it starts as if ``prior`` frames had
+    An exponential mean over about `MEMORY_FRAMES` good frames; it starts as if `PRIOR_FRAMES` had
     been as expected.
     """
 
-    def __init__(self, memory: float = 100.0, prior: float = 8.0) -> None:
-        self._memory = memory
-        self._weight = prior
-        self._sum = prior
+    def __init__(self) -> None:
+        self._weight = self._sum = PRIOR_FRAMES
 
     @property
     def value(self) -> float:
@@ -205,7 +209,7 @@ class NoiseScale:
 
     def add(self, ratio: float) -> None:
         """Take in the residual power per degree of freedom of one more good frame."""
-        keep = 1.0 - 1.0 / self._memory
+        keep = 1.0 - 1.0 / MEMORY_FRAMES
         self._weight = keep * self._weight + 1.0
         self._sum = keep * self._sum + min(ratio, 4.0 * self.value)
 

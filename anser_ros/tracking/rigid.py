@@ -22,6 +22,9 @@ from anser_ros.tracking.solve import Array, RealField
 MAX_EVALUATIONS = 30
 """Evaluations of the residuals after which a descent is given up as not converged. Good starts
 need a few; the bound keeps the time of a frame limited when the fluxes fit no pose."""
+GRID_STARTS = 12
+"""Starts from the grid of a body whose coils have no poses of their own. Fewer miss the right
+valley more often; each more costs a descent of all coils."""
 PARALLEL = 0.05
 """Sine of the angle between axes below which all coils of a tool count as parallel."""
 
@@ -216,7 +219,7 @@ def start_from_coils(
 
 
 def start_from_grid(
-    grid: SeedGrid, field: RealField, coils: BodyCoils, flux: Array, count: int = 12
+    grid: SeedGrid, field: RealField, coils: BodyCoils, flux: Array
 ) -> list[tuple[Array, Array]]:
     """Starts for a body whose single coils have no pose of their own (few emitters, many axes).
 
@@ -231,8 +234,6 @@ def start_from_grid(
     coils : BodyCoils
     flux : ndarray, shape (S, 2K)
         T.
-    count : int
-        Most starts wanted.
 
     Returns
     -------
@@ -253,11 +254,11 @@ def start_from_grid(
     rotations = u @ vt
     predicted = np.einsum('sj,gij,gik->gsk', coils.axes, rotations, fields, optimize=True)
     misfit = ((flux - predicted) ** 2).sum(axis=(1, 2))
-    order: Sequence[int] = np.argsort(misfit, kind='stable')[: 8 * count].tolist()
+    order: Sequence[int] = np.argsort(misfit, kind='stable')[: 8 * GRID_STARTS].tolist()
     chosen: list[int] = []
     for index in order:
         apart = [np.linalg.norm(grid.points[index] - grid.points[c]) for c in chosen]
-        if len(chosen) < count and all(distance > grid.spacing_m for distance in apart):
+        if len(chosen) < GRID_STARTS and all(distance > grid.spacing_m for distance in apart):
             chosen.append(index)
     return [
         (grid.points[i] - rotations[i] @ coils.offsets.mean(axis=0), rotations[i]) for i in chosen

@@ -30,6 +30,9 @@ descent; starts that need more are in a wrong valley."""
 HOPELESS = 100.0
 """Starts whose descent ends so many times above the gate and the best one are given up."""
 
+STARTS = 6
+"""Starts of a coil without a pose that are always tried. Fewer miss the right valley more often;
+each more costs a descent."""
 LAST_RESORT = 5
 """How many times more starts are tried when none of the first ones leads below the gate."""
 
@@ -290,7 +293,6 @@ def solve_cold(
     high: Array,
     length_m: float = 0.0,
     gate: float = math.inf,
-    candidates: int = 6,
     thorough: bool = True,
 ) -> list[CoilSolution]:
     """Return every distinct pose that the best grid points lead to, least chi-square first.
@@ -304,8 +306,6 @@ def solve_cold(
     gate : float
         Chi-square that an acceptable pose stays below; when none of the first starts leads there,
         more are tried.
-    candidates : int
-        Starts that are always tried.
     thorough : bool
         Whether more are tried when those lead to nothing acceptable.
 
@@ -316,7 +316,7 @@ def solve_cold(
     """
     found: list[CoilSolution] = []
     tried = 0
-    for count in (candidates, LAST_RESORT * candidates):
+    for count in (STARTS, LAST_RESORT * STARTS):
         chosen, axes, _ = scan(grid, flux, count)
         more = _polish(
             field, grid, flux, whitening, low, high, length_m, gate, chosen[tried:], axes

@@ -112,22 +112,18 @@ class CoilSolution:
     converged: bool
 
 
-def whitening_of(sigma: Array, modes: Array | None = None) -> Array:
+def whitening_of(sigma: Array) -> Array:
     """Return the matrix that turns a flux residual into one of unit covariance.
 
     Parameters
     ----------
     sigma : ndarray, shape (2K,)
         Standard deviation of each flux component, T.
-    modes : ndarray, shape (R, 2K), or None
-        Flux errors of one standard deviation each, T, common to several components (what the
-        model's own uncertainty does at this pose).
 
     Returns
     -------
-    ndarray, shape (1, 2K) or (2K, 2K)
-        1/T: the diagonal alone where there are no modes, else the inverse of the covariance's
-        Cholesky factor.
+    ndarray, shape (1, 2K)
+        1/T: the diagonal alone.
 
     Raises
     ------
@@ -137,13 +133,7 @@ def whitening_of(sigma: Array, modes: Array | None = None) -> Array:
     deviations = np.asarray(sigma, dtype=np.float64)
     if not (np.isfinite(deviations).all() and (deviations > 0).all()):
         raise TrackingError('flux standard deviations must be positive and finite')
-    if modes is None or len(modes) == 0:
-        return np.ascontiguousarray(1.0 / deviations[None, :])
-    scaled = np.asarray(modes, dtype=np.float64) / deviations
-    if not np.isfinite(scaled).all():
-        raise TrackingError('the model covariance must be finite')
-    factor = np.linalg.cholesky(np.eye(len(deviations)) + scaled.T @ scaled)
-    return np.ascontiguousarray(np.linalg.inv(factor) / deviations)
+    return np.ascontiguousarray(1.0 / deviations[None, :])
 
 
 def solve_coil(

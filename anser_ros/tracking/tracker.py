@@ -47,8 +47,6 @@ class Tracker:
     sensors : SensorTable
         The tool sensors, positions and axes in their body's frame.
     settings : TrackerSettings, optional
-    model_id : str, optional
-        Name of the model in the estimates; by default a digest of its arrays.
 
     Attributes
     ----------
@@ -75,7 +73,6 @@ class Tracker:
         model: FieldModel | None,
         sensors: SensorTable,
         settings: TrackerSettings | None = None,
-        model_id: str | None = None,
     ) -> None:
         if len(sensors) == 0:
             raise TrackingError('there is no tool sensor to track')
@@ -100,9 +97,9 @@ class Tracker:
         self._correction: Correction | None = None
         self._table = sensors
         self._find_bodies()
-        self._use(model, model_id)
+        self._use(model)
 
-    def _use(self, model: FieldModel | None, model_id: str | None) -> None:
+    def _use(self, model: FieldModel | None, model_id: str | None = None) -> None:
         if model is not None:
             context = build_context(model, self.settings, self._context, model_id)
             if model.effects is not self._effects or self._correction is None:

@@ -8,6 +8,8 @@ TRACKED, OPTICAL = '/tracked/', '/optical/'
 """What the topics of tracked and of optical poses begin with."""
 ENDING = '/pose'
 """What the topics of poses end with."""
+BODY = 'body'
+"""What a body is called to which nobody gave a name."""
 SCHEMA = 'anser_poses/1'
 """Schema of the setup document of a session of poses."""
 
