@@ -1,6 +1,7 @@
 """Fills the optical body's path between its poses: smooth, with velocity, or behind a low pass."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -24,7 +25,7 @@ STEPS_A_TAU = 8
 SMALLEST_STEP_S = 0.002  # grid of a filter, s: a hand moves by 0.2 mm in it
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OpticalPath:
     """Describes a body's path as cubic pieces through its poses, with a parabola's slopes at each.
 
@@ -111,21 +112,7 @@ class OpticalPath:
 
         Two-sided, it looks as far ahead as back, with the same width and no delay.
         """
-        tau = tau / np.sqrt(2) if two_sided else tau
-        step = max(SMALLEST_STEP_S, tau / STEPS_A_TAU)
-        grid = np.arange(self.knots[0], self.knots[-1] + step, step)
-        values = self._spline(np.minimum(grid, self.knots[-1]))
-        keep = float(np.exp(-step / tau))
-        # A straight line between samples goes through the filter exactly.
-        late = (1 - keep) * tau / step
-        passed = values
-        for way in (1, -1) if two_sided else (1,):
-            turned = passed[::way]
-            driven = lfilter([1 - late, late - keep], [1.0, -keep], turned - turned[0], axis=0)
-            passed = (driven + turned[0])[::way]
-        spline = CubicHermiteSpline(grid, passed, np.gradient(passed, grid, axis=0))
-        gaps = _Gaps(self.knots, self.longest_gap)
-        return _FilteredPath(grid, self.longest_gap, self.is_at_rest, spline, gaps)
+        return _behind(self, tau, two_sided)
 
 
 def _share_at_zero(nodes: Array, k: int) -> Array:
@@ -148,7 +135,7 @@ class _Gaps:
         return np.asarray(inside & near)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _FilteredPath(OpticalPath):
     """A filtered path is on a grid of its own, and known where the unfiltered one is."""
 
@@ -157,3 +144,23 @@ class _FilteredPath(OpticalPath):
     def at(self, time: Array) -> tuple[Array, Array, Array, Mask]:
         position, rotation, velocity, valid = super().at(time)
         return position, rotation, velocity, valid & self.gaps.valid(time)
+
+
+@lru_cache(maxsize=8)
+def _behind(path: OpticalPath, tau: float, two_sided: bool) -> OpticalPath:
+    """Return what `OpticalPath.filtered` does; a fit asks again and again for the same filter."""
+    tau = tau / np.sqrt(2) if two_sided else tau
+    step = max(SMALLEST_STEP_S, tau / STEPS_A_TAU)
+    grid = np.arange(path.knots[0], path.knots[-1] + step, step)
+    values = path._spline(np.minimum(grid, path.knots[-1]))
+    keep = float(np.exp(-step / tau))
+    # A straight line between samples goes through the filter exactly.
+    late = (1 - keep) * tau / step
+    passed = values
+    for way in (1, -1) if two_sided else (1,):
+        turned = passed[::way]
+        driven = lfilter([1 - late, late - keep], [1.0, -keep], turned - turned[0], axis=0)
+        passed = (driven + turned[0])[::way]
+    spline = CubicHermiteSpline(grid, passed, np.gradient(passed, grid, axis=0))
+    gaps = _Gaps(path.knots, path.longest_gap)
+    return _FilteredPath(grid, path.longest_gap, path.is_at_rest, spline, gaps)
