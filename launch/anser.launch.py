@@ -35,7 +35,7 @@ ARGUMENTS = {
     'simulate': ('false', 'whether a simulated control unit replaces the real one'),
     'composed': ('false', 'whether acquisition, field model and tracker are one process, live'),
     'optical': ('/optical', 'namespace of the optical poses'),
-    'frame_prefix': ('', 'put before the frames of poses and of /tf'),
+    'frame_prefix': ('', 'prefix of the frames of poses and of /tf'),
     'record': ('true', 'whether a bag is recorded'),
     'directory': ('recordings', 'folder of the bags'),
     'watch': ('false', 'whether effects that the model lacks are reported in /diagnostics'),

@@ -20,7 +20,7 @@ PORT = '/tmp/anser_cu'
 BOARD_SEED = 1
 SHARED_TOPICS = ('setup', 'tool/flux', 'reference/flux')
 ARGUMENTS = {
-    'duration': ('30.0', 'time from the first pose on, s; 0 for no end'),
+    'duration': ('30.0', 'duration, from the first pose on, s; 0 for no end'),
     'directory': ('recordings', 'folder of the bag'),
     'metal': ('true', 'whether a steel disc comes and goes'),
 }
@@ -66,7 +66,7 @@ def generate_launch_description():
         output='screen',
         duration_s=value('duration'),
         compare='frozen',
-        compare_note='"gate off: what a tracker without a residual gate would say"',
+        compare_note='"gate off: what a tracker without a residual gate would publish"',
     )
     shared = [(topic, f'/anser/{topic}') for topic in SHARED_TOPICS]
     return LaunchDescription(

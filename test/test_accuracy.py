@@ -229,7 +229,7 @@ class TestF2554:
         assert group.summary['RMS'].low < 3e-4 * np.sqrt(3) * 1e3 < group.summary['RMS'].high
         assert 1e-3 < estimates['span_m'].value < 3e-3
         far = sequence_of('tip', time, 300 * (place - place[0]), poses.quaternion)
-        with pytest.raises(FitError, match='give the tip with --tip'):
+        with pytest.raises(FitError, match='state the tip with --tip'):
             single_point(far, rng)
 
 
@@ -346,8 +346,8 @@ class TestCommand:
         ('options', 'words'),
         [
             (['grid', 'board.tum', '--grid', '3by4'], '--grid takes'),
-            (['grid', 'board.tum', '--grid', '2x4'], 'a board of 2 x 4 holes takes 8'),
-            (['rest', 'board.tum'], 'a rest is of one that stays'),
+            (['grid', 'board.tum', '--grid', '2x4'], 'a board of 2 x 4 holes needs 8'),
+            (['rest', 'board.tum'], 'needs a tool that stays in place'),
             (['rest', 'board.tum', 'board.tum'], 'rest takes one recording'),
             (['metal', 'board.tum'], 'without metal first'),
             (['dynamic', 'board.tum'], 'needs a moving reference'),

@@ -362,7 +362,7 @@ class TestStream:
 def test_pseudo_port_leaves_foreign_files_alone(tmp_path):
     taken = tmp_path / 'file'
     taken.write_text('mine')
-    with pytest.raises(PortError, match='is no link'):
+    with pytest.raises(PortError, match='is not a link'):
         PseudoPort(taken)
     with pytest.raises(PortError, match='cannot make the link'):
         PseudoPort(tmp_path / 'no' / 'folder')

@@ -46,7 +46,7 @@ def test_a_model_that_lies_aside_is_refused_and_its_shift_is_told(recorded, shif
     # What is told is where the board is, seen from the model.
     assert placed.shift_m == pytest.approx(-np.array(shift), abs=1.5e-4)
     assert placed.is_certain
-    with pytest.raises(BagError, match='beside where the references have the board'):
+    with pytest.raises(BagError, match='from where the references locate the board'):
         clean_flux(session, session.reference.sensors, aside)
 
 

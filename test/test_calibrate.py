@@ -144,7 +144,7 @@ def test_without_poses(factory, tmp_path, capsys):
 
 def test_without_fluxes(factory, tmp_path, capsys):
     bag = write_bag(tmp_path / 'b.mcap', factory.setup, factory.tools[0], fluxes=False)
-    assert 'no flux' in refusal(capsys, bag, '--out', tmp_path / 'm.yaml')
+    assert 'no readable flux' in refusal(capsys, bag, '--out', tmp_path / 'm.yaml')
 
 
 def test_without_setup(factory, tmp_path, capsys):
@@ -159,7 +159,7 @@ def test_too_few_points(factory, tmp_path, capsys):
         capsys, bag, '--out', tmp_path / 'm.yaml'
     )
     text = refusal(capsys, FACTORY, '--out', tmp_path / 'm.yaml', '--dipoles', '40x40')
-    assert '1600 dipoles need at least 1600 readings an emitter, got 1521' in text
+    assert '1600 dipoles need at least 1600 readings per emitter, got 1521' in text
 
 
 def test_all_points_in_one_plane(factory, tmp_path, capsys):

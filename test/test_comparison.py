@@ -89,7 +89,7 @@ def test_a_side_without_a_pose_is_told_and_not_refused(tmp_path, capsys):
     out = capsys.readouterr().out
     assert 'position error: nothing to compare of 1' in out
     assert 'frames with a pose: first better for 1 of 1' in out
-    assert f'0 poses with an error both have, {FRAMES - 1} only the first, 0 only the sec' in out
+    assert f'Both have 0 poses with an error; {FRAMES - 1} only the first, 0 only the sec' in out
     document = json.loads((tmp_path / 'out' / 'comparison.json').read_text())
     assert document['position']['a']['rmse_b'] is None
 

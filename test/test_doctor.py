@@ -42,7 +42,7 @@ def test_ports_that_are_missing_or_closed(tmp_path, monkeypatch):
     for name in ('/dev/null', str(tmp_path / 'ttyACM2')):
         (tmp_path / 'ttyACM2').touch()
         (other,) = doctor.ports(name)
-        assert (other.state, other.found) == (doctor.BAD, 'is no serial port') and other.remedy
+        assert (other.state, other.found) == (doctor.BAD, 'is not a serial port') and other.remedy
     for code, state in ((errno.EBUSY, doctor.NOTE), (errno.EIO, doctor.BAD)):
         failure = OSError(code, os.strerror(code))
         monkeypatch.setattr(doctor.os, 'open', mock.Mock(side_effect=failure))
@@ -126,7 +126,7 @@ def test_the_graph():
         'ROS': doctor.GOOD, '/anser/tracker': doctor.BAD, 'graph': doctor.GOOD,
         'anser/field_model': doctor.NOTE,
     }  # fmt: skip
-    assert '3 nodes, 2 of them ours' in found[2].found
+    assert '3 nodes, 2 of them from anser_ros' in found[2].found
 
 
 @pytest.mark.processes

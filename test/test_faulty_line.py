@@ -44,7 +44,7 @@ def test_what_repeats_itself_is_stale_and_said(line):
     count = len(listener.tool)
     listener.until(lambda: len(listener.tool) > count + 15 and ring.is_full)
     ring.on = True
-    told = 'anser/acquisition: the control unit sends the same samples again'
+    told = 'anser/acquisition: the control unit keeps sending the same samples'
     listener.until(lambda: told in listener.seen)
     assert (points(listener.tool[-1][0]).flags & STALE).all()
     ring.on = False

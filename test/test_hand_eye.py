@@ -192,7 +192,7 @@ def test_the_command_takes_a_bag_or_files(tmp_path, capsys):
     assert 'no second stream' in capsys.readouterr().err
     assert run_verb('handeye', [str(bag), *files[1:]]) == 2
     assert run_verb('handeye', [*files, '--optical', '/optical/x/pose']) == 2
-    assert 'about a bag' in capsys.readouterr().err
+    assert 'need a bag' in capsys.readouterr().err
 
 
 def test_millimetres_under_heads_of_metres_are_said_or_refused(tmp_path, capsys):

@@ -64,7 +64,7 @@ def test_a_model_file_that_was_changed_is_refused_and_an_old_one_is_believed():
     np.testing.assert_array_equal(back.references.flux, references.flux)
     louder = [[*row[:6], *(1.01 * np.array(row[6:]))] for row in document['dipoles']]
     document['dipoles'] = louder
-    with pytest.raises(ModelFileError, match=f'{model.fingerprint}, its content is'):
+    with pytest.raises(ModelFileError, match=f'{model.fingerprint}, but its content has'):
         from_document(document)
     for key in ('fingerprint', 'made_for', 'references'):
         del document[key]

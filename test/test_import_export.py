@@ -140,7 +140,7 @@ def test_columns_of_csv_become_a_session_with_poses(folder, moving, capsys):
         ({'file': 'absent.npz'}, 'no such file'),
         ({'file': 'torn.npz'}, 'cannot be read'),
         ({'colour': 'red'}, 'no key colour'),
-        ({'stamp': 'B'}, 'so B is no column'),
+        ({'stamp': 'B'}, 'so B is not a column'),
         ({'stamp': 'z'}, 'the same stamp twice'),
     ],
 )

@@ -172,7 +172,7 @@ def test_a_busy_machine_is_told_and_no_figure_shown():
         assert ('1.234' in text) is not busy
         assert ('machine too busy' in text) is busy
         assert 'gain: 1.02 put in, 1.019 found' in text
-        assert 'the watcher said sensor_gain (channel 3) 12 s' in text
+        assert 'the watcher reported sensor_gain (channel 3) 12 s' in text
         assert 'round 1, first run: anser/cu_simulator: 9 lags' in text
 
 

@@ -61,8 +61,8 @@ def test_added_dipoles_add_their_field():
         ({'emitters': [{'name': 'a'}]}, 'malformed'),
         ({'shift_sigma_m': 'far'}, 'shift_sigma_m is malformed'),
         ({'dipoles': [[1, 2]]}, 'rows of 10 numbers'),
-        ({'dipoles': 'many'}, 'no table of numbers|rows of 10'),
-        ({'dipoles': [[0.0] * 10]}, 'no unit vector'),
+        ({'dipoles': 'many'}, 'not a table of numbers|rows of 10'),
+        ({'dipoles': [[0.0] * 10]}, 'not a unit vector'),
         ({'dipoles': [[float('nan')] * 10]}, 'not finite'),
         ({'effects': [{'parameters': {}}]}, 'needs a name'),
         ({'effects': {'name': 'x'}}, 'must be a list'),
@@ -96,7 +96,7 @@ def test_a_snapshot_with_metal_in_it_is_no_calibration(tmp_path, capsys):
     assert load_model(path).provenance == base.provenance, 'nothing has changed but the error'
     for changed in (metal, replace(base, moments=1.001 * base.moments)):
         save_model(path, as_saved(changed, base, 7))
-        with pytest.raises(ModelFileError, match=r'saved\.yaml: a snapshot .*stamp_ns 7.*no cali'):
+        with pytest.raises(ModelFileError, match=r'saved\.yaml: a snapshot .*stamp_ns 7.*not a c'):
             load_model(path)
         read = load_model(path, snapshot=True)
         assert is_snapshot(read)

@@ -91,7 +91,7 @@ def test_the_model_in_force_ages_by_the_clock_of_the_frames():
     assert force.at(first + second // 4).withheld is None
     assert force.at(first + second).withheld.state == 'references_lost'
     publish(first + second, withheld=1)
-    assert 'no references heard yet, or too few' in force.at(first + second).withheld.reason
+    assert 'no reference readings yet, or too few' in force.at(first + second).withheld.reason
     publish(first + 2 * second)
     assert force.at(first + 2 * second).withheld is None
     publish(first + 2 * second + 1, withheld=2)

@@ -323,7 +323,7 @@ class TestNames:
             check_templates(OpenIGTLinkParameters(body_name='{tool}'))
 
     def test_two_devices_of_one_name_are_refused(self):
-        with pytest.raises(ParameterError, match="both the device 'pen'"):
+        with pytest.raises(ParameterError, match="both become the device 'pen'"):
             self.named(body_name='pen', coil_name='pen')
         assert igtl.device_names({'a': 'a_long_instrument/sensor_0/x'}) == {
             'a': 'nstrument/sensor_0/x'
@@ -331,7 +331,7 @@ class TestNames:
         long = ['left_distal/coil/x', 'right_distal/coil/x']
         with pytest.raises(ParameterError, match='ight_distal/coil/x'):
             igtl.device_names({n: f'instrument/inner_{n}' for n in ['right_' + m for m in long]})
-        with pytest.raises(ParameterError, match='is no name for a device'):
+        with pytest.raises(ParameterError, match='cannot be the name of a device'):
             igtl.device_names({'a': 'Größe'})
         with pytest.raises(ParameterError, match="'pen/state'"):
             igtl.device_names({'a': 'pen', 'b': 'pen/state'})

@@ -114,7 +114,7 @@ def shuffle(encoded, width):
         (lambda f, s, w, d: ([x for x in f if 'coil' not in x[0]], s, w, d), "'coil0_re'"),
         (lambda f, s, w, d: (f, s, w, d[:-1]), 'need 368 bytes, got 367'),
         (lambda f, s, w, d: (f, s, w + 1, d), 'bytes'),
-        (lambda f, s, w, d: (f, 0, w, d), 'make no cloud'),
+        (lambda f, s, w, d: (f, 0, w, d), 'do not make a cloud'),
         (lambda f, s, w, d: (f + [('x', 0, 7, 1)], s, w, d), 'twice'),
         (lambda f, s, w, d: (f + [('y2', 90, 7, 1)], s, w, d), 'leaves the point'),
         (lambda f, s, w, d: (f + [('y2', 0, 77, 1)], s, w, d), 'datatype 77'),

@@ -143,7 +143,7 @@ def test_commands_reach_the_wire_with_their_tag(wire, port):
     ('device', 'why'),
     [
         ('/dev/no_such_port', 'No such file or directory'),
-        (__file__, 'it is no serial port'),
+        (__file__, 'it is not a serial port'),
         ('nothing://here', "invalid URL, protocol 'nothing' not known"),
         ('loop://?unknown=1', "unknown option: 'unknown'"),
     ],

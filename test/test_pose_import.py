@@ -137,8 +137,8 @@ def test_a_file_of_no_known_form_is_refused_in_a_line(tmp_path, text, capsys):
     [
         (('1,2,3',), 'no complete pose'),
         (('inf,1,2,3,0,0,0,1',), 'no pose has a time'),
-        (('-5,1,2,3,0,0,0,1',), 'no stamps of a bag'),
-        (('99999999999999999999999,1,2,3,0,0,0,1',), 'no stamps of a bag'),
+        (('-5,1,2,3,0,0,0,1',), 'cannot be stamps of a bag'),
+        (('99999999999999999999999,1,2,3,0,0,0,1',), 'cannot be stamps of a bag'),
     ],
 )
 def test_a_table_without_one_pose_or_time_is_refused_and_leaves_no_bag(

@@ -109,7 +109,7 @@ def test_a_unit_without_the_command_is_not_asked_for_other_tones():
     control = StreamControl((7000.0,), set_frequencies=TOY.sets_tones)
     control.take(Record(HELLO), 1_000_000_000)
     assert control.due(1_100_000_000) is None
-    assert 'the setup asks for 7000 Hz' in control.refusal
+    assert 'but the setup requires 7000 Hz' in control.refusal
 
 
 def test_a_reader_that_fails_closes_the_port_and_it_is_opened_again(wire, port, monkeypatch):

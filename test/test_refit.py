@@ -133,7 +133,7 @@ def test_no_baseline_is_taken_while_metal_moves():
     for at_rest in (0.0, metal):
         window = window_of(world, lambda share, at_rest=at_rest: at_rest)
         np.testing.assert_array_equal(window.still_mean(), window.mean())
-    with pytest.raises(FitError, match='metal that moves'):
+    with pytest.raises(FitError, match='is metal moving'):
         window_of(world, lambda share: share * metal).still_mean()
 
 

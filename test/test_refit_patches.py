@@ -104,7 +104,7 @@ def test_the_command_takes_patches(bags, capsys):
     assert main([*arguments, '--patch', f'patch={TOPIC}']) == 0
     assert (bags / 'out' / 'poses.csv').read_text().count('patch/0') == 6
     assert main([*arguments, '--patch', 'patch']) == 2
-    assert 'no new body=topic' in capsys.readouterr().err
+    assert 'must be BODY=TOPIC' in capsys.readouterr().err
 
 
 def test_what_the_bag_lacks_is_said(bags):
@@ -115,5 +115,5 @@ def test_what_the_bag_lacks_is_said(bags):
         track_session(
             session, world.model, baseline=session, refit=True, patches={'patch': '/nobody'}
         )
-    with pytest.raises(ParameterError, match='no new body=topic'):
+    with pytest.raises(ParameterError, match='must be BODY=TOPIC'):
         parse_patches(['a=x', 'a=y'])

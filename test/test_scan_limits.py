@@ -31,7 +31,7 @@ def test_a_camera_that_jitters_shifts_neither_field_nor_tool():
 def test_a_scan_without_turns_tells_no_lever_arm_and_poses_know_it():
     found, _ = surveyed(22, 3, 6.0, 0.01, Errors(), CENTRES)
     assert 'lever_arm' in found.untold
-    line = "lever_arm: the scan tells it to 5 mm only; the setup's is kept"
+    line = 'lever_arm: the scan determines it only to 5 mm; the value of the setup is kept'
     assert line in untold_words(found)
     assert 0.2e-3 < found.shift_sigma_m <= 1.01 * SURVEYED_M
     population = Population(found.parameters)

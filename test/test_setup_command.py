@@ -88,7 +88,7 @@ def test_tables_are_taken_as_rows(tmp_path, capsys):
         (['--coil', '0,0,0,0'], 'takes 5 numbers'),
         (['--geometry', 'side_m=x'], 'must be a number'),
         (['--volume', '0,0,0'], '--volume takes 6 numbers'),
-        (['config/demo_setup.yaml'], 'a document states all'),
+        (['config/demo_setup.yaml'], 'a setup document is complete'),
     ],
 )
 def test_what_is_wrong_is_one_line_and_nothing_is_written(tmp_path, capsys, change, said):

@@ -370,5 +370,5 @@ class TestNewSurvey:
         assert new.made_for.bodies[body] == setup.identity.bodies[body]
         with pytest.raises(ModelFileError, match='no body'):
             with_new_survey(old, setup, ['nobody'])
-        with pytest.raises(ModelFileError, match='does not tell'):
+        with pytest.raises(ModelFileError, match='does not state'):
             with_new_survey(replace(old, made_for=None), setup, [body])

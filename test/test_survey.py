@@ -187,7 +187,9 @@ def test_what_a_scan_cannot_tell_is_said(dirty):
     nothing = Likelihood(np.zeros((47, 47)), np.zeros(47))
     assert set(population.untold(nothing)) == set(KINDS)
     lines = untold_words(replace(found, untold={'lever_arm': 0.004}))
-    assert lines == ("lever_arm: the scan tells it to 4 mm only; the setup's is kept",)
+    assert lines == (
+        'lever_arm: the scan determines it only to 4 mm; the value of the setup is kept',
+    )
 
 
 def test_references_say_when_metal_moved():

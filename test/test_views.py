@@ -84,4 +84,4 @@ def test_another_board_in_another_namespace(tmp_path, capsys):
 def test_a_namespace_that_is_none(tmp_path, capsys, name):
     command = ['views', 'demo_setup.yaml', '--out', str(tmp_path), '--namespace', name]
     assert main(command) == 2
-    assert 'is no namespace' in capsys.readouterr().err
+    assert 'is not a namespace' in capsys.readouterr().err

@@ -232,7 +232,7 @@ def test_over_dds_a_finding_is_raised_and_cleared(ros, start, moving, tmp_path):
         return lines[title][:2] == (0, 'gone') and lines['anser/watcher'][0] == 0
 
     assert heard.until(is_cleared), f'{heard.lines}\n{watcher.output}'
-    assert 'all as the model says' in heard.lines['anser/watcher'][1]
+    assert 'nothing found' in heard.lines['anser/watcher'][1]
     published = {
         name for name, _ in heard.node.get_publisher_names_and_types_by_node('watcher', '/anser')
     }

@@ -122,14 +122,16 @@ def judged(
     if tolerance is not None and abs(value) > tolerance:
         return Verdict(FAIL, f'beyond the tolerance of {tolerance:.4g}', limits, tolerance)
     if limits is None:
-        words = f'{len(earlier)} of {FEWEST} sessions that make limits'
+        words = f'{len(earlier)} of {FEWEST} sessions that control limits need'
         return Verdict(PASS, words, None, tolerance)
     off = (value - limits.mean) / limits.sigma
     side = 'above' if off > 0 else 'below'
     for state, deviations in ((ALERT, ACTION), (NOTE, WARNING)):
         reach = limits.reach(deviations, figures)
         if abs(off) > reach:
-            words = f'{abs(off):.1f} deviations {side} the mean, {state} from {reach:.1f}'
+            words = (
+                f'{abs(off):.1f} standard deviations {side} the mean ({state} from {reach:.1f} on)'
+            )
             return Verdict(state, words, limits, tolerance)
     last = np.sign(np.array([*earlier, value])[-RUN:] - limits.mean)
     if last.size == RUN and abs(last.sum()) == RUN:

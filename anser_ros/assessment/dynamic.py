@@ -96,7 +96,7 @@ def assess_motion(found: HandEye, sensor: str, rng: np.random.Generator) -> Dyna
     speed = np.linalg.norm(velocity, axis=1)
     if float(np.median(speed)) < SLOWEST_M_S or found.offset_s is None:
         raise FitError(
-            f'the tool moved at {1e3 * np.median(speed):.0f} mm/s in the median; move it at '
+            f'the median speed of the tool was {1e3 * np.median(speed):.0f} mm/s; move it at '
             f'{1e3 * SLOWEST_M_S:.0f} mm/s or more, at several speeds'
         )
     offset, sigma = found.offset_s

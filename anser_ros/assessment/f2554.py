@@ -53,7 +53,7 @@ def single_point(
         When there are too few readings, or they are of several locations.
     """
     if poses.size < FEWEST_READINGS:
-        raise FitError(f'{poses.size} readings; a point takes {FEWEST_READINGS} or more')
+        raise FitError(f'a point needs at least {FEWEST_READINGS} readings, got {poses.size}')
     rows = np.linspace(0, poses.size - 1, min(poses.size, MOST_READINGS)).astype(int)
     place, time = poses.position[rows], poses.time[rows]
     spread = float(
@@ -61,8 +61,9 @@ def single_point(
     )
     if spread > FAR_M:
         raise FitError(
-            f'the readings extend over {1e3 * spread:.0f} mm: they are of several locations, or '
-            'of the sensor and not of the tip (give the tip with --tip)'
+            f'the readings extend over {1e3 * spread:.0f} mm: they were taken at several '
+            'locations, or are those of the sensor instead of the tip (state the tip with '
+            '--tip)'
         )
     size = 1e3 * np.linalg.norm(place - place.mean(axis=0), axis=1)
     group = grouped('mm', [f'Reading at {t:.2f} s' for t in time], size,
@@ -97,9 +98,9 @@ def point_to_point(
         When the numbers differ, there are too few, or the order is not that of the truth.
     """
     if len(points) != len(true):
-        raise FitError(f'{len(points)} points were found, and the truth has {len(true)}')
+        raise FitError(f'{len(points)} points were found, but the truth has {len(true)}')
     if len(points) < 3:
-        raise FitError(f'{len(points)} points; distances take three or more')
+        raise FitError(f'distances need at least three points, got {len(points)}')
     place = np.array([p.position for p in points])
     first, second = np.triu_indices(len(points), 1)
     measured = np.linalg.norm(place[first] - place[second], axis=1)
@@ -107,8 +108,8 @@ def point_to_point(
     signed = 1e3 * (measured - wanted)
     if float(np.median(np.abs(signed))) > 0.25 * 1e3 * float(np.median(wanted)):
         raise FitError(
-            f'distances are {np.median(np.abs(signed)):.0f} mm off in the median: the points are '
-            'not in the order of the truth, or a unit is wrong'
+            f'the median error of the distances is {np.median(np.abs(signed)):.0f} mm: the '
+            'points are not in the order of the truth, or a unit is wrong'
         )
     pairs = np.stack([first, second], axis=1)
     words = [f'Distance {a + 1} to {b + 1}' for a, b in pairs]

@@ -97,13 +97,14 @@ class Grid:
             if known is None:
                 takes = ', '.join(f'{n} ({r} x {c})' for n, (_, r, c) in VOLUMES.items())
                 raise ParameterError(
-                    f'{count} points; the protocol takes {takes}: state your board with --grid '
-                    'ROWSxCOLUMNS, or see the points found for one too many or too few'
+                    f'{count} points were found, but the protocol needs {takes}: state your '
+                    'board with --grid ROWSxCOLUMNS, or check the points for one too many or '
+                    'too few'
                 )
             return cls(known[1], known[2], spacing_m, known[0])
         if shape[0] * shape[1] != count:
             raise ParameterError(
-                f'{count} points, and a board of {shape[0]} x {shape[1]} holes takes '
+                f'{count} points were found, but a board of {shape[0]} x {shape[1]} holes needs '
                 f'{shape[0] * shape[1]}'
             )
         name = known[0] if known and shape == known[1:] else ''
@@ -131,20 +132,21 @@ def grid_points(points: Sequence[StillPoint], grid: Grid, order: str = 'rows') -
     if turned_off[1] < WRONG_ORDER * off[1] and off[1] > WRONG_ORDER * grid.spacing_m:
         better = next(o for o in ORDERS if o != order)
         raise FitError(
-            f'neighbouring points are {1e3 * off[1]:.0f} mm off (rms), and with --order {better} '
-            f'{1e3 * turned_off[1]:.1f} mm'
+            f'the distances of neighbouring points are wrong by {1e3 * off[1]:.0f} mm (rms), '
+            f'but with --order {better} by only {1e3 * turned_off[1]:.1f} mm'
         )
     lying = place.reshape(grid.columns, grid.rows, 3)
     if _off(lying, grid)[1] < WRONG_ORDER * off[1] and off[1] > WRONG_ORDER * grid.spacing_m:
         raise FitError(
-            f'neighbouring points are {1e3 * off[1]:.0f} mm off (rms), and with --grid '
-            f'{grid.columns}x{grid.rows} {1e3 * _off(lying, grid)[1]:.1f} mm'
+            f'the distances of neighbouring points are wrong by {1e3 * off[1]:.0f} mm (rms), '
+            f'but with --grid {grid.columns}x{grid.rows} by only '
+            f'{1e3 * _off(lying, grid)[1]:.1f} mm'
         )
     if off[0] > WRONG_ORDER * grid.spacing_m:
         raise FitError(
-            f'neighbouring points are {1e3 * off[0]:.0f} mm off their '
-            f'{1e3 * grid.spacing_m:.0f} mm in the median: are they row by row, as many as --grid '
-            'says, and is --spacing-mm right?'
+            f'the median error of the distances of neighbouring points is {1e3 * off[0]:.0f} '
+            f'mm, of a spacing of {1e3 * grid.spacing_m:.0f} mm: were they recorded row by row, '
+            'and are --grid and --spacing-mm right?'
         )
     return taken
 
@@ -154,7 +156,7 @@ def _off(place: Array, grid: Grid) -> tuple[float, float]:
     along = [np.linalg.norm(np.diff(place, axis=k), axis=2).ravel() for k in (0, 1)]
     size = np.abs(np.concatenate(along) - grid.spacing_m)
     if not size.size:
-        raise FitError('a board has two holes or more')
+        raise FitError('a board must have at least two holes')
     return float(np.median(size)), float(np.sqrt(np.mean(size**2)))
 
 
@@ -297,7 +299,9 @@ def rotation_errors(
         When there are fewer than two points.
     """
     if len(points) < 2:
-        raise FitError(f'{len(points)} points; a ring takes two or more, the protocol 32')
+        raise FitError(
+            f'a ring needs at least two points (the protocol has 32), got {len(points)}'
+        )
     turns = Rotation.from_matrix(np.array([p.rotation for p in points]))
     if axis is None:
         angles = (turns[:-1].inv() * turns[1:]).magnitude()
@@ -307,8 +311,9 @@ def rotation_errors(
     signed = np.rad2deg(angles) - step_deg
     if float(np.median(np.abs(signed))) > WRONG_ORDER * step_deg:
         raise FitError(
-            f'turns are {np.median(np.abs(signed)):.1f} deg off their {step_deg:g} deg in the '
-            'median: are the points in the order of the holes, and --step-deg right?'
+            f'the median error of the turns is {np.median(np.abs(signed)):.1f} deg, of a step '
+            f'of {step_deg:g} deg: are the points in the order of the holes, and is --step-deg '
+            'right?'
         )
     words = [f'Rotation Error ROT{k} / ROT{k + 1}' for k in range(1, len(points))]
     # Neighbouring turns share a hole: they are drawn again by twos.

@@ -53,7 +53,9 @@ def metal_shifts(
 def _mean(poses: PoseSequence) -> tuple[Array, Array, Array, Array]:
     """Mean position and rotation, and the variances of both by axis."""
     if poses.size < FEWEST_POSES:
-        raise FitError(f'{poses.name}: {poses.size} poses; a rest takes {FEWEST_POSES}')
+        raise FitError(
+            f'{poses.name}: a tool at rest needs at least {FEWEST_POSES} poses, got {poses.size}'
+        )
     point = point_of(poses)
     turns = Rotation.from_quat(poses.quaternion)
     angles = (Rotation.from_matrix(point.rotation).inv() * turns).as_rotvec()

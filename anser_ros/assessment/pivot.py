@@ -121,7 +121,8 @@ def fit_pivot(
     fresh = poses.rows(~poses.repeated)
     if fresh.size < FEWEST_POSES:
         raise FitError(
-            f'{fresh.size} different poses; a pivot takes {FEWEST_POSES}, better 500 over 20 s'
+            f'a pivot calibration needs at least {FEWEST_POSES} different poses, better 500 '
+            f'over 20 s; got {fresh.size}'
         )
     jitter = turn_jitter(fresh)
     chosen = fresh.rows(np.linspace(0, fresh.size - 1, min(fresh.size, MOST_POSES)).astype(int))
@@ -139,8 +140,9 @@ def fit_pivot(
         )
     if rms > limits.rms_m:
         raise FitError(
-            f'the poses do not turn about one point: the best is {1e3 * rms:.1f} mm off (rms, at '
-            f'most {1e3 * limits.rms_m:.1f}); keep the tip in a dimple while the tool tilts'
+            'the poses do not turn about one point: they miss the best point by '
+            f'{1e3 * rms:.1f} mm (rms, at most {1e3 * limits.rms_m:.1f}); keep the tip in a '
+            'dimple while the tool tilts'
         )
     tilt = _refuse_poor_motion(turn, agrees)
     covariance = _covariance(place, turn, chosen.time, agrees, tip, point, inverse)

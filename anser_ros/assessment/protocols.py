@@ -174,8 +174,8 @@ def points_of(recordings: Sequence[AssessedPoses], rule: PauseRule) -> list[Stil
     pauses = still_points(recordings[0].poses, rule)
     if not pauses:
         raise FitError(
-            f'no pause of {rule.least_s:g} s was found; rest longer on each point, set --pause-s, '
-            'or give one recording a point'
+            f'no pause of {rule.least_s:g} s was found; rest longer on each point, set '
+            '--pause-s, or give one recording per point'
         )
     return pauses
 
@@ -190,8 +190,8 @@ def _rest(
     notes = []
     if found.even_share < EVEN_ENOUGH:
         notes.append(
-            f'poses lack: the Allan deviation is of the longest stretch without a gap, '
-            f'{found.even_share:.0%} of the poses'
+            'poses are missing: the Allan deviation is that of the longest stretch without a '
+            f'gap, {found.even_share:.0%} of the poses'
         )
     return replace(empty, estimates=found.estimates, allan=found.allan, notes=tuple(notes))
 
@@ -212,8 +212,8 @@ def _grid(
     notes: tuple[str, ...] = ()
     if lines_alike(place, grid):
         notes = (
-            'neighbouring lines of holes seem to err alike, as in a distorted field: intervals '
-            'come from thirds of the board, and are wide',
+            'neighbouring lines of holes seem to have the same error, as in a distorted field: '
+            'intervals come from thirds of the board, and are wide',
         )
     groups = distance_errors(place, grid, rng)
     return replace(empty, estimates=estimates, groups=groups, points=tuple(points), notes=notes)
@@ -284,7 +284,9 @@ def _point_to_point(
         recordings = [replace(first, poses=found.session.sensors[first.poses.name])]
         points = points_of(recordings, options.pause)
         true = _optical_points(found, recordings[0].poses, points)
-        notes.append('the truth is the optical reference, whose own error is in the figures')
+        notes.append(
+            'the truth is the optical reference, whose own error is included in the figures'
+        )
     else:
         points = points_of(recordings, options.pause)
     group, estimates = point_to_point(points, true, rng)
@@ -335,5 +337,8 @@ def _dynamic(
         raise ParameterError('dynamic needs a moving reference: a bag with optical poses')
     found = fit_hand_eye(session)
     motion = assess_motion(found, recordings[0].poses.name, rng)
-    notes = ('latency is against the reference and its clock, whose own latency is in it',)
+    notes = (
+        'latency is measured against the reference and its clock, and includes the latency of '
+        'the reference',
+    )
     return replace(empty, estimates=motion.estimates, speeds=motion.groups, notes=notes)

@@ -77,11 +77,17 @@ def assess_rest(poses: PoseSequence) -> Rest:
         When there are too few, or the tool was moved.
     """
     if poses.size < FEWEST_POSES:
-        raise FitError(f'{poses.size} poses; a rest takes {FEWEST_POSES}, better minutes of them')
+        raise FitError(
+            f'a tool at rest needs at least {FEWEST_POSES} poses, better some minutes of them; '
+            f'got {poses.size}'
+        )
     low, high = np.percentile(poses.position, [5, 95], axis=0)
     extent = float(np.linalg.norm(high - low))
     if extent > FARTHEST_M:
-        raise FitError(f'the tool moved by {1e3 * extent:.0f} mm; a rest is of one that stays')
+        raise FitError(
+            f'the tool moved by {1e3 * extent:.0f} mm: the protocol rest needs a tool that '
+            'stays in place'
+        )
     turns = Rotation.from_quat(poses.quaternion)
     angles = (turns.mean().inv() * turns).as_rotvec()
     estimates: dict[str, IntervalEstimate] = {}

@@ -36,7 +36,7 @@ def check_measurements(
     measurements : sequence of Measurements
         Tool measurements, one per body and session.
     needed : int
-        Number of readings an emitter that the dipoles need.
+        Number of readings per emitter that the dipoles need.
     field_alone : bool
         Whether nothing is estimated of the sensors, so that few poses of many sensors do.
 
@@ -76,7 +76,7 @@ def check_measurements(
     readings = sum(int(m.usable.sum()) for m in measurements)
     if readings < needed:
         raise FitError(
-            f'{needed} dipoles need at least {needed} readings an emitter, got {readings}'
+            f'{needed} dipoles need at least {needed} readings per emitter, got {readings}'
         )
     _check_thickness(measurements)
     return readings
@@ -92,7 +92,7 @@ def check_kept(
     measurements, kept : sequence of Measurements
         Tool measurements, one per body and session, before and after frames were left out.
     needed : int
-        Number of readings an emitter that the dipoles need.
+        Number of readings per emitter that the dipoles need.
 
     Raises
     ------
@@ -104,8 +104,8 @@ def check_kept(
     except FitError as error:
         before, after = _usable_frames(measurements), _usable_frames(kept)
         raise FitError(
-            f'{before - after} of {before} frames were left out, as their poses are not where '
-            f'the fluxes are or something moved; of the rest: {error}'
+            f'{before - after} of {before} frames were left out, because their poses contradict '
+            f'their fluxes or something moved; of the others: {error}'
         ) from error
 
 
@@ -159,6 +159,7 @@ def check_agreement(
     worst = max(part.fit.noise_t for part in alone)
     if joint.noise_t > DISAGREEMENT * worst:
         raise FitError(
-            f'the sessions are of different boards: one field leaves {joint.noise_t:.3g} T, '
-            f'more than {DISAGREEMENT:g} times the {worst:.3g} T that each leaves alone'
+            'the sessions are of different boards: the residual of one field for all is '
+            f'{joint.noise_t:.3g} T, more than {DISAGREEMENT:g} times the {worst:.3g} T of a '
+            'field for each'
         )

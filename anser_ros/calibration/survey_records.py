@@ -40,7 +40,9 @@ def untold_words(result: SurveyResult) -> tuple[str, ...]:
     for kind, size in result.untold.items():
         factor, unit = UNITS[kind]
         told = f'{_short(factor * size)} {unit}'
-        words.append(f"{kind}: the scan tells it to {told} only; the setup's is kept")
+        words.append(
+            f'{kind}: the scan determines it only to {told}; the value of the setup is kept'
+        )
     return tuple(words)
 
 

@@ -48,27 +48,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('protocol', choices=list(PROTOCOLS), help='what was recorded, see below')
     parser.add_argument(
         'recordings', nargs='+', type=Path,
-        help='bag or file of poses; several: one a point (grid, rotation, point-to-point)',
+        help='bag or file of poses; several files: one per point (grid, rotation, point-to-point)',
     )  # fmt: skip
     add_source_options(parser)
     parser.add_argument('--optical', metavar='TOPIC', help='topic of the reference')
     parser.add_argument(
         '--pause-s', type=float, default=PauseRule().least_s,
-        help=f'shortest rest that is a point, s ({PauseRule().least_s:g})',
+        help=f'shortest pause that counts as a point, s ({PauseRule().least_s:g})',
     )  # fmt: skip
     parser.add_argument('--grid', metavar='RxC', help='rows and columns of a board of your own')
     parser.add_argument(
-        '--spacing-mm', type=float, default=1e3 * SPACING_M, help='of the holes of the board (50)'
+        '--spacing-mm',
+        type=float,
+        default=1e3 * SPACING_M,
+        help='spacing of the holes of the board, mm (50)',
     )
     parser.add_argument(
         '--order', choices=ORDERS, default=ORDERS[0],
         help='rows: all in one direction; serpentine: every other one backwards',
     )  # fmt: skip
     parser.add_argument(
-        '--step-deg', type=float, default=RING_STEP_DEG, help='of the holes of the ring (11.25)'
+        '--step-deg',
+        type=float,
+        default=RING_STEP_DEG,
+        help='step of the holes of the ring, degrees (11.25)',
     )
     parser.add_argument(
-        '--axis', metavar='X,Y,Z', help='of a sensor without roll: the direction whose turn counts'
+        '--axis',
+        metavar='X,Y,Z',
+        help='for a sensor without roll: the direction whose rotation is evaluated',
     )
     parser.add_argument(
         '--truth', default=OPTICAL_TRUTH, metavar='FILE',
@@ -151,7 +159,7 @@ def _say(found: Assessment, document: dict[str, Any], state: str, sessions: int)
             if one['words']
         )
         console.print(
-            f'[{COLORS[state]}]{state}[/], beside {sessions} earlier sessions'
+            f'[{COLORS[state]}]{state}[/], compared with {sessions} earlier sessions'
             + (f': {words}' if words else ''), highlight=False,
         )  # fmt: skip
 

@@ -49,7 +49,7 @@ def render(found: Assessment, document: dict[str, Any]) -> str:
         ]
         sections += [
             f'<h2>{html.escape(name)}</h2>',
-            table(('', f'error, {group.unit}', f'measured less true, {group.unit}'), rows),
+            table(('', f'error, {group.unit}', f'measured minus true, {group.unit}'), rows),
         ]
     return page('Accuracy', sections)
 
@@ -85,7 +85,7 @@ def _errors(found: Assessment) -> Figure:
     for panel, (name, group) in zip(panels[0], found.groups.items(), strict=True):
         panel.hist(group.signed, bins=min(30, max(5, group.signed.size // 4)))
         panel.axvline(0.0, color='0.5')
-        panel.set(xlabel=f'measured less true, {group.unit}')
+        panel.set(xlabel=f'measured minus true, {group.unit}')
         panel.set_title(name, fontsize=9)
     panels[0][0].set_ylabel('number')
     return figure

@@ -54,7 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         verb.add_argument('sessions', nargs='+', metavar='BAG', help='.mcap files or bag folders')
         verb.add_argument(
             '--out', required=True, type=Path,
-            help='folder for summary.csv, summary.html and a folder a session, made if missing',
+            help='folder for summary.csv, summary.html and one folder per session, made if '
+            'missing',
         )  # fmt: skip
         where = verb.add_mutually_exclusive_group()
         where.add_argument(
@@ -64,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         )  # fmt: skip
         where.add_argument(
             '--workers', type=int, default=cores(), metavar='N',
-            help='processes on this machine, by default one a core',
+            help='processes on this machine, by default one per core',
         )  # fmt: skip
         importlib.import_module(f'anser_ros.cli.{name}').add_options(verb)
         verb.add_argument('--json', action='store_true', help='print the summary on stdout')
@@ -135,7 +136,7 @@ def _lost(run: SessionRun, error: Any, code: int, words: str) -> Outcome:
     from distributed import KilledWorker
 
     if isinstance(error, KilledWorker):
-        line = 'every worker that took it died, as for want of memory'
+        line = 'every worker that ran it died, possibly for lack of memory'
         return Outcome(run.name, run.session, EXIT_BAD_INPUT, {}, line)
     trace = words if code == EXIT_DEFECT else ''
     return Outcome(run.name, run.session, code, {}, words.splitlines()[-1], trace)

@@ -65,8 +65,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         '--estimate', type=_kinds, default=KINDS, metavar='LIST',
-        help='find these of sensors and clock together with the field, where the scan speaks for '
-        f'them; "none" takes all as the setup says; by default {",".join(KINDS)}; '
+        help='errors of sensors and clock to estimate together with the field, where the scan '
+        f'supports them; "none" trusts the setup for all; by default {",".join(KINDS)}; '
         f'{",".join(NAMED_KINDS)} only when named',
     )  # fmt: skip
     parser.add_argument(
@@ -160,7 +160,7 @@ def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
     table = Table(title='calibration', show_header=False)
     held_out = calibration.held_out
     rows: tuple[tuple[str, str], ...] = (
-        ('readings an emitter', f'{document["n_measurements"]}'),
+        ('readings per emitter', f'{document["n_measurements"]}'),
         ('dipoles', calibration.layout.describe()),
         ('damping', f'{calibration.damping:g}'),
         ('residual, T rms', f'{document["flux_rmse_t"]:.4g}'),

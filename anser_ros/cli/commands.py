@@ -15,10 +15,10 @@ NODES = {
     'replay': 'publishes a bag again: replay BAG [--rate R] [--loop]',
     'openigtlink': 'serves the poses to 3D Slicer as OpenIGTLink',
     'cu_simulator': 'a control unit behind a pseudo-terminal',
-    'corrector': 'corrects the poses of a tracker of poses by a model of diagnose --poses',
+    'corrector': 'corrects the poses of another tracker with a model of diagnose --poses',
     'monitor': 'a live table of sensors, rates and latencies',
     'dashboard': 'a live view in the browser, with the loop of record, diagnose and correct',
-    'watcher': 'names live, in /diagnostics, what the model lacks',
+    'watcher': 'names the effects that the model lacks, live in /diagnostics',
 }
 
 COMPOSED = {
@@ -28,12 +28,12 @@ COMPOSED = {
 OFFLINE = {
     'accuracy': 'jitter, drift, distances, rotations, latency by published protocols',
     'bags': 'record the small simulated sessions of the folder bags/',
-    'batch': 'calibrate, evaluate or diagnose many sessions with Dask, and sum them up',
+    'batch': 'calibrate, evaluate or diagnose many sessions with Dask, with a summary',
     'calibrate': 'fit a field model to recorded sessions',
     'compare': 'compare two evaluations of a session, paired, with bootstrap intervals',
     'demo': 'watch a simulated tool being tracked: a live table, a bag, a picture',
     'diagnose': 'find what a model leaves unexplained on a session, name the effect, correct it',
-    'doctor': 'look at installation, ports, clock and graph, with a remedy for each problem',
+    'doctor': 'check the installation, ports, clock and graph, with a remedy for each problem',
     'error_map': 'learn an error map from tracked and true positions, and apply it to others',
     'evaluate': 'track recorded sessions and compare their poses with the optical ones',
     'export': 'write poses and fluxes of a bag as CSV, TUM or MATLAB files',

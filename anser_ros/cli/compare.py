@@ -108,7 +108,7 @@ def alone(found: Mapping[str, Compared]) -> str:
     counts = [sum(getattr(one, side) for one in found.values()) for side in ('only_a', 'only_b')]
     said = [f'{count} only the {WORDS[key]}' for key, count in zip('ab', counts, strict=True)]
     pairs = sum(one.n for one in found.values())
-    return f'{pairs} poses with an error both have, {", ".join(said)} has.'
+    return f'Both have {pairs} poses with an error; {", ".join(said)} has.'
 
 
 def _errors(found: Mapping[str, Compared], title: str, scale: float) -> Table:

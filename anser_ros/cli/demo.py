@@ -50,7 +50,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command line of the demo."""
     parser.epilog = 'example: anser demo --duration 30'
     parser.add_argument(
-        '--duration', type=float, default=30.0, metavar='S', help='time from the first pose on'
+        '--duration',
+        type=float,
+        default=30.0,
+        metavar='S',
+        help='duration, from the first pose on, s',
     )
     parser.add_argument(
         '--out', type=Path, default=Path('recordings'), metavar='DIR',

@@ -13,7 +13,7 @@ LIVE = 'live'
 FROZEN = 'frozen'
 MEANINGS = {
     LIVE: 'model refitted to the reference coils, gated',
-    FROZEN: 'frozen model, gate off: what a tracker without a residual gate would say',
+    FROZEN: 'frozen model, gate off: what a tracker without a residual gate would publish',
 }
 COLOURS = ('tab:blue', 'tab:orange')
 GAP_S = 0.1

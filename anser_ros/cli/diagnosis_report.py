@@ -32,9 +32,9 @@ def render(result: SessionDiagnosis, document: dict[str, Any], *, session: str, 
         f'<h1>Diagnosis</h1><p class="note">session <code>{html.escape(session)}</code>, '
         f'model <code>{html.escape(model)}</code></p>',
         f'<p class="verdict">{html.escape(verdict(document))}</p>',
-        '<h2>Before and after</h2><p>Measured on every fifth stretch of time, which took no part '
-        'in choosing or fitting. Each frame&#39;s optical jitter, which moves all channels '
-        'together, is taken out of the flux residual.</p>',
+        '<h2>Before and after</h2><p>Measured on every fifth stretch of time, which was used '
+        'neither to choose nor to fit. Each frame&#39;s optical jitter, which moves all '
+        'channels together, is taken out of the flux residual.</p>',
         _held_out(document),
         '<h2>Effects</h2>',
         _effects(document),
@@ -73,11 +73,11 @@ def _effects(document: dict[str, Any]) -> str:
     if not document['effects']:
         if document['unexplained']['fraction'] > 0:
             return (
-                '<p>None is named: what explained something was not the same in all parts of the '
-                'data, or left too much where it acts (see below, refused). Nothing is corrected; '
-                'a wrong correction would be worse than none.</p>'
+                '<p>No effect is named: those that explained something differed from one part '
+                'of the data to the next, or left too much where they act (see Refused, below). '
+                'Nothing is corrected; a wrong correction would be worse than none.</p>'
             )
-        return '<p>None. A clean session passes every test and is not corrected.</p>'
+        return '<p>None: the session passes every test, and nothing is corrected.</p>'
     rows = []
     for effect in document['effects']:
         values = '\n'.join(f'{k} = {value_text(v)}' for k, v in short_ones(effect['parameters']))
@@ -124,8 +124,9 @@ def _populations(result: SessionDiagnosis) -> Iterator[str]:
     records = result.diagnosis.model.effects
     figure = population_figure(records)
     if figure is not None:
-        yield '<h2>What every sensor has</h2><p>Its own error, one standard deviation behind it, '
-        yield 'as the corrected model undoes it; the grey band is the width of the population.</p>'
+        yield '<h2>Errors of all sensors</h2><p>The error of each sensor with one standard '
+        yield 'deviation, as the corrected model removes it; the grey band is the spread of all '
+        yield 'sensors.</p>'
         yield image(figure)
         yield table(*population_table(records))
 
@@ -144,9 +145,15 @@ def _structure(result: SessionDiagnosis) -> str:
         for other in found.tests_before
         if other.variable == test.variable
     ]
-    head = ['residual against', 'share before', 'share after', 'chance of that in noise', 'left?']
+    head = [
+        'residual against',
+        'share before',
+        'share after',
+        'probability in noise alone',
+        'left?',
+    ]
     text = '<p>Share of the residual power that follows each variable beyond chance. A trace is '
-    text += 'plain to see, but too small to matter.</p>'
+    text += 'significant, but too small to matter.</p>'
     if found.unexplained > 0:
         text += f'<p>{html.escape(strongest(found.after))}</p>'
     return text + table(head, rows)
@@ -172,7 +179,7 @@ def _candidates(rounds: Sequence[Sequence[Candidate]]) -> str:
             f'{table(head, rows)}</details>'
         )
     return (
-        '<p>What each takes off the squared residual of blocks that its fit has not seen, in '
+        '<p>How much each lowers the squared residual of blocks that its fit did not use, in '
         'units of the misfit.</p>' + ''.join(parts)
     )
 
@@ -185,8 +192,11 @@ def _left_out(result: SessionDiagnosis) -> str:
     ]
     text = ''
     if rows:
-        text += '<h2>Refused</h2><p>These explained something, but may not be named.</p>'
-        head = ['candidate', 'why', 'varies by', 'leaves where it acts']
+        text += (
+            '<h2>Refused</h2><p>These explained something, but not reliably enough to be '
+            'named.</p>'
+        )
+        head = ['candidate', 'why', 'varies by', 'residual where it acts']
         text += table(head, rows)
     if found.search.removed:
         names = ', '.join(term.label for term in found.search.removed)

@@ -38,8 +38,8 @@ def _paragraph(document: dict[str, Any], names: str) -> str:
     if effects:
         text = (
             f'The model lacks {len(effects)} effect{"s" if len(effects) > 1 else ""}: {names}. '
-            f'With {"them" if len(effects) > 1 else "it"} the residual on data that took no part '
-            f'falls from {1e12 * before:.0f} to {1e12 * after:.0f} pT'
+            f'With {"them" if len(effects) > 1 else "it"} the residual on held-out data falls '
+            f'from {1e12 * before:.0f} to {1e12 * after:.0f} pT'
         )
         pair = held['position_rmse_before_m'], held['position_rmse_after_m']
         if None not in pair:
@@ -47,7 +47,7 @@ def _paragraph(document: dict[str, Any], names: str) -> str:
         text += '.'
     else:
         floor = 1e12 * held['flux_rms_floor_t']
-        text = 'No effect that is known here explains what this session shows: '
+        text = 'No known effect explains the residual of this session: '
         if document['unexplained']['fraction'] == 0:
             text = 'The model explains this session, and no effect is needed: '
         text += (
@@ -55,7 +55,7 @@ def _paragraph(document: dict[str, Any], names: str) -> str:
         )
     rest = document['unexplained']
     if rest['fraction'] > 0:
-        on = ', '.join(rest['depends_on']) or 'nothing that was looked at'
+        on = ', '.join(rest['depends_on']) or 'none of the variables examined'
         share = f'{rest["fraction"]:.0%}' if rest['fraction'] >= 0.01 else 'Less than 1%'
         text += f' {share} of the power above the noise stays unexplained; it depends on {on}.'
     else:

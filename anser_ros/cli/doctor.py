@@ -151,7 +151,7 @@ def kernels() -> list[Observation]:
     cache = KernelCache(folder_of(fill_frame))
     if cache.is_full:
         return [Observation('kernels', GOOD, f'all {cache.total} are compiled')]
-    words = 'not said to be compiled as a whole: the first start sees to it, up to a minute'
+    words = 'not all compiled: the first start compiles the rest, which takes up to a minute'
     return [Observation('kernels', NOTE, words, 'anser warm_up')]
 
 
@@ -169,22 +169,22 @@ def _port(name: str) -> Observation:
     if not os.path.exists(name):
         return Observation(name, BAD, 'not there', 'plug it in; see dmesg for its name')
     if not os.access(name, os.R_OK | os.W_OK):
-        remedy = f'sudo usermod -aG {_group(name)} $USER, and log in anew'
-        return Observation(name, BAD, 'may not be read and written', remedy)
+        remedy = f'sudo usermod -aG {_group(name)} $USER, then log out and in again'
+        return Observation(name, BAD, 'no permission to read and write it', remedy)
     try:
         handle = os.open(name, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     except OSError as error:
         if error.errno == errno.EBUSY:
-            words = 'another program has it to itself'
+            words = 'another program uses it exclusively'
             return Observation(name, NOTE, words, f'fine if that is acquisition: fuser {name}')
         words = f'cannot be opened: {error.strerror}'
         return Observation(name, BAD, words, 'unplug it and plug it in; see dmesg')
     try:
         if os.isatty(handle):
-            return Observation(name, GOOD, 'may be opened')
+            return Observation(name, GOOD, 'can be opened')
     finally:
         os.close(handle)
-    return Observation(name, BAD, 'is no serial port', 'see dmesg for the name of the port')
+    return Observation(name, BAD, 'is not a serial port', 'see dmesg for the name of the port')
 
 
 def _group(name: str) -> str:
@@ -208,7 +208,7 @@ def clock(tool: str = 'timedatectl') -> list[Observation]:
     kept = {'yes': True, 'no': False}.get(said)
     kept = kernel_clock() if kept is None else kept
     if kept is None:
-        return [Observation('clock', NOTE, 'unknown, as nobody tells')]
+        return [Observation('clock', NOTE, 'unknown: no time service reports it')]
     if kept:
         return [Observation('clock', GOOD, 'synchronised')]
     remedy = 'install chrony, or timedatectl set-ntp true'
@@ -243,7 +243,7 @@ def domain() -> list[Observation]:
     if number in DOMAINS:
         words = f'{text}: Linux gives its ports to other programs too'
         return [Observation('ROS_DOMAIN_ID', NOTE, words, remedy)]
-    return [Observation('ROS_DOMAIN_ID', BAD, f'{text!r} is no domain', remedy)]
+    return [Observation('ROS_DOMAIN_ID', BAD, f'{text!r} is not a domain', remedy)]
 
 
 def graph(seconds: float) -> list[Observation]:
@@ -260,7 +260,7 @@ def graph(seconds: float) -> list[Observation]:
         remedy = 'look at RMW_IMPLEMENTATION and the network'
         return [Observation('ROS', BAD, 'the middleware does not answer', remedy)]
     if done.returncode:
-        last = (done.stderr.strip().splitlines() or [f'ends with {done.returncode}'])[-1]
+        last = (done.stderr.strip().splitlines() or [f'exit code {done.returncode}'])[-1]
         last = re.sub(r'^(\[[^]]*\] *)+: *', '', last)  # a log's level, time and name
         return [Observation('ROS', BAD, last, _ros_remedy(last))]
     told = json.loads(done.stdout.strip().splitlines()[-1])
@@ -285,8 +285,10 @@ def graph_findings(told: dict[str, Any]) -> list[Observation]:
         remedy = 'end one, or give it a namespace or ROS_DOMAIN_ID of its own'
         found.append(Observation(name, BAD, 'runs more than once', remedy))
     ours = [name for name in told['nodes'] if name.rsplit('/', 1)[-1] in NODES]
-    words = f'{len(told["nodes"])} nodes, {len(ours)} of them ours, {told["topics"]} topics'
+    words = (
+        f'{len(told["nodes"])} nodes, {len(ours)} of them from anser_ros, {told["topics"]} topics'
+    )
     found.append(Observation('graph', GOOD, words))
     for name, text in told['complaints'].items():
-        found.append(Observation(name, NOTE, text, 'docs/faults.md has what states mean'))
+        found.append(Observation(name, NOTE, text, 'docs/faults.md explains the states'))
     return found

@@ -38,11 +38,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f'positions: a CSV with {", ".join(TRACKED)}, or a list of 3D Slicer ({MARKUPS}, mm)',
     )  # fmt: skip
     parser.add_argument(
-        '--true', type=Path, metavar='PLACES', help='the true positions, a row a tracked one'
+        '--true',
+        type=Path,
+        metavar='PLACES',
+        help='the true positions, one row per tracked position',
     )
     parser.add_argument(
         '--register', action='store_true',
-        help='the true positions are in a frame of their own: a shift or turn is no error',
+        help='the true positions are in another frame: a shift and a rotation between both are '
+        'not counted as errors',
     )  # fmt: skip
     parser.add_argument(
         '--out',
@@ -50,7 +54,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help='folder for error_map.json and model.yaml, made if missing',
     )
-    parser.add_argument('--sensor', default='sensor', help='whose poses the model is for')
+    parser.add_argument(
+        '--sensor', default='sensor', help='name of the sensor whose poses the model corrects'
+    )
     parser.add_argument(
         '--apply', type=Path, metavar='POSES', help='CSV to correct, e.g. poses.csv of evaluate'
     )

@@ -50,8 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--out',
         required=True,
         type=Path,
-        help='folder for the results, made if missing; of several bags each has a folder in it, '
-        'and summary.csv and summary.html tell of all',
+        help='folder for the results, made if missing; with several bags each has a folder in '
+        'it, and summary.csv and summary.html summarise them',
     )
     add_options(parser)
     parser.add_argument(
@@ -69,12 +69,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--references',
         metavar='CHANNEL,...|none',
-        help='reference sensors that the refit may use; the others count as not there',
+        help='reference sensors that the refit may use; the others are ignored',
     )
     parser.add_argument(
         '--witnesses',
         action='store_true',
-        help='let a refit heed what the coils of rigid tools contradict; for few references',
+        help='let the refit also use contradictions among the coils of rigid tools; for few '
+        'references',
     )
     parser.add_argument(
         '--patch',
@@ -91,8 +92,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         '--gate',
         type=float,
         default=TrackerSettings().gate,
-        help='largest residual of a pose, in units of the expected one; inf refuses none '
-        '(for the error that a wrong model would make, never for use)',
+        help='largest residual of a pose, in units of the expected one; inf withholds none (only '
+        'to see the error that a wrong model would cause)',
     )
     add_pose_options(parser)
     add_stated_values(parser, 'accuracy', 'refit', 'tools')
@@ -140,7 +141,7 @@ def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result
     need_model(args)
     session = load_session(args.session).with_stated(stated_values(args))
     if args.witnesses and not args.refit:
-        raise ParameterError('--witnesses tell a refit of metal; they need --refit')
+        raise ParameterError('--witnesses extends the refit; it needs --refit')
     if args.references is not None:
         if not args.refit:
             raise ParameterError('--references chooses those of a refit; it needs --refit')
@@ -190,8 +191,8 @@ def _few_notes(session: Session) -> tuple[str, ...]:
     if count >= need:
         return ()
     return (
-        f'a refit with {count} reference sensors gives no pose, as min_references is {need}; '
-        f'evaluate without --refit, or --set min_references={max(count, 1)}',
+        f'a refit with {count} reference sensors gives no pose, because min_references is '
+        f'{need}; evaluate without --refit, or --set min_references={max(count, 1)}',
     )
 
 

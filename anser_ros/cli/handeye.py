@@ -56,19 +56,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--model', default='', help="track the bag's fluxes with this model (or 'nominal')"
     )
-    parser.add_argument('--body', default='', help='with --model: the tool, of several')
+    parser.add_argument(
+        '--body', default='', help='with --model: which tool, if there are several'
+    )
     parser.add_argument(
         '--pairs', action='store_true',
-        help='static poses: the n-th of one stream with the n-th of the other, without clocks',
+        help='poses at rest: pair the n-th of one stream with the n-th of the other, without '
+        'clocks',
     )  # fmt: skip
     parser.add_argument(
-        '--stamps', choices=STAMPS, default='host', help='of files: the time that is taken'
+        '--stamps', choices=STAMPS, default='host', help='for files: which of their times to use'
     )
     parser.add_argument(
-        '--unit', choices=list(UNITS), help='of files: unit of the tracked positions'
+        '--unit', choices=list(UNITS), help='for files: unit of the tracked positions'
     )
     parser.add_argument(
-        '--quaternion', choices=list(ORDERS), help='of files: how the tracked ones are written'
+        '--quaternion',
+        choices=list(ORDERS),
+        help='for files: how the tracked quaternions are written',
     )
     parser.add_argument(
         '--out',
@@ -124,7 +129,7 @@ def _session(args: argparse.Namespace) -> PoseSession:
             return read_poses(first, PoseSource(model=args.model, body=args.body)).session
         return load_poses(first, args)
     if args.topics or args.optical or args.model:
-        raise ParameterError('--tracked, --model and --optical are about a bag')
+        raise ParameterError('--tracked, --model and --optical need a bag')
     return import_poses(
         args.tracked, args.reference, stamps=args.stamps, unit=args.unit,
         quaternion=args.quaternion,
@@ -239,7 +244,7 @@ def render(found: HandEye, document: dict[str, Any]) -> str:
         for k, axis in enumerate('xyz')
     ]
     open_ones = ''.join(f'<li>{html.escape(words)}</li>' for words in found.undetermined)
-    clocks = '; '.join(clock_words(document)) or 'nothing is known of the clocks'
+    clocks = '; '.join(clock_words(document)) or 'the clocks were not compared'
     return page('Hand-eye', [
         '<h1>Hand-eye calibration</h1>'
         f'<p class="note"><code>{html.escape(found.session.path)}</code></p>'
@@ -250,7 +255,7 @@ def render(found: HandEye, document: dict[str, Any]) -> str:
         "<h2>From the optical frame to the tracker's</h2>",
         table(('axis', 'translation, mm', '1 sigma', 'rotation vector, deg', '1 sigma'), rows),
         f'<h2>Not determined</h2><ul>{open_ones}</ul>' if open_ones else '',
-        '<h2>What is left, over time</h2>', image(_over_time(found)),
+        '<h2>Residuals over time</h2>', image(_over_time(found)),
     ])  # fmt: skip
 
 

@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     check_new_file(args.out)
     is_document = args.source.suffix in DOCUMENTS
     if is_document and (args.remap or args.setup is not None):
-        raise ParameterError('--remap and --setup are for bags; the document tells its setup')
+        raise ParameterError('--remap and --setup are for bags; a document names its own setup')
     lost, left_out = '', {}
     with stages_of('importing') as tell:
         tell(f'reading {args.source}')

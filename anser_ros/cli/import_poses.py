@@ -38,11 +38,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='the .mcap file to write, its folder made if missing',
     )
     parser.add_argument(
-        '--stamps', choices=STAMPS, default='host', help='the time that becomes the stamp'
+        '--stamps', choices=STAMPS, default='host', help='which of their times becomes the stamp'
     )
     parser.add_argument('--unit', choices=list(UNITS), help='unit of the tracked positions')
     parser.add_argument(
-        '--quaternion', choices=list(ORDERS), help='how the tracked ones are written'
+        '--quaternion', choices=list(ORDERS), help='how the tracked quaternions are written'
     )
     parser.add_argument(
         '--name',

@@ -134,7 +134,9 @@ def table(rounds: list[dict[str, Any]], console: Console) -> None:
     console.print(out)
     for number, one in enumerate(rounds, 1):
         for name, after_s in one['watcher_said_after_s'].items():
-            text = f'round {number}: the watcher said {name} {after_s:.0f} s after the first flux'
+            text = (
+                f'round {number}: the watcher reported {name} {after_s:.0f} s after the first flux'
+            )
             console.print(text, highlight=False)
     for number, one in enumerate(rounds, 1):
         for name, signs in one['machine'].items():

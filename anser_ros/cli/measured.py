@@ -204,7 +204,7 @@ def to_document(rows: list[ReportRow]) -> dict[str, Any]:
 
 def table(rows: list[ReportRow]) -> Table:
     """Return the rows as a table for the terminal."""
-    out = Table(title='Measured data: before and after, on data that took no part')
+    out = Table(title='Measured data: before and after, on held-out data')
     figures = ('before', 'after', 'special', 'target')
     for heading in ('data set', 'figure', *figures, 'met', 'chosen on'):
         number = heading in figures

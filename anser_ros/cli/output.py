@@ -25,7 +25,7 @@ def check_file(path: Path) -> None:
     """
     make_folder(path.parent)
     if path.is_dir():
-        raise ParameterError(f'{path} is a folder, and has to be a file')
+        raise ParameterError(f'{path} is a folder, but must be a file')
     if path.exists() and not os.access(path, os.W_OK):
         raise ParameterError(f'no permission to write {path}')
 
@@ -102,7 +102,7 @@ def say_written(*paths: Path) -> None:
 
 def snapshot_notes(name: str, model: FieldModel) -> tuple[str, ...]:
     """Say that a command works with a snapshot of a refit, where it does."""
-    return (f'{name} is a {SNAPSHOT}, no calibration',) if is_snapshot(model) else ()
+    return (f'{name} is a {SNAPSHOT}, not a calibration',) if is_snapshot(model) else ()
 
 
 def loss_notes(session: str, lost: str) -> tuple[str, ...]:

@@ -126,7 +126,7 @@ def _body(args: argparse.Namespace, found: AssessedPoses, text: str) -> str:
         fitting = [b for b in setup.bodies if f'/{found.name}'.endswith(f'/{topic_of(b)}')]
         if len(fitting) != 1:
             raise SetupError(
-                f'which body {found.name} is the setup does not tell; name it with --body, one '
+                f'the setup does not say which body {found.name} is; state it with --body, one '
                 f'of {", ".join(setup.bodies)}'
             )
         name = fitting[0]
@@ -169,7 +169,7 @@ def _write(
         if not kept:
             raise SetupError(
                 f'{args.setup}: the key tips cannot be written into a document of this layout; '
-                'write its keys one a line, not in braces'
+                'write its keys one per line, not in braces'
             )
         aside = args.setup.with_name(args.setup.name + '.new')
         aside.write_text(new, encoding='utf-8')

@@ -86,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--error-mm',
         type=float,
         default=5.0,
-        help='error of poses that each metal makes while nobody corrects it (%(default)s)',
+        help='pose error that each metal causes while it is not compensated (%(default)s)',
     )
     parser.add_argument('--out', required=True, type=Path, help='folder, made if missing')
     add_stated_values(parser, 'accuracy', 'refit')
@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
     kinds = [kind.strip() for kind in args.metal.split(',')]
     unknown = sorted(set(kinds) - set(KINDS))
     if unknown or not kinds:
-        raise ParameterError(f'--metal {args.metal}: wanted some of {", ".join(KINDS)}')
+        raise ParameterError(f'--metal {args.metal}: must be some of {", ".join(KINDS)}')
     if not (np.isfinite(args.error_mm) and args.error_mm > 0.0):
         raise ParameterError(f'--error-mm must be positive, got {args.error_mm}')
     setup = parse_setup(read_config(args.setup)).with_stated(stated_values(args))
@@ -151,7 +151,9 @@ def propose(
     """
     field = Drawing.of(setup).field
     if field is None:
-        raise SetupError(f'a board of the kind {setup.emitter.kind!r} is not drawn')
+        raise SetupError(
+            f'places need a board with drawn coils, not one of the kind {setup.emitter.kind!r}'
+        )
     whole = region_of(field)
     region = Region(whole.centre, whole.half, stated_volume(setup))
     candidates = candidates_of(setup, origin, region)
@@ -179,7 +181,7 @@ def candidates_of(setup: Setup, origin: str, region: Region) -> SensorTable:
     if origin == 'setup':
         table = sensor_table(setup.reference_sensors)
         if not len(table):
-            raise ParameterError('the setup has no reference sensors; say --from frame or plane=Z')
+            raise ParameterError('the setup has no reference sensors; use --from frame or plane=Z')
         return _bounded(table, origin, region)
     half, middle = region.half, region.centre
     if origin == 'frame':
@@ -211,8 +213,8 @@ def _bounded(table: SensorTable, origin: str, region: Region) -> SensorTable:
         unit = unit_words(float(np.median(away)) / region.half, LENGTH_UNITS)
         raise ParameterError(
             f'--from {origin}: coils lie up to {away.max():.3g} m from a board of '
-            f'{2e3 * region.half:.0f} mm, and hear it within {FARTHEST * region.half:.2g} m'
-            + (f': {unit}?' if unit else '; places are in m')
+            f'{2e3 * region.half:.0f} mm, whose field they receive only within '
+            f'{FARTHEST * region.half:.2g} m' + (f': {unit}?' if unit else '; places are in m')
         )
     if len(table) > MOST_CANDIDATES:
         raise ParameterError(
@@ -249,7 +251,7 @@ def _read(path: Path) -> SensorTable:
         return _every_axis(places)
     axes = _numbers(path, rows, ('ax', 'ay', 'az'))
     if not (np.linalg.norm(axes, axis=1) > 0.0).all():
-        raise ParameterError(f'{path}: an axis has no length')
+        raise ParameterError(f'{path}: an axis has zero length')
     length: float | Array = LENGTH_M
     if 'length_m' in rows[0]:
         length = _numbers(path, rows, ('length_m',))[:, 0]

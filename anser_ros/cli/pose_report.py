@@ -31,12 +31,12 @@ def pose_verdict(document: dict[str, Any]) -> str:
     before, after = 1e3 * held['position_rmse_before_m'], 1e3 * held['position_rmse_after_m']
     if found:
         names = ', '.join(dict.fromkeys(str(effect['name']) for effect in found))
-        text = f'Found: {names}. On poses that took no part the error falls from '
+        text = f'Found: {names}. On held-out poses the error falls from '
         text += f'{before:.2f} to {after:.2f} mm.'
     else:
         text = f'No effect is found: with hand-eye alone the held-out error is {after:.2f} mm.'
     if rest['fraction'] > 0:
-        on = ', '.join(rest['depends_on']) or 'nothing that was looked at'
+        on = ', '.join(rest['depends_on']) or 'none of the variables examined'
         text += f' {rest["fraction"]:.0%} of the squared error above the jitter stays'
         text += f' unexplained; it depends on {on}.'
     return text
@@ -48,8 +48,8 @@ def render_poses(found: PoseDiagnosis, document: dict[str, Any], session: str) -
     sections = [
         f'<h1>Diagnosis of poses</h1><p class="note">session <code>{html.escape(session)}</code>'
         f'</p><p class="verdict">{html.escape(pose_verdict(document))}</p>',
-        '<h2>Before and after</h2><p>Every fifth stretch of time took no part in choosing or '
-        'fitting; these are its errors, root mean square.</p>',
+        '<h2>Before and after</h2><p>Root mean square errors of every fifth stretch of time, '
+            'which was used neither to choose nor to fit.</p>',
         _by_sensor(document),
         '<h2>Effects</h2>',
         _effects(document),
@@ -169,5 +169,5 @@ def _bland_altman(state: PoseState) -> Figure:
             panel.axhline(line, color='0.4', lw=0.8)
         panel.set(xlabel=f'{name}, mm')
         panel.locator_params(axis='x', nbins=5)
-    panels[0].set_ylabel('tracked less optical, mm')
+    panels[0].set_ylabel('tracked minus optical, mm')
     return figure

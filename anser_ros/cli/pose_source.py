@@ -25,20 +25,18 @@ def add_source_options(parser: argparse.ArgumentParser, *, tip: bool = True) -> 
     """Declare which poses of a recording are meant."""
     parser.add_argument(
         '--topic', default='', metavar='TOPIC',
-        help='topic of the poses (PoseStamped), where the bag has several',
+        help='topic of the poses (PoseStamped), if the bag has several',
     )  # fmt: skip
     parser.add_argument(
         '--model', default='', metavar='MODEL',
         help="track the bag's fluxes with this model (or 'nominal') instead of reading poses",
     )  # fmt: skip
-    parser.add_argument('--body', default='', help='tool that is meant, where there are several')
-    parser.add_argument(
-        '--sensor', default='', help='sensor that is meant, of several in a bag or file'
-    )
+    parser.add_argument('--body', default='', help='which tool, if there are several')
+    parser.add_argument('--sensor', default='', help='which sensor, of several in a bag or file')
     if tip:
         parser.add_argument(
             '--tip', type=Path, metavar='FILE',
-            help="take the tip's poses: tips.yaml of pivot, or a setup document with the tip",
+            help='use the poses of the tip: tips.yaml of pivot, or a setup document with the tip',
         )  # fmt: skip
 
 

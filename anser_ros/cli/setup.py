@@ -50,11 +50,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--board',
         choices=[ANSER, *GEOMETRY],
-        help='the Anser v1 board, or how its coils are drawn',
+        help='the Anser v1 board, or the kind of its coils',
     )
     parser.add_argument(
         '--geometry', action='append', default=[], metavar='KEY=VALUE',
-        help='of all emitter coils, SI units: ' + '; '.join(f'{k}: {", ".join(v)}' for k, v in
+        help='geometry of emitter coils, SI units: ' + '; '.join(f'{k}: {", ".join(v)}' for k, v in
                                                             GEOMETRY.items()),
     )  # fmt: skip
     parser.add_argument(
@@ -66,20 +66,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--sensor', action='append', default=[], metavar='CHANNEL,NAME,BODY,X,Y,Z,AXIS[,LENGTH]',
-        help='a coil that listens, mm in the frame of its body, which is fg for a reference coil; '
-        'the axis is x, -x, ... or three numbers with blanks; may be repeated',
+        help='a sensor coil: position in mm in the frame of its body, which is fg for a '
+        'reference coil; the axis is x, -x, ... or three numbers with blanks; may be '
+        'repeated',
     )  # fmt: skip
     parser.add_argument(
         '--sensors', type=Path, action='append', default=[], metavar='CSV',
-        help=f'such coils: {",".join(SENSOR_COLUMNS)}[,length_mm]; may be repeated',
+        help=f'sensor coils: {",".join(SENSOR_COLUMNS)}[,length_mm]; may be repeated',
     )  # fmt: skip
     parser.add_argument('--rate', type=float, default=50.0, help='flux windows a second (50)')
     parser.add_argument(
         '--volume', metavar='X,Y,Z,X,Y,Z',
-        help='two corners of the tracked volume, mm; over the board by its size by default',
+        help='two corners of the tracked volume, mm; by default above the board, by its size',
     )  # fmt: skip
     add_stated_values(parser, 'accuracy', 'refit', 'tools')
-    parser.add_argument('--json', action='store_true', help='print what was written and advised')
+    parser.add_argument(
+        '--json', action='store_true', help='print the written files and the advice as JSON'
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -88,7 +91,9 @@ def run(args: argparse.Namespace) -> int:
     make_folder(args.out)
     if args.document is not None:
         if any(parts) or args.volume or args.stated:
-            raise ParameterError('a document states all; options are for a new one')
+            raise ParameterError(
+                'a setup document is complete: these options are for a new one only'
+            )
         text = read_config(args.document)
         setup = parse_setup(text)
     elif any(parts):

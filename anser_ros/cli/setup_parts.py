@@ -133,7 +133,7 @@ def axis_of(text: str, what: str) -> list[float]:
     values = np.array(numbers_of(text, (3,), f'{what}: axis'))
     length = float(np.linalg.norm(values))
     if length == 0.0:
-        raise ParameterError(f'{what}: an axis has a length')
+        raise ParameterError(f'{what}: an axis must not have zero length')
     return [round(float(value), 9) for value in values / length]
 
 
@@ -213,22 +213,24 @@ def advice_on(setup: Setup) -> list[str]:
     found, emitters = [], setup.emitter.coils
     if len(emitters) < LEAST_EMITTERS:
         found.append(
-            f'{len(emitters)} emitter coils: a single coil is tracked from {LEAST_EMITTERS} on'
+            f'{len(emitters)} emitter coils: tracking a single coil needs at least '
+            f'{LEAST_EMITTERS}'
         )
     tones = sorted((coil.frequency_hz, coil.name) for coil in emitters)
     for (one, name), (other, neighbour) in itertools.pairwise(tones):
         if other - one < FEWEST_WINDOWS * setup.flux_rate_hz:
             found.append(
-                f'tones of {name} and {neighbour} are {other - one:g} Hz apart, nearer than '
-                f'{setup.flux_rate_hz:g} windows a second tell them apart'
+                f'tones of {name} and {neighbour} are {other - one:g} Hz apart, too close for '
+                f'{setup.flux_rate_hz:g} windows a second to separate them'
             )
     for body in setup.bodies:
         axes = np.array([sensor.axis for sensor in setup.sensors if sensor.body == body])
         if (np.abs(axes @ axes[0]) > PARALLEL).all():
-            found.append(f'{body}: all coils are parallel, so its roll is not seen: no whole pose')
+            found.append(
+                f'{body}: all coils are parallel, so its roll cannot be determined, nor a 6-DoF '
+                'pose'
+            )
     count, least = len(setup.reference_sensors), setup.refit.min_references
     if count < least:
-        found.append(
-            f'{count} reference coils: the model follows metal from {least} on, well from 16'
-        )
+        found.append(f'{count} reference coils: the refit needs at least {least}, better 16')
     return found

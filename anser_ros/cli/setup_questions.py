@@ -39,12 +39,12 @@ def ask_all(ask: Callable[[str], str], say: Callable[[str], object]) -> Document
         Shows a line.
     """
     say('Lengths are in mm, in the frame of the board: origin at its centre, z up to the patient.')
-    say('An empty answer takes what stands in [brackets].')
+    say('An empty answer accepts the value in [brackets].')
     emitter = _emitter(ask, say)
     sensors: list[Document] = []
     say('Now the tools: coils fixed to a body that moves, places and axes in its own frame.')
     while True:
-        body = _ask(ask, say, 'name of a tool, or empty where there are no more', str)
+        body = _ask(ask, say, 'name of a tool, or empty if there are no more', str)
         if not body:
             if sensors:
                 break
@@ -55,7 +55,7 @@ def ask_all(ask: Callable[[str], str], say: Callable[[str], object]) -> Document
     sensors += _sensors(ask, say, emitter, sensors, FIELD_GENERATOR)
     rate = _ask(ask, say, 'flux windows a second [50]', lambda t: number_of(t or '50', 'the rate'))
     volume = _ask(
-        ask, say, 'corners of the tracked volume, x y z x y z [over the board, by its size]',
+        ask, say, 'corners of the tracked volume, x y z x y z [above the board, by its size]',
         lambda t: numbers_of(t, (6,), 'the volume') if t else None,
     )  # fmt: skip
     return document_of(emitter, sensors, rate, volume, {})
@@ -106,7 +106,7 @@ def _emitter(ask: Callable[[str], str], say: Callable[[str], object]) -> Documen
         try:
             check_document(document_of(emitter, [ONE_TOOL_COIL], 50.0, None, {}))
         except AnserError as error:
-            say(f'  {error}; once more')
+            say(f'  {error}; try again')
             continue
         return emitter
 
@@ -162,7 +162,7 @@ def _count(usual: int, least: int) -> Callable[[str], int]:
     def read(text: str) -> int:
         value = number_of(text or str(usual), 'the number')
         if value != int(value) or value < least:
-            raise ParameterError(f'must be a whole number from {least} on, got {text}')
+            raise ParameterError(f'must be a whole number of at least {least}, got {text}')
         return int(value)
 
     return read

@@ -33,6 +33,7 @@ def add_resurveyed(parser: argparse.ArgumentParser) -> None:
         action='append',
         default=[],
         metavar='BODY',
-        help='the sensors on BODY are those of the model, surveyed anew: what it knows of their '
-        'channels holds, the places and axes are those of the session; may be repeated',
+        help='the sensors on BODY are those of the model, and were surveyed again: their '
+        'channels are corrected as the model says, and their places and axes are those of '
+        'the session; may be repeated',
     )

@@ -208,7 +208,7 @@ def _page(command: str, folder: Path, rows: Sequence[Row]) -> str:
     failed = sum(row['status'] != 'ok' for row in rows)
     head = ''.join(
         f'<th>{html.escape(text)}</th>'
-        for text in ('session', *(column.heading for column in columns), 's', 'what is to know')
+        for text in ('session', *(column.heading for column in columns), 's', 'notes')
     )
     lines = []
     for row in rows:

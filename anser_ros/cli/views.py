@@ -36,7 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--optical', default='/optical', help='namespace of the optical poses (%(default)s)'
     )
     parser.add_argument(
-        '--frame-prefix', default='', help="the tracker's frame_prefix, where boards are several"
+        '--frame-prefix',
+        default='',
+        help="the tracker's frame_prefix, if there are several boards",
     )
     parser.add_argument('--json', action='store_true', help='print the written files as JSON')
 
@@ -45,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
     space = args.namespace.strip('/')
     if not NAMESPACE.match(space):
-        raise ParameterError(f'{args.namespace!r} is no namespace')
+        raise ParameterError(f'{args.namespace!r} is not a namespace')
     setup = parse_setup(read_config(args.setup))
     make_folder(args.out)
     topics = Topics(space, args.optical.rstrip('/'), args.frame_prefix)

@@ -81,16 +81,16 @@ class Confirmation:
     def reason(self) -> str:
         """Return why it may not be named, in words."""
         if not self.plausible:
-            return 'its parameters are outside their range'
+            return 'its parameters are outside their plausible range'
         if not self.helps:
-            return 'only the references speak for it, the tools against it'
+            return 'only the references support it, and the tools contradict it'
         if self.variation >= LARGEST_VARIATION:
             return 'its parameters differ from one part of the data to the next'
         if self.remainder >= self.inexact:
-            return 'where it acts, more stays than it could leave'
+            return 'too much stays unexplained where it acts'
         if self.alike >= MANY:
-            return 'with others of its kind it stands in for something that they share'
-        return 'far more stays unexplained than it explains'
+            return 'several effects of its kind together imitate a cause that they share'
+        return 'much more stays unexplained than it explains'
 
 
 def _checked(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmation:

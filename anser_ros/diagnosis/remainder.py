@@ -99,7 +99,7 @@ class Remainders:
 def _resting(term: Term) -> Resting:
     """Where a term of metal at rest is."""
     found = term.effect.resting(term)
-    assert found is not None, f'{term.label} is no metal at rest'
+    assert found is not None, f'{term.label} is not metal at rest'
     return found
 
 

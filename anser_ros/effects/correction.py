@@ -62,7 +62,7 @@ def _term(effect: Effect[Any], record: EffectRecord) -> Term:
             term: Term = effect.term(record)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise ModelFileError(
-            f'effect {record.name}: no term in its parameters ({type(error).__name__}: {error})'
+            f'effect {record.name}: its parameters are malformed ({type(error).__name__}: {error})'
         ) from error
     if not np.isfinite(np.asarray(term.theta, dtype=np.float64)).all():
         raise ModelFileError(f'effect {record.name}: its parameters are not finite')

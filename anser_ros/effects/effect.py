@@ -58,17 +58,17 @@ class Remedy(Enum):
     SENSORS = 'the sensor table is corrected'
     FIELD = "the field model's dipoles are corrected"
     OPTICAL = 'the optical pose is corrected'
-    NONE = 'nothing can be corrected, only said'
+    NONE = 'nothing can be corrected, only reported'
 
 
 class Family(Enum):
     """Names how the search for effects treats an effect."""
 
     STEADY = 'a constant, or a curve with few parameters'
-    METAL_AT_REST = 'metal that stays where it is; refined by what it is besides a simple body'
-    MOVING_METAL = 'metal whose answer changes with time; refined by a richer body and course'
-    REMAINDER = 'part of the explanation by another effect, and none of its own'
-    FLUCTUATION = 'a random number a frame, with a spread'
+    METAL_AT_REST = 'metal that stays where it is; refined by its deviation from a simple body'
+    MOVING_METAL = 'metal whose response changes with time; refined by a richer body and path'
+    REMAINDER = 'a part of another effect, never named by itself'
+    FLUCTUATION = 'a random number per frame, with a spread'
     SEEN = 'seen directly, without a parameter to fit: wiring, noise, outliers'
 
     @property

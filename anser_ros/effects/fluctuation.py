@@ -206,7 +206,7 @@ class OpticalJitter(Fluctuation):
     """Changes a `Registration`: what the optical poses err by beyond what they may."""
 
     name = 'optical_jitter'
-    summary = 'the optical poses err by more than they may'
+    summary = 'the optical poses have larger errors than stated'
     units: ClassVar[Mapping[str, str]] = {'rms': 'm and rad'}
     of = Registration()
 

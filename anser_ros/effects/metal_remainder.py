@@ -154,7 +154,7 @@ class MetalRemainder(Effect[RemainderTerm]):
     """Takes what the few parameters of metal at rest leave (`Couplings` or `Lighting`)."""
 
     name = 'metal_remainder'
-    summary = 'what a simple metal body leaves'
+    summary = 'the residual that a simple metal body leaves'
     remedy = Remedy.FIELD
     family = Family.REMAINDER
 

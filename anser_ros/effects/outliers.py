@@ -27,7 +27,7 @@ class Outliers(Effect[OutliersTerm]):
     """Is found as frames that stand out from their neighbours in time (`anser_ros.diagnosis`)."""
 
     name = 'outliers'
-    summary = 'some frames belong to no model'
+    summary = 'some frames fit no model'
     units: ClassVar[Mapping[str, str]] = {'fraction': '1', 'channels': '1'}
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'fraction': (0.0, 0.5)}
     remedy = Remedy.NONE

@@ -85,7 +85,10 @@ class ReferenceChanged(Pickup):
     """Acts as `Pickup` on a reference sensor, which rests: any lasting change is a constant."""
 
     name = 'reference_changed'
-    summary = "a reference sensor's reading changed for good: it was moved, turned or picks up"
+    summary = (
+        "a reference sensor's reading changed permanently: it was moved or turned, or picks up "
+        'interference'
+    )
 
     def candidates(self, apparatus: Apparatus) -> Sequence[Term]:
         """Return a candidate for every channel of a reference sensor."""

@@ -18,7 +18,7 @@ class Registration(Effect[Term]):
     """Theta is a rotation vector r (rad) and a translation t (m): optical = R(r) fg + t."""
 
     name = 'registration'
-    summary = "the optical frame is not the field generator's"
+    summary = "the optical frame is not aligned with the field generator's"
     units: ClassVar[Mapping[str, str]] = {'rotation_deg': 'deg', 'translation_m': 'm'}
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
         'rotation_deg': (-10.0, 10.0),

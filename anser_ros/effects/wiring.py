@@ -89,7 +89,7 @@ class DeadChannel(Effect[Term]):
     """Silences channels whose readings are noise; they take no part in anything."""
 
     name = 'dead_channel'
-    summary = 'a channel hears nothing'
+    summary = 'a channel receives nothing'
     units: ClassVar[Mapping[str, str]] = {'channels': '1'}
     remedy = Remedy.NONE
     family = Family.SEEN

@@ -145,8 +145,8 @@ class Study:
         calibration = our_model(sessions)
         self.results.models[name] = (
             f'{calibration.layout.describe()}, damping {calibration.damping:g}, '
-            f'{calibration.n_measurements} readings an emitter, '
-            f'held out {1e12 * calibration.held_out.score_t:.0f} pT with the pose marginalised'
+            f'{calibration.n_measurements} readings per emitter, held out '
+            f'{1e12 * calibration.held_out.score_t:.0f} pT with the pose marginalised'
         )
         return calibration
 

@@ -230,7 +230,7 @@ def _table(value: Any, width: int, what: str) -> Array:
     try:
         table = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ModelFileError(f'model: {what} is no table of numbers') from error
+        raise ModelFileError(f'model: {what} is not a table of numbers') from error
     if table.ndim != 2 or table.shape[1] != width or table.shape[0] == 0:
         raise ModelFileError(f'model: {what} must be rows of {width} numbers, got {table.shape}')
     if not np.isfinite(table).all():
@@ -285,7 +285,7 @@ def from_document(document: Any) -> FieldModel:
     table = _table(document.get('dipoles'), 6 + 2 * k, 'dipoles')
     norms = np.linalg.norm(table[:, 3:6], axis=1)
     if np.abs(norms - 1.0).max() > 1e-6:
-        raise ModelFileError('model: a dipole direction is no unit vector')
+        raise ModelFileError('model: a dipole direction is not a unit vector')
     modes = None
     if document.get('modes'):
         parts = [_table(mode, 2 * k, 'modes') for mode in document['modes']]
@@ -316,7 +316,8 @@ def from_document(document: Any) -> FieldModel:
     told = document.get('fingerprint')
     if told is not None and str(told) != model.fingerprint:
         raise ModelFileError(
-            f'model: the file says that it is the model {told}, its content is the model '
-            f'{model.fingerprint}; was it changed? Without its key fingerprint it is believed'
+            f'model: the file states the fingerprint {told}, but its content has '
+            f'{model.fingerprint}; was it changed? Remove the key fingerprint to use it all the '
+            'same'
         )
     return model

@@ -160,8 +160,8 @@ class BoardPlace:
         if found is not None and found.is_certain:
             told = ', '.join(f'{1e3 * v:+.1f}' for v in found.shift_m)
             raise FitError(
-                f'the model lies {1e3 * np.linalg.norm(found.shift_m):.1f} mm ({told} along x, y, '
-                'z) beside where the references have the board; is it of another frame?'
+                f'the model lies {1e3 * np.linalg.norm(found.shift_m):.1f} mm ({told} along x, '
+                'y, z) from where the references locate the board; is it in another frame?'
             )
         return found is not None
 

@@ -95,8 +95,8 @@ def check_steady(parts: list[ComplexArray], sigma_t: float, allowed: float) -> N
             share = _typical_change(now, before, np.sqrt(2.0) * sigma_t, allowed)
             if share > 0.0:
                 raise FitError(
-                    f'most reference readings change by {share:.2%} while it is recorded; '
-                    'is there metal that moves?'
+                    f'most reference readings change by {share:.2%} during the recording; is '
+                    'metal moving nearby?'
                 )
 
 
@@ -141,8 +141,8 @@ def check_as_calibrated(
     share = _typical_change(flux, before, noise, STABLE_SHARE * accuracy.reference_gain)
     if share > 0.0:
         raise FitError(
-            f'most reference readings differ by {share:.2%} from those of the calibration; '
-            'is there metal, or is it another board?'
+            f'most reference readings differ by {share:.2%} from those of the calibration; is '
+            'metal nearby, or is it another board?'
         )
     return True
 
@@ -210,8 +210,8 @@ def check_as_drawn(
     if beyond > DRAWN_GATE:
         raise FitError(
             f'the reference readings differ from the drawn board by {beyond:.1f} times what its '
-            'tolerances and the survey allow; is there metal? A model calibrated with it, '
-            'from a scan with the references, would know of it'
+            'tolerances and the survey allow; is metal nearby? If it has to stay, calibrate a '
+            'model with it in place, from a scan with the references'
         )
 
 

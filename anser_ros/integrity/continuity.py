@@ -65,7 +65,7 @@ def leap(before: list[Place], now: Place, bounds: MotionBounds) -> str:
     away = math.dist(now.position, last.position)
     error = SIGMAS * math.hypot(now.sigma_m, last.sigma_m)
     if away > bounds.speed_m_s * dt + error:
-        return f'{1e3 * away:.3g} mm in {1e3 * dt:.3g} ms are {away / dt:.3g} m/s'
+        return f'{1e3 * away:.3g} mm in {1e3 * dt:.3g} ms is a speed of {away / dt:.3g} m/s'
     if len(before) < 2:
         return ''
     first = before[-2]
@@ -146,8 +146,8 @@ class Continuity:
         if contradiction and not old:
             return contradiction
         return (
-            f'{100 * self.refused_share:.0f} % of the last second refused; '
-            f'{self._frames} good frames in a row are not enough'
+            f'{100 * self.refused_share:.0f} % of the frames of the last second were refused, '
+            f'and {self._frames} good frames in a row are too few'
         )
 
     def _is_confirmed(self, stamp_ns: int) -> bool:

@@ -363,7 +363,7 @@ class Acquisition(AnserNode):
             return Level.ERROR, '; '.join(filter(None, words))
         frames = interval.frames
         if interval.repeats == frames and max(frames, interval.duplicates) > 0:
-            return Level.ERROR, 'the control unit sends the same samples again'
+            return Level.ERROR, 'the control unit keeps sending the same samples'
         troubles = [(self._faults.level, self._faults.words)] if self._faults.words else []
         slow = too_slow(interval.skipped, frames)
         if slow:

@@ -63,7 +63,8 @@ class CuSimulatorParameters:
     board_seed: int = parameter(
         0,
         'of the board: 0 for one as drawn, which the nominal model fits; 1 for that of '
-        'demo_model.yaml and bags/; any other for one with its own tolerances of a workshop',
+        'demo_model.yaml and bags/; any other number for one with random manufacturing '
+        'tolerances',
         minimum=0,
     )
     sample_rate_hz: float = parameter(
@@ -80,7 +81,7 @@ class CuSimulatorParameters:
     )
     current_drift: float = parameter(
         FrontEnd.current_drift,
-        'share by which the coil currents fall as they warm up',
+        'share by which the currents fall as the coils warm up',
         minimum=0.0,
         maximum=0.5,
     )
@@ -90,11 +91,13 @@ class CuSimulatorParameters:
         (0.05, -0.03, -0.08), 'nearest position of the disc in fg, m', minimum=-2.0, maximum=2.0
     )
     metal_start_s: float = parameter(
-        12.0, 'when the disc sets out, s after the first start of the stream', minimum=0.0
+        12.0, 'when the disc starts to move, s after the first start of the stream', minimum=0.0
     )
     metal_travel_s: float = parameter(4.0, 'time of its way in, and out, s', minimum=0.1)
     metal_stay_s: float = parameter(6.0, 'time that it stays near, s', minimum=0.0)
-    metal_period_s: float = parameter(30.0, 'its visit repeats; 0 for once, s', minimum=0.0)
+    metal_period_s: float = parameter(
+        30.0, 'period of its visits; 0 for a single one, s', minimum=0.0
+    )
     optical_rate_hz: float = parameter(
         60.0, 'poses a second of the optical truth', minimum=1.0, maximum=200.0
     )
@@ -102,7 +105,7 @@ class CuSimulatorParameters:
         0.0, 'jitter of the optical position, m rms an axis', minimum=0.0, maximum=0.01
     )
     path_phase_rad: float = parameter(
-        0.0, "phase at which the tools' paths begin; another one is another path", minimum=0.0
+        0.0, "phase at which the tools' paths begin; another value gives another path", minimum=0.0
     )
     fault: str = parameter(NONE, 'fault of the line', choices=FAULTS, live=True)
     fault_period_s: float = parameter(
@@ -114,7 +117,7 @@ class CuSimulatorParameters:
     )
     effect_seed: int = parameter(0, 'of the effect; 0 for another one every time', minimum=0)
     optical: str = optical_parameter()
-    effect_file: str = parameter('', 'file (.json) that gets the effect drawn; empty for none')
+    effect_file: str = parameter('', 'file (.json) to write the chosen effect to; empty for none')
 
 
 class CuSimulator(AnserNode):
@@ -268,7 +271,7 @@ class CuSimulator(AnserNode):
 
     def status(self) -> Status:
         """Return the state of the simulated control unit."""
-        state = 'streaming' if self._unit.streaming else 'idle, waits for a start'
+        state = 'streaming' if self._unit.streaming else 'idle, waiting for a start'
         values: dict[str, object] = {'link': self.parameters.link, 'fault': self._injector.kind}
         if self.parameters.metal:
             position, _ = self._metal[0].path(self._elapsed_s())

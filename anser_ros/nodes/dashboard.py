@@ -23,7 +23,8 @@ class DashboardParameters:
     """Holds the parameters of the live view."""
 
     host: str = parameter(
-        '127.0.0.1', 'address that the page is served on; any but this machine needs a token'
+        '127.0.0.1',
+        "address that the page is served on; any other than this machine's own needs a token",
     )
     port: int = parameter(
         LIVE_VIEW, 'TCP port of the page; 0 for any that is free', minimum=0, maximum=65535

@@ -40,18 +40,18 @@ class MonitorParameters:
     """Holds the parameters of the monitor."""
 
     duration_s: float = parameter(
-        0.0, 'ends by itself so long after the first pose; 0 for never, s', minimum=0.0
+        0.0, 'time from the first pose until it ends by itself; 0 for never, s', minimum=0.0
     )
     patience_s: float = parameter(
-        0.0, 'gives up when no pose came in so long; 0 for never, s', minimum=0.0
+        0.0, 'time without a pose after which it gives up; 0 for never, s', minimum=0.0
     )
-    compare: str = parameter('', 'namespace of a second tracker to show beside; empty for none')
+    compare: str = parameter('', 'namespace of a second tracker to show as well; empty for none')
     compare_note: str = parameter('', 'what is special about the second tracker, in words')
     optical: str = optical_parameter()
-    output: str = parameter('', 'file (.npz) that gets all poses and errors at the end')
+    output: str = parameter('', 'file (.npz) to write all poses and errors to at the end')
     period_s: float = parameter(
         0.25,
-        'from one table to the next; without a terminal a line a second, s',
+        'interval of the table; without a terminal one line a second, s',
         minimum=0.05,
         maximum=10.0,
     )

@@ -34,19 +34,23 @@ class OpenIGTLinkParameters:
     port: int = parameter(OPENIGTLINK, 'TCP port, 0 for a free one', minimum=0, maximum=65535)
     stale_after_s: float = parameter(
         TrackerParameters.stale_after_s,
-        'a sensor without a pose for so long is reported, s',
+        'time without a pose after which a sensor is reported, s',
         minimum=0.02,
         live=True,
     )
     version: int = parameter(
         1,
-        'version of the headers to who has asked nothing; 2 has TransformStatus, and is read by '
-        'OpenIGTLink 3 only; who asks in version 2 gets that',
+        'version of the headers for a client that has sent nothing; 2 has TransformStatus, and '
+        'is read by OpenIGTLink 3 only; a client that sends version 2 gets version 2',
         minimum=1,
         maximum=2,
     )
-    body_name: str = parameter('{body}', "a body's device, 20 characters; e.g. {body}ToTracker")
-    coil_name: str = parameter('{name}', "a coil's device: of {name} and its {body} and {sensor}")
+    body_name: str = parameter(
+        '{body}', "name of a body's device, 20 characters; e.g. {body}ToTracker"
+    )
+    coil_name: str = parameter(
+        '{name}', "name of a coil's device: of {name} and its {body} and {sensor}"
+    )
     coils: bool = parameter(True, 'whether single coils are sent too, whose roll is arbitrary')
 
 

@@ -40,20 +40,20 @@ STAMPED = (
 class RecorderParameters:
     """Holds the parameters of the recorder."""
 
-    directory: str = parameter('recordings', 'folder that gets one folder a bag')
+    directory: str = parameter('recordings', 'folder that gets one folder per bag')
     name: str = parameter(
-        '', "the bag's folder, with _1, _2 behind it where there is one; empty: date and time"
+        '', "name of the bag's folder, with _1, _2 appended if it exists; empty: date and time"
     )
     autostart: bool = parameter(True, 'record from the start on')
     flush_period_s: float = parameter(
-        0.25, 'most that a crash may cost, s', minimum=0.05, maximum=1.0
+        0.25, 'longest time that a crash may lose, s', minimum=0.05, maximum=1.0
     )
     optical: str = optical_parameter()
     topics: tuple[str, ...] = parameter((), 'topics to record besides those of docs/interfaces.md')
     without: tuple[str, ...] = parameter(
         ('field_model_error',),
-        'last names of topics that are left out; the default: 100 kB each time that metal moves, '
-        'which evaluate works out anew from the fluxes',
+        'last parts of names of topics that are not recorded; the default takes 100 kB each '
+        'time that metal moves, and evaluate computes it from the fluxes',
     )
 
 

@@ -94,17 +94,19 @@ class Replay(AnserNode):
     def add_arguments(cls, parser: argparse.ArgumentParser) -> None:
         """Add the bag and how to play it."""
         parser.add_argument('bag', help='the .mcap file, or the folder that holds it')
-        parser.add_argument('--rate', type=float, default=1.0, help='speed; 0: as fast as taken')
+        parser.add_argument(
+            '--rate', type=float, default=1.0, help='speed; 0: as fast as the subscribers take it'
+        )
         parser.add_argument('--loop', action='store_true', help='begin again at the end')
         parser.add_argument(
             '--all', dest='all_topics', action='store_true', help='poses and diagnostics as well'
         )
         parser.add_argument(
             '--wait', type=float, default=WAIT_S,
-            help='longest wait for listeners, s (%(default)g, and up to five times that before '
-            'while a node is still starting): it begins when all nodes that take the fluxes are '
-            'ready, and all who listen to them or to poses are connected, not before it has '
-            'looked around for 3 s; who starts to listen later misses what is out',
+            help='longest wait for subscribers, s (%(default)g, and up to five times that before '
+            'while a node is still starting): replay begins when all nodes that use the '
+            'fluxes are ready and all subscribers to fluxes and poses are connected, but '
+            'not in the first 3 s; who subscribes later misses what was published before',
         )  # fmt: skip
 
     def __init__(

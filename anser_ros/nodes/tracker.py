@@ -364,7 +364,7 @@ class TrackerNode(AnserNode):
         gate = tracker.settings.gate
         if gate > WIDE_GATE:
             return Status(
-                '', Level.WARN, f'{tracked}; a gate of {gate:g} lets wrong poses out', values
+                '', Level.WARN, f'{tracked}; a gate of {gate:g} lets wrong poses through', values
             )
         return Status('', Level.OK, tracked, values)
 

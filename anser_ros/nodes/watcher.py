@@ -61,21 +61,30 @@ class WatcherParameters:
     )
     optical: str = optical_parameter()
     tracked_poses: tuple[str, ...] = parameter(
-        (), 'topics of tracked poses (PoseStamped); with these it watches a tracker of poses alone'
+        (),
+        'topics of tracked poses (PoseStamped); with these it diagnoses another tracker by '
+        'its poses',
     )
     reference_pose: str = parameter(
-        '', 'with tracked_poses: topic of the reference; none to judge the sensors by each other'
+        '',
+        'with tracked_poses: topic of the reference; none to compare the sensors with each other',
     )
     baseline_file: str = parameter(
-        '', 'distortion-free recording of the same board; without one the references have no say'
+        '', 'distortion-free recording of the same board; without one the references are not used'
     )
-    window_s: float = parameter(20.0, 'how far back it looks, s', minimum=5.0, maximum=120.0)
-    frames: int = parameter(100, 'flux frames it looks at', minimum=40, maximum=400)
+    window_s: float = parameter(
+        20.0, 'length of the stretch that it diagnoses, s', minimum=5.0, maximum=120.0
+    )
+    frames: int = parameter(100, 'flux frames of it that are used', minimum=40, maximum=400)
     period_s: float = parameter(
-        5.0, 'least time from one look to the next, s', minimum=0.1, maximum=600.0, live=True
+        5.0,
+        'shortest time from one diagnosis to the next, s',
+        minimum=0.1,
+        maximum=600.0,
+        live=True,
     )
     cpu_share: float = parameter(
-        0.2, 'most of one processor that it takes on average', minimum=0.01, maximum=1.0, live=True
+        0.2, 'largest share of one processor on average', minimum=0.01, maximum=1.0, live=True
     )
     flux_noise_t: float = stated('flux_noise_t')
     optical_position_m: float = stated('optical_position_m')
@@ -281,7 +290,7 @@ class Watcher(AnserNode):
         if quiet:
             return Status('', Level.WARN, f'no poses on {", ".join(quiet)}', values)
         if seen is None:
-            state = self._trouble or f'gathers, {window.span_s:.0f} s so far'
+            state = self._trouble or f'collecting data, {window.span_s:.0f} s so far'
             return Status('', Level.OK, state, values)
         values |= pose_values(seen) if isinstance(seen, PoseSighting) else values_of(seen)
         words = pose_words(seen) if isinstance(seen, PoseSighting) else words_of(seen)

@@ -68,7 +68,7 @@ class PoseReading:
             },
             {},
             {'misfit_as_written_m': before, 'misfit_so_read_m': after, 'extent_ratio': ratio,
-             'summary': 'the stream means something else than it says'},
+             'summary': 'the poses follow another convention than the stream states'},
         )  # fmt: skip
 
     def applied(self, session: PoseSession) -> PoseSession:
@@ -145,7 +145,9 @@ def reading_words(record: EffectRecord) -> str:
             f'hand-eye is off by {1e3 * told["misfit_so_read_m"]:.1f} mm so, '
             f'and by {1e3 * before:.0f} mm as written'
         )
-    return f'the {read["stream"]} poses are read otherwise than they say: {"; ".join(said)}'
+    return (
+        f'the {read["stream"]} poses are read in another convention than stated: {"; ".join(said)}'
+    )
 
 
 def _readings(unit: str) -> Iterator[PoseReading]:

@@ -66,7 +66,7 @@ class PoseCorrector:
 
     def __init__(self, document: Mapping[str, Any]) -> None:
         if not isinstance(document, Mapping) or document.get('schema') != MODEL_SCHEMA:
-            raise ModelFileError(f'no model of poses: the schema must be {MODEL_SCHEMA}')
+            raise ModelFileError(f'not a model of poses: the schema must be {MODEL_SCHEMA}')
         try:
             support = document['support']
             self._low = np.asarray(support['low_m'], dtype=np.float64)
@@ -78,7 +78,7 @@ class PoseCorrector:
                 for e in document['effects']
             ]
         except (KeyError, TypeError, ValueError) as error:
-            raise ModelFileError(f'model of poses: {error!r} is missing or no number') from None
+            raise ModelFileError(f'model of poses: {error!r} is missing or not a number') from None
         self.sensors = {str(r.parameters['sensor']) for r in records if r.name == 'hand_eye'}
         self._offsets = [r for r in records if r.name == PoseTimeOffset.name]
         bend = FieldDistortion()

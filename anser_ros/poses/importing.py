@@ -143,7 +143,9 @@ def _session(path: str, pieces: Sequence[tuple[str, Array, Array, Array]]) -> Po
     start = min(float(np.nanmin(time)) for _, time, _, _ in pieces)
     end = max(float(np.nanmax(time)) for _, time, _, _ in pieces)
     if start < 0.0 or end > LATEST_S:
-        raise ParameterError(f'{path}: times from {start:g} to {end:g} s: no stamps of a bag')
+        raise ParameterError(
+            f'{path}: times from {start:g} to {end:g} s cannot be stamps of a bag'
+        )
     sequences: dict[str, PoseSequence] = {}
     for label in dict.fromkeys(piece[0] for piece in pieces):
         chosen = [piece for piece in pieces if piece[0] == label]

@@ -171,8 +171,8 @@ class PoseWatch:
         limit = max(EXPLAINED * worst, CHANGED * max(known.misfit.values()))
         if left > limit:
             return worst, (), (
-                f'{", ".join(off)}: poses are {1e3 * worst:.1f} mm from where the frames of '
-                'earlier have them, and no single frame explains it yet'
+                f'{", ".join(off)}: poses are {1e3 * worst:.1f} mm from where the frames found '
+                    'earlier place them, and no single frame explains it yet'
             )  # fmt: skip
         return worst, (_change(terms[index], moved[index], state, worst, left),), ''
 

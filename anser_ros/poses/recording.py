@@ -67,7 +67,9 @@ def read_pose_session(
             known = ', '.join(sorted(rows)) or 'none'
             raise BagError(f'{name}: no poses on {topic}; topics of poses: {known}')
     if not chosen:
-        raise BagError(f'{name}: no tracked poses, which stand on {TRACKED}<sensor>{ENDING}')
+        raise BagError(
+            f'{name}: no tracked poses, which are expected on {TRACKED}<sensor>{ENDING}'
+        )
     start = min(min(stamps[topic]) for topic in (*chosen.values(), *filter(None, [reference])))
 
     def sequence(label: str, topic: str) -> PoseSequence:

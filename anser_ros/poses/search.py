@@ -194,7 +194,7 @@ def _accepted(
         return None
     last = len(trial.terms) - 1
     if not term.effect.possible(term.effect.record(trial.terms[last], trial.covariance_of(last))):
-        refused.append((term.label, 'parameters that no instrument has'))
+        refused.append((term.label, 'implausible parameters'))
         return None
     if is_of(term, Role.SCALE) and not _one_scale(trial):
         refused.append((term.label, 'sensors of one reference see different scales'))

@@ -95,7 +95,9 @@ def missing_words(poses: PoseSequence) -> str:
     if not poses.missing.size:
         return ''
     count = poses.size + poses.missing.size
-    return f'{poses.missing.size} of {count} poses of {poses.name} are none (no numbers), left out'
+    return (
+        f'{poses.missing.size} of {count} poses of {poses.name} have no numbers, and are left out'
+    )
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,9 @@ class ReadingWindow:
             When the number of emitters is another one.
         """
         if frame.flux.shape != self._shape:
-            raise FitError(f'readings of {self._shape[1]} emitters wanted, got {frame.flux.shape}')
+            raise FitError(
+                f'readings must be of {self._shape[1]} emitters, got {frame.flux.shape}'
+            )
         stamp_ns = frame.stamp_ns
         if self._frames and stamp_ns < self._frames[-1][0]:
             self._frames.clear()
@@ -106,8 +108,8 @@ class ReadingWindow:
         share = np.sqrt(np.mean((moved**2).sum(axis=1) / np.maximum(size**2, 1e-300)))
         if beyond > CHANGING and share > FELT:
             raise FitError(
-                f'the reference readings change by {share:.2%} while a baseline is taken; '
-                'is there metal that moves?'
+                f'the reference readings change by {share:.2%} while a baseline is taken; is '
+                'metal moving nearby?'
             )
         return mean
 

@@ -49,7 +49,7 @@ def parse_remaps(entries: Sequence[str]) -> dict[str, str]:
     for entry in entries:
         old, _, new = entry.partition(':=')
         if not old.startswith('/') or not new.startswith('/') or old in names:
-            raise ParameterError(f'{entry!r} is no new /FROM:=/TO')
+            raise ParameterError(f'a new name must be /FROM:=/TO, each once, got {entry!r}')
         names[old] = new
     return names
 

@@ -76,7 +76,7 @@ def clean_flux(recording: Session, sensors: SensorTable, model: FieldModel) -> C
         sigma = steady_sigma(recording)
         check_clean(model, sensors, flux, sigma, recording.setup)
     except FitError as error:
-        raise BagError(f'{recording.path} is no baseline: {error}') from error
+        raise BagError(f'{recording.path} is not usable as a baseline: {error}') from error
     return flux
 
 

@@ -24,7 +24,7 @@ def parse_references(text: str) -> tuple[int, ...]:
         return ()
     entries = [entry.strip() for entry in text.split(',')]
     if not all(entry.isascii() and entry.isdigit() for entry in entries):
-        raise ParameterError(f"references: wanted CHANNEL,... or '{NONE}', got {text!r}")
+        raise ParameterError(f"references must be CHANNEL,... or '{NONE}', got {text!r}")
     channels = tuple(int(entry) for entry in entries)
     if len(set(channels)) != len(channels):
         raise ParameterError(f'references: a channel appears twice in {text!r}')

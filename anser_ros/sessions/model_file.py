@@ -31,8 +31,8 @@ def load_model(path: str | os.PathLike[str], snapshot: bool = False) -> FieldMod
         model = from_document(read_document(path))
         if is_snapshot(model) and not snapshot:
             raise ModelFileError(
-                f'a {SNAPSHOT} (stamp_ns {model.provenance.get("stamp_ns")}) is no calibration; '
-                'load the model that the refit started from'
+                f'a {SNAPSHOT} (stamp_ns {model.provenance.get("stamp_ns")}) is not a '
+                'calibration; load the model that the refit started from'
             )
     except ModelFileError as error:
         text = str(error)

@@ -31,7 +31,7 @@ def parse_patches(entries: Sequence[str]) -> dict[str, str]:
     for entry in entries:
         body, _, topic = entry.partition('=')
         if not body or not topic or body in topics:
-            raise ParameterError(f'patches: {entry!r} is no new body=topic')
+            raise ParameterError(f'patches must be BODY=TOPIC, each once, got {entry!r}')
         topics[body] = topic
     return topics
 

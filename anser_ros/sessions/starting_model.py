@@ -127,7 +127,7 @@ def with_new_survey(model: FieldModel, setup: Setup, bodies: Sequence[str]) -> F
             raise ModelFileError(f'no body {body} in the setup to be surveyed anew')
         if made is None:
             raise ModelFileError(
-                f'the model {model.fingerprint} does not tell what it was made for'
+                f'the model {model.fingerprint} does not state what it was made for'
             )
         made = Identity(made.board, {**made.bodies, body: setup.identity.bodies[body]})
         kept = tuple(
@@ -151,8 +151,8 @@ def check_made_for(model: FieldModel, setup: Setup, where: str) -> None:
         return
     if made.board != now.board:
         raise ModelFileError(
-            f'the model {model.fingerprint} is of the board {made.board}; {where} has the board '
-            f'{now.board}'
+            f'the model {model.fingerprint} was made for the board {made.board}; {where} has '
+            f'the board {now.board}'
         )
     for body in sorted(_bodies_of(model, setup)):
         known = made.bodies.get(body)

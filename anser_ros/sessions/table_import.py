@@ -246,13 +246,13 @@ def _phasors(table: NumberTable, given: Any, emitters: int, name: str) -> Array:
         return np.asarray(parts[0] + 1j * parts[1])
     found = table.columns(given, emitters, name)
     if found.dtype.kind not in 'fiuc':
-        raise ParameterError(f'{table.path}: {name} has cells that are no numbers')
+        raise ParameterError(f'{table.path}: {name} has cells that are not numbers')
     return found
 
 
 def _real(values: Array, table: NumberTable, name: str) -> Array:
     if values.dtype.kind not in 'fiu':
-        raise ParameterError(f'{table.path}: {name} has cells that are no real numbers')
+        raise ParameterError(f'{table.path}: {name} has cells that are not real numbers')
     return np.asarray(values, dtype=np.float64)
 
 

@@ -49,14 +49,14 @@ class NumberTable:
         """
         match = REFERENCE.match(str(reference))
         if match is None:
-            raise ParameterError(f'{self.path}: {reference!r} is no column, such as x or x[3]')
+            raise ParameterError(f'{self.path}: {reference!r} is not a column, such as x or x[3]')
         found = self.array(match[1])
         rest = tuple(int(i) for i in match[2].split(',')) if match[2] else ()
         if found.ndim == 2 and 1 in found.shape and not rest:  # MATLAB has no plain vectors
             found = found.ravel()
         if found.ndim != 1 + len(rest):
             raise ParameterError(
-                f'{self.path}: {match[1]} has shape {found.shape}, so {reference} is no column'
+                f'{self.path}: {match[1]} has shape {found.shape}, so {reference} is not a column'
             )
         if any(i >= n for i, n in zip(rest, found.shape[1:], strict=True)):
             raise ParameterError(f'{self.path}: {reference} is beyond shape {found.shape}')

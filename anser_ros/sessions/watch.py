@@ -183,7 +183,7 @@ class Watch:
                     last, frames=frames, excess=excess, excess_left=left, flux_rms_t=_rms(plain)
                 )
         if not _moves(problem):
-            return replace(seen, remark='the tool moves too little to tell what it is')
+            return replace(seen, remark='the tool moves too little to identify the effect')
         self.searches += 1
         found = diagnose(problem, self._prepared.model, LIGHT, progress)
         left = _excess(evaluate(problem, found.terms))

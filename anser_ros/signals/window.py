@@ -104,7 +104,8 @@ class WindowCutter:
     ) -> None:
         if min(hop_samples, window_samples) < 1:
             raise ParameterError(
-                f'a window of {window_samples} and a hop of {hop_samples} samples: both need one'
+                f'a window of {window_samples} and a hop of {hop_samples} samples: both must be '
+                'at least one'
             )
         self.counters = CutterCounters()
         self.columns = watch.columns

@@ -46,7 +46,7 @@ class PseudoPort:
     def plug(self) -> None:
         """Plug the cable in: a new terminal appears behind the same link."""
         if self.link.exists() and not self.link.is_symlink():
-            raise PortError(f'{self.link} exists and is no link')
+            raise PortError(f'{self.link} exists, but is not a link')
         master, slave = os.openpty()
         tty.setraw(slave)
         os.set_blocking(master, False)

@@ -222,7 +222,7 @@ def track_body(
     """Estimate a body's pose from the fluxes, shape (S, 2K), of its usable coils."""
     used = np.flatnonzero(usable)
     if len(used) < 2 or not coils.subset(used).observable:
-        reason = f'{len(used)} of {len(usable)} coils usable, two that are not parallel needed'
+        reason = f'{len(used)} of {len(usable)} coils usable; two that are not parallel are needed'
         worst = next(
             (s.estimate.state for i, s in enumerate(single) if not usable[i]), states.STALE
         )

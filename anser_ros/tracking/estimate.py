@@ -93,7 +93,9 @@ class TrackerSettings:
             if not (math.isfinite(value) and value > 0) and not (name == 'gate' and value > 0):
                 raise TrackingError(f'setting {name} must be positive and finite, got {value}')
         if not 0.0 <= self.stamp_sigma_s < math.inf:
-            raise TrackingError(f'setting stamp_sigma_s is an error, got {self.stamp_sigma_s}')
+            raise TrackingError(
+                f'setting stamp_sigma_s must be finite and not negative, got {self.stamp_sigma_s}'
+            )
         if not self.odds >= 1 or not self.min_signal >= 0:
             raise TrackingError('settings: odds must be at least 1, min_signal at least 0')
 

@@ -182,7 +182,7 @@ def track_source(
     used, settings, context = np.flatnonzero(usable), frame.settings, frame.context
     if len(used) < FEWEST_SENSORS:
         reason = (
-            f'{len(used)} sensors usable, {FEWEST_SENSORS} needed to find and judge the source'
+            f'{len(used)} sensors usable, {FEWEST_SENSORS} are needed to find and judge the source'
         )
         return no_pose(frame.name, frame.stamp_ns, states.STALE, context.model_id, reason)
     if track.scan is None or track.coils is not frame.coils:

@@ -72,9 +72,9 @@ class Guard:
     ) -> tuple[int, str] | None:
         host, origin = headers.get('host', ''), headers.get('origin', '')
         if not self._token and not is_local(urlsplit(f'//{host}').hostname or ''):
-            return 403, 'The live view answers to localhost alone.'
+            return 403, 'The live view answers to localhost only.'
         if origin and urlsplit(origin).netloc != host:
-            return 403, 'Another page asks for this one.'
+            return 403, 'The request comes from another page.'
         if self._token and not hmac.compare_digest(
             (given or _token_of(headers)).encode(), self._token.encode()
         ):

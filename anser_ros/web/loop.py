@@ -207,7 +207,7 @@ class CorrectionLoop:
 
     async def _start(self, kind: str) -> str:
         if self.is_running:
-            raise ParameterError('a command runs already')
+            raise ParameterError('a command is already running')
         name = self.chosen
         bag = self.folder.recording(name)
         options: list[str] = []
@@ -247,7 +247,7 @@ class CorrectionLoop:
 
     async def _undo(self) -> str:
         if not self._loaded:
-            raise ParameterError('nothing was loaded here')
+            raise ParameterError('no model was loaded from this page')
         last = self._loaded[-1]
         await self._exchange(await self._chain.model_files(), last.before)
         self._loaded.pop()
@@ -316,7 +316,7 @@ def _read_calibration(document: dict[str, Any]) -> tuple[str, tuple[tuple[str, s
     after = _scaled(document['heldout_flux_rmse_t'], 1e12)
     words = (
         f'A model of {document["n_dipoles"]} dipoles from {document["n_measurements"]} readings '
-        f'an emitter; on data that took no part its residual is {_text(after, 0)} pT, '
+        f'per emitter; on held-out data its residual is {_text(after, 0)} pT, '
         f'{document["heldout_n_rmse_percent"]:.3f} % of the range.'
     )
     rows = (('residual, pT (before: nominal model)', _text(before, 0), _text(after, 0)),)

@@ -45,7 +45,7 @@ def token_for(host: str, token_file: str) -> str:
     except (OSError, UnicodeDecodeError) as error:
         raise ParameterError(f'token_file {token_file}: {error}') from error
     if len(token) < LEAST_TOKEN or not token.isascii() or not token.isprintable():
-        raise ParameterError(f'token_file {token_file}: needs {LEAST_TOKEN} letters or more')
+        raise ParameterError(f'token_file {token_file}: needs at least {LEAST_TOKEN} characters')
     return token
 
 

@@ -321,7 +321,7 @@ def read_bag(path: str | os.PathLike[str]) -> Bag:
     tool, reference = collector.flux_stream('tool'), collector.flux_stream('reference')
     if tool is None and reference is None:
         reasons = ''.join(f'; {text}' for text in list(collector.refused)[:1])
-        raise BagError(f'{os.fspath(path)}: the bag has no flux that reads{reasons}')
+        raise BagError(f'{os.fspath(path)}: the bag has no readable flux{reasons}')
     return Bag(
         os.fspath(path), setup, text, tool, reference, collector.pose_streams(),
         dict(collector.refused), salvage.lost,

@@ -109,12 +109,14 @@ def device_names(named: Mapping[str, str]) -> dict[str, str]:
     owners: dict[str, str] = {}
     for name, device in devices.items():
         if not device or not device.isascii():
-            raise ParameterError(f'{name}: {device!r} is no name for a device, which are in ASCII')
+            raise ParameterError(
+                f'{name}: {device!r} cannot be the name of a device, which is in ASCII'
+            )
         for known in (device, state_device(device)):
             if known in owners:
                 raise ParameterError(
-                    f'{owners[known]} and {name} are both the device {known!r}, as names have '
-                    f'{NAME_BYTES} characters; a template can shorten them'
+                    f'{owners[known]} and {name} both become the device {known!r}, as names are '
+                    f'cut to {NAME_BYTES} characters; a template can shorten them'
                 )
             owners[known] = name
     return devices

@@ -94,7 +94,7 @@ def _records(
     big_endian: bool,
 ) -> NDArray[np.void]:
     if point_step <= 0 or width < 0:
-        raise LayoutError(f'point_step {point_step} and width {width} make no cloud')
+        raise LayoutError(f'point_step {point_step} and width {width} do not make a cloud')
     if width > MOST_POINTS:
         raise LayoutError(f'{width} points are refused, the most is {MOST_POINTS}')
     size = memoryview(data).nbytes
@@ -120,7 +120,7 @@ def _columns(records: NDArray[np.void], names: Sequence[str]) -> Array:
 def _integers(records: NDArray[np.void], name: str) -> NDArray[np.int64]:
     values = _columns(records, (name,))[:, 0]
     if not (np.abs(values) < 2.0**31).all():
-        raise LayoutError(f'the field {name!r} holds what is no small integer')
+        raise LayoutError(f'the field {name!r} holds values that are not small integers')
     return values.astype(np.int64)
 
 

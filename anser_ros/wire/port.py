@@ -348,4 +348,4 @@ def find_port(
             continue
         finally:
             close_line(port)
-    raise PortError(f'no control unit speaks on any of {len(devices)} serial ports')
+    raise PortError(f'no control unit was found on any of {len(devices)} serial ports')

@@ -22,7 +22,7 @@ _READ_BYTES = 1 << 16
 OPEN_FAILURES = {
     errno.EAGAIN: 'another program uses it',
     errno.EBUSY: 'another program uses it',
-    errno.ENOTTY: 'it is no serial port',
+    errno.ENOTTY: 'it is not a serial port',
     errno.EACCES: 'no permission (is the user in its group, often dialout?)',
 }
 """Plain words for messages of the operating system."""

@@ -245,7 +245,7 @@ def _parse_volume(item: Any) -> tuple[Vector, Vector]:
     volume = read_mapping(item, 'volume')
     unknown = sorted(set(volume) - {'low_m', 'high_m'})
     if unknown:
-        raise SetupError(f'setup: volume has low_m and high_m, not {unknown[0]}')
+        raise SetupError(f'setup: volume has only the keys low_m and high_m, not {unknown[0]}')
     low, high = (
         read_vector(take(volume, key, 'volume'), f'volume.{key}') for key in ('low_m', 'high_m')
     )

@@ -55,7 +55,9 @@ def parse_tips(item: Any) -> dict[str, TipSpec]:
         tip = read_mapping(value, where)
         unknown = sorted(set(map(str, tip)) - set(KEYS))
         if unknown:
-            raise SetupError(f'setup: {where} has {" and ".join(KEYS)}, not {unknown[0]}')
+            raise SetupError(
+                f'setup: {where} has only the keys {" and ".join(KEYS)}, not {unknown[0]}'
+            )
         if 'position_m' not in tip:
             raise SetupError(f'setup: {where} lacks position_m')
         place = read_vector(tip['position_m'], f'{where}.position_m')

@@ -107,4 +107,4 @@ class StreamControl:
 def _disagreement(wanted: tuple[float, ...], hello: Hello) -> str:
     have = ', '.join(f'{tone:g}' for tone in hello.frequencies_hz)
     want = ', '.join(f'{tone:g}' for tone in wanted)
-    return f'the control unit drives {have} Hz, the setup asks for {want} Hz'
+    return f'the control unit drives {have} Hz, but the setup requires {want} Hz'

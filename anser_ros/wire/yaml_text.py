@@ -43,7 +43,9 @@ def _check(text: str) -> None:
             continue
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in sizes:
-                raise yaml.YAMLError(f'the alias {event.anchor} stands for nothing, or for itself')
+                raise yaml.YAMLError(
+                    f'the alias {event.anchor} is not defined, or contains itself'
+                )
             total += sizes[event.anchor]
         elif isinstance(event, yaml.NodeEvent):
             total += 1

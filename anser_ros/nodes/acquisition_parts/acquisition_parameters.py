@@ -14,11 +14,9 @@ class AcquisitionParameters:
     device: str = parameter(
         '/dev/ttyACM0', "the control unit's port, or auto: listen on all ports for its hello"
     )
-    protocol: str = parameter(
-        'anser', 'how the control unit speaks on its line', choices=tuple(PROTOCOLS)
-    )
+    protocol: str = parameter('anser', 'protocol of the control unit', choices=tuple(PROTOCOLS))
     baud: int = parameter(
-        DEFAULT_BAUD, 'line speed; without meaning over USB', minimum=9600, maximum=50_000_000
+        DEFAULT_BAUD, 'baud rate of the line; ignored over USB', minimum=9600, maximum=50_000_000
     )
     setup_file: str = parameter('demo_setup.yaml', 'setup document: a path, or a file of config/')
     channels_file: str = parameter(
@@ -45,5 +43,8 @@ class AcquisitionParameters:
         True, 'whether the control unit is told to drive the tones of the setup document'
     )
     silence_s: float = parameter(
-        SILENCE_S, 'time without a byte that counts as a fault, s', minimum=0.1, maximum=60.0
+        SILENCE_S,
+        'time without a byte after which it reports a fault, s',
+        minimum=0.1,
+        maximum=60.0,
     )

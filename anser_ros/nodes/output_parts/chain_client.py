@@ -120,7 +120,7 @@ async def _text_parameter(getter: Any, name: str) -> str:
 async def _ask(client: Any, request: Any, longest_s: float) -> Any:
     """Wait for an answer, which comes in the executor's thread."""
     if not client.service_is_ready():
-        raise ChainError(f'nobody offers {client.srv_name}')
+        raise ChainError(f'no node offers {client.srv_name}')
     loop = asyncio.get_running_loop()
     answered = asyncio.Event()
     future = client.call_async(request)

@@ -140,7 +140,7 @@ def read_dipoles(message: PointCloud2) -> DipolePoints:
         raise LayoutError('the field model has no dipole')
     norms = np.linalg.norm(points.directions, axis=1)
     if np.abs(norms - 1.0).max() > 1e-3:
-        raise LayoutError('a dipole direction is no unit vector')
+        raise LayoutError('a dipole direction is not a unit vector')
     return points
 
 

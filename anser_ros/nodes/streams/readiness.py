@@ -106,14 +106,14 @@ class Readiness:
         self.is_starting = any(name.strip('/') not in self._told for name in working)
         quiet_s = now_s - self._since_s
         if not any(matched):
-            return 'nobody listens to the fluxes'
+            return 'nobody subscribes to the fluxes'
         unready = [name for name in working if not self._is_ready(name, listeners)]
         if TRACKER in (name.rsplit('/', 1)[1] for name in working) and reached < sum(wanted):
-            unready.append('somebody who listens to poses')
+            unready.append('a subscriber to poses')
         if unready:
             return f'{", ".join(unready)} not ready'
         if quiet_s < SETTLE_S or now_s - self._node.started_s < LOOK_S:
-            return 'others may be joining'
+            return 'others may still be starting'
         if quiet_s < PATIENCE_S:
             return self._missed(listeners, matched, wanted, given)
         return ''
@@ -130,11 +130,11 @@ class Readiness:
         """Return who ought to be there by what others are waiting for."""
         for (topic, names), count in zip(listeners.items(), matched, strict=True):
             if all(name.rsplit('/', 1)[1] in PASSIVE for name in names):
-                return f'nobody works on {topic}'
+                return f'no node processes {topic}'
             if count < len(names):
-                return f'not all who listen to {topic} are connected'
+                return f'not all subscribers to {topic} are connected'
         if any(want and not give for want, give in zip(wanted, given, strict=True)):
-            return 'nobody publishes the poses that somebody listens to'
+            return 'no node publishes the poses that somebody subscribes to'
         return ''
 
     def _listeners(self, topic: str) -> tuple[str, ...]:

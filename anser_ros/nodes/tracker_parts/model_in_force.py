@@ -9,7 +9,7 @@ from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import OTHER_MODEL, REFERENCES_LOST, UNCALIBRATED, Withheld
 from anser_ros.wire.setup import Setup
 
-REASONS = {REFERENCES_LOST: 'no references heard yet, or too few'}
+REASONS = {REFERENCES_LOST: 'no reference readings yet, or too few'}
 """What is said of a state that the server names, where it needs words."""
 OTHER_CLOCK_NS = 5_000_000_000
 """A model whose stamp is that far ahead of the frames' has it from another clock: the host's,
@@ -89,7 +89,7 @@ class ModelInForce:
         if own is not None and own.fingerprint != error.fingerprint:
             return f'{served}, the model_file here is the model {own.fingerprint}'
         if own is None and error.effects:
-            return f'{served}, with {error.effects} effects to be undone: give its model_file here'
+            return f'{served}, with {error.effects} effects to correct: give its model_file here'
         return ''
 
     def at(self, stamp_ns: int) -> Standing:

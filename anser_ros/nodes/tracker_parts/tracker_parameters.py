@@ -17,15 +17,16 @@ class TrackerParameters:
 
     model_file: str = parameter(
         '',
-        'model whose effects apply, and its field until field_model speaks; empty or nominal for '
-        'none',
+        'model whose effects are corrected, and whose field is used until field_model publishes '
+        'one; empty or nominal for none',
         live=True,
     )
     tips_file: str = parameter(
-        '', "tips.yaml of pivot, or a setup document, whose tips go before the setup's own"
+        '', "tips.yaml of pivot, or a setup document, whose tips replace the setup's own"
     )
     frame_prefix: str = parameter(
-        '', "put before the frames of poses and of /tf, the board's too, where boards are several"
+        '',
+        "prefix of the frames of poses and of /tf, the board's too, if there are several boards",
     )
     allow_uncalibrated: bool = parameter(
         False, 'whether poses are given by the nominal model though field_model withholds them'
@@ -58,10 +59,10 @@ class TrackerParameters:
         live=True,
     )
     volume_low_m: tuple[float, ...] = parameter(
-        (), "lower corner of the box where tools may be, m; empty: the setup's volume"
+        (), "lower corner of the tracked volume, m; empty: the setup's volume"
     )
     volume_high_m: tuple[float, ...] = parameter(
-        (), "upper corner of the box where tools may be, m; empty: the setup's volume"
+        (), "upper corner of the tracked volume, m; empty: the setup's volume"
     )
     grid_spacing_m: float = parameter(
         TrackerSettings.grid_spacing_m,
@@ -71,13 +72,13 @@ class TrackerParameters:
     )
     warm_age_s: float = parameter(
         TrackerSettings.warm_age_s,
-        'how old a good pose may be to start from, s',
+        'largest age of a good pose that a solve starts from, s',
         minimum=0.01,
         maximum=60.0,
         live=True,
     )
     stale_after_s: float = parameter(
-        0.3, 'a sensor without fluxes for so long is stale, s', minimum=0.02, live=True
+        0.3, 'time without fluxes after which a sensor is stale, s', minimum=0.02, live=True
     )
     model_wait_s: float = parameter(
         0.1,

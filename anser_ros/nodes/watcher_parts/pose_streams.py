@@ -96,7 +96,7 @@ def pose_words(seen: PoseSighting) -> str:
         return '; '.join(filter(None, [findings_words(seen.findings), with_them, seen.remark]))
     if seen.remark:
         return '; '.join(filter(None, [seen.remark, size]))
-    return f'all is well; {size}'
+    return f'nothing found; {size}'
 
 
 def pose_values(seen: PoseSighting) -> dict[str, object]:

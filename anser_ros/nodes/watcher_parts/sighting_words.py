@@ -20,8 +20,8 @@ def words_of(seen: Sighting) -> str:
         left = f'{seen.excess_left**0.5:.1f} x with it corrected'
         return f'{findings_words(seen.findings)}; {size}, {left}'
     if seen.is_clear:
-        return f'all as the model says; {size}'
-    cause = seen.remark or 'no effect that is known explains it'
+        return f'nothing found; {size}'
+    cause = seen.remark or 'no known effect explains it'
     depends = f', it depends on {", ".join(seen.depends_on)}' if seen.depends_on else ''
     return f'{size}; {cause}{depends}'
 

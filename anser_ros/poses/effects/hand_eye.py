@@ -54,7 +54,7 @@ class OpticalFrame(PoseEffect):
     """Theta is the translation (m) and a turn (rad) from the optical frame to the tracker's."""
 
     name = 'registration'
-    summary = "the optical frame is not the tracker's"
+    summary = "the optical frame is not aligned with the tracker's"
 
     def prior(self, term: Term) -> Array:
         """Return a wide prior, as nothing is known of the frame before."""

@@ -94,7 +94,7 @@ class PoseOutliers(PoseEffect):
     """Reports poses that no explanation reaches, such as a marker seen in its other solution."""
 
     name = 'outliers'
-    summary = 'poses that belong to no model, such as those of a marker in its other solution'
+    summary = 'poses that fit no model, such as those of a marker in its other solution'
     units: ClassVar[Mapping[str, str]] = {'fraction': '1'}
 
     def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
