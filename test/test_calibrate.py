@@ -115,6 +115,7 @@ def test_the_same_twice_gives_the_same_file(tmp_path):
     assert (tmp_path / 'a').read_bytes() == (tmp_path / 'b').read_bytes()
 
 
+@pytest.mark.long
 def test_reference_sensors_take_no_part(factory):
     options = Options(layout=Layout('layer', 9, 1.25, 0.0))
     without = replace(factory, reference=None)

@@ -159,6 +159,7 @@ class TestFit:
         beside = fit.sites.positions[-3 * fit.beside :: 3]
         assert fit.beside and np.linalg.norm(beside - IRON_M, axis=1).min() < 0.02
 
+    @pytest.mark.long
     def test_a_sound_plate_has_nothing(self):
         measured, _, _ = recorded(12, gain=0.0, tilt=0.0, bend=0.0, iron=False)
         fit = StillFitter(measured, CENTRES, KINDS, STATED).fit()
