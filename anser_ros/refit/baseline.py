@@ -18,9 +18,6 @@ ComplexArray = NDArray[np.complex128]
 
 FEWEST_FRAMES = 3
 """Frames that a baseline needs at least: their scatter is its noise."""
-CHANGING, FELT = 4.0, 2e-4
-"""Readings that change while a baseline is taken: in units of the noise, and as a share of their
-size (which moves a pose by a hundredth of a millimetre)."""
 MOST_FRAMES = 2000
 """Most recent frames that a baseline is averaged over, 40 s at 50 Hz."""
 
@@ -81,37 +78,10 @@ class ReadingWindow:
         while stamp_ns - self._frames[0][0] > self._span_ns:
             self._frames.popleft()
 
-    def still_mean(self) -> ComplexArray:
-        """Return the mean reading, as `mean` does, of readings that do not change.
-
-        The window is judged as a whole, its last third against its first, so that a drift too slow
-        to show from one frame to the next is noticed: slowly moving metal must not enter a
-        baseline. `change.Average` asks another question, whether the newest frame still belongs to
-        a mean, and must answer it at once. So the two have tests of their own.
-
-        Raises
-        ------
-        FitError
-            As `mean`, and while the readings change: beyond their noise, which is that of second
-            differences, and by more than a pose would feel.
-        """
-        mean = self.mean()
-        stack = np.stack([frame for _, frame in self._frames])
-        stack = stack[:, np.isfinite(stack).all(axis=(0, 2))]
-        third = len(stack) // 3
-        if third < FEWEST_FRAMES or not stack.size:
-            return mean
-        moved = np.abs(stack[-third:].mean(axis=0) - stack[:third].mean(axis=0))
-        noise = np.abs(np.diff(stack, 2, axis=0)) / np.sqrt(3 * third)
-        beyond = np.sqrt(np.mean(moved**2 / np.maximum((noise**2).mean(axis=0), 1e-300)))
-        size = np.sqrt((np.abs(stack) ** 2).mean(axis=0).sum(axis=1))
-        share = np.sqrt(np.mean((moved**2).sum(axis=1) / np.maximum(size**2, 1e-300)))
-        if beyond > CHANGING and share > FELT:
-            raise FitError(
-                f'the reference readings change by {share:.2%} while a baseline is taken; is '
-                'metal moving nearby?'
-            )
-        return mean
+    @property
+    def frames(self) -> ComplexArray:
+        """Return all readings (F, S, K), T, in the order of time; NaN in place of bad ones."""
+        return np.stack([frame for _, frame in self._frames])
 
     def mean(self) -> ComplexArray:
         """Return the mean reading (S, K), T, with NaN for sensors that are bad in half the frames.
@@ -126,7 +96,7 @@ class ReadingWindow:
                 f'a baseline needs {FEWEST_FRAMES} frames of reference readings, '
                 f'there are {len(self._frames)}'
             )
-        stack = np.stack([frame for _, frame in self._frames])
+        stack = self.frames
         good = np.asarray(np.isfinite(stack).all(axis=2))
         count = np.asarray(good.sum(axis=0))
         total = np.where(good[:, :, None], stack, 0.0).sum(axis=0)

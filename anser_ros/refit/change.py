@@ -98,8 +98,8 @@ class Average:
     Each new frame is compared with the mean so far, given the noise expected of their difference,
     and the mean starts again at the first frame that deviates: a change must be followed without
     delay. A drift below the noise is followed too, late by about `longest` frames. A baseline may
-    contain no drift at all, so `baseline.ReadingWindow.still_mean` judges a whole window in
-    hindsight.
+    contain no drift at all, so `integrity.clean_references.check_steady` judges a whole window
+    in hindsight.
 
     Attributes
     ----------

@@ -17,7 +17,7 @@ from anser_ros.integrity.clean_references import (
     check_steady,
 )
 from anser_ros.physics.sensor import SensorTable
-from anser_ros.refit.baseline import FELT, ReadingWindow
+from anser_ros.refit.baseline import ReadingWindow
 from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import is_nominal
@@ -48,12 +48,6 @@ class Baseline:
 
     path: str
     flux: ComplexArray
-
-
-PARTS = 3
-"""Parts of a recording whose means must agree: metal may come and go, and be away at both ends."""
-FEWEST_FRAMES = 12
-"""Frames of a recording in which a change is looked for: four a part."""
 
 
 def baseline_of(recording: Session, sensors: SensorTable, model: FieldModel) -> Baseline:
@@ -141,9 +135,10 @@ def clean_mean(
     FitError
         When they change, or are not what the references read without metal.
     """
-    mean = window.still_mean()
+    mean, sigma = window.mean(), check_steady(window.frames)
     if model is not None and sensors is not None:
-        sigma = setup.accuracy.flux_noise_t / math.sqrt(len(window))
+        if sigma is None:
+            sigma = setup.accuracy.flux_noise_t / math.sqrt(len(window))
         check_clean(model, sensors, mean, sigma, setup)
     return mean
 
@@ -156,26 +151,11 @@ def steady_sigma(recording: Session) -> float:
     FitError
         When the readings change during the recording by more than an emitter's strength.
     """
-    reference = recording.reference
-    if reference is None or len(reference.flux) < FEWEST_FRAMES:
-        return recording.setup.accuracy.flux_noise_t
-    flux = np.where(reference.valid[:, :, None], reference.flux, np.nan)
-    good = np.isfinite(flux).all(axis=2)
-    whole = good.sum(axis=0) > len(flux) // 2
-    flux = flux[:, whole]
-    # The variance of a second difference of complex noise is 12 times that of a component.
-    scatter = np.abs(np.diff(flux, 2, axis=0)) ** 2
-    noise = float(np.sqrt(np.nanmedian(np.nanmean(scatter, axis=2)) / 12.0)) if flux.size else 0.0
-    parts = [_mean_of(part) for part in np.array_split(flux, PARTS)]
-    check_steady(parts, noise / np.sqrt(len(flux) / PARTS), FELT)
-    return noise / float(np.sqrt(len(flux)))
-
-
-def _mean_of(flux: ComplexArray) -> ComplexArray:
-    """Mean (R, K) of frames (F, R, K) with NaN where a reading is bad; NaN where all are."""
-    good = np.isfinite(flux)
-    total = np.where(good, flux, 0.0).sum(axis=0)
-    return np.asarray(np.where(good.any(axis=0), total / np.maximum(good.sum(axis=0), 1), np.nan))
+    reference, stated = recording.reference, recording.setup.accuracy.flux_noise_t
+    if reference is None:
+        return stated
+    sigma = check_steady(np.where(reference.valid[:, :, None], reference.flux, np.nan))
+    return stated if sigma is None else sigma
 
 
 def readings_of(recording: Session) -> ReferenceReadings | None:
