@@ -4,6 +4,7 @@ import signal
 import sys
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 from conftest import Process, spin_until
@@ -182,6 +183,15 @@ class TestProcess:
         assert process.interrupt() == 0
         assert time.monotonic() - began < 2.5
         assert process.output == f'rate {rate}.0\n'
+
+    def test_a_signal_ends_it_while_it_imports(self, domain, tmp_path):
+        command = [sys.executable, '-P', '-m', 'anser_ros.nodes.tracker']
+        process = Process(command, tmp_path / 'log')
+        maps = Path(f'/proc/{process.popen.pid}/maps')
+        while 'numpy' not in maps.read_text():
+            time.sleep(0.002)
+        assert process.interrupt() == 0
+        assert 'Traceback' not in process.output
 
     def test_it_can_end_itself(self, run):
         assert run('--end', '0').popen.wait(20) == 0
