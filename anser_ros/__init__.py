@@ -49,5 +49,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return the public names beside the module's own."""
+    """Return the public names besides the module's own."""
     return sorted({*globals(), *__all__})

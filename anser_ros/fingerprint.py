@@ -17,7 +17,7 @@ nobody can set or measure a length or a moment so well."""
 
 @dataclass(frozen=True)
 class Identity:
-    """Says what a setup is of.
+    """States what a setup is of.
 
     Attributes
     ----------

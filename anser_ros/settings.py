@@ -41,7 +41,7 @@ def _check(settings: object) -> None:
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Says how accurate an installation's instruments are: one standard deviation of each error.
+    """States how accurate an installation's instruments are: one standard deviation of each error.
 
     The defaults are those of the Anser sessions that this package was developed on: their noise
     and jitter, and the accuracy that their survey of the reference sensors states. If a value is
@@ -111,7 +111,7 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class ToolSettings:
-    """Says how well tools are known, and how fast they may be.
+    """States how well tools are known, and how fast they may be.
 
     Raises
     ------
@@ -122,8 +122,8 @@ class ToolSettings:
     ----------
     tool_coil_position_m, tool_coil_axis_rad : float
         Error of a tool coil's place along each axis, m, and of its direction along both tangents,
-        rad: one standard deviation. Too small, and sound coils contradict their body; too large,
-        and a coil may be wrong by some times this before its body notices.
+        rad: one standard deviation. Too small, and faultless coils contradict their body; too
+        large, and a coil may be wrong by some times this before its body notices.
     tool_coil_gain : float
         Relative error of a tool coil's gain, one standard deviation.
     max_speed_m_s, max_acceleration_m_s2 : float
@@ -148,7 +148,7 @@ class ToolSettings:
 
 @dataclass(frozen=True)
 class RefitSettings:
-    """Says how the live refit follows; nothing here belongs to a particular board or metal.
+    """States how the live refit follows; nothing here belongs to a particular board or metal.
 
     Raises
     ------
@@ -176,7 +176,7 @@ class RefitSettings:
         half a second at 50 Hz.
     references_age_s : float
         How long, s, poses are given while the references are silent. A C-arm that comes at 10 cm/s
-        is 5 cm nearer after half a second, and metal that comes anew has not come far. Shorter,
+        is 5 cm nearer after half a second, and metal that comes again has not come far. Shorter,
         and a hiccup of the line costs poses; longer, and poses are given that nobody vouches for.
     error_modes : int
         Rank of the uncertainty that is handed on with the model. Fewer are cheaper to send and to

@@ -14,7 +14,7 @@ from anser_ros.assessment.hummel import (
     Grid,
     distance_errors,
     grid_points,
-    lines_alike,
+    have_common_errors,
     rotation_errors,
 )
 from anser_ros.assessment.metal import metal_shifts
@@ -169,12 +169,12 @@ class TestHummel:
         mean = np.mean([sizes(place).mean() for place in boards(range(8000, 8400))])
         hits, alike = [], []
         for place in boards(range(8400, 8425)):
-            alike.append(lines_alike(place, grid))
+            alike.append(have_common_errors(place, grid))
             found = distance_errors(place, grid, rng_of(1))['15 cm distance errors']
             hits.append(found.summary['Mean'].low < mean < found.summary['Mean'].high)
         assert all(alike) and np.mean(hits) > 0.88
         quiet = true.reshape(9, 10, 3) + rng_of(3).normal(0, 3e-4, (9, 10, 3))
-        assert not lines_alike(quiet, grid)
+        assert not have_common_errors(quiet, grid)
         narrow = distance_errors(quiet, grid, rng_of(1))['15 cm distance errors'].summary['Mean']
         assert narrow.high - narrow.low < 0.5 * narrow.value
 

@@ -119,7 +119,7 @@ def test_damage_inside_never_crashes_and_never_reads_wrong(whole, tmp_path):
         (lambda p: p.write_bytes(b'\x89MCAP0\r\n'), 'no message can be read'),
         (lambda p: write(p, setup=None), 'no setup'),
         (lambda p: write(p, setup='schema: other'), 'schema must be'),
-        (lambda p: write(p, frames=0), 'no flux'),
+        (lambda p: write(p, frames=0), 'no readable flux'),
     ],
 )
 def test_a_bag_that_is_none_is_refused(tmp_path, make, message):

@@ -82,14 +82,14 @@ def test_poses_wait_for_references_that_are_announced_and_not_for_others(recorde
     session, model = recorded
     sensors, announced = session.reference.sensors, [0]
     watch = PlaceWatch.of(model, sensors, session.setup, lambda: announced[0])
-    assert watch.awaits, 'whoever sends references may not be known yet'
+    assert watch.is_waiting, 'whoever sends references may not be known yet'
     monkeypatch.setattr(place_watch, 'DISCOVERY_S', 0.0)
-    assert not watch.awaits
+    assert not watch.is_waiting
     announced[0] = 1
-    assert watch.awaits
+    assert watch.is_waiting
     frame = SimpleNamespace(readings=session.reference.flux[0])
     window = SimpleNamespace(full=False)
-    assert watch.look(frame, window) and not watch.awaits and not watch.misplaced
+    assert watch.look(frame, window) and not watch.is_waiting and not watch.misplaced
     assert not watch.look(frame, window), 'it is said once'
     bare = PlaceWatch.of(model, sensors.select(np.zeros(0, int)), session.setup, lambda: 1)
-    assert not bare.awaits and not PlaceWatch().awaits
+    assert not bare.is_waiting and not PlaceWatch().is_waiting

@@ -10,7 +10,7 @@ from refit_world import anser_world, metal_block, three_coil_world
 from anser_ros.errors import BagError, FitError
 from anser_ros.field.reference_readings import ReferenceReadings
 from anser_ros.integrity.clean_references import (
-    change_beside_gains,
+    change_without_gains,
     check_as_calibrated,
     check_as_drawn,
     check_steady,
@@ -48,7 +48,7 @@ def drifted(world, rng):
 def test_metal_at_rest_differs_from_the_calibration_and_drift_does_not(world, rng):
     flux = drifted(world, rng)
     assert check_as_calibrated(known_of(world), world.references, flux, SIGMA_T, ACCURACY)
-    change = change_beside_gains(flux, world.baseline)
+    change = change_without_gains(flux, world.baseline)
     assert np.isnan(change[7]) and change[3] > 0.05
     assert np.nanmedian(change) < 1e-4
     metal = world.metal(metal_block((0.05, 0.0, -0.08), (0.06, 0.06, 0.02)))

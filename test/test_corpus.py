@@ -183,7 +183,10 @@ def test_whatever_a_client_says_to_openigtlink():
 
 def test_an_effect_that_is_none_is_named():
     for parameters, words in (
-        ({'coil': 'coil3', 'gain': 1.0, 'phase_deg': 0.0}, 'effect coil_gain: no term'),
+        (
+            {'coil': 'coil3', 'gain': 1.0, 'phase_deg': 0.0},
+            'effect coil_gain: its parameters are malformed',
+        ),
         ({'coil': 0, 'gain': float('nan'), 'phase_deg': 0.0}, 'effect coil_gain'),
     ):
         with pytest.raises(ModelFileError, match=words):

@@ -23,7 +23,7 @@ from anser_ros.cli.main import main
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.nodes.dashboard import DashboardParameters
 from anser_ros.nodes.output_parts import live_view
-from anser_ros.nodes.output_parts.causes import Told
+from anser_ros.nodes.output_parts.causes import LastStatus
 from anser_ros.nodes.output_parts.chain_client import ChainClient, ChainError
 from anser_ros.nodes.output_parts.live_view import LiveView, read_pose
 from anser_ros.nodes.output_parts.polled import polling_node
@@ -338,8 +338,8 @@ def test_the_view_has_place_ellipsoid_error_and_residual(monkeypatch):
     assert view.frame() == [None] * 11
     view.take_optical('pen', [pose(t, (0.1, 0.0, 0.2)) for t in (1.0, 1.02, 1.04)])
     view.take_pose(2, [pose(1.01, (9.0, 9.0, 9.0), 1.0), pose(1.03, (0.1, OFF_M, 0.22), 1e-3)])
-    told = Told(0, 'ok', {'residual_t': '2e-10', 'rate_hz': '25', 'frame_rate_hz': '50'})
-    view.take_told('anser/tracker: pen/c2', told)
+    told = LastStatus(0, 'ok', {'residual_t': '2e-10', 'rate_hz': '25', 'frame_rate_hz': '50'})
+    view.take_status('anser/tracker: pen/c2', told)
     view.add_point()
     row = view.frame()[2]
     assert row[:7] == [0.1, OFF_M, 0.22, 0, 0, 0, 1]
@@ -379,7 +379,7 @@ def test_the_nodes_are_asked_for_services_and_models(ros, tmp_path):
         assert await client.baseline_file() == ''
         with pytest.raises(ChainError, match='no setup yet'):
             await client.trigger('field_model/set_baseline')
-        with pytest.raises(ChainError, match='nobody offers'):
+        with pytest.raises(ChainError, match='no node offers'):
             await client.trigger('recorder/start')
         with pytest.raises(ChainError, match=r'field_model: .*nowhere'):
             await client.load_model({'field_model': str(tmp_path / 'nowhere.yaml')})

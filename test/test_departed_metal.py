@@ -89,7 +89,7 @@ def test_what_metal_does_at_rest_is_found_from_how_it_moves(scanned, monkeypatch
     monkeypatch.setattr(departing, 'MANY_FRAMES', 100)
     monkeypatch.setattr(departing, 'SPACINGS', {})
     found = departure(problem, 0.0)
-    assert found is not None and found.is_understood and found.before > 5.0 * found.after
+    assert found is not None and found.is_predictive and found.before > 5.0 * found.after
     view = evaluate(problem.in_blocks(np.array([3, 12])), ()).parts[0].view
     flux, sigma = found.rest_flux(view)
     truth = view.along(resting.flux(*view.flat))

@@ -64,7 +64,7 @@ def test_effects_declare_what_the_search_needs(scenery):
             assert (effect.opened(term) is not None) is (effect.family is Family.FLUCTUATION)
             assert effect.covers(term, term), name
             assert term.complexity >= term.theta.size
-            assert term.free().seat == term.hold().seat
+            assert term.free().name_and_site == term.hold().name_and_site
         assert np.isinf(effect.inexact) is np.bool_(effect.family.is_metal), name
         assert not effect.drifts or effect.remedy is Remedy.FLUX, name
 

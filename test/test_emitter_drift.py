@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from anser_ros.calibration.emitter_drift import at_strength, emitter_strength
-from anser_ros.calibration.survey_records import drift_tellings
+from anser_ros.calibration.survey_records import drift_records
 from anser_ros.sessions.session import load_session
 
 BAGS = Path(__file__).resolve().parents[1] / 'bags'
@@ -31,7 +31,7 @@ def test_a_drift_is_found_and_taken_away(recorded):
     assert np.abs(ratio / ratio.mean() - 1.0).max() < 1e-3
     constant = at_strength(drifting, drifting.time, strength)
     assert (emitter_strength(constant) == 1.0).all()
-    (record,) = drift_tellings(strength)
+    (record,) = drift_records(strength)
     assert record.parameters['coil'] == 5
     way = np.ptp(np.abs(true[:, 5]))
     assert record.parameters['amount'] == pytest.approx(way, rel=0.05)
@@ -42,4 +42,4 @@ def test_steady_emitters_and_metal_are_no_drift(recorded):
         assert (emitter_strength(reference) == 1.0).all()
     few = recorded[0].sensors_only(np.arange(3))
     assert (emitter_strength(replace(few, flux=few.flux * 1.5)) == 1.0).all()
-    assert drift_tellings(emitter_strength(recorded[1])) == ()
+    assert drift_records(emitter_strength(recorded[1])) == ()

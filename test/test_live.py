@@ -10,7 +10,7 @@ import pytest
 from conftest import spin_until
 
 from anser_ros.errors import ParameterError
-from anser_ros.nodes.runtime.handover import Aside, HandedFlux, Handover, Taking
+from anser_ros.nodes.runtime.handover import DirectSubscription, HandedFlux, Handover, NewestWorker
 from anser_ros.nodes.runtime.parameter_files import names_for
 from anser_ros.wire.points import FluxPoints, as_sent, decode_flux, encode_flux
 
@@ -44,7 +44,7 @@ def test_what_takes_long_is_done_aside_with_the_newest():
             finished.set()
 
     finished = threading.Event()
-    aside = Aside(lambda: skipped.append(1))
+    aside = NewestWorker(lambda: skipped.append(1))
     aside.put('/a', slow, 'a1')
     assert began.wait(10)
     for k in range(2, 5):
@@ -100,9 +100,9 @@ def test_what_is_put_off_is_done_one_thing_a_pause_while_there_are_pauses():
         done.append('second')
         return True
 
-    assert not handover.put_off(second)
+    assert not handover.defer(second)
     handover.pause()
-    assert all(handover.put_off(work) for work in (first, second, first))
+    assert all(handover.defer(work) for work in (first, second, first))
     assert not done
     for _ in range(4):
         handover.pause()
@@ -178,7 +178,7 @@ def test_frames_are_handed_over_as_objects_while_two_senders_are_still_told(ros)
     giver.offer(publisher)
     taker = Taker(handover=handover, beside=(Giver, Taker))
     source = OneSource(taker, PointCloud2, 'tool/flux', got.append, qos.STREAM)
-    assert isinstance(source.subscription, Taking)
+    assert isinstance(source.subscription, DirectSubscription)
     frame = HandedFlux(1, 'fg', FluxPoints(*5 * [np.zeros(0)]))
     giver.hand_over(publisher, frame)
     assert got == [frame] and got[0] is frame
@@ -254,7 +254,7 @@ def test_who_is_given_up_says_good_bye_to_devices_first(monkeypatch, is_noticed)
     monkeypatch.setattr(process.os, '_exit', lambda code: done.append(code))
     signals = process._Signals.__new__(process._Signals)
     signals._noticed = threading.Event()
-    signals.farewells = [fail, lambda: done.append('stopped')]
+    signals.abandon_calls = [fail, lambda: done.append('stopped')]
     signals._reader, writer = socket.socketpair()
     writer.send(bytes([signal.SIGINT]))
     if is_noticed:

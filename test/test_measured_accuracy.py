@@ -20,7 +20,7 @@ FRAME = SimpleNamespace(window=SimpleNamespace(sigma=np.array([7e-11, np.nan, 8.
 def told(accuracy, sigmas_s, seconds, begin_s=0.0):
     """Times at which the setup is told anew, with one frame every 20 ms."""
     times = begin_s + 0.02 * np.arange(round(seconds / 0.02))
-    return [t for t in times if accuracy.is_news(FRAME, sigmas_s(t), t)]
+    return [t for t in times if accuracy.must_republish(FRAME, sigmas_s(t), t)]
 
 
 def test_the_noise_is_told_with_the_first_frame_and_the_stamps_only_if_they_differ():

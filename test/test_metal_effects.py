@@ -9,7 +9,7 @@ from effects_scene import candidates, in_force, moving, visiting
 from metal_world import induced_moments
 
 from anser_ros.effects.metal_path import FreePath, StraightPath, moving_times
-from anser_ros.effects.metal_remainder import REMAINDER, UP_M, Couplings, Lighting
+from anser_ros.effects.metal_remainder import REMAINDER, UP_M, Couplings, IlluminationChange
 from anser_ros.effects.prediction import tool_view
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.metal.body import (
@@ -177,7 +177,7 @@ def test_leftovers_are_linear_and_belong_to_their_metal(scenery):
     view = tool_view(problem.tools[0], [], problem.fields)
     for leftover in (
         Couplings(shapes, parent.theta[:3], modes),
-        Lighting([parent], problem.apparatus.emitters),
+        IlluminationChange([parent], problem.apparatus.emitters),
     ):
         term = REMAINDER.of(parent, leftover)
         assert term.belongs_to(parent.hold())
@@ -197,7 +197,7 @@ def test_lighting_is_an_emitter_that_sits_higher(scenery):
     parent = in_force(found)
     view = tool_view(problem.tools[0], [], problem.fields)
     light = view.illumination
-    lighting = Lighting([parent], problem.apparatus.emitters)
+    lighting = IlluminationChange([parent], problem.apparatus.emitters)
     column = lighting.columns(view)[..., 3 * problem.apparatus.emitters + 1]
     higher = replace(light, positions=light.positions + [0.0, 0.0, UP_M])
     both = [

@@ -130,13 +130,13 @@ class TestRecalling:
         watch = RepetitionWatch(2, RATE_HZ)
         samples = fresh(4000, [2.4, 2.4])
         feed(watch, samples)
-        assert watch.recalls(400, samples[400:440]) is True
-        assert watch.recalls(440, samples[400:440]) is False
-        assert watch.recalls(3990, samples[:40]) is False
+        assert watch.matches_history(400, samples[400:440]) is True
+        assert watch.matches_history(440, samples[400:440]) is False
+        assert watch.matches_history(3990, samples[:40]) is False
         watch.skip(400)
-        assert watch.recalls(4040, samples[:40]) is None
+        assert watch.matches_history(4040, samples[:40]) is None
         feed(watch, fresh(200_000, [2.4, 2.4]), 400)
-        assert watch.recalls(400, samples[400:440]) is False
+        assert watch.matches_history(400, samples[400:440]) is False
 
     @pytest.mark.parametrize(('columns', 'rate_hz'), [(0, 4e4), (3, 0.0), (3, float('nan'))])
     def test_refusals(self, columns, rate_hz):

@@ -7,7 +7,7 @@ from calibration_world import CENTRES, Errors, moved_scan, scene, tool_of
 from anser_ros.calibration.population import Likelihood, Population
 from anser_ros.calibration.sensor_parameters import KINDS, SURVEYED_M
 from anser_ros.calibration.sensor_survey import SensorSurveyor
-from anser_ros.calibration.survey_records import untold_words
+from anser_ros.calibration.survey_records import undetermined_words
 from anser_ros.settings import Accuracy
 
 EIGHT = np.array([[x, y, 0.0] for x in (-0.09, 0.0, 0.09) for y in (-0.09, 0.0, 0.09) if x or y])
@@ -30,9 +30,9 @@ def test_a_camera_that_jitters_shifts_neither_field_nor_tool():
 
 def test_a_scan_without_turns_tells_no_lever_arm_and_poses_know_it():
     found, _ = surveyed(22, 3, 6.0, 0.01, Errors(), CENTRES)
-    assert 'lever_arm' in found.untold
+    assert 'lever_arm' in found.undetermined
     line = 'lever_arm: the scan determines it only to 5 mm; the value of the setup is kept'
-    assert line in untold_words(found)
+    assert line in undetermined_words(found)
     assert 0.2e-3 < found.shift_sigma_m <= 1.01 * SURVEYED_M
     population = Population(found.parameters)
     size = len(found.parameters)
@@ -43,8 +43,8 @@ def test_a_scan_without_turns_tells_no_lever_arm_and_poses_know_it():
 
 def test_a_scan_of_seconds_tells_nothing_of_the_sensors_and_takes_the_setup():
     found, _ = surveyed(23, 9, 2.0, 0.6, Errors())
-    assert set(found.untold) == set(KINDS) and not found.evidence
-    assert len(untold_words(found)) == len(KINDS)
+    assert set(found.undetermined) == set(KINDS) and not found.evidence
+    assert len(undetermined_words(found)) == len(KINDS)
     survey = found.survey('tool')
     assert (survey.gain == 1.0).all() and not survey.place.any() and not survey.lever_arm.any()
     assert found.kept[0].sum() >= 45
@@ -52,12 +52,12 @@ def test_a_scan_of_seconds_tells_nothing_of_the_sensors_and_takes_the_setup():
 
 def test_of_one_coil_in_seconds_what_is_not_told_stays_at_the_setups():
     found, _ = surveyed(31, 1, 8.0, 0.6, Errors())
-    assert {'axes', 'lever_arm'} <= set(found.untold)
-    assert not set(found.untold) & set(found.evidence)
+    assert {'axes', 'lever_arm'} <= set(found.undetermined)
+    assert not set(found.undetermined) & set(found.evidence)
     assert np.abs(found.survey('tool').lever_arm).max() < 1e-9
 
 
 def test_a_flat_scan_says_what_it_cannot_give():
     found, _ = surveyed(24, 3, 6.0, 0.6, Errors(), CENTRES, flat=True)
-    assert 'lever_arm' in found.untold and 'lever_arm' not in found.evidence
+    assert 'lever_arm' in found.undetermined and 'lever_arm' not in found.evidence
     assert 0.2e-3 < found.shift_sigma_m <= 1.01 * SURVEYED_M

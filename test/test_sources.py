@@ -15,7 +15,7 @@ from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.requirements import check_kept, check_measurements
 from anser_ros.calibration.sensor_survey import SensorSurveyor
-from anser_ros.calibration.survey_records import corrections, tellings
+from anser_ros.calibration.survey_records import corrections, reported_effects
 from anser_ros.diagnosis import outlying
 from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.correction import Correction
@@ -147,7 +147,7 @@ def test_poses_that_are_seconds_apart_say_nothing_of_movement(rate_hz, monkeypat
     generator = Generator(np.zeros((1, 3)), np.zeros(1), 0.1)
     accuracy = Accuracy(flux_noise_t=NOISE_T, optical_position_m=1e-5, optical_rotation_rad=1e-4)
     found = SensorSurveyor([measured], ('gains',), generator, accuracy).fit()
-    assert bool(tellings(found, [measured])) is (rate_hz > 1.0)
+    assert bool(reported_effects(found, [measured])) is (rate_hz > 1.0)
 
 
 class TestFewPoses:

@@ -14,8 +14,8 @@ from anser_ros.calibration.sensor_survey import SensorSurveyor
 from anser_ros.calibration.survey_records import (
     contradiction_words,
     corrections,
-    tellings,
-    untold_words,
+    reported_effects,
+    undetermined_words,
 )
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import ModelFileError
@@ -94,7 +94,7 @@ def test_jitter_and_reflected_poses_are_told(dirty):
     wrong = [np.argmin(abs(told.time - told.track.time[i] - OFFSET_S)) for i in GLITCHES]
     assert not found.kept[0][wrong].any()
     assert found.kept[0].mean() > 0.97
-    assert tellings(found, [told]) == ()
+    assert reported_effects(found, [told]) == ()
     outliers = corrections(found)[-1]
     assert outliers.parameters['fraction'] == pytest.approx(6 / FRAMES, rel=0.5)
 
@@ -182,11 +182,11 @@ def test_what_the_data_do_not_tell_stays_at_zero(dirty):
 
 def test_what_a_scan_cannot_tell_is_said(dirty):
     _, found, _ = dirty
-    assert not found.untold
+    assert not found.undetermined
     population = Population(found.parameters)
     nothing = Likelihood(np.zeros((47, 47)), np.zeros(47))
-    assert set(population.untold(nothing)) == set(KINDS)
-    lines = untold_words(replace(found, untold={'lever_arm': 0.004}))
+    assert set(population.undetermined(nothing)) == set(KINDS)
+    lines = undetermined_words(replace(found, undetermined={'lever_arm': 0.004}))
     assert lines == (
         'lever_arm: the scan determines it only to 4 mm; the value of the setup is kept',
     )

@@ -118,7 +118,7 @@ def test_what_a_correction_makes_absurd_is_no_signal(rng):
     tracker = Tracker(replace(MODEL, effects=(record,)), TOOL)
     found = one_frame(tracker, flux)
     assert found[TOOL.name[3]].state == states.NO_SIGNAL
-    assert 'absurd' in found[TOOL.name[3]].reason
+    assert 'implausible' in found[TOOL.name[3]].reason
     assert tracker.counters['readings_absurd'] == 1
     assert found['tool_a'].state == states.OK
 
@@ -201,7 +201,7 @@ def test_sensors_and_settings_that_are_none_are_refused():
 def test_no_gate_is_the_same_however_it_is_said(gate):
     """The node's largest gate refuses no more than the infinite one of a command line does."""
     settings = TrackerSettings(gate=gate)
-    assert not settings.has_gate and settings.leniency(9.0) == 3.0
+    assert not settings.has_gate and settings.max_sigma_factor(9.0) == 3.0
     assert settings.margin(400.0) == -math.inf, 'the best of poses that all fit badly is taken'
     assert TrackerSettings(gate=NO_GATE / 2).margin(400.0) > 0.0
 

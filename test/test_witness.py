@@ -71,7 +71,7 @@ def followed(world, witnesses: bool, gain=None, off_m: float = 0.0):
     refit, rng = few(world), np.random.default_rng(4)
     rows = [0, 4, 8, 12]
     if witnesses:
-        refit.heed_tools(NOISE_T)
+        refit.enable_witnesses(NOISE_T)
     share, gain = [], np.ones(9) if gain is None else gain
     for frame in range(2 * FRAMES):
         metal = METAL if frame >= FRAMES else None

@@ -24,7 +24,7 @@ HOSTILE = {
     'nested deeper': '[' * 200_000,
     'deeper than': '- ' * 100_000,
     'levels': '{a: ' * 50_000,
-    'for itself': 'a: &a [*a]',
+    'contains itself': 'a: &a [*a]',
     'python/object': '!!python/object/apply:os.system ["true"]',
     'constructor': '!mine {a: 1}',
 }

@@ -62,7 +62,7 @@ def calibrate(
     force : bool
         Whether a model is returned that is worse on held-out readings than the drawn board.
     progress : callable, optional
-        Told the stage in words, and the finished share from 0 to 1.
+        Called with the stage in words, and the finished share from 0 to 1.
 
     Raises
     ------

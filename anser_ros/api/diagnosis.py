@@ -48,9 +48,9 @@ def diagnose(
         With optical poses of at least one tool.
     model : Model
     baseline : Session, optional
-        Distortion-free recording of the same board; with it the reference sensors have a say.
+        Distortion-free recording of the same board; with it the reference sensors are used.
     progress : callable, optional
-        Told in words what goes on.
+        Called with words on what goes on.
 
     Raises
     ------

@@ -50,7 +50,7 @@ def write_session(
         the body's origin in fg in m, unit quaternions x y z w (M, 4) from body to fg. Their rate
         may differ from the fluxes'.
     start_ns : int, optional
-        Stamp of time 0, ns. By default the present time; a diagnosis tells sessions apart by it.
+        Stamp of time 0, ns. By default the present time; a diagnosis distinguishes sessions by it.
     overwrite : bool
         Whether a file that is there already is replaced.
 

@@ -130,7 +130,7 @@ def track(
         Largest residual of a pose in units of the expected one; the tracker's default when not
         given. Infinity refuses no pose for what the model lacks: to measure errors, never for use.
     progress : callable, optional
-        Told the finished share from 0 to 1.
+        Called with the finished share from 0 to 1.
 
     Raises
     ------

@@ -70,7 +70,7 @@ def _multiple(count: int, deviations: float, figures: int) -> float:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Says what a figure is worth beside those of earlier sessions.
+    """Judges a figure by those of earlier sessions.
 
     Attributes
     ----------

@@ -29,7 +29,7 @@ MOST_READINGS = 2000  # that take part, evenly over the recording: two million p
 BLOCKS = 20  # stretches of time that are drawn again: a hand's tilt takes about a second
 FAR_M = 0.05
 """Extent of readings, m, beyond which they are no readings of one location."""
-FEWEST_TO_TELL = 6
+FEWEST_FOR_OUTLIER = 6
 """Points without which none is said to stand alone: a rigid fit has six unknowns."""
 ALONE = 0.5
 """Share of a rigid fit's error that is left without a point that stands alone."""
@@ -137,7 +137,7 @@ def standing_alone(place: Array, true: Array) -> tuple[int, float, float] | None
     None if no single point stands alone, or if there are too few points.
     """
     count = len(place)
-    if count < FEWEST_TO_TELL:
+    if count < FEWEST_FOR_OUTLIER:
         return None
     whole = rigid_distance(true, place)
     rest = [

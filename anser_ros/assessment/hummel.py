@@ -165,8 +165,8 @@ def distance_errors(place: Array, grid: Grid, rng: np.random.Generator) -> dict[
 
     MITK gives 15 cm, 30 cm and accumulated distances for the standard volume alone; here every
     board has those that fit. Intervals resample whole lines of holes, because errors along a line
-    are correlated. If those of neighbouring lines are correlated too (`lines_alike`), strips of
-    the board are also resampled.
+    are correlated. If those of neighbouring lines are correlated too (`have_common_errors`),
+    strips of the board are also resampled.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def distance_errors(place: Array, grid: Grid, rng: np.random.Generator) -> dict[
     rng : Generator
         Draws the intervals.
     """
-    found, alike = {}, lines_alike(place, grid)
+    found, alike = {}, have_common_errors(place, grid)
     for name, step in STEPS:
         rows = [(r, c, r, c + step) for r in range(grid.rows) for c in range(grid.columns - step)]
         across = [
@@ -192,8 +192,8 @@ def distance_errors(place: Array, grid: Grid, rng: np.random.Generator) -> dict[
     return found
 
 
-def lines_alike(place: Array, grid: Grid) -> bool:
-    """Return whether distances err as those beside them do, as in a distorted field.
+def have_common_errors(place: Array, grid: Grid) -> bool:
+    """Return whether neighbouring distances have common errors, as in a distorted field.
 
     Parallel distances share no hole, so the noise of holes leaves them uncorrelated.
 

@@ -135,7 +135,7 @@ def _statistics(ordered: Array, weights: Array) -> Mapping[str, Array]:
 
 
 def independent_for_variance(values: Array) -> float:
-    """Return how many independent values tell a variance as well as these do.
+    """Return how many independent values determine a variance as well as these do.
 
     Of a stationary series it is ``n / (1 + 2 sum rho_k^2)``.
     """
@@ -143,7 +143,7 @@ def independent_for_variance(values: Array) -> float:
 
 
 def independent_for_mean(values: Array) -> float:
-    """Return how many independent values tell a mean as well: ``n / (1 + 2 sum rho_k)``."""
+    """Return how many independent values determine a mean as well: ``n / (1 + 2 sum rho_k)``."""
     return _independent(values, 1)
 
 

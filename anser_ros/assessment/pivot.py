@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 FEWEST_POSES = 30  # poses without which nothing is said; at 20 Hz a second and a half
-MOST_POSES = 3000  # poses that take part, evenly over the recording; more tell nothing new
+MOST_POSES = 3000  # poses that take part, evenly over the recording; more add nothing new
 DRAWS = 300
 """Samples drawn: with half of the poses wrong, one in sixteen has four right ones."""
 SAMPLE = 4  # poses of a sample; three turns about two axes already determine tip and point

@@ -17,7 +17,7 @@ from anser_ros.assessment.hummel import (
     Grid,
     distance_errors,
     grid_points,
-    lines_alike,
+    have_common_errors,
     matching_error,
     rotation_errors,
 )
@@ -38,7 +38,7 @@ EVEN_ENOUGH = 0.9
 
 @dataclass(frozen=True)
 class ProtocolOptions:
-    """Holds what a protocol is told beside its recordings.
+    """Holds what a protocol is given besides its recordings.
 
     Attributes
     ----------
@@ -210,7 +210,7 @@ def _grid(
         'point_jitter_rms_m': _jitter(points),
     }
     notes: tuple[str, ...] = ()
-    if lines_alike(place, grid):
+    if have_common_errors(place, grid):
         notes = (
             'neighbouring lines of holes seem to have the same error, as in a distorted field: '
             'intervals come from thirds of the board, and are wide',

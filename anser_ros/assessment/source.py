@@ -31,7 +31,7 @@ TOOL = 'tool'
 
 @dataclass(frozen=True)
 class PoseSource:
-    """Says which poses are meant; what is not said is found where there is only one.
+    """States which poses are meant; what is not said is found where there is only one.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class PoseSource:
 
 @dataclass(frozen=True)
 class AssessedPoses:
-    """Holds the poses of one body, and what is known beside them.
+    """Holds the poses of one body, and what else is known of them.
 
     Attributes
     ----------

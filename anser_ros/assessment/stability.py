@@ -19,7 +19,7 @@ from anser_ros.poses.sequence import PoseSequence
 
 Array = NDArray[np.float64]
 
-FEWEST_POSES = 50  # fewer tell a standard deviation to worse than 10 %
+FEWEST_POSES = 50  # fewer determine a standard deviation to worse than 10 %
 AXES = ('x', 'y', 'z')
 EVEN = 1.5
 """Interval of two poses, in median intervals, from which on the series is not evenly spaced."""

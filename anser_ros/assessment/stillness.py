@@ -31,7 +31,7 @@ LONGEST_GAP_S = 1.0  # silence that ends a pause: nobody knows where the tool wa
 
 @dataclass(frozen=True)
 class PauseRule:
-    """Says what counts as a point.
+    """States what counts as a point.
 
     Attributes
     ----------

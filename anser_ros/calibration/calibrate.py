@@ -24,7 +24,7 @@ from anser_ros.calibration.selection import (
     thin_frames,
 )
 from anser_ros.calibration.sensor_survey import SensorSurveyor
-from anser_ros.calibration.survey_records import contradiction_words, corrections, tellings
+from anser_ros.calibration.survey_records import contradiction_words, corrections, reported_effects
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy
@@ -49,7 +49,7 @@ class Options:
         Damping of the moments; chosen by held-out error by default.
     estimate : tuple of str
         What is estimated of sensors and clock together with the field, of
-        `sensor_parameters.KINDS`. Whatever is, frames whose pose or field is not sound are left
+        `sensor_parameters.KINDS`. Whatever is, frames whose pose or field is bad are left
         out then, and the optical jitter is estimated.
     """
 
@@ -143,7 +143,7 @@ def survey(
     progress: Progress | None = None,
     steady: Sequence[NDArray[np.bool_]] | None = None,
 ) -> Scan:
-    """Return the measurements as sound sensors would have given them, and what was not.
+    """Return the measurements as ideal sensors would have given them, and what was not.
 
     Parameters
     ----------
@@ -182,7 +182,9 @@ def survey(
         optical_rotation_rad=float(root * result.optical.rotation_rad),
     )
     corrected = tuple(with_pose(result.survey(m.body).apply(m)) for m in sound)
-    return Scan(corrected, accuracy, corrections(result), tellings(result, measurements), result)
+    return Scan(
+        corrected, accuracy, corrections(result), reported_effects(result, measurements), result
+    )
 
 
 def _is_explained(scan: Scan) -> bool:

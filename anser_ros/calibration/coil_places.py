@@ -23,12 +23,12 @@ Array = NDArray[np.float64]
 
 SHIFT_M = 2e-3
 """Prior width of a coil's shift along each axis, m: some times what boards differ from their
-drawing by, so that it only holds what the readings do not tell."""
+drawing by, so that it only holds what the readings do not determine."""
 TURN_RAD = 0.03
 """Prior width of a coil's turn about each axis, rad, for the same reason."""
 DIFFERENCE = 1e-2
-"""Step by which derivatives are taken, as a fraction of these widths: small beside any curvature
-of the field, and far above rounding."""
+"""Step by which derivatives are taken, as a fraction of these widths: small compared with any
+curvature of the field, and far above rounding."""
 MOST_STEPS = 5
 """Gauss-Newton steps of a coil at most; two are enough for shifts of a millimetre."""
 CONVERGED = 1e-3

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 CERTAIN = 6.0
 """Standard deviations between two sessions from which on they contradict each other: a value of a
 normal variable is that far out once in a billion."""
-FELT = 0.5
+NOTICEABLE = 0.5
 """Share of the useful size of a parameter (`USEFUL`) below which a difference is not told: it
 moves poses by less than a tenth of a millimetre."""
 
@@ -61,7 +61,8 @@ def contradictions(
     kinds : sequence of str
         What is corrected.
     sums : callable
-        Given parameters and measurements, what these say of the parameters beside the field.
+        Given parameters and measurements, what these say about the parameters, with the field
+        unknown.
     """
     bodies = [part.body for part in parts]
     if len(set(bodies)) == len(bodies):
@@ -96,7 +97,7 @@ def contradictions(
                 size = float(np.linalg.norm(difference))
                 found = Contradiction(kind, name or bodies[i], size, sigma, (i, j))
                 known = worst.get((kind, found.place))
-                if size < max(FELT * USEFUL[kind], CERTAIN * sigma):
+                if size < max(NOTICEABLE * USEFUL[kind], CERTAIN * sigma):
                     continue
                 if known is None or size / sigma > known.size / known.sigma:
                     worst[kind, found.place] = found

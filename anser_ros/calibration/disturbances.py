@@ -39,8 +39,8 @@ EDGE = 3.0
 a disturbance over quiet stretches next to it; larger leaves its beginning and end in the data. Its
 choice is not recorded."""
 ROUNDS = 6
-"""Rounds in which the quiet stretches are told from the others. Fewer may end before the stretches
-have settled; more cost a fit each."""
+"""Rounds in which the quiet stretches are distinguished from the others. Fewer may end before the
+stretches have settled; more cost a fit each."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from anser_ros.calibration.moments import MomentFit
 from anser_ros.calibration.optical_noise import OpticalNoise
 from anser_ros.calibration.requirements import FEWEST_FRAMES
 from anser_ros.calibration.result import Calibration
-from anser_ros.calibration.survey_records import untold_words
+from anser_ros.calibration.survey_records import undetermined_words
 from anser_ros.field.model import EffectRecord
 from anser_ros.field.plain_data import plain
 
@@ -70,8 +70,8 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
             ],
         },
         'nominal_flux_rmse_t': nominal,
-        'effects': [_effect(record) for record in (*scan.corrections, *scan.tellings)],
-        'unobservable': [] if scan.survey is None else list(untold_words(scan.survey)),
+        'effects': [_effect(record) for record in (*scan.corrections, *scan.reported_effects)],
+        'unobservable': [] if scan.survey is None else list(undetermined_words(scan.survey)),
         'shift_sigma_m': calibration.model.shift_sigma_m,
         'contradictions': list(calibration.contradictions),
         'optical_noise': None if scan.survey is None else _optical(scan.survey.optical),

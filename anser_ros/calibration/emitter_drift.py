@@ -29,7 +29,7 @@ leaves a drift in the data where references are noisy."""
 COMMON = 0.995
 """Share of the power of an emitter's changes that one factor must explain. It explains all of a
 drift; of a large metal body that comes up from below it explains up to 97 %, so that less would
-take metal for a drift, and more would miss a drift beside a little of anything else."""
+take metal for a drift, and more would miss a drift with a little of anything else."""
 
 
 def emitter_strength(reference: Measurements) -> ComplexArray:

@@ -199,13 +199,13 @@ class Population:
                 changed = True
         return changed
 
-    def untold(self, likelihood: Likelihood) -> dict[str, float]:
-        """Return the kinds that the data do not tell to a useful degree, and how far they do."""
+    def undetermined(self, likelihood: Likelihood) -> dict[str, float]:
+        """Return the kinds that the data do not usefully determine, with their uncertainty."""
         told = self._told(likelihood)
         return {kind: size for kind, size in told.items() if size > USEFUL[kind]}
 
     def _told(self, likelihood: Likelihood) -> dict[str, float]:
-        """How far the data by themselves tell each kind: its typical standard deviation."""
+        """How far the data by themselves determine each kind: its typical standard deviation."""
         width = self._start(())
         variance = np.maximum(np.diag(solve(likelihood, width).covariance), 0.0)
         return {
@@ -235,13 +235,13 @@ class Population:
         return float(min(SURVEYED_M, AS_PLACES * np.hypot(width, told['places'])))
 
     def fixed(self, likelihood: Likelihood) -> tuple[str, ...]:
-        """Return the kinds that the data do not tell: they stay at zero.
+        """Return the kinds that the data do not determine: they stay at zero.
 
         Otherwise the field's prior, which does not know the tools, would divide what the field
         and, say, a lever arm could both explain; and the width of a population is found from its
         values.
         """
-        return tuple(self.untold(likelihood))
+        return tuple(self.undetermined(likelihood))
 
     def _power(self, likelihood: Likelihood, found: Posterior, kind: str) -> float:
         """What a kind of error does to the fluxes, in the power of their noise."""

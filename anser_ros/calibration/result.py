@@ -55,7 +55,7 @@ def residuals(measurements: Sequence[Measurements], model: FieldModel) -> Residu
 
 @dataclass(frozen=True)
 class Scan:
-    """Holds a scan as sound sensors and a sound clock would have given it.
+    """Holds a scan as ideal sensors and an ideal clock would have given it.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Scan:
         Noise and jitter, estimated where they were.
     corrections : tuple of EffectRecord
         What was wrong with sensors and clock; the model corrects it.
-    tellings : tuple of EffectRecord
+    reported_effects : tuple of EffectRecord
         What the scan contained besides.
     survey : SurveyResult or None
         How that was found; None where nothing was estimated.
@@ -77,7 +77,7 @@ class Scan:
     measurements: tuple[Measurements, ...]
     accuracy: Accuracy
     corrections: tuple[EffectRecord, ...] = ()
-    tellings: tuple[EffectRecord, ...] = ()
+    reported_effects: tuple[EffectRecord, ...] = ()
     survey: SurveyResult | None = None
     field_sigma_t: float = 0.0
 

@@ -43,21 +43,21 @@ USEFUL = {
     'gains': 2e-3, 'axes': 5e-3, 'places': 2e-4, 'lever_arm': 2e-4, 'time_offset': 1e-3,
     'clock_rate': 1e-4, 'offsets': 2e-3,
 }  # fmt: skip
-"""Standard deviation, in the parameters' own units, beyond which a scan does not tell them: that
-much makes errors of some tenths of a millimetre, as a tool that was not calibrated has."""
+"""Standard deviation, in the parameters' own units, beyond which a scan does not determine them:
+that much makes errors of some tenths of a millimetre, as a tool that was not calibrated has."""
 SHARED_SHIFT = 'lever_arm'
-"""The kind that shifts all sensors of a body, and so the field, where nothing else tells them
-apart."""
+"""The kind that shifts all sensors of a body, and so the field, where nothing else distinguishes
+them."""
 SURVEYED_M = 1e-3
-"""Standard deviation of a setup's lever arm, m along each axis, where no scan tells it: that of a
-tool measured with a ruler. All places that a coil is found at are off by as much."""
+"""Standard deviation of a setup's lever arm, m along each axis, where no scan determines it: that
+of a tool measured with a ruler. All places that a coil is found at are off by as much."""
 AS_PLACES = 4.0
 """The same in widths of the places' population, where that is less: a tool whose coils are where
 its setup has them is one that was measured well. An assumption, not a result."""
 TURNED_RAD = 0.05
-"""Turn of a body, rad rms, about a second axis from which on it tells a lever arm: a millimetre is
-then 0.05 mm of movement. With less, what a field's model misses decides how a shift is shared out
-between lever arm and field: an example with 0.02 rad was off by 1.3 mm."""
+"""Turn of a body, rad rms, about a second axis from which on it determines a lever arm: a
+millimetre is then 0.05 mm of movement. With less, what a field's model misses decides how a shift
+is shared out between lever arm and field: an example with 0.02 rad was off by 1.3 mm."""
 BY_RULE = 1e-9
 """Standard deviation, relative or m, of what a rule sets: far below any spread, and above what
 rounding makes of it."""
@@ -96,7 +96,7 @@ class Survey:
         return replace(track, time=track.time * (1.0 + self.rate) + self.offset_s)
 
     def apply(self, measurements: Measurements) -> Measurements:
-        """Return the measurements as sound sensors and a sound clock would have given them."""
+        """Return the measurements as ideal sensors and an ideal clock would have given them."""
         sensors = measurements.sensors
         out = replace(
             measurements,
@@ -115,7 +115,7 @@ class Survey:
 
 
 def has_turned(measurements: Measurements) -> bool:
-    """Return whether a body turned about two axes at least by enough to tell its lever arm.
+    """Return whether a body turned about two axes at least by enough to determine its lever arm.
 
     If a body does not turn, a shift of all its sensors cannot be distinguished from a shift of the
     field.
@@ -211,7 +211,7 @@ class SensorParameters:
         return out
 
     def rule(self) -> Array:
-        """Return the information (Q, Q) of the rule for what no data tell.
+        """Return the information (Q, Q) of the rule for what no data determine.
 
         The mean of all gains is one, and the mean of a body's places is zero.
         """

@@ -69,7 +69,7 @@ LOOSE = OpticalNoise(1e-3, 1e-2)
 lever arm are unknown."""
 FREE_POSE = np.repeat([1.0 / 0.02**2, 1.0 / 0.1**2], 3)
 """Precision of a pose that is to follow the fluxes, 1/m^2 and 1/rad^2: a prior of 2 cm and 0.1 rad
-holds only what they do not tell."""
+holds only what they do not determine."""
 FIELD_WIDTH = 0.3
 """Prior width of the field's deviation from the drawing, relative to the flux, to begin with.
 Smaller holds the first steps to a poor drawing; larger lets it take up what is the sensors'."""
@@ -162,7 +162,8 @@ class SensorSurveyor:
         total = COARSE_STEPS + 3 * FINE_STEPS
         tools = self._tools(COARSE_ROWS)
         self._start(tools)
-        # With too few to tell noise from modes of the field, errors of any size seem certain.
+        # With too few to distinguish noise from modes of the field, errors of any size seem
+        # certain.
         poses, modes = sum(len(tool.weights) for tool in tools), self.modes.size.size
         readings = sum(int(m.usable.sum()) for m in self.measured)
         path = any(m.is_followed for m in self.measured)  # its neighbouring poses are alike
@@ -208,7 +209,7 @@ class SensorSurveyor:
     def _sums(
         self, tools: Sequence[_Tool], parameters: SensorParameters, linear: Sequence[Linear]
     ) -> Eliminated:
-        """What the tools say of some parameters beside the field."""
+        """What the tools say about some parameters, with the field unknown."""
         system = JointSystem(parameters, self.modes, self.field.shape[1])
         noise_t = float(np.sqrt(self.inflation)) * self.noise_t
         for tool, at in zip(tools, linear, strict=True):
@@ -227,10 +228,10 @@ class SensorSurveyor:
         return contradictions([self._corrected(tool) for tool in tools], kinds, sums)
 
     def _untold(self) -> dict[str, float]:
-        """Kinds that the scan does not tell, those among them that were not even tried."""
+        """Kinds that the scan does not determine, those among them that were not even tried."""
         not_tried = set(self.parameters.asked) - set(self.parameters.kinds)
         wide = {kind: PRIOR[kind] for kind in self.parameters.asked if kind in not_tried}
-        return {**self.population.untold(self.likelihood), **wide}
+        return {**self.population.undetermined(self.likelihood), **wide}
 
     def _tell(self, share: float) -> None:
         if self.progress is not None:
@@ -379,7 +380,7 @@ class SensorSurveyor:
     def _all_frames(
         self, steady: Sequence[NDArray[np.bool_]]
     ) -> tuple[tuple[NDArray[np.bool_], ...], float]:
-        """Which of all frames are sound, and the share of those whose pose is not."""
+        """Which of all frames are good, and the share of those whose pose is not."""
         out, bad, seen = [], 0, 0
         for whole, mask in zip(self.measured, steady, strict=True):
             kept = mask.copy()

@@ -44,7 +44,7 @@ Array = NDArray[np.float64]
 STILL_KINDS = ('gains', 'axes', 'bend')
 """Kinds of errors that few poses of many sensors tell."""
 STILL_ONLY = ('bend',)
-"""Those of them that nothing else tells."""
+"""Those of them that nothing else determines."""
 POPULATIONS = ('gains', 'axes')
 """Those of them that every sensor has a value of."""
 
@@ -154,7 +154,7 @@ def _survey(measured: Measurements, fit: StillFit) -> Survey:
 
 
 def _held_out(posed: Measurements, folds: Sequence[StillFit], accuracy: Accuracy) -> HeldOut:
-    """Sum up each frame's residual, its sensors and its field as the other frames tell them."""
+    """Sum up each frame's residual, its sensors and its field as the other frames predict them."""
     noise = min(fit.widths.noise_t for fit in folds)
     tally = HeldOutTally(noise, noise, accuracy, max(len(fit.sites) for fit in folds))
     for frame, fit in enumerate(folds):
@@ -166,7 +166,7 @@ def _held_out(posed: Measurements, folds: Sequence[StillFit], accuracy: Accuracy
 
 
 def _scan(posed: Measurements, frames: int, fit: StillFit, accuracy: Accuracy) -> Scan:
-    """The frames as sound sensors on a flat body would have given them, and what was not sound;
+    """The frames as ideal sensors on a flat body would have given them, and what was not ideal;
     ``frames`` are those of the session, without a pose too.
     """
     parameters, values, sigma = _parameters(posed, fit)
@@ -190,7 +190,7 @@ def _scan(posed: Measurements, frames: int, fit: StillFit, accuracy: Accuracy) -
         evidence, fit.widths.noise_t, poses, {kind: np.zeros(0, np.int64) for kind in POPULATIONS},
         (every,), (every,), 0.0, {}, accuracy.optical_position_m / np.sqrt(len(offsets)),
     )  # fmt: skip
-    flat = fit.model.sound(fit.unknowns, fit.sites)
+    flat = fit.model.unbent(fit.unknowns, fit.sites)
     sound = result.survey(posed.body).apply(flat)
     return Scan((sound,), accuracy, corrections(result), _bends(fit), result)
 

@@ -39,8 +39,8 @@ MOST_NOISE_STEPS = 20
 DIPOLE_PAYS = 20.0
 """Log evidence that a free dipole must add: many places were tried, of which the best is always
 better than none."""
-MOST_BESIDE = 6
-"""Free dipoles beside the emitters at most; each further one costs a search."""
+MOST_FREE_DIPOLES = 6
+"""Free dipoles in addition to the emitters at most; each further one costs a search."""
 REACH = 0.7
 """How far beyond the sensors they are looked for, as a fraction of the sensors' extent."""
 GRID = 0.25
@@ -125,9 +125,9 @@ class StillFitter:
     def _around(self, centres: Array) -> tuple[DipoleSites, Array]:
         """Return dipoles about each emitter, and how large their moments may be.
 
-        One dipole finds an emitter's place. Six more about it, at a distance that is small beside
-        that of the sensors, make the multipoles of its size. All serve all emitters, as the iron
-        of one carries the fields of the others.
+        One dipole finds an emitter's place. Six more about it, at a distance that is small
+        compared with that of the sensors, make the multipoles of its size. All serve all emitters,
+        as the iron of one carries the fields of the others.
         """
         start = coaxial(centres, np.tile(UNIT_Z, (len(centres), 1)), 1, np.ones(len(centres)))
         weights = [usable_weights(self.measurements)]
@@ -153,7 +153,7 @@ class StillFitter:
             if gain < LEAST_EVIDENCE:
                 break
             best, evidence[kind] = tried[kind], float(gain)
-        while best.beside < MOST_BESIDE:
+        while best.beside < MOST_FREE_DIPOLES:
             found = self._place_beside(best)
             if found is None:
                 break

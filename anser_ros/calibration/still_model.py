@@ -102,7 +102,7 @@ class StillModel:
         return as_real(flux) if self.is_complex else np.ascontiguousarray(flux.real)
 
     def nothing(self, dipoles: int) -> StillUnknowns:
-        """Return the unknowns of a sound body at its stated poses without a field."""
+        """Return the unknowns of an ideal body at its stated poses without a field."""
         frames, sensors = self.reading.shape[:2]
         return StillUnknowns(
             np.zeros((dipoles, self.parts)),
@@ -214,8 +214,8 @@ class StillModel:
             out[..., 3 * j : 3 * j + 3] = -self._amplified(slope, now).transpose(1, 3, 0, 2)
         return out.reshape(sensors, self.parts * frames, 3 * movable)
 
-    def sound(self, now: StillUnknowns, sites: DipoleSites) -> Measurements:
-        """Return the measurements as a body that is not bent would have given them."""
+    def unbent(self, now: StillUnknowns, sites: DipoleSites) -> Measurements:
+        """Return the measurements that the body would have given without its bend."""
         if self.bend is None or not now.frames[:, POSE:].any():
             return self.measured
         flat = now.frames.copy()

@@ -34,10 +34,10 @@ UNITS = {
 """Factor and unit in which each kind of parameter is told to people."""
 
 
-def untold_words(result: SurveyResult) -> tuple[str, ...]:
-    """Return a line for every kind of parameter that the scan cannot give."""
+def undetermined_words(result: SurveyResult) -> tuple[str, ...]:
+    """Return a line for every kind of parameter that the scan does not determine."""
     words = []
-    for kind, size in result.untold.items():
+    for kind, size in result.undetermined.items():
         factor, unit = UNITS[kind]
         told = f'{_short(factor * size)} {unit}'
         words.append(
@@ -46,7 +46,7 @@ def untold_words(result: SurveyResult) -> tuple[str, ...]:
     return tuple(words)
 
 
-def drift_tellings(strength: NDArray[np.complex128]) -> tuple[EffectRecord, ...]:
+def drift_records(strength: NDArray[np.complex128]) -> tuple[EffectRecord, ...]:
     """Return the emitters that drifted in a scan, from their strengths (F, K), and how far."""
     size = np.abs(strength)
     records = []
@@ -232,7 +232,7 @@ def _single(
     )
 
 
-def tellings(
+def reported_effects(
     result: SurveyResult, measurements: Sequence[Measurements]
 ) -> tuple[EffectRecord, ...]:
     """Return what the scan alone contained: metal that moved.

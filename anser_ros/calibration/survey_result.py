@@ -32,13 +32,13 @@ class SurveyResult:
     alone : dict of str to ndarray of int
         Parameters of channels that stand outside their population.
     kept, steady : tuple of ndarray of bool
-        Frames of each of the measurements whose pose and field are sound, and those in which
+        Frames of each of the measurements whose pose and field are good, and those in which
         nothing moved.
     reflected : float
         Share of the frames whose pose is not where the fluxes put it.
-    untold : dict of str to float
-        Kinds that the scan does not tell, with the standard deviation that it leaves; these are
-        as the setup says, or as their prior makes them.
+    undetermined : dict of str to float
+        Kinds that the scan does not determine, with the standard deviation that it leaves; these
+        are as the setup says, or as their prior makes them.
     shift_sigma_m : float
         Standard deviation along each axis, m, of a shift that the whole field shares: of the lever
         arm, and of the mean of all optical poses.
@@ -56,7 +56,7 @@ class SurveyResult:
     kept: tuple[NDArray[np.bool_], ...]
     steady: tuple[NDArray[np.bool_], ...]
     reflected: float
-    untold: dict[str, float]
+    undetermined: dict[str, float]
     shift_sigma_m: float = 0.0
     contradictions: tuple[Contradiction, ...] = ()
 

@@ -109,7 +109,7 @@ def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result
     args : argparse.Namespace
         Of `add_arguments`.
     tell : callable
-        Is told the stage and the finished share of it.
+        Called with the stage and the finished share of it.
 
     Raises
     ------

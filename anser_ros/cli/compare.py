@@ -91,7 +91,7 @@ def _plain(one: Compared | ComparedShares) -> dict[str, Any]:
 
 
 def verdict(found: Mapping[str, Mapping[str, Compared | ComparedShares]]) -> str:
-    """Say in a line for how many coils and bodies each is better, in error and in coverage."""
+    """State in a line for how many coils and bodies each is better, in error and in coverage."""
     words = {'position': 'position error', 'orientation': 'orientation error',
              'coverage': 'frames with a pose'}  # fmt: skip
     parts = []
@@ -104,7 +104,7 @@ def verdict(found: Mapping[str, Mapping[str, Compared | ComparedShares]]) -> str
 
 
 def alone(found: Mapping[str, Compared]) -> str:
-    """Say how many errors only one of the two has, as the other gave no pose there."""
+    """State how many errors only one of the two has, as the other gave no pose there."""
     counts = [sum(getattr(one, side) for one in found.values()) for side in ('only_a', 'only_b')]
     said = [f'{count} only the {WORDS[key]}' for key, count in zip('ab', counts, strict=True)]
     pairs = sum(one.n for one in found.values())

@@ -58,7 +58,7 @@ def work(args: argparse.Namespace, tell: Callable[[str], None]) -> Result:
     args : argparse.Namespace
         Of `add_arguments`.
     tell : callable
-        Is told what has been reached, in words.
+        Called with words on what has been reached.
     """
     if args.poses:
         return diagnose_pose_session(args, tell)

@@ -24,7 +24,7 @@ BEFORE, AFTER = '#c44e52', '#4c72b0'
 
 
 def strongest(state: State) -> str:
-    """Say in words on which channel and emitter the residual is largest."""
+    """State in words on which channel and emitter the residual is largest."""
     largest = []
     parts = _tools(state)
     emitters = state.problem.fields.omega.size

@@ -11,7 +11,7 @@ MOST_CHARACTERS = 400
 
 
 def verdict(document: dict[str, Any]) -> str:
-    """Say in one short paragraph what was found and what stays unexplained.
+    """State in one short paragraph what was found and what stays unexplained.
 
     Effects are named with their parameters if there is room, otherwise without.
     """

@@ -97,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def verdict(error_map: ErrorMap) -> str:
-    """Say in a line what places that took no part say of the map."""
+    """State in a line what places that took no part say of the map."""
     before, after = 1e3 * error_map.before_m, 1e3 * error_map.after_m
     along = 'in the plane of the places, ' if error_map.before.in_plane is not None else ''
     figures = f'held out, {along}{before:.3f} mm rms without a map, {after:.3f} mm with'

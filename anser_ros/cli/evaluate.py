@@ -134,7 +134,7 @@ def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result
     args : argparse.Namespace
         Of `add_arguments`, and ``session``, the one to evaluate.
     tell : callable
-        Is told the stage and the finished share of it.
+        Called with the stage and the finished share of it.
     """
     if args.poses:
         return evaluate_pose_session(args, lambda stage: tell(stage, 0.0))
@@ -185,7 +185,7 @@ def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result
 
 
 def _few_notes(session: Session) -> tuple[str, ...]:
-    """Say why a refit gives no pose, where it has fewer references than it takes."""
+    """State why a refit gives no pose, where it has fewer references than it takes."""
     count = 0 if session.reference is None else len(session.reference.sensors)
     need = session.setup.refit.min_references
     if count >= need:

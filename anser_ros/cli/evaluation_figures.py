@@ -28,7 +28,8 @@ from anser_ros.sessions.pose_errors import PoseSeries
 Array = NDArray[np.float64]
 
 MOST_POINTS = 4000
-"""Most points that a figure shows of one coil: more are not told apart, and make files large."""
+"""Most points that a figure shows of one coil: more cannot be distinguished, and make files
+large."""
 COVERAGE_SIGMAS = np.linspace(0.0, 4.0, 81)
 """Multiples of sigma for which the share of errors within is drawn, to where all should be."""
 STYLE = """

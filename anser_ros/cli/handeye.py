@@ -137,7 +137,7 @@ def _session(args: argparse.Namespace) -> PoseSession:
 
 
 def to_document(found: HandEye) -> dict[str, Any]:
-    """Return the result as plain data; null where the recording does not tell."""
+    """Return the result as plain data; null if it is not determined."""
     vector, quaternion = turn_of(found.rotation)
     offset, rate = (pair or (None, None) for pair in (found.offset_s, found.rate_ppm))
     document: dict[str, Any] = {

@@ -82,7 +82,8 @@ def run(args: argparse.Namespace) -> int:
     for variable in ('OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
         os.environ.setdefault(variable, '1')
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    # A ROS system that runs already must neither be heard nor hear what is simulated here.
+    # A ROS system that runs already must neither receive nor be received by what is simulated
+    # here.
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % LAST_DOMAIN))
     folder = args.out / time.strftime('loop_%Y%m%d_%H%M%S')
     make_folder(folder)

@@ -25,7 +25,7 @@ def verdict(truth: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> str:
     """Return how right a diagnosis is; empty for a clean run that was found clean.
 
     An effect that the diagnosis knows must be named, at its site, and nothing else. One that it
-    does not know must be reported as unexplained: completely, or in part beside other names.
+    does not know must be reported as unexplained: completely, or in part among other names.
 
     Parameters
     ----------

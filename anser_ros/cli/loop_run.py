@@ -91,7 +91,7 @@ class Run:
     baseline : Path or None
         Clean recording; with it the served model follows the references.
     known : Path or None
-        Uncorrected model of the trackers that run beside it; None for no such trackers.
+        Uncorrected model of the trackers that run in parallel; None for no such trackers.
     watched : mapping or None
         Parameters of a watcher; None for no watcher.
     """

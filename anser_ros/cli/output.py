@@ -60,7 +60,7 @@ class Result:
 
 
 def say(command: str, result: Result, *, as_json: bool) -> None:
-    """Say the notes on stderr, and on stdout the document alone or all that is shown."""
+    """Print the notes on stderr, and on stdout the document alone or all that is shown."""
     for note in result.notes:
         print(f'anser {command}: {note}', file=sys.stderr)
     if as_json:
@@ -101,10 +101,10 @@ def say_written(*paths: Path) -> None:
 
 
 def snapshot_notes(name: str, model: FieldModel) -> tuple[str, ...]:
-    """Say that a command works with a snapshot of a refit, where it does."""
+    """Report that a command works with a snapshot of a refit, where it does."""
     return (f'{name} is a {SNAPSHOT}, not a calibration',) if is_snapshot(model) else ()
 
 
 def loss_notes(session: str, lost: str) -> tuple[str, ...]:
-    """Say what a session has lost, where it has."""
+    """State what a session has lost, where it has."""
     return (f'{session}: {lost}',) if lost else ()

@@ -138,9 +138,9 @@ def propose(
     kinds : list of str
         Of `KINDS`.
     error_m : float
-        Error of poses that each metal makes while nobody corrects it, m.
+        Error of poses that each metal makes while it is not corrected, m.
     progress : callable
-        Is told the stage and the finished share of all.
+        Called with the stage and the finished share of all.
 
     Raises
     ------

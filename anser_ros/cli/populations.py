@@ -85,7 +85,7 @@ def _shown(record: EffectRecord) -> tuple[tuple[str, ...], str, Array, Array]:
     effect = effect_named(record.name)
     factor, unit = SHOWN[effect.units['values']]
     values = np.array(record.parameters['values'], dtype=np.float64)
-    # What all sound channels have, one for a gain, is no error.
+    # What all faultless channels have, one for a gain, is no error.
     values = factor * (values - np.median(values, axis=0).round())
     sigma = factor * np.array(record.parameters['uncertainty'], dtype=np.float64)
     if values.shape[1] <= MOST_PARTS:

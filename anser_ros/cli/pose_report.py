@@ -25,7 +25,7 @@ LIMITS = 1.96  # standard deviations within which 95 % of normal differences lie
 
 
 def pose_verdict(document: dict[str, Any]) -> str:
-    """Say in one paragraph what was found and what stays unexplained."""
+    """State in one paragraph what was found and what stays unexplained."""
     held, rest = document['held_out'], document['unexplained']
     found = [effect for effect in document['effects'] if effect['name'] != 'hand_eye']
     before, after = 1e3 * held['position_rmse_before_m'], 1e3 * held['position_rmse_after_m']

@@ -69,7 +69,8 @@ def diagnose_pose_session(args: argparse.Namespace, tell: Callable[[str], None])
 
 
 def evaluate_pose_session(args: argparse.Namespace, tell: Callable[[str], None]) -> Result:
-    """Tell the errors of a session of poses, into the folder of the arguments, and the stages."""
+    """Report the errors of a session of poses, into the folder of the arguments, and the
+    stages."""
     found, diagnosis = _found(args, tell)
     document = _evaluation(found, diagnosis)
     _write_poses(args.out / 'poses.csv', found)

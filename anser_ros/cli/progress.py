@@ -17,7 +17,7 @@ left is told. Before, it would be that of loading and compiling, which do not co
 
 @contextmanager
 def progress_of(command: str) -> Iterator[Callable[[str, float], None]]:
-    """Yield a function that is told the stage and the finished share of it, 0 to 1.
+    """Yield a function that takes the stage and the finished share of it, 0 to 1.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def progress_of(command: str) -> Iterator[Callable[[str, float], None]]:
 
 @contextmanager
 def stages_of(command: str) -> Iterator[Callable[[str], None]]:
-    """Yield a function that is told in words what has been reached, where no share is known."""
+    """Yield a function that takes words on what has been reached, where no share is known."""
     console = Console(stderr=True)
     if console.is_terminal:
         with console.status(command) as status:

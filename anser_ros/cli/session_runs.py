@@ -65,7 +65,7 @@ def runs_of(command: str, args: argparse.Namespace) -> list[SessionRun]:
 
 
 def names_of(sessions: Sequence[str]) -> list[str]:
-    """Return names for sessions by their paths: as many last parts as tell them apart.
+    """Return names for sessions by their paths: as many last parts as distinguish them.
 
     Raises
     ------

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.effect import Remedy
-from anser_ros.effects.prediction import Fields, lit
+from anser_ros.effects.prediction import Fields, changed_illumination
 from anser_ros.effects.term import Term
 from anser_ros.field.dipoles import Dipoles
 from anser_ros.field.model import EffectRecord, FieldModel
@@ -23,7 +23,7 @@ def corrected_model(
     Metal that moves is not included: the live refit finds its place from the references.
     """
     dipoles = Dipoles(model.positions, model.directions, model.moments)
-    light = lit(terms, fields.illumination)
+    light = changed_illumination(terms, fields.illumination)
     for term in terms:
         if term.effect.remedy is Remedy.FIELD and not term.effect.moving:
             added = term.effect.sources(term, fields.model, light, fields.omega)

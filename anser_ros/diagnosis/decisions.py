@@ -37,7 +37,7 @@ LEAST_SHARE = 0.002
 """Gain over the number of values, in units of the misfit, that an effect must have on top: what a
 field model's own error lets an effect gain grows with the data, while chance doesn't."""
 LEAST_SHARE_BESIDE_METAL = 0.01
-"""The same beside metal, whose shape is never known and leaves what other effects can take up."""
+"""The same with metal, whose shape is never known and leaves what other effects can take up."""
 LEAST_OF_EXCESS = 0.4
 """Share of what is left to explain that an explanation with freedom in time (a fluctuation, or
 metal at another place in each block) must explain: less than that is another effect's trace along
@@ -54,13 +54,13 @@ of these leave pass for another piece; fewer leave a second piece to be taken fo
 MOST_DOUBTFUL = 2
 """With so many effects in force that are not the same in all parts of the data, something else is
 the cause, and further effects would only stand in for it: the search ends."""
-PLAIN_TO_SEE = 5.0
+CLEAR_GAIN = 5.0
 """An effect whose parameters stand so many times above what it must gain (by their covariance) is
 kept without the fit of all the others without it."""
-TOLD_APART = 0.05
-"""A candidate of whose power the fluctuations in force leave less than this share (0 to 1) can't
-be told from them. Smaller fits candidates that only noise decides on; larger hides effects behind
-a fluctuation."""
+DISTINGUISHABLE = 0.05
+"""A candidate of whose power the fluctuations in force leave less than this share (0 to 1) cannot
+be distinguished from them. Smaller fits candidates that only noise decides on; larger hides
+effects behind a fluctuation."""
 
 # --- which candidates are fitted in full -------------------------------------------------------
 PROMISING = 0.5
@@ -79,8 +79,8 @@ AS_GOOD, AS_GOOD_PER_PARAMETER = 10.0, 4.0
 parameter that it spares. Together they are less than what a further effect with as many parameters
 must gain (`LEAST_GAIN`, `PER_PARAMETER`), so what is given up would not have been accepted."""
 ALIKE = 0.02
-"""Share of a gain by which two explanations may differ that the data don't tell apart: metal of an
-unknown shape leaves about as much. Within it a rival is listed, and metal rests."""
+"""Share of a gain by which two explanations may differ that the data do not distinguish: metal of
+an unknown shape leaves about as much. Within it a rival is listed, and metal rests."""
 STEADY = 0.8
 """Share of a fluctuation's gain from which a constant, or a curve, of the same coil or channel is
 tried first: freedom in every frame also takes off what is another effect's."""
@@ -93,13 +93,13 @@ explanations that reach it is taken."""
 SOMETHING_LEFT = 1.02
 """Misfit over the noise's from which there is something to explain: a body is made richer only
 above it, and below it nothing that stays speaks against an effect."""
-MUCH_LEFT = 1.3
+COARSE_REMAINDER = 1.3
 """The same for a first, coarse shape: the finer one follows once all effects are known. Smaller
 spends modes on what effects that are not found yet do; larger leaves so much of the metal that
 other effects stand in for it."""
 
 # --- whether metal moves or rests --------------------------------------------------------------
-FREER = 1.05
+LEAST_PATH_GAIN = 1.05
 """Factor by which metal at the best place for each block of time must explain more than at one
 place, or it isn't tried as metal that moves. Smaller tries it for what noise gives so much
 freedom; larger overlooks metal that moves little."""
@@ -110,9 +110,9 @@ NO_RIVAL = 0.25
 """Metal at rest that by itself explains less than this share (0 to 1) of what moving metal
 explains is no rival to it. Smaller spends fits on metal at rest that cannot win; larger lets
 moving metal be named without asking whether rest and one more effect would do."""
-BESIDE_REST = 3
-"""Effects that are tried beside metal at rest before metal is said to move. Fewer let metal move
-for what rest and one more effect explain; each further one costs a full fit."""
+MOST_EFFECTS_AT_REST = 3
+"""Effects that are tried together with metal at rest before metal counts as moving. Fewer let
+metal move for what rest and one more effect explain; each further one costs a full fit."""
 
 # --- whether an effect is confirmed and named --------------------------------------------------
 TIME_PARTS = 6
@@ -151,13 +151,13 @@ of 16 values passes its limit once in 5e12, one of 8 values once in 1e7."""
 KNOWN_SIGMAS = 3.0
 """Standard deviations by which a share of frames may exceed the one that the model knows of, which
 chance alone does in one session of 700."""
-BESIDE_OUTLIERS = 0.3
+MOST_EXCESS_OF_OUTLIERS = 0.3
 """Unexplained power over the floor's up to which frames that stand out are outliers: a model that
 is wrong by more makes some itself. Larger names outliers that are another effect's; smaller leaves
-true ones unnamed beside a small unknown."""
+true ones unnamed if there is a small unknown."""
 STRUCTURED, UNSTRUCTURED = 0.03, 0.1
 """Unexplained power over the floor's from which it is reported: where it depends on something, and
-where no test finds on what. Smaller reports a sound model's own error; larger keeps silent about
+where no test finds on what. Smaller reports a correct model's own error; larger keeps silent about
 what is there."""
 DEPENDENT = 0.05
 """Unexplained power over the floor's from which it is said what it depends on. Smaller gives names

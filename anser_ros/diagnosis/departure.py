@@ -38,7 +38,7 @@ value was chosen is not recorded."""
 FINE_KNOTS = 17
 """Knots at last. A spline of few pieces cannot rest at its ends, where what is asked is told: with
 nine the metal at rest was half again too strong, with 17 and with 25 right."""
-WAYS = (0.12, 0.24)
+PATH_LENGTHS_M = (0.12, 0.24)
 """Lengths of the ways that are tried, m: the shorter about a hand's way, twice it, and between
 them the fit finds its way. Only shorter ones, and metal that crosses the volume is not found; only
 longer ones, and a start lies too far from a small movement. How the value was chosen is not
@@ -91,8 +91,8 @@ class Departure:
         return cast(DepartedTerm, self.fit.terms[0])
 
     @property
-    def is_understood(self) -> bool:
-        """Return whether body and path foretell the unseen blocks."""
+    def is_predictive(self) -> bool:
+        """Return whether body and path predict the held-out blocks."""
         return self.after < max(2.0, EXPLAINED * self.before)
 
     def rest_flux(self, view: View) -> tuple[ComplexArray, Array]:
@@ -131,7 +131,7 @@ def departure(problem: Problem, rest_s: float) -> Departure | None:
     if not known:
         return None
     fitter = Fitter(some, blocks, FOLDS, STEPS)
-    best = Shaping(fitter, BODY).freed(min(known, key=fitter.held_out), 0)
+    best = Shaping(fitter, BODY).with_freer_course(min(known, key=fitter.held_out), 0)
     cleaned = without_outliers(problem, evaluate(problem, best.terms))
     last = Fitter(_thinned(cleaned.in_blocks(blocks), MANY_FRAMES), blocks, FOLDS, STEPS)
     fit = last.fit(best.terms)
@@ -158,7 +158,7 @@ def _thinned(problem: Problem, frames: int) -> Problem:
 def _best_starts(
     problem: Problem, effect: DepartedMetal, blocks: NDArray[np.int64]
 ) -> list[tuple[DepartedTerm, str]]:
-    """The start that foretells left-out blocks best with a compact body, and with pieces."""
+    """The start that predicts left-out blocks best with a compact body, and with pieces."""
     state = evaluate(problem, ())
     found = []
     for start, kinds in _starts(problem, state, effect, blocks):
@@ -217,13 +217,15 @@ def _ways() -> list[Array]:
     level = np.sqrt(1.0 - SLOPE**2)
     turns = 2.0 * np.pi * np.arange(AROUND) / AROUND
     aside = [np.array([level * np.cos(a), level * np.sin(a), -SLOPE]) for a in turns]
-    return [length * way for way in (np.array([0.0, 0.0, -1.0]), *aside) for length in WAYS]
+    return [
+        length * way for way in (np.array([0.0, 0.0, -1.0]), *aside) for length in PATH_LENGTHS_M
+    ]
 
 
 def _refined(
     problem: Problem, start: DepartedTerm, kind: str, blocks: NDArray[np.int64]
 ) -> Fit | None:
-    """Body and path together, first coarsely; the body is shaped anew for the finer path."""
+    """Body and path together, first coarsely; the body is reshaped for the finer path."""
     fitter = Fitter(problem, blocks, FOLDS, STEPS)
     shaping = Shaping(fitter, BODY)
     fit = shaping.shaped_as(fitter.fit([start.hold()], 0), 0, start, [kind])

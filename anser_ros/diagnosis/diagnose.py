@@ -18,7 +18,7 @@ from anser_ros.diagnosis.decisions import (
 )
 from anser_ros.diagnosis.finding import Finding, fitted_finding
 from anser_ros.diagnosis.fit import Fit, Fitter
-from anser_ros.diagnosis.fluctuating import respread
+from anser_ros.diagnosis.fluctuating import refit_spreads
 from anser_ros.diagnosis.noise import noise_findings, outlier_findings
 from anser_ros.diagnosis.outlying import clean_start, outlying_share, without_outliers
 from anser_ros.diagnosis.prepare import test_blocks, train_blocks
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 SEARCH_FRAMES, FINAL_FRAMES, WIRING_FRAMES = 270, 400, 150
 """Frames of each tool, about, that the search, the last fit and the look for wiring faults work
-on: time grows with them in proportion, and neighbouring frames tell much the same."""
+on: time grows with them in proportion, and neighbouring frames say much the same."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def diagnose(
         What the problem was built with.
     settings : SearchSettings, optional
     progress : callable, optional
-        Told in words what goes on.
+        Called with words on what goes on.
     """
     how, say = settings or SearchSettings(), progress or (lambda text: None)
     screened = screen(problem)
@@ -215,8 +215,8 @@ def _settled(
         refused += [(term, check) for check, term in dropped]
         gone = [term for _, term in dropped]
         rest = [t for t in fit.terms if not any(t is term or t.belongs_to(term) for term in gone)]
-        fit = settled(fitter, respread(fitter.problem, rest))
-    return settled(last, respread(last.problem, fit.terms), FINE), tuple(refused)
+        fit = settled(fitter, refit_spreads(fitter.problem, rest))
+    return settled(last, refit_spreads(last.problem, fit.terms), FINE), tuple(refused)
 
 
 def conclude(

@@ -72,7 +72,7 @@ class Fit:
 
 @dataclass(frozen=True)
 class Fitter:
-    """Says what effects are fitted on, and how.
+    """States what effects are fitted on, and how.
 
     Attributes
     ----------

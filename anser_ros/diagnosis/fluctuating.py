@@ -83,8 +83,8 @@ def fluctuation_of(state: State, term: Term) -> tuple[float, Term] | None:
     return gain_of(found, spread), replace(free, spread=spread, frames=found.right.shape[0])
 
 
-def respread(problem: Problem, terms: Sequence[Term]) -> tuple[Term, ...]:
-    """Return the terms with the spread of each fluctuation found anew beside the others."""
+def refit_spreads(problem: Problem, terms: Sequence[Term]) -> tuple[Term, ...]:
+    """Return the terms with the spread of each fluctuation fitted again, given the others."""
     out = list(terms)
     for i, term in enumerate(out):
         if term.effect.family is Family.FLUCTUATION:

@@ -28,8 +28,8 @@ LEAST_ERROR = 1e-5
 """Relative error that references are given at least, so that exact ones do not divide by zero."""
 DRAWING_ERROR = 0.05
 """Prior spread of the sheet's moments about the drawn ones, as a share of their rms. Smaller holds
-the sheet to the drawing where the data contradict it; larger leaves free what they do not tell,
-where no sensor was. Its choice is not recorded."""
+the sheet to the drawing where the data contradict it; larger leaves free what they do not
+determine, where no sensor was. Its choice is not recorded."""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.decisions import FREER, LEAST_MORE, LEAST_OF_EXCESS
+from anser_ros.diagnosis.decisions import LEAST_MORE, LEAST_OF_EXCESS, LEAST_PATH_GAIN
 from anser_ros.diagnosis.problem import Problem
 from anser_ros.diagnosis.scoring import BlockSums, Score, Scorer
 from anser_ros.effects.effect import Effect
@@ -14,7 +14,7 @@ from anser_ros.effects.term import Term
 
 Array = NDArray[np.float64]
 
-WAY_PRICE = 0.05
+STEP_PRICE = 0.05
 """What a way of one step of the grid of places between two blocks costs, as a share of the largest
 gain of a place in a block; it grows with the square of the way. Without it a place jumps wherever
 noise favours another one, with much more it stays at one place."""
@@ -70,7 +70,7 @@ def _starts(
     gains = np.array([s.explained_alone(np.full(s.size, NO_PRIOR)) for _, s, _ in places])
     alone = float(gains.max(axis=0).sum())
     excess = scorer.state.sum_of_squares - scorer.state.count
-    if alone < max(FREER * one_place + LEAST_MORE, LEAST_OF_EXCESS * excess):
+    if alone < max(LEAST_PATH_GAIN * one_place + LEAST_MORE, LEAST_OF_EXCESS * excess):
         return []
     course, solution = _course([(centre, own) for centre, own, _ in places], gains)
     time = (blocks + 0.5) * problem.apparatus.duration / (blocks.max() + 1)
@@ -120,7 +120,7 @@ def _smoothest(points: Array, gains: Array) -> NDArray[np.int64]:
     """Place (by index) in each block: much gain, little way (Viterbi's algorithm)."""
     apart = np.linalg.norm(points[:, None] - points[None], axis=2)
     step = np.median(np.where(apart > 0, apart, np.inf).min(axis=1))
-    price = WAY_PRICE * gains.max() * (apart / step) ** 2
+    price = STEP_PRICE * gains.max() * (apart / step) ** 2
     best, back = gains[:, 0], []
     for block in range(1, gains.shape[1]):
         total = best[None, :] - price

@@ -4,7 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from anser_ros.diagnosis.decisions import BESIDE_OUTLIERS, FEWEST_OUTLIERS, KNOWN_SIGMAS, NOISIER
+from anser_ros.diagnosis.decisions import (
+    FEWEST_OUTLIERS,
+    KNOWN_SIGMAS,
+    MOST_EXCESS_OF_OUTLIERS,
+    NOISIER,
+)
 from anser_ros.diagnosis.finding import Finding, plain_finding
 from anser_ros.diagnosis.outlying import outlying_share
 from anser_ros.diagnosis.problem import Problem, State
@@ -40,7 +45,7 @@ def outlier_findings(
     share, channels = outlying_share(whole, cleaned)
     # A fluctuation is taken for normal: frames far out along it are its own tails.
     own_tails = any(term.effect.family is Family.FLUCTUATION for term in after.terms)
-    alone = excess < BESIDE_OUTLIERS and not own_tails
+    alone = excess < MOST_EXCESS_OF_OUTLIERS and not own_tails
     frames = sum(tool.time.size for tool in whole.tools)
     always = known_share(known)
     usual = always + KNOWN_SIGMAS * float(np.sqrt(always / max(frames, 1)))

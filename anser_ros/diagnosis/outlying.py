@@ -36,7 +36,7 @@ has thousands. Smaller takes a model's errors for loose contacts."""
 WHOLE = 0.5
 """Share of a frame's readings, and of frames that lost any, from which whole frames are out: more
 bad than good, so that what is left of the frame is not to be believed either."""
-OFTEN = 0.2
+LEAST_CHANNEL_SHARE = 0.2
 """Share of the frames with an outlier from which a channel that has it is named: of nine channels
 that are hit by chance each has a ninth."""
 
@@ -118,7 +118,9 @@ def outlying_share(before: Problem, after: Problem) -> tuple[float, list[int]]:
     share = lost_frames / max(frames, 1)
     if whole > WHOLE * max(lost_frames, 1):
         return share, []
-    return share, [c for c, n in by_channel.items() if n > OFTEN * max(lost_frames, 1)]
+    return share, [
+        c for c, n in by_channel.items() if n > LEAST_CHANNEL_SHARE * max(lost_frames, 1)
+    ]
 
 
 def clean_start(problem: Problem) -> Problem:

@@ -24,7 +24,7 @@ to hold some out and still have every pose in the rest."""
 TEST_EVERY = 5
 """One block of five never takes part in choosing or fitting."""
 BINS_PER_BLOCK = 2
-"""Means of the references in each block of time: they don't move, so more tell no more."""
+"""Means of the references in each block of time: they don't move, so more add nothing."""
 FEWEST_FRAMES = 30
 """Frames with an optical pose that a diagnosis needs, about one in each block."""
 POINTS = 250

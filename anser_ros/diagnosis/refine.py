@@ -7,7 +7,7 @@ the uncertainty of a place includes that of the body's shape.
 
 from collections.abc import Sequence
 
-from anser_ros.diagnosis.decisions import MUCH_LEFT, SOMETHING_LEFT
+from anser_ros.diagnosis.decisions import COARSE_REMAINDER, SOMETHING_LEFT
 from anser_ros.diagnosis.fit import Fit, Fitter
 from anser_ros.diagnosis.remainder import Remainders
 from anser_ros.diagnosis.shaping import Shaping
@@ -15,9 +15,9 @@ from anser_ros.effects.body_term import Richness
 from anser_ros.effects.effect import Family
 from anser_ros.effects.term import Term
 
-COARSE = Richness(50, (17,), MUCH_LEFT)
+COARSE = Richness(50, (17,), COARSE_REMAINDER)
 """How finely metal is shaped during the search: by what shapes usually leave, about half of the
-modes that the data tell, and a knot in 2.5 s of a session of 40 s."""
+modes that the data determine, and a knot in 2.5 s of a session of 40 s."""
 FINE = Richness(90, (17, 25), SOMETHING_LEFT)
 """How finely metal is shaped in the last fit, which is made once."""
 
@@ -29,13 +29,13 @@ def settled(fitter: Fitter, terms: Sequence[Term], richness: Richness = COARSE) 
     ----------
     fitter : Fitter
     terms : sequence of Term
-        Start values; remainders of metal among them are made anew.
+        Start values; remainders of metal among them are made again.
     richness : Richness
         How finely metal is shaped.
     """
     plain = [term.free() for term in terms if term.effect.family is not Family.REMAINDER]
     bodies = [term.effect.body(term) for term in plain]
-    # What moves and has its shape already is shaped anew below.
+    # What moves and has its shape already is reshaped below.
     known = any(body is not None and body.richness is not None for body in bodies)
     fit = fitter.fit(plain, 1 if known else None)
     shaping, remainders = Shaping(fitter, richness), Remainders(fitter, richness)
@@ -47,7 +47,7 @@ def settled(fitter: Fitter, terms: Sequence[Term], richness: Richness = COARSE) 
 
 
 def _held(fit: Fit, fitter: Fitter) -> Fit:
-    """The same fit, metal held where it is: what is tried beside it is then cheap to fit."""
+    """The same fit, metal held where it is: what is tried with it is then cheap to fit."""
     if not any(term.effect.family.is_metal for term in fit.terms):
         return fit
     held = [

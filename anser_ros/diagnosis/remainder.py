@@ -13,7 +13,12 @@ from anser_ros.diagnosis.scoring import joined
 from anser_ros.diagnosis.structure import noise_scale
 from anser_ros.effects.body_term import Richness
 from anser_ros.effects.effect import Resting, SizedShapes
-from anser_ros.effects.metal_remainder import REMAINDER, Couplings, Leftover, Lighting
+from anser_ros.effects.metal_remainder import (
+    REMAINDER,
+    Couplings,
+    IlluminationChange,
+    RemainderPart,
+)
 from anser_ros.effects.term import Term
 from anser_ros.effects.view import View
 from anser_ros.metal.scattering import Shapes
@@ -22,7 +27,7 @@ Array = NDArray[np.float64]
 
 ROUNDS = 2
 """Times that modes are made about where the metal then is; the second hardly ever moves it."""
-AWAY_M = 2e-3
+NEW_MODES_M = 2e-3
 """A centre that a fit moves farther than this (m) asks for new modes: modes about a centre that is
 off by a tenth of a body's radius stand for it as well."""
 
@@ -54,9 +59,9 @@ class Remainders:
                 return fit
             start = [t if i != index else term for i, t in enumerate(plain)]
             emitters = self.fitter.problem.apparatus.emitters
-            light = REMAINDER.of(term, Lighting([term, own], emitters))
+            light = REMAINDER.of(term, IlluminationChange([term, own], emitters))
             fit = self.fitter.fit([*start, own, light])
-            if np.linalg.norm(_resting(fit.terms[index]).centre - before.centre) < AWAY_M:
+            if np.linalg.norm(_resting(fit.terms[index]).centre - before.centre) < NEW_MODES_M:
                 break
         return self._extended(fit, index)
 
@@ -76,14 +81,14 @@ class Remainders:
     def _couplings(
         self, fit: Fit, term: Term, beside: Sequence[Term], shapes: Sequence[SizedShapes]
     ) -> Term | None:
-        """The couplings about metal at rest that predict best beside other terms."""
+        """The couplings about metal at rest that predict best, given the other terms."""
         fitter, few = self.fitter, thinned(fit.state, self.fitter.blocks)
         centre = _resting(term).centre
         known = (
             joined([few.design(t) for t in beside]),
             np.concatenate([t.effect.prior(t) for t in beside]),
         )
-        best: tuple[float, Leftover] | None = None
+        best: tuple[float, RemainderPart] | None = None
         for kind, sizes in shapes:
 
             def unit(view: View, modes: Array, kind: Shapes = kind) -> NDArray[np.inexact]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from anser_ros.diagnosis.decisions import ALIKE, BESIDE_REST, LEAST_MORE, NO_RIVAL
+from anser_ros.diagnosis.decisions import ALIKE, LEAST_MORE, MOST_EFFECTS_AT_REST, NO_RIVAL
 from anser_ros.diagnosis.fit import Fit, Fitter, misfit
 from anser_ros.diagnosis.refine import settled
 from anser_ros.diagnosis.scoring import Score, Scorer
@@ -17,7 +17,7 @@ def moves_or_rests(
     candidates: Callable[[Scorer], Sequence[tuple[Term, Score]]],
     explained: float,
 ) -> Fit:
-    """Return metal that moves, or at rest where that explains as much, alone or beside one effect.
+    """Return metal that moves, or at rest where that explains as much, alone or with one effect.
 
     Parameters
     ----------
@@ -51,7 +51,10 @@ def moves_or_rests(
         if term.effect.family.is_metal or term.effect.name in tried:
             continue
         # A linear score is only a promise: the fit may still bring down what is within these.
-        if len(tried) == BESIDE_REST or score.held_out > 2.0 * limit + 0.5 * scorer.held_out:
+        if (
+            len(tried) == MOST_EFFECTS_AT_REST
+            or score.held_out > 2.0 * limit + 0.5 * scorer.held_out
+        ):
             break
         tried.add(term.effect.name)
         for start in term.effect.started(term, score.solution):

@@ -21,10 +21,10 @@ Known = tuple[list[Array | None], Array]
 Unit = Callable[[View, Array], NDArray[np.inexact]]
 """Flux (F, S, K, m) of modes (c, m) of couplings in a view."""
 
-MOST_TOLD = 130
+MOST_SIZED_MODES = 130
 """Modes, at most, of which the data are asked how large they are: more would be slower to compare
 than they could ever explain."""
-LEAST_TOLD = 0.3
+LEAST_INFORMATION = 0.3
 """Information in the data, over that in the prior, below which a mode is left out: it would stay
 at about zero and only take time."""
 SCORED_FRAMES = 130
@@ -47,7 +47,7 @@ def rich_modes(
     few : State
         At a fit without these couplings, or with others in their place; some frames do.
     known : Known
-        Columns of what is fitted beside them, and their prior sizes.
+        Columns of what is fitted with them, and their prior sizes.
     unit : callable
         Flux (F, S, K, m) of modes (c, m) in a view.
     spreads : sequence of ndarray, shape (c,)
@@ -65,8 +65,8 @@ def rich_modes(
     values, vectors = np.linalg.eigh(
         _information(few, unit, widest.size) * widest[:, None] * widest
     )
-    told = np.argsort(values)[::-1][:MOST_TOLD]
-    told = told[values[told] > LEAST_TOLD]
+    told = np.argsort(values)[::-1][:MOST_SIZED_MODES]
+    told = told[values[told] > LEAST_INFORMATION]
     if told.size == 0:
         return None
     vectors = vectors[:, told]
@@ -90,7 +90,7 @@ def rich_modes(
     total = sums.normal.sum(axis=0)[width : width + count, width : width + count]
     told_by, turn = np.linalg.eigh(root.T @ total @ root)
     order = np.argsort(told_by)[::-1][:most]
-    order = order[told_by[order] > LEAST_TOLD]
+    order = order[told_by[order] > LEAST_INFORMATION]
     if not order.size:
         return None
     return best[0], (widest[:, None] * vectors) @ root @ turn[:, order]

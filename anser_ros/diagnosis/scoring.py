@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 Columns = Sequence[Array | None]
 
 MOST_COLUMNS = 60
-"""Columns that a term in force may have to be fitted again beside each candidate. A term with more
+"""Columns that a term in force may have to be fitted again with each candidate. A term with more
 is what metal left, and no effect's rival."""
 
 
@@ -169,7 +169,7 @@ def _width(group: Columns) -> int:
 
 @dataclass(frozen=True)
 class Score:
-    """Says what one candidate is worth beside the effects that are in force.
+    """Scores one candidate, given the effects that are in force.
 
     Attributes
     ----------

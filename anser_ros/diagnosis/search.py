@@ -34,7 +34,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """Says how the search goes.
+    """States how the search goes.
 
     Attributes
     ----------
@@ -111,7 +111,7 @@ def search_effects(
         Effects that are known already (polarities, for example).
     settings : SearchSettings, optional
     progress : callable, optional
-        Told in words what has been found.
+        Called with words on what has been found.
     """
     how = settings or SearchSettings()
     say = progress or (lambda text: None)
@@ -131,8 +131,8 @@ def search_effects(
     return search
 
 
-def worth(gain: float, parameters: int, fit: Fit) -> bool:
-    """Return whether a gain pays for its parameters, with this fit left."""
+def is_worthwhile(gain: float, parameters: int, fit: Fit) -> bool:
+    """Return whether a gain is worth its parameters, by what this fit leaves."""
     left = max(misfit(fit), 1.0)
     metal = any(term.effect.family.is_metal for term in fit.terms)
     share = decisions.LEAST_SHARE_BESIDE_METAL if metal else decisions.LEAST_SHARE
@@ -163,7 +163,7 @@ class _Round:
                 search.metal_gain = max(search.metal_gain, metal[0])
                 return shaped
         term = best.newest
-        if not worth(gain, term.complexity, best):
+        if not is_worthwhile(gain, term.complexity, best):
             return None
         if term.effect.family.is_metal:
             if gain < decisions.REMNANT * search.metal_gain:
@@ -273,7 +273,7 @@ def _scored(problem: Problem, scorer: Scorer) -> list[tuple[Term, Score]]:
             if metals and not all(channel in ours for channel in term.channels):
                 # Beside metal a reference's survey error looks like a fault of its channel.
                 continue
-            if left_over(scorer.state, term) < decisions.TOLD_APART:
+            if left_over(scorer.state, term) < decisions.DISTINGUISHABLE:
                 continue
             score = scorer.score(term)
             if score is not None:
@@ -351,7 +351,7 @@ def _thin_out(fitter: Fitter, search: Search) -> None:
             rest = [t for t in search.fit.terms if t is not term]
             without = settled(fitter, rest)
             gain = fitter.held_out(without) - full
-            if not worth(gain, term.complexity, search.fit):
+            if not is_worthwhile(gain, term.complexity, search.fit):
                 search.removed.append(term)
                 search.fit = without
                 break
@@ -362,4 +362,4 @@ def _thin_out(fitter: Fitter, search: Search) -> None:
 def _is_plain(fit: Fit, index: int) -> bool:
     """Whether the parameters of a term show by themselves that it is needed."""
     size = fit.terms[index].theta.size
-    return size > 0 and worth(_wald(fit, index) / decisions.PLAIN_TO_SEE, size, fit)
+    return size > 0 and is_worthwhile(_wald(fit, index) / decisions.CLEAR_GAIN, size, fit)

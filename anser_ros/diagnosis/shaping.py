@@ -45,10 +45,10 @@ class Shaping:
         body = _body(fit.terms[index])
         if body is None or body.richness == self.richness:
             return fit
-        return self.freed(self._bodied(fit, index, body), index)
+        return self.with_freer_course(self._bodied(fit, index, body), index)
 
-    def freed(self, fit: Fit, index: int) -> Fit:
-        """Return the fit with a freer course, as long as its parameters pay."""
+    def with_freer_course(self, fit: Fit, index: int) -> Fit:
+        """Return the fit with a freer path, as long as its parameters are worth it."""
         for knots in self.richness.knots:
             body = _body(fit.terms[index])
             if body is None or misfit(fit) < self.richness.left * noise_scale(fit.state) ** 2:

@@ -19,7 +19,7 @@ SIGNIFICANT = 1e-5
 whose noise is only estimated. Larger reports chance, smaller needs more frames to see anything. No
 more is known of its choice than that thresholds of the diagnosis were chosen on seeds below 100
 (`docs/log.md`)."""
-MATTERS = 0.005
+LEAST_DEPENDENCE = 0.005
 """Share (0 to 1) of the residual power that a dependence must explain, beyond chance, to be
 reported. Smaller reports what is certain only because there are many frames, as a model's small
 error; larger leaves a weak dependence unsaid. No more is known of its choice than that thresholds
@@ -49,7 +49,7 @@ class StructureTest:
     @property
     def significant(self) -> bool:
         """Return whether noise hardly does that, and it matters."""
-        return self.probability < SIGNIFICANT and self.share > MATTERS
+        return self.probability < SIGNIFICANT and self.share > LEAST_DEPENDENCE
 
 
 def structure_tests(state: State) -> list[StructureTest]:

@@ -36,9 +36,10 @@ NOT_NORMAL = 0.35
 again as the 0.22 that normal noise reached. Smaller refuses true noise; larger lets rounding pass
 for it."""
 OUTLYING = 4.5
-"""Standard deviations beyond which a value has no say here, which a normal one is once in 150,000:
-outliers are judged elsewhere, and one alone would make a kurtosis. Smaller takes the tails of
-noise away that are to be judged; larger lets a single outlier make noise look heavy-tailed."""
+"""Standard deviations beyond which a value is not used here, which a normal one is once in
+150,000: outliers are judged elsewhere, and one alone would make a kurtosis. Smaller takes the
+tails of noise away that are to be judged; larger lets a single outlier make noise look
+heavy-tailed."""
 
 
 @dataclass(frozen=True)

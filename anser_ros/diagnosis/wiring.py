@@ -12,11 +12,11 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 Mask = NDArray[np.bool_]
 
-ITS_OWN = 0.9
+OWN_CORRELATION = 0.9
 """Correlation (0 to 1) with its own prediction from which a reading is its own, whatever its sign:
 the prediction then leaves less than a fifth of its power. Smaller calls a reading reversed that is
-hardly like its prediction; larger misses a reversed plug beside another effect. No more is known
-of its choice than that thresholds of the diagnosis were chosen on seeds below 100
+hardly like its prediction; larger misses a reversed plug if there is another effect. No more is
+known of its choice than that thresholds of the diagnosis were chosen on seeds below 100
 (`docs/log.md`)."""
 TURNED_ROUND = 0.3
 """A gain within this of -1 is a polarity: as far as a gain is expected from one (the prior of
@@ -25,8 +25,8 @@ sensor with a turned phase for one."""
 ALIKE, BETTER = 0.95, 0.1
 """Correlation (0 to 1) with another's prediction, and share of the power that its own leaves which
 the other's may leave, from which a plug is in its socket. A looser pair takes neighbours that read
-alike for exchanged ones; a stricter one misses an exchange beside other effects. No more is known
-of the choice than that thresholds of the diagnosis were chosen on seeds below 100
+alike for exchanged ones; a stricter one misses an exchange if there are other effects. No more is
+known of the choice than that thresholds of the diagnosis were chosen on seeds below 100
 (`docs/log.md`)."""
 DEAD = 0.02
 """Share of the expected reading below which a channel hears nothing: a fifth of the leak that
@@ -52,7 +52,7 @@ def wiring_faults(problem: Problem) -> list[Term]:
         gain, alike = _likeness(tool.flux, part.view.flux, usable)
         own = np.diag(alike)
         turned += channels[
-            (np.abs(np.diag(gain) + 1) < TURNED_ROUND) & (own > ITS_OWN) & ~silent
+            (np.abs(np.diag(gain) + 1) < TURNED_ROUND) & (own > OWN_CORRELATION) & ~silent
         ].tolist()
         order = np.argmax(alike, axis=1)
         moved = _moved(alike, ~silent)

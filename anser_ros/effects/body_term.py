@@ -22,12 +22,12 @@ LARGEST = 10.0
 """Prior standard deviation of the amplitudes of a simple body's modes, in units of 1e-4 m^3
 (`anser_ros.metal.scattering.UNIT`). A perfectly conducting ball of 25 mm radius has -1, one of
 54 mm -10: the prior holds nothing back that fits beside a tracked volume, and only keeps modes
-that the data don't tell from growing without bound."""
+that the data do not determine from growing without bound."""
 
 
 @dataclass(frozen=True)
 class Richness:
-    """Says how finely metal is shaped.
+    """States how finely metal is shaped.
 
     Attributes
     ----------

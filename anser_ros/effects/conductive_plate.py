@@ -28,8 +28,8 @@ MESH = 12
 """Loops along an edge of the sheet's mesh: a loop is then as wide as a twelfth of the edge, less
 than the distance to the sensors for any sheet that is found."""
 STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])
-"""Steps of the central differences, in theta's units: small beside the distances and beside a
-change of the resistance that shows."""
+"""Steps of the central differences, in theta's units: small compared with the distances and with
+a change of the resistance that shows."""
 TYPICAL_OHM = 3e-5
 """Surface resistance, ohm, that a plate's fit starts from: about that of a millimetre of
 aluminium. It is only a start, from which the fit moves."""

@@ -44,8 +44,8 @@ def drifts(record: EffectRecord) -> bool:
     return effect_named(record.name).drifts
 
 
-def is_undone(record: EffectRecord) -> bool:
-    """Return whether tracking has to undo a record's effect, as the dipoles do not hold it.
+def needs_correction(record: EffectRecord) -> bool:
+    """Return whether tracking has to correct an effect, because the dipoles do not include it.
 
     Raises
     ------
@@ -147,7 +147,7 @@ class Correction:
         *,
         recorded: bool = False,
     ) -> ComplexArray:
-        """Return a frame's fluxes as sound sensors and emitters would have given them.
+        """Return a frame's fluxes as ideal sensors and emitters would have given them.
 
         Parameters
         ----------

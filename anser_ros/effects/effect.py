@@ -44,7 +44,8 @@ SizedShapes = tuple[Shapes, Sequence[Array]]
 
 FROZEN = 1e-12
 """Prior spread of a parameter that a fit must leave where it is, in the parameter's own unit. It
-only has to be negligible beside any step of a fit; zero would make the prior's weight infinite."""
+only has to be negligible compared with any step of a fit; zero would make the prior's weight
+infinite."""
 INEXACT = 0.01
 """Share of an effect's power that its model may miss where the effect is truly there, unless the
 effect says otherwise. Gains, tilts and shifts are modelled to better than this; what leaves more
@@ -79,7 +80,7 @@ class Family(Enum):
 
 @dataclass(frozen=True)
 class Resting:
-    """Says where metal at rest is, and what it may be besides its few parameters.
+    """States where metal at rest is, and what it may be besides its few parameters.
 
     Attributes
     ----------
@@ -201,7 +202,7 @@ class Effect(Generic[TermT]):
 
     def covers(self, term: TermT, candidate: Term) -> bool:
         """Return whether a term of this effect in force stands for a candidate already."""
-        return candidate.seat == term.seat
+        return candidate.name_and_site == term.name_and_site
 
     def rivals(self, term: TermT, other: Term) -> bool:
         """Return whether a steady term is about the same thing, so that one is superfluous."""

@@ -11,7 +11,7 @@ from anser_ros.field.model import EffectRecord
 
 @dataclass(frozen=True, kw_only=True)
 class ExcessNoiseTerm(Term):
-    """Says how much the noise has grown.
+    """States how much the noise has grown.
 
     Attributes
     ----------

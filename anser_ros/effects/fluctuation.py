@@ -101,7 +101,7 @@ class Fluctuation(Effect[FluctuationTerm]):
     def covers(self, term: FluctuationTerm, candidate: Term) -> bool:
         """Cover the constant effect at its site too, whose columns are its own."""
         if candidate.effect.name == self.of.name:
-            return candidate.seat[1] == term.seat[1]
+            return candidate.name_and_site[1] == term.name_and_site[1]
         return super().covers(term, candidate)
 
     def rivals(self, term: FluctuationTerm, other: Term) -> bool:
@@ -142,7 +142,7 @@ class Fluctuation(Effect[FluctuationTerm]):
 
 
 class CoilFluctuation(Fluctuation):
-    """Changes a `CoilGain`; live, the references tell the strength of the moment."""
+    """Changes a `CoilGain`; live, the references determine the strength of the moment."""
 
     name = 'coil_fluctuation'
     summary = "an emitter's strength steps, swings or fails, not as a warming coil's does"

@@ -161,7 +161,7 @@ class FreePath:
         return path, np.asarray(course.ravel(), dtype=np.float64)
 
 
-def way_of(path: MetalPath, theta: Array, time: Array) -> tuple[Array, Array]:
+def distance_travelled(path: MetalPath, theta: Array, time: Array) -> tuple[Array, Array]:
     """Return fine times over those given, and the way made since the first, (T,) each, s and m."""
     count = max(3, int((time.max() - time.min()) / FINE_STEP_S) + 1)
     fine = np.linspace(time.min(), time.max(), count)
@@ -173,7 +173,7 @@ def moving_times(path: MetalPath, theta: Array, time: Array) -> tuple[float, flo
     """Return when the body begins and ends its way, s."""
     if not path.knots:
         return float(theta[6]), float(theta[7])
-    fine, way = way_of(path, theta, time)
+    fine, way = distance_travelled(path, theta, time)
     share = way / max(float(way[-1]), 1e-9)
     first = int(np.searchsorted(share, NEGLIGIBLE_WAY))
     last = int(np.searchsorted(share, 1 - NEGLIGIBLE_WAY))

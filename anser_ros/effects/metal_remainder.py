@@ -20,13 +20,13 @@ from anser_ros.metal.scattering import Shapes
 
 GAIN, ASIDE_M, UP_M = 3e-3, 0.2e-3, 0.4e-3
 """How well an emitter's field is known where metal is and nothing was measured: as if the emitter
-were so much stronger, or so far away. The far side of the board tells least about its height."""
+were so much stronger, or so far away. The far side of the board says least about its height."""
 STEP_M = 0.5e-3
 """Shift (m) of an emitter in the differences that tell what its place does to metal."""
 
 
-class Leftover(Protocol):
-    """Holds a linear part of a metal's answer, its parameters of unit prior size."""
+class RemainderPart(Protocol):
+    """Holds a linear part of a metal's response, with parameters of unit prior size."""
 
     @property
     def count(self) -> int:
@@ -81,8 +81,8 @@ class Couplings:
 
 
 @dataclass(frozen=True, eq=False)
-class Lighting:
-    """Changes each emitter's strength and place (x, y, z), as metal sees them.
+class IlluminationChange:
+    """Changes each emitter's strength and place (x, y, z) as they act on metal.
 
     Attributes
     ----------
@@ -142,32 +142,32 @@ class RemainderTerm(Term):
     Attributes
     ----------
     parent : tuple of str
-        `Term.seat` of the metal.
-    leftover : Leftover
+        `Term.name_and_site` of the metal.
+    leftover : RemainderPart
     """
 
     parent: tuple[str, str]
-    leftover: Leftover
+    leftover: RemainderPart
 
 
 class MetalRemainder(Effect[RemainderTerm]):
-    """Takes what the few parameters of metal at rest leave (`Couplings` or `Lighting`)."""
+    """Describes the residual of metal at rest by `Couplings` or an `IlluminationChange`."""
 
     name = 'metal_remainder'
     summary = 'the residual that a simple metal body leaves'
     remedy = Remedy.FIELD
     family = Family.REMAINDER
 
-    def of(self, parent: Term, leftover: Leftover) -> RemainderTerm:
+    def of(self, parent: Term, leftover: RemainderPart) -> RemainderTerm:
         """Return a leftover of a metal that is at rest, with parameters of zero."""
         return RemainderTerm(
             self, {'of': parent.effect.name}, np.zeros(leftover.count),
-            parent=parent.seat, leftover=leftover,
+            parent=parent.name_and_site, leftover=leftover,
         )  # fmt: skip
 
     def belongs(self, term: RemainderTerm, other: Term) -> bool:
         """Return whether ``other`` is the metal that this leftover belongs to."""
-        return term.parent == other.seat
+        return term.parent == other.name_and_site
 
     def columns(self, term: RemainderTerm, view: View) -> ComplexArray | None:
         """Return the leftover's own columns: it is linear in its parameters."""

@@ -11,7 +11,7 @@ from anser_ros.field.model import EffectRecord
 
 @dataclass(frozen=True, kw_only=True)
 class OutliersTerm(Term):
-    """Says how many frames stand out.
+    """States how many frames stand out.
 
     Attributes
     ----------

@@ -50,7 +50,7 @@ def tool_view(body: Measurements, terms: Sequence[Term], fields: Fields) -> View
         sensors = term.effect.table(term, sensors)
     centres, axes = sensors.placed(position, rotation)
     dipoles = _with_sources(fields.model, terms, fields)
-    light = lit(terms, fields.illumination)
+    light = changed_illumination(terms, fields.illumination)
     lengths = np.tile(sensors.length, body.time.size)
     flux, d_position, d_axis = flux_jacobian(
         centres.reshape(-1, 3), axes.reshape(-1, 3), lengths,
@@ -97,7 +97,8 @@ def reference_view(
         d_position=np.broadcast_to(d_position, (frames, *d_position.shape)),
         d_axis=np.broadcast_to(d_axis, (frames, *d_axis.shape)),
         d_turn=np.broadcast_to(np.zeros_like(d_axis), (frames, *d_axis.shape)),
-        dipoles=base.joined(added), illumination=lit(terms, base), omega=fields.omega,
+        dipoles=base.joined(added), illumination=changed_illumination(terms, base),
+        omega=fields.omega,
         is_reference=True,
     )  # fmt: skip
     return _measured(_with_motion(view, terms), terms)
@@ -120,8 +121,8 @@ def _poses(body: Measurements, terms: Sequence[Term]) -> tuple[Array, Array, Arr
     return position, rotation, track.velocity(inside)
 
 
-def lit(terms: Sequence[Term], illumination: Dipoles) -> Dipoles:
-    """Return the emitters' own field where metal is, with what the effects do to it."""
+def changed_illumination(terms: Sequence[Term], illumination: Dipoles) -> Dipoles:
+    """Return the emitters' own dipoles, as the effects change what metal receives of them."""
     for term in terms:
         illumination = term.effect.light(term, illumination)
     return illumination
@@ -130,7 +131,7 @@ def lit(terms: Sequence[Term], illumination: Dipoles) -> Dipoles:
 def _with_sources(
     start: Dipoles, terms: Sequence[Term], fields: Fields, base: Dipoles | None = None
 ) -> Dipoles:
-    out, light = start, lit(terms, fields.illumination)
+    out, light = start, changed_illumination(terms, fields.illumination)
     for term in terms:
         added = term.effect.sources(term, base or fields.model, light, fields.omega)
         if added is not None:

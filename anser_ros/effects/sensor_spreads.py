@@ -100,7 +100,7 @@ class SensorSpread(Effect[SpreadTerm]):
         )  # fmt: skip
 
     def _offset(self, width: int) -> Array:
-        """What the values of a sound channel are."""
+        """What the values of a faultless channel are."""
         return np.array(self.offset_of_values or (0.0,) * width)
 
     def term(self, record: EffectRecord) -> SpreadTerm:

@@ -36,7 +36,7 @@ from anser_ros.metal.scattering import UNIT
 from anser_ros.physics.constants import MU_0
 
 STEP = 1e-3
-"""Step (m) of the central differences that give the derivative by the place, small beside a
+"""Step (m) of the central differences that give the derivative by the place, small compared with a
 decimetre."""
 CLOSEST = 0.02
 """Metal that is searched keeps this distance (m) from where sensors were: a point-like answer is

@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 
 class Site(TypedDict, total=False):
-    """Says where an effect acts, by the keys that it needs, in the words of records and reports.
+    """States where an effect acts, by the keys that it needs, in the words of records and reports.
 
     It is a plain mapping, as it is printed, compared and written; the type checker knows each key
     and the type of its value.
@@ -104,7 +104,7 @@ class Term:
         return (*one, *(int(c) for c in self.site.get('channels', ())))
 
     @property
-    def seat(self) -> tuple[str, str]:
+    def name_and_site(self) -> tuple[str, str]:
         """Return name and site: the same for one term whatever its parameters, held or free."""
         return self.effect.name, repr(sorted(self.site.items()))
 

@@ -32,13 +32,13 @@ def centres_extension(session: Session) -> float:
     return float((reach / generator.half_extent).max())
 
 
-def drawn_model(session: Session, learnt_from: Sequence[Session]) -> FieldModel:
+def drawn_model(session: Session, training: Sequence[Session]) -> FieldModel:
     """Return the drawing's Biot-Savart model with a real gain for each emitter.
 
     The gains are fitted to undistorted recordings.
     """
     nominal = model_for(NOMINAL, session)
-    tools = [with_pose(tool) for other in learnt_from for tool in other.tools]
+    tools = [with_pose(tool) for other in training for tool in other.tools]
     gains = emitter_gains(nominal, tools).real
     # The drawing's own tolerances are what the gains and the data now replace.
     model = replace(nominal, moments=nominal.moments * gains, modes=None)

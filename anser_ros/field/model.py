@@ -73,8 +73,8 @@ class FieldModel:
     provenance : mapping
         How the model was made, with its held-out error.
     made_for : Identity or None
-        Board and bodies that it was calibrated on, or its effects were found on; None where nobody
-        has told.
+        Board and bodies that it was calibrated on, or its effects were found on; None if not
+        stated.
     references : ReferenceReadings or None
         What the references read when it was calibrated.
     shift_sigma_m : float

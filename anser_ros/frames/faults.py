@@ -46,7 +46,7 @@ STALE = Fault('stale', states.STALE, 'flagged stale by the acquisition')
 DROPPED = Fault('dropped', states.DROPPED, 'flagged dropped by the acquisition')
 FLAGGED = Fault('flagged', states.NO_SIGNAL, 'flagged by the acquisition with an unknown bit')
 NOT_FINITE = Fault('not_finite', states.NO_SIGNAL, 'the fluxes are not finite')
-ABSURD = Fault('absurd', states.NO_SIGNAL, f'fluxes beyond {LARGEST_FLUX_T:g} T are not plausible')
+ABSURD = Fault('absurd', states.NO_SIGNAL, f'fluxes beyond {LARGEST_FLUX_T:g} T are implausible')
 STUCK = Fault('stuck', states.STALE, 'stuck: the same reading as before')
 
 FAULTS: tuple[Fault | None, ...] = (

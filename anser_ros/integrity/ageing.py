@@ -21,7 +21,7 @@ SPEED_S = 0.3
 taken for speed; longer, and metal that comes near counts as slow: its effect grows with the sixth
 power of its distance, as it is driven less and heard less from afar."""
 STEPS = 10
-"""Steps that a model ages in, from fresh to given up. More make trackers lay the model out anew
+"""Steps that a model ages in, from fresh to given up. More make trackers lay the model out again
 more often; fewer make it older than it is."""
 FASTER = 2.0
 """How many times as fast as before metal may move on. With 1, metal that comes nearer is not
@@ -34,13 +34,13 @@ metal may turn aside. With 0 that is not covered; more makes poses uncertain for
 
 
 @dataclass(frozen=True)
-class Standing:
-    """Says what a frame may be tracked with.
+class FrameModel:
+    """Holds the model that a frame may be tracked with.
 
     Attributes
     ----------
     model : FieldModel or None
-        None where there never was an answer: the model in force stays as it is.
+        None if the references never gave a model: the model in force stays unchanged.
     withheld : Withheld or None
         Why no pose may be given; None where it may.
     """
@@ -49,12 +49,12 @@ class Standing:
     withheld: Withheld | None = None
 
 
-AS_IT_IS = Standing(None)
-"""Of a model that follows nothing."""
+UNCHANGED_MODEL = FrameModel(None)
+"""For a model that does not follow references."""
 
 
 class ModelAge:
-    """Keeps the last answers of the references, and ages the newest while there is no other.
+    """Keeps the last models that the references gave, and ages the newest until the next.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ class ModelAge:
         self._aged = None
 
     def answered(self, stamp_ns: int, model: FieldModel) -> None:
-        """Take the model that the references of a frame gave; a jump back in time starts anew."""
+        """Take the model that the references of a frame gave; a jump back in time restarts it."""
         answers = self._answers
         if answers and stamp_ns < answers[-1][0]:
             answers.clear()
@@ -92,7 +92,7 @@ class ModelAge:
         answers.append((stamp_ns, model))
         self._aged = None
 
-    def at(self, stamp_ns: int, why: str = '') -> Standing:
+    def at(self, stamp_ns: int, why: str = '') -> FrameModel:
         """Return what a frame may be tracked with.
 
         Parameters
@@ -103,20 +103,20 @@ class ModelAge:
             Why the references gave no answer, where that is known.
         """
         if not self._answers:
-            return Standing(None, Withheld(REFERENCES_LOST, why)) if why else AS_IT_IS
+            return FrameModel(None, Withheld(REFERENCES_LOST, why)) if why else UNCHANGED_MODEL
         last_ns, model = self._answers[-1]
         age_ns = stamp_ns - last_ns
         if age_ns > self._longest_ns:
             words = why or 'no reference fluxes'
             longest_s = self._longest_ns * NANO
             reason = f'{words} for {age_ns * NANO:.2f} s, {longest_s:g} s at most'
-            return Standing(model, Withheld(REFERENCES_LOST, reason))
+            return FrameModel(model, Withheld(REFERENCES_LOST, reason))
         if age_ns <= 0:
-            return Standing(model)
+            return FrameModel(model)
         step = math.ceil(STEPS * age_ns / self._longest_ns)
         if self._aged is None or self._aged[0] != step:
             self._aged = step, self._older(step * self._longest_ns / STEPS)
-        return Standing(self._aged[1])
+        return FrameModel(self._aged[1])
 
     def _older(self, age_ns: float) -> FieldModel:
         """Return the newest model with the error that it has after so long."""

@@ -30,7 +30,7 @@ of that among 32 of them. Smaller refuses models for errors of the survey; large
 wrong by as much, all alike."""
 FAR_SIGMAS = 5.0
 """The same in standard deviations of that distance, for few sensors or a poor survey. Smaller
-refuses a sound model for what the survey's errors make; larger lets a board that lies elsewhere
+refuses a correct model for what the survey's errors make; larger lets a board that lies elsewhere
 pass where sensors are few. Its choice is not recorded."""
 EXPLAINED = 1.0
 """Misfit of the typical reference, in what survey and manufacture allow, up to which the distance
@@ -68,7 +68,7 @@ not recorded."""
 
 @dataclass(frozen=True)
 class Misplacement:
-    """Says how far a model's board lies from where the references have it.
+    """States how far a model's board lies from where the references have it.
 
     Attributes
     ----------
@@ -149,7 +149,7 @@ class BoardPlace:
         return Misplacement(placed[:3], placed[3:], sigma[:3], misfit)
 
     def check(self, flux: ComplexArray) -> bool:
-        """Refuse a model that lies beside the board; return whether the readings tell.
+        """Refuse a model that lies beside the board; return whether the readings determine it.
 
         Raises
         ------

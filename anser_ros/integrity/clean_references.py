@@ -35,7 +35,7 @@ PARTS = 3
 """Parts of a recording whose means must agree: metal may come and go, and be away at both ends."""
 FEWEST_FRAMES = 12
 """Frames in which a change is looked for: four a part. In fewer, noise hides it."""
-FELT = 2e-4
+NOTICEABLE = 2e-4
 """Change of a reading during a recording that counts, as a share of its size. Smaller refuses what
 moves poses by less than they jitter; larger lets metal into a baseline."""
 MOST_SENSORS = 0.9
@@ -58,15 +58,15 @@ LEAST_SHARE = 1e-4
 """Error of a drawn field relative to itself: turns and leads are not drawn to less."""
 
 
-def change_beside_gains(now: ComplexArray, before: ComplexArray) -> Array:
-    """Return by how much each sensor's readings changed, beside a gain of each emitter.
+def change_without_gains(now: ComplexArray, before: ComplexArray) -> Array:
+    """Return by how much each sensor's readings changed, apart from a gain of each emitter.
 
     The gains are those of most sensors: the fit gives less weight to those that changed more.
 
     Parameters
     ----------
     now, before : ndarray, shape (R, K), complex
-        T; rows with NaN have no say.
+        T; rows with NaN are not used.
 
     Returns
     -------
@@ -121,7 +121,7 @@ def check_steady(flux: ComplexArray) -> float | None:
     means = [mean_reading(part) for part in np.array_split(flux, PARTS)]
     sigma = np.sqrt(2.0 * PARTS / len(flux)) * noise
     for before, now in itertools.combinations(means, 2):
-        share = _change(now, before, sigma, FELT, MOST_SENSORS)
+        share = _change(now, before, sigma, NOTICEABLE, MOST_SENSORS)
         if share > 0.0:
             raise FitError(
                 f'reference readings change by {share:.2%} during the recording; is metal '
@@ -191,7 +191,7 @@ def _change(
 
     The sensor is the one that a part (0 to 1) of all sensors change less than.
     """
-    change = change_beside_gains(now, before)
+    change = change_without_gains(now, before)
     known = np.isfinite(change)
     if known.sum() < FEWEST_SENSORS:
         return 0.0

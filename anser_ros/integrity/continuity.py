@@ -33,7 +33,7 @@ Shorter lets wrong poses that agree for a moment pass; longer keeps a tool witho
 disturbance. Its choice is not recorded."""
 SIGMAS = 3.0
 """Allowance for the poses' own errors, in units of `Place.sigma_m`, when they are compared with
-the bounds of the motion. Smaller, and an uncertain pose at rest is said to leap; larger, and the
+the bounds of the motion. Smaller, and an uncertain pose at rest counts as a jump; larger, and the
 leaps of uncertain poses pass."""
 
 
@@ -45,15 +45,16 @@ class MotionBounds(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Says where something was, and how well that is known: stamp, position (m), its sigma, m."""
+    """States where something was, and how well that is known: stamp, position (m), its sigma,
+    m."""
 
     stamp_ns: int
     position: Sequence[float]
     sigma_m: float
 
 
-def leap(before: list[Place], now: Place, bounds: MotionBounds) -> str:
-    """Say how a place contradicts the places before it, oldest first; empty if it does not.
+def motion_contradiction(before: list[Place], now: Place, bounds: MotionBounds) -> str:
+    """State how a place contradicts the places before it, oldest first; empty if it does not.
 
     Of the last two places and this one: for an acceleration of at most a, the place is no further
     than ``a dt (dt + dt_before) / 2`` from where the mean velocity before leads.
@@ -132,12 +133,12 @@ class Continuity:
         if place is None:
             self._run, self._frames = [], 0
             return ''
-        contradiction = leap(self._track, place, bounds)
+        contradiction = motion_contradiction(self._track, place, bounds)
         old = not self._track or stamp_ns - self._track[-1].stamp_ns > RECORD_S / NANO
         if not (old or contradiction or self._refused > MOST_REFUSED * len(self._record)):
             self._track, self._frames = [self._track[-1], place], 0
             return ''
-        if not self._frames or leap(self._run, place, bounds):
+        if not self._frames or motion_contradiction(self._run, place, bounds):
             self._run, self._frames, self._began_ns = [], 0, stamp_ns
         self._run, self._frames = [*self._run[-1:], place], self._frames + 1
         if alone or self._is_confirmed(stamp_ns):

@@ -20,11 +20,11 @@ the tools takes the poses of the others; larger, and a model that is a little wr
 third pose passes, is believed."""
 FEWEST = 6
 """Readings that a share is made of at least. Fewer, and a single bad coil is the whole chain."""
-SOUND = 0.2
+GOOD_SHARE = 0.2
 """Share (0 to 1) of refused readings up to which a frame speaks for the model. Smaller lets one
-bad coil keep a sound model doubtful; larger believes a model again that is still wrong for part of
-the tools. Its choice is not recorded."""
-SOUND_S = 0.5
+bad coil keep a correct model doubtful; larger believes a model again that is still wrong for part
+of the tools. Its choice is not recorded."""
+RECOVERY_S = 0.5
 """For so long, s, all frames must speak for a doubtful model before it gives poses again. Smaller,
 and a model that is wrong somewhere gives poses where it happens to fit; larger, and poses come
 later after metal has gone."""
@@ -71,9 +71,9 @@ class ModelRecord:
             self._refused, self._total = self._refused - gone, self._total - counted
         frames.append((stamp_ns, refused, total, residual))
         self._refused, self._total = self._refused + refused, self._total + total
-        if (total and refused > SOUND * total) or not self._sound_since_ns:
+        if (total and refused > GOOD_SHARE * total) or not self._sound_since_ns:
             self._sound_since_ns = stamp_ns
-        is_sound = stamp_ns - self._sound_since_ns >= SOUND_S / NANO
+        is_sound = stamp_ns - self._sound_since_ns >= RECOVERY_S / NANO
         if self._total >= FEWEST and self.refused_share > DOUBTFUL and not is_sound:
             self.is_doubtful = True
         elif is_sound:

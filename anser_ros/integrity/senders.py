@@ -12,8 +12,8 @@ from collections.abc import Hashable
 from dataclasses import dataclass
 
 SILENT_S = 1.0
-"""A sender of a stream that said nothing for so long, s, is taken for gone. Smaller, and two that
-send in turns pass for one; larger, and a sender that was started anew is taken later."""
+"""A sender of a stream that said nothing for this time, s, counts as gone. Smaller, and two that
+send in turns pass for one; larger, and a sender that was started again is taken later."""
 
 
 @dataclass
@@ -26,7 +26,7 @@ class _Run:
 
 
 class Senders:
-    """Tells the senders of one topic apart.
+    """Distinguishes the senders of one topic.
 
     Parameters
     ----------

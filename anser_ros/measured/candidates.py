@@ -18,7 +18,7 @@ CLEAR = 2.0
 """Standard errors (over the blocks) by which a gain must differ from zero."""
 IDLE = 1.0
 """Standard errors below which an effect that was chosen before is taken back."""
-WORTH = 0.01
+LEAST_CHANGE = 0.01
 """Least change of the logarithm of the power, so that trifles stay out."""
 
 
@@ -71,13 +71,14 @@ def _compare(
 
 
 def _pays(trial: CandidateTrial) -> bool:
-    return trial.change < -WORTH and trial.change < -CLEAR * trial.scatter
+    return trial.change < -LEAST_CHANGE and trial.change < -CLEAR * trial.scatter
 
 
 def _simplest(
     paying: Sequence[tuple[CandidateTrial, Array]], sizes: Mapping[str, int]
 ) -> tuple[CandidateTrial, Array]:
-    """Of those that the blocks cannot tell from the best, the one of the fewest parameters."""
+    """Of those that the blocks cannot distinguish from the best, the one of the fewest
+    parameters."""
     best = min(paying, key=lambda item: item[0].change)
     alike = [p for p in paying if p[0].change <= best[0].change + best[0].scatter]
     return min(alike, key=lambda item: (sizes.get(item[0].name, 0), item[0].change))
@@ -134,7 +135,7 @@ def _prune(
         rest = tuple(other for other in chosen if other != name)
         loss = score(rest)
         trial = _compare(rest, name, loss, power)
-        if trial.change > -WORTH or trial.change > -IDLE * trial.scatter:
+        if trial.change > -LEAST_CHANGE or trial.change > -IDLE * trial.scatter:
             trials.append(_compare(chosen, f'-{name}', power, loss, chosen=True))
             chosen, power = rest, loss
     return chosen, power

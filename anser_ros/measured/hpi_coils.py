@@ -48,7 +48,7 @@ TARGET_MM, TARGET_CORRELATION = 1.2, 0.9999
 correlation."""
 MOST_LEADS, FOLDS = 5, 6
 """Largest number of dipoles of a lead, and folds of channels by which the number is chosen."""
-WORTH = 0.02
+LEAST_CHANGE = 0.02
 """Least fall of the held-out loss (log density a channel) that a dipole of a lead must bring."""
 FREEDOM = 4.0
 """Degrees of freedom of the Student density that scores held-out channels."""
@@ -201,7 +201,7 @@ def choose_leads(loss: Array) -> int:
     """Return the number of dipoles, of losses (D, folds): the last that lowers the unseen loss."""
     best = 0
     for n in range(1, len(loss)):
-        if np.mean(loss[n] - loss[best]) < -WORTH:
+        if np.mean(loss[n] - loss[best]) < -LEAST_CHANGE:
             best = n
     return best
 

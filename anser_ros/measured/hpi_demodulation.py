@@ -31,7 +31,7 @@ class Tones:
     phasors : ndarray, shape (K, S) complex
         In the samples' unit, referred to the common phase of each tone: in phase = real part.
     noise : ndarray, shape (S,)
-        Standard deviation of one component of a phasor, from frequencies beside the tones.
+        Standard deviation of one component of a phasor, from frequencies next to the tones.
     """
 
     frequencies_hz: Array

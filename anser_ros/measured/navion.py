@@ -107,7 +107,7 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
 
 
 def commands(bags: list[Path], out: Path) -> list[list[str]]:
-    """Return the commands that foretell each height, with sensors as stated and as found."""
+    """Return the commands that predict each height, with sensors as stated and as found."""
     return [
         [
             'calibrate', str(bags[0]), '--estimate', estimate, '--out', str(out / f'{kind}.yaml'),

@@ -11,7 +11,7 @@ from anser_ros.measured import ReportRow
 
 @dataclass(frozen=True)
 class Recipe:
-    """Says what `anser measured` does with a data set.
+    """States what `anser measured` does with a data set.
 
     Attributes
     ----------

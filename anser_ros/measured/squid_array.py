@@ -138,7 +138,7 @@ class SquidWhitener:
     def explained(self, left: Array) -> Array:
         """Return the expected part of residuals (S,) that the chips' places and tilts make.
 
-        A channel that took no part is told by the other channels of its chip.
+        A channel that took no part is determined by the other channels of its chip.
         """
         white = np.einsum('cij,cj->ci', self.factors, left[self.chips])
         inverse = np.einsum('cji,cj->ci', self.factors, white)

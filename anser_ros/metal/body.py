@@ -23,7 +23,7 @@ RADIUS = 0.025
 HIGHEST = 4
 """Largest order l of a multipole. Its field falls with distance r as 1 / r^(l + 2), so higher ones
 matter only to sensors that almost touch the metal."""
-TOGETHER = 6
+LARGEST_ORDER_SUM = 6
 """Largest sum of two orders that are coupled: what they make falls as the radius over the distance
 to the power of the sum and one."""
 ODD = 0.2
@@ -80,7 +80,7 @@ def multipoles() -> Shapes:
         functionals += list(shapes[:count].reshape(count, -1, 3) * root)
     orders = _orders()
     first, second = np.triu_indices(orders.size)
-    keep = orders[first] + orders[second] <= TOGETHER
+    keep = orders[first] + orders[second] <= LARGEST_ORDER_SUM
     first, second = first[keep], second[keep]
     dipoles = np.flatnonzero((first < 3) & (second < 3))
     return Shapes(RADIUS * SPHERE_POINTS, np.array(functionals), first, second, dipoles)

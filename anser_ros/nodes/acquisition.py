@@ -190,7 +190,7 @@ class Acquisition(AnserNode):
         if wanted == 1 and self._woken_early:
             self._woken_early = False
             if not port.has_more:
-                self._stream.rehearse()
+                self._stream.warm_up()
         return wanted - 1 if self._woken_early and wanted > 1 else wanted
 
     def _dispatch(self, record: Record, arrival_ns: int) -> None:
@@ -273,11 +273,11 @@ class Acquisition(AnserNode):
 
     def _publish_frame(self, frame: FluxFrame, arrival_ns: int) -> None:
         stream = self._stream
-        if stream is not None and self._accuracy.is_news(
+        if stream is not None and self._accuracy.must_republish(
             frame, stream.clock.sigma_s, time.monotonic()
         ):
             self._publish_setup(self._accuracy.stated_in(self._setup, stream.rate_hz))
-        # The system's clock may be set while we run; the offset is taken anew for every stamp.
+        # The system's clock may be set while we run; the offset is taken again for every stamp.
         stamp_ns = frame.host_ns + self._wall_clock.offset_ns()
         self._hand_over_flux(self._tool_publisher, frame.tool, stamp_ns)
         if len(frame.tool.channel):
@@ -307,12 +307,12 @@ class Acquisition(AnserNode):
         self._rebuild = True
 
     def close(self) -> None:
-        """Tell the control unit to stop, and end both threads."""
+        """Command the control unit to stop, and end both threads."""
         self._closing.set()
         self._worker.join(2.0)
 
-    def farewell(self) -> None:
-        """Tell the control unit to stop, whatever the other threads are at."""
+    def on_abandon(self) -> None:
+        """Command the control unit to stop, whatever the other threads are at."""
         self._closing.set()
         if self._port is not None:
             self._port.end_stream()

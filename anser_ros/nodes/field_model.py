@@ -30,7 +30,7 @@ from anser_ros.nodes.runtime.node import LONGEST_END_S, AnserNode, Level, Status
 from anser_ros.nodes.runtime.stated_parameters import stated_by
 from anser_ros.nodes.streams.flux_reader import read_frame
 from anser_ros.nodes.streams.newest_frame import NewestSource
-from anser_ros.nodes.streams.one_source import LOOK_S, said_of, setup_source
+from anser_ros.nodes.streams.one_source import LOOK_S, sender_words, setup_source
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.baseline import ReadingWindow, check_enough
 from anser_ros.refit.change import Pace
@@ -186,9 +186,9 @@ class FieldModelNode(AnserNode):
 
     @property
     def _state(self) -> tuple[bool, ...]:
-        """What receivers are told beside the model; of it the first two are in the message."""
-        awaits = self._setup is None or self._place.awaits
-        return self._follows, awaits, self._unfit, self._is_uncalibrated
+        """What receivers are given besides the model; of it the first two are in the message."""
+        is_waiting = self._setup is None or self._place.is_waiting
+        return self._follows, is_waiting, self._unfit, self._is_uncalibrated
 
     # The model and its baseline -----------------------------------------------------------
 
@@ -198,16 +198,18 @@ class FieldModelNode(AnserNode):
         The model of a frame of readings has their stamp, which may be of another day. ``withheld``
         is the state for which trackers should publish no poses, at once or soon.
         """
-        self._told = follows, awaits, *_ = self._state
+        self._told = follows, is_waiting, *_ = self._state
         if self._unfit or self._place.misplaced:
             withheld = states.OTHER_MODEL
-        elif awaits:
+        elif is_waiting:
             withheld = states.REFERENCES_LOST
         elif not withheld and self._is_uncalibrated:
             withheld = states.UNCALIBRATED
         self._stamp_ns = stamp_ns if stamp_ns != self._stamp_ns else stamp_ns + 1
         # A model that is about to be judged lets trackers wait for the verdict on their frame.
-        self._output.publish(model, self._frame_id, self._stamp_ns, follows or awaits, withheld)
+        self._output.publish(
+            model, self._frame_id, self._stamp_ns, follows or is_waiting, withheld
+        )
         if model is not self._model:
             self.count('models')
         self._model = model
@@ -342,7 +344,7 @@ class FieldModelNode(AnserNode):
         """Return which model is in force, where it comes from, and what the refit does."""
         model = self._model
         values: dict[str, object] = {'last_refusal': self._trouble.last}
-        said = said_of(self._sources)
+        said = sender_words(self._sources)
         if said:
             return Status('', Level.ERROR, f'{states.TWO_SOURCES}: {said}', values)
         if self._unfit or self._place.misplaced:
@@ -365,7 +367,7 @@ class FieldModelNode(AnserNode):
         if trouble:
             return Status('', Level.WARN, f'{activity}; lately: {trouble}', values)
         lost = f'{states.REFERENCES_LOST}: no reference fluxes'
-        if self._place.awaits:
+        if self._place.is_waiting:
             return Status('', Level.WARN, f'{lost} yet', values)
         silent_s, setup = time.monotonic() - self._heard_s, self._setup
         if setup is not None and self._follows and silent_s > setup.refit.references_age_s:

@@ -16,7 +16,7 @@ from rich.markup import escape
 from rich.table import Table
 from std_msgs.msg import String
 
-from anser_ros.nodes.output_parts.causes import Told, causes
+from anser_ros.nodes.output_parts.causes import LastStatus, causes
 from anser_ros.nodes.output_parts.traces import OpticalTrace, Row, Traces, latency_of, targets_of
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.node import AnserNode, Level, Status, main
@@ -74,7 +74,7 @@ class Monitor(AnserNode):
         self._setup: Setup | None = None
         self._chains: dict[str, Traces] = {}
         self._optical: dict[str, OpticalTrace] = {}
-        self._told: dict[str, Told] = {}
+        self._told: dict[str, LastStatus] = {}
         self._note = ''
         self._metal: list[tuple[float, float]] = []
         self._pose_subscriptions: list[Any] = []
@@ -142,7 +142,7 @@ class Monitor(AnserNode):
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             values = {pair.key: pair.value for pair in status.values}
-            self._told[status.name] = Told(status.level[0], status.message, values)
+            self._told[status.name] = LastStatus(status.level[0], status.message, values)
             if status.name.endswith('cu_simulator') and 'metal_distance_m' in values:
                 self._metal.append((time.time(), float(values['metal_distance_m'])))
 
@@ -181,7 +181,7 @@ class Monitor(AnserNode):
     def _state(self, chain: str, name: str) -> tuple[int, str]:
         namespace = self.get_namespace().strip('/')
         prefix = f'{namespace}/{chain}' if chain else namespace
-        return self._told.get(f'{prefix}/tracker: {name}', Told(1, 'waiting', {}))[:2]
+        return self._told.get(f'{prefix}/tracker: {name}', LastStatus(1, 'waiting', {}))[:2]
 
     def _table(self, rows: dict[str, list[Row]]) -> Table:
         """The table; one column for a position, and states only where they are not ok."""

@@ -260,7 +260,7 @@ def _described(profile: QoSProfile) -> dict[str, Any]:
     return qos_profile(
         reliable=profile.reliability == ReliabilityPolicy.RELIABLE,
         latched=profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
-        depth=max(profile.depth, 1),  # the graph does not tell the depth
+        depth=max(profile.depth, 1),  # the graph does not state the depth
     )
 
 

@@ -41,7 +41,7 @@ STARTING_FACTOR = 5.0
 # How often a paused or waiting replay looks whether it may go on, s.
 POLL_S = 0.05
 # Who is waited for is said after so long.
-TELL_AFTER_S = 3.0
+REPORT_AFTER_S = 3.0
 # Time of the recording between two messages on /clock, ns: half a window at 50 Hz.
 CLOCK_PERIOD_NS = 10_000_000
 # How long the end waits for listeners to acknowledge the last messages, s.
@@ -222,7 +222,7 @@ class Replay(AnserNode):
             if now_s - started_s > self._wait_s:
                 self.warn('no_listeners', f'begins after {waited_s:.3g} s although {missing}')
                 break
-            if waited_s > TELL_AFTER_S and missing != told:
+            if waited_s > REPORT_AFTER_S and missing != told:
                 told = missing
                 self.get_logger().info(f'waits: {missing}')
         readiness.close()
@@ -307,7 +307,7 @@ class Replay(AnserNode):
         self.stop(0)
 
     def _played(self) -> str:
-        """How much was published, in words; `_done` counts anew in every pass."""
+        """How much was published, in words; `_done` counts again in every pass."""
         part = f'{self._done} of {self._total} messages'
         if not self._loop:
             return part

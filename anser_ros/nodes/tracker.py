@@ -15,7 +15,7 @@ from std_msgs.msg import String
 
 from anser_ros.errors import AnserError
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.ageing import Standing
+from anser_ros.integrity.ageing import FrameModel
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import Trouble
 from anser_ros.nodes.runtime.handover import HandedFlux
@@ -24,7 +24,7 @@ from anser_ros.nodes.runtime.stated_parameters import stated_by
 from anser_ros.nodes.streams.backlog import Backlog
 from anser_ros.nodes.streams.flux_reader import read_frame
 from anser_ros.nodes.streams.newest_frame import newest_of
-from anser_ros.nodes.streams.one_source import OneSource, said_of, setup_source
+from anser_ros.nodes.streams.one_source import OneSource, sender_words, setup_source
 from anser_ros.nodes.streams.overload import Load
 from anser_ros.nodes.streams.readiness import digest_of
 from anser_ros.nodes.tracker_parts.answered_frames import AnsweredFrames
@@ -253,9 +253,9 @@ class TrackerNode(AnserNode):
         begin_s = time.perf_counter()
         stamp_ns, points = frame
         estimates, changed = [], False
-        said = said_of(self._sources)
+        said = sender_words(self._sources)
         if said:  # the frame may be another sender's, so the model's age is not told by its stamp
-            standing = Standing(None, Withheld(TWO_SOURCES, said))
+            standing = FrameModel(None, Withheld(TWO_SOURCES, said))
         else:
             standing = self._in_force.at(stamp_ns)
         self._withheld = standing.withheld
@@ -330,7 +330,7 @@ class TrackerNode(AnserNode):
         values['pose_listeners'] = sum(topic.listeners for topic in self._topics.values())
         if tracker is not None:
             values |= {name: count for name, count in tracker.counters.items() if name != 'frames'}
-        said = said_of(self._sources)
+        said = sender_words(self._sources)
         if said:
             return Status('', Level.ERROR, f'{TWO_SOURCES}: {said}', values)
         if self._setup is None:
@@ -348,7 +348,8 @@ class TrackerNode(AnserNode):
         values['tracked'] = good
         dead = ', '.join(tracker.dead_emitters)
         values['dead_emitters'] = dead
-        # A drift takes no recorded course here: field_model follows it where references tell.
+        # A drift takes no recorded course here: field_model follows it where references determine
+        # it.
         values['left_to_references'] = ', '.join(tracker.drifting_effects)
         values['corrected'] = ', '.join(tracker.corrected_effects)
         if self._withheld is not None and self._withheld.state != TWO_SOURCES:

@@ -20,7 +20,7 @@ from anser_ros.nodes.runtime.parameters import parameter
 from anser_ros.nodes.runtime.shared_names import optical_parameter
 from anser_ros.nodes.runtime.stated_parameters import stated, stated_by
 from anser_ros.nodes.streams.flux_reader import read_frame
-from anser_ros.nodes.streams.one_source import OneSource, said_of, setup_source
+from anser_ros.nodes.streams.one_source import OneSource, sender_words, setup_source
 from anser_ros.nodes.watcher_parts.pose_streams import PoseStreams, pose_values, pose_words
 from anser_ros.nodes.watcher_parts.sighting_words import (
     figures_of,
@@ -47,7 +47,7 @@ POLL_S = 0.2
 FILLED = 0.5
 """Share of the window that must be there before the first look."""
 SILENCE_S = 2.0
-"""Time without fluxes, s, after which the stream is said to be silent and no look begins."""
+"""Time without fluxes, s, after which the stream counts as silent and no look begins."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class WatcherParameters:
 
 @dataclass(frozen=True)
 class Task:
-    """Says what one look is at, and with whom."""
+    """States what one look is at, and with whom."""
 
     watch: Watch | PoseWatch
     session: Session | PoseSession
@@ -163,7 +163,7 @@ class Watcher(AnserNode):
             self._refuse('setups_refused', error)
 
     def on_parameters(self, old: WatcherParameters, new: WatcherParameters) -> None:
-        """Begin anew with another model."""
+        """Start again with another model."""
         if old.model_file != new.model_file and self._offered:
             self._begin(self._offered)
 
@@ -277,7 +277,7 @@ class Watcher(AnserNode):
         """Return what is there, in one line, with its figures."""
         window, seen = self._window, self._sighting
         values: dict[str, object] = {'look_cpu_s': self._look_s, 'last_refusal': self._trouble}
-        said = said_of(self._sources)
+        said = sender_words(self._sources)
         if said:
             return Status('', Level.ERROR, f'{TWO_SOURCES}: {said}', values)
         if window is None or self._watch is None:

@@ -18,9 +18,10 @@ VELOCITY_STEP_S = 0.02
 poses, much longer smooths away how a hand accelerates."""
 
 REACH = (2, 3, 4)
-"""Poses before and after an interval by which its curvature is told: three tellings, of which the
-middle one counts, since a reflected pose is in one of them only. Nearer ones jitter more, farther
-ones miss how the acceleration changes; with these a pose's jitter grows by some percent."""
+"""Poses before and after an interval by which its curvature is determined: three estimates, of
+which the middle one counts, since a reflected pose is in one of them only. Nearer ones jitter
+more, farther ones miss how the acceleration changes; with these a pose's jitter grows by some
+percent."""
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.convention import read_rightly
-from anser_ros.poses.effect import PoseSight, Sensing
+from anser_ros.poses.effect import PoseResiduals, Sensing
 from anser_ros.poses.effects.clock import one_clock
 from anser_ros.poses.effects.hand_eye import FrameTerm, Mount, OpticalFrame
 from anser_ros.poses.effects.noise import jitter
-from anser_ros.poses.fit import PoseFit, fit_poses, noise_of, standing_out
+from anser_ros.poses.fit import PoseFit, fit_poses, noise_of, unexplained_poses
 from anser_ros.poses.problem import PosePart, PoseProblem, PoseState
 from anser_ros.poses.registry import pose_effects
 from anser_ros.poses.search import PoseEvidence, search_effects
@@ -190,7 +190,7 @@ def _without_stamps(problem: PoseProblem) -> PoseProblem:
 def _judged(problem: PoseProblem, fit: PoseFit) -> PoseProblem:
     """A problem without the poses that stand out from a fit."""
     every = replace(problem, weight=tuple(np.ones(s.size) for s in problem.sensors))
-    out = standing_out(replace(fit, state=every.state(fit.terms)))
+    out = unexplained_poses(replace(fit, state=every.state(fit.terms)))
     return replace(problem, weight=tuple(np.where(mask, 0.0, 1.0) for mask in out))
 
 
@@ -215,13 +215,13 @@ def _sensings(state: PoseState, out: tuple[NDArray[np.bool_], ...]) -> list[Sens
     return found
 
 
-def _sight(session: PoseSession, problem: PoseProblem, whole: PoseFit) -> PoseSight:
+def _sight(session: PoseSession, problem: PoseProblem, whole: PoseFit) -> PoseResiduals:
     every = replace(problem, noise=whole.state.problem.noise)
-    out = standing_out(replace(whole, state=every.state(whole.terms)))
+    out = unexplained_poses(replace(whole, state=every.state(whole.terms)))
     # What stands out of this fit, and not of the one before it: every pose is used or out.
     weight = tuple(np.where(mask, 0.0, 1.0) for mask in out)
     sensings = tuple(_sensings(replace(every, weight=weight).state(whole.terms), out))
-    return PoseSight(session, problem.setting, sensings, problem.blocks)
+    return PoseResiduals(session, problem.setting, sensings, problem.blocks)
 
 
 def _floor(state: PoseState) -> float:
@@ -253,8 +253,8 @@ def _records(
             frame = whole if isinstance(whole, FrameTerm) else None
             spread = None if base is None else covariances[base]
             part = next(p for p in fit.state.parts if p.view.sensor == term.site['sensor'])
-            is_told = lever_is_told(part, shaking)
-            records.append(hand_eye_record(term, covariances[i], frame, spread, is_told))
+            is_determined = is_lever_determined(part, shaking)
+            records.append(hand_eye_record(term, covariances[i], frame, spread, is_determined))
     for term, one, spread in zip(fit.terms, evidence, covariances, strict=True):
         if one is None:
             continue
@@ -270,21 +270,21 @@ def _records(
     return one_clock(records, fit.state.problem.setting.duration)
 
 
-LEAST_JITTER_RAD = 1e-5  # no reference tells turns better; none at all has no inverse
+LEAST_JITTER_RAD = 1e-5  # no reference measures turns better; none at all has no inverse
 FEWEST_TURNS = 20  # poses that tell a reference's jitter, to 16 %
 MOST_BLUR = 0.1  # share by which a lever arm that is given may be too small
 LEAST_KNOWN_M, LEAST_KNOWN_RAD = 0.01, 0.1
 """Standard deviation of a lever arm's component, m, or a turn, rad, beyond which it is not given:
 the motion does not determine it."""
-HARDLY_TOLD_M = 0.022
+HARDLY_DETERMINED_M = 0.022
 """Lever arm, m, that would make the median error by turns alone, from which the motion does not
-tell it, whatever its formal uncertainty: errors of trackers go with the turns of a hand. On
+determine it, whatever its formal uncertainty: errors of trackers go with the turns of a hand. On
 recordings of one body levers were off by 9 mm and more beyond this, and by 4 mm and less below."""
 
 
-def lever_is_told(part: PosePart, jitter_rad: float) -> NDArray[np.bool_]:
-    """Return the mask (3,) of the components of a lever arm that the motion tells."""
-    return (lever_blur(part, jitter_rad) < MOST_BLUR) & (lever_reach(part) < HARDLY_TOLD_M)
+def is_lever_determined(part: PosePart, jitter_rad: float) -> NDArray[np.bool_]:
+    """Return the mask (3,) of the components of a lever arm that the motion determines."""
+    return (lever_blur(part, jitter_rad) < MOST_BLUR) & (lever_reach(part) < HARDLY_DETERMINED_M)
 
 
 def lever_reach(part: PosePart) -> Array:
@@ -332,10 +332,10 @@ def hand_eye_record(
     spread: Array,
     frame: FrameTerm | None,
     frame_spread: Array | None,
-    is_told: NDArray[np.bool_],
+    is_determined: NDArray[np.bool_],
 ) -> EffectRecord:
     """Return optical frame, lever arm and mount of a sensor; None where the motion does not
-    tell.
+    determine them.
     """
 
     def degrees(matrix: Array) -> list[float]:
@@ -345,7 +345,7 @@ def hand_eye_record(
     sigma = np.sqrt(np.maximum(np.diag(spread), 0.0))
     lever = [
         float(v) if s < LEAST_KNOWN_M and told else None
-        for v, s, told in zip(mount.translation, sigma[:3], is_told, strict=True)
+        for v, s, told in zip(mount.translation, sigma[:3], is_determined, strict=True)
     ]
     values: dict[str, object] = {
         'sensor': mount.site['sensor'],

@@ -134,7 +134,7 @@ class PoseEffect(Effect[Term]):
         """Return tracked poses, (n, 3) m and (n, 3, 3), without what the effect does to them."""
         return position, rotation
 
-    def observed(self, sight: 'PoseSight') -> Sequence[EffectRecord]:
+    def observed(self, sight: 'PoseResiduals') -> Sequence[EffectRecord]:
         """Return what is seen of the effect without a fit; nothing where parameters are fitted."""
         return ()
 
@@ -185,7 +185,7 @@ class Sensing:
 
 
 @dataclass(frozen=True)
-class PoseSight:
+class PoseResiduals:
     """Holds a session and what its fit leaves, where effects without a parameter to fit are seen.
 
     Attributes

@@ -166,8 +166,8 @@ def _spread(part: PosePart) -> PoseNoise:
     )
 
 
-def standing_out(fit: PoseFit) -> tuple[NDArray[np.bool_], ...]:
-    """Return poses that no explanation reaches: far beyond the spread of their sensor's others."""
+def unexplained_poses(fit: PoseFit) -> tuple[NDArray[np.bool_], ...]:
+    """Return the poses that nothing explains: far beyond the spread of their sensor's others."""
     found = []
     for part in fit.state.parts:
         noise = replace(_spread(part), stamp_s=part.noise.stamp_s)

@@ -20,7 +20,7 @@ from anser_ros.poses.diagnosis import (
     LEAST_KNOWN_M,
     LEAST_KNOWN_RAD,
     hand_eye_record,
-    lever_is_told,
+    is_lever_determined,
     turn_jitter,
 )
 from anser_ros.poses.effects.clock import PoseClockRate, PoseTimeOffset
@@ -49,7 +49,7 @@ class SensorFrames:
     Attributes
     ----------
     lever_m : ndarray, shape (3,)
-        m, body's frame; NaN where the motion does not tell.
+        m, body's frame; NaN where the motion does not determine it.
     lever_sigma_m : ndarray, shape (3,)
     mount : ndarray, shape (3, 3), or None
         Rotation from the sensor's frame to the body's; None where it is not determined.
@@ -85,16 +85,17 @@ class HandEye:
         From the optical frame to the tracker's.
     rotation_sigma_rad : ndarray, shape (3,)
     translation_m, translation_sigma_m : ndarray, shape (3,)
-        Of the optical frame's origin in the tracker's, m; NaN where the motion does not tell.
+        Of the optical frame's origin in the tracker's, m; NaN where the motion does not determine
+        it.
     offset_s, rate_ppm : tuple of float (value, standard deviation), or None
         At stamp t of a tracked pose the optical pose stamped t - offset applies; the tracked clock
-        gains on the optical one by the rate; the offset is that at ``middle_s``. None where the
-        recording does not tell.
+        gains on the optical one by the rate; the offset is that at ``middle_s``. None if the
+        recording does not determine it.
     middle_s : float
         s since the recording's start.
     sensors : dict of str to SensorFrames
     undetermined : tuple of str
-        What the recording does not tell, and what it would take, in words.
+        What the recording does not determine, and what it would take, in words.
     fit : PoseFit
     """
 
@@ -148,7 +149,7 @@ def fit_hand_eye(
     session : PoseSession
         With a reference.
     pairs : bool
-        Whether the poses are static pairs (`as_pairs`), which tell nothing of clocks.
+        Whether the poses are static pairs (`as_pairs`), which say nothing about clocks.
     progress : callable, optional
         Called with the name of the stage and its finished fraction.
 
@@ -181,7 +182,7 @@ def fit_hand_eye(
 
 
 def _fitted(problem: PoseProblem) -> PoseFit:
-    """The frames, and the clocks as far as the motion tells them."""
+    """The frames, and the clocks as far as the motion determines them."""
     fit = first_fit(problem, coarse_offset(problem), False)
     if problem.path.is_at_rest:
         frames = [t for t in fit.terms if isinstance(t, FrameTerm)]
@@ -228,7 +229,7 @@ def _told(
         name = term.site['sensor']
         part = next(p for p in fit.state.parts if p.view.sensor == name)
         record = hand_eye_record(
-            term, spreads[index], frame, spreads[base], lever_is_told(part, shaking)
+            term, spreads[index], frame, spreads[base], is_lever_determined(part, shaking)
         )
         lever = [np.nan if v is None else float(v) for v in record.parameters['lever_arm_m']]
         sigma = np.sqrt(np.maximum(np.diag(spreads[index]), 0.0))
@@ -271,7 +272,7 @@ def _middle(terms: tuple[Term, ...]) -> float:
 
 
 def _open_lever(name: str, lever: Array, turn: Array) -> list[str]:
-    """Say which components of a lever arm are open, and what motion would tell them."""
+    """State which components of a lever arm are open, and what motion would determine them."""
     if not np.isnan(lever).any():
         return []
     middle = turn.mean(axis=0)

@@ -43,7 +43,7 @@ def import_poses(
         Several of each are recordings one after the other, the n-th of both together.
     stamps : {'host', 'device'}
     unit : str, optional
-        Unit of the tracked positions where the form does not tell it rightly (`UNITS`).
+        Unit of the tracked positions where the form does not state it correctly (`UNITS`).
     quaternion : str, optional
         How the tracked quaternions are written where it is not as usual in their form (`ORDERS`).
 

@@ -36,7 +36,7 @@ CHANGED, CHANGED_M = 2.5, 1.5e-3
 """Factor of the median misfit over the one that was there when the frames were learnt, and its
 growth (m), from which something has changed."""
 EXPLAINED = 0.4
-"""Share of the misfit that may be left when one frame is fitted anew for that one to have
+"""Share of the misfit that may be left when one frame is fitted again for that one to have
 changed."""
 STEPS = 12  # Gauss-Newton steps for one frame; a turn of 30 deg takes six
 NOISIER = 2.0
@@ -241,7 +241,7 @@ def _misfits(state: PoseState) -> dict[str, float]:
 
 
 def _learnt(session: PoseSession, found: PoseDiagnosis) -> _Known | None:
-    """What later windows are judged by; None where the motion does not tell the frames."""
+    """What later windows are judged by; None where the motion does not determine the frames."""
     eyes = [record for record in found.records if record.name == 'hand_eye']
     if session.reference is None or not all(e.evidence.get('observable') for e in eyes):
         return None

@@ -13,7 +13,7 @@ from anser_ros.poses.document import MODEL_SCHEMA
 from anser_ros.poses.effects.field_distortion import FieldDistortion
 
 SMOOTH = 'smooth'
-"""The kind of a map that is told by the points that it was learnt from."""
+"""The kind of a map that is determined by the points that it was learnt from."""
 
 
 def to_point_model(found: ErrorMap, sensor: str, source: str) -> dict[str, Any]:
@@ -47,7 +47,7 @@ def to_point_model(found: ErrorMap, sensor: str, source: str) -> dict[str, Any]:
         'schema': MODEL_SCHEMA,
         'provenance': {'points': source},
         'held_out_position_rmse_m': best.whole,
-        'held_out_orientation_rmse_rad': float(np.pi),  # points tell nothing of it
+        'held_out_orientation_rmse_rad': float(np.pi),  # points say nothing about it
         'support': {
             'low_m': found.places.min(axis=0).tolist(),
             'high_m': found.places.max(axis=0).tolist(),

@@ -25,7 +25,7 @@ filter's grid; larger, its curvature."""
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """Says how far a sensor's poses are off without any effect, one standard deviation.
+    """States how far a sensor's poses are off without any effect, one standard deviation.
 
     Attributes
     ----------
@@ -229,13 +229,13 @@ class PoseState:
         normal = np.zeros((numbers.size, total, total))
         right, squares = np.zeros((numbers.size, total)), np.zeros(numbers.size)
         filters = [t for t in wanted if is_of(t, Role.FILTER)] if filter_slopes else []
-        turned = {t.seat: self._differences(t) for t in filters}
+        turned = {t.name_and_site: self._differences(t) for t in filters}
         for i, (part, label) in enumerate(zip(self.parts, labels, strict=True)):
             columns = np.zeros((part.residual.shape[0], 6, total))
             for term, a, b in zip(wanted, edges[:-1], edges[1:], strict=True):
                 slope = effect_of(term).slopes(term, part.view)
-                if term.seat in turned:
-                    slope = turned[term.seat][i]
+                if term.name_and_site in turned:
+                    slope = turned[term.name_and_site][i]
                 if slope is not None:
                     columns[:, :, a:b] = slope
             white = part.white

@@ -15,7 +15,14 @@ from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN
 from anser_ros.effects.term import Term
 from anser_ros.poses.effect import Role, effect_of, is_of
 from anser_ros.poses.effects.hand_eye import FrameTerm
-from anser_ros.poses.fit import FOLDS, LARGEST_STAMP_S, PoseFit, fit_poses, noise_of, standing_out
+from anser_ros.poses.fit import (
+    FOLDS,
+    LARGEST_STAMP_S,
+    PoseFit,
+    fit_poses,
+    noise_of,
+    unexplained_poses,
+)
 from anser_ros.poses.prices import LEAST_SHARE, is_scale, price
 from anser_ros.poses.problem import PoseNoise, PosePart
 from anser_ros.poses.registry import pose_effects
@@ -86,7 +93,7 @@ def with_noise(fit: PoseFit) -> PoseFit:
     """Return the fit with the noise that it shows, and without poses that stand out from that."""
     problem = fit.state.problem
     for _ in range(NOISE_ROUNDS):
-        out = standing_out(fit)
+        out = unexplained_poses(fit)
         weight = tuple(np.where(mask, 0.0, 1.0) for mask in out)
         cut = replace(problem, weight=weight)
         noise = tuple(likely_noise(part)[0] for part in cut.state(fit.terms).parts)
@@ -94,7 +101,7 @@ def with_noise(fit: PoseFit) -> PoseFit:
         judged = replace(problem, weight=every, noise=noise)
         state = judged.state(fit.terms)
         fit = replace(fit, state=state)
-    out = standing_out(fit)
+    out = unexplained_poses(fit)
     weight = tuple(np.where(mask, 0.0, 1.0) for mask in out)
     return fit_poses(replace(fit.state.problem, weight=weight), fit.terms)
 
@@ -131,11 +138,15 @@ def effects_of(fit: PoseFit) -> list[Term]:
 def _best_addition(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | None:
     """The fit with the candidate that is worth most, or None; a lag is looked for at the end."""
     setting = fit.state.problem.setting
-    force = {term.seat for term in fit.terms}
+    force = {term.name_and_site for term in fit.terms}
     promising: list[tuple[float, Term]] = []
     for effect in pose_effects().values():
         for term in _beside_scale(effect.sites(setting), fit.terms):
-            if term.seat in force or _is_part(term, fit.terms) or is_of(term, Role.FILTER):
+            if (
+                term.name_and_site in force
+                or _is_part(term, fit.terms)
+                or is_of(term, Role.FILTER)
+            ):
                 continue
             if 6 * POSES_A_PARAMETER * term.theta.size > fit.state.count:
                 continue
@@ -356,7 +367,8 @@ def _one_map(fit: PoseFit) -> PoseFit:
 def _settled(
     fit: PoseFit,
 ) -> tuple[PoseFit, tuple[PoseEvidence | None, ...], list[tuple[str, str]]]:
-    """Drop effects that no longer pay beside the others; evidence for those that stay."""
+    """Drop effects that are no longer worth their parameters, given the others; evidence for those
+    that stay."""
     dropped: list[tuple[str, str]] = []
     while True:
         evidence: list[PoseEvidence | None] = []

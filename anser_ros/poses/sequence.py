@@ -25,7 +25,7 @@ marker."""
 LEAP_M, LEAP_RAD, LEAP_TIMES = 0.01, 0.25, 3.0
 """How far a pose is from the line between its neighbours if it leaps: m, rad, and in distances of
 these from each other. A hand that shakes turns back within 5 mm at 20 poses a second."""
-LONGEST_LEAP = 3  # rounds; each takes out one pose of a run, or two from its ends
+LONGEST_JUMP = 3  # rounds; each takes out one pose of a run, or two from its ends
 NOT_UNIT = 0.05
 """How far the norm of a quaternion may be from one: four digits are given by the coarsest form.
 Smaller refuses rounded files; larger takes other numbers for quaternions."""
@@ -131,14 +131,14 @@ class PoseSession:
         return {**self.sensors, **({} if reference is None else {REFERENCE: reference})}
 
 
-def leaps(poses: PoseSequence) -> Mask:
+def jumping_poses(poses: PoseSequence) -> Mask:
     """Return the mask (n,) of single poses, or a few, that leap away from those before and after
     them.
 
     A marker found in its second solution does this: it is far away between two poses that agree.
     """
     away = np.zeros(poses.size, dtype=bool)
-    for _ in range(LONGEST_LEAP):
+    for _ in range(LONGEST_JUMP):
         rows = np.flatnonzero(~away)
         if rows.size < 5:
             break

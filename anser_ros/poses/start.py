@@ -15,7 +15,7 @@ from anser_ros.poses.effects.hand_eye import Mount, OpticalFrame, frame_term
 from anser_ros.poses.fit import PoseFit, robust_fit
 from anser_ros.poses.path import OpticalPath
 from anser_ros.poses.problem import PoseNoise, PoseProblem
-from anser_ros.poses.sequence import PoseSequence, PoseSession, leaps
+from anser_ros.poses.sequence import PoseSequence, PoseSession, jumping_poses
 
 Array = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ FEWEST_POSES = 8
 """Poses with a reference that hand-eye needs: it has twelve unknowns, a pose tells six, and as
 many again have to judge it."""
 MOST_POSES = 900
-"""Poses of a sensor that are fitted at most, evenly over the session. More tell no more of errors
+"""Poses of a sensor that are fitted at most, evenly over the session. More add nothing of errors
 that are alike for seconds, and a session of four sensors has to be done within seconds. Fewer make
 effects uncertain; more cost time."""
 COARSE_S, COARSE_STEP_S = 1.5, 0.05
@@ -64,7 +64,7 @@ def pose_problem(session: PoseSession) -> PoseProblem:
             raise DiagnosisError(
                 f'{session.path}: one sensor and no reference; there is nothing to compare'
             )
-    reference = reference.rows(~leaps(reference))
+    reference = reference.rows(~jumping_poses(reference))
     path = OpticalPath.through(reference.track())
     kept = {name: _thinned(poses) for name, poses in sensors.items()}
     starts = _pauses(list(kept.values()))

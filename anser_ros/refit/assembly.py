@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.model import FieldModel
-from anser_ros.refit.beside import Beside
+from anser_ros.refit.background import BackgroundTask
 from anser_ros.refit.evidence import FrameEvidence
 from anser_ros.refit.layer import Layer, component_rows
 from anser_ros.refit.modes import ErrorLevel, PosteriorModes, error_level, error_modes
@@ -92,7 +92,7 @@ class Assembly:
     def __init__(self, model: FieldModel) -> None:
         self.base = model
         self._modes: dict[tuple[object, ...], PosteriorModes] = {}
-        self._coming: dict[tuple[object, ...], Beside[PosteriorModes]] = {}
+        self._coming: dict[tuple[object, ...], BackgroundTask[PosteriorModes]] = {}
         self._last: _ErrorBefore | None = None
         self._interim: tuple[object, Uncertainty] | None = None
         self._whole: dict[tuple[object, ...], tuple[int, Uncertainty]] = {}
@@ -100,7 +100,7 @@ class Assembly:
         self._geometry: Geometry | None = None
 
     def forget(self) -> None:
-        """Forget what was told last: the next frame is of another time."""
+        """Forget the last error: the next frame is of another time."""
         self._last = self._interim = None
 
     def _place(self, layers: Sequence[Layer]) -> Geometry:
@@ -227,7 +227,7 @@ class Assembly:
         if key not in self._coming:
             make_room(self._coming, MOST_MODES)
             work = partial(error_modes, bank, bank.posterior(hypothesis), level, count)
-            self._coming[key] = Beside(work, change.stamp_ns)
+            self._coming[key] = BackgroundTask(work, change.stamp_ns)
         if not self._coming[key].is_due(change.stamp_ns):
             return None
         make_room(self._modes, MOST_MODES)
@@ -307,7 +307,7 @@ class _Change:
 
 @dataclass(frozen=True)
 class _ErrorBefore:
-    """The error that was told last, and of which hypothesis it is."""
+    """The last error that was given, and of which hypothesis it is."""
 
     coils: bytes
     hypothesis: int

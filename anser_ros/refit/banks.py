@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.refit.beside import begin_beside
+from anser_ros.refit.background import begin_in_background
 from anser_ros.refit.posterior import Bank
 from anser_ros.refit.slots import SLOTS, BodySlots
 from anser_ros.refit.tables import RefitTables
@@ -59,7 +59,7 @@ class Banks:
                 tables.priors, rows, self._drift, self._row_noise, SLOTS, len(tables.bodies)
             )
             self._known[key] = (bank, BodySlots(bank, tables))
-            begin_beside(bank.make_ready)
+            begin_in_background(bank.make_ready)
         return self._known[key]
 
     def forget(self) -> None:

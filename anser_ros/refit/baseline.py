@@ -60,7 +60,7 @@ class ReadingWindow:
         self._frames.clear()
 
     def add(self, frame: Frame) -> None:
-        """Take in a judged frame of the sensors; a jump back in time starts anew.
+        """Take in a judged frame of the sensors; a jump back in time restarts it.
 
         Raises
         ------

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-NOTHING = 0.99
+UNCHANGED = 0.99
 """Probability of no change from which on the calibrated model is in force."""
 
 
@@ -38,9 +38,9 @@ class Belief:
         self.weights[0] = 1.0
 
     @property
-    def something(self) -> bool:
+    def may_have_changed(self) -> bool:
         """Return whether the field may have changed: the calibrated model does not hold then."""
-        return bool(self.weights[0] < NOTHING)
+        return bool(self.weights[0] < UNCHANGED)
 
     @property
     def log_odds(self) -> float:
@@ -56,8 +56,8 @@ class Belief:
         weights = np.exp(log_weight - log_weight.max())
         self.weights = weights / weights.sum()
 
-    def heed(self, names: Sequence[str], told: Mapping[str, float]) -> None:
-        """Weigh the hypotheses by what else, in the same frame, tells of them.
+    def update_by(self, names: Sequence[str], told: Mapping[str, float]) -> None:
+        """Update the weights of the hypotheses by other evidence of the same frame.
 
         Parameters
         ----------

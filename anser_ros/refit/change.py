@@ -87,7 +87,7 @@ class NoiseLevel:
         return self._known > 1
 
     def forget(self) -> None:
-        """Start anew after a gap in time; the level is kept."""
+        """Restart after a gap in time; the level is kept."""
         self._previous.clear()
 
 
@@ -134,5 +134,5 @@ class Average:
         return self._mean, self._frames
 
     def forget(self) -> None:
-        """Drop the mean, so that averaging begins anew."""
+        """Drop the mean, so that averaging starts again."""
         self._mean, self._frames = None, 0

@@ -45,7 +45,7 @@ class StatedMetal:
     covariance : ndarray, shape (C K, C K)
         Of the readings, noise and drift included.
     error_m : float
-        Error of poses while nobody corrects it, root mean square.
+        Error of poses while it is not corrected, root mean square.
     """
 
     name: str

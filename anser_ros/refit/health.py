@@ -54,7 +54,7 @@ MOST_AT_ONCE = 4
 
 
 class ReferenceHealth(NamedTuple):
-    """Says how one reference coil is in one frame.
+    """States how one reference coil is in one frame.
 
     Attributes
     ----------
@@ -196,7 +196,7 @@ class ReferenceWatch:
         self.excluded[coil], self.reason[coil], self._good[coil] = True, DISAGREES, 0
 
     def recover(self, coil: int) -> None:
-        """Take a coil for sound again whose readings have jumped back; it waits as others do."""
+        """Take a coil for good again whose readings have jumped back; it waits as others do."""
         if self.excluded[coil] and self.reason[coil] == DISAGREES:
             self.reason[coil], self._good[coil] = RECOVERING, 0
 

@@ -23,7 +23,7 @@ from anser_ros.stamps import NANO
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-NOTICED = 5.0
+LEAST_JUMP_POWER = 5.0
 """Power of a jump, in units of what noise makes, from which on jumps are judged. Noise of sixteen
 components is that loud once in a year; lower, and judging costs time for nothing."""
 FARTHEST = 3.0
@@ -34,8 +34,8 @@ SUDDEN = 0.05
 each second. In recordings of an X-ray head that comes close it stays below the noise, a hundredth
 of this at 25 Hz. Larger, and faults pass for metal by the errors that a survey allows it; smaller,
 and metal that is thrown about is taken for faults."""
-FORETOLD = 0.1
-"""Share of a coil's jump, in power, that may be other than the other coils foretell where metal
+UNPREDICTED = 0.1
+"""Share of a coil's jump, in power, that may differ from what the others predict where metal
 has appeared from one frame to the next, and share of the coils for which it may be more. Smaller,
 and metal that is described badly is taken for faults; larger, and faults that look alike pass for
 metal."""
@@ -48,7 +48,7 @@ RETURNED = 0.1
 
 @dataclass(frozen=True)
 class Jumps:
-    """Says how far a frame's readings are off their courses.
+    """States how far a frame's readings are off their courses.
 
     Attributes
     ----------
@@ -133,7 +133,7 @@ class Courses:
             Of a phasor component of each, T.
         """
         away, size = self._farthest > 0.0, np.linalg.norm(self._away, axis=1)
-        calm = math.sqrt(NOTICED * 2 * self._away.shape[1]) * noise
+        calm = math.sqrt(LEAST_JUMP_POWER * 2 * self._away.shape[1]) * noise
         back = away & (size < np.maximum(RETURNED * self._farthest, calm))
         if (np.linalg.norm(self._last[away], axis=1) < calm[away]).all():
             back = away
@@ -150,15 +150,15 @@ def _bounded(bank: Bank, seen: FrameEvidence, largest: float) -> FrameEvidence:
     return replace(seen, log_evidence=evidence + bank.log_prior, strength=whole)
 
 
-def _is_foretold(bank: Bank, seen: FrameEvidence, jumps: Array) -> bool:
-    """Return whether each coil's jump is what the others foretell, as when metal is put down."""
+def _is_predicted(bank: Bank, seen: FrameEvidence, jumps: Array) -> bool:
+    """Return whether each coil's jump is what the others predict, as when metal is put down."""
     _, residual = left_out(bank, seen, int(seen.log_evidence.argmax()))
-    noise = NOTICED * jumps[0].size * (seen.noise * bank.row_noise[:: bank.width]) ** 2
+    noise = LEAST_JUMP_POWER * jumps[0].size * (seen.noise * bank.row_noise[:: bank.width]) ** 2
     off = (residual**2).sum(axis=(1, 2))
     size = (jumps**2).sum(axis=(1, 2)) + ((jumps - residual) ** 2).sum(axis=(1, 2))
     concerned = size > noise
-    strange = concerned & (off > FORETOLD * size)
-    return int(strange.sum()) <= FORETOLD * int(concerned.sum())
+    strange = concerned & (off > UNPREDICTED * size)
+    return int(strange.sum()) <= UNPREDICTED * int(concerned.sum())
 
 
 def jumped(
@@ -190,11 +190,11 @@ def jumped(
     top = curve.max(axis=0)
     broad = top + np.log(np.exp(curve - top).mean(axis=0))
     apart = np.maximum(quiet, broad)
-    # Before all else: by a drift of all emitters the coils foretell each other's jumps too.
+    # Before all else: by a drift of all emitters the coils predict each other's jumps too.
     if _is_common_gain(bank, seen, jumps, spread * drift):
         return np.arange(len(jumps))
     odds = apart.sum() - log_sum(seen.log_evidence)
-    if odds > FAULT_ODDS and not _is_foretold(bank, free, jumps):
+    if odds > FAULT_ODDS and not _is_predicted(bank, free, jumps):
         return np.flatnonzero((broad > quiet).any(axis=1))
     return np.empty(0, dtype=np.int64)
 
@@ -204,5 +204,5 @@ def _is_common_gain(bank: Bank, seen: FrameEvidence, jumps: Array, drift: float)
     mean, _ = bank.drifts(seen, int(seen.log_evidence.argmax()))
     step = drift * (mean @ np.array([1.0, 1.0j]))
     left = jumps.reshape(-1, 2) - bank.drift @ mean
-    explained = float((left**2).sum()) < FORETOLD * float((jumps**2).sum())
+    explained = float((left**2).sum()) < UNPREDICTED * float((jumps**2).sum())
     return explained and float(np.abs(step).min()) > COMMON

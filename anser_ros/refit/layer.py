@@ -42,7 +42,7 @@ SAMPLES = (12, 7)
 samples and, of metal that touches the board, 40 % wrong between them."""
 AT_ONCE = 64
 """Sources whose field at the samples is worked out at once, 5 MB: with many more, the time goes
-into waiting for memory, with many fewer, into beginning anew."""
+into waiting for memory, with many fewer, into starting again."""
 MOST_MIDDLE = 60
 """Samples in the middle that tell what the uncertainty's modes leave."""
 CLEAR = 0.35

@@ -32,7 +32,7 @@ from anser_ros.refit.evidence import FrameEvidence
 from anser_ros.refit.excitation import FieldFunction
 from anser_ros.refit.frame import BaselineCheck, NoiseUnits
 from anser_ros.refit.health import ReferenceHealth, ReferenceWatch
-from anser_ros.refit.jumps import NOTICED, SUDDEN, Courses, jumped
+from anser_ros.refit.jumps import LEAST_JUMP_POWER, SUDDEN, Courses, jumped
 from anser_ros.refit.posterior import Bank
 from anser_ros.refit.result import (
     FEW_REFERENCES,
@@ -244,7 +244,7 @@ class LiveRefit:
         jumps = self._courses.follow(stamp_ns, change)
         parts = self._units.of(jumps.off) / jumps.spread[:, None, None]
         noise = level * self._row_noise[:: parts.shape[1]]
-        loud = (parts**2).mean(axis=(1, 2)) > NOTICED * noise**2
+        loud = (parts**2).mean(axis=(1, 2)) > LEAST_JUMP_POWER * noise**2
         away, coils = self._courses.away(), np.flatnonzero(self._in_use())
         if not (loud.any() or away.size):
             return
@@ -311,7 +311,7 @@ class LiveRefit:
 
     def _result(self, stamp_ns: int, bank: Bank, seen: FrameEvidence, level: float) -> RefitResult:
         self._belief.update(seen.log_evidence)
-        weights, moving = self._belief.weights, self._belief.something
+        weights, moving = self._belief.weights, self._belief.may_have_changed
         best = int(weights.argmax())
         typical = health.typical(self._distance) / (2 * bank.width)
         mean, variance = bank.drifts(seen, best)
@@ -348,8 +348,8 @@ class LiveRefit:
             drift=drift, find=metal,
         )  # fmt: skip
 
-    def heed_tools(self, flux_noise_t: float) -> None:
-        """Let `witnessed` have a say from now on; the noise is of the tools' components, T."""
+    def enable_witnesses(self, flux_noise_t: float) -> None:
+        """Use `witnessed` from now on; the noise is of the tools' components, T."""
         self._witness = Witness(self._tables, self.model, self.settings.tools, flux_noise_t)
 
     def witnessed(self, readings: Sequence[ToolReading]) -> None:
@@ -359,11 +359,11 @@ class LiveRefit:
         """
         if self._witness is None:
             return
-        if not self._belief.something:
+        if not self._belief.may_have_changed:
             self._witness.learn(readings)
             return
         bank, _ = self._bank()
-        self._belief.heed(bank.names, self._witness.update(readings))
+        self._belief.update_by(bank.names, self._witness.update(readings))
 
     def _finish(
         self, stamp_ns: int, model: FieldModel, state: str, reason: str, level: float, **more: Any

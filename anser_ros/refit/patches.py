@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 MOVED_M = 3e-3
-"""Shift of a patch's coil, m, from which on its tables are built anew."""
+"""Shift of a patch's coil, m, from which on its tables are rebuilt."""
 TURNED_RAD = 0.03
 """Rotation of a patch's coil, rad, and shift above, within which a refit's tables stay valid."""
 
@@ -158,7 +158,7 @@ class PatchCoils:
         return Placed(np.where(usable[:, None], self._flux, np.nan), clean)
 
     def must_rebuild(self, now: SensorTable) -> bool:
-        """Return whether coils have moved so far that the refit has to be built anew."""
+        """Return whether coils have moved so far that the refit has to be rebuilt."""
         return self._built_at is None or bool(has_moved(self._built_at, now).any())
 
     def follow(self, refit: LiveRefit, frame: Frame) -> RefitResult:

@@ -43,7 +43,7 @@ def make_room(table: dict[Any, Any], most: int) -> None:
 
 @dataclass(frozen=True)
 class Eigenbasis:
-    """Says what a prior's covariance is made of, for the readings in use.
+    """States what a prior's covariance is made of, for the readings in use.
 
     Attributes
     ----------
@@ -147,11 +147,11 @@ class Bank:
         self._name()
 
     def eigenbasis(self, prior: CloudPrior) -> Eigenbasis:
-        """Return what `occupy` needs; takes long and changes nothing, so any thread may do it."""
+        """Return what `replace_prior` needs; slow, but without side effects, for any thread."""
         values, basis = self._decomposed(prior)
         return Eigenbasis(prior, values, basis, self._to_moments(prior, basis))
 
-    def occupy(self, hypothesis: int, eigenbasis: Eigenbasis) -> None:
+    def replace_prior(self, hypothesis: int, eigenbasis: Eigenbasis) -> None:
         """Put a prior into a slot in place of the former one."""
         self.priors[hypothesis - 1] = eigenbasis.prior
         self.spectra[hypothesis] = eigenbasis.values
@@ -172,7 +172,7 @@ class Bank:
         )  # fmt: skip
 
     def _name(self) -> None:
-        """Name the hypotheses anew after one of them has changed."""
+        """Name the hypotheses again after one of them has changed."""
         slots = (f'slot {i}' if p is None else p.name for i, p in enumerate(self.priors))
         self.names: tuple[str, ...] = ('nothing', *slots)
 

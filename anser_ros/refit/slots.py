@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.refit.beside import Beside
+from anser_ros.refit.background import BackgroundTask
 from anser_ros.refit.evidence import STRENGTHS
 from anser_ros.refit.posterior import Bank, Eigenbasis
 from anser_ros.refit.search import BodySearch
@@ -41,7 +41,7 @@ class _Coming(NamedTuple):
 
     slot: int
     body: int
-    eigenbasis: Beside[Eigenbasis]
+    eigenbasis: BackgroundTask[Eigenbasis]
 
 
 class BodySlots:
@@ -71,8 +71,8 @@ class BodySlots:
     def fill(self, readings: Array, noise: float, stamp_ns: int) -> None:
         """Take in one frame; every few frames a body may be replaced by a better one.
 
-        The chosen body's hypothesis is computed beside the frames, and takes its slot in a later
-        frame.
+        The chosen body's hypothesis is computed in parallel with the frames, and takes its slot in
+        a later frame.
 
         Parameters
         ----------
@@ -93,7 +93,9 @@ class BodySlots:
         chosen = self._choose(self._search.scores(readings, noise))
         if chosen is not None:
             slot, body = chosen
-            self._coming = _Coming(slot, body, Beside(partial(self._eigenbasis, body), stamp_ns))
+            self._coming = _Coming(
+                slot, body, BackgroundTask(partial(self._eigenbasis, body), stamp_ns)
+            )
 
     def _eigenbasis(self, body: int) -> Eigenbasis:
         return self._bank.eigenbasis(self._tables.body_prior(body))
@@ -103,7 +105,7 @@ class BodySlots:
         coming = self._coming
         if coming is None or not coming.eigenbasis.is_due(stamp_ns):
             return
-        self._bank.occupy(self._first + coming.slot, coming.eigenbasis.result())
+        self._bank.replace_prior(self._first + coming.slot, coming.eigenbasis.result())
         self._bodies[coming.slot : coming.slot + 1] = [coming.body]
         self._coming = None
 

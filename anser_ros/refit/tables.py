@@ -32,8 +32,8 @@ from anser_ros.settings import RefitSettings
 
 Array = NDArray[np.float64]
 Hypothesis = tuple[Cloud, Response, Layer]
-Told = Callable[[float], None]
-"""Is told between two pieces of the work which share of it is done."""
+ReportShare = Callable[[float], None]
+"""Called between two pieces of the work with the share that is done."""
 
 START = 0.1
 """Share of the tables' work that is done before the first hypothesis, on the article's board."""
@@ -117,7 +117,7 @@ def build_tables(
     settings: RefitSettings,
     drawing: FieldFunction | None,
     volume: TrackedVolume | None = None,
-    told: Told = lambda share: None,
+    told: ReportShare = lambda share: None,
 ) -> RefitTables:
     """Compute the tables; raises `FitError` as `excitation_for` does, and what ``told`` raises."""
     excitation, region = excitation_for(model, drawing, volume)
@@ -171,7 +171,7 @@ def _priors(
     excitation: Excitation,
     frequencies_hz: tuple[float, ...],
     settings: RefitSettings,
-    told: Told = lambda share: None,
+    told: ReportShare = lambda share: None,
 ) -> tuple[CloudPrior, ...]:
     rng, out = np.random.default_rng(settings.seed), []
     sizes = np.cumsum([0, *(len(cloud.positions) for cloud, _, _ in hypotheses)])

@@ -20,7 +20,7 @@ SETUP_TYPE = 'std_msgs/msg/String'
 
 @dataclass(frozen=True)
 class ImportedBag:
-    """Says what came of an import.
+    """States what came of an import.
 
     Attributes
     ----------

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.effects.correction import is_undone
+from anser_ros.effects.correction import needs_correction
 from anser_ros.errors import BagError, FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.reference_readings import ReferenceReadings
@@ -56,7 +56,7 @@ def baseline_of(recording: Session, sensors: SensorTable, model: FieldModel) -> 
 
 
 def clean_flux(recording: Session, sensors: SensorTable, model: FieldModel) -> ComplexArray:
-    """Return mean readings of a recording without metal in it, as far as anything tells.
+    """Return mean readings of a recording without metal in it, as far as it can be checked.
 
     Arguments, result and further errors are those of `baseline_flux`.
 
@@ -122,7 +122,7 @@ def board_place_of(model: FieldModel, sensors: SensorTable, setup: Setup) -> Boa
 
 def _is_without_metal(model: FieldModel) -> bool:
     """Whether all effects of a model are those of sensors, emitters and optics."""
-    return all(is_undone(record) for record in model.effects)
+    return all(needs_correction(record) for record in model.effects)
 
 
 def clean_mean(

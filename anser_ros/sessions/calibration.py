@@ -14,7 +14,7 @@ from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.requirements import FEWEST_FRAMES, FEWEST_POSES, MANY_SENSORS
 from anser_ros.calibration.result import Calibration, Scan
 from anser_ros.calibration.still import STILL_ONLY, calibrate_still, is_still
-from anser_ros.calibration.survey_records import drift_tellings
+from anser_ros.calibration.survey_records import drift_records
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord
@@ -91,7 +91,7 @@ def calibrate_sessions(
         )
     steady = [_steady(session, tool) for session in sessions for tool in session.tools]
     scan = survey(measurements, generator, options, nominal, progress, steady)
-    scan = replace(scan, tellings=(*scan.tellings, *drifts))
+    scan = replace(scan, reported_effects=(*scan.reported_effects, *drifts))
 
     def fitted(scan: Scan, options: Options) -> Calibration:
         return fit_scan(
@@ -125,7 +125,7 @@ def _at_constant_strength(session: Session) -> tuple[Session, tuple[EffectRecord
         return session, ()
     tools = tuple(at_strength(tool, reference.time, strength) for tool in session.tools)
     constant = at_strength(reference, reference.time, strength)
-    return replace(session, tools=tools, reference=constant), drift_tellings(strength)
+    return replace(session, tools=tools, reference=constant), drift_records(strength)
 
 
 def _steady(session: Session, tool: Measurements) -> NDArray[np.bool_]:

@@ -80,9 +80,9 @@ def diagnose_session(
     model : FieldModel
         Of the session's emitters.
     baseline : Session, optional
-        Distortion-free recording of the same board; with it the reference sensors have a say.
+        Distortion-free recording of the same board; with it the reference sensors are used.
     progress : callable, optional
-        Told in words what goes on.
+        Called with words on what goes on.
 
     Raises
     ------

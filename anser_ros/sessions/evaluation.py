@@ -76,7 +76,7 @@ def track_session(
     patches : dict of str to str, optional
         Bodies that carry further reference coils, each with the topic of its poses in the bag.
     witnesses : bool
-        Whether the refit also heeds what the coils of rigid tools contradict.
+        Whether the refit also uses what the coils of rigid tools contradict.
 
     Raises
     ------

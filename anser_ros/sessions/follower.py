@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from anser_ros.errors import BagError, FitError
-from anser_ros.integrity.ageing import ModelAge, Standing
+from anser_ros.integrity.ageing import FrameModel, ModelAge
 from anser_ros.pose_states import OK, REFERENCES_LOST, Withheld
 from anser_ros.refit.baseline import check_enough
 from anser_ros.refit.change import Pace
@@ -81,37 +81,37 @@ class ModelFollower:
             raise BagError(f'{baseline.path}: {error}') from error
         self._patches = PatchFollower(prepared, patches) if patches else None
         self._refit = self._patches or _refit_of(prepared, baseline)
-        self._prepared, self._heeds_tools = prepared, witnesses
+        self._prepared, self._uses_witnesses = prepared, witnesses
         if witnesses:
             if not isinstance(self._refit, LiveRefit):
                 why = 'patches move' if patches else 'there are no reference sensors'
                 raise BagError(f'{session.path}: tools cannot be witnesses where {why}')
-            self._refit.heed_tools(tracking_noise(session.setup))
+            self._refit.enable_witnesses(tracking_noise(session.setup))
         self._pace = Pace()
         self._age = ModelAge(session.setup.refit.references_age_s, prepared.volume)
         self._result: RefitResult | None = None
         self.summary = RefitSummary()
 
-    def at(self, frame: SessionFrame) -> Standing:
+    def at(self, frame: SessionFrame) -> FrameModel:
         """Return what a frame is tracked with: its references' model, or the last one, aged."""
         if self._patches is not None and frame.tools is not None:
             tools = frame.tools
             self._patches.take_flux(frame.stamp_ns, tools.channels, tools.flux, tools.flags)
         if self._refit is None:
-            return Standing(None, Withheld(REFERENCES_LOST, 'there are no reference sensors'))
+            return FrameModel(None, Withheld(REFERENCES_LOST, 'there are no reference sensors'))
         if frame.reference is not None:
             self._follow(frame.stamp_ns, frame.reference)
         result = None if frame.reference is None else self._result
         standing = self._age.at(frame.stamp_ns, '' if result is None else result.reason)
         if result is not None and result.withheld not in ('', REFERENCES_LOST):
-            return Standing(standing.model, Withheld(result.withheld, result.reason))
+            return FrameModel(standing.model, Withheld(result.withheld, result.reason))
         return standing
 
     def witnessed(
         self, stamp_ns: int, tools: FrameReadings, found: Sequence[PoseEstimate]
     ) -> None:
         """Let a frame's tools tell of metal, at the poses that were found for their bodies."""
-        if not self._heeds_tools or not isinstance(self._refit, LiveRefit):
+        if not self._uses_witnesses or not isinstance(self._refit, LiveRefit):
             return
         correction, flux = self._prepared.correction, tools.flux
         if correction.changes_flux:

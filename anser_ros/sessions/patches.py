@@ -39,8 +39,8 @@ def parse_patches(entries: Sequence[str]) -> dict[str, str]:
 class PatchFollower:
     """Runs a refit with the coils of patches, whose poses lie in the session's own bag.
 
-    The live node computes a refit for new places beside its callbacks and continues without the
-    patches meanwhile; here that takes no time.
+    The live node computes a refit for new places in parallel with its callbacks and continues
+    without the patches meanwhile; here that takes no time.
 
     Parameters
     ----------

@@ -37,7 +37,7 @@ MOST_FROZEN = 0.5
 WIDEST_POINTS_M = 10.0
 """Largest extent of a tracker's positions, m: a tracked volume is below 1, a room below 10."""
 USUAL_EXTENT_M = 0.3
-"""Usual extent of a tracker's positions, m, by which a unit is told."""
+"""Usual extent of a tracker's positions, m, by which a unit is recognised."""
 
 
 def plausible_tools(

@@ -132,7 +132,7 @@ def _correction(model: FieldModel, session: Session) -> Correction:
 def correct(prepared: PreparedSession) -> PreparedSession:
     """Return the session as the effects that the model knows already leave it.
 
-    Fluxes are those that sound sensors and emitters would have given, sensors are where they
+    Fluxes are those that ideal sensors and emitters would have given, sensors are where they
     truly are, and optical poses are on the fluxes' clock and in the frame fg.
     """
     session = prepared.session

@@ -82,7 +82,7 @@ def _level(status: Any) -> int:
 
 
 def overload(path: str | os.PathLike[str]) -> list[str]:
-    """Return signs, in words, that the machine was too busy for a recording; empty if sound."""
+    """Return signs, in words, that the machine was too busy for a recording; empty if complete."""
     signs = []
     for name, values in last_words(path).items():
         for key, meaning in BUSY.items():

@@ -29,15 +29,15 @@ from anser_ros.sessions.session import Session
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-BESIDE_S = 1.0
+MOTION_MARGIN_S = 1.0
 """Time (s) before and after something is seen to move that is looked at as well: it begins to move
 before it is seen."""
 FEWEST_STEADY = 10
 """Frames of the references at rest, of which their steady readings are the mean, at least."""
-LEARNT_M = 0.015
+FIELD_REACH_M = 0.015
 """Distance (m) of a coil from where the field was learnt, up to which it takes part: frames in
-which metal moves were not learnt from, and farther off the field is foretold less well."""
-ASKED = 60
+which metal moves were not learnt from, and farther off the field is predicted less well."""
+UNCERTAINTY_FRAMES = 60
 """Frames of a tool, about, in which the uncertainty of the metal at rest is worked out."""
 
 
@@ -74,13 +74,13 @@ def without_resting_metal(
     calibration : Calibration
         With the metal in its field.
     progress : callable, optional
-        Told the name of the stage.
+        Called with the name of the stage.
     """
     scan = calibration.scan
     if scan.survey is None:
         return None
     measurements, start, found = list(scan.measurements), 0, []
-    tellings = list(scan.tellings)
+    reported_effects = list(scan.reported_effects)
     for session in sessions:
         rows = range(start, start + len(session.tools))
         start += len(session.tools)
@@ -104,25 +104,28 @@ def without_resting_metal(
                 whole, flux=np.where(usable, whole.flux - flux, whole.flux)
             )
         found.append(metal)
-        tellings = [_told(telling, metal, ends) for telling in tellings]
+        reported_effects = [_told(record, metal, ends) for record in reported_effects]
     if not found:
         return None
     sigma = float(np.sqrt(np.mean([metal.sigma_t**2 for metal in found])))
     return replace(
-        scan, measurements=tuple(measurements), tellings=tuple(tellings), field_sigma_t=sigma
+        scan,
+        measurements=tuple(measurements),
+        reported_effects=tuple(reported_effects),
+        field_sigma_t=sigma,
     )
 
 
-def _told(telling: EffectRecord, metal: RestingMetal, ends: tuple[float, float]) -> EffectRecord:
+def _told(record: EffectRecord, metal: RestingMetal, ends: tuple[float, float]) -> EffectRecord:
     """The telling of a span in which this metal moved, with where it rested."""
-    told = telling.parameters
+    told = record.parameters
     if not ends[0] <= told['t_start_s'] <= ends[1]:
-        return telling
+        return record
     return replace(
-        telling,
+        record,
         parameters={**metal.record.parameters, **told},
-        uncertainty={**telling.uncertainty, **metal.record.uncertainty},
-        evidence={**telling.evidence, **metal.record.evidence},
+        uncertainty={**record.uncertainty, **metal.record.uncertainty},
+        evidence={**record.evidence, **metal.record.evidence},
     )
 
 
@@ -133,7 +136,7 @@ def _resting(
     ends: tuple[float, float],
 ) -> RestingMetal | None:
     """What metal that moves between two times does at rest to the frames that are kept."""
-    begin, end = ends[0] - BESIDE_S, ends[1] + BESIDE_S
+    begin, end = ends[0] - MOTION_MARGIN_S, ends[1] + MOTION_MARGIN_S
     problem = _problem(session, calibration, begin, end)
     if problem is None:
         return None
@@ -141,13 +144,13 @@ def _resting(
     first = min(float(tool.time[0]) for tool in session.tools)
     rest_s = 0.0 if begin > first else problem.apparatus.duration
     found = departure(problem, rest_s)
-    if found is None or not found.is_understood:
+    if found is None or not found.is_predictive:
         return None
     flux, variance, power = [], [], []
     for tool in kept:
         view = tool_view(tool, (), problem.fields)
         flux.append(found.term.rest_flux(view))
-        some = np.arange(0, tool.time.size, max(1, tool.time.size // ASKED))
+        some = np.arange(0, tool.time.size, max(1, tool.time.size // UNCERTAINTY_FRAMES))
         there, sigma = found.rest_flux(view.frames(some))
         variance.append(np.mean(sigma**2))
         power.append(np.mean(np.abs(there) ** 2) / 2.0)
@@ -207,7 +210,7 @@ def _near(learnt: cKDTree, tool: Measurements) -> Measurements:
     """The frames with a pose in which all coils are near where the field was learnt."""
     posed = tool.frames(tool.has_pose)
     distance, _ = learnt.query(posed.placed()[0])
-    return posed.frames((distance < LEARNT_M).all(axis=1))
+    return posed.frames((distance < FIELD_REACH_M).all(axis=1))
 
 
 def _between(measurements: Measurements, begin: float, end: float) -> Measurements:

@@ -102,7 +102,7 @@ class SlidingWindow:
             rows.popleft()
 
     def _forget(self) -> None:
-        """Begin anew: a replay has begun again, or the clock was set."""
+        """Start again: a replay has begun again, or the clock was set."""
         self.restarts += 1
         self.first_ns = 0
         self._tool.rows.clear()

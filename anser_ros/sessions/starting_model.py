@@ -81,7 +81,7 @@ def model_for(
     """Return the model that ``name`` stands for: a file's path, or ``nominal``.
 
     ``snapshot`` is whether a snapshot of a refit, which is no calibration, is accepted, and
-    ``resurveyed`` names bodies whose sensors are the same, surveyed anew.
+    ``resurveyed`` names bodies whose sensors are the same, surveyed again.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def made_for(model: FieldModel, setup: Setup) -> FieldModel:
 
 
 def with_new_survey(model: FieldModel, setup: Setup, bodies: Sequence[str]) -> FieldModel:
-    """Return the model for bodies whose sensors are the same, but surveyed anew.
+    """Return the model for bodies whose sensors are the same, but surveyed again.
 
     The model's corrections of channels, such as their gains, still hold. Places and axes of
     sensors are now those of the new survey: effects that corrected the old one are removed.
@@ -119,7 +119,7 @@ def with_new_survey(model: FieldModel, setup: Setup, bodies: Sequence[str]) -> F
     Raises
     ------
     ModelFileError
-        When the setup has no such body, or the model does not tell what it was made for.
+        When the setup has no such body, or the model does not state what it was made for.
     """
     made, kept = model.made_for, model.effects
     for body in bodies:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from anser_ros.errors import BagError
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.ageing import AS_IT_IS
+from anser_ros.integrity.ageing import UNCHANGED_MODEL
 from anser_ros.sessions.follower import ModelFollower, RefitSummary
 from anser_ros.sessions.frames import frames_of
 from anser_ros.sessions.prepared import PreparedSession
@@ -82,7 +82,7 @@ def track(
     frames = list(frames_of(prepared.session))
     start = time.perf_counter()
     for count, frame in enumerate(frames, start=1):
-        standing = AS_IT_IS if follower is None else follower.at(frame)
+        standing = UNCHANGED_MODEL if follower is None else follower.at(frame)
         if standing.model is not None and standing.model is not tracker.model:
             tracker = tracker.with_model(standing.model)
         if frame.tools is not None:
@@ -106,7 +106,8 @@ def track(
 
 
 def _tracker(prepared: PreparedSession, settings: TrackerSettings, *, follows: bool) -> Tracker:
-    """A tracker told of the session's noise, and of a drift's course where nothing else tells."""
+    """A tracker told of the session's noise, and of a drift's course where nothing else
+    determines it."""
     return Tracker(
         prepared.model,
         prepared.sensors,

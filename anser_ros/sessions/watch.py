@@ -38,7 +38,7 @@ EXCESS = 1.25
 """Mean square of the whitened residuals from which on the model lacks something. Noise alone gives
 1; less of a margin would start searches on noise, more would miss small effects."""
 SAME = 1.3
-"""Factor by which the residual that a finding leaves may grow before it is searched for anew."""
+"""Factor by which the residual that a finding leaves may grow before it is searched for again."""
 LEAST_SPREAD_M, LEAST_TURN_RAD = 0.01, 0.1
 """Least standard deviation of a tool's places, m, and of its orientations, rad, for a search. A
 tool that stays closer shows that something is wrong, but not what."""
@@ -96,7 +96,7 @@ class Watch:
     ----------
     prepared : PreparedSession
         Any session of the setup, an empty one too, with the model whose effects are corrected
-        already; without a baseline the references have no say.
+        already; without a baseline the references are not used.
 
     Attributes
     ----------
@@ -122,7 +122,7 @@ class Watch:
         first_ns : int
             Stamp that the time of the model's own effects counts from.
         progress : callable, optional
-            Told in words what goes on.
+            Called with words on what goes on.
 
         Raises
         ------
@@ -250,7 +250,7 @@ def _rms(state: State) -> float:
 
 
 def _moves(problem: Problem) -> bool:
-    """Whether a tool was at places and in orientations that tell effects apart."""
+    """Whether a tool was at places and in orientations that distinguish effects."""
     for tool in problem.tools:
         spread = np.linalg.norm(np.std(tool.position, axis=0))
         closest = float(np.linalg.norm(tool.rotation.mean(axis=0), -2))

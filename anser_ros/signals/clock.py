@@ -23,7 +23,7 @@ _REFUTED_NS = 1_000_000.0
 """By how much (1 ms) an answer must show a line to be too early to refute it: what the line itself
 is uncertain by. More lets a device lose so much time unseen."""
 _SETTLED_NS = 1_000_000.0
-"""Fall of a new line (1 ms) that begins the time anew; less is how arrivals scatter."""
+"""Fall of a new line (1 ms) that begins the time again; less is how arrivals scatter."""
 _ANSWER_S = 0.15
 """Longest time, s, that an answer of the device may take to bound nothing: it has 100 ms for it,
 and the line the rest. If it takes longer, the line itself is late."""
@@ -77,7 +77,7 @@ class SampleClock:
     Attributes
     ----------
     jumps : int
-        How often the line was begun anew because it was refuted.
+        How often the line was started again because it was refuted.
     confirmed : float
         Number of the newest sample that an arrival in time, or an answer, has confirmed; -inf
         before.

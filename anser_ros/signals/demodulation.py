@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 from anser_ros.errors import FitError, ParameterError
 
 SHORTEST_WINDOW_S = 0.005
-"""Shortest window, s. Tones 170 Hz apart need about 1/170 s to be told apart."""
+"""Shortest window, s. Tones 170 Hz apart need about 1/170 s to be separated."""
 LONGEST_WINDOW_S = 0.05
 """Longest window, s. A tool at 0.2 m/s moves 1 cm meanwhile, and its phasors no longer change
 linearly."""
 MAINS_HARMONICS = 5
-"""Harmonics of the mains that are fitted beside the tones: rectifiers make odd ones, weaker the
-higher. Fewer leave hum in the noise; more cost window length where tones are near."""
+"""Harmonics of the mains that are fitted in addition to the tones: rectifiers make odd ones,
+weaker the higher. Fewer leave hum in the noise; more cost window length where tones are near."""
 _RANK_TOLERANCE = 1e-6
 """Singular values below this fraction of the largest are left out. What the window determines lies
 far above it, and rounding far below."""
@@ -97,7 +97,7 @@ class Demodulator:
     Raises
     ------
     ParameterError
-        When the window is not 5 to 50 ms long, or too short to tell two tones apart.
+        When the window is not 5 to 50 ms long, or too short to separate two tones.
     """
 
     def __init__(

@@ -64,7 +64,7 @@ class Envelope:
             self._draw(time_ns)
 
     def _draw(self, time_ns: float) -> None:
-        """Draw the line anew at the end of a stretch, and begin another one."""
+        """Draw the line again at the end of a stretch, and begin another one."""
         if len(self._earliest) >= _FEWEST:
             self._slope = _slope_below(self._earliest)
         self._offset_ns = min(o + self._slope * (time_ns - d) for d, o in self._earliest)

@@ -42,7 +42,7 @@ MOST_BYTES = 64_000_000
 _LONGEST_STEP = 2048
 """Most samples, and a power of 2, that wait to be searched; less than any history has."""
 _JUDGED_SAMPLES = 2 * _LONGEST_STEP
-"""Samples after which it is worked out anew how long runs must be: every 0.1 s at 40 kS/s, far
+"""Samples after which it is worked out again how long runs must be: every 0.1 s at 40 kS/s, far
 less than `FORGETS_S`. More often only costs time."""
 SHORTEST_LAG_S = 1e-3
 """Shortest lag, s, at which fresh samples are compared: over a shorter one a tone at 1 kHz or less
@@ -118,7 +118,8 @@ class RepetitionWatch:
 
     @property
     def noiseless(self) -> NDArray[np.bool_]:
-        """Return the columns with too little noise in their samples to tell new from old, (C,)."""
+        """Return the columns with too little noise in their samples to distinguish new from old,
+        (C,)."""
         return self._needed > self._longest
 
     @property
@@ -163,7 +164,7 @@ class RepetitionWatch:
         self._search()
         return np.where(self._until > first, self._age, 0)
 
-    def recalls(self, position: int, codes: NDArray[np.int16]) -> bool | None:
+    def matches_history(self, position: int, codes: NDArray[np.int16]) -> bool | None:
         """Return whether the samples at a position were these (n, C); None where it is a hole."""
         rows = len(self._history)
         if position < max(0, self.position - rows) or position + len(codes) > self.position:

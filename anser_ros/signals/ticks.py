@@ -20,7 +20,7 @@ _HOLE_TOLERANCE = 0.01
 above the rate error of any clock and below one block in a hundred."""
 _LONGEST_HOLE_S = 10.0
 """Longest hole, s, that the sequence number alone may tell of while ticks are not believed. After
-a longer one little is lost by beginning anew."""
+a longer one little is lost by starting again."""
 _WRAP = 2**32
 """Ticks after which a 32-bit counter begins again."""
 

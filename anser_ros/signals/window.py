@@ -37,7 +37,7 @@ class Window:
         How long before, samples, a column said what it says in the window, or a part of it; 0
         where all of it is new.
     noiseless : ndarray of bool, shape (C,)
-        Whether a column holds too little noise to tell new samples from old ones.
+        Whether a column holds too little noise to distinguish new samples from old ones.
     repeats : bool
         Whether no column says anything new.
     """
@@ -184,7 +184,7 @@ class WindowCutter:
         ahead, block = (sequence - self._expected) % _SEQUENCES, len(codes)
         if ahead >= _SEQUENCES // 2:
             place = self._watch.position - (_SEQUENCES - ahead) * block
-            if self._watch.recalls(place, codes) is not False:
+            if self._watch.matches_history(place, codes) is not False:
                 return -1
         elif self._ticks.confirms((ahead + 1) * block, ticks):
             return ahead

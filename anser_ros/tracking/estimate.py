@@ -36,7 +36,7 @@ right."""
 
 @dataclass(frozen=True)
 class TrackerSettings:
-    """Says what the tracker may assume.
+    """States what the tracker may assume.
 
     Attributes
     ----------
@@ -120,8 +120,8 @@ class TrackerSettings:
             return -math.inf
         return 2.0 * math.log(self.odds) * max(1.0, ratio)
 
-    def leniency(self, scale: float) -> float:
-        """Return the factor on ``max_sigma_m``: without a gate, what misfit adds is forgiven."""
+    def max_sigma_factor(self, scale: float) -> float:
+        """Return the factor on ``max_sigma_m``: larger without a gate, by the misfit."""
         return 1.0 if self.has_gate else math.sqrt(max(1.0, scale))
 
 

@@ -76,7 +76,7 @@ class BodyCoils:
 
 @dataclass(frozen=True)
 class BodySolution:
-    """Says where a rigid tool's solve ended.
+    """States where a rigid tool's solve ended.
 
     Attributes
     ----------

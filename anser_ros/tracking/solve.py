@@ -83,7 +83,7 @@ class RealField:
 
 @dataclass(frozen=True)
 class CoilSolution:
-    """Says where a coil's solve ended.
+    """States where a coil's solve ended.
 
     Attributes
     ----------

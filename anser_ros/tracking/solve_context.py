@@ -213,7 +213,7 @@ class SolveContext:
 
 
 def model_digest(model: FieldModel) -> str:
-    """Return eight hexadecimal digits that tell models apart."""
+    """Return eight hexadecimal digits that distinguish models."""
     digest = hashlib.blake2b(digest_size=4)
     for array in (model.positions, model.directions, model.moments):
         digest.update(np.ascontiguousarray(array).tobytes())

@@ -117,7 +117,7 @@ def verdict(
         return states.OUTSIDE_VOLUME, f'at {millimetres(place)} mm'
     if not converged:
         return states.AMBIGUOUS, 'the solve did not converge'
-    if sigma_m > settings.max_sigma_m * settings.leniency(scale):
+    if sigma_m > settings.max_sigma_m * settings.max_sigma_factor(scale):
         return states.AMBIGUOUS, f'{what} uncertain by {1e3 * sigma_m:.3g} mm'
     if in_metal and settings.has_gate:
         return states.AMBIGUOUS, 'where there may be metal'

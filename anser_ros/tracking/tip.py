@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Tip:
-    """Says where a tip is on its body.
+    """States where a tip is on its body.
 
     Attributes
     ----------

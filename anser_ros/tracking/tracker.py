@@ -110,7 +110,7 @@ class Tracker:
         self._model = model
 
     def _find_bodies(self) -> None:
-        """Tell which coils make bodies whose six degrees of freedom they see."""
+        """Determine which coils make bodies whose six degrees of freedom they see."""
         table = self._table
         self._bodies: dict[str, tuple[NDArray[np.int64], BodyCoils]] = {}
         for body in self._body_tracks:
@@ -130,7 +130,7 @@ class Tracker:
 
     @property
     def dead_emitters(self) -> tuple[str, ...]:
-        """Return emitters that no sensor heard in the last frame while others were heard."""
+        """Return emitters that no sensor received in the last frame while others were received."""
         return self._intake.dead
 
     @property
@@ -164,7 +164,7 @@ class Tracker:
         return other
 
     def renamed(self, model_id: str) -> 'Tracker':
-        """Return the same tracker whose model has another name: one found anew, but the same."""
+        """Return the same tracker whose model has another name: one found again, but the same."""
         other = Tracker.__new__(Tracker)
         other.__dict__.update(self.__dict__)
         if self._context is not None:

@@ -112,7 +112,7 @@ class Job:
         self.end()
 
     def end(self, number: int = signal.SIGTERM) -> None:
-        """Tell its processes to end."""
+        """Ask its processes to end."""
         process = self._process
         if process is not None and process.returncode is None:
             with contextlib.suppress(ProcessLookupError):

@@ -24,7 +24,7 @@ MOST_UNDONE = 20
 
 
 class Chain(Protocol):
-    """Says what the page can ask of the running nodes."""
+    """States what the page can ask of the running nodes."""
 
     async def trigger(self, service: str) -> str:
         """Call a service and return its answer; AnserError where it refuses."""

@@ -28,7 +28,7 @@ _LIBRARIES = (ui.scene, ui.echart)
 
 
 class ShownGraph(Protocol):
-    """Says what the page shows; numbers that are not known are None."""
+    """States what the page shows; numbers that are not known are None."""
 
     @property
     def version(self) -> int:
@@ -160,7 +160,7 @@ class Screen:
             self._instrument.run_method('frame', rows)
 
     def refresh(self) -> None:
-        """Show everything else anew, as far as it has changed."""
+        """Show everything else again, as far as it has changed."""
         source = self._source
         if self._is_ready and self._version != source.version:
             world = source.world()

@@ -22,7 +22,7 @@ MOST_BYTES = 262_144
 MOST_CONNECTIONS = 64
 """Connections at a time, those of a page's files among them."""
 PATIENCE_S = 20.0
-"""Time that a page may be silent, s, before it is taken for gone; it is loaded anew when it comes
+"""Time that a page may be silent, s, before it is taken for gone; it is reloaded when it comes
 back. Shorter, and a browser that is busy drawing loses its page."""
 END_S = 2.0
 """Time that open connections have at the end, s: a page that hangs must not hold the node."""

@@ -53,7 +53,7 @@ class ModelError:
 def _layout(
     n_emitters: int, has_origin: bool = True
 ) -> tuple[list[PointFieldTuple], 'np.dtype[np.void]']:
-    """Fields and record; what was recorded before 0.2 does not tell which model it is from."""
+    """Fields and record; what was recorded before 0.2 does not state which model it is from."""
     fields: list[PointFieldTuple] = [
         ('mode', 0, UINT16, 1),
         ('dipole', 2, UINT16, 1),

@@ -24,7 +24,7 @@ from anser_ros.wire.protocols import ANSER, SerialProtocol, records_of
 from anser_ros.wire.records import Hello, Payload, Record, SampleBlock, Stop
 from anser_ros.wire.serial_line import cause_of, close_line, open_line, receiver_of
 
-GOODBYE_S = 0.1
+STOP_S = 0.1
 """Time, s, that the last messages get to leave before the process ends."""
 DEFAULT_BAUD = 12_000_000
 """Baud rate of the port; USB devices ignore it."""
@@ -149,9 +149,9 @@ class ControlUnitPort:
         self._thread.start()
 
     def end_stream(self) -> None:
-        """Tell the control unit to stop, and give the message time to leave."""
+        """Command the control unit to stop, and give the message time to leave."""
         self.send(Stop())
-        time.sleep(GOODBYE_S)
+        time.sleep(STOP_S)
 
     def stop(self, timeout_s: float = 1.0) -> None:
         """End the reader thread and close the port."""

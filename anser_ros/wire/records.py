@@ -88,7 +88,8 @@ class Channel:
 
 @dataclass(frozen=True)
 class Hello:
-    """Tells what the control unit is and how it samples; sent once a second and after each change.
+    """States what the control unit is and how it samples; sent once a second and after each
+    change.
 
     Attributes
     ----------
@@ -134,7 +135,7 @@ class SampleBlock:
 
 @dataclass(frozen=True)
 class DeviceStatus:
-    """Tells the control unit's health, once a second and when it changes."""
+    """States the control unit's health, once a second and when it changes."""
 
     state: DeviceState
     flags: StatusFlag

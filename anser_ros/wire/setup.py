@@ -16,7 +16,7 @@ import yaml
 from anser_ros.errors import ParameterError, SetupError
 from anser_ros.fingerprint import Identity, fingerprint_of
 from anser_ros.settings import SECTIONS, Accuracy, RefitSettings, settings_from
-from anser_ros.wire.setup_tips import TipSpec, dump_tips, parse_tips, refuse_homeless
+from anser_ros.wire.setup_tips import TipSpec, dump_tips, parse_tips, refuse_unknown_bodies
 from anser_ros.wire.setup_values import (
     Vector,
     read_axis,
@@ -127,7 +127,7 @@ class Setup:
             When a tip is of no body, or its topic is that of a sensor.
         """
         topics = [topic_of(name) for name in (*(s.name for s in self.tool_sensors), *self.bodies)]
-        refuse_homeless(tips, {body: topic_of(body) for body in self.bodies}, topics)
+        refuse_unknown_bodies(tips, {body: topic_of(body) for body in self.bodies}, topics)
         return replace(self, tips={**self.tips, **tips})
 
     @cached_property
@@ -217,7 +217,7 @@ def _parse_emitter(item: Any) -> Emitter:
         raise SetupError('setup: emitter.coils must be a list of at least one coil')
     parsed = tuple(_parse_coil(coil, f'emitter.coils[{i}]') for i, coil in enumerate(coils))
     refuse_repeats([coil.name for coil in parsed], 'coil')
-    # What tells emitters apart is their tone.
+    # What distinguishes emitters is their tone.
     refuse_repeats([coil.frequency_hz for coil in parsed], "emitter's frequency_hz")
     geometry = {k: v for k, v in emitter.items() if k not in ('kind', 'coils')}
     kind = take(emitter, 'kind', 'emitter')

@@ -80,8 +80,10 @@ def parse_tips(item: Any) -> dict[str, TipSpec]:
     return tips
 
 
-def refuse_homeless(tips: Iterable[str], bodies: Mapping[str, str], topics: Iterable[str]) -> None:
-    """Refuse tips of no body, or whose topic exists already; bodies are given with their topics.
+def refuse_unknown_bodies(
+    tips: Iterable[str], bodies: Mapping[str, str], topics: Iterable[str]
+) -> None:
+    """Refuse tips of unknown bodies, or whose topic exists; bodies are given with their topics.
 
     Raises
     ------

@@ -18,7 +18,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
 
-from anser_ros.assessment.hummel import VOLUMES, Grid, distance_errors, lines_alike
+from anser_ros.assessment.hummel import VOLUMES, Grid, distance_errors, have_common_errors
 
 FIRST_SEED, TRUTH_SEED, TRUE_BOARDS = 9000, 8999, 3000
 NOISE_M, DISTORTION_M = 3e-4, 1e-3
@@ -76,7 +76,7 @@ def row_of(count: int, length_m: float, boards: int) -> list[str]:
     for seed in range(FIRST_SEED, FIRST_SEED + boards):
         rng = np.random.default_rng(seed)
         place = drawn.draw(rng)
-        alike += lines_alike(place, drawn.grid)
+        alike += have_common_errors(place, drawn.grid)
         for group, errors in distance_errors(place, drawn.grid, rng).items():
             for figure in FIGURES:
                 one, true = errors.summary[figure], truth[group[0]][figure]

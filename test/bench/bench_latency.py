@@ -102,7 +102,7 @@ def _latencies(what: str, run: Run, rival: Run, name: str) -> Iterator[dict]:
 
 
 def _busy(run: Run) -> str:
-    """Say that the machine was busy: latencies say more of that than of the chain."""
+    """Report that the machine was busy: latencies say more of that than of the chain."""
     late = run.device_late_ms
     return f' (machine busy: the bytes themselves {late:.0f} ms late)' if late > BUSY_MS else ''
 

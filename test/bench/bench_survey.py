@@ -122,9 +122,14 @@ def _tracked(
             squares[i, c] = error**2
             over += int(error > 3.0 * one.sigma_position_m)
     rms = 1e3 * np.sqrt(np.nanmean(squares, axis=0))
-    untold = '' if scan.survey is None else ', '.join(sorted(scan.survey.untold))
+    undetermined = '' if scan.survey is None else ', '.join(sorted(scan.survey.undetermined))
     ok = np.isfinite(squares).sum()
-    return float(np.sqrt(np.mean(rms**2))), float(rms.max()), 100.0 * over / max(ok, 1), untold
+    return (
+        float(np.sqrt(np.mean(rms**2))),
+        float(rms.max()),
+        100.0 * over / max(ok, 1),
+        undetermined,
+    )
 
 
 def row_of(coils: int, seconds: float, turns_deg: float, errors: Errors, seed: int) -> str:
@@ -141,12 +146,12 @@ def row_of(coils: int, seconds: float, turns_deg: float, errors: Errors, seed: i
     place = 1e3 * np.sqrt(np.mean(np.sum((survey.place - truth.place) ** 2, axis=1)))
     lever = 1e3 * np.linalg.norm(survey.lever_arm - truth.lever)
     offset = 1e3 * abs(survey.offset_s - errors.offset_s)
-    untold = ', '.join(sorted(found.untold)) or 'nothing'
+    undetermined = ', '.join(sorted(found.undetermined)) or 'nothing'
     values = (
         coils, f'{seconds:g}', f'{turns_deg:g}', f'{100 * errors.gain:g}',
         f'{1e3 * errors.offset_s:g}', f'{1e3 * errors.jitter * JITTER_M:.3f}', f'{gain:.4f}',
         f'{axis:.3f}', f'{place:.4f}', f'{lever:.3f}', f'{offset:.4f}',
-        f'{1e3 * found.optical.position_m:.3f}', untold, f'{spent:.0f}',
+        f'{1e3 * found.optical.position_m:.3f}', undetermined, f'{spent:.0f}',
     )  # fmt: skip
     return f'| {" | ".join(map(str, values))} |'
 

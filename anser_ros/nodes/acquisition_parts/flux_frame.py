@@ -24,7 +24,7 @@ class Staleness:
     Attributes
     ----------
     age_s : how long before a sensor said the same, s; 0 where what it says is new or constant
-    noiseless : whether it holds too little noise to tell new from old
+    noiseless : whether it holds too little noise to distinguish new from old
     """
 
     age_s: NDArray[np.float64]

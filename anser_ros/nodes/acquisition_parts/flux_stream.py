@@ -25,7 +25,7 @@ from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
 
 @dataclass(frozen=True)
 class StreamOptions:
-    """Says how to demodulate: window and rate, and what to fit besides the tones."""
+    """States how to demodulate: window and rate, and what to fit besides the tones."""
 
     window_s: float
     rate_hz: float
@@ -33,7 +33,8 @@ class StreamOptions:
 
 
 class FluxStream:
-    """Turns samples into fluxes; it is made anew for every hello that differs from the one before.
+    """Turns samples into fluxes; it is made again for every hello that differs from the one
+    before.
 
     Parameters
     ----------
@@ -111,7 +112,7 @@ class FluxStream:
         return -(-self._cutter.samples_wanted // self._block_samples)
 
     def restart(self, sent_ns: int | None) -> None:
-        """Begin anew: the device has answered a start, sent at a host time, with sample 0."""
+        """Start again: the device has answered a start, sent at a host time, with sample 0."""
         self.waiting.forget()
         self._cutter.reset()
         self.clock.restart()
@@ -135,7 +136,7 @@ class FluxStream:
         if self.counters.restarts != restarts:
             self.waiting.forget()
             self.clock.restart()
-        # What comes twice tells nothing of now.
+        # What comes twice says nothing about now.
         if self._cutter.end_sample != before and not self._watch.repeats:
             self.clock.observe(self._cutter.end_sample, arrival_ns)
         for window in windows:
@@ -153,8 +154,8 @@ class FluxStream:
             self.waiting.add(frame, window.middle_sample, end, arrival_ns)
         return self.waiting.release(arrival_ns)
 
-    def rehearse(self) -> None:
-        """Demodulate the newest window once more for nothing but speed, see `Acquisition`."""
+    def warm_up(self) -> None:
+        """Demodulate the newest window again, only to keep caches warm; see `Acquisition`."""
         if self._newest is not None:
             fit = self._demodulator.demodulate(self._newest.codes, self._newest.present)
             self._converter.convert(fit)

@@ -11,10 +11,11 @@ from anser_ros.settings import Accuracy
 from anser_ros.wire.setup import Setup
 
 EARLIEST_S = 10.0
-"""Least time, s, from one setup document to the next for the sake of the stamps: trackers begin
-anew with it, and a host's load changes within seconds."""
+"""Least time, s, from one setup document to the next for the sake of the stamps: trackers start
+again with it, and a host's load changes within seconds."""
 _FACTOR = 2.0
-"""Ratio by which the stamps' uncertainty must differ from what was told to be told anew."""
+"""Ratio by which the stamps' uncertainty must differ from what was published to be published
+again."""
 
 
 class MeasuredAccuracy:
@@ -24,15 +25,15 @@ class MeasuredAccuracy:
         self.reset()
 
     def reset(self) -> None:
-        """Begin anew: the stream is another one."""
+        """Start again: the stream is another one."""
         self._noise_t: float | None = None
         self._begun_s = -math.inf
         self._told_s = Accuracy.stamp_sigma_s
         self._squares = 0.0
         self._frames = 0
 
-    def is_news(self, frame: FluxFrame, sigma_s: float, now_s: float) -> bool:
-        """Take a frame with its stamp's uncertainty; whether the setup must be told anew."""
+    def must_republish(self, frame: FluxFrame, sigma_s: float, now_s: float) -> bool:
+        """Take a frame with its stamp's uncertainty; return whether to publish the setup again."""
         if math.isfinite(sigma_s):
             self._squares += sigma_s**2
             self._frames += 1

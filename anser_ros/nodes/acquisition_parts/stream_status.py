@@ -12,7 +12,7 @@ from anser_ros.wire.points import DROPPED, SATURATED, STALE
 from anser_ros.wire.setup import Coil
 
 MOST_NAMES = 4
-"""Sensors that are named in one line; of the others their number is told."""
+"""Sensors that are named in one line; of the others the number is given."""
 STATES = (
     (STALE, Level.ERROR, 'stuck', 'all samples of a window are the same'),
     (SATURATED, Level.WARN, 'saturated', ''),

@@ -27,8 +27,8 @@ WORKER = 'patches'
 
 
 class Patches(PatchCoils):
-    """Follows the patches that messages tell of; a refit for new places is worked out beside the
-    callbacks.
+    """Follows the patches that messages tell of; a refit for new places is computed in
+    parallel with the callbacks.
 
     Parameters
     ----------

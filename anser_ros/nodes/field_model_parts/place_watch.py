@@ -36,7 +36,7 @@ class PlaceWatch:
     Attributes
     ----------
     misplaced : str
-        How the model lies aside; empty where it does not, or nobody can tell yet.
+        How the model lies aside; empty where it does not, or it is not known yet.
     """
 
     def __init__(
@@ -62,12 +62,12 @@ class PlaceWatch:
 
     @property
     def is_open(self) -> bool:
-        """Return whether references could tell, and none has been heard."""
+        """Return whether references could tell, and none has been received."""
         return self._place is not None and not self._has_heard
 
     @property
-    def awaits(self) -> bool:
-        """Return whether references that are announced, or may still be, are about to tell."""
+    def is_waiting(self) -> bool:
+        """Return whether readings of announced references, or of ones still to be, may come."""
         is_early = time.monotonic() - self._begin_s < DISCOVERY_S
         return self.is_open and (is_early or self._announced() > 0)
 

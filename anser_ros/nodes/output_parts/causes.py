@@ -7,24 +7,24 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 MOST_CAUSES = 4
-"""Causes that are told at once: what is behind all else is among the gravest."""
+"""Causes that are reported at once: what is behind all else is among the gravest."""
 MOST_NAMES = 3
-"""Sensors that are named for one cause; of the others their number is told."""
+"""Sensors that are named for one cause; of the others the number is given."""
 MOST_TEXT = 160
 """Characters of a cause: two lines of a terminal."""
 LEAST_LOSS = 0.05
 """Share of frames missing that is told: a rate counted over a second is off by a few percent."""
 
 
-class Told(NamedTuple):
-    """Holds what was said last of a node or of a part of it: level, words, figures by name."""
+class LastStatus(NamedTuple):
+    """Holds the last status of a node or of a part of it: level, words, figures by name."""
 
     level: int
     message: str
     values: Mapping[str, str]
 
 
-def causes(told: Mapping[str, Told], namespace: str, flux_rate_hz: float = 0.0) -> list[str]:
+def causes(told: Mapping[str, LastStatus], namespace: str, flux_rate_hz: float = 0.0) -> list[str]:
     """Name what is wrong: nodes that complain, then sensors without pose, by their reasons.
 
     Parameters
@@ -53,8 +53,8 @@ def causes(told: Mapping[str, Told], namespace: str, flux_rate_hz: float = 0.0) 
     return [_short(text) for text in texts[:MOST_CAUSES]]
 
 
-def _loss(one: Told, flux_rate_hz: float) -> str:
-    """The share of frames that are missing, where a node tells its rate."""
+def _loss(one: LastStatus, flux_rate_hz: float) -> str:
+    """The share of frames that are missing, where a node states its rate."""
     try:
         rate_hz = float(one.values['rate_hz'])
     except (KeyError, ValueError):

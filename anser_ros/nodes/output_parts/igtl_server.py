@@ -20,7 +20,7 @@ sensors at 25 Hz: older poses are of no use to it."""
 MOST_CLIENTS = 16
 """Clients that are served at once; each has a thread and a queue. A room has a few screens; more
 connections than this are a mistake or an attack, and are closed as they come."""
-HEARD_BYTES = 1 << 14
+READ_BYTES = 1 << 14
 """Bytes that are read of a client at a time. A client that sends without end is slowed down by the
 system, and takes no time from the others."""
 IDLE_S, PROBE_S, PROBES = 10, 5, 3
@@ -129,7 +129,7 @@ class _Client:
         """Read some of what the client says, and answer what it asks."""
         if not select.select([self._connection], [], [], 0.0)[0]:
             return False
-        data = self._connection.recv(HEARD_BYTES)
+        data = self._connection.recv(READ_BYTES)
         for header, body in self._requests.feed(data):
             self.version = max(self.version, header.version)
             if header.kind == 'STT_TDATA':

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.nodes.output_parts.causes import Told, causes
+from anser_ros.nodes.output_parts.causes import LastStatus, causes
 from anser_ros.nodes.output_parts.traces import LONGEST_GAP_S, OpticalTrace, latency_of, targets_of
 from anser_ros.wire.setup import Setup
 
@@ -50,7 +50,7 @@ def read_pose(data: bytes) -> tuple[float, Array]:
 
 @dataclass(frozen=True)
 class Figures:
-    """Says how well it goes, over all coils and a stretch of time; NaN where nothing is known.
+    """States how well it goes, over all coils and a stretch of time; NaN where nothing is known.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class LiveView:
         self.setup, self.namespace = setup, namespace
         self.targets = targets_of(setup)
         self.bodies = {target.body for target in self.targets}
-        self.told: dict[str, Told] = {}
+        self.told: dict[str, LastStatus] = {}
         self._told_s: dict[str, float] = {}
         count = len(self.targets)
         self._stamp_s = np.full(count, np.nan)
@@ -133,8 +133,8 @@ class LiveView:
             trace.add(stamp_s, tuple(values[:3]), tuple(values[3:POSE]))
         trace.forget(OPTICAL_KEPT)
 
-    def take_told(self, name: str, told: Told) -> None:
-        """Take what a node says."""
+    def take_status(self, name: str, told: LastStatus) -> None:
+        """Take the status of a node."""
         self.told[name], self._told_s[name] = told, time.monotonic()
 
     # What is shown ------------------------------------------------------------------------
@@ -163,9 +163,9 @@ class LiveView:
         fresh = time.monotonic() - self._heard_s < FRESH_S
         return np.where(fresh, np.sqrt(trace), np.nan)
 
-    def told_of(self, name: str) -> Told:
-        """Return what the tracker says of a target."""
-        return self.told.get(f'{self.namespace}/tracker: {name}', Told(1, 'waiting', {}))
+    def last_status(self, name: str) -> LastStatus:
+        """Return the last status of a target from the tracker."""
+        return self.told.get(f'{self.namespace}/tracker: {name}', LastStatus(1, 'waiting', {}))
 
     def figure(self, node: str, key: str) -> float:
         """Return a number that a node of the chain told, NaN where it did not."""
@@ -174,12 +174,12 @@ class LiveView:
 
     def residual_t(self) -> Array:
         """Return the residual of every target's fluxes, T."""
-        return np.array([_number(self.told_of(t.name), 'residual_t') for t in self.targets])
+        return np.array([_number(self.last_status(t.name), 'residual_t') for t in self.targets])
 
     def tracked(self) -> Array:
         """Return the share of frames with a pose of every target."""
         pairs = [
-            [_number(self.told_of(t.name), key) for key in ('rate_hz', 'frame_rate_hz')]
+            [_number(self.last_status(t.name), key) for key in ('rate_hz', 'frame_rate_hz')]
             for t in self.targets
         ]
         poses, frames = np.array(pairs).reshape(-1, 2).T
@@ -262,7 +262,7 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _number(told: Told | None, key: str) -> float:
+def _number(told: LastStatus | None, key: str) -> float:
     try:
         return math.nan if told is None else float(told.values[key])
     except (KeyError, ValueError):

@@ -16,7 +16,7 @@ from rclpy.serialization import deserialize_message
 from visualization_msgs.msg import Marker, MarkerArray
 
 from anser_ros.errors import AnserError
-from anser_ros.nodes.output_parts.causes import Told
+from anser_ros.nodes.output_parts.causes import LastStatus
 from anser_ros.nodes.output_parts.live_view import LiveView, known
 from anser_ros.nodes.output_parts.polled import STREAMS, Polled
 from anser_ros.nodes.output_parts.processor import Processor
@@ -29,15 +29,15 @@ STREAM = QoSProfile(
 )
 """Poses as they come; the newest matters, and there is room for those of a tick at 200 Hz."""
 SILENT_S = 3.5
-"""Time, s, after which a node that says nothing is said to be silent; it speaks once a second."""
+"""Time, s, after which a node that says nothing counts as silent; it speaks once a second."""
 MOST_MARKS = 20
 """Moments that are marked in the curves: more words than these cover the curves."""
 MOST_METAL = 400
 """Balls of metal that are drawn; all are sent to every page whenever they change."""
-MOST_TOLD = 4096
+MOST_STATUSES = 4096
 """Names in diagnostics of which what was said is kept: several lines for each of 1000 sensors."""
 COIL_M = 0.07
-"""Side of an emitter coil, m, that is drawn where the setup does not tell it."""
+"""Side of an emitter coil, m, that is drawn where the setup does not state it."""
 
 
 class ViewSource:
@@ -50,7 +50,7 @@ class ViewSource:
     optical : str
         Namespace of the optical poses.
     refused : callable
-        Is told of what can't be read.
+        Called for what can't be read.
     is_there : callable
         Whether somebody offers a service.
 
@@ -82,7 +82,7 @@ class ViewSource:
         self._metals = Polled(node, MarkerArray, 'metal', qos.LATCHED)
         self._poses: list[Polled] = []
         self._optical: dict[str, Polled] = {}
-        self._told: dict[str, Told] = {}
+        self._told: dict[str, LastStatus] = {}
         self._balls: list[list[float]] = []
         self._marks: deque[tuple[float, str]] = deque(maxlen=MOST_MARKS)
         self._processor = Processor()
@@ -127,7 +127,7 @@ class ViewSource:
             polled.close()
         view = LiveView(setup, self.namespace)
         for name, told in self._told.items():
-            view.take_told(name, told)
+            view.take_status(name, told)
         self._poses = [
             Polled(self._node, PoseWithCovarianceStamped,
                    f'{topic_of(target.name)}/pose_with_covariance', STREAM)
@@ -142,13 +142,13 @@ class ViewSource:
     def _take_told(self, message: DiagnosticArray) -> None:
         for status in message.status:
             is_ours = status.name.startswith(f'{self.namespace}/')
-            if not is_ours or (status.name not in self._told and len(self._told) >= MOST_TOLD):
+            if not is_ours or (status.name not in self._told and len(self._told) >= MOST_STATUSES):
                 continue
             values = {pair.key: pair.value for pair in status.values}
-            told = Told(status.level[0], status.message, values)
+            told = LastStatus(status.level[0], status.message, values)
             self._told[status.name] = told
             if self.view is not None:
-                self.view.take_told(status.name, told)
+                self.view.take_status(status.name, told)
 
     def add_point(self) -> None:
         """Take the next point of the curves, and see where the metal is."""
@@ -194,7 +194,7 @@ class ViewSource:
         view = self.view
         if view is None:
             return []
-        told = [view.told_of(target.name) for target in view.targets]
+        told = [view.last_status(target.name) for target in view.targets]
         columns = zip(
             told, 1e3 * view.sigma_m(), 1e3 * view.error_m, 1e12 * view.residual_t(),
             view.rate_hz, strict=True,
@@ -230,8 +230,8 @@ class ViewSource:
         }  # fmt: skip
         if view is None:
             return status
-        tracker = self._told.get(f'{space}/tracker', Told(1, 'no tracker', {}))
-        good = sum(view.told_of(target.name).level == 0 for target in view.targets)
+        tracker = self._told.get(f'{space}/tracker', LastStatus(1, 'no tracker', {}))
+        good = sum(view.last_status(target.name).level == 0 for target in view.targets)
         rates = view.rate_hz[view.rate_hz > 0]
         recorder = self._told.get(f'{space}/recorder')
         is_recording = recorder is not None and recorder.message == 'recording'
@@ -252,7 +252,7 @@ class ViewSource:
             home, _, short = name.rpartition('/')
             if home == self.namespace and ':' not in name and name not in self._own:
                 if view.silent_s(name) > SILENT_S:
-                    told = Told(3, 'silent', {})
+                    told = LastStatus(3, 'silent', {})
                 found.append((short, told.level, told.message))
         return sorted(found)
 
@@ -269,7 +269,7 @@ class ViewSource:
         return [(own.level, own.message), *parts]
 
 
-def _recording(recorder: Told) -> str:
+def _recording(recorder: LastStatus) -> str:
     name = recorder.values.get('bag', '').rpartition('/')[2]
     return f'{name} {float(recorder.values.get("duration_s", 0.0)):.0f} s'
 

@@ -10,8 +10,8 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 HARDWARE_ID = 'anser'
-TROUBLE_TOLD_S = 10.0
-"""How long, s, a trouble is still told of after it was last seen, so that nobody misses it."""
+TROUBLE_HELD_S = 10.0
+"""How long, s, a trouble is still reported after it was last seen, so that nobody misses it."""
 
 
 class Level(IntEnum):
@@ -71,12 +71,12 @@ class Trouble:
 
     Parameters
     ----------
-    told_s : float
+    held_s : float
         How long it is news.
     """
 
-    def __init__(self, told_s: float = TROUBLE_TOLD_S) -> None:
-        self._told_s = told_s
+    def __init__(self, held_s: float = TROUBLE_HELD_S) -> None:
+        self._held_s = held_s
         self._at_s = -math.inf
         self.last = ''
 
@@ -86,7 +86,7 @@ class Trouble:
 
     def recent(self, now_s: float) -> str:
         """Return what went wrong lately; empty when nothing did."""
-        return self.last if now_s - self._at_s < self._told_s else ''
+        return self.last if now_s - self._at_s < self._held_s else ''
 
     def forget(self) -> None:
         """Take the trouble for over."""

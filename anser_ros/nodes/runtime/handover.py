@@ -37,20 +37,20 @@ class HandedFlux:
 
 
 @dataclass(frozen=True, eq=False)
-class Taking:
-    """Stands in for a subscription where a node is handed the topic."""
+class DirectSubscription:
+    """Replaces a subscription where messages are passed directly to a node."""
 
     topic_name: str
     taker: Taker
 
 
-class Aside:
-    """Works in a thread on the newest of what is handed over, so that who gives it goes on.
+class NewestWorker:
+    """Processes the newest object handed over in a thread, so that the sender need not wait.
 
     Parameters
     ----------
     skipped : callable
-        Called for each thing that gave way to a newer one of its topic.
+        Called for each object that a newer one of its topic has replaced.
     """
 
     def __init__(self, skipped: Callable[[], object]) -> None:
@@ -98,35 +98,35 @@ class Handover:
     def __init__(self) -> None:
         self._put_off: deque[Callable[[], bool]] = deque()
         self._paused_s = -math.inf
-        self._takings: defaultdict[str, list[Taking]] = defaultdict(list)
+        self._takings: defaultdict[str, list[DirectSubscription]] = defaultdict(list)
         self._offered: dict[str, bool] = {}
         self._last: dict[str, Any] = {}
 
     def offer(self, topic: str, *, lasts: bool = False) -> None:
-        """Promise to give what is published on a topic.
+        """Declare that the messages of a topic will be passed to receivers directly.
 
         A receiver that registers later gets the last one at once if it ``lasts``.
         """
         self._offered[topic] = lasts
 
     def offers(self, topic: str) -> bool:
-        """Return whether a topic is given to those who take it."""
+        """Return whether the messages of a topic are passed to its receivers directly."""
         return topic in self._offered
 
-    def take(self, topic: str, taker: Taker) -> Taking:
+    def take(self, topic: str, taker: Taker) -> DirectSubscription:
         """Have all that is given on a topic go to a callable, in the thread of who gives it."""
-        taking = Taking(topic, taker)
+        taking = DirectSubscription(topic, taker)
         self._takings[topic].append(taking)
         if topic in self._last:
             taker(self._last[topic])
         return taking
 
-    def drop(self, taking: Taking) -> None:
+    def drop(self, taking: DirectSubscription) -> None:
         """End what `take` began."""
         self._takings[taking.topic_name].remove(taking)
 
-    def put_off(self, work: Callable[[], bool]) -> bool:
-        """Have some work done in the next pause; False where nobody makes pauses at present.
+    def defer(self, work: Callable[[], bool]) -> bool:
+        """Do some work in the next pause; return False if no node makes pauses at present.
 
         Work that returns False could not be done, and is tried again in the pause after.
         """

@@ -38,7 +38,7 @@ from rclpy.parameter import Parameter
 from anser_ros.errors import AnserError
 from anser_ros.nodes.runtime import incoming, parameters, qos
 from anser_ros.nodes.runtime.diagnostics import Level, Status, Throttle, diagnostic_array
-from anser_ros.nodes.runtime.handover import Aside, Handover, Taking
+from anser_ros.nodes.runtime.handover import DirectSubscription, Handover, NewestWorker
 from anser_ros.nodes.runtime.process import main
 
 NAMESPACE = 'anser'
@@ -101,7 +101,7 @@ class AnserNode(Node):
         self._handover = handover
         self._beside = tuple(beside)
         # Where frames are handed over, they come in another thread than the executor's.
-        self._aside: Aside | None = None
+        self._aside: NewestWorker | None = None
         self._turn: Any = contextlib.nullcontext() if handover is None else threading.RLock()
         self.counters: Counter[str] = Counter()
         self.exit_code: int | None = None
@@ -147,8 +147,8 @@ class AnserNode(Node):
     def close(self) -> None:
         """Release what the node holds; called once at the end, signals already ignored."""
 
-    def farewell(self) -> None:
-        """Tell devices that it is over where the process is given up; in a thread of its own."""
+    def on_abandon(self) -> None:
+        """Inform devices that it is over where the process is given up; in a thread of its own."""
 
     # What a node uses ---------------------------------------------------------------------
 
@@ -193,7 +193,7 @@ class AnserNode(Node):
 
     def _diagnostics_due(self) -> None:
         """Publish them in the next pause between two frames, where there are such."""
-        if self._handover is None or not self._handover.put_off(self._speak_if_free):
+        if self._handover is None or not self._handover.defer(self._speak_if_free):
             self._speak()
 
     def _speak_if_free(self) -> bool:
@@ -212,7 +212,7 @@ class AnserNode(Node):
         )
 
     def _say_starting(self, text: str) -> None:
-        """Say what the start waits for, in the log once and in ``/diagnostics``."""
+        """State what the start waits for, in the log once and in ``/diagnostics``."""
         if self._throttle.admit('start', text, time.monotonic()) is not None:
             self.get_logger().info(text)
         self._send_statuses(Status('', Level.WARN, text))
@@ -276,7 +276,7 @@ class AnserNode(Node):
 
     def destroy_subscription(self, subscription: Any) -> bool:
         """Destroy a subscription as rclpy does, or take no longer what is handed over."""
-        if isinstance(subscription, Taking) and self._handover is not None:
+        if isinstance(subscription, DirectSubscription) and self._handover is not None:
             self._handover.drop(subscription)
             return True
         return super().destroy_subscription(subscription)
@@ -284,7 +284,7 @@ class AnserNode(Node):
     def _put_aside(self, topic: str, taker: Callable) -> Callable:
         if not self.WORKS_ASIDE:
             return taker
-        aside = self._aside = self._aside or Aside(lambda: self.count('frames_skipped'))
+        aside = self._aside = self._aside or NewestWorker(lambda: self.count('frames_skipped'))
         return lambda what: aside.put(topic, taker, what)
 
     def stop_working(self) -> bool:

@@ -22,7 +22,7 @@ SCALARS = (bool, int, float, str)
 
 @dataclasses.dataclass(frozen=True)
 class Rule:
-    """Says what a parameter's value must satisfy, and what it means.
+    """States what a parameter's value must satisfy, and what it means.
 
     Attributes
     ----------

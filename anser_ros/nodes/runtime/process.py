@@ -64,7 +64,7 @@ def main(
     Returns
     -------
     int
-        0 ended as asked; 2 a wrong argument or parameter, said in one line; 1 a defect.
+        0 ended as asked; 2 a wrong argument or parameter, reported in one line; 1 a defect.
     """
     arguments = list(sys.argv if argv is None else argv)
     classes = tuple(node_class) if isinstance(node_class, Sequence) else (node_class,)
@@ -189,8 +189,8 @@ class _Signals:
         self.is_node_made = False
         self.caught: list[int] = []
         self._noticed = threading.Event()
-        # What devices have to be told where the process is given up.
-        self.farewells: list[Callable[[], object]] = []
+        # What devices have to be informed where the process is given up.
+        self.abandon_calls: list[Callable[[], object]] = []
         for number in ENDING:
             signal.signal(number, self._catch)
         # Python's handlers wait for the main thread; this channel does not.
@@ -215,9 +215,9 @@ class _Signals:
             pass
         if self._noticed.wait(NOTICE_S):
             return
-        for farewell in self.farewells:
+        for on_abandon in self.abandon_calls:
             try:
-                farewell()
+                on_abandon()
             except Exception:  # noqa: BLE001 - the process ends, whatever a device says
                 traceback.print_exc()
         if not self._noticed.is_set():
@@ -256,7 +256,7 @@ def _run(
                 arguments_of = meant[node_class.NAME]
                 options = {'handover': handover, 'beside': classes, 'cli_args': arguments_of}
             nodes.append(node_class(**own, **options))
-            signals.farewells.append(nodes[-1].farewell)
+            signals.abandon_calls.append(nodes[-1].on_abandon)
         _complain(nodes, arguments)
         for node in nodes:
             executor.add_node(node)

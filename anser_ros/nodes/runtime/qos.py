@@ -13,7 +13,7 @@ def latched(depth: int) -> QoSProfile:
     )
 
 
-# The setup document and whatever else holds until it is said anew.
+# The setup document and whatever else holds until it is said again.
 LATCHED = latched(1)
 # Field models and their uncertainty. While the model is refitted every frame has its own, so what
 # a busy reader has not taken yet must not give way to the next: there is room for a second's.

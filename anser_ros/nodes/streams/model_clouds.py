@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from sensor_msgs.msg import PointCloud2, PointField
 
-from anser_ros.effects.correction import is_undone
+from anser_ros.effects.correction import needs_correction
 from anser_ros.errors import LayoutError
 from anser_ros.field.model import FieldModel
 from anser_ros.stamps import set_stamp
@@ -64,7 +64,7 @@ class ModelWriter:
 
     def name_origin(self, base: FieldModel) -> None:
         """Tell from now on which model the served ones are made from."""
-        self._origin = base.fingerprint, sum(is_undone(record) for record in base.effects)
+        self._origin = base.fingerprint, sum(needs_correction(record) for record in base.effects)
 
     def dipoles(self, model: FieldModel, frame_id: str, stamp_ns: int) -> PointCloud2:
         """Return the ``field_model`` message; for the model of the last one, that one renamed."""

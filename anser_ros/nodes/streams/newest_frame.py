@@ -77,7 +77,7 @@ def newest_of(
     if not (live and received_ns and backlog.is_hopeless((now_ns - received_ns) / SECOND_NS)):
         return message
     waiting = take_waiting(source.subscription)
-    believed = [source.hears(about) for _, about in waiting]
+    believed = [source.accepts(about) for _, about in waiting]
     if not all(believed):
         return None
     if not waiting:

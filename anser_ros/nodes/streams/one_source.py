@@ -50,7 +50,7 @@ class OneSource:
     Attributes
     ----------
     subscription : Subscription
-        The present one: that of a latched topic is made anew once it has a single sender again.
+        The present one: that of a latched topic is made again once it has a single sender again.
     """
 
     def __init__(
@@ -95,8 +95,8 @@ class OneSource:
         """Return how many publishers the graph knows, idle ones included."""
         return self._count(time.monotonic())
 
-    def hears(self, info: Mapping[str, Any], lasting: Hashable = None) -> bool:
-        """Take a message's information; return whether the message may be believed."""
+    def accepts(self, info: Mapping[str, Any], lasting: Hashable = None) -> bool:
+        """Take a message's information; return whether the message may be used."""
         now_s, number = time.monotonic(), info.get(NUMBER)
         if number is not None and not self._sources.continues(number):
             self._looked_s = 0.0  # the graph as it is at this moment is needed
@@ -117,7 +117,7 @@ class OneSource:
 
     def _take(self, message: Any, info: Mapping[str, Any]) -> None:
         lasting = None if self._lasting is None else self._lasting(message)
-        callback = self._callback if self.hears(info, lasting) else self._doubted
+        callback = self._callback if self.accepts(info, lasting) else self._doubted
         if callback is not None:
             callback(message, *([info] if self._informed else []))
 
@@ -136,6 +136,6 @@ def setup_source(node: 'AnserNode', callback: Callable[[Any], None]) -> OneSourc
     )  # fmt: skip
 
 
-def said_of(sources: list[OneSource]) -> str:
-    """Return what is said of topics with several senders; empty where each has one."""
+def sender_words(sources: list[OneSource]) -> str:
+    """Return the topics with several senders, in words; empty if each has one."""
     return '; '.join(filter(None, [source.said for source in sources]))

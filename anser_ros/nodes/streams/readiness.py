@@ -34,7 +34,7 @@ PATIENCE_S = 8.0
 
 
 def digest_of(setup_text: str) -> str:
-    """Return eight hexadecimal digits that tell setups apart."""
+    """Return eight hexadecimal digits that distinguish setups."""
     return hashlib.blake2b(setup_text.encode(), digest_size=4).hexdigest()
 
 
@@ -127,7 +127,7 @@ class Readiness:
         wanted: list[int],
         given: list[int],
     ) -> str:
-        """Return who ought to be there by what others are waiting for."""
+        """Return who should be there by what others are waiting for."""
         for (topic, names), count in zip(listeners.items(), matched, strict=True):
             if all(name.rsplit('/', 1)[1] in PASSIVE for name in names):
                 return f'no node processes {topic}'

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.ageing import ModelAge, Standing
+from anser_ros.integrity.ageing import FrameModel, ModelAge
 from anser_ros.nodes.tracker_parts.model_intake import GivenModel
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import OTHER_MODEL, REFERENCES_LOST, UNCALIBRATED, Withheld
@@ -92,13 +92,13 @@ class ModelInForce:
             return f'{served}, with {error.effects} effects to correct: give its model_file here'
         return ''
 
-    def at(self, stamp_ns: int) -> Standing:
+    def at(self, stamp_ns: int) -> FrameModel:
         """Return what a frame of fluxes may be tracked with."""
         self._frame_ns = stamp_ns
         if self.field is not None and self._age.newest_ns > stamp_ns + OTHER_CLOCK_NS:
             self._age.answered(stamp_ns, self.field)
         if self._differs:
-            return Standing(self.field, Withheld(OTHER_MODEL, self._differs))
+            return FrameModel(self.field, Withheld(OTHER_MODEL, self._differs))
         state = '' if self.given is None else self.given.withheld
         if state == UNCALIBRATED and self._uncalibrated:
             state = ''
@@ -106,5 +106,5 @@ class ModelInForce:
         if standing.model is None:
             standing = replace(standing, model=self.field)
         if state and state != REFERENCES_LOST:
-            return Standing(standing.model, Withheld(state, 'reported by field_model'))
+            return FrameModel(standing.model, Withheld(state, 'reported by field_model'))
         return standing

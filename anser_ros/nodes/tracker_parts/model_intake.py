@@ -20,7 +20,7 @@ MOST_EARLY = 32
 
 @dataclass(frozen=True)
 class GivenModel:
-    """Holds a model as it came; ``error`` is None where nobody tells its uncertainty."""
+    """Holds a model as it came; ``error`` is None if its uncertainty is not stated."""
 
     stamp_ns: int
     data: bytes

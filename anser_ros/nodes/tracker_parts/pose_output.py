@@ -34,7 +34,7 @@ class Tally:
 
 
 class PoseTopic:
-    """Publishes a sensor's or body's two pose topics; its messages are built once, filled anew."""
+    """Publishes a sensor's or body's two pose topics; its messages are built once, refilled."""
 
     def __init__(self, node: Any, name: str, frame_id: str, prefix: str = '') -> None:
         self.name = name

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from anser_ros.nodes.runtime.node import AnserNode
 
 QUIET_S = 2.0
-"""Time without a pose on a topic, s, after which it is said to be silent."""
+"""Time without a pose on a topic, s, after which it counts as silent."""
 
 
 def sensor_of(topic: str) -> str:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from anser_ros.field.model import EffectRecord
-from anser_ros.poses.effect import PoseEffect, PoseSight, Sensing
+from anser_ros.poses.effect import PoseEffect, PoseResiduals, Sensing
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -36,7 +36,7 @@ LOOSE, FAST = 0.5, 0.25
 and up to which the others' must be lower."""
 
 
-def windows_of(sensing: Sensing, sight: PoseSight) -> NDArray[np.int64]:
+def windows_of(sensing: Sensing, sight: PoseResiduals) -> NDArray[np.int64]:
     """Return the window of each pose of a sensor that counts; -1 for the others."""
     start = min(float(s.view.time[0]) for s in sight.sensors)
     share = (sensing.view.time - start) / max(sight.setting.duration, 1e-9)
@@ -44,7 +44,7 @@ def windows_of(sensing: Sensing, sight: PoseSight) -> NDArray[np.int64]:
     return np.where(sensing.used | sensing.out, window, -1)
 
 
-def episode_windows(sensing: Sensing, sight: PoseSight) -> list[int]:
+def episode_windows(sensing: Sensing, sight: PoseResiduals) -> list[int]:
     """Return windows in which a sensor is off that was right at other times at the same places."""
     window = windows_of(sensing, sight)
     square = np.sum(sensing.residual[:, :3] ** 2, axis=1)
@@ -80,7 +80,7 @@ class PoseMovingMetal(PoseEffect):
     summary = 'metal comes near for a while'
     units: ClassVar[Mapping[str, str]] = {'t_start_s': 's', 't_end_s': 's'}
 
-    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
         """Return one record for all sensors that are off at the time."""
         found = {s.view.sensor: episode_windows(s, sight) for s in sight.sensors}
         found = {name: windows for name, windows in found.items() if windows}
@@ -102,7 +102,7 @@ class LooseMount(PoseEffect):
     summary = 'a sensor moves against the body and the other sensors'
     units: ClassVar[Mapping[str, str]] = {'rms_m': 'm', 'rms_deg': 'deg'}
 
-    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
         """Return the sensor whose shifts are its own; a single sensor's could be anything else."""
         if len(sight.sensors) < 2:
             return []
@@ -123,7 +123,7 @@ class LooseMount(PoseEffect):
         return found
 
 
-def _shifts(sensing: Sensing, sight: PoseSight) -> tuple[float, float, float]:
+def _shifts(sensing: Sensing, sight: PoseResiduals) -> tuple[float, float, float]:
     """Share of squared error that windows' means in the body's frame explain; rms, m, rad."""
     window = windows_of(sensing, sight)
     back = (sensing.view.frame @ sensing.view.turn).transpose(0, 2, 1)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from anser_ros.field.model import EffectRecord
-from anser_ros.poses.effect import PoseEffect, PoseSight, Sensing
+from anser_ros.poses.effect import PoseEffect, PoseResiduals, Sensing
 
 Array = NDArray[np.float64]
 
@@ -106,7 +106,7 @@ class PoseExcessNoise(PoseEffect):
     summary = "a sensor's noise is larger than the others'"
     units: ClassVar[Mapping[str, str]] = {'factor': '1'}
 
-    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
         """Return each sensor that is noisier than the median of the others."""
         noise = {}
         law = RangeNoise().observed(sight)
@@ -133,7 +133,7 @@ class RangeNoise(PoseEffect):
     summary = 'jitter grows with the distance from the field generator'
     units: ClassVar[Mapping[str, str]] = {'exponent': '1', 'reference_m': 'm'}
 
-    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
         """Return a power law of all sensors together, each with a level of its own."""
         # Each sensor has a level of its own, so only what changes within one tells a power.
         pairs = [pair for pair in map(jitter, sight.sensors) if pair[0].size >= FEWEST]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.model import EffectRecord
-from anser_ros.poses.effect import PoseEffect, PoseSight
+from anser_ros.poses.effect import PoseEffect, PoseResiduals
 
 Array = NDArray[np.float64]
 
@@ -60,13 +60,13 @@ def stamp_step(time: Array) -> float:
     return 0.0
 
 
-def _is_wide(sight: PoseSight) -> tuple[float, float]:
+def _is_wide(sight: PoseResiduals) -> tuple[float, float]:
     """The median error of the stamps over the sensors, and what believing it gains."""
     rms = float(np.median([s.stamp_s for s in sight.sensors]))
     return rms, float(np.median([s.stamp_gain for s in sight.sensors]))
 
 
-def _step(sight: PoseSight, rms: float) -> float:
+def _step(sight: PoseResiduals, rms: float) -> float:
     """The step of the stamps that makes an error of that size, or zero."""
     for sensing in sight.sensors:
         step = stamp_step(sight.session.sensors[sensing.view.sensor].time)
@@ -82,7 +82,7 @@ class ReceiptJitter(PoseEffect):
     summary = 'stamps are those of receipt, and jitter'
     units: ClassVar[Mapping[str, str]] = {'rms_s': 's'}
 
-    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
         """Look for a residual that lies along the velocity and grows with it."""
         rms, gain = _is_wide(sight)
         if rms < LEAST_S or gain < BELIEVED or _step(sight, rms):
@@ -99,7 +99,7 @@ class QuantisedStamps(PoseEffect):
     summary = 'stamps are those of a poll'
     units: ClassVar[Mapping[str, str]] = {'step_s': 's'}
 
-    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
         """Look for an error of the stamps that is that of their grid."""
         rms, gain = _is_wide(sight)
         step = _step(sight, rms) if rms >= LEAST_S and gain >= BELIEVED else 0.0

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from anser_ros.diagnosis.decisions import FEWEST_OUTLIERS
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import LONGEST_GAP_S
-from anser_ros.poses.effect import PoseEffect, PoseSight, Sensing
+from anser_ros.poses.effect import PoseEffect, PoseResiduals, Sensing
 from anser_ros.poses.effects.episodes import episode_windows, windows_of
-from anser_ros.poses.sequence import PoseSequence, leaps
+from anser_ros.poses.sequence import PoseSequence, jumping_poses
 
 Array = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ class StalePoses(PoseEffect):
     summary = 'the same pose again under a new stamp'
     units: ClassVar[Mapping[str, str]] = {'fraction': '1', 'runs': '1'}
 
-    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
         """Return a record for each stream in which poses come again."""
         found = []
         for poses in _streams(sight):
@@ -71,7 +71,7 @@ class MissingPoses(PoseEffect):
     summary = 'poses are missing, or marked as such by the device'
     units: ClassVar[Mapping[str, str]] = {'fraction': '1', 'spans': 's'}
 
-    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
         """Return a record for each stream that lacks poses."""
         found = []
         for poses in _streams(sight):
@@ -97,7 +97,7 @@ class PoseOutliers(PoseEffect):
     summary = 'poses that fit no model, such as those of a marker in its other solution'
     units: ClassVar[Mapping[str, str]] = {'fraction': '1'}
 
-    def observed(self, sight: PoseSight) -> Sequence[EffectRecord]:
+    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
         """Return one record of the outlying poses of all sensors."""
         found = list(self._leaping(sight))
         outs = [_alone(sensing, sight) for sensing in sight.sensors]
@@ -128,19 +128,19 @@ class PoseOutliers(PoseEffect):
         }
         return [_record(self.name, values, {'fraction': float(np.sqrt(share / out.size))})]
 
-    def _leaping(self, sight: PoseSight) -> Iterator[EffectRecord]:
+    def _leaping(self, sight: PoseResiduals) -> Iterator[EffectRecord]:
         """The reference's poses that leap."""
         reference = sight.session.reference
         if reference is None:
             return
-        away = leaps(reference)
+        away = jumping_poses(reference)
         share = float(away.mean()) if away.size else 0.0
         if share > FEWEST_OUTLIERS and np.count_nonzero(away) >= FEWEST_POSES:
             values = {'fraction': share, 'stream': reference.name}
             yield _record(self.name, values, {'fraction': float(np.sqrt(share / away.size))})
 
 
-def _alone(sensing: Sensing, sight: PoseSight) -> NDArray[np.bool_]:
+def _alone(sensing: Sensing, sight: PoseResiduals) -> NDArray[np.bool_]:
     """Poses of a sensor that stand out, less those of an episode, which are off together."""
     inside = np.isin(windows_of(sensing, sight), episode_windows(sensing, sight))
     return np.asarray(sensing.out & ~inside)
@@ -152,7 +152,7 @@ def _record(
     return EffectRecord(name, parameters, uncertainty)
 
 
-def _streams(sight: PoseSight) -> list[PoseSequence]:
+def _streams(sight: PoseResiduals) -> list[PoseSequence]:
     reference = sight.session.reference
     return [*sight.session.sensors.values(), *([reference] if reference else [])]
 

@@ -15,8 +15,8 @@ from anser_ros.poses.path import OpticalPath
 Array = NDArray[np.float64]
 
 TAUS_S = (0.015, 0.03, 0.06, 0.12, 0.24)
-"""Time constants that are tried, s: below a hundredth no hand's motion tells a filter from a
-delay, beyond a quarter nobody would work with the tracker."""
+"""Time constants that are tried, s: below a hundredth no hand's motion distinguishes a filter from
+a delay, beyond a quarter nobody would work with the tracker."""
 
 
 class TrackerLag(PoseEffect):

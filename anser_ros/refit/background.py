@@ -23,20 +23,20 @@ def _worker() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=1, thread_name_prefix='refit')
 
 
-def begin_beside(work: Callable[[], None]) -> None:
-    """Let the thread do what spares a later frame some time and changes no result."""
+def begin_in_background(work: Callable[[], None]) -> None:
+    """Start work in the thread that saves a later frame time and changes no result."""
     _worker().submit(work)
 
 
-class Beside(Generic[Result]):
-    """Runs one piece of work that has been given to the thread.
+class BackgroundTask(Generic[Result]):
+    """Runs one piece of work in the background thread.
 
     Parameters
     ----------
     work : callable
-        Must only read what nobody changes.
+        Must only read what nothing else changes.
     stamp_ns : int
-        Of the frame that asks.
+        Stamp of the frame that starts it, ns.
     """
 
     def __init__(self, work: Callable[[], Result], stamp_ns: int) -> None:
