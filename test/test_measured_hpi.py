@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from anser_ros.assessment.hummel import rigid_distances
 from anser_ros.errors import FitError
 from anser_ros.measured import hpi_coils
 from anser_ros.measured.hpi_channels import examine
@@ -23,7 +24,6 @@ from anser_ros.measured.hpi_places import (
     distance_mm,
     order_of,
     outward,
-    rigid_distance,
 )
 from anser_ros.measured.squid_array import ChipErrors, SquidArray, whitener
 
@@ -193,7 +193,7 @@ class TestPlaces:
         turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         turn *= np.sign(np.linalg.det(turn))
         moved = points @ turn.T + 1.0
-        assert rigid_distance(moved, points).max() < 1e-12
+        assert rigid_distances(moved, points).max() < 1e-12
         order = [2, 0, 3, 1]
         assert order_of(moved, points[order]) == order
         assert distance_mm(moved, points[order]) < 1e-9

@@ -1,7 +1,7 @@
 """How far a command is, where there is no terminal: few lines, with a share and a time."""
 
 from anser_ros.cli import progress
-from anser_ros.cli.progress import SAY_S, progress_of, stages_of
+from anser_ros.cli.progress import SAY_S, progress_of
 
 
 def test_lines_come_now_and_then_with_the_share_and_the_time_that_is_left(monkeypatch, capsys):
@@ -44,7 +44,7 @@ def test_a_short_command_says_nothing(capsys):
 def test_stages_are_lines_of_their_own_once_it_takes_long(monkeypatch, capsys):
     now_s = [100.0]
     monkeypatch.setattr(progress.time, 'monotonic', lambda: now_s[0])
-    with stages_of('diagnosing') as say:
+    with progress_of('diagnosing') as say:
         say('a first look')
         now_s[0] += 12.0
         say('joint fit')

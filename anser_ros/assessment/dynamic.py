@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.assessment.intervals import (
+    BLOCKS,
     LEVEL,
     IntervalEstimate,
     blocks_of_time,
@@ -24,9 +25,6 @@ Array = NDArray[np.float64]
 
 GROUPS = 5  # groups of speeds, with equal numbers of poses: a row of the table each
 FEWEST_POSES = 100  # fewer leave a group less than 20, whose 95th percentile would be one pose
-BLOCKS = 20
-"""Stretches of time that are drawn again. More are so short that neighbours err alike; with fewer
-the ends of an interval depend on single ones."""
 SLOWEST_M_S = 0.02
 """Median speed below which a recording is of a rest, where a jitter of 0.1 mm is 5 ms of
 latency."""
@@ -103,7 +101,7 @@ def assess_motion(found: HandEye, sensor: str, rng: np.random.Generator) -> Dyna
     # A late pose is where the tool was: back along the velocity by speed times latency.
     live = rest - offset * velocity
     error, error_live = np.linalg.norm(rest, axis=1), np.linalg.norm(live, axis=1)
-    clusters = blocks_of_time(time, BLOCKS)
+    clusters = blocks_of_time(time)
     edges = np.quantile(speed, np.linspace(0, 1, GROUPS + 1))
     groups = []
     for k in range(GROUPS):

@@ -26,7 +26,6 @@ Array = NDArray[np.float64]
 
 FEWEST_READINGS = 10  # of a point: fewer give no mean that a bad reading leaves alone
 MOST_READINGS = 2000  # that take part, evenly over the recording: two million pairs of them
-BLOCKS = 20  # stretches of time that are drawn again: a hand's tilt takes about a second
 FAR_M = 0.05
 """Extent of readings, m, beyond which they are no readings of one location."""
 FEWEST_FOR_OUTLIER = 6
@@ -67,7 +66,7 @@ def single_point(
         )
     size = 1e3 * np.linalg.norm(place - place.mean(axis=0), axis=1)
     group = grouped('mm', [f'Reading at {t:.2f} s' for t in time], size,
-                    [blocks_of_time(time, BLOCKS)], rng)  # fmt: skip
+                    [blocks_of_time(time)], rng)  # fmt: skip
     return group, {'span_m': IntervalEstimate(_span(place))}
 
 

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.assessment.intervals import (
     IntervalEstimate,
     cluster_weights,
+    equal_parts,
     summarised,
     widest,
 )
@@ -238,15 +239,9 @@ def _group(
     clusters = [np.array(lines)]
     if alike:
         ends = np.array(pairs, dtype=np.float64)
-        clusters += [_strips(ends[:, k] + ends[:, k + 2]) for k in (0, 1)]
+        # Strips of the board that the middle of each distance is in.
+        clusters += [equal_parts(ends[:, k] + ends[:, k + 2], PARTS) for k in (0, 1)]
     return grouped('mm', words, np.array(signed), clusters, rng)
-
-
-def _strips(middle: Array) -> NDArray[np.int64]:
-    """The strip of the board, of `PARTS` of one width, that the middle of each distance is in."""
-    extent = max(float(np.ptp(middle)), 1e-9)
-    numbers = (PARTS * (middle - middle.min()) / extent).astype(np.int64)
-    return np.asarray(np.minimum(numbers, PARTS - 1), dtype=np.int64)
 
 
 def grouped(
@@ -269,11 +264,16 @@ def matching_error(place: Array, grid: Grid) -> float:
     return rigid_distance(true.astype(np.float64), place.reshape(-1, 3))
 
 
-def rigid_distance(true: Array, measured: Array) -> float:
-    """Return the rms distance, m, of points (n, 3) that are laid on each other rigidly."""
+def rigid_distances(true: Array, measured: Array) -> Array:
+    """Return the distances (n,), m, of points (n, 3) that are laid on each other rigidly."""
     left, right = measured - measured.mean(axis=0), true - true.mean(axis=0)
-    root = Rotation.align_vectors(left, right)[1]  # of the sum of squares
-    return float(root / np.sqrt(len(true)))
+    turn = Rotation.align_vectors(left, right)[0]
+    return np.asarray(np.linalg.norm(turn.apply(right) - left, axis=1))
+
+
+def rigid_distance(true: Array, measured: Array) -> float:
+    """Return the root mean square of `rigid_distances`, m."""
+    return float(np.sqrt(np.mean(rigid_distances(true, measured) ** 2)))
 
 
 def rotation_errors(

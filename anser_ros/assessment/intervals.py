@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 
 LEVEL = 0.95
 """Probability with which an interval holds what it is an interval of."""
+BLOCKS = 20
+"""Stretches of time whose errors count as alike. More are so short that neighbours err alike, a
+hand's tilt takes about a second; with fewer the ends of an interval depend on single ones."""
 DRAWS = 1000  # resamples; the ends of an interval scatter by a few hundredths of its width
 CHUNK = 1_000_000  # numbers of a piece of the resamples, which takes 8 MB of memory
 FEWEST = 3  # clusters without which nothing is resampled: two have three different resamples
@@ -173,8 +176,13 @@ def deviation_interval(value: float, freedoms: float) -> IntervalEstimate:
     )
 
 
-def blocks_of_time(time: Array, count: int) -> NDArray[np.int64]:
-    """Return the number of the equal stretch of time, of so many, that each moment (n,) is in."""
-    length = max(float(np.ptp(time)), 1e-9)
-    numbers = (count * (time - time.min()) / length).astype(np.int64)
+def blocks_of_time(time: Array) -> NDArray[np.int64]:
+    """Return the number of the equal stretch of time, of `BLOCKS`, that each moment (n,) is in."""
+    return equal_parts(time, BLOCKS)
+
+
+def equal_parts(values: Array, count: int) -> NDArray[np.int64]:
+    """Return which of so many parts of equal extent each value (n,) is in."""
+    extent = max(float(np.ptp(values)), 1e-9)
+    numbers = (count * (values - values.min()) / extent).astype(np.int64)
     return np.asarray(np.minimum(numbers, count - 1), dtype=np.int64)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from anser_ros.assessment.intervals import blocks_of_time
 from anser_ros.errors import FitError
 from anser_ros.poses.diagnosis import turn_jitter
 from anser_ros.poses.sequence import PoseSequence
@@ -38,7 +39,6 @@ LEAST_TILT_DEG = 8.0
 place along it is refused: noise and distortions then decide on it."""
 TWO_AXES = 0.25
 """Share of the middle tilt below which the least one is called turning about a single axis."""
-BLOCKS = 20  # stretches of time whose errors count as alike
 SMALLEST_SIGMA_M = 1e-7  # of a coordinate; simulated poses without noise have no scale
 
 
@@ -227,8 +227,7 @@ def _covariance(
     rest = (place + turn @ tip - point)[agrees]
     turned, when = turn[agrees], time[agrees]
     formal = inverse * float(np.sum(rest**2)) / (3 * len(rest) - 6)
-    length = max(float(when[-1] - when[0]), 1e-9)
-    blocks = np.minimum((BLOCKS * (when - when[0]) / length).astype(int), BLOCKS - 1)
+    blocks = blocks_of_time(when)
     scores = np.concatenate([np.einsum('nji,nj->ni', turned, rest), -rest], axis=1)
     sums = np.stack([scores[blocks == b].sum(axis=0) for b in np.unique(blocks)]) @ inverse
     robust = np.sum(sums**2, axis=0) * len(sums) / max(len(sums) - 6, 1)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_basis
+from anser_ros.physics.sensor import along_each_axis
 
 Array = NDArray[np.float64]
 
@@ -24,7 +25,7 @@ class DipoleSites:
     @staticmethod
     def of_any_direction(places: Array) -> 'DipoleSites':
         """Return three dipoles, along x, y and z, at each of P places (P, 3), m."""
-        return DipoleSites(np.repeat(places, 3, axis=0), np.tile(np.eye(3), (len(places), 1)))
+        return DipoleSites(*along_each_axis(places))
 
     def joined(self, other: 'DipoleSites') -> 'DipoleSites':
         """Return these dipoles, then the others."""

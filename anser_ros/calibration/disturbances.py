@@ -27,17 +27,17 @@ was near the same place, from which on something moved. What a field's model mis
 a scan is a few times the noise, in power; what moves there leaves it also a millimetre away.
 Smaller takes the edge of a scan for metal; larger fits a field to metal that moved."""
 SHORTEST_S = 2.0
-"""Time, s, for which a tool must see that something moves: a glimpse is no path. Shorter takes
-single bad stretches for metal; longer misses what passes quickly. How the value was chosen is not
-recorded."""
+"""Time, s, for which a tool must see that something moves: four stretches, as a path needs a
+beginning, an end and a way between. Shorter takes single bad stretches for metal; longer misses
+what passes quickly."""
 SEEN = 8.0
 """Power of the references' deviation in a stretch, in standard deviations beyond the noise's, from
-which on something moved. Smaller takes slow drifts for metal; larger misses small metal far away.
-How the value was chosen is not recorded."""
+which on something moved; noise reaches it once in 1e15 stretches. Smaller takes slow drifts for
+metal; larger misses small metal far away."""
 EDGE = 3.0
-"""The same, beside a stretch that something moved in: it comes and goes gradually. Smaller spreads
-a disturbance over quiet stretches next to it; larger leaves its beginning and end in the data. Its
-choice is not recorded."""
+"""The same, beside a stretch that something moved in: it comes and goes gradually, and noise alone
+reaches it in one stretch of 700. Smaller spreads a disturbance over quiet stretches next to it;
+larger leaves its beginning and end in the data."""
 ROUNDS = 6
 """Rounds in which the quiet stretches are distinguished from the others. Fewer may end before the
 stretches have settled; more cost a fit each."""

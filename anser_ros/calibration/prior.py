@@ -16,6 +16,7 @@ from anser_ros.calibration.readings import usable_readings
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_basis
+from anser_ros.physics.sensor import along_each_axis
 
 Array = NDArray[np.float64]
 
@@ -25,16 +26,19 @@ second one along z). With three axes a point they are some 2000 equations for at
 dipoles; fewer would leave the field between the points free."""
 MARGIN = 0.3
 """How far beyond the measured volume the drawn field is followed, as a fraction of its half size,
-so that a model extrapolates as the drawing does. Smaller leaves the field beyond the edge of a
-scan free; larger spends dipoles on places where nobody measures. Its choice is not recorded."""
+so that a model extrapolates as the drawing does: a scan as wide as the board then covers the box
+in which poses are accepted, 1.15 times 1.15 as wide (`volume.BESIDE`, `volume.FRINGE`). Smaller
+leaves the field beyond the edge of a scan free; larger spends dipoles on places where nobody
+measures."""
 LEAST_HALF_SIZE_M = 0.02
-"""Half size of that volume at least, m, for measurements along a line or in a plane. Smaller gives
-a lattice so flat that it does not tell the field across it; larger follows the drawing far from
-what was measured. Its choice is not recorded."""
+"""Half size of that volume at least, m, for measurements along a line or in a plane: over 2 cm a
+field 10 cm from its coils changes by half, which shows how it falls. Smaller gives a lattice so
+flat that it does not tell the field across it; larger follows the drawing far from what was
+measured."""
 LEAST_HEIGHT = 0.8
-"""Lowest point of that volume as a fraction of the lowest reading's height. Smaller asks for the
-field farther down, where that of the drawn coils changes too fast for a layer of dipoles; larger
-leaves it free just below the scan. Its choice is not recorded."""
+"""Lowest point of that volume as a fraction of the lowest reading's height: there the field is at
+most twice as strong as at that reading. Smaller asks for the field farther down, where that of the
+drawn coils changes too fast for a layer of dipoles; larger leaves it free just below the scan."""
 PROJECTION_DAMPING = 1e-6
 """Damping when a known field without noise is expressed by dipoles, as a fraction of the largest
 singular value. It only keeps nearly parallel columns from making huge moments."""
@@ -81,7 +85,7 @@ def volume_lattice(measurements: Sequence[Measurements]) -> tuple[Array, Array]:
     lattice = np.stack(np.meshgrid(steps, steps, steps[::2], indexing='ij'), axis=3)
     where = middle + lattice.reshape(-1, 3) * half
     where[:, 2] = np.maximum(where[:, 2], LEAST_HEIGHT * low[2])
-    return np.repeat(where, 3, axis=0), np.tile(np.eye(3), (len(where), 1))
+    return along_each_axis(where)
 
 
 def emitter_gains(nominal: FieldModel, measurements: Sequence[Measurements]) -> ComplexArray:

@@ -17,7 +17,7 @@ matplotlib.use('Agg')
 import matplotlib.pyplot as plt
 
 from anser_ros.cli.output import make_folder, say_written
-from anser_ros.cli.progress import stages_of
+from anser_ros.cli.progress import progress_of
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.comparison import (
     Compared,
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
     if args.out is not None:
         make_folder(args.out)
-    with stages_of('comparing') as tell:
+    with progress_of('comparing') as tell:
         one, two = read_errors(args.first), read_errors(args.second)
         tell('resampling')
         rng = np.random.default_rng(SEED)

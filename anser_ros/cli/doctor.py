@@ -24,7 +24,7 @@ from rich.table import Table
 
 from anser_ros.cli.commands import NODES
 from anser_ros.cli.missing import OPTIONAL, PYPI
-from anser_ros.cli.progress import stages_of
+from anser_ros.cli.progress import progress_of
 from anser_ros.errors import ParameterError
 
 SCHEMA = 'anser_doctor/1'
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the command: 0 where nothing is wrong, 2 where something is."""
     if not 0.0 < args.seconds <= LONGEST_LOOK_S:
         raise ParameterError(f'--seconds must lie in 0 .. {LONGEST_LOOK_S:g}, got {args.seconds}')
-    with stages_of('looking') as tell:
+    with progress_of('looking') as tell:
         findings: list[Observation] = []
         for name, look in looks(args.device, args.seconds):
             tell(f'looking at {name}')

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from anser_ros.calibration.error_map import ErrorMap, HeldOutError, learn_error_map
 from anser_ros.cli.output import make_folder, say_written
-from anser_ros.cli.progress import stages_of
+from anser_ros.cli.progress import progress_of
 from anser_ros.errors import FitError, ParameterError, PlausibilityError
 from anser_ros.poses.point_model import to_point_model
 from anser_ros.sessions.plausibility import check_points
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
         check_points(tracked, true)
     except PlausibilityError as error:
         raise PlausibilityError(f'{args.points}: {error}') from error
-    with stages_of('learning') as tell:
+    with progress_of('learning') as tell:
         tell(f'a map of {len(tracked)} places')
         error_map = learn_error_map(tracked, true, registers=args.register)
     if args.apply is not None:

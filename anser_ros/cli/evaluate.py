@@ -2,7 +2,6 @@
 
 import argparse
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ from rich.table import Table
 from anser_ros.cli.evaluation_figures import write_figures
 from anser_ros.cli.output import Result, loss_notes, make_folder, say, snapshot_notes
 from anser_ros.cli.pose_session import add_pose_options, evaluate_pose_session, need_model
-from anser_ros.cli.progress import progress_of, stages_of
+from anser_ros.cli.progress import Tell, progress_of
 from anser_ros.cli.session_runs import finish, perform, runs_of
 from anser_ros.cli.stated_values import add_resurveyed, add_stated_values, stated_values
 from anser_ros.errors import ParameterError
@@ -104,12 +103,8 @@ def run(args: argparse.Namespace) -> int:
     if len(args.sessions) > 1:
         return _several(args)
     args.session = args.sessions[0]
-    if args.poses:  # what its search has before it is not known
-        with stages_of('evaluating') as reached:
-            result = work(args, lambda stage, _: reached(stage))
-    else:
-        with progress_of('evaluating') as tell:
-            result = work(args, tell)
+    with progress_of('evaluating') as tell:
+        result = work(args, tell)
     say('evaluate', result, as_json=args.json)
     return 0
 
@@ -126,7 +121,7 @@ def _several(args: argparse.Namespace) -> int:
     return finish('evaluate', 'evaluate', outcomes, args)
 
 
-def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result:
+def work(args: argparse.Namespace, tell: Tell) -> Result:
     """Evaluate the session of the arguments into its folder.
 
     Parameters
@@ -134,10 +129,10 @@ def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result
     args : argparse.Namespace
         Of `add_arguments`, and ``session``, the one to evaluate.
     tell : callable
-        Called with the stage and the finished share of it.
+        Called with the stage, and the finished share of it where that is known.
     """
     if args.poses:
-        return evaluate_pose_session(args, lambda stage: tell(stage, 0.0))
+        return evaluate_pose_session(args, tell)
     need_model(args)
     session = load_session(args.session).with_stated(stated_values(args))
     if args.witnesses and not args.refit:

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 from anser_ros.cli.output import make_folder, say_written
-from anser_ros.cli.progress import stages_of
+from anser_ros.cli.progress import progress_of
 from anser_ros.sessions.bag_export import CSV, FORMATS, export_bag
 
 SCHEMA = 'anser_export/1'
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
     make_folder(args.out)
-    with stages_of('exporting') as tell:
+    with progress_of('exporting') as tell:
         tell(f'reading {args.bag}')
         written = export_bag(args.bag, args.out, args.format)
     if args.json:

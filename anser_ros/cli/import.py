@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from anser_ros.cli.output import check_new_file, say_written
-from anser_ros.cli.progress import stages_of
+from anser_ros.cli.progress import progress_of
 from anser_ros.errors import ParameterError
 from anser_ros.sessions.bag_import import import_bag, parse_remaps
 from anser_ros.sessions.table_import import import_tables
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     if is_document and (args.remap or args.setup is not None):
         raise ParameterError('--remap and --setup are for bags; a document names its own setup')
     lost, left_out = '', {}
-    with stages_of('importing') as tell:
+    with progress_of('importing') as tell:
         tell(f'reading {args.source}')
         if is_document:
             counts = import_tables(args.source, args.out).messages

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 from anser_ros.cli.output import check_new_file, say_written
-from anser_ros.cli.progress import stages_of
+from anser_ros.cli.progress import progress_of
 from anser_ros.errors import ParameterError
 from anser_ros.poses.forms import ORDERS, UNITS
 from anser_ros.poses.importing import STAMPS, import_poses
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
     names = [parse_name(text) for text in args.name]
     check_new_file(args.out)
-    with stages_of('reading') as tell:
+    with progress_of('reading') as tell:
         session = import_poses(
             args.tracked,
             args.reference,

@@ -2,8 +2,9 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
@@ -15,9 +16,16 @@ LEAST_SHARE, LEAST_S = 0.1, 1.0
 left is told. Before, it would be that of loading and compiling, which do not come again."""
 
 
+class Tell(Protocol):
+    """Takes what has been reached."""
+
+    def __call__(self, stage: str, share: float | None = None) -> None:
+        """Take in the stage and the finished share of it, 0 to 1, where that is known."""
+
+
 @contextmanager
-def progress_of(command: str) -> Iterator[Callable[[str, float], None]]:
-    """Yield a function that takes the stage and the finished share of it, 0 to 1.
+def progress_of(command: str) -> Iterator[Tell]:
+    """Yield a function that takes how far a command is.
 
     Parameters
     ----------
@@ -33,35 +41,19 @@ def progress_of(command: str) -> Iterator[Callable[[str, float], None]]:
         TextColumn('{task.fields[left]}'),
     )  # fmt: skip
     with Progress(*columns, console=console) as bar:
-        task, stage = bar.add_task(command, total=1.0, left=''), command
+        task, stage = bar.add_task(command, total=None, left=''), command
         remaining = _Remaining()
 
-        def tell(name: str, share: float) -> None:
+        def tell(name: str, share: float | None = None) -> None:
             nonlocal stage
             if name != stage:
                 stage = name
                 bar.reset(task, description=name)
-            bar.update(task, completed=share, left=remaining.words(name, share))
+            bar.tasks[0].total = None if share is None else 1.0  # without one the bar only moves
+            left = '' if share is None else remaining.words(name, share)
+            bar.update(task, completed=share or 0.0, left=left)
 
         yield tell
-
-
-@contextmanager
-def stages_of(command: str) -> Iterator[Callable[[str], None]]:
-    """Yield a function that takes words on what has been reached, where no share is known."""
-    console = Console(stderr=True)
-    if console.is_terminal:
-        with console.status(command) as status:
-            yield status.update
-        return
-    begin_s = time.monotonic()
-
-    def tell(what: str) -> None:
-        past_s = time.monotonic() - begin_s
-        if past_s > SAY_S:
-            print(f'{command}: {what}, after {past_s:.0f} s', file=sys.stderr, flush=True)
-
-    yield tell
 
 
 class _Remaining:
@@ -93,13 +85,20 @@ class _Lines:
 
     def __init__(self, command: str) -> None:
         self._command, self._remaining = command, _Remaining()
-        self._said_s = time.monotonic()
+        self._begin_s = self._said_s = time.monotonic()
 
-    def tell(self, stage: str, share: float) -> None:
+    def tell(self, stage: str, share: float | None = None) -> None:
         """Take in how far a stage is, and say it where it is time to."""
-        now_s, left = time.monotonic(), self._remaining.words(stage, share)
+        now_s = time.monotonic()
+        if share is None:
+            if now_s - self._begin_s > SAY_S:
+                self._say(f'{stage}, after {now_s - self._begin_s:.0f} s')
+            return
+        left = self._remaining.words(stage, share)
         if now_s - self._said_s < SAY_S:
             return
         self._said_s = now_s
-        words = ', '.join(filter(None, (f'{stage}, {share:.0%}', left)))
+        self._say(', '.join(filter(None, (f'{stage}, {share:.0%}', left))))
+
+    def _say(self, words: str) -> None:
         print(f'{self._command}: {words}', file=sys.stderr, flush=True)

@@ -16,6 +16,7 @@ from typing import Any
 import numba.core.event
 from numba.core.dispatcher import Dispatcher
 
+from anser_ros.cli.progress import SAY_S
 from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import fill_frame
@@ -27,8 +28,6 @@ from anser_ros.wire.setup import parse_setup
 SCHEMA = 'anser_warm_up/1'
 POLL_S = 0.2
 """Time from one look at the processes to the next, s: how late their end is noticed."""
-SAY_S = 5.0
-"""Time from one line about the progress to the next, s; all takes about a minute."""
 PACKAGE = 'anser_ros.'
 
 

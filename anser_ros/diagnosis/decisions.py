@@ -23,8 +23,9 @@ Unless a number says otherwise, it was chosen by hand on injected effects with s
 
 # --- whether an effect is accepted -------------------------------------------------------------
 FOLDS = 4
-"""Parts of the cross-validation over time blocks: each fit uses three quarters of them. More cost
-a fit each, fewer leave less to fit on. Its choice is not recorded."""
+"""Parts of the cross-validation over time blocks: of the twenty blocks that are fitted each part
+holds out five, as many as take no part at all. More cost a fit each, fewer leave less to fit
+on."""
 LEAST_GAIN = 40.0
 """Gain, in units of the misfit, that any effect must have before its parameters are paid for. The
 best of 700 candidates gains about 15 on a clean session; smaller lets chance win now and then,

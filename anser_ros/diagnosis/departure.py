@@ -13,7 +13,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.decisions import FOLDS, SOMETHING_LEFT
+from anser_ros.diagnosis.decisions import SOMETHING_LEFT
 from anser_ros.diagnosis.fit import Fit, Fitter
 from anser_ros.diagnosis.moving_start import course_of
 from anser_ros.diagnosis.outlying import without_outliers
@@ -33,40 +33,44 @@ ComplexArray = NDArray[np.complex128]
 
 KNOTS = 9
 """Knots of a path to begin with: three seconds apart in half a minute of moving. Fewer cannot
-follow a way that stops; more start the fit with parameters that few frames determine. How the
-value was chosen is not recorded."""
+follow a way that stops for some seconds; more start the fit with parameters that few of the
+`SOME_FRAMES` determine, of which each knot now has six or seven."""
 FINE_KNOTS = 17
 """Knots at last. A spline of few pieces cannot rest at its ends, where what is asked is told: with
 nine the metal at rest was half again too strong, with 17 and with 25 right."""
 PATH_LENGTHS_M = (0.12, 0.24)
-"""Lengths of the ways that are tried, m: the shorter about a hand's way, twice it, and between
-them the fit finds its way. Only shorter ones, and metal that crosses the volume is not found; only
-longer ones, and a start lies too far from a small movement. How the value was chosen is not
-recorded."""
+"""Lengths of the ways that are tried, m: about a hand's way, and twice it, which is the width of
+the volume. A way between them is within a factor of 1.4 of one. Only shorter ones, and metal that
+crosses the volume is not found; only longer ones, and a start lies too far from a small
+movement."""
 SLOPE = 0.57
-"""Share of a way that goes down, for ways to the side: metal that goes away does not come nearer
-to the tools above the board, and hardly ever goes level. Smaller, and starts are level; larger,
-and metal that is drawn aside is looked for below. How the value was chosen is not recorded."""
+"""Share of a way that goes down, for ways to the side, the sine of 35 deg: with the way straight
+down these are within 29 deg of every way that goes down by 15 deg or more. Metal that goes away
+does not come nearer to the tools above the board, and hardly ever goes level. Smaller, and starts
+are level; larger, and metal that is drawn aside is looked for below."""
 AROUND = 8
 """Directions to the side in which a way is tried, one in 45 deg. Fewer may start too far from the
 true way for the fit to find it; time grows with their number."""
 FEW_FRAMES, SOME_FRAMES, MANY_FRAMES = 25, 60, 300
-"""Frames of a tool, about, on which ways are compared, refined, and fitted at last. Fewer are
-faster and noisier; more cost time in proportion and tell little, as neighbouring frames are alike.
-How the value was chosen is not recorded."""
+"""Frames of a tool, about, on which ways are compared, refined, and fitted at last: one, two or
+three, and a dozen in each of the 25 blocks of time. Fewer are faster and noisier; more cost time
+in proportion and tell little, as neighbouring frames are alike."""
 BODY = Richness(90, (25,), SOMETHING_LEFT)
 """How finely the body is shaped, and the path divided beyond `FINE_KNOTS` where much is left."""
 STEPS = 6
-"""Steps of a fit at most; fewer end before it has settled, and each further one costs as much time
-as the one before. Its choice is not recorded."""
+"""Steps of a fit at most: it ends by itself once it has settled (`fit.SETTLED`), and a path that
+creeps for longer is judged by what it foretells. Fewer cut fits that would settle; each further
+one costs as much time as the one before."""
 EXPLAINED = 0.1
-"""Share of the power in unseen blocks, beyond the noise's, that may stay: with more, the body is
-no picture of this metal, and what it does at rest would be a guess. Smaller leaves metal in the
-field that is nearly understood. Its choice is not recorded."""
+"""Share of the power in unseen blocks, beyond the noise's, that may stay. Its root, a third, is
+what then is wrong of the metal's field, as much as `KNOWN` allows; with more, the body is no
+picture of this metal, and what it does at rest would be a guess. Smaller leaves metal in the field
+that is nearly understood."""
 KNOWN = 0.3
 """Standard deviation of what the metal does at rest, relative to that, from which on it is not
-taken off: it would be made worse as likely as better. Larger takes off guesses; smaller leaves
-metal in the field that was known well enough. Its choice is not recorded."""
+taken off. Below it a third stays at most, typically, and taking it off makes a field worse less
+than once in a thousand times. Larger takes off guesses; smaller leaves metal in the field that was
+known well enough."""
 
 
 @dataclass(frozen=True)
@@ -124,16 +128,16 @@ def departure(problem: Problem, rest_s: float) -> Departure | None:
         return None
     blocks = train_blocks()
     effect = DepartedMetal(rest_s=rest_s)
-    few, some = (_thinned(problem.in_blocks(blocks), count) for count in (FEW_FRAMES, SOME_FRAMES))
+    few, some = (problem.in_blocks(blocks).thinned(count) for count in (FEW_FRAMES, SOME_FRAMES))
     best_starts = _best_starts(few, effect, blocks)
     fits = [_refined(some, start, kind, blocks) for start, kind in best_starts]
     known = [fit for fit in fits if fit is not None]
     if not known:
         return None
-    fitter = Fitter(some, blocks, FOLDS, STEPS)
+    fitter = Fitter(some, blocks, STEPS)
     best = Shaping(fitter, BODY).with_freer_course(min(known, key=fitter.held_out), 0)
     cleaned = without_outliers(problem, evaluate(problem, best.terms))
-    last = Fitter(_thinned(cleaned.in_blocks(blocks), MANY_FRAMES), blocks, FOLDS, STEPS)
+    last = Fitter(cleaned.in_blocks(blocks).thinned(MANY_FRAMES), blocks, STEPS)
     fit = last.fit(best.terms)
     unseen = cleaned.in_blocks(test_blocks())
     return Departure(fit, _power(evaluate(unseen, ())), _power(evaluate(unseen, fit.terms)))
@@ -145,14 +149,6 @@ def _power(state: State) -> float:
     count = [np.count_nonzero(part.whitener.weight, axis=1) for part in state.parts]
     used = np.concatenate(count)
     return float(np.median(np.concatenate(each)[used > 0] / used[used > 0]))
-
-
-def _thinned(problem: Problem, frames: int) -> Problem:
-    """About so many frames per tool."""
-    most = max((tool.time.size for tool in problem.tools), default=0)
-    step = max(1, round(most / frames))
-    keep = [np.arange(0, tool.time.size, step) for tool in problem.tools]
-    return problem.frames(keep, np.arange(problem.reference_blocks.size))
 
 
 def _best_starts(
@@ -169,7 +165,7 @@ def _best_starts(
 
             none = [np.zeros((*part.white.shape, 0)) for part in state.parts]
             modes = rich_modes(
-                state, (list(none), np.zeros(0)), unit, body_sizes(kind), blocks, FOLDS,
+                state, (list(none), np.zeros(0)), unit, body_sizes(kind), blocks,
                 BODY.modes,
             )  # fmt: skip
             if modes is not None:
@@ -189,7 +185,7 @@ def _starts(
     duration, still = problem.apparatus.duration, effect.still
     assert still is not None and problem.references is not None
     knots = np.linspace(0.0, duration, KNOTS)
-    scorer = Scorer(state, blocks, FOLDS)
+    scorer = Scorer(state, blocks)
     scored = [
         (term, score)
         for term in still.candidates(problem.apparatus)
@@ -226,7 +222,7 @@ def _refined(
     problem: Problem, start: DepartedTerm, kind: str, blocks: NDArray[np.int64]
 ) -> Fit | None:
     """Body and path together, first coarsely; the body is reshaped for the finer path."""
-    fitter = Fitter(problem, blocks, FOLDS, STEPS)
+    fitter = Fitter(problem, blocks, STEPS)
     shaping = Shaping(fitter, BODY)
     fit = shaping.shaped_as(fitter.fit([start.hold()], 0), 0, start, [kind])
     if fit is None:

@@ -100,7 +100,7 @@ class Screened:
 
     def training(self, frames: int) -> Problem:
         """Return about so many frames per tool of the blocks to choose and fit effects on."""
-        return _thinned(self.start.in_blocks(train_blocks()), frames)
+        return self.start.in_blocks(train_blocks()).thinned(frames)
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def diagnose(
 
 def screen(problem: Problem) -> Screened:
     """Name the faults of the wiring, and leave out dead channels and values that stand out."""
-    known = wiring_faults(_thinned(problem, WIRING_FRAMES))
+    known = wiring_faults(problem.thinned(WIRING_FRAMES))
     whole = _without_dead(problem, known)
     return Screened(tuple(known), whole, whole if known else clean_start(whole))
 
@@ -171,7 +171,7 @@ def confirm(screened: Screened, search: Search, how: SearchSettings) -> Confirme
     fit, refused = _settled(how.fitter(search.fit.state.problem, blocks), last, search)
     cleaned = without_outliers(whole, evaluate(whole, fit.terms))
     if outlying_share(screened.start, cleaned)[0] > FEWEST_OUTLIERS:
-        thinned = _thinned(cleaned.in_blocks(blocks), FINAL_FRAMES)
+        thinned = cleaned.in_blocks(blocks).thinned(FINAL_FRAMES)
         fit = settled(how.fitter(thinned, blocks), fit.terms, FINE)
     return Confirmed(fit, cleaned, refused)
 
@@ -189,14 +189,6 @@ def _without_dead(problem: Problem, known: Sequence[Term]) -> Problem:
         valid = references.readings.valid & heard
         references = replace(references, readings=replace(references.readings, valid=valid))
     return replace(problem, good=good, references=references)
-
-
-def _thinned(problem: Problem, frames: int) -> Problem:
-    """About so many frames per tool."""
-    most = max((tool.time.size for tool in problem.tools), default=0)
-    step = max(1, round(most / frames))
-    keep = [np.arange(0, tool.time.size, step) for tool in problem.tools]
-    return problem.frames(keep, np.arange(problem.reference_blocks.size))
 
 
 def _settled(

@@ -1,11 +1,13 @@
 """Fits the parameters of all effects in force by Gauss-Newton."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.diagnosis.decisions import FOLDS
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.diagnosis.scoring import BlockSums, block_sums, joined
 from anser_ros.effects.effect import Family
@@ -17,9 +19,21 @@ ATTEMPTS = 6
 """Dampings that are tried for a step that lowers the sum of squares; each is ten or a hundred
 times the one before, so the last steps are far too small to help."""
 SETTLED = 1e-5
-"""Share of the sum of squares by which a step must lower it for the fit to go on. Larger ends fits
-that still creep; smaller costs steps that change parameters by far less than their uncertainty.
-Its choice is not recorded."""
+"""Share of the sum of squares by which a step must lower it for the fit to go on: one, where 1e5
+readings are fitted to their noise, so that the step was by a standard deviation and the next, of a
+fit that converges, is by far less. Larger ends fits that still creep; smaller costs steps that
+change parameters by less than their uncertainty."""
+
+
+class _HasSum(Protocol):
+    """Something with a sum of squares."""
+
+    @property
+    def sum_of_squares(self) -> float: ...
+
+
+AnyState = TypeVar('AnyState', bound=_HasSum)
+"""The state of a fit, of fluxes or of poses."""
 
 
 @dataclass(frozen=True)
@@ -65,9 +79,9 @@ class Fit:
         rows = slice(sizes[index], sizes[index + 1])
         return self.covariance[rows, rows]
 
-    def held_out(self, folds: int) -> float:
+    def held_out(self) -> float:
         """Return the cross-validated squares, linear about the optimum, plus what freedom cost."""
-        return self.sums.held_out(self.prior, folds) + self.state.penalty
+        return self.sums.held_out(self.prior, FOLDS) + self.state.penalty
 
 
 @dataclass(frozen=True)
@@ -79,15 +93,12 @@ class Fitter:
     problem : Problem
     blocks : ndarray of int
         The time blocks that take part.
-    folds : int
-        Parts of the cross-validation over those blocks.
     iterations : int
         Most steps of a fit.
     """
 
     problem: Problem
     blocks: NDArray[np.int64]
-    folds: int
     iterations: int
 
     def fit(self, terms: Sequence[Term], iterations: int | None = None) -> Fit:
@@ -97,7 +108,7 @@ class Fitter:
 
     def held_out(self, fit: Fit) -> float:
         """Return the cross-validated sum of squares of a fit, and what its freedom cost."""
-        return fit.held_out(self.folds)
+        return fit.held_out()
 
 
 def fit_terms(
@@ -118,38 +129,51 @@ def fit_terms(
     iterations : int
         At most.
     """
-    state = evaluate(problem, terms)
-    sums, prior = _sums(state, block_numbers)
-    damping = 0.0
-    for _ in range(iterations):
-        if prior.size == 0:
-            break
-        better, damping = _better(problem, state, sums, prior, damping)
+    state, sums, prior = descended(
+        evaluate(problem, terms),
+        lambda state: _sums(state, block_numbers),
+        lambda state, step: evaluate(problem, stepped(state.terms, step)),
+        iterations,
+    )
+    misfit = state.sum_of_squares / max(state.count, 1)
+    covariance = sums.covariance(prior, misfit) if prior.size else np.zeros((0, 0))
+    return Fit(state, covariance, sums, prior)
+
+
+def descended(
+    state: AnyState,
+    sums_of: Callable[[AnyState], tuple[BlockSums, Array]],
+    moved: Callable[[AnyState, Array], AnyState],
+    iterations: int,
+) -> tuple[AnyState, BlockSums, Array]:
+    """Lower a sum of squares by damped Gauss-Newton steps until it has settled.
+
+    Parameters
+    ----------
+    state : State or alike
+        Where it starts.
+    sums_of, moved : callable
+        They return the normal equations with the prior, and the state after a step.
+    iterations : int
+        Most steps.
+
+    Returns
+    -------
+    state, sums, prior
+        At the end.
+    """
+    (sums, prior), damping = sums_of(state), 0.0
+    for _ in range(iterations if prior.size else 0):
+        better, damping = _better(state, sums, prior, moved, damping)
         if better is None:
             break
         gain = state.sum_of_squares - better.sum_of_squares
         settled = gain < SETTLED * state.sum_of_squares
         state = better
-        sums, prior = _sums(state, block_numbers)
+        sums, prior = sums_of(state)
         if settled:
             break
-    covariance = _covariance(state, sums, prior) if prior.size else np.zeros((0, 0))
-    return Fit(state, covariance, sums, prior)
-
-
-def _covariance(state: State, sums: BlockSums, prior: Array) -> Array:
-    """Covariance of all parameters, honest about errors that are alike within a block of time.
-
-    The formal one is scaled by the misfit; where the blocks' scores scatter more than it predicts
-    (White's sandwich with blocks as clusters), a parameter's variance is raised accordingly.
-    """
-    formal = sums.solve(prior)[1]
-    blocks = max(sums.squares.size, 2)
-    scores = sums.right @ formal
-    robust = np.sum(scores**2, axis=0) * blocks / (blocks - 1)
-    variance = np.diag(formal) * max(state.sum_of_squares / max(state.count, 1), 1.0)
-    scale = np.sqrt(np.maximum(variance, robust) / np.maximum(np.diag(formal), 1e-300))
-    return np.asarray(formal * scale[:, None] * scale[None, :])
+    return state, sums, prior
 
 
 def misfit(fit: Fit) -> float:
@@ -168,12 +192,15 @@ def stepped(terms: Sequence[Term], step: Array) -> list[Term]:
 
 
 def _better(
-    problem: Problem, state: State, sums: BlockSums, prior: Array, damping: float
-) -> tuple[State | None, float]:
+    state: AnyState,
+    sums: BlockSums,
+    prior: Array,
+    moved: Callable[[AnyState, Array], AnyState],
+    damping: float,
+) -> tuple[AnyState | None, float]:
     """A state with a lower sum of squares, and the damping (Marquardt's) that found it."""
     for attempt in range(ATTEMPTS):
-        step = sums.step(prior, damping)
-        trial = evaluate(problem, stepped(state.terms, step))
+        trial = moved(state, sums.step(prior, damping))
         if trial.sum_of_squares < state.sum_of_squares:
             return trial, damping / 30 if damping > 1e-6 else 0.0
         damping = max(1e-5, 10 ** (attempt % 2 + 1) * damping)

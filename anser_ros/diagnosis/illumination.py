@@ -21,15 +21,18 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 VOLUME_ERROR = 1e-3
-"""Relative error that the fit allows the model in the volume. Smaller lets the sheet follow the
-model's own errors at the cost of the references; larger lets the references outvote the model. Its
-choice is not recorded."""
+"""Relative error that the fit allows the model in the volume, a quarter of a reference's
+(`reference_gain`, 0.4 % by default): calibrated models are better than that. Smaller lets the
+sheet follow the model's own errors at the cost of the references; larger lets the references
+outvote the model."""
 LEAST_ERROR = 1e-5
 """Relative error that references are given at least, so that exact ones do not divide by zero."""
 DRAWING_ERROR = 0.05
-"""Prior spread of the sheet's moments about the drawn ones, as a share of their rms. Smaller holds
-the sheet to the drawing where the data contradict it; larger leaves free what they do not
-determine, where no sensor was. Its choice is not recorded."""
+"""Prior spread of the sheet's moments about the drawn ones, as a share of their rms: a coil's
+moment is off by 2 % (`nominal.Tolerances`), and a shift of half a millimetre moves a few percent
+of it to the neighbouring centimetre of the sheet. Smaller holds the sheet to the drawing where the
+data contradict it; larger leaves free what they do not
+determine, where no sensor was."""
 
 
 @dataclass(frozen=True)

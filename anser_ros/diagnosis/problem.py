@@ -81,6 +81,13 @@ class Problem:
             reference_blocks=self.reference_blocks[bins],
         )
 
+    def thinned(self, frames: int) -> 'Problem':
+        """Return the problem with about so many frames of a tool, and all of the references."""
+        most = max((tool.time.size for tool in self.tools), default=0)
+        step = max(1, round(most / frames))
+        keep = [np.arange(0, tool.time.size, step) for tool in self.tools]
+        return self.frames(keep, np.arange(self.reference_blocks.size))
+
     def in_blocks(self, wanted: NDArray[np.int64], step: int = 1) -> 'Problem':
         """Return the problem of every ``step``-th frame of some blocks, with the bins of those
         blocks.

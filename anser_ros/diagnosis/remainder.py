@@ -95,7 +95,7 @@ class Remainders:
                 return Couplings(kind, centre, modes).unit(view)
 
             most = self.richness.modes
-            found = rich_modes(few, known, unit, sizes, fitter.blocks, fitter.folds, most)
+            found = rich_modes(few, known, unit, sizes, fitter.blocks, most)
             if found is not None and (best is None or found[0] < best[0]):
                 best = (found[0], Couplings(kind, centre, found[1]))
         return None if best is None else REMAINDER.of(term, best[1])

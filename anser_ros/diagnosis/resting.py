@@ -45,7 +45,7 @@ def moves_or_rests(
     limit = _limit(fitter, shaped, explained)
     if fitter.held_out(rest) < limit:
         return rest
-    scorer = Scorer(rest.state, fitter.blocks, fitter.folds)
+    scorer = Scorer(rest.state, fitter.blocks)
     tried: set[str] = set()
     for term, score in candidates(scorer):
         if term.effect.family.is_metal or term.effect.name in tried:

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.diagnosis.decisions import FOLDS
 from anser_ros.diagnosis.problem import Part, State
 from anser_ros.diagnosis.scoring import BlockSums, block_sums, joined
 from anser_ros.diagnosis.whitening import parts
@@ -37,7 +38,6 @@ def rich_modes(
     unit: Unit,
     spreads: Sequence[Array],
     blocks: NDArray[np.int64],
-    folds: int,
     most: int,
 ) -> tuple[float, Array] | None:
     """Return combinations of couplings, of the size that predicts held-out blocks best.
@@ -52,7 +52,7 @@ def rich_modes(
         Flux (F, S, K, m) of modes (c, m) in a view.
     spreads : sequence of ndarray, shape (c,)
         Prior sizes of the couplings that are tried.
-    blocks, folds : as in `anser_ros.diagnosis.fit`
+    blocks : as in `anser_ros.diagnosis.fit`
     most : int
 
     Returns
@@ -75,12 +75,12 @@ def rich_modes(
     sums = block_sums(few, joined([columns, group]), blocks)
     width, count = prior.size, told.size
     bare = sums.columns(np.arange(width))
-    best: tuple[float, Array] = (bare.held_out(prior, folds), np.zeros((0, 0)))
+    best: tuple[float, Array] = (bare.held_out(prior, FOLDS), np.zeros((0, 0)))
     for spread in spreads:
         turned = vectors * (spread / widest)[:, None]
         root = np.linalg.cholesky(turned.T @ turned + 1e-12 * np.eye(count))
         left = _turned(sums, width, root).held_out(
-            np.concatenate([prior, np.ones(2 * count)]), folds
+            np.concatenate([prior, np.ones(2 * count)]), FOLDS
         )
         if left < best[0]:
             best = (left, root)

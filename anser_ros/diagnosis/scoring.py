@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from anser_ros.diagnosis.decisions import FOLDS
 from anser_ros.diagnosis.problem import State
 from anser_ros.effects.term import Term
 
@@ -62,6 +63,21 @@ class BlockSums:
         """Return what the columns explain in each block (B,), fitted to that block alone."""
         covariance = _covariance(self.normal, prior)
         return np.asarray(np.einsum('bi,bij,bj->b', self.right, covariance, self.right))
+
+    def covariance(self, prior: Array, misfit: float) -> Array:
+        """Return the covariance of all parameters, honest about errors alike within a block.
+
+        The formal one is scaled by the misfit, the mean square of the whitened residuals; where
+        the blocks' scores scatter more than it predicts (White's sandwich with blocks as
+        clusters), a parameter's variance is raised accordingly.
+        """
+        formal = self.solve(prior)[1]
+        blocks = max(self.squares.size, 2)
+        scores = self.right @ formal
+        robust = np.sum(scores**2, axis=0) * blocks / (blocks - 1)
+        variance = np.diag(formal) * max(misfit, 1.0)
+        scale = np.sqrt(np.maximum(variance, robust) / np.maximum(np.diag(formal), 1e-300))
+        return np.asarray(formal * scale[:, None] * scale[None, :])
 
     def held_out(self, prior: Array, folds: int) -> float:
         """Return the sum of squared residuals of each fold, predicted from the others."""
@@ -189,15 +205,15 @@ class Score:
 class Scorer:
     """Scores candidates against one state; the sums of the effects in force are made once."""
 
-    def __init__(self, state: State, blocks: NDArray[np.int64], folds: int) -> None:
-        self.state, self.blocks, self.folds = state, blocks, folds
+    def __init__(self, state: State, blocks: NDArray[np.int64]) -> None:
+        self.state, self.blocks = state, blocks
         # Terms of very many columns stay as they are: they are what metal left, not effects.
         terms = [t for t in state.terms if t.theta.size <= MOST_COLUMNS]
         self._active = joined([state.design(t) for t in terms]) if terms else None
         self.prior = np.concatenate([t.effect.prior(t) for t in terms] or [np.zeros(0)])
         empty: list[Array | None] = [None] * len(state.parts)
         self.sums = block_sums(state, self._active or empty, blocks)
-        self.held_out = self.sums.held_out(self.prior, folds) + state.penalty
+        self.held_out = self.sums.held_out(self.prior, FOLDS) + state.penalty
 
     def score(self, term: 'Term') -> Score | None:
         """Return the worth of a candidate; None when it touches no value, or is at a dipole's own
@@ -215,7 +231,7 @@ class Scorer:
         prior = np.where(scale > 0, 1e4 / np.maximum(scale, 1e-300), 1.0)
         full_prior = np.concatenate([self.prior, prior])
         estimate, _ = sums.solve(full_prior)
-        left = sums.held_out(full_prior, self.folds) + self.state.penalty
+        left = sums.held_out(full_prior, FOLDS) + self.state.penalty
         return Score(left, estimate[-width:], own)
 
     def _beside(self, probe: Columns, own: BlockSums) -> BlockSums:

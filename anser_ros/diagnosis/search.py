@@ -52,7 +52,7 @@ class SearchSettings:
 
     def fitter(self, problem: Problem, blocks: NDArray[np.int64]) -> Fitter:
         """Return what fits effects on some blocks of a problem with these settings."""
-        return Fitter(problem, blocks, decisions.FOLDS, self.iterations)
+        return Fitter(problem, blocks, self.iterations)
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ class _Round:
     def __init__(self, fitter: Fitter, search: Search, how: SearchSettings) -> None:
         self._fitter, self._search, self._how = fitter, search, how
         self._before = search.fit
-        self._scorer = Scorer(self._before.state, fitter.blocks, fitter.folds)
+        self._scorer = Scorer(self._before.state, fitter.blocks)
 
     def best(self) -> Fit | None:
         """The fit with one effect more, or None when none pays."""

@@ -106,7 +106,7 @@ class Shaping:
                 return body.with_body(kind, modes, np.ones(modes.shape[1])).unit(view)
 
             most, sizes = self.richness.modes, body_sizes(kind)
-            found = rich_modes(few, known, unit, sizes, fitter.blocks, fitter.folds, most)
+            found = rich_modes(few, known, unit, sizes, fitter.blocks, most)
             if found is not None and (best is None or found[0] < best[0]):
                 best = (found[0], kind, found[1])
         if best is None:

@@ -17,9 +17,9 @@ FINE_STEP_S = 0.05
 NODES, NODES_PER_KNOT = 41, 6
 """Nodes on a path, in which fields are found; between them they are interpolated."""
 NEGLIGIBLE_WAY = 0.02
-"""Share (0 to 1) of a way that counts as not yet begun, or as over. Smaller takes ripples of a
-fitted path at rest for its start; larger cuts slow beginnings and ends off. Its choice is not
-recorded."""
+"""Share (0 to 1) of a way that counts as not yet begun, or as over: 2 to 5 mm of a hand's way,
+less than metal that matters is large. Smaller takes ripples of a fitted path at rest for its
+start; larger cuts slow beginnings and ends off."""
 
 
 class MetalPath(Protocol):

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.physics.dipole import dipole_field, flux_basis
+from anser_ros.physics.sensor import along_each_axis
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -44,12 +45,8 @@ class Dipoles:
         moments : ndarray, shape (M, 3, K), complex
             Moment vectors, A m^2, frame fg.
         """
-        count = points.shape[0]
-        return Dipoles(
-            np.repeat(points, 3, axis=0),
-            np.tile(np.eye(3), (count, 1)),
-            np.ascontiguousarray(moments.reshape(3 * count, -1)),
-        )
+        flat = np.ascontiguousarray(moments.reshape(3 * len(points), -1))
+        return Dipoles(*along_each_axis(points), flat)
 
     def joined(self, other: 'Dipoles') -> 'Dipoles':
         """Return the union of these dipoles and the others."""

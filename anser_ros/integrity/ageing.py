@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from anser_ros.field.model import FieldModel
+from anser_ros.physics.sensor import along_each_axis
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.pose_states import REFERENCES_LOST, Withheld
 from anser_ros.stamps import NANO
@@ -66,9 +67,7 @@ class ModelAge:
 
     def __init__(self, longest_s: float, volume: TrackedVolume) -> None:
         self._longest_ns = round(longest_s / NANO)
-        points = volume.samples(*SAMPLES)
-        self._points = np.repeat(points, 3, axis=0)
-        self._axes = np.tile(np.eye(3), (len(points), 1))
+        self._points, self._axes = along_each_axis(volume.samples(*SAMPLES))
         self._answers: deque[tuple[int, FieldModel]] = deque()
         self._aged: tuple[int, FieldModel] | None = None
 

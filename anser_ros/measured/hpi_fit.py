@@ -29,8 +29,8 @@ GRID_GAP_M = (0.02, 0.12)
 LEAD_MOMENT = 3e-10
 """Plausible moment of a stretch of lead, A m^2: a few hundredths of a coil's."""
 FREEDOM = 4.0
-"""Degrees of freedom of the Student density of a chip's residuals; fewer give outliers less
-weight."""
+"""Degrees of freedom of the Student density of residuals, of a chip's together and of single
+held-out channels; fewer give outliers less weight."""
 
 
 @dataclass(frozen=True)
@@ -140,10 +140,14 @@ def student_weight(white: SquidWhitener, left: Array) -> Array:
     return np.asarray((FREEDOM + 3.0) / (FREEDOM + power))
 
 
-def student_loss(left: Array) -> float:
-    """Return the negative log density of all chips' whitened residuals (3C,), up to a constant."""
-    power = np.sum(left.reshape(-1, 3) ** 2, axis=1)
-    return float(np.sum(0.5 * (FREEDOM + 3.0) * np.log1p(power / FREEDOM)))
+def student_loss(left: Array, together: int) -> Array:
+    """Return the negative log density of whitened residuals, up to a constant.
+
+    Student's t with `FREEDOM` degrees of freedom, of so many neighbours together: shape (n,) for
+    residuals (n together,).
+    """
+    power = np.sum(left.reshape(-1, together) ** 2, axis=1)
+    return np.asarray(0.5 * (FREEDOM + together) * np.log1p(power / FREEDOM))
 
 
 def fit_coil(
@@ -177,7 +181,7 @@ def fit_coil(
         places,
         moments.reshape(-1, 3),
         matrix @ moments,
-        -student_loss(plain.apply(left)) - plain.half_log_det,
+        -float(student_loss(plain.apply(left), 3).sum()) - plain.half_log_det,
         float(left_white @ left_white) / int(data.used.sum()),
         float(np.sqrt(np.trace(covariance))),
         white,

@@ -4,7 +4,8 @@ import itertools
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+
+from anser_ros.assessment.hummel import rigid_distance, rigid_distances
 
 Array = NDArray[np.float64]
 
@@ -12,29 +13,17 @@ ARMS_M = np.arange(-6e-3, 6.001e-3, 5e-5)
 """Distances tried between a coil's magnetic centre and the digitised point, along its axis."""
 
 
-def rigid_distance(fitted: Array, digitised: Array) -> Array:
-    """Return the distances (n,) of points after the best rotation and shift; rows correspond."""
-    a, b = fitted - fitted.mean(axis=0), digitised - digitised.mean(axis=0)
-    turn = Rotation.align_vectors(b, a)[0]
-    return np.asarray(np.linalg.norm(turn.apply(a) - b, axis=1))
-
-
-def rms(values: Array) -> float:
-    """Return the root of the mean square."""
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def order_of(places_m: Array, digitised_m: Array) -> list[int]:
     """Return which fitted coil each digitised point is; far apart, only one order fits."""
     orders = itertools.permutations(range(len(digitised_m)))
-    best = min(orders, key=lambda o: rms(rigid_distance(places_m[list(o)], digitised_m)))
+    best = min(orders, key=lambda o: rigid_distance(places_m[list(o)], digitised_m))
     return list(best)
 
 
 def distance_mm(places_m: Array, digitised_m: Array) -> float:
     """Return the rms distance to the digitised places after rigid alignment, mm."""
     order = order_of(places_m, digitised_m)
-    return 1e3 * rms(rigid_distance(places_m[order], digitised_m))
+    return 1e3 * rigid_distance(places_m[order], digitised_m)
 
 
 def outward(places_m: Array, moments: Array) -> Array:
@@ -46,7 +35,7 @@ def outward(places_m: Array, moments: Array) -> Array:
 
 def best_arm(places_m: Array, axes: Array, digitised_m: Array) -> float:
     """Return the arm (m) along the axes that brings rows of places closest to digitised ones."""
-    misfit = [rms(rigid_distance(places_m - arm * axes, digitised_m)) for arm in ARMS_M]
+    misfit = [rigid_distance(places_m - arm * axes, digitised_m) for arm in ARMS_M]
     return float(ARMS_M[int(np.argmin(misfit))])
 
 
@@ -66,5 +55,5 @@ def arms_left_out(places_m: Array, moments: Array, digitised_m: Array) -> tuple[
     for k in range(len(order)):
         rest = np.arange(len(order)) != k
         arms[k] = best_arm(places[rest], axes[rest], digitised_m[rest])
-        distances[k] = rigid_distance(places - arms[k] * axes, digitised_m)[k]
+        distances[k] = rigid_distances(places - arms[k] * axes, digitised_m)[k]
     return arms, distances

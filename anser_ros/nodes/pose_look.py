@@ -9,11 +9,10 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import qos_profile_sensor_data
 
+from anser_ros.nodes.graph_look import SLICE_S
 from anser_ros.stamps import SECOND_NS
 
 NAME = 'anser_pose_look'
-SLICE_S = 0.1
-"""Longest time that one message is waited for, s: the look ends that much late at most."""
 FIRST_S = 10.0
 """Least time, s, that the first pose is waited for: a graph takes seconds to be discovered."""
 

@@ -1,10 +1,17 @@
 """Holds poses of one body over time, as a tracker with its own clock and rate reports them."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
@@ -49,6 +56,14 @@ class PoseTrack:
         sign = np.cumprod(np.concatenate([[1.0], np.where(near, 1.0, -1.0)]))
         return np.asarray(self.quaternion * sign[:, None])
 
+    @cached_property
+    def _slerp(self) -> Callable[[Array], Rotation]:
+        """The rotations between the samples along great arcs."""
+        from scipy.spatial.transform import Rotation, Slerp
+
+        slerp: Callable[[Array], Rotation] = Slerp(self.time, Rotation.from_quat(self.quaternion))
+        return slerp
+
     def at(
         self, time: Array, longest_gap: float = LONGEST_GAP_S
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -84,7 +99,7 @@ class PoseTrack:
         valid = exact | (bracketed & (self.time[right] - self.time[left] <= longest_gap))
         if valid.any():
             # Loaded here, as each start of a node would pay for it that interpolates no poses.
-            from scipy.spatial.transform import Rotation, Slerp
+            from scipy.spatial.transform import Rotation
 
             inside, bent = time[valid], _Bend(self.time, left[valid], right[valid], time[valid])
             for axis in range(3):
@@ -93,9 +108,7 @@ class PoseTrack:
             if self.time.size == 1:
                 rotation[valid] = Rotation.from_quat(self.quaternion[0]).as_matrix()
             else:
-                slerp = Slerp(self.time, Rotation.from_quat(self.quaternion))
-                samples = self._aligned
-                turned = slerp(inside).as_quat()
+                samples, turned = self._aligned, self._slerp(inside).as_quat()
                 same = np.einsum('fi,fi->f', turned, samples[left[valid]]) >= 0.0
                 turned = np.where(same[:, None], turned, -turned) + bent.of(samples)
                 rotation[valid] = Rotation.from_quat(turned).as_matrix()

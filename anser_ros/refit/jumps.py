@@ -118,7 +118,7 @@ class Courses:
 
     def away(self) -> NDArray[np.int64]:
         """Return the references that are off by jumps."""
-        return np.flatnonzero(self._farthest > 0.0)
+        return np.flatnonzero(self._farthest)
 
     def returned(self, noise: Array) -> NDArray[np.int64]:
         """Return the references that are no longer off by jumps, which is then forgotten.

@@ -18,6 +18,7 @@ from scipy.linalg import cholesky
 
 from anser_ros.field.model import FieldModel
 from anser_ros.physics.dipole import flux_basis
+from anser_ros.physics.sensor import along_each_axis
 from anser_ros.refit.clouds import Cloud, Region
 from anser_ros.refit.excitation import Excitation
 from anser_ros.refit.kernels import fill_dipole_tensors
@@ -123,10 +124,6 @@ def _parts(sources: Array) -> list[Array]:
     return np.array_split(sources, -(-len(sources) // AT_ONCE) or 1)
 
 
-def _axes_at(points: Array) -> tuple[Array, Array]:
-    return np.repeat(points, 3, axis=0), np.tile(np.eye(3), (len(points), 1))
-
-
 def _field_rows(points: Array, sources: Array) -> Array:
     """Return the field samples per unit moment component, shape (3P, 3M)."""
     out = np.empty((3 * len(points), 3 * len(sources)))
@@ -136,7 +133,7 @@ def _field_rows(points: Array, sources: Array) -> Array:
 
 def component_rows(points: Array, positions: Array, directions: Array) -> Array:
     """Return the field samples per unit moment of dipoles (N, 3), shape (3P, N)."""
-    at, axes = _axes_at(points)
+    at, axes = along_each_axis(points)
     return flux_basis(at, axes, None, positions, directions)
 
 
@@ -195,8 +192,7 @@ def body_layer(region: Region, weight: Array, cloud: Cloud) -> Layer:
     away = np.linalg.norm(points[:, None] - cloud.positions, axis=2).min(axis=1)
     clear = away > CLEAR * cloud.standoff_m
     points = points[clear]
-    positions = np.repeat(cloud.positions, 3, axis=0)
-    directions = np.tile(np.eye(3), (len(cloud.positions), 1))
+    positions, directions = along_each_axis(cloud.positions)
     basis = component_rows(points, positions, directions)
     metric = _metric(basis, weight[clear])
     middle = basis[_middle(points, region.half)]

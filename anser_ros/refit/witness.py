@@ -49,7 +49,8 @@ ELSEWHERE = 0.1
 NEAR_M = 0.01
 """How far around the coils that is, m."""
 SPARSE = 30
-"""Every so many of a layer's samples stand for the volume before a tool was seen."""
+"""Every so many of a layer's samples stand for the volume before a tool was seen, and tell the
+size of an error until it is known: thirty points, a millisecond's work at the most."""
 _AROUND = np.array([[0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
 """A coil's own place and the corners of a tetrahedron around it, in units of `NEAR_M`."""
 

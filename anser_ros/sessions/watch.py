@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from anser_ros.diagnosis.diagnose import diagnose
 from anser_ros.diagnosis.prepare import FEWEST_FRAMES
 from anser_ros.diagnosis.problem import Problem, State, evaluate
+from anser_ros.diagnosis.residuals import rms
 from anser_ros.diagnosis.search import SearchSettings
 from anser_ros.effects.term import Term
 from anser_ros.field.measurements import Measurements
@@ -170,7 +171,7 @@ class Watch:
         problem = problem_with(self._prepared.model)
         plain = evaluate(problem, ())
         excess, frames = _excess(plain), sum(tool.time.size for tool in problem.tools)
-        seen = Sighting(truth, frames, (), excess, excess, _rms(plain))
+        seen = Sighting(truth, frames, (), excess, excess, rms(plain))
         if excess < EXCESS:
             return seen
         last = self._last
@@ -180,7 +181,7 @@ class Watch:
             left = _excess(evaluate(again, last.terms))
             if left < max(EXCESS, SAME * self._left):
                 return replace(
-                    last, frames=frames, excess=excess, excess_left=left, flux_rms_t=_rms(plain)
+                    last, frames=frames, excess=excess, excess_left=left, flux_rms_t=rms(plain)
                 )
         if not _moves(problem):
             return replace(seen, remark='the tool moves too little to identify the effect')
@@ -239,14 +240,6 @@ def _posed_by_itself(tool: Measurements, model: FieldModel) -> Measurements:
 def _excess(state: State) -> float:
     """Mean square of the whitened residuals of the worst part: a tool, or the references."""
     return max(float(np.sum(part.white**2)) / max(part.count, 1) for part in state.parts)
-
-
-def _rms(state: State) -> float:
-    """Residual of the tools, T a phasor component."""
-    tools = [part for part in state.parts if not part.view.is_reference]
-    squares = sum(float(np.sum(part.white**2)) for part in tools)
-    count = sum(part.count for part in tools)
-    return float(np.sqrt(squares / max(count, 1))) * state.problem.spread.flux_t
 
 
 def _moves(problem: Problem) -> bool:

@@ -56,8 +56,8 @@ holds the first 0.1 s, until there are samples at the worst lag; more would slow
 _PRIOR_RUNS = 4.0
 """Coincidences that the prior of what follows one counts for: that noise is so correlated that
 every further sample is worth half of its own surprise."""
-_RAILS = np.array([-32768, 32767], np.int16)
-"""Ends of the range of the 16-bit converter."""
+RAILS = np.array([np.iinfo(np.int16).min, np.iinfo(np.int16).max], np.int16)
+"""Ends of the range of the 16-bit converter; a code at either end counts as saturated."""
 
 
 class RepetitionWatch:
@@ -191,7 +191,7 @@ class RepetitionWatch:
             if contiguous > self._worst_lag:
                 is_new = (self._run < self._needed).astype(np.int64)
                 count_coincidences(
-                    self._history, first, count, at, self._worst_lag, _RAILS, is_new,
+                    self._history, first, count, at, self._worst_lag, RAILS, is_new,
                     self._equal, self._tried, self._same, self._continued,
                 )  # fmt: skip
             self._searched = at + count

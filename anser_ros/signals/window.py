@@ -8,13 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError
-from anser_ros.signals.repetition import RepetitionWatch
+from anser_ros.signals.repetition import RAILS, RepetitionWatch
 from anser_ros.signals.ticks import TickCheck
 
 _SEQUENCES = 2**32
 """Number after which the blocks' sequence number begins again (an unsigned 32-bit counter)."""
-_FULL_SCALE = (-32768, 32767)
-"""Ends of the range of the 16-bit converter; a code at either end counts as saturated."""
 
 
 @dataclass(frozen=True)
@@ -240,7 +238,7 @@ class WindowCutter:
         if arrived < self._window:
             self.counters.windows_dropped_samples += 1
         low, high = seen.min(axis=0), seen.max(axis=0)
-        saturated = (low <= _FULL_SCALE[0]) | (high >= _FULL_SCALE[1])
+        saturated = (low <= RAILS[0]) | (high >= RAILS[1])
         watch, first = self._watch, end - self._window - self._begin_sample
         return [
             Window(

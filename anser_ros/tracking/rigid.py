@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import TrackingError
 from anser_ros.physics.dipole import flux_jacobian
+from anser_ros.physics.sensor import along_each_axis
 from anser_ros.tracking.body_descent import descend_body, fill_common
 from anser_ros.tracking.rotations import nearest_rotation
 from anser_ros.tracking.seed import SeedGrid
@@ -239,10 +240,9 @@ def start_from_grid(
     -------
     list of (position, rotation)
     """
-    unit = np.eye(3)
     total = len(grid.points)
     complex_moments = field.moments.view(np.complex128)
-    points, axes = np.repeat(grid.points, 3, axis=0), np.tile(unit, (total, 1))
+    points, axes = along_each_axis(grid.points)
     model, _, _ = flux_jacobian(
         points, axes, None, field.positions, field.directions, complex_moments
     )

@@ -21,8 +21,10 @@ from anser_ros.tracking.projection import descend_projected
 from anser_ros.tracking.solve import Array, CoilSolution, RealField, solve_coil
 
 SAME_PLACE_M, SAME_AXIS = 2e-3, 0.05
-"""Two solutions closer than this (m; chord of the unit axes) are one. Larger, and a rival that
-makes a pose ambiguous is overlooked; smaller, and one solution is found to rival itself."""
+"""Two solutions closer than this (m; chord of the unit axes) are one. On the drawn board, with 80
+poses from 30 starts each, those of one pose were within 0.1 mm and 0.0005, those of two poses 3 cm
+and 0.5 apart. Larger, and a rival that makes a pose ambiguous is overlooked; smaller, and one
+solution is found to rival itself."""
 
 PROJECTED_BUDGET = 25
 """Evaluations that the descent of a start may take with the axis eliminated, before the joint

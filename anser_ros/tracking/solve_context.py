@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from anser_ros.field.model import FieldModel
 from anser_ros.field.symmetry import SymmetryAxis, symmetry_axis
 from anser_ros.physics.dipole import flux_basis
+from anser_ros.physics.sensor import along_each_axis
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.error_whitening import error_whitening, source_spacing
 from anser_ros.tracking.estimate import TrackerSettings
@@ -64,7 +65,7 @@ class Starts:
             for a, b in zip(self._volume.low, self._volume.high, strict=True)
         ]
         points = np.stack([side.ravel() for side in np.meshgrid(*sides, indexing='ij')], axis=1)
-        at, axes = np.repeat(points, 3, axis=0), np.tile(np.eye(3), (len(points), 1))
+        at, axes = along_each_axis(points)
         basis = flux_basis(at, axes, None, field.positions, field.directions)
         return basis, basis @ field.moments
 

@@ -24,11 +24,6 @@ RARE = 0.01
 It is smaller than that of a single coil, for many degrees of freedom make much of a small
 excess."""
 
-SAME_PLACE_M = 2e-3
-"""Solutions no further apart, m, are one pose that several descents ended at. Smaller, and a pose
-makes itself ambiguous; larger, and a second pose near by is not seen. How the value was chosen is
-not recorded."""
-
 
 def variance_scale(
     noise: NoiseScale,

@@ -17,12 +17,14 @@ from anser_ros import pose_states as states
 from anser_ros.field.symmetry import SymmetryAxis
 from anser_ros.physics.dipole import field_basis
 from anser_ros.stamps import NANO
+from anser_ros.tracking.coil_track import UNKNOWNS
 from anser_ros.tracking.estimate import NoiseScale, PoseEstimate, TrackerSettings, no_pose
 from anser_ros.tracking.rigid import BodyCoils, BodySolution, common_factor, solve_body
 from anser_ros.tracking.rotations import nearest_rotation, rotation_of_vector
+from anser_ros.tracking.seed import SAME_PLACE_M
 from anser_ros.tracking.solve import RealField
 from anser_ros.tracking.solve_context import SolveContext
-from anser_ros.tracking.solve_verdict import RARE, SAME_PLACE_M, variance_scale, verdict
+from anser_ros.tracking.solve_verdict import RARE, variance_scale, verdict
 from anser_ros.tracking.uncertainty import ROLL_VARIANCE, bounded_inverse
 
 Array = NDArray[np.float64]
@@ -35,8 +37,6 @@ NEAREST = 0.2
 """Places nearer to a sensor than this part of the least distance are no place of a source."""
 STARTS = 4
 """Places of the scan from which the pose is descended to."""
-UNKNOWNS = 5
-"""Numbers that a source's place and axis have; the turn about its axis is open."""
 FEWEST_SENSORS = UNKNOWNS + 1
 """Sensors that find a source and leave a residual to judge it by."""
 

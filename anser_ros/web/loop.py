@@ -11,11 +11,11 @@ from typing import Any, Protocol
 from anser_ros.cli.diagnosis_words import verdict
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.physics.constants import DEGREES
+from anser_ros.sessions.starting_model import NOMINAL
 from anser_ros.web.folder import RecordingFolder
 from anser_ros.web.job import Job
 
 CALIBRATE, DIAGNOSE = 'calibrate', 'diagnose'
-NOMINAL = 'nominal'
 SETTLING_S = 2.0
 """Time, s, after a change of the model that the figures after it leave out: warm starts and
 averages of before have their end in it."""

@@ -19,7 +19,7 @@ from anser_ros.signals.ticks import TickCheck
 from anser_ros.signals.window import Window, WindowCutter
 from anser_ros.wire.channel_calibration import ChannelCalibration
 from anser_ros.wire.points import DROPPED, SATURATED, STALE, FluxPoints
-from anser_ros.wire.records import ChannelKind, Hello, SampleBlock
+from anser_ros.wire.records import FULL_SCALE_CODE, ChannelKind, Hello, SampleBlock
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup
 
 
@@ -243,7 +243,7 @@ def _nominal_currents(setup: Setup, hello: Hello) -> NDArray[np.float64]:
 def _converter(
     hello: Hello, stream: FluxStream, columns: dict[int, int], calibration: ChannelCalibration
 ) -> FluxConverter:
-    per_code = np.array([channel.full_scale / 32768 for channel in hello.channels])
+    per_code = np.array([channel.full_scale / FULL_SCALE_CODE for channel in hello.channels])
     current = _current_column(hello)
     numbers = [sensor.channel for sensor in stream.sensors]
     chosen = np.array([columns[number] for number in numbers])

@@ -22,9 +22,10 @@ TIMES = 9.0
 the error, which the range of places in a session hardly makes. Smaller takes the far side of the
 volume for an episode; larger misses those that bend poses little."""
 LONGEST = 0.4
-"""Share (0 to 1) of the windows that episodes may be: what is there for longer is no episode.
-Larger takes half a session for the exception; smaller overlooks metal that stayed for a while. Its
-choice is not recorded."""
+"""Share (0 to 1) of the windows that episodes may be: they stand out from the median
+window, which is a quiet one only where fewer than half are in episodes, and a tenth is left for
+what else is loud. Larger takes half a session for the exception; smaller overlooks metal that
+stayed for a while."""
 ALIKE = 0.4  # share of a window's squared error that its mean must be; noise has a small one
 NEAR_M = 0.03
 """Distance within which a place outside the episode is the same place; metal changes over its own

@@ -16,9 +16,9 @@ from anser_ros.poses.sequence import PoseSequence, jumping_poses
 Array = NDArray[np.float64]
 
 FEWEST_STALE = 0.02
-"""Share (0 to 1) of poses of a moving body from which repeats are named; a hand stops now and
-then. Smaller names these stops; larger leaves a tracker unnamed that seldom repeats itself. Its
-choice is not recorded."""
+"""Share (0 to 1) of poses of a moving body from which repeats are named. One in 60 comes again
+where a tracker of 60 Hz is polled a hertz too fast, which harms nothing. Smaller names that, and a
+hand that stops; larger leaves a tracker unnamed that seldom repeats itself."""
 MOVING_M = 5e-4
 """Way between two poses, m, from which a body moves: trackers tell a tenth of it. Smaller takes
 jitter for motion, so that a tracker at rest seems to repeat poses; larger sees no motion in slow
