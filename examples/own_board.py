@@ -1,4 +1,4 @@
-"""Describe a board and a tool of your own, and see what a calibration is worth on it."""
+"""Describe a board and a tool of your own, and see what a calibration improves on it."""
 
 import sys
 from pathlib import Path
@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from anser_ros import Model, calibrate, load_session, track, write_session
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else 'out')
-
 # Eight round coils; docs/setup.md has every key and every kind of emitter.
 places = [(x, y, 0.0) for x in (-0.09, 0.0, 0.09) for y in (-0.09, 0.0, 0.09) if (x, y) != (0, 0)]
 setup = {
@@ -36,5 +35,6 @@ write_session(out / 'board.mcap', setup, poses['pen'][0], flux, poses, overwrite
 session = load_session(out / 'board.mcap')
 for label, model in ('as drawn', drawn), ('calibrated', calibrate(session, dipoles=10).model):
     pen = track(session, model)['pen']
-    sigma, error = (np.nanmedian(v[pen.ok]) for v in (pen.sigma_position_m, pen.position_error_m))
-    print(f'{label}: {pen.ok.mean():.0%} tracked, {1e3 * error:.2f} of {1e3 * sigma:.2f} mm off')
+    both = (pen.sigma_position_m, pen.position_error_m)
+    sigma, error = (1e3 * np.nanmedian(values[pen.ok]) for values in both)
+    print(f'{label}: {pen.ok.mean():.0%} tracked, error {error:.3f} mm, sigma {sigma:.3f} mm')

@@ -76,7 +76,7 @@ def _why_stale(staleness: Staleness | None, row: int) -> str:
     if staleness is not None and staleness.age_s[row] > 0:
         return f'repeats its samples of {staleness.age_s[row]:.2g} s ago'
     if staleness is not None and staleness.noiseless[row]:
-        return 'has no noise that tells new samples from old'
+        return 'has no noise that distinguishes new samples from old'
     return ''
 
 
