@@ -18,15 +18,16 @@ POOR_M = 8e-3
 """Median misfit of hand-eye, m and tenths of rad together, from which other readings are tried:
 distorted trackers are off by less, and the inverse of a quaternion makes 25 mm and more."""
 BETTER = 0.5
-"""Share (0 to 1) of the misfit as it stands below which another reading is the right one. Larger
-re-reads a session that is only distorted; smaller refuses a right reading of a tracker that is
-poor besides. Its choice is not recorded."""
+"""Share (0 to 1) of the misfit as it stands below which another reading is the right one: the
+right one of a distorted tracker leaves a third of a wrong one (`POOR_M`), and two wrong ones leave
+alike. Larger re-reads a session that is only distorted; smaller refuses a right reading of a
+tracker that is poor besides."""
 FEW_POSES = 150  # poses of a sensor that a reading is judged by, a fit each: a median needs few
 HOPELESS_M = 25e-3
-"""Median misfit, m, with which no reading fits and a session is refused: its files do not belong
-together, or mean something that is not known here. Smaller refuses sessions with much distortion;
-larger takes files that do not belong together for bad ones. How the value was chosen is not
-recorded."""
+"""Median misfit, m, with which no reading fits and a session is refused: as much as a wrong
+reading makes at least (`POOR_M`), so its files do not belong together, or mean something that is
+not known here. Smaller refuses sessions with much distortion; larger takes files that do not
+belong together for bad ones."""
 UNITS = {
     'mm': 1e-3, 'cm': 1e-2, 'inch': 0.0254, 'km': 1e3,
     'inch taken for mm': 25.4, 'mm taken for inch': 1 / 25.4,

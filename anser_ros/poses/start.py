@@ -37,9 +37,10 @@ COARSE_S, COARSE_STEP_S = 1.5, 0.05
 """Range and step of the first look for a time offset, s."""
 COARSE_POSES = 300  # poses of that look; it takes a regression at each of its steps
 CLEARLY = 0.8
-"""Share of the misfit at no offset below which a coarse offset is taken. Smaller starts at no
-offset although there is one; larger starts at an offset that noise has made. How the value was
-chosen is not recorded."""
+"""Share of the misfit at no offset below which a coarse offset is taken. Chance takes off 6 %: the
+mean distance of 300 poses scatters by 2.4 %, and the least of 61 offsets is some 2.4 of that
+lower; an offset of a single step moves a hand by a centimetre, many times the misfit. Smaller
+starts at no offset although there is one; larger starts at an offset that noise has made."""
 START_NOISE = PoseNoise(2e-3, 0.02)  # m, rad: of the first fit, which then finds its own
 
 
