@@ -110,15 +110,19 @@ class Courses:
     def note(self, jumps: Jumps, coils: NDArray[np.int64]) -> None:
         """Remember which references have jumped: a jump is no part of a course."""
         self._step_ns[coils] = np.nan
-        first = self._farthest[coils] == 0.0
+        first = ~self._is_away[coils]
         whole = (self._last - self._before[0])[coils]
         self._away[coils] += np.where(first[:, None], whole, jumps.off[coils])
         size = np.linalg.norm(self._away[coils], axis=1)
         self._farthest[coils] = np.maximum(self._farthest[coils], size)
 
+    @property
+    def _is_away(self) -> NDArray[np.bool_]:
+        return np.asarray(self._farthest > 0.0)
+
     def away(self) -> NDArray[np.int64]:
         """Return the references that are off by jumps."""
-        return np.flatnonzero(self._farthest)
+        return np.flatnonzero(self._is_away)
 
     def returned(self, noise: Array) -> NDArray[np.int64]:
         """Return the references that are no longer off by jumps, which is then forgotten.
@@ -132,7 +136,7 @@ class Courses:
         noise : ndarray, shape (S,)
             Of a phasor component of each, T.
         """
-        away, size = self._farthest > 0.0, np.linalg.norm(self._away, axis=1)
+        away, size = self._is_away, np.linalg.norm(self._away, axis=1)
         calm = math.sqrt(LEAST_JUMP_POWER * 2 * self._away.shape[1]) * noise
         back = away & (size < np.maximum(RETURNED * self._farthest, calm))
         if (np.linalg.norm(self._last[away], axis=1) < calm[away]).all():

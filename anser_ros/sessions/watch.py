@@ -111,9 +111,7 @@ class Watch:
         self._left = 1.0  # what the last search left
         self.searches = 0
 
-    def look(
-        self, session: Session, first_ns: int, progress: Callable[[str], None] | None = None
-    ) -> Sighting:
+    def look(self, session: Session, first_ns: int) -> Sighting:
         """Look at a window.
 
         Parameters
@@ -122,8 +120,6 @@ class Watch:
             The last seconds.
         first_ns : int
             Stamp that the time of the model's own effects counts from.
-        progress : callable, optional
-            Called with words on what goes on.
 
         Raises
         ------
@@ -139,7 +135,7 @@ class Watch:
             """Where the tools give their own poses, `model` is what they are worked out with."""
             return self._problem(seen, model if truth == RIGID else None)
 
-        self._last = self._judged(problem_with, truth, progress)
+        self._last = self._judged(problem_with, truth)
         return self._last
 
     def _corrected(self, session: Session, began_s: float) -> PreparedSession:
@@ -162,12 +158,7 @@ class Watch:
         spread = replace(spread, accuracy=replace(spread.accuracy, **free))
         return problem_of(seen.with_session(replace(seen.session, tools=tools)), spread)
 
-    def _judged(
-        self,
-        problem_with: Callable[[FieldModel], Problem],
-        truth: str,
-        progress: Callable[[str], None] | None,
-    ) -> Sighting:
+    def _judged(self, problem_with: Callable[[FieldModel], Problem], truth: str) -> Sighting:
         problem = problem_with(self._prepared.model)
         plain = evaluate(problem, ())
         excess, frames = _excess(plain), sum(tool.time.size for tool in problem.tools)
@@ -186,11 +177,11 @@ class Watch:
         if not _moves(problem):
             return replace(seen, remark='the tool moves too little to identify the effect')
         self.searches += 1
-        found = diagnose(problem, self._prepared.model, LIGHT, progress)
+        found = diagnose(problem, self._prepared.model, LIGHT)
         left = _excess(evaluate(problem, found.terms))
         if truth == RIGID and found.findings and left >= EXCESS:
             problem = problem_with(found.model)
-            found = diagnose(problem, self._prepared.model, LIGHT, progress)
+            found = diagnose(problem, self._prepared.model, LIGHT)
             left = _excess(evaluate(problem, found.terms))
         self._left = left
         return replace(

@@ -15,12 +15,10 @@ METADATA_VERSION = 9
 FOREVER = {'sec': 9223372036, 'nsec': 854775807}
 
 
-def qos_profile(
-    *, reliable: bool = True, latched: bool = False, depth: int = 1, keep_all: bool = False
-) -> dict[str, Any]:
+def qos_profile(*, reliable: bool = True, latched: bool = False, depth: int = 1) -> dict[str, Any]:
     """Return an offered quality of service as rosbag2 (version 9) writes it."""
     return {
-        'history': 'keep_all' if keep_all else 'keep_last',
+        'history': 'keep_last',
         'depth': depth,
         'reliability': 'reliable' if reliable else 'best_effort',
         'durability': 'transient_local' if latched else 'volatile',
