@@ -1,4 +1,4 @@
-"""Names contents shortly: what is equal has one name, on every machine and in every file."""
+"""Gives contents short names: equal contents have one name, on every machine, in every file."""
 
 import hashlib
 from collections.abc import Mapping

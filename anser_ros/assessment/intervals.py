@@ -1,4 +1,4 @@
-"""Computes statistics of errors, and 95 % intervals that know which errors hang together.
+"""Computes statistics of errors, and 95 % intervals that account for correlated errors.
 
 Errors that share points or moments are not independent: whole clusters are resampled (cluster
 bootstrap), and for distances between points, the points (vertex bootstrap of Snijders and

@@ -1,4 +1,4 @@
-"""Measures what metal beside a resting sensor does: its pose's shift from that without metal."""
+"""Measures the shift of a resting sensor's pose that metal near it causes."""
 
 from collections.abc import Sequence
 

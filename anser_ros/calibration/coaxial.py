@@ -4,9 +4,9 @@ data.
 A magnet, an electromagnet or a coil of unknown shape has an axis; around it the field hardly
 changes. One dipole is its far field. Equal distances h along the axis make three or five dipoles
 the multipoles of the source's size: their moments are linear, and of either sign, so that a long
-source and a flat one are both described, whatever h is, as long as it is small beside the distance
-of the sensors. A source's place and axis are found with the moments eliminated (variable
-projection).
+source and a flat one are both described, whatever h is, as long as it is small compared with
+the distance of the sensors. A source's place and axis are found with the moments eliminated
+(variable projection).
 """
 
 from collections.abc import Sequence

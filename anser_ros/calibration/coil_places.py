@@ -1,4 +1,4 @@
-"""Places the drawn coils where they lie: each is shifted, turned and scaled as fluxes ask.
+"""Places the drawn coils where they lie: each is shifted, turned and scaled to fit the fluxes.
 
 A board's coils are etched, glued and soldered a fraction of a millimetre beside their drawing, and
 near them that is most of what a drawing misses. Far fewer readings determine six coordinates and a

@@ -1,4 +1,4 @@
-"""Finds sessions of one tool that tell different things of its sensors.
+"""Finds sessions of one tool that disagree about its sensors.
 
 Every session gets its own parameters about the joint estimate, beside the field that all share.
 The values that two sessions give for a sensor must agree within their uncertainty. Clocks are left

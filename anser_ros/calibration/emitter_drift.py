@@ -1,4 +1,4 @@
-"""Finds emitters whose strength changes during a scan, as the references tell.
+"""Finds emitters whose strength changes during a scan, from the references.
 
 A change of an emitter's strength changes all references' readings of it by one factor, and nothing
 else. Metal changes each of them by another one.

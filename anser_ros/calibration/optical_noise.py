@@ -1,4 +1,4 @@
-"""Estimates the jitter of an optical tracker from poses that the fluxes tell much better."""
+"""Estimates the jitter of an optical tracker from poses that the fluxes determine much better."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Finds widths of populations, and which kinds of errors the data speak for at all.
+"""Finds widths of populations, and which kinds of errors the data support at all.
 
 The likelihood of the parameters is Gaussian about the present estimate. A population's values are
 random with one width, which is the one that makes the data most probable (empirical Bayes; MacKay,

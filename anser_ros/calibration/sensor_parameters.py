@@ -1,4 +1,4 @@
-"""Lists what a scan's sensors, optics and clocks may be off by, and what that does to fluxes.
+"""Lists the errors that a scan's sensors, optics and clocks may have, and their effect on fluxes.
 
 A body's S sensors have a complex gain each (real part minus one, imaginary part), a tilt of the
 axis (rad, along two directions across the surveyed axis) and a place (m, in the body's frame);

@@ -3,7 +3,7 @@
 A plate of a hundred three-axis sensors laid at four heights has more readings than many a scan,
 but nothing that a scan has: no poses to average over, and each sensor saw as many places as there
 are poses. Field, sensors, poses and a bend of the plate are found jointly (`still_fit`). The
-held-out error is that of each pose foretold, where it is stated to be, by all the others: field,
+held-out error is that of each pose predicted, where it is stated to be, by all the others: field,
 sensors, noise and what is chosen come from those alone.
 """
 

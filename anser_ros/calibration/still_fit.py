@@ -2,7 +2,7 @@
 
 Gauss-Newton steps, in which widths of populations follow the spread that is found (expectation
 maximisation), and readings that fit badly lose weight. The noise, the kinds of errors and the free
-dipoles beside the emitters are chosen by the log evidence.
+dipoles in addition to the emitters are chosen by the log evidence.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Records what a survey found: what a model carries, and what is only told."""
+"""Records what a survey found: what a model corrects, and what is only reported."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Handles packages that rosdep does not know: what needs them asks for them in a line."""
+"""Handles packages that rosdep does not know: a command that needs one says so in a line."""
 
 from importlib.util import find_spec
 

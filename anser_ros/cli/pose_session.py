@@ -1,4 +1,4 @@
-"""Adds options to commands that take a session of poses, and does with one what they say."""
+"""Adds options to commands that take a session of poses, and carries them out."""
 
 import argparse
 import csv

@@ -1,4 +1,4 @@
-"""Adds options that several commands share: values stated, bodies surveyed anew."""
+"""Adds options that several commands share: values stated, bodies surveyed again."""
 
 import argparse
 

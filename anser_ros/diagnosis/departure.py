@@ -1,4 +1,4 @@
-"""Tells what metal does at rest by how it moves, for a field that was learnt with it nearby.
+"""Determines what metal does at rest from how it moves, for a field calibrated with it nearby.
 
 While it moves, tools and references sense the difference between the metal at its present place
 and at its place of rest. Body and path are fitted to that difference as to any moving metal. A
@@ -59,7 +59,7 @@ BODY = Richness(90, (25,), SOMETHING_LEFT)
 """How finely the body is shaped, and the path divided beyond `FINE_KNOTS` where much is left."""
 STEPS = 6
 """Steps of a fit at most: it ends by itself once it has settled (`fit.SETTLED`), and a path that
-creeps for longer is judged by what it foretells. Fewer cut fits that would settle; each further
+creeps for longer is judged by what it predicts. Fewer cut fits that would settle; each further
 one costs as much time as the one before."""
 EXPLAINED = 0.1
 """Share of the power in unseen blocks, beyond the noise's, that may stay. Its root, a third, is

@@ -1,4 +1,4 @@
-"""Fits all effects jointly, metal as richly shaped as the data can tell.
+"""Fits all effects jointly, metal in as much detail as the data determine.
 
 A simple body has few parameters; a real one has more, which a prior keeps small. The width of the
 prior is the one that predicts held-out blocks best. Place and couplings are fitted together, so

@@ -1,4 +1,4 @@
-"""Finds what metal at rest is besides its few parameters, as richly as the data can tell."""
+"""Finds how metal at rest differs from a simple body, in as much detail as the data determine."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

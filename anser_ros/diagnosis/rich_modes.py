@@ -1,4 +1,4 @@
-"""Combines a metal's couplings into those that the data tell, of the size that predicts them best.
+"""Combines a metal's couplings into those that the data determine, of the size that predicts best.
 
 Metal has many more couplings than any data can determine. The combinations that the data determine
 best are its modes; the width of their prior is chosen on held-out blocks of time.

@@ -1,4 +1,4 @@
-"""Shapes a richer body for metal that moves, and a freer course where that pays."""
+"""Shapes a richer body for metal that moves, and a freer path where that is worth it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

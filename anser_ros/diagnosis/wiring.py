@@ -1,4 +1,4 @@
-"""Finds wiring faults: no small changes, they show in whose prediction a reading resembles."""
+"""Finds wiring faults: they are not small, and show by whose prediction a reading resembles."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""Describes a session as far as effects need it to say at which sites they may sit."""
+"""Describes what effects need to know of a session to list the sites where they may act."""
 
 from dataclasses import dataclass
 

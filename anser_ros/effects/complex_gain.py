@@ -1,4 +1,4 @@
-"""Writes a complex gain as two numbers beside one, and as the size and phase that a record has."""
+"""Writes a complex gain as its deviation from one, and as the size and phase of a record."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Tells where moving metal is at each time: straight from rest to rest, or along a spline."""
+"""Computes where moving metal is at each time: straight from rest to rest, or along a spline."""
 
 from dataclasses import dataclass
 from typing import Protocol

@@ -1,4 +1,4 @@
-"""Models what a simple metal body or sheet leaves: finer couplings, and light not quite known.
+"""Models the residual of a simple metal body or sheet: finer couplings, errors in illumination.
 
 Not an effect of its own (no registry holds it): it belongs to the metal that it refines, so that
 the corrected field is as good as the data allow while the metal's own parameters stay few.

@@ -1,4 +1,4 @@
-"""Plugs in wrong sockets: channels or emitters exchanged, and channels that hear nothing.
+"""Plugs in wrong sockets: channels or emitters exchanged, and channels that receive nothing.
 
 None has a parameter to fit; they are found before the search (`anser_ros.diagnosis.wiring`).
 """

@@ -1,4 +1,4 @@
-"""Tells whether a topic has one sender, by the numbers that each sender gives its messages.
+"""Detects whether a topic has one sender, by the numbers that each sender gives its messages.
 
 The middleware numbers the messages of a publisher, 1, 2, 3, but does not identify the publisher.
 Messages that continue one sequence are one stream; a second sequence is a second sender,

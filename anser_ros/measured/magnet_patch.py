@@ -3,7 +3,7 @@
 By reciprocity the layout of sessions fits as it stands: frame `fg` is the magnet's own, turned so
 that the patch is above it; its one emitter is a constant dipole (written as a tone of 1 Hz, since
 a tone is asked for; all phasors are real), and every axis of every sensor is a tool sensor of the
-rigid body `patch`. Each file states the sensors' axes anew, up to a degree apart, so a model of
+rigid body `patch`. Each file states the sensors' axes again, up to a degree apart, so a model of
 one file is taken to another with ``--resurveyed patch``.
 
 The data (github xpy-zju/Dual-stage-magnetic-localization, MIT) are read where they lie.

@@ -1,4 +1,4 @@
-"""Imports a plate of Hall sensors over three electromagnets; every height foretells the others.
+"""Imports a plate of Hall sensors over three electromagnets; every height predicts the others.
 
 The data (Boehler et al., IEEE T-RO 2022, doi 10.1109/TRO.2022.3197107, Apache-2.0) are read where
 they lie. The emitters are the magnets' three coils, each driven with a constant current (written

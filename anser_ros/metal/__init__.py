@@ -1,1 +1,1 @@
-"""Models how metal answers to the emitters: bodies and sheets as operators on shapes of field."""
+"""Models how metal responds to the emitters: bodies and sheets as operators on shapes of field."""

@@ -1,4 +1,4 @@
-"""Corrects the poses of a tracker of poses by a model that `diagnose --poses` made."""
+"""Corrects the poses of another tracker by a model that `diagnose --poses` made."""
 
 import sys
 import time

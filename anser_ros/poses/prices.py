@@ -1,4 +1,4 @@
-"""Says what an effect on poses must explain on blocks that it has not seen, to be named."""
+"""States how much of held-out blocks an effect on poses must explain to be named."""
 
 from collections.abc import Sequence
 

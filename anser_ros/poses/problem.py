@@ -1,4 +1,4 @@
-"""Sets a session of poses up for fitting: what is predicted, and by how much it is missed."""
+"""Sets a session of poses up for fitting: what is predicted, and the errors of that."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

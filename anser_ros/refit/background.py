@@ -1,4 +1,4 @@
-"""Works out what takes longer than a frame may beside the frames, by one thread of the process.
+"""Runs work that takes longer than a frame in one background thread of the process.
 
 A result comes into use at a fixed time after it was requested, measured by the stamps of the
 frames: so the refit's results do not depend on how busy the machine is, and a recording gives the

@@ -1,4 +1,4 @@
-"""Says which readings are refitted, how noisy they are, and averages them while nothing moves."""
+"""Decides which readings are refitted, and averages them, with their noise, at rest."""
 
 import math
 from dataclasses import dataclass, field

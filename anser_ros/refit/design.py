@@ -1,4 +1,4 @@
-"""Finds where reference coils tell most: the expected error of poses over a family of metals.
+"""Finds where reference coils inform most: expected errors of poses over a family of metals.
 
 For metal of a known kind and strength everything is Gaussian, so the remaining uncertainty with
 any choice of coils follows before a coil is glued on: the posterior covariance of the metal's

@@ -1,4 +1,4 @@
-"""Puts references' readings beside their baselines, with a reason for each unusable one."""
+"""Compares references' readings with their baselines, with a reason for each unusable one."""
 
 import math
 

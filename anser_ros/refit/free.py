@@ -1,4 +1,4 @@
-"""Fits free dipoles, a separate set for every emitter, as a rival of the shared polarisability.
+"""Fits free dipoles, a set for every emitter, for comparison with the shared polarisability.
 
 This is a refit without the physics of metal: each emitter's change is fitted by separate sources,
 which have only their possible places in common. Clouds, noise, evidence for standoff and strength,

@@ -1,4 +1,4 @@
-"""Reduces a hypothesis' metal to few numbers: the directions in which poses feel it.
+"""Reduces a hypothesis' metal to few numbers: the directions that affect poses.
 
 The field of a cloud's thousands of sources, as the layer makes it in the tracked volume, has some
 tens of directions that affect poses. Coordinates along them have unit variance for metal of unit

@@ -1,5 +1,4 @@
-"""Takes tools as witnesses of metal: what their coils contradict updates what references leave
-open.
+"""Uses tools as witnesses of metal: contradictions of coils settle what references leave open.
 
 The references determine a hypothesis' metal with a known error (`refit.posterior`). A tool that
 moves through the field senses this error: a pose takes six numbers of the readings of its coils,
@@ -8,7 +7,7 @@ and all others remain. They enter a Kalman filter over the coordinates of the er
 next frame's poses are then independent of them, and nothing is counted twice.
 
 Metal moves slowly, and so does the error of its estimate. So the error is a stationary process
-with a memory of `MEMORY_S`; the references of every frame bound its size anew.
+with a memory of `MEMORY_S`; the references of every frame bound its size again.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Finds units and order in which optical poses and fluxes were written, by what the fluxes tell.
+"""Finds units and order in which optical poses and fluxes were written, from the fluxes.
 
 Poses predict the fluxes of the drawn board. If they do not fit as they are, but fit when read in
 another unit or another order, they were written in that convention. If nothing fits (an optical

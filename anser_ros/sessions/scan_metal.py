@@ -1,4 +1,4 @@
-"""Takes metal that moved during a scan, and rested near it before and after, off the scan.
+"""Removes the field of metal from a scan that moved in it, and rested near before and after.
 
 Frames in which it moves are left out of a calibration, but a field that is fitted to the others
 contains the resting metal. Its motion determines its field at rest

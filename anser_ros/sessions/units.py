@@ -1,4 +1,4 @@
-"""Tells units that numbers are often written in by mistake by how much too large they are."""
+"""Recognises units that are often used by mistake, by how much too large the numbers are."""
 
 import math
 from collections.abc import Mapping

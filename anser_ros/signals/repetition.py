@@ -1,4 +1,4 @@
-"""Finds repeated samples: a column whose newest samples equal, bit for bit, what it said before.
+"""Finds repeated samples: a column whose newest samples equal earlier ones bit for bit.
 
 Fresh samples carry new noise, so that a long run of them never equals an earlier one. How long a
 run must be follows from the observed noise of a column: at the lag at which its tones return most

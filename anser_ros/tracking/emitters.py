@@ -1,4 +1,4 @@
-"""Goes on tracking with the emitters that are left when others have died.
+"""Continues tracking with the remaining emitters after others have failed.
 
 An emitter of which no sensor has a flux (not finite, or exactly zero) has no part in the solve: it
 has no weight, and the covariance grows accordingly.

@@ -1,4 +1,4 @@
-"""Runs a command of the suite as a process of its own, with what it says of its progress."""
+"""Runs a command of the suite as a process of its own, and reads its progress."""
 
 import asyncio
 import contextlib

@@ -1,5 +1,4 @@
-"""Reads the channel calibration (`anser_channels/1`), which leads from volts at the converter to
-tesla.
+"""Reads the channel calibration (`anser_channels/1`), from volts at the converter to tesla.
 
 For each sensor channel it holds the effective area a = N A G of coil and amplifier, m^2, so that
 V = j w a B exp(-j w d), and the delay d, s, of everything behind the coil. It belongs to a control

@@ -1,4 +1,4 @@
-"""Lists of points of 3D Slicer (markups, ``.fcsv``)."""
+"""Reads lists of points of 3D Slicer (markups, ``.fcsv``)."""
 
 from pathlib import Path
 

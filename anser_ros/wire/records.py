@@ -1,4 +1,4 @@
-"""Defines what the control unit and the host tell each other: hellos, samples, commands.
+"""Defines what the control unit and the host exchange: hellos, samples, commands.
 
 `frames` turns these records into bytes and back; `docs/cu_protocol.md` says what each field means.
 """

@@ -1,4 +1,4 @@
-"""Reads the setup document (`anser_setup/1`): which coils drive, which listen, and where they are.
+"""Reads the setup document (`anser_setup/1`): which coils drive, which sense, and where they are.
 
 The YAML text is contained in every bag and published on the latched topic ``setup``. Sensor
 positions and axes are given in the frame of the sensor's body; the body ``fg`` is the field

@@ -1,4 +1,4 @@
-"""Takes values of a setup document whole, or refuses them with their place in the document.
+"""Reads values of a setup document, or refuses them with their place in the document.
 
 All functions raise `SetupError` with one line that names the value and its place.
 """

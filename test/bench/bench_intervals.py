@@ -1,6 +1,6 @@
 """How often the 95 % intervals of Hummel's board hold the truth: simulated boards, other seeds.
 
-The points of a board have independent errors, or a smooth distortion besides that is drawn anew
+The points of a board have independent errors, or a smooth distortion besides that is drawn again
 for each board (a Gaussian process of the stated length, 1 mm rms a coordinate). The truth is the
 mean of three thousand boards. No seed below 8999 is used here: the rule was chosen on some of
 those. The table goes into docs/howto/accuracy.md.

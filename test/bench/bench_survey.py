@@ -1,7 +1,7 @@
 """How well a scan tells its own errors: simulated scans by a hand, on seeds that chose nothing.
 
 Coils of seven random dipoles each, no drawing. Of three coils, what is found is compared with what
-was put in, relative to the rules for what no data tell. Of eight, the tool's coils are tracked
+was put in, relative to the rules for what no data determine. Of eight, the coils are tracked
 singly on a path that the scan did not take, and their exact error is compared with that of a scan
 by a perfect tool and a camera that only jitters. Both tables go into docs/calibration.md.
 

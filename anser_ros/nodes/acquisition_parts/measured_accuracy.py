@@ -1,4 +1,4 @@
-"""Measures what only the stream tells of its own accuracy, for the setup document."""
+"""Measures the accuracy that only the stream itself shows, for the setup document."""
 
 import math
 from dataclasses import replace

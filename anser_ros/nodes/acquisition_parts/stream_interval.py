@@ -1,4 +1,4 @@
-"""Counts what the acquisition has published since it last told of itself."""
+"""Counts what the acquisition has published since its last status."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Tells what an acquisition says of emitters and sensors: a line each, what is wrong in words."""
+"""Reports the state of emitters and sensors: a line for each, with what is wrong in words."""
 
 from collections.abc import Iterable, Sequence
 

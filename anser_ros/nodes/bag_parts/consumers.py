@@ -1,4 +1,4 @@
-"""Tells when the nodes that listen have caught up, for a replay without a clock of its own.
+"""Detects when the subscribers have caught up, for a replay without a clock of its own.
 
 DDS confirms the messages that a listener's queue has taken, not those that its callbacks have
 processed. But every node answers parameter requests from the same executor that runs its

@@ -1,4 +1,4 @@
-"""Gathers what a field_model hears of reference coils on moving bodies: poses and fluxes."""
+"""Gathers what a field_model receives about reference coils on moving bodies: poses and fluxes."""
 
 from collections.abc import Callable, Mapping
 from typing import Any

@@ -1,4 +1,4 @@
-"""Watches whether the references have the board where the served model has it."""
+"""Watches whether the references locate the board where the served model has it."""
 
 import time
 from collections.abc import Callable

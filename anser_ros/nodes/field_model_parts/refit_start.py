@@ -1,7 +1,7 @@
-"""Makes a refit beside the callbacks, which go on meanwhile.
+"""Makes a refit in the background, while the callbacks go on.
 
 Its tables, seconds of work, need the model and the references' places only, so they are begun
-before there is a baseline. What a baseline adds is half a second more, for each baseline anew.
+before there is a baseline. What a baseline adds is half a second more, for each baseline again.
 """
 
 from concurrent.futures import Future, ThreadPoolExecutor, wait

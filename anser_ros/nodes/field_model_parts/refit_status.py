@@ -1,4 +1,4 @@
-"""Tells ``/diagnostics`` of model and refit: their figures, and a line for every reference."""
+"""Reports model and refit in ``/diagnostics``: their figures, and a line for every reference."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Tells why things are as they are, in the words of the nodes' diagnostics, the gravest first.
+"""Explains the system's state in the words of the nodes' diagnostics, the gravest cause first.
 
 A service answers with the same words, because both come from the node concerned.
 """

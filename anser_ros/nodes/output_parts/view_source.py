@@ -1,4 +1,4 @@
-"""Tells the page what the graph shows: topics are looked at, and become arrays and words."""
+"""Gives the page what the graph shows: topics are polled, and become arrays and words."""
 
 import math
 import os

@@ -1,4 +1,4 @@
-"""Finds parameter files that say nothing to the node that was given them."""
+"""Finds parameter files without an entry for the node that they were given to."""
 
 import difflib
 import itertools

@@ -1,1 +1,1 @@
-"""Holds what several nodes receive or send: clouds, one believed publisher, the newest frame."""
+"""Holds what several nodes receive or send: clouds, a single publisher, the newest frame."""

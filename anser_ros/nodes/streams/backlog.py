@@ -1,4 +1,4 @@
-"""Tells when a node has fallen behind what it receives, so far that it won't catch up by itself.
+"""Detects when a node has fallen too far behind what it receives to catch up by itself.
 
 Poses that are late by several windows are useless for guidance, so a node that is slower than its
 input discards the waiting messages and takes the newest. A node that only paused may catch up, and

@@ -1,4 +1,4 @@
-"""Subscribes to a topic and believes one publisher, and says so where there are more."""
+"""Subscribes to a topic, uses a single publisher of it, and reports when there are more."""
 
 import time
 from collections.abc import Callable, Hashable, Mapping

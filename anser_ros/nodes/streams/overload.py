@@ -1,4 +1,4 @@
-"""Says where a computer is too slow for the frames that come."""
+"""Reports when a computer is too slow for the frames that it receives."""
 
 import os
 

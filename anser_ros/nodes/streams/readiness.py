@@ -1,4 +1,4 @@
-"""Tells when all who will listen to a replay are ready, so that nothing of it is lost.
+"""Detects when all subscribers of a replay are ready, so that nothing of it is lost.
 
 The graph shows who subscribes to the fluxes and to the poses that the setup promises, and which of
 the nodes that work on fluxes are running. ``/diagnostics`` tells whether the tracker has the

@@ -1,4 +1,4 @@
-"""Keeps the model that the tracker uses, with its age while the references say nothing."""
+"""Keeps the model that the tracker uses, with its age while the references are silent."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Takes topics of poses for a watcher, and says what it saw in them."""
+"""Takes topics of poses for a watcher, and reports what it found in them."""
 
 import time
 from collections.abc import Callable, Sequence

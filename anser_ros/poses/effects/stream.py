@@ -1,4 +1,4 @@
-"""Finds what is wrong with a stream: poses that come again, are missing, or belong nowhere."""
+"""Finds what is wrong with a stream: poses that are repeated, missing or outliers."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import ClassVar
