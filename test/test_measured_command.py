@@ -36,7 +36,7 @@ def test_a_recipe_is_commands_that_anybody_can_type(capsys, tmp_path, monkeypatc
         return Recipe(
             'set', lambda folder, into: [into / f'{folder.name}.mcap'],
             lambda bags, out: [[verb, str(bags[0])]],
-            lambda bags, out: [
+            lambda folder, bags, out: [
                 ReportRow('set', 'figure', 2.0, 1.0, 'mm', 1.1, True, 'nothing', 0.9)
             ],
         )  # fmt: skip

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_measured_hpi import COIL, MOMENT, helmet
+from scipy.spatial.transform import Rotation
 
 from anser_ros.cli import measured
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, FitError
-from anser_ros.measured import hpi_session, navion
-from anser_ros.measured.hpi_coils import HpiData
+from anser_ros.measured import hpi_coils, navion
 from anser_ros.measured.session_file import write_frames
 from anser_ros.sessions.session import load_session
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
@@ -21,6 +20,7 @@ from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get('ANSER_SHARED', ROOT.parent / 'shared'))
 NAVION = SHARED / 'measured' / 'navion'
+PLACES = np.array([[0.06, 0.02, 0.01], [-0.05, 0.04, 0.0], [-0.04, -0.05, 0.03], [0.0, 0.0, 0.09]])
 COILS = tuple(Coil(f'c{k}', (0.1 * k, 0.0, 0.0), 0.0, 1.0 + k) for k in range(3))
 
 
@@ -111,35 +111,78 @@ class TestNavion:
             (tmp_path / kind).mkdir()
             text = json.dumps({'heldout_by_pose': poses})
             (tmp_path / kind / 'calibration.json').write_text(text)
-        every, inner = navion.rows([], tmp_path)
+        every, inner = navion.rows(tmp_path, [], tmp_path)
         assert inner.before == pytest.approx(0.3) and inner.after == pytest.approx(0.05)
         assert inner.met and not every.met
         assert every.after == pytest.approx(np.sqrt((0.2**2 + 0.05**2 + 0.1**2) / 3))
 
 
 class TestHpi:
-    TONES = np.array([70.0, 72.0])
+    def epoch(self, rng, inverted=(5, 10)):
+        """Thirty-six channels in the stored layout, gradiometers but for each third; 4 tones."""
+        count, time = 36, np.arange(600) / 600.0
+        weight = np.where(np.arange(count)[:, None] % 3, [[60.0, -60.0]], [[0.5, 0.5]])
+        point = rng.normal(size=(count, 1, 3)) + [[[0.01, 0, 0]], [[-0.01, 0, 0]]][0]
+        point = np.concatenate([point, point + [[[0.0, 0.01, 0.0]]]], axis=1)
+        normal = np.tile([0.0, 0.0, 1.0], (count, 2, 1))
+        stored = 1e-12 * rng.normal(size=(4, count))
+        sign = np.where(np.isin(np.arange(count), inverted), -1.0, 1.0)
+        wave = np.cos(2.0 * np.pi * np.outer(hpi_coils.TONES_HZ, time) + 0.3)
+        samples = 1e14 * (stored * sign).T @ wave + 5.0 + 3.0 * time
+        return hpi_coils.Epoch(
+            tuple(f'c{k}' for k in range(count)), np.arange(count) % 3 == 0, point, normal,
+            weight, samples, 600.0, stored, PLACES, PLACES,
+        )  # fmt: skip
 
-    def test_magnetometers_are_references_and_coils_emitters(self, tmp_path, monkeypatch):
-        array = helmet(12)
-        places = np.array([COIL, COIL * [-1, 1, 1]])
-        signal = np.array([array.signals(place) @ MOMENT for place in places]).T
-        flux = (signal * (1 + 0.1j))[array.is_magnetometer]
-        data = HpiData(array, signal.T, np.zeros((36, 600)), 600.0, places, places)
-        monkeypatch.setattr(hpi_session, 'phasors', lambda given: (self.TONES, flux))
-        path = tmp_path / 'hpi.mcap'
-        hpi_session.write_session(data, path)
-        session = load_session(path)
-        assert session.tools == () and session.setup.frequencies_hz == (70.0, 72.0)
-        reference = session.reference
-        np.testing.assert_allclose(reference.flux[0], flux, rtol=1e-6)
-        assert len(reference.sensors) == 12
-        # A point at a magnetometer's middle sees what the magnetometer does, to its size.
-        distance = reference.sensors.position - places[0]
-        r = np.linalg.norm(distance, axis=1)[:, None]
-        field = 1e-7 * (3 * distance * (distance @ MOMENT)[:, None] / r**5 - MOMENT / r**3)
-        seen = np.sum(field * reference.sensors.axis, axis=1)
-        np.testing.assert_allclose(reference.flux[0, :, 0].real, seen, rtol=0.1, atol=1e-13)
+    def test_fluxes_are_the_tones_in_tesla_with_the_signs_as_sampled(self, rng):
+        epoch = self.epoch(rng)
+        flux, base = hpi_coils.fluxes(epoch), epoch.base_m
+        assert base[0] == 1.0 and base[1] == pytest.approx(1.0 / 60.0)
+        sign = np.where(np.isin(np.arange(36), (5, 10)), -1.0, 1.0)
+        wanted = (epoch.stored * base * sign).T
+        # The phase of a tone is known up to half a turn.
+        turned = np.sign((flux[0].real * wanted).sum(axis=0))
+        np.testing.assert_allclose(turned * flux[0], wanted, atol=1e-15)
+        assert np.flatnonzero(hpi_coils.inverted(epoch)).tolist() == [5, 10]
+
+    def test_the_setup_has_a_sum_of_points_for_each_channel(self, rng):
+        epoch = self.epoch(rng)
+        setup = hpi_coils.setup_of(epoch)
+        assert len(setup.sensors) == 36 and setup.bodies == ('helmet',)
+        loop, difference = setup.sensors[0], setup.sensors[1]
+        assert sum(w[3] for w in loop.windings) == pytest.approx(1.0)
+        assert [w[3] for w in difference.windings] == [1.0, -1.0]
+        np.testing.assert_allclose(difference.position_m, epoch.points_m[1].mean(axis=0))
+
+    def test_distances_are_free_of_order_and_of_a_rigid_move(self, rng):
+        turned = PLACES[[2, 0, 3, 1]] @ Rotation.from_rotvec([0.3, 1.0, 2.0]).as_matrix() + 0.3
+        assert hpi_coils.distance_mm(turned, PLACES) < 1e-6
+        off = PLACES + 1e-3 * rng.normal(size=(4, 3))
+        assert 0.1 < hpi_coils.distance_mm(off, PLACES) < 3.0
+
+    def test_rows_compare_names_and_places(self, tmp_path, rng, monkeypatch):
+        epoch = self.epoch(rng)
+        monkeypatch.setattr(hpi_coils, 'load', lambda folder: epoch)
+        for kind, channels in (('plain', []), ('full', [5, 7])):
+            (tmp_path / kind).mkdir()
+            effects = [{'name': 'sensor_polarity', 'parameters': {'channels': channels}}]
+            sources = [{'position_m': place.tolist()} for place in PLACES]
+            document = {
+                'effects': effects, 'sources': sources, 'heldout_flux_rmse_t': 1e-12
+            }  # fmt: skip
+            (tmp_path / kind / 'calibration.json').write_text(json.dumps(document))
+        vendor, _, named, foretold, falsely = hpi_coils.rows(tmp_path, [], tmp_path)
+        assert vendor.after < 1e-6 and vendor.met
+        assert (named.before, named.after, named.target, named.met) == (0.0, 1.0, 2.0, False)
+        assert foretold.after == pytest.approx(1.0)
+        assert (falsely.after, falsely.met) == (1.0, False)
+
+    def test_a_file_that_is_missing_or_another_is_refused(self, tmp_path):
+        with pytest.raises(FitError, match='no such file'):
+            hpi_coils.load(tmp_path)
+        np.savez(tmp_path / 'hpi_coils.npz', a=1)
+        with pytest.raises(FitError, match='not the expected set'):
+            hpi_coils.load(tmp_path)
 
 
 def test_the_command_writes_bags_and_says_what_has_none(tmp_path, monkeypatch, capsys):

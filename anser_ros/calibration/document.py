@@ -71,11 +71,32 @@ def to_document(calibration: Calibration) -> dict[str, Any]:
         },
         'nominal_flux_rmse_t': nominal,
         'effects': [_effect(record) for record in (*scan.corrections, *scan.reported_effects)],
-        'unobservable': [] if scan.survey is None else list(undetermined_words(scan.survey)),
+        'unobservable': [
+            *([] if scan.survey is None else undetermined_words(scan.survey)),
+            *calibration.undetermined,
+        ],
+        **_sources(calibration),
         'shift_sigma_m': calibration.model.shift_sigma_m,
         'contradictions': list(calibration.contradictions),
         'optical_noise': None if scan.survey is None else _optical(scan.survey.optical),
     }
+
+
+def _sources(calibration: Calibration) -> dict[str, Any]:
+    """Places of emitters that were found, and how far the sensors are off altogether."""
+    if not calibration.sources:
+        return {}
+    found = [
+        {
+            'name': one.name,
+            'position_m': one.position_m.tolist(),
+            'sigma_m': one.sigma_m,
+            'moment_am2': one.moment_am2.tolist(),
+            'stray_dipoles': one.stray_dipoles,
+        }
+        for one in calibration.sources
+    ]
+    return {'sources': found, 'sensor_widths': dict(calibration.sensor_widths)}
 
 
 def _by_pose(held_out: HeldOut) -> dict[str, Any]:

@@ -57,10 +57,10 @@ class Layout:
 
     Attributes
     ----------
-    kind : {'layer', 'layer_xyz', 'coils', 'coaxial', 'drawing', 'free'}
+    kind : {'layer', 'layer_xyz', 'coils', 'coaxial', 'drawing', 'free', 'sources'}
         A layer of z-dipoles, a layer of dipoles with three free components, z-dipoles on the
         coils, dipoles along an axis of its own for each coil, those of the drawn coils, or some
-        about each coil and ``count`` beside them, each where the data put it.
+        about each coil (or one in its place) and ``count`` beside them, where the data put them.
     count : int
         Number of dipoles along a side of the layer, of each coil, along each axis, or in all.
     extension : float
@@ -94,6 +94,11 @@ class Layout:
             return (
                 f'three-component dipoles at 7 places about every emitter, place free, and at '
                 f'{self.count} beside them'
+            )
+        if self.kind == 'sources':
+            return (
+                f'a three-component dipole for every emitter, place free, and {self.count} of '
+                'their stray fields'
             )
         if self.kind == 'drawing':
             return f'{self.count} of the drawn coils, each coil placed where it fits, pulled to it'

@@ -82,6 +82,20 @@ def check_measurements(
     return readings
 
 
+def check_single_coils(measurements: Sequence[Measurements]) -> None:
+    """Raise `FitError` when a sensor is a sum of windings: only a body at one place may have
+    them.
+    """
+    for m in measurements:
+        rows = np.flatnonzero(~m.sensors.is_single)
+        if rows.size:
+            raise FitError(
+                f'{m.sensors.name[rows[0]]} has windings: such sensors are calibrated only on a '
+                f'body of at least {MANY_SENSORS} sensors that rests at one place, over emitters '
+                'without a drawing'
+            )
+
+
 def check_kept(
     measurements: Sequence[Measurements], kept: Sequence[Measurements], needed: int
 ) -> None:

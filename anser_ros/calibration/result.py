@@ -1,7 +1,7 @@
 """Holds the result of a calibration with its residuals and its provenance."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -83,6 +83,29 @@ class Scan:
 
 
 @dataclass(frozen=True)
+class SourcePlace:
+    """Says where an emitter of unknown place was found.
+
+    Attributes
+    ----------
+    name : str
+        Of the emitter.
+    position_m, moment_am2 : ndarray, shape (3,)
+        Place, and the in-phase part of its moment, frame fg.
+    sigma_m : float
+        Standard deviation of the place, root of the sum over three axes.
+    stray_dipoles : int
+        Dipoles that describe its stray field.
+    """
+
+    name: str
+    position_m: Array
+    sigma_m: float
+    moment_am2: Array
+    stray_dipoles: int
+
+
+@dataclass(frozen=True)
 class Calibration:
     """Holds a field model with the figures of its fit and of its choice.
 
@@ -113,6 +136,13 @@ class Calibration:
         The scan with what was wrong with it.
     contradictions : tuple of str
         A line for every sensor of which two sessions say different things.
+    sources : tuple of SourcePlace
+        Of the emitters whose places are not in the setup, where these were found.
+    sensor_widths : mapping of str to float
+        Standard deviations of the sensors' places (m), axes (rad) and gains, where only these can
+        be told.
+    undetermined : tuple of str
+        A line for everything that was asked for, and that the readings do not determine.
     """
 
     model: FieldModel
@@ -127,6 +157,9 @@ class Calibration:
     residuals: Residuals
     scan: Scan
     contradictions: tuple[str, ...] = ()
+    sources: tuple[SourcePlace, ...] = ()
+    sensor_widths: Mapping[str, float] = field(default_factory=dict)
+    undetermined: tuple[str, ...] = ()
 
     @property
     def better_than_nominal(self) -> bool:

@@ -46,6 +46,31 @@ def undetermined_words(result: SurveyResult) -> tuple[str, ...]:
     return tuple(words)
 
 
+def reversed_sensors(
+    channels: NDArray[np.int64], evidence: Array, held_out: Array
+) -> tuple[EffectRecord, ...]:
+    """Return a record of the channels that are the wrong way round, none where there are none.
+
+    ``evidence`` is the log probability of each over its opposite, ``held_out`` the same where the
+    channel took no part.
+    """
+    if not channels.size:
+        return ()
+    told = {
+        'log_probability': float(evidence.min()),
+        'held_out_log_probability': float(held_out.min()),
+    }
+    return (EffectRecord('sensor_polarity', {'channels': channels.tolist()}, {}, told),)
+
+
+def noisy_sensors(channels: NDArray[np.int64], ratios: Array) -> tuple[EffectRecord, ...]:
+    """Return a record of each channel that is noisier than the median one by a ratio."""
+    return tuple(
+        EffectRecord('excess_noise', {'factor': ratio, 'channels': [channel]})
+        for channel, ratio in zip(channels.tolist(), ratios.tolist(), strict=True)
+    )
+
+
 def drift_records(strength: NDArray[np.complex128]) -> tuple[EffectRecord, ...]:
     """Return the emitters that drifted in a scan, from their strengths (F, K), and how far."""
     size = np.abs(strength)

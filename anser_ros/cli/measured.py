@@ -23,7 +23,6 @@ from anser_ros.measured import (
     ReportRow,
     anser_board,
     hpi_coils,
-    hpi_session,
     magnet_patch,
     magnet_step,
     navion,
@@ -38,11 +37,6 @@ def _magnet_step(folder: Path) -> tuple[list[ReportRow], str]:
     return magnet_step.rows(analysis), magnet_step.tables(analysis)
 
 
-def _hpi_coils(folder: Path) -> tuple[list[ReportRow], str]:
-    analysis = hpi_coils.analyse(folder)
-    return hpi_coils.rows(analysis), hpi_coils.tables(analysis)
-
-
 def _anser_board(folder: Path) -> tuple[list[ReportRow], str]:
     analysis = anser_board.analyse(folder)
     return anser_board.rows(analysis), anser_board.tables(analysis)
@@ -50,17 +44,15 @@ def _anser_board(folder: Path) -> tuple[list[ReportRow], str]:
 
 STUDIES: dict[str, Study] = {
     magnet_step.NAME: _magnet_step,
-    hpi_coils.NAME: _hpi_coils,
     anser_board.NAME: _anser_board,
 }
 """Analysis of each data set without a recipe: rows of its figures, text of its candidates."""
 RECIPES: dict[str, Recipe] = {
-    recipe.name: recipe for recipe in (navion.RECIPE, magnet_patch.RECIPE)
+    recipe.name: recipe for recipe in (navion.RECIPE, magnet_patch.RECIPE, hpi_coils.RECIPE)
 }
 """Data sets that the shipped commands are run on."""
 SESSIONS: dict[str, Callable[[Path, Path], list[Path]]] = {
-    **{name: recipe.write_sessions for name, recipe in RECIPES.items()},
-    hpi_coils.NAME: hpi_session.write_sessions,
+    name: recipe.write_sessions for name, recipe in RECIPES.items()
 }
 """Function of each data set with fluxes that writes its sessions as bags."""
 NAMES = (*RECIPES, *STUDIES)
@@ -149,7 +141,7 @@ def _cook(
                 raise ParameterError(
                     f'{recipe.name}: anser {command[0]} ended with {code}: {_last(said)}'
                 )
-        return recipe.rows(bags, out)
+        return recipe.rows(folder, bags, out)
 
 
 def _last(said: io.StringIO) -> str:

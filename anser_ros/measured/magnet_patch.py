@@ -212,7 +212,7 @@ def commands(bags: list[Path], out: Path) -> list[list[str]]:
     return told
 
 
-def rows(bags: list[Path], out: Path) -> list[ReportRow]:
+def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
     """Return the errors before and after, on files that took no part."""
     made = []
     for bag, other in itertools.permutations(bags, 2):

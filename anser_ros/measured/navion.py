@@ -117,7 +117,7 @@ def commands(bags: list[Path], out: Path) -> list[list[str]]:
     ]  # fmt: skip
 
 
-def rows(bags: list[Path], out: Path) -> list[ReportRow]:
+def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
     """Return the errors of heights that took no part, without and with what was found."""
     before, after = (_errors_mt(ran(out / kind, 'calibration.json')) for kind in ('plain', 'full'))
     return [

@@ -23,13 +23,14 @@ class Recipe:
         From the bags and the folder for results to the command lines, in their order: verb and
         arguments of `anser`, as anybody would type them.
     rows : callable
-        From the bags and the folder to the figures, read from what the commands wrote.
+        From the folder of the data, the bags and the folder for results to the figures, read from
+        what the commands wrote.
     """
 
     name: str
     write_sessions: Callable[[Path, Path], list[Path]]
     commands: Callable[[list[Path], Path], list[list[str]]]
-    rows: Callable[[list[Path], Path], list[ReportRow]]
+    rows: Callable[[Path, list[Path], Path], list[ReportRow]]
 
 
 def ran(folder: Path, name: str) -> dict[str, Any]:

@@ -18,6 +18,61 @@ share a centre within winding tolerances of some 0.1 mm, separate sensors are ce
 
 
 @dataclass(frozen=True)
+class Windings:
+    """Holds sensors that are weighted sums of points, such as loops and gradiometers.
+
+    A reading is the sum of each point's weight times the flux density there along the sensor's
+    axis. Weights of a loop have the sum one, those of two coils wound against each other zero. A
+    sensor with fewer points has further ones of weight zero.
+
+    Attributes
+    ----------
+    offset : ndarray, shape (S, Q, 3)
+        From the sensor's position, m, in the frame of its body.
+    weight : ndarray, shape (S, Q)
+        Zero in all of a row for a sensor that is a single coil.
+    """
+
+    offset: Array
+    weight: Array
+
+    @staticmethod
+    def of(rows: Sequence[Sequence[Sequence[float]]]) -> 'Windings | None':
+        """Return windings of lists of (x, y, z, weight), a list a sensor; None where all are
+        empty.
+        """
+        most = max((len(row) for row in rows), default=0)
+        if most == 0:
+            return None
+        table = np.zeros((len(rows), most, 4))
+        for own, row in zip(table, rows, strict=True):
+            own[: len(row)] = np.asarray(row, dtype=np.float64).reshape(-1, 4)
+        return Windings(table[:, :, :3], table[:, :, 3])
+
+    @property
+    def is_sum(self) -> NDArray[np.bool_]:
+        """Return which sensors (S,) are a sum of points."""
+        return np.asarray((self.weight != 0.0).any(axis=1))
+
+
+def joined_windings(tables: Sequence['SensorTable']) -> Windings | None:
+    """Return the windings of several tables, one table after the other."""
+    given = [table.windings for table in tables]
+    most = max((w.weight.shape[1] for w in given if w is not None), default=0)
+    if most == 0:
+        return None
+    offset, weight = [], []
+    for table, own in zip(tables, given, strict=True):
+        points = np.zeros((len(table), most, 4))
+        if own is not None:
+            points[:, : own.weight.shape[1], :3] = own.offset
+            points[:, : own.weight.shape[1], 3] = own.weight
+        offset.append(points[:, :, :3])
+        weight.append(points[:, :, 3])
+    return Windings(np.concatenate(offset), np.concatenate(weight))
+
+
+@dataclass(frozen=True)
 class SensorTable:
     """Holds a table of S pick-up coils with one row each.
 
@@ -31,6 +86,8 @@ class SensorTable:
         Centre (m) and unit sensitive axis in the frame of the sensor's body.
     length : ndarray, shape (S,)
         Length of the coil along its axis, m; 0 for a point sensor.
+    windings : Windings or None
+        Points of the sensors that are sums of several; None where all are single coils.
     """
 
     channel: NDArray[np.int64]
@@ -39,6 +96,14 @@ class SensorTable:
     position: Array
     axis: Array
     length: Array
+    windings: Windings | None = None
+
+    @property
+    def is_single(self) -> NDArray[np.bool_]:
+        """Return which sensors (S,) are single coils, not sums of points."""
+        if self.windings is None:
+            return np.ones(len(self), dtype=bool)
+        return ~self.windings.is_sum
 
     def __len__(self) -> int:
         return len(self.name)
@@ -53,6 +118,9 @@ class SensorTable:
             position=self.position[index],
             axis=self.axis[index],
             length=self.length[index],
+            windings=None
+            if self.windings is None
+            else Windings(self.windings.offset[index], self.windings.weight[index]),
         )
 
     def of_body(self, body: str) -> 'SensorTable':
@@ -69,6 +137,7 @@ class SensorTable:
             position=np.concatenate([table.position for table in tables]),
             axis=np.concatenate([table.axis for table in tables]),
             length=np.concatenate([table.length for table in tables]),
+            windings=joined_windings(tables),
         )
 
     def with_geometry(

@@ -11,7 +11,13 @@ from anser_ros.calibration.calibrate import Options, fit_scan, survey
 from anser_ros.calibration.disturbances import outside, spans_of, unsteady_references
 from anser_ros.calibration.emitter_drift import at_strength, emitter_strength
 from anser_ros.calibration.layouts import Generator
-from anser_ros.calibration.requirements import FEWEST_FRAMES, FEWEST_POSES, MANY_SENSORS
+from anser_ros.calibration.one_place import calibrate_at_one_place, is_at_one_place
+from anser_ros.calibration.requirements import (
+    FEWEST_FRAMES,
+    FEWEST_POSES,
+    MANY_SENSORS,
+    check_single_coils,
+)
 from anser_ros.calibration.result import Calibration, Scan
 from anser_ros.calibration.still import STILL_ONLY, calibrate_still, is_still
 from anser_ros.calibration.survey_records import drift_records
@@ -78,7 +84,15 @@ def calibrate_sessions(
     names = [Path(session.path).name for session in sessions for _ in session.tools]
     options = replace(options, accuracy=setup.accuracy)
     generator, nominal = generator_of(setup), Drawing.of(setup).model
-    if options.estimate and options.layout is None and nominal is None and is_still(measurements):
+    alone = options.layout is None and nominal is None
+    if alone and is_at_one_place(measurements, options.accuracy):
+        found = calibrate_at_one_place(
+            measurements[0], names[0], setup.emitter_names, setup.frequencies_hz,
+            options.estimate, options.accuracy, progress,
+        )  # fmt: skip
+        return _for_sessions(found, sessions)
+    check_single_coils(measurements)
+    if options.estimate and alone and is_still(measurements):
         still = calibrate_still(
             measurements[0], names[0], generator, setup.emitter_names, setup.frequencies_hz,
             options.estimate, options.accuracy, progress,

@@ -11,7 +11,7 @@ from anser_ros.errors import BagError
 from anser_ros.field.measurements import Measurements
 from anser_ros.frames.faults import GOOD, value_codes
 from anser_ros.physics.pose_track import PoseTrack
-from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.sensor import SensorTable, Windings
 from anser_ros.sessions.plausibility import plausible_tools
 from anser_ros.stamps import NANO
 from anser_ros.wire.points import STALE
@@ -78,6 +78,7 @@ def sensor_table(specs: tuple[SensorSpec, ...]) -> SensorTable:
         position=np.array([s.position_m for s in specs], dtype=np.float64).reshape(-1, 3),
         axis=np.array([s.axis for s in specs], dtype=np.float64).reshape(-1, 3),
         length=np.array([s.length_m for s in specs], dtype=np.float64),
+        windings=Windings.of([s.windings for s in specs]),
     )
 
 

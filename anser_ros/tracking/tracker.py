@@ -45,7 +45,8 @@ class Tracker:
     model : FieldModel or None
         None until one is known; every state is then ``no_model``.
     sensors : SensorTable
-        The tool sensors, positions and axes in their body's frame.
+        The tool sensors, positions and axes in their body's frame. Those that are sums of
+        windings are left out.
     settings : TrackerSettings, optional
 
     Attributes
@@ -74,8 +75,9 @@ class Tracker:
         sensors: SensorTable,
         settings: TrackerSettings | None = None,
     ) -> None:
+        sensors = sensors.select(sensors.is_single)
         if len(sensors) == 0:
-            raise TrackingError('there is no tool sensor to track')
+            raise TrackingError('there is no tool sensor to track that is a single coil')
         if len(set(sensors.channel.tolist())) != len(sensors):
             raise TrackingError('a channel appears twice in the sensors')
         if len(set(sensors.name)) != len(sensors):

@@ -5,7 +5,6 @@ positions and axes are given in the frame of the sensor's body; the body ``fg`` 
 generator itself.
 """
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -19,11 +18,14 @@ from anser_ros.settings import SECTIONS, Accuracy, RefitSettings, settings_from
 from anser_ros.wire.setup_tips import TipSpec, dump_tips, parse_tips, refuse_unknown_bodies
 from anser_ros.wire.setup_values import (
     Vector,
+    Winding,
     read_axis,
     read_mapping,
     read_name,
     read_number,
     read_vector,
+    read_windings,
+    refuse_misspelt,
     refuse_repeats,
     take,
 )
@@ -34,9 +36,6 @@ KEYS = (
     'schema', 'fingerprint', 'frame_id', 'flux_rate_hz', 'flux_unit', 'emitter', 'sensors',
     'volume', 'tips', *SECTIONS,
 )  # fmt: skip
-LIKENESS = 0.8
-"""Ratio of equal letters (`difflib`) from which an unknown key is taken for a misspelt one: one
-letter off in a short key, two in a long one. Smaller, and somebody's own keys are refused."""
 FIELD_GENERATOR = 'fg'
 LOWEST_VOLUME_M = 1e-3
 """A tracked volume ends at least so far over the board's copper (z = 0), m: nearer than the copper
@@ -68,7 +67,10 @@ class Emitter:
 
 @dataclass(frozen=True)
 class SensorSpec:
-    """Describes a coil: channel, name, body, position (m) and unit axis in the body's frame."""
+    """Describes a coil: channel, name, body, position (m) and unit axis in the body's frame.
+
+    ``windings`` (offset from the position, m, and weight each) make it a weighted sum of points.
+    """
 
     channel: int
     name: str
@@ -76,6 +78,7 @@ class SensorSpec:
     position_m: Vector
     axis: Vector
     length_m: float
+    windings: tuple[Winding, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -141,7 +144,7 @@ class Setup:
             {
                 body: fingerprint_of(
                     [
-                        [s.channel, s.name, s.position_m, s.axis, s.length_m]
+                        [s.channel, s.name, s.position_m, s.axis, s.length_m, *s.windings]
                         for s in sensors if s.body == body
                     ]
                 )
@@ -238,6 +241,9 @@ def _parse_sensor(item: Any, where: str) -> SensorSpec:
         position_m=read_vector(take(sensor, 'position_m', where), f'{where}.position_m'),
         axis=read_axis(take(sensor, 'axis', where), f'{where}.axis'),
         length_m=read_number(sensor.get('length_m', 0.0), f'{where}.length_m', 0.0, 1.0),
+        windings=(
+            read_windings(sensor['windings'], f'{where}.windings') if 'windings' in sensor else ()
+        ),
     )
 
 
@@ -284,14 +290,6 @@ def _stated_sections(stated: Mapping[str, float]) -> dict[str, dict[str, float]]
         for section, names in SECTIONS.items()
     }
     return {section: values for section, values in sections.items() if values}
-
-
-def _no_misspelt(extra: Mapping[str, Any]) -> None:
-    """Refuse a key that is nearly one of ours: its values would be passed over in silence."""
-    for key in map(str, extra):
-        meant = difflib.get_close_matches(key.lower(), KEYS, n=1, cutoff=LIKENESS)
-        if meant:
-            raise SetupError(f'setup: unknown key {key!r}: is {meant[0]!r} meant?')
 
 
 def parse_setup(text: str) -> Setup:
@@ -344,7 +342,7 @@ def parse_setup(text: str) -> Setup:
         [topic_of(name) for name in [s.name for s in tools] + bodies], 'topic of sensor or body'
     )
     extra = {key: value for key, value in root.items() if key not in KEYS}
-    _no_misspelt(extra)
+    refuse_misspelt(extra, KEYS)
     return Setup(
         frame_id=frame_id,
         flux_rate_hz=read_number(
@@ -377,6 +375,7 @@ def dump_setup(setup: Setup) -> str:
             'position_m': list(s.position_m),
             'axis': list(s.axis),
             'length_m': s.length_m,
+            **({'windings': [list(w) for w in s.windings]} if s.windings else {}),
         }
         for s in setup.sensors
     ]

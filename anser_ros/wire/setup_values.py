@@ -3,8 +3,10 @@
 All functions raise `SetupError` with one line that names the value and its place.
 """
 
+import difflib
 import math
 import re
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -15,8 +17,12 @@ AXIS_TOLERANCE = 1e-3
 """Largest deviation of an axis' length from one; axes with three written digits pass."""
 LARGEST_NUMBER = 1e300
 """Size from which on a number counts as infinite, in any unit."""
+LIKENESS = 0.8
+"""Ratio of equal letters (`difflib`) from which an unknown key is taken for a misspelt one: one
+letter off in a short key, two in a long one. Smaller, and somebody's own keys are refused."""
 NAME = re.compile(r'^[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*$')
 Vector = tuple[float, float, float]
+Winding = tuple[float, float, float, float]
 
 
 def read_number(value: Any, where: str, low: float = -math.inf, high: float = math.inf) -> float:
@@ -51,6 +57,20 @@ def read_axis(value: Any, where: str) -> Vector:
     return x, y, z
 
 
+def read_windings(value: Any, where: str) -> tuple[Winding, ...]:
+    """Return the points of a sensor that is no single coil: offsets, m, and weights."""
+    if not isinstance(value, list) or len(value) < 2:
+        raise SetupError(f'setup: {where} must be a list of at least two windings, got {value!r}')
+    windings = []
+    for i, item in enumerate(value):
+        here = f'{where}[{i}]'
+        if not isinstance(item, list) or len(item) != 4:
+            raise SetupError(f'setup: {here} must be [x, y, z, weight], got {item!r}')
+        weight = read_number(item[3], f'{here}[3]', -100.0, 100.0)
+        windings.append((*read_vector(item[:3], here), weight))
+    return tuple(windings)
+
+
 def read_mapping(value: Any, where: str) -> dict[str, Any]:
     """Return what has to be a mapping."""
     if not isinstance(value, dict):
@@ -79,3 +99,11 @@ def refuse_repeats(values: list[Any], what: str) -> None:
         if value in seen:
             raise SetupError(f'setup: {what} {value!r} appears twice')
         seen.add(value)
+
+
+def refuse_misspelt(given: Iterable[Any], known: Iterable[str]) -> None:
+    """Refuse a key that is nearly one of ours: its values would be passed over in silence."""
+    for key in map(str, given):
+        meant = difflib.get_close_matches(key.lower(), list(known), n=1, cutoff=LIKENESS)
+        if meant:
+            raise SetupError(f'setup: unknown key {key!r}: is {meant[0]!r} meant?')
