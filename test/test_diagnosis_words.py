@@ -13,7 +13,7 @@ from anser_ros.diagnosis.problem import evaluate
 from anser_ros.effects.metal_path import StraightPath
 from anser_ros.effects.registry import all_effects
 from anser_ros.field.plain_data import plain
-from anser_ros.sessions.diagnosis_document import BULKY, DEPENDENCIES
+from anser_ros.sessions.diagnosis_document import DEPENDENCIES, MODEL_FILE_ONLY
 
 
 @pytest.fixture(scope='module')
@@ -23,7 +23,7 @@ def moving():
     way = np.array([0.02, 0.0, -0.12, 0.07, 0.02, -0.09, 0.5, 1.9, 0.5])
     term = effect.starting(StraightPath(), way, 2.4, np.array([-2.0, -0.3]))
     record = effect.record(term, 1e-6 * np.eye(term.theta.size))
-    short = {key: value for key, value in record.parameters.items() if key not in BULKY}
+    short = {key: value for key, value in record.parameters.items() if key not in MODEL_FILE_ONLY}
     return {
         'name': record.name,
         'parameters': plain(short),

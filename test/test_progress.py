@@ -1,7 +1,7 @@
 """How far a command is, where there is no terminal: few lines, with a share and a time."""
 
 from anser_ros.cli import progress
-from anser_ros.cli.progress import SAY_S, progress_of
+from anser_ros.cli.progress import LINE_INTERVAL_S, progress_of
 
 
 def test_lines_come_now_and_then_with_the_share_and_the_time_that_is_left(monkeypatch, capsys):
@@ -9,7 +9,7 @@ def test_lines_come_now_and_then_with_the_share_and_the_time_that_is_left(monkey
     monkeypatch.setattr(progress.time, 'monotonic', lambda: now_s[0])
     with progress_of('calibrating') as tell:
         for step in range(1, 11):
-            now_s[0] += 0.4 * SAY_S
+            now_s[0] += 0.4 * LINE_INTERVAL_S
             tell('layouts' if step < 7 else 'positions', 0.1 * step)
     said = capsys.readouterr().err.splitlines()
     assert said[0] == 'calibrating: layouts, 30%, about 14 s left'

@@ -155,8 +155,8 @@ class TestWatch:
         )
 
     def test_what_nothing_explains_is_not_given_a_name(self, moving, watch, monkeypatch):
-        nothing = replace(watching.LIGHT, most_effects=0)  # as if no effect explained it
-        monkeypatch.setattr(watching, 'LIGHT', nothing)
+        nothing = replace(watching.LIGHT_SEARCH, most_effects=0)  # as if no effect explained it
+        monkeypatch.setattr(watching, 'LIGHT_SEARCH', nothing)
         window = filled(moving, gain=GAIN)
         seen = watch.look(window.session(), window.first_ns)
         assert seen.findings == () and not seen.is_clear and seen.excess_left > 100

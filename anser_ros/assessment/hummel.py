@@ -40,7 +40,7 @@ NEIGHBOURS = '5 cm distance errors'
 STEPS = ((NEIGHBOURS, 1), ('15 cm distance errors', 3), ('30 cm distance errors', 6))
 """Kinds of distances, and how many spacings of the board's points each is."""
 ACCUMULATED = 'accumulated distance errors'
-ALIKE = 1.0
+COMMON_ERROR_SIGMAS = 1.0
 """Correlation of the errors of parallel neighbouring distances, in its standard errors, from which
 on they count as alike: in doubt the interval is the wider one. Chosen on simulated boards; those
 that the documentation reports are others."""
@@ -221,7 +221,7 @@ def have_common_errors(place: Array, grid: Grid) -> bool:
         if not products or not np.concatenate(products).size:
             continue
         product, square = np.concatenate(products), np.concatenate(squares)
-        if product.sum() > ALIKE * np.sqrt(product.size) * square.mean():
+        if product.sum() > COMMON_ERROR_SIGMAS * np.sqrt(product.size) * square.mean():
             return True
     return False
 

@@ -46,8 +46,8 @@ LEAST_FREE_BYTES = 2 * 2**30
 PORTS = ('/dev/ttyACM*', '/dev/ttyUSB*')
 SAFE_DOMAINS, DOMAINS = range(102), range(233)
 """Values of ROS_DOMAIN_ID whose ports nobody else is given, and all that DDS has ports for."""
-UNSET = 5
-"""What adjtimex returns where nobody keeps the kernel's clock right (TIME_ERROR)."""
+CLOCK_UNSET = 5
+"""What adjtimex returns if nothing keeps the kernel's clock right (TIME_ERROR)."""
 TIMEX_BYTES = 512
 """Room for the kernel's record of its clock, bytes: more than any of its versions takes."""
 
@@ -221,7 +221,7 @@ def kernel_clock() -> bool | None:
         state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX_BYTES))
     except (OSError, AttributeError):
         return None
-    return None if state < 0 else state != UNSET
+    return None if state < 0 else state != CLOCK_UNSET
 
 
 def disk(folder: Path, least: int = LEAST_FREE_BYTES) -> list[Observation]:

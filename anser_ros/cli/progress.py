@@ -9,7 +9,7 @@ from typing import Protocol
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
-SAY_S = 5.0
+LINE_INTERVAL_S = 5.0
 """Time from one line to the next, s: enough to see that it goes on, few enough for a log."""
 LEAST_SHARE, LEAST_S = 0.1, 1.0
 """Finished share of a stage, and time that its later half took, s, from which on the time that is
@@ -91,11 +91,11 @@ class _Lines:
         """Take in how far a stage is, and say it where it is time to."""
         now_s = time.monotonic()
         if share is None:
-            if now_s - self._begin_s > SAY_S:
+            if now_s - self._begin_s > LINE_INTERVAL_S:
                 self._say(f'{stage}, after {now_s - self._begin_s:.0f} s')
             return
         left = self._remaining.words(stage, share)
-        if now_s - self._said_s < SAY_S:
+        if now_s - self._said_s < LINE_INTERVAL_S:
             return
         self._said_s = now_s
         self._say(', '.join(filter(None, (f'{stage}, {share:.0%}', left))))

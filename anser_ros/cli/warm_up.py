@@ -16,7 +16,7 @@ from typing import Any
 import numba.core.event
 from numba.core.dispatcher import Dispatcher
 
-from anser_ros.cli.progress import SAY_S
+from anser_ros.cli.progress import LINE_INTERVAL_S
 from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import fill_frame
@@ -85,7 +85,7 @@ def compile_kernels(
             while any(process.poll() is None for process in running):
                 if is_stopped():
                     return
-                if time.monotonic() - said_s > SAY_S:
+                if time.monotonic() - said_s > LINE_INTERVAL_S:
                     said_s = time.monotonic()
                     say(f'{cache.done} of {cache.total} kernels, {said_s - begin_s:.0f} s')
                 time.sleep(POLL_S)

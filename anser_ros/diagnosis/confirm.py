@@ -18,9 +18,9 @@ from anser_ros.diagnosis.decisions import (
     LARGEST_VARIATION,
     LEAST_OF_THE_REST,
     MANY,
+    MODEL_ERROR,
     SOMETHING_LEFT,
     TIME_PARTS,
-    WRONG_BY,
 )
 from anser_ros.diagnosis.fit import Fit, misfit
 from anser_ros.diagnosis.problem import Part, Problem, State, evaluate
@@ -112,7 +112,7 @@ def _checked(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmati
         power / max(left_tools, 1e-3 * fit.state.count),
         0.0
         if np.isinf(term.effect.inexact)
-        else _stays(fit.state, columns, noise, max(1.0, WRONG_BY * noise)) / max(power, 1e-300),
+        else _stays(fit.state, columns, noise, max(1.0, MODEL_ERROR * noise)) / max(power, 1e-300),
         inexact=term.effect.inexact,
         alike=_crowd(fit, term),
         plausible=_plausible(fit, term),

@@ -64,7 +64,7 @@ be distinguished from them. Smaller fits candidates that only noise decides on; 
 effects behind a fluctuation."""
 
 # --- which candidates are fitted in full -------------------------------------------------------
-PROMISING = 0.5
+LEAST_PROBE_GAIN = 0.5
 """Share of the best fitted gain that a candidate's probe must promise. The probe is linear and
 may promise too little, by less than this for the effects that there are."""
 OPEN_FINALISTS = 3
@@ -104,7 +104,7 @@ LEAST_PATH_GAIN = 1.05
 """Factor by which metal at the best place for each block of time must explain more than at one
 place, or it isn't tried as metal that moves. Smaller tries it for what noise gives so much
 freedom; larger overlooks metal that moves little."""
-LEAST_MORE = 100.0
+LEAST_MOTION_GAIN = 100.0
 """Gain, in units of the misfit, that metal that moves must have over metal at rest, beside the
 shares above: its course and shape cost some dozens of parameters."""
 NO_RIVAL = 0.25
@@ -133,7 +133,7 @@ CLEAR = 6.0
 it once in 1e9, the power of normal noise in one cell of 400 frames once in 5e7. Where the median
 cell is taken its spread is a quarter larger, and a normal variable passes once in 1e6. Noise that
 depends on its neighbours passes oftener. One test per effect is made."""
-WRONG_BY = 1.3
+MODEL_ERROR = 1.3
 """Variance over the noise's up to which a field model may be wrong, whatever it says: of a board
 beyond what was scanned. It is not held against an effect on everything."""
 MANY = 3
@@ -143,7 +143,7 @@ CHANGED = 0.1
 reads of one emitter): taking the pose out spreads a trace of each change over all of them."""
 
 # --- whether what stays is noise ---------------------------------------------------------------
-NOISIER = 1.15
+LEAST_NOISE_GROWTH = 1.15
 """Factor from which noise counts as grown. A channel's spread over 400 frames of eight emitters is
 known to 1 %, so it is no chance; how much is worth a name was chosen, as the rest, by hand."""
 FEWEST_OUTLIERS = 0.004

@@ -48,7 +48,7 @@ SLOPE = 0.57
 down these are within 29 deg of every way that goes down by 15 deg or more. Metal that goes away
 does not come nearer to the tools above the board, and hardly ever goes level. Smaller, and starts
 are level; larger, and metal that is drawn aside is looked for below."""
-AROUND = 8
+SIDE_DIRECTIONS = 8
 """Directions to the side in which a way is tried, one in 45 deg. Fewer may start too far from the
 true way for the fit to find it; time grows with their number."""
 FEW_FRAMES, SOME_FRAMES, MANY_FRAMES = 25, 60, 300
@@ -211,7 +211,7 @@ def _starts(
 def _ways() -> list[Array]:
     """Ways from where metal is strongest to where it rests, m."""
     level = np.sqrt(1.0 - SLOPE**2)
-    turns = 2.0 * np.pi * np.arange(AROUND) / AROUND
+    turns = 2.0 * np.pi * np.arange(SIDE_DIRECTIONS) / SIDE_DIRECTIONS
     aside = [np.array([level * np.cos(a), level * np.sin(a), -SLOPE]) for a in turns]
     return [
         length * way for way in (np.array([0.0, 0.0, -1.0]), *aside) for length in PATH_LENGTHS_M

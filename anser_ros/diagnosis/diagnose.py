@@ -11,8 +11,8 @@ from anser_ros.diagnosis.corrected_model import corrected_model
 from anser_ros.diagnosis.decisions import (
     DEPENDENT,
     FEWEST_OUTLIERS,
+    LEAST_NOISE_GROWTH,
     MANY,
-    NOISIER,
     STRUCTURED,
     UNSTRUCTURED,
 )
@@ -221,7 +221,7 @@ def conclude(
     white = whiteness(after)
     expected = cleaned.spread.flux_t
     # Residuals that are no noise must not make the floor that they are measured by.
-    grown = noise_t(after) > NOISIER * cleaned.spread.noise_t
+    grown = noise_t(after) > LEAST_NOISE_GROWTH * cleaned.spread.noise_t
     scale = min(noise_scale(after), 1.0) if grown and not white.holds else noise_scale(after)
     floor = min(scale * expected, rms(after))
     tests = tuple(structure_tests(after))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.decisions import LEAST_MORE, LEAST_OF_EXCESS, LEAST_PATH_GAIN
+from anser_ros.diagnosis.decisions import LEAST_MOTION_GAIN, LEAST_OF_EXCESS, LEAST_PATH_GAIN
 from anser_ros.diagnosis.problem import Problem
 from anser_ros.diagnosis.scoring import BlockSums, Score, Scorer
 from anser_ros.effects.effect import Effect
@@ -70,7 +70,7 @@ def _starts(
     gains = np.array([s.explained_alone(np.full(s.size, NO_PRIOR)) for _, s, _ in places])
     alone = float(gains.max(axis=0).sum())
     excess = scorer.state.sum_of_squares - scorer.state.count
-    if alone < max(LEAST_PATH_GAIN * one_place + LEAST_MORE, LEAST_OF_EXCESS * excess):
+    if alone < max(LEAST_PATH_GAIN * one_place + LEAST_MOTION_GAIN, LEAST_OF_EXCESS * excess):
         return []
     course, solution = _course([(centre, own) for centre, own, _ in places], gains)
     time = (blocks + 0.5) * problem.apparatus.duration / (blocks.max() + 1)

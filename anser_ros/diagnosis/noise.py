@@ -7,8 +7,8 @@ import numpy as np
 from anser_ros.diagnosis.decisions import (
     FEWEST_OUTLIERS,
     KNOWN_SIGMAS,
+    LEAST_NOISE_GROWTH,
     MOST_EXCESS_OF_OUTLIERS,
-    NOISIER,
 )
 from anser_ros.diagnosis.finding import Finding, plain_finding
 from anser_ros.diagnosis.outlying import outlying_share
@@ -58,7 +58,7 @@ def outlier_findings(
 def noise_findings(whole: Problem, after: State) -> list[Finding]:
     """Return excess noise, of all channels or of those that have it."""
     factor = noise_t(after) / whole.spread.noise_t
-    if factor <= NOISIER:
+    if factor <= LEAST_NOISE_GROWTH:
         return []
     noisy = _noisy_channels(after)
     count: float = after.count
@@ -92,7 +92,7 @@ def _noisy_channels(state: State) -> tuple[int, ...]:
         sensors = len(part.view.sensors)
         size = squares.reshape(-1, 2, sensors, emitters).mean(axis=(0, 1, 3))
         for channel, value in zip(part.view.sensors.channel.tolist(), size, strict=True):
-            if value > NOISIER**2:
+            if value > LEAST_NOISE_GROWTH**2:
                 noisy.append(int(channel))
             else:
                 sound += 1

@@ -33,7 +33,7 @@ PLACE_RATIO = 40.0
 in time are centimetres away, and what the field's model misses differs between them. Over the
 middle of a simulated board single readings of an older model had 6 to 18; a contact that fails
 has thousands. Smaller takes a model's errors for loose contacts."""
-WHOLE = 0.5
+WHOLE_FRAME_SHARE = 0.5
 """Share of a frame's readings, and of frames that lost any, from which whole frames are out: more
 bad than good, so that what is left of the frame is not to be believed either."""
 LEAST_CHANNEL_SHARE = 0.2
@@ -111,12 +111,12 @@ def outlying_share(before: Problem, after: Problem) -> tuple[float, list[int]]:
     for tool, old, new in zip(before.tools, before.good, after.good, strict=True):
         lost = old & ~new
         lost_frames += int(lost.any(axis=1).sum())
-        whole += int((lost.sum(axis=1) > WHOLE * old.sum(axis=1).clip(1)).sum())
+        whole += int((lost.sum(axis=1) > WHOLE_FRAME_SHARE * old.sum(axis=1).clip(1)).sum())
         frames += tool.time.size
         for row, channel in enumerate(tool.sensors.channel.tolist()):
             by_channel[channel] = int(lost[:, row].sum())
     share = lost_frames / max(frames, 1)
-    if whole > WHOLE * max(lost_frames, 1):
+    if whole > WHOLE_FRAME_SHARE * max(lost_frames, 1):
         return share, []
     return share, [
         c for c, n in by_channel.items() if n > LEAST_CHANNEL_SHARE * max(lost_frames, 1)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from anser_ros.diagnosis.decisions import ALIKE, LEAST_MORE, MOST_EFFECTS_AT_REST, NO_RIVAL
+from anser_ros.diagnosis.decisions import ALIKE, LEAST_MOTION_GAIN, MOST_EFFECTS_AT_REST, NO_RIVAL
 from anser_ros.diagnosis.fit import Fit, Fitter, misfit
 from anser_ros.diagnosis.refine import settled
 from anser_ros.diagnosis.scoring import Score, Scorer
@@ -70,5 +70,5 @@ def moves_or_rests(
 
 def _limit(fitter: Fitter, moving: Fit, explained: float) -> float:
     """Held-out sum of squares up to which metal at rest explains as much."""
-    more = ALIKE * explained + LEAST_MORE * max(misfit(moving), 1.0)
+    more = ALIKE * explained + LEAST_MOTION_GAIN * max(misfit(moving), 1.0)
     return fitter.held_out(moving) + more

@@ -194,7 +194,7 @@ class _Round:
         starts += moving_starts(fitter.problem, scored, scorer, fitter.blocks)
         fitted: list[tuple[float, Fit]] = []
         for expected, term in sorted(starts + fluctuations, key=lambda pair: -pair[0]):
-            if fitted and expected < decisions.PROMISING * max(g for g, _ in fitted):
+            if fitted and expected < decisions.LEAST_PROBE_GAIN * max(g for g, _ in fitted):
                 continue
             if any(at_floor(f) and term.complexity > f.newest.complexity for _, f in fitted):
                 continue
@@ -233,7 +233,7 @@ def _metal_beside(
     metals = [
         (g, f)
         for g, f in fitted
-        if f.newest.effect.family is Family.MOVING_METAL and g > decisions.PROMISING * gain
+        if f.newest.effect.family is Family.MOVING_METAL and g > decisions.LEAST_PROBE_GAIN * gain
     ]
     return max(metals, key=lambda pair: pair[0], default=None)
 

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 LAGS = 12
 """Frames back to which a memory is looked for: half a second at 25 Hz. Fewer overlook a slow
 course, and each further one is one more chance for noise to pass the bound."""
-REMEMBERED = 0.06
+LEAST_CORRELATION = 0.06
 """Correlation (-1 to 1) with a frame before from which residuals have a memory, just above the
 0.053 that normal noise reached. Smaller refuses true noise; larger lets a hum pass for it."""
 SHARED = 1.6
@@ -60,7 +60,7 @@ class Whiteness:
     def depends_on(self) -> tuple[str, ...]:
         """Return what they depend on, in the words of `docs/interfaces.md`."""
         found: list[str] = []
-        if self.memory > REMEMBERED:
+        if self.memory > LEAST_CORRELATION:
             found.append('time')
         if self.shared > SHARED:
             found += ['channel', 'emitter']

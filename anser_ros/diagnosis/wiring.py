@@ -18,7 +18,7 @@ the prediction then leaves less than a fifth of its power. Smaller calls a readi
 hardly like its prediction; larger misses a reversed plug if there is another effect. No more is
 known of its choice than that thresholds of the diagnosis were chosen on seeds below 100
 (`docs/log.md`)."""
-TURNED_ROUND = 0.3
+POLARITY_GAIN = 0.3
 """A gain within this of -1 is a polarity: as far as a gain is expected from one (the prior of
 `sensor_gain`). Smaller misses a turned sensor whose gain is off as well; larger takes a weak
 sensor with a turned phase for one."""
@@ -52,7 +52,7 @@ def wiring_faults(problem: Problem) -> list[Term]:
         gain, alike = _likeness(tool.flux, part.view.flux, usable)
         own = np.diag(alike)
         turned += channels[
-            (np.abs(np.diag(gain) + 1) < TURNED_ROUND) & (own > OWN_CORRELATION) & ~silent
+            (np.abs(np.diag(gain) + 1) < POLARITY_GAIN) & (own > OWN_CORRELATION) & ~silent
         ].tolist()
         order = np.argmax(alike, axis=1)
         moved = _moved(alike, ~silent)

@@ -41,7 +41,7 @@ decimetre."""
 CLOSEST = 0.02
 """Metal that is searched keeps this distance (m) from where sensors were: a point-like answer is
 no model of a body that is nearer than its own size."""
-APART = 0.12
+SAME_BODY_M = 0.12
 """Distance (m) from metal in force within which further metal is taken for the same body: about
 the step of the grid of places. Nearer candidates only stand in for the body's shape."""
 
@@ -158,7 +158,7 @@ class StaticMetal(Effect[Term]):
         """Take metal that is near to metal in force for the same body."""
         if candidate.effect is not self:
             return False
-        return bool(np.linalg.norm(candidate.theta[:3] - term.theta[:3]) < APART)
+        return bool(np.linalg.norm(candidate.theta[:3] - term.theta[:3]) < SAME_BODY_M)
 
     def resting(self, term: Term) -> Resting:
         """Return a compact body at its place; small pieces of an extended one if much is left."""

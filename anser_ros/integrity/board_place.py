@@ -54,7 +54,7 @@ volume move the distance by 20 and 45 um."""
 SIDE = 4
 """Points along a side of that part; three readings each. Fewer leave one bad place much weight;
 more tell the same again and cost time: three and six move the distance by 2 um at most."""
-ALIKE = 40.0
+EFFECTIVE_READINGS = 40.0
 """So many of these readings count, about one in five: neighbouring points tell the same. Smaller
 lets the readings of references decide alone; larger makes the model too sure of itself. Half and
 twice as many move the distance by 4 um at most."""
@@ -203,7 +203,7 @@ def _of_model(
     rows = _rows(drawn, centres, middle)
     difference = model.flux(points, axes, lengths).real - drawn.flux
     size = np.linalg.norm(drawn.flux, axis=1) / np.sqrt(drawn.flux.shape[1])
-    weight = np.sqrt(ALIKE / len(points)) / np.maximum(
+    weight = np.sqrt(EFFECTIVE_READINGS / len(points)) / np.maximum(
         MODEL_SHARE * size, LEAST_SHARE * size.max()
     )
     return rows * weight[:, None, None], difference * weight[:, None]

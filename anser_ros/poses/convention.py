@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 POOR_M = 8e-3
 """Median misfit of hand-eye, m and tenths of rad together, from which other readings are tried:
 distorted trackers are off by less, and the inverse of a quaternion makes 25 mm and more."""
-BETTER = 0.5
+RIGHT_MISFIT_SHARE = 0.5
 """Share (0 to 1) of the misfit as it stands below which another reading is the right one: the
 right one of a distorted tracker leaves a third of a wrong one (`POOR_M`), and two wrong ones leave
 alike. Larger re-reads a session that is only distorted; smaller refuses a right reading of a
@@ -116,7 +116,7 @@ def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None
         return plain.applied(session), record
     trials = [(_cost(reading.applied(session)), reading) for reading in _readings(unit)]
     best, reading = min(trials, key=lambda pair: pair[0])
-    if best < BETTER * cost:
+    if best < RIGHT_MISFIT_SHARE * cost:
         return reading.applied(session), reading.record(cost, best, ratio)
     if cost > HOPELESS_M:
         raise PlausibilityError(

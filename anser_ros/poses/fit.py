@@ -17,7 +17,7 @@ from anser_ros.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState
 
 Array = NDArray[np.float64]
 
-HEAVY = 4.0
+STUDENT_FREEDOM = 4.0
 """Degrees of freedom of Student's distribution by which poses are weighted in a robust fit: the
 usual compromise between the mean (infinite) and a distribution without one (1). Smaller gives far
 poses less weight and costs precision where the errors are normal; larger lets a few bad poses move
@@ -29,7 +29,7 @@ STANDS_OUT, FAR_OUT = 7.0, 25.0
 """Distances of a pose from its prediction, in robust spreads of a coordinate, from which it stands
 out: where few do, and where many do. Three normal coordinates reach the first once in 1e10; what
 many poses share is something to explain, and only what no distortion makes is left out of it."""
-FEW = 0.03
+FEW_SHARE = 0.03
 """Share of a sensor's poses up to which those that stand out are few. It lies between one window
 and the two that metal must be near to be named (`episodes.WINDOWS`). Smaller takes a handful of
 reflections for something to explain; larger takes an effect of a few seconds for outliers."""
@@ -124,7 +124,7 @@ def robust_fit(problem: PoseProblem, terms: Sequence[Term]) -> PoseFit:
 def _student(part: PosePart, noise: PoseNoise) -> Array:
     white = noise.whitened(part.residual, part.view.velocity)
     far = np.sum(white**2, axis=1)
-    return np.asarray(np.sqrt((HEAVY + 6) / (HEAVY + far)))
+    return np.asarray(np.sqrt((STUDENT_FREEDOM + 6) / (STUDENT_FREEDOM + far)))
 
 
 def _spread(part: PosePart) -> PoseNoise:
@@ -148,7 +148,9 @@ def unexplained_poses(fit: PoseFit) -> tuple[NDArray[np.bool_], ...]:
         place = np.linalg.norm(white[:, :3], axis=1)
         turn = np.linalg.norm(white[:, 3:], axis=1)
         far = np.maximum(place, turn)
-        few = np.count_nonzero(part.used & (far > STANDS_OUT)) <= FEW * np.count_nonzero(part.used)
+        few = np.count_nonzero(part.used & (far > STANDS_OUT)) <= FEW_SHARE * np.count_nonzero(
+            part.used
+        )
         found.append(part.used & (far > (STANDS_OUT if few else FAR_OUT)))
     return tuple(found)
 

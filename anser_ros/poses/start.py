@@ -36,7 +36,7 @@ effects uncertain; more cost time."""
 COARSE_S, COARSE_STEP_S = 1.5, 0.05
 """Range and step of the first look for a time offset, s."""
 COARSE_POSES = 300  # poses of that look; it takes a regression at each of its steps
-CLEARLY = 0.8
+COARSE_OFFSET_MISFIT = 0.8
 """Share of the misfit at no offset below which a coarse offset is taken. Chance takes off 6 %: the
 mean distance of 300 poses scatters by 2.4 %, and the least of 61 offsets is some 2.4 of that
 lower; an offset of a single step moves a hand by a centimetre, many times the misfit. Smaller
@@ -168,7 +168,7 @@ def coarse_offset(problem: PoseProblem) -> float:
     misfits = np.array([_misfit(problem.path, chosen, float(trial)) for trial in trials])
     still = float(misfits[np.argmin(np.abs(trials))])
     best = int(np.argmin(misfits))
-    return float(trials[best]) if misfits[best] < CLEARLY * still else 0.0
+    return float(trials[best]) if misfits[best] < COARSE_OFFSET_MISFIT * still else 0.0
 
 
 def _misfit(path: OpticalPath, sensors: Sequence[PoseSequence], offset: float) -> float:

@@ -13,7 +13,7 @@ from anser_ros.refit.evidence import FrameEvidence
 from anser_ros.refit.layer import Layer, component_rows
 from anser_ros.refit.modes import ErrorLevel, PosteriorModes, error_level, error_modes
 from anser_ros.refit.posterior import Bank, make_room
-from anser_ros.refit.witness import SPARSE, Witness
+from anser_ros.refit.witness import FIRST_SAMPLE_STEP, Witness
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -290,7 +290,7 @@ class _Change:
 
     def size(self, hypothesis: int, moments: ComplexArray) -> float:
         """Return the rms of a component of the field of moments (N, K) in the volume, T."""
-        points = self.bank.prior(hypothesis).layer.points[::SPARSE]
+        points = self.bank.prior(hypothesis).layer.points[::FIRST_SAMPLE_STEP]
         field = component_rows(points, self.place.positions, self.place.directions) @ moments
         return float(np.sqrt(np.mean(np.abs(field) ** 2) / 2.0))
 

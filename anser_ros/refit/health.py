@@ -34,7 +34,7 @@ RECOVERING = 'recovering'
 
 FAULT_SCALES = 10.0 ** np.arange(0.0, 6.1, 0.5)
 """Sizes of a faulty reading's error, in noise deviations, all as likely."""
-SUSPICIOUS = 2.8
+SUSPECT_CHI2 = 2.8
 """Left-out chi-square per degree of freedom from which on a fault is considered."""
 FAULT_ODDS = 100.0
 """Logarithm of the odds that a coil is at fault from which on it is left out.
@@ -43,7 +43,7 @@ Metal that the clouds describe badly reaches 70 in recordings; faults that matte
 """
 SEEN = 10.0
 """Log odds, by the other coils alone, from which on a compact body counts as seen by them."""
-AGREES = 2.5
+AGREEMENT_CHI2 = 2.5
 """Left-out chi-square per degree of freedom below which an excluded coil agrees again."""
 RETRY_FRAMES = 25
 """Frames after which an excluded coil is looked at again."""
@@ -239,11 +239,11 @@ class ReferenceWatch:
         """
         self._since += 1
         level = OUTSTANDING**2 * max(typical(power), freedom)
-        if chi2.max() <= SUSPICIOUS * freedom and power.max() <= level:
+        if chi2.max() <= SUSPECT_CHI2 * freedom and power.max() <= level:
             return []
         order = np.argsort(-chi2)[:3]
         sets = [order[i : i + 1] for i in range(len(order))]
-        sets = [s for s in sets if chi2[s[0]] > max(SUSPICIOUS * freedom, 0.5 * chi2[order[0]])]
+        sets = [s for s in sets if chi2[s[0]] > max(SUSPECT_CHI2 * freedom, 0.5 * chi2[order[0]])]
         by_power = np.argsort(-power)
         out = by_power[: MOST_AT_ONCE + 1]
         out = out[power[out] > level]

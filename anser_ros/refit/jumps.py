@@ -29,7 +29,7 @@ components is that loud once in a year; lower, and judging costs time for nothin
 FARTHEST = 3.0
 """Steps, in units of the last one, over which a course is carried on. Farther, and the noise of
 the last step is carried on with it."""
-SUDDEN = 0.05
+LARGEST_RATE = 0.05
 """Rate at which metal may take the readings off their course, as a part of the baseline's size
 each second. In recordings of an X-ray head that comes close it stays below the noise, a hundredth
 of this at 25 Hz. Larger, and faults pass for metal by the errors that a survey allows it; smaller,

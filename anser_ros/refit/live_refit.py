@@ -32,7 +32,7 @@ from anser_ros.refit.evidence import FrameEvidence
 from anser_ros.refit.excitation import FieldFunction
 from anser_ros.refit.frame import BaselineCheck, NoiseUnits
 from anser_ros.refit.health import ReferenceHealth, ReferenceWatch
-from anser_ros.refit.jumps import LEAST_JUMP_POWER, SUDDEN, Courses, jumped
+from anser_ros.refit.jumps import LARGEST_RATE, LEAST_JUMP_POWER, Courses, jumped
 from anser_ros.refit.posterior import Bank
 from anser_ros.refit.result import (
     FEW_REFERENCES,
@@ -257,7 +257,7 @@ class LiveRefit:
             return
         bank, _ = self._bank()
         seen = bank.evaluate(parts[coils].reshape(-1, 2), level)
-        largest = SUDDEN * jumps.since_s * self._units.size
+        largest = LARGEST_RATE * jumps.since_s * self._units.size
         spread, drift = float(np.median(jumps.spread[coils])), self.settings.emitter_drift
         found = coils[jumped(bank, seen, parts[coils], spread, drift, largest)]
         for coil in found.tolist():
@@ -307,7 +307,7 @@ class LiveRefit:
         for coil in np.flatnonzero(self._watch.excluded & readable):
             rows = coil * k + np.arange(k)
             distance = distance_of(bank, seen, best, rows, values[coil], level)
-            self._watch.agreed(int(coil), distance < health.AGREES * 2 * k)
+            self._watch.agreed(int(coil), distance < health.AGREEMENT_CHI2 * 2 * k)
 
     def _result(self, stamp_ns: int, bank: Bank, seen: FrameEvidence, level: float) -> RefitResult:
         self._belief.update(seen.log_evidence)

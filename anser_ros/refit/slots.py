@@ -23,7 +23,7 @@ SLOTS = 3
 """Compact bodies that are full hypotheses at a time: two that explain the readings alike, and one
 more that may be better. Fewer forget one of the two; each more costs the posterior of a source in
 every frame."""
-BETTER = 3.0
+SLOT_EVIDENCE = 3.0
 """Gain of approximate log evidence for which a body takes another's slot: odds of twenty to one,
 so that two that explain alike do not take turns. Smaller, and bodies change places with the noise;
 larger, and a body that has become the likely one waits for frames."""
@@ -117,4 +117,6 @@ class BodySlots:
         if len(self._bodies) < SLOTS:
             return len(self._bodies), best
         worst = min(range(SLOTS), key=lambda slot: float(scores[self._bodies[slot]]))
-        return (worst, best) if scores[best] > scores[self._bodies[worst]] + BETTER else None
+        return (
+            (worst, best) if scores[best] > scores[self._bodies[worst]] + SLOT_EVIDENCE else None
+        )

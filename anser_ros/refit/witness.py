@@ -40,14 +40,14 @@ MEMORY_S = 2.0
 larger, with five no smaller (four references, the head at the board)."""
 ODD = 1.5
 """Squared misfit of a tool's readings, over what is expected, from which they count less."""
-CONSIDERED = 1e-3
+LEAST_PROBABILITY = 1e-3
 """Probability from which on a hypothesis has a filter, which costs time. One that is less probable
 hardly changes the mean, whatever a tool says of it."""
 ELSEWHERE = 0.1
 """Weight of the whole volume beside the surroundings of the tools, where modes are chosen."""
 NEAR_M = 0.01
 """How far around the coils that is, m."""
-SPARSE = 30
+FIRST_SAMPLE_STEP = 30
 """Every so many of a layer's samples stand for the volume before a tool was seen, and tell the
 size of an error until it is known: thirty points, a millisecond's work at the most."""
 _AROUND = np.array([[0, 0, 0], [1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
@@ -112,7 +112,7 @@ class Witness:
         self._frame = bank, seen, drift
         self._best = bank.names[1 + int(weights[1:].argmax())]
         filters = {}
-        for h in np.flatnonzero(weights > CONSIDERED).tolist():
+        for h in np.flatnonzero(weights > LEAST_PROBABILITY).tolist():
             if h == 0:
                 continue
             name = bank.prior(h).name
@@ -159,7 +159,7 @@ class Witness:
         reduced = self._reduced_of(bank, h)
         d, k = len(state.mean), bank.width
         layer = bank.prior(h).layer
-        points = layer.points[::SPARSE] if self._near is None else self._near
+        points = layer.points[::FIRST_SAMPLE_STEP] if self._near is None else self._near
         weight = points[:, 2]
         rows = component_rows(points, layer.positions, layer.directions)
         rows = rows * np.repeat(weight / weight.mean(), 3)[:, None]

@@ -11,7 +11,7 @@ DEPENDENCIES = (
     'time', 'position', 'orientation', 'speed', 'emitter', 'channel', 'amplitude', 'frequency',
 )  # fmt: skip
 """Variables on which a remainder may be said to depend; other tests are for the report only."""
-BULKY = ('groups', 'knots_s', 'course', 'couplings_m3')
+MODEL_FILE_ONLY = ('groups', 'knots_s', 'course', 'couplings_m3')
 """Parameters that only a program needs: lists of hundreds of numbers. They are left out here and
 stand in the model file."""
 
@@ -40,7 +40,7 @@ def to_document(result: SessionDiagnosis) -> dict[str, Any]:
 
 def _effect(finding: Finding) -> dict[str, Any]:
     record = finding.record
-    short = {key: value for key, value in record.parameters.items() if key not in BULKY}
+    short = {key: value for key, value in record.parameters.items() if key not in MODEL_FILE_ONLY}
     return {
         'name': record.name,
         'parameters': plain(short),

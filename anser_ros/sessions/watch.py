@@ -29,7 +29,7 @@ from anser_ros.tracking.tracker import Tracker
 Array = NDArray[np.float64]
 
 OPTICAL, RIGID = 'optical poses', 'rigidity of the tools'
-LIGHT = SearchSettings(most_effects=1, finalists=4, iterations=6)
+LIGHT_SEARCH = SearchSettings(most_effects=1, finalists=4, iterations=6)
 """A search that names the strongest effect alone, so that a look takes seconds. What that effect
 leaves is reported, and finding its cause is left to the whole diagnosis."""
 FREE_POSE_M, FREE_POSE_RAD = 0.02, 0.1
@@ -177,11 +177,11 @@ class Watch:
         if not _moves(problem):
             return replace(seen, remark='the tool moves too little to identify the effect')
         self.searches += 1
-        found = diagnose(problem, self._prepared.model, LIGHT)
+        found = diagnose(problem, self._prepared.model, LIGHT_SEARCH)
         left = _excess(evaluate(problem, found.terms))
         if truth == RIGID and found.findings and left >= EXCESS:
             problem = problem_with(found.model)
-            found = diagnose(problem, self._prepared.model, LIGHT)
+            found = diagnose(problem, self._prepared.model, LIGHT_SEARCH)
             left = _excess(evaluate(problem, found.terms))
         self._left = left
         return replace(

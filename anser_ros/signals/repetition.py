@@ -43,11 +43,11 @@ _LONGEST_STEP = 2048
 """Most samples, and a power of 2, that wait to be searched; less than any history has."""
 _JUDGED_SAMPLES = 2 * _LONGEST_STEP
 """Samples after which it is worked out again how long runs must be: every 0.1 s at 40 kS/s, far
-less than `FORGETS_S`. More often only costs time."""
+less than `MEMORY_S`. More often only costs time."""
 SHORTEST_LAG_S = 1e-3
 """Shortest lag, s, at which fresh samples are compared: over a shorter one a tone at 1 kHz or less
 is no other than it was."""
-FORGETS_S = 1.0
+MEMORY_S = 1.0
 """Time constant, s, with which coincidences are forgotten. A longer one keeps a tool's movement,
 which makes coincidences rarer, in mind when it rests; a shorter one counts few."""
 _PRIOR = 32.0
@@ -205,7 +205,7 @@ class RepetitionWatch:
         surprise = -np.log2(np.maximum(same, followed / (self._same + _PRIOR_RUNS)))
         samples = np.ceil(EVIDENCE_BITS / np.maximum(surprise, 1e-6))
         self._needed = np.maximum(samples, FINGERPRINT_SAMPLES).astype(np.int64)
-        kept = math.exp(-_JUDGED_SAMPLES / (FORGETS_S * self._rate_hz))
+        kept = math.exp(-_JUDGED_SAMPLES / (MEMORY_S * self._rate_hz))
         for counted in (self._tried, self._same, self._continued):
             counted *= kept
 

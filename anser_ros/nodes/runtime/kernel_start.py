@@ -10,7 +10,7 @@ from anser_ros.kernel_cache import KernelCache, folder_of
 
 POLL_S = 0.1
 """Time from one look at the compiling process to the next, s: how late its end is noticed."""
-SAY_S = 1.0
+LINE_INTERVAL_S = 1.0
 """Time from one word about the progress to the next, s, as of a node that runs."""
 
 
@@ -38,10 +38,10 @@ def wait_for_kernels(say: Callable[[str], None]) -> str:
         command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
         text=True,
     )  # fmt: skip
-    said_s = -SAY_S
+    said_s = -LINE_INTERVAL_S
     try:
         while process.poll() is None:
-            if time.monotonic() - said_s >= SAY_S:
+            if time.monotonic() - said_s >= LINE_INTERVAL_S:
                 said_s = time.monotonic()
                 say(
                     f'compiling kernels, once after an installation: {cache.done} of {cache.total}'

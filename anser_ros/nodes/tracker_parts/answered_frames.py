@@ -18,7 +18,7 @@ OTHER_CLOCK_NS = 1_000_000_000
 """A model that far from a frame has its stamp from another clock (a recording's, the host's)."""
 MOST_LATE = 5
 """Frames in a row that waited in vain, after which none waits until an answer has come again."""
-NOT_AT_ALL = -math.inf
+NO_WAIT_S = -math.inf
 """Time until which a frame waits that is not to wait."""
 MOST_WAITING = 200
 """Most frames and models that are kept waiting, each; older models are dropped, and the oldest
@@ -71,7 +71,7 @@ class AnsweredFrames(Generic[Model, Frame]):
 
         A frame that should not wait, with 0, is not late.
         """
-        until_s = now_s + longest_wait_s if longest_wait_s > 0 else NOT_AT_ALL
+        until_s = now_s + longest_wait_s if longest_wait_s > 0 else NO_WAIT_S
         self._frames.append((stamp_ns, frame, until_s))
         self.work(now_s)
 
@@ -82,7 +82,7 @@ class AnsweredFrames(Generic[Model, Frame]):
             self._use_models(stamp_ns)
             if not self._is_answered(stamp_ns):
                 overdue = now_s >= until_s or len(self._frames) > MOST_WAITING
-                waits = until_s != NOT_AT_ALL
+                waits = until_s != NO_WAIT_S
                 if self.follows and waits and self._in_vain < MOST_LATE:
                     if not overdue:
                         return

@@ -31,7 +31,7 @@ NEAR_M = 0.03
 """Distance within which a place outside the episode is the same place; metal changes over its own
 size, centimetres. Smaller finds no pose to compare with; larger compares places where a constant
 distortion differs."""
-SEEN_AGAIN = 0.5  # share of the episode's places that must have been visited outside it
+REVISITED_SHARE = 0.5  # share of the episode's places that must have been visited outside it
 LOOSE, FAST = 0.5, 0.25
 """Share of a sensor's squared error that shifts in the body's frame explain if its mount is loose,
 and up to which the others' must be lower."""
@@ -64,7 +64,7 @@ def episode_windows(sensing: Sensing, sight: PoseResiduals) -> list[int]:
         return []
     place = sensing.view.measured
     distance, _ = cKDTree(place[outside]).query(place[inside])
-    return runs if np.mean(distance < NEAR_M) > SEEN_AGAIN else []
+    return runs if np.mean(distance < NEAR_M) > REVISITED_SHARE else []
 
 
 def _is_shift(sensing: Sensing, inside: Mask) -> bool:

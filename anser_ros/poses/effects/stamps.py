@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 LEAST_S = 2e-3
 """Error of the stamps, s, from which it is named: less moves a hand by a tenth of a millimetre.
 Smaller names what harms nobody; larger leaves errors of a fast hand unnamed."""
-BELIEVED = 25.0
+LEAST_LIKELIHOOD_GAIN = 25.0
 """Minus twice the log likelihood that it must take off in the median sensor; chance takes one, and
 so much once in two million sensors. Smaller takes chance for an error of the stamps; larger misses
 one that takes little off."""
@@ -85,7 +85,7 @@ class ReceiptJitter(PoseEffect):
     def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
         """Look for a residual that lies along the velocity and grows with it."""
         rms, gain = _is_wide(sight)
-        if rms < LEAST_S or gain < BELIEVED or _step(sight, rms):
+        if rms < LEAST_S or gain < LEAST_LIKELIHOOD_GAIN or _step(sight, rms):
             return []
         spread = max(float(np.std([s.stamp_s for s in sight.sensors])), rms / np.sqrt(2 * gain))
         values = {'rms_s': rms, 'by_sensor': {s.view.sensor: s.stamp_s for s in sight.sensors}}
@@ -102,7 +102,7 @@ class QuantisedStamps(PoseEffect):
     def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
         """Look for an error of the stamps that is that of their grid."""
         rms, gain = _is_wide(sight)
-        step = _step(sight, rms) if rms >= LEAST_S and gain >= BELIEVED else 0.0
+        step = _step(sight, rms) if rms >= LEAST_S and gain >= LEAST_LIKELIHOOD_GAIN else 0.0
         if not step:
             return []
         values = {'step_s': step, 'rms_s': rms}
