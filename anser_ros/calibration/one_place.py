@@ -3,7 +3,7 @@
 An array of hundreds of sensors around a few coils determines where these are without a pose that
 changes (`sources`). One place does not determine each sensor's own error, which other places
 would show: it is a width here, no correction, except which way round it is. The held-out error
-is that of sensors: each fifth of them foretold by the others, from the start.
+is that of sensors: each fifth of them predicted by the others, from the start.
 """
 
 from collections.abc import Sequence
@@ -256,12 +256,12 @@ def _moment_fit(mean: _Mean, fit: SourcesFit, model: FieldModel) -> MomentFit:
 
 
 def _unclear(posed: Measurements, fit: SourcesFit, others: Mask) -> tuple[str, ...]:
-    """A line for the sensors of which the readings do not tell which way round they are."""
+    """A line for the sensors whose polarity the readings do not determine."""
     rows = np.flatnonzero(others & (np.abs(fit.sign_evidence) <= LEAST_EVIDENCE))
     if not rows.size:
         return ()
     names = ', '.join(posed.sensors.name[row] for row in rows)
-    return (f'polarity: the readings do not tell which way round {names} are; taken as stated',)
+    return (f'polarity: the readings do not determine it for {names}; taken as stated',)
 
 
 def _places(emitters: tuple[str, ...], fit: SourcesFit) -> tuple[SourcePlace, ...]:

@@ -63,7 +63,7 @@ def _verdict(document: dict[str, Any]) -> str:
         for name, one in qa['figures'].items()
         if one['words']
     )
-    text = f'{qa["state"]}, beside {qa["earlier_sessions"]} earlier sessions. {words}'
+    text = f'{qa["state"]}, compared with {qa["earlier_sessions"]} earlier sessions. {words}'
     return f'<p class="verdict">{html.escape(text)}</p>'
 
 

@@ -115,7 +115,7 @@ def search_effects(start: PoseFit, say: Callable[[str], None] | None = None) -> 
     fit = with_noise(start)
     refused: list[tuple[str, str]] = []
     for _ in range(MOST_EFFECTS):
-        tell(f'search beside {len(effects_of(fit))} effects')
+        tell(f'search besides {len(effects_of(fit))} effects')
         better = _best_addition(fit, refused)
         if better is None:
             break

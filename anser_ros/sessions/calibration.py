@@ -100,8 +100,9 @@ def calibrate_sessions(
         return _for_sessions(still, sessions)
     if not {*options.estimate}.isdisjoint(STILL_ONLY):
         raise FitError(
-            f'{", ".join(STILL_ONLY)}: told only by {FEWEST_POSES} to {FEWEST_FRAMES - 1} poses '
-            f'of one body with at least {MANY_SENSORS} sensors, over emitters without a drawing'
+            f'{", ".join(STILL_ONLY)}: can be determined only from {FEWEST_POSES} to '
+            f'{FEWEST_FRAMES - 1} poses of one body with at least {MANY_SENSORS} sensors, over '
+            'emitters without a drawing'
         )
     steady = [_steady(session, tool) for session in sessions for tool in session.tools]
     scan = survey(measurements, generator, options, nominal, progress, steady)

@@ -124,7 +124,7 @@ def with_new_survey(model: FieldModel, setup: Setup, bodies: Sequence[str]) -> F
     made, kept = model.made_for, model.effects
     for body in bodies:
         if body not in setup.identity.bodies:
-            raise ModelFileError(f'no body {body} in the setup to be surveyed anew')
+            raise ModelFileError(f'no body {body} in the setup to be surveyed again')
         if made is None:
             raise ModelFileError(
                 f'the model {model.fingerprint} does not state what it was made for'

@@ -69,7 +69,7 @@ def type_hash(type_name: str) -> str:
 def _split(type_name: str) -> tuple[str, str, str]:
     tokens = type_name.split('/')
     if len(tokens) != 3 or not all(tokens):
-        raise BagError(f'{type_name!r} is no message type')
+        raise BagError(f'{type_name!r} is not a message type')
     return tokens[0], tokens[1], tokens[2]
 
 
