@@ -16,9 +16,10 @@ from anser_ros.calibration.prior import DrawnBoard
 from anser_ros.calibration.readings import with_pose
 from anser_ros.calibration.requirements import check_agreement, check_kept, check_measurements
 from anser_ros.calibration.result import Calibration, Scan, provenance, residuals
+from anser_ros.calibration.scan_gaps import gaps_of
 from anser_ros.calibration.selection import (
     COUNTS,
-    LEAST_GAIN_OF_FIXED,
+    THREE_TIMES,
     Selection,
     choose_layout,
     thin_frames,
@@ -110,7 +111,7 @@ def fit_scan(
     chosen, held_out = _better([(one, tested(one)) for one in selection.finalists])
     if options.damping is None:
         chosen, held_out = best_damped(chosen, held_out, tested)
-    damping = chosen.damping if options.damping is None else options.damping
+    damping = _damping(chosen, options)
     whole = fit_layout(
         posed, chosen.layout, damping, generator, options.accuracy, nominal, progress=progress
     )
@@ -126,6 +127,7 @@ def fit_scan(
         flux_error_t=float(np.hypot(held_out.flux_error_t, scan.field_sigma_t)),
         shift_sigma_m=0.0 if scan.survey is None else scan.survey.shift_sigma_m,
         effects=scan.corrections,
+        gaps=None if chosen.layout.local else gaps_of(whole, damping, posed, held_out.gap_factor),
     )
     calibration = Calibration(
         model, fit, held_out, None if nominal is None else residuals(posed, nominal).rmse_t,
@@ -195,10 +197,14 @@ def _is_explained(scan: Scan) -> bool:
     return 0 < len(scan.survey.contradictions) <= FEW_SENSORS * sensors
 
 
+def _damping(candidate: LayoutCandidate, options: Options) -> float:
+    return candidate.damping if options.damping is None else options.damping
+
+
 def _fitter(
     candidate: LayoutCandidate, generator: Generator, options: Options, nominal: FieldModel | None
 ) -> Callable[[list[Measurements]], LayoutFit]:
-    damping = candidate.damping if options.damping is None else options.damping
+    damping = _damping(candidate, options)
 
     def fit(part: list[Measurements]) -> LayoutFit:
         return fit_layout(
@@ -222,8 +228,9 @@ def _tested(
     fitter = _fitter(candidate, generator, options, nominal)
     reference = selection.reference
     return predict_held_out(
-        thin, folds, fitter, options.accuracy, reference.noise_t, reference.quadrature_noise_t
-    )
+        thin, folds, fitter, options.accuracy, reference.noise_t, reference.quadrature_noise_t,
+        None if candidate.layout.local else _damping(candidate, options),
+    )  # fmt: skip
 
 
 def best_damped(
@@ -248,7 +255,10 @@ def best_damped(
 
 
 def _better(tested: Sequence[tuple[LayoutCandidate, HeldOut]]) -> tuple[LayoutCandidate, HeldOut]:
-    """Return the finalist with the fewest dipoles that is as good within `LEAST_GAIN_OF_FIXED`."""
-    limit = min(held_out.score_t for _, held_out in tested) * (1.0 + LEAST_GAIN_OF_FIXED)
-    good = [pair for pair in tested if pair[1].score_t <= limit]
-    return min(good, key=lambda pair: (pair[1].n_dipoles, pair[1].score_t))
+    """Return the finalist whose error is least, three times the dipoles as `THREE_TIMES` worse."""
+
+    def cost(pair: tuple[LayoutCandidate, HeldOut]) -> float:
+        held_out = pair[1]
+        return float(held_out.score_t * held_out.n_dipoles ** (np.log(THREE_TIMES) / np.log(3.0)))
+
+    return min(tested, key=cost)

@@ -18,6 +18,7 @@ from anser_ros.calibration.layout_fit import LayoutFit
 from anser_ros.calibration.pose_correction import PoseTerms, pose_precision, pose_terms
 from anser_ros.calibration.pose_whitening import PoseWhitener
 from anser_ros.calibration.readings import frame_blocks, usable_weights, with_pose
+from anser_ros.calibration.scan_gaps import expected_power, factor_of, open_moments
 from anser_ros.field.measurements import Measurements
 from anser_ros.parallel import in_order
 from anser_ros.settings import Accuracy
@@ -50,6 +51,8 @@ class HeldOut:
         Where each frame's body was, m, frame fg.
     frame_rmse_t : ndarray, shape (F,)
         Root mean square magnitude of each frame's ``error``, T.
+    gap_factor : float
+        By which errors are larger than the covariance of the fitted moments makes them.
     """
 
     error: ComplexArray
@@ -61,6 +64,7 @@ class HeldOut:
     n_dipoles: int
     place: Array
     frame_rmse_t: Array
+    gap_factor: float
 
     @property
     def score_t(self) -> float:
@@ -79,6 +83,7 @@ def predict_held_out(
     accuracy: Accuracy,
     noise_t: float | None = None,
     flux_noise_t: float | None = None,
+    damping: float | None = None,
 ) -> HeldOut:
     """Predict each fold by a fit to the other folds.
 
@@ -98,6 +103,9 @@ def predict_held_out(
     flux_noise_t : float, optional
         Flux noise alone, T a component, that is subtracted; estimated from the imaginary parts by
         default.
+    damping : float, optional
+        Of the moments, if they are damped alike everywhere: then it is said by which factor errors
+        are larger than the moments' covariance makes them.
     """
 
     def fitted(fold: int) -> tuple[int, LayoutFit]:
@@ -109,12 +117,14 @@ def predict_held_out(
     flux_noise = min(noise, quadrature if flux_noise_t is None else flux_noise_t)
     tally = HeldOutTally(noise, flux_noise, accuracy, len(fits[0][1].dipoles))
     for fold, part_fit in fits:
+        left = None if damping is None else open_moments(part_fit, damping)
         for m, f in zip(measurements, folds, strict=True):
             test = with_pose(m.frames(f == fold))
             for block in frame_blocks(len(test.time), len(test.sensors)):
                 part = test.frames(block)
                 terms = pose_terms(part, part_fit.dipoles, part_fit.fit.moments)
-                tally.add(terms, usable_weights(part), part.position)
+                told = None if left is None else expected_power(left, part_fit.dipoles, part)
+                tally.add(terms, usable_weights(part), part.position, told)
     return tally.result()
 
 
@@ -138,9 +148,14 @@ class HeldOutTally:
         self.excess: list[Array] = []
         self.place: list[Array] = []
         self.frame_power: list[Array] = []
+        self.told: list[Array] = []
 
-    def add(self, terms: PoseTerms, weights: Array, place: Array) -> None:
-        """Take in frames with weights (F, S) of their readings, and places (F, 3), m."""
+    def add(
+        self, terms: PoseTerms, weights: Array, place: Array, told: Array | None = None
+    ) -> None:
+        """Take in frames with weights (F, S) of their readings, places (F, 3), m, and the power
+        (F,), T^2, that their errors should have.
+        """
         if terms.residual.shape[0] == 0:
             return
         white = PoseWhitener(terms.slope, weights, self.noise_t, self.precision)
@@ -153,13 +168,16 @@ class HeldOutTally:
         self.place.append(place)
         self.frame_power.append(power.sum(axis=1) / np.maximum(used.sum(axis=1), 1))
         self.excess.append(white.excess_power(terms.residual, self.flux_noise_t))
+        if told is not None:
+            self.told.append(told)
 
     def result(self) -> HeldOut:
         """Return the figures of all frames that were taken in."""
         error, left = np.concatenate(self.error), np.concatenate(self.left)
         components = 2 * error.size
         # The median leaves out outliers and the frames beyond the edge of what was fitted.
-        excess = float(np.median(np.concatenate(self.excess)))
+        found = np.concatenate(self.excess)
+        excess = float(np.median(found))
         return HeldOut(
             error=error,
             left_over=left,
@@ -170,6 +188,7 @@ class HeldOutTally:
             n_dipoles=self.n_dipoles,
             place=np.concatenate(self.place),
             frame_rmse_t=np.sqrt(np.concatenate(self.frame_power)),
+            gap_factor=factor_of(np.concatenate(self.told), found) if self.told else 1.0,
         )
 
 

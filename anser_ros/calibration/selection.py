@@ -65,9 +65,11 @@ LEAST_GAIN = 0.08
 """Fraction by which more dipoles must lower the predictive error to be chosen. Below the noise a
 lower error changes no pose, while tracking takes time in proportion to the dipoles. A smaller
 value chooses larger layouts, a larger one gives accuracy away."""
-LEAST_GAIN_OF_FIXED = 0.15
-"""The same when a layout with more dipoles is to replace one with fewer among the finalists: a
-layer of fixed dipoles has about three times as many as moved ones with the same error."""
+THREE_TIMES = 1.15
+"""Factor by which a finalist's predictive error may be larger if it has a third of the dipoles: as
+many as moved ones need for the error of a layer of fixed ones. A finalist with nearly as many
+dipoles must be nearly as good: where a scan has gaps, some percent of the error of blocks, most of
+which is noise, are half of what the field is wrong by in the gaps."""
 
 
 @dataclass(frozen=True)

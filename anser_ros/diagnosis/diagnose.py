@@ -24,7 +24,7 @@ from anser_ros.diagnosis.outlying import clean_start, outlying_share, without_ou
 from anser_ros.diagnosis.prepare import test_blocks, train_blocks
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.diagnosis.refine import FINE, settled
-from anser_ros.diagnosis.residuals import rms
+from anser_ros.diagnosis.residuals import expected_rms, rms
 from anser_ros.diagnosis.search import Progress, Search, SearchSettings, search_effects
 from anser_ros.diagnosis.structure import StructureTest, noise_scale, noise_t, structure_tests
 from anser_ros.diagnosis.whiteness import whiteness
@@ -219,7 +219,7 @@ def conclude(
     unseen = cleaned.in_blocks(test_blocks())
     before, after = evaluate(unseen, ()), evaluate(unseen, fit.terms)
     white = whiteness(after)
-    expected = cleaned.spread.flux_t
+    expected = expected_rms(after)
     # Residuals that are no noise must not make the floor that they are measured by.
     grown = noise_t(after) > LEAST_NOISE_GROWTH * cleaned.spread.noise_t
     scale = min(noise_scale(after), 1.0) if grown and not white.holds else noise_scale(after)

@@ -113,7 +113,16 @@ def build_problem(
     )
     blocks = tuple(_numbers(tool.time, edges) for tool in posed)
     good = tuple(tool.valid.copy() for tool in posed)
-    return Problem(posed, blocks, references, reference_blocks, fields, apparatus, spread, good)
+    gaps_t = tuple(_gaps_t(tool, model) for tool in posed)
+    return Problem(
+        posed, blocks, references, reference_blocks, fields, apparatus, spread, good, gaps_t
+    )
+
+
+def _gaps_t(tool: Measurements, model: FieldModel) -> Array:
+    if model.gaps is None:
+        return np.zeros(tool.valid.shape)
+    return model.gaps.sigma_t(*tool.placed(), tool.sensors.length)
 
 
 def _numbers(time: Array, edges: Array) -> NDArray[np.int64]:

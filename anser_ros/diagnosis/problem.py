@@ -54,6 +54,8 @@ class Problem:
     spread : Spread
     good : tuple of ndarray of bool, one per tool, shape (F, S)
         Values that take part (valid, and no outliers).
+    gaps_t : tuple of ndarray, one per tool, shape (F, S)
+        By how much a modelled flux may be off where the model's scan has gaps, T a component.
     """
 
     tools: tuple[Measurements, ...]
@@ -64,6 +66,7 @@ class Problem:
     apparatus: Apparatus
     spread: Spread
     good: tuple[Mask, ...]
+    gaps_t: tuple[Array, ...]
 
     def frames(self, keep: Sequence[NDArray[np.generic]], bins: NDArray[np.generic]) -> 'Problem':
         """Return the frames of each tool, and the bins, that are named by index or mask."""
@@ -77,6 +80,7 @@ class Problem:
             tools=tuple(tool.frames(rows) for tool, rows in zip(self.tools, keep, strict=True)),
             blocks=tuple(b[rows] for b, rows in zip(self.blocks, keep, strict=True)),
             good=tuple(g[rows] for g, rows in zip(self.good, keep, strict=True)),
+            gaps_t=tuple(g[rows] for g, rows in zip(self.gaps_t, keep, strict=True)),
             references=references,
             reference_blocks=self.reference_blocks[bins],
         )
@@ -156,12 +160,14 @@ class State:
 def evaluate(problem: Problem, terms: Sequence[Term]) -> State:
     """Predict all readings with some effects in force, and whiten what they differ by."""
     found = []
-    for tool, blocks, good in zip(problem.tools, problem.blocks, problem.good, strict=True):
+    for tool, blocks, good, gaps_t in zip(
+        problem.tools, problem.blocks, problem.good, problem.gaps_t, strict=True
+    ):
         if tool.time.size == 0:
             continue
         view = tool_view(tool, terms, problem.fields)
         residual = parts(np.where(good[..., None], tool.flux - view.flux, 0.0))
-        weight = _repeat(good / problem.spread.flux_t, tool.flux.shape[2])
+        weight = _repeat(good / np.hypot(problem.spread.flux_t, gaps_t), tool.flux.shape[2])
         pose = pose_jacobian(view) * problem.spread.accuracy.pose_jitter
         whitener = Whitener.of(weight, _with_free(pose, terms, view), pose.shape[2])
         found.append(Part(view, residual, whitener, whitener(residual), blocks))

@@ -1,8 +1,10 @@
 """Measures how large the residuals of the tools are."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from anser_ros.diagnosis.problem import Part, State
+from anser_ros.diagnosis.problem import Part, State, evaluate
 
 
 def tool_parts(state: State) -> list[Part]:
@@ -11,7 +13,23 @@ def tool_parts(state: State) -> list[Part]:
 
 
 def rms(state: State) -> float:
-    """Return the residual of the tools with the jitter taken out, T a phasor component."""
+    """Return the residual of the tools with the jitter taken out, T a phasor component.
+
+    All readings count alike, also where the model's scan has gaps.
+    """
+    problem = state.problem
+    if any(gaps_t.any() for gaps_t in problem.gaps_t):
+        alike = replace(problem, gaps_t=tuple(np.zeros_like(g) for g in problem.gaps_t))
+        state = evaluate(alike, state.terms)
     squares = sum(float(np.sum(part.white**2)) for part in tool_parts(state))
     count = sum(part.count for part in tool_parts(state))
-    return float(np.sqrt(squares / max(count, 1))) * state.problem.spread.flux_t
+    return float(np.sqrt(squares / max(count, 1))) * problem.spread.flux_t
+
+
+def expected_rms(state: State) -> float:
+    """Return what that residual should be: noise, and what the model may be wrong by."""
+    problem = state.problem
+    pairs = zip(problem.gaps_t, problem.good, strict=True)
+    gaps_t = np.concatenate([gaps_t[good] for gaps_t, good in pairs])
+    power = float(np.mean(gaps_t**2)) if gaps_t.size else 0.0
+    return float(np.hypot(problem.spread.flux_t, np.sqrt(power)))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import ModelFileError
+from anser_ros.field.gaps import ScanGaps, gaps_document, parse_gaps
 from anser_ros.field.plain_data import plain
 from anser_ros.field.reference_readings import (
     ReferenceReadings,
@@ -80,6 +81,9 @@ class FieldModel:
     shift_sigma_m : float
         Standard deviation along each axis, m, of a shift that all places in the field share: what
         the calibration could not tell between the field and where the tool's sensors are.
+    gaps : ScanGaps or None
+        By how much the field may be off where the scan has gaps, beyond ``flux_error_t``. Only a
+        diagnosis reads it; no pose follows from it.
 
     Raises
     ------
@@ -99,6 +103,7 @@ class FieldModel:
     made_for: Identity | None = None
     references: ReferenceReadings | None = None
     shift_sigma_m: float = 0.0
+    gaps: ScanGaps | None = None
 
     def __post_init__(self) -> None:
         n, k = self.positions.shape[0], len(self.emitters)
@@ -220,6 +225,8 @@ def to_document(model: FieldModel) -> dict[str, Any]:
     }
     if model.references is not None:
         document['references'] = readings_document(model.references)
+    if model.gaps is not None:
+        document['gaps'] = gaps_document(model.gaps)
     if model.modes is not None:
         parts = np.stack([model.modes.real, model.modes.imag], axis=3)
         document['modes'] = parts.reshape(*model.modes.shape[:2], -1).tolist()
@@ -298,7 +305,7 @@ def from_document(document: Any) -> FieldModel:
     provenance = document.get('provenance') or {}
     if not isinstance(provenance, dict):
         raise ModelFileError('model: provenance must be a mapping')
-    references = document.get('references')
+    references, gaps = document.get('references'), document.get('gaps')
     model = FieldModel(
         positions=table[:, :3].copy(),
         directions=table[:, 3:6].copy(),
@@ -312,6 +319,7 @@ def from_document(document: Any) -> FieldModel:
         provenance=provenance,
         made_for=_made_for(document.get('made_for')),
         references=None if references is None else parse_readings(references, k),
+        gaps=None if gaps is None else parse_gaps(gaps),
     )
     told = document.get('fingerprint')
     if told is not None and str(told) != model.fingerprint:
