@@ -28,6 +28,9 @@ MOST_MODES = 24
 """Combinations of moments that are kept at most; each costs the model's file a number a dipole."""
 LEAST_SHARE = 0.1
 """Largest flux of a mode at any place, relative to the flux noise, below which it is left out."""
+DIGITS = 5
+"""Digits after the first of the largest moment: an uncertainty needs no more, and the model's file
+is shorter."""
 FEWEST_FRAMES = 20
 """Held-out frames at least from which a factor is taken."""
 
@@ -103,4 +106,6 @@ def gaps_of(
     keep = np.abs(made).max(axis=0) > LEAST_SHARE * fitted.fit.noise_t
     if not keep.any():
         return None
-    return ScanGaps(sites.positions, sites.directions, turned.T[keep])
+    moments = turned.T[keep]
+    decimals = DIGITS - int(np.floor(np.log10(np.abs(moments).max())))
+    return ScanGaps(sites.positions, sites.directions, np.round(moments, decimals))
