@@ -32,23 +32,18 @@ from anser_ros.measured.recipe import Recipe
 Study = Callable[[Path], tuple[list[ReportRow], str]]
 
 
-def _magnet_step(folder: Path) -> tuple[list[ReportRow], str]:
-    analysis = magnet_step.analyse(folder.with_name(magnet_patch.NAME))
-    return magnet_step.rows(analysis), magnet_step.tables(analysis)
-
-
 def _anser_board(folder: Path) -> tuple[list[ReportRow], str]:
     analysis = anser_board.analyse(folder)
     return anser_board.rows(analysis), anser_board.tables(analysis)
 
 
 STUDIES: dict[str, Study] = {
-    magnet_step.NAME: _magnet_step,
     anser_board.NAME: _anser_board,
 }
 """Analysis of each data set without a recipe: rows of its figures, text of its candidates."""
 RECIPES: dict[str, Recipe] = {
-    recipe.name: recipe for recipe in (navion.RECIPE, magnet_patch.RECIPE, hpi_coils.RECIPE)
+    recipe.name: recipe
+    for recipe in (navion.RECIPE, magnet_patch.RECIPE, magnet_step.RECIPE, hpi_coils.RECIPE)
 }
 """Data sets that the shipped commands are run on."""
 SESSIONS: dict[str, Callable[[Path, Path], list[Path]]] = {

@@ -12,6 +12,8 @@ The data (github xpy-zju/Dual-stage-magnetic-localization, MIT) are read where t
 import csv
 import itertools
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +22,10 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import FitError
 from anser_ros.measured import ReportRow
-from anser_ros.measured.magnet_model import Recording
 from anser_ros.measured.recipe import Recipe, figure, ran
 from anser_ros.measured.session_file import vector, write_frames
 from anser_ros.stamps import SECOND_NS
-from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
+from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup, Vector
 
 Array = NDArray[np.float64]
 
@@ -48,6 +49,35 @@ SPECIAL = {
 }  # fmt: skip
 """Errors, mm and degrees, of code that was written for these data alone (docs/results/README.md):
 learnt on the first file, the second one tracked."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Holds F poses of a magnet before S three-axis sensors, frame of the optical system.
+
+    Attributes
+    ----------
+    name : str
+    field_t : ndarray, shape (F, S, 3)
+        Flux density in each sensor's own axes, ambient field removed, T.
+    sensor_m : ndarray, shape (F, S, 3)
+        Stated sensor positions, m.
+    sensor_rotation : ndarray, shape (F, S, 3, 3)
+        Stated rotations, sensor to optical frame.
+    magnet_m : ndarray, shape (F, 3)
+        Stated magnet centre, m.
+    magnet_rotation : ndarray, shape (F, 3, 3)
+        Magnet to optical frame; the moment lies along the magnet's +z.
+    stamp_s : ndarray, shape (F,)
+    """
+
+    name: str
+    field_t: Array
+    sensor_m: Array
+    sensor_rotation: Array
+    magnet_m: Array
+    magnet_rotation: Array
+    stamp_s: Array
 
 
 def read_table(path: Path) -> tuple[list[str], Array]:
@@ -150,7 +180,12 @@ def patch_in_fg(recording: Recording) -> tuple[Array, Array]:
     return turn, np.einsum('fij,fj->fi', turn, middle - recording.magnet_m)
 
 
-def setup_of(recording: Recording) -> Setup:
+def setup_of(
+    recording: Recording,
+    volume: tuple[Vector, Vector] = VOLUME,
+    stated: Mapping[str, float] = STATED,
+    geometry: Mapping[str, float] = GEOMETRY,
+) -> Setup:
     """Return a setup of one emitter, and three channels a sensor, as the first frame states
     them.
     """
@@ -168,18 +203,24 @@ def setup_of(recording: Recording) -> Setup:
         for k in range(len(place))
         for axis in range(3)
     )
-    emitter = Emitter('cylinder_magnet', GEOMETRY, (Coil('magnet', (0.0, 0.0, 0.0), 0.0, 1.0),))
+    emitter = Emitter('cylinder_magnet', geometry, (Coil('magnet', (0.0, 0.0, 0.0), 0.0, 1.0),))
     rate = 1.0 / float(np.median(np.diff(recording.stamp_s)))
-    return Setup('fg', rate, emitter, sensors, VOLUME, STATED)
+    return Setup('fg', rate, emitter, sensors, volume, stated)
 
 
-def write_session(recording: Recording, path: Path) -> None:
-    """Write one recording as an MCAP session; raises `BagError` when the file exists already."""
+def write_session(recording: Recording, path: Path, setup: Setup | None = None) -> None:
+    """Write one recording as an MCAP session, by default with the setup that `setup_of` makes.
+
+    Raises
+    ------
+    BagError
+        When the file exists already.
+    """
     turn, place = patch_in_fg(recording)
     stamps = np.round(recording.stamp_s * SECOND_NS).astype(np.int64).tolist()
     flux = recording.field_t.reshape(len(stamps), -1, 1).astype(np.complex128)
     quaternion = Rotation.from_matrix(turn).as_quat()
-    write_frames(path, setup_of(recording), stamps, flux, {BODY: (place, quaternion)})
+    write_frames(path, setup or setup_of(recording), stamps, flux, {BODY: (place, quaternion)})
 
 
 def write_sessions(folder: Path, into: Path) -> list[Path]:
