@@ -35,7 +35,7 @@ REFERENCES_DOUBTFUL = 'references_doubtful'
 OTHER_MODEL = 'other_model'
 """The model in force was made for another board, or is not the one whose effects are undone."""
 UNCALIBRATED = 'uncalibrated'
-"""The model is the nominal one, and nobody has allowed its use."""
+"""The model is the nominal one, and its use has not been allowed."""
 TWO_SOURCES = 'two_sources'
 """More than one node publishes the fluxes, the setup or the model; the tracker finds this."""
 

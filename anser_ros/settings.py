@@ -177,7 +177,7 @@ class RefitSettings:
     references_age_s : float
         How long, s, poses are given while the references are silent. A C-arm that comes at 10 cm/s
         is 5 cm nearer after half a second, and metal that comes again has not come far. Shorter,
-        and a hiccup of the line costs poses; longer, and poses are given that nobody vouches for.
+        and a hiccup of the line costs poses; longer, and poses are given without evidence.
     error_modes : int
         Rank of the uncertainty that is handed on with the model. Fewer are cheaper to send and to
         use; what they leave out is added as noise.

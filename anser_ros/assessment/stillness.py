@@ -26,7 +26,7 @@ MOST_MOVE_M, MOST_MOVE_RAD = 2.5e-3, 0.05
 by its differences, and no rest."""
 LONGER = 1.5
 """Share of the shortest pause that the fewest windows of a noisy tracker may take."""
-LONGEST_GAP_S = 1.0  # silence that ends a pause: nobody knows where the tool was meanwhile
+LONGEST_GAP_S = 1.0  # silence that ends a pause: it is not known where the tool was meanwhile
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ KINDS = ('places', 'axes', 'gains')
 """Kinds of errors whose widths are found, where they are asked for. Whenever any is, which way
 round each sensor is, is found as well."""
 FOLDS = 5
-"""Parts of the sensors that are foretold by the others in turn."""
+"""Parts of the sensors that are predicted by the others in turn."""
 STILL = 5.0
 """Standard deviations of the optical jitter within which all poses are one place."""
 NOISY = 5.0
@@ -126,7 +126,7 @@ def calibrate_at_one_place(
     emitters, frequencies_hz : tuple, length K
         Names of the emitters, and their frequencies, Hz.
     kinds : sequence of str
-        Of `KINDS`; others are left as the setup says. With none, sensors are as stated.
+        Of `KINDS`; others keep the setup's values. With none, sensors are as stated.
     accuracy : Accuracy
         Noise of a single frame.
     progress : callable, optional

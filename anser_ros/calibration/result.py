@@ -84,7 +84,7 @@ class Scan:
 
 @dataclass(frozen=True)
 class SourcePlace:
-    """Says where an emitter of unknown place was found.
+    """States where an emitter of unknown place was found.
 
     Attributes
     ----------

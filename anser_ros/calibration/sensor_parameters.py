@@ -50,7 +50,7 @@ SHARED_SHIFT = 'lever_arm'
 them."""
 SURVEYED_M = 1e-3
 """Standard deviation of a setup's lever arm, m along each axis, where no scan determines it: that
-of a tool measured with a ruler. All places that a coil is found at are off by as much."""
+of a tool measured with a ruler. All places that a coil is found at are wrong by as much."""
 AS_PLACES = 4.0
 """The same in widths of the places' population, where that is less: a tool whose coils are where
 its setup has them is one that was measured well. An assumption, not a result."""

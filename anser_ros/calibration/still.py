@@ -79,7 +79,7 @@ def calibrate_still(
     emitters, frequencies_hz : tuple, length K
         Names of the emitters, and their frequencies, Hz.
     kinds : sequence of str
-        What is looked for, of `STILL_KINDS`; others are left as the setup says.
+        What is looked for, of `STILL_KINDS`; others keep the setup's values.
     accuracy : Accuracy
         Noise to begin with, and errors of the poses.
     progress : callable, optional

@@ -197,7 +197,7 @@ def _group(name: str) -> str:
 
 
 def clock(tool: str = 'timedatectl') -> list[Observation]:
-    """Check the system's clock: whether somebody keeps it right, as poses of two machines
+    """Check the system's clock: whether something keeps it right, as poses of two machines
     need it.
     """
     said = ''
@@ -216,7 +216,7 @@ def clock(tool: str = 'timedatectl') -> list[Observation]:
 
 
 def kernel_clock() -> bool | None:
-    """Return whether somebody keeps the kernel's clock right; None where it does not say."""
+    """Return whether something keeps the kernel's clock right; None where it does not say."""
     try:
         state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX_BYTES))
     except (OSError, AttributeError):

@@ -41,7 +41,7 @@ FRAME_HEIGHTS, FRAME_WIDTH, FRAME_PLACES = (0.15, 0.7, 1.3), 1.15, 12
 AXES = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [1, -1, -1]]) / np.sqrt(
     np.array([[1], [1], [1], [3], [3]])
 )
-"""Axes that a coil may have where nobody states them: three of a cluster, and two oblique ones."""
+"""Axes that a coil may have if none are stated: three of a cluster, and two oblique ones."""
 LENGTH_M = 0.008
 """Length of a coil that is not stated, m: about that of the coils of the demo's setup."""
 FARTHEST = 10.0

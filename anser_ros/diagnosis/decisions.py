@@ -161,8 +161,9 @@ STRUCTURED, UNSTRUCTURED = 0.03, 0.1
 where no test finds on what. Smaller reports a correct model's own error; larger keeps silent about
 what is there."""
 DEPENDENT = 0.05
-"""Unexplained power over the floor's from which it is said what it depends on. Smaller gives names
-to dependences of next to nothing; larger leaves a remainder without the hint where to look."""
+"""Unexplained power over the floor's from which it is reported what it depends on. Smaller gives
+names to dependences of next to nothing; larger leaves a remainder without the hint where to
+look."""
 
 
 def as_good(spared: int) -> float:

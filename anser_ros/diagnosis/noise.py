@@ -1,4 +1,4 @@
-"""Finds frames that belong to no model, and noise that has grown, once all else is explained."""
+"""Finds frames that fit no model, and noise that has grown, once all else is explained."""
 
 from collections.abc import Sequence
 

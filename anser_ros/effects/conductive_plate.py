@@ -35,7 +35,7 @@ TYPICAL_OHM = 3e-5
 aluminium. It is only a start, from which the fit moves."""
 
 HEIGHT, RIM, OHM = 0.005, 0.03, 0.1
-"""How well a sheet is known at best, whose true outline, thickness and bend nobody knows: its
+"""How well a sheet is known at best, whose true outline, thickness and bend are unknown: its
 height and each rim as shares of its edge, and its resistance."""
 
 

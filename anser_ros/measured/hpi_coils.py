@@ -229,7 +229,7 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
             bool((named[1] | ~truth).all()), chosen, SPECIAL_INVERTED,
         ),
         ReportRow(
-            NAME, 'a fifth of the channels foretold by the others, RMSE', *errors, 'pT', None,
+            NAME, 'a fifth of the channels predicted by the others, RMSE', *errors, 'pT', None,
             None, 'field and signs on the others',
         ),
         ReportRow(

@@ -216,7 +216,7 @@ class FieldModelNode(AnserNode):
 
     @property
     def _is_uncalibrated(self) -> bool:
-        """Whether the base is the drawing of the board, and nobody has said that this will do."""
+        """Whether the base is the drawing of the board, and its use has not been allowed."""
         base, allowed = self._base, self.parameters.allow_uncalibrated
         return base is not None and is_nominal(base) and not allowed
 

@@ -3,7 +3,7 @@
 The number of coils, their kind and their places are data. A *kind* is a function that draws one
 coil around its own centre; a new kind of board needs one more function in `KINDS`.
 
-The key ``winding`` of the geometry tells which way a positive current runs, seen from +z: ``ccw``
+The key ``winding`` of the geometry states which way a positive current runs, seen from +z: ``ccw``
 (counter-clockwise, moment along +z) or ``cw``. Printed spirals are ``cw`` by default because the
 Anser board's are (its measured in-phase moments are negative); plain loops are ``ccw``.
 """

@@ -71,7 +71,7 @@ class TrackedVolume:
         return cls((x - reach, y - reach, FLOOR * half), (x + reach, y + reach, CEILING * half))
 
     def with_fringe(self) -> 'TrackedVolume':
-        """Return the box in which the tracker accepts poses when nobody has stated the volume.
+        """Return the box in which the tracker accepts poses if no volume is stated.
 
         All lengths, seen from the middle of its footprint on the board, are `FRINGE` times as
         large. The floor rises with them: nearest to the coils a field model is at its worst.

@@ -376,7 +376,7 @@ class LiveRefit:
         )  # fmt: skip
 
     def _too_few(self, stamp_ns: int, level: float) -> RefitResult:
-        """Return to the calibrated model, which is no answer: nobody knows where metal is."""
+        """Return to the calibrated model, which is no answer: it is not known where metal is."""
         self._belief.forget()
         self._average.forget()
         if self._witness is not None:

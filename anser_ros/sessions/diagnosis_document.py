@@ -10,7 +10,7 @@ from anser_ros.sessions.diagnosis import SessionDiagnosis
 DEPENDENCIES = (
     'time', 'position', 'orientation', 'speed', 'emitter', 'channel', 'amplitude', 'frequency',
 )  # fmt: skip
-"""Variables on which a remainder may be said to depend; other tests are for the report only."""
+"""Variables on which a remainder may depend in words; other tests are for the report only."""
 MODEL_FILE_ONLY = ('groups', 'knots_s', 'course', 'couplings_m3')
 """Parameters that only a program needs: lists of hundreds of numbers. They are left out here and
 stand in the model file."""

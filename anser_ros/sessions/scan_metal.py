@@ -36,7 +36,7 @@ FEWEST_STEADY = 10
 """Frames of the references at rest, of which their steady readings are the mean, at least."""
 FIELD_REACH_M = 0.015
 """Distance (m) of a coil from where the field was learnt, up to which it takes part: frames in
-which metal moves were not learnt from, and farther off the field is predicted less well."""
+which metal moves were not learnt from, and farther away the field is predicted less well."""
 UNCERTAINTY_FRAMES = 60
 """Frames of a tool, about, in which the uncertainty of the metal at rest is worked out."""
 

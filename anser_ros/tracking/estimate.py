@@ -180,7 +180,7 @@ class PoseEstimate:
 
     def with_shift(self, sigma_m: float) -> 'PoseEstimate':
         """Return the estimate with a shift, m along each axis, in its sigma and covariance."""
-        for i in range(3):  # the estimate's own matrix is nobody else's
+        for i in range(3):  # the estimate's own matrix is not used elsewhere
             self.covariance[i, i] += sigma_m**2
         return self.with_sigma(math.sqrt(self.sigma_position_m**2 + 3.0 * sigma_m**2))
 

@@ -106,7 +106,7 @@ class Judgement:
         before, after = last.rotation, estimate.rotation
         if before is None or after is None:
             before, after = last.axis[:, None], estimate.axis[:, None]
-        # The estimate's own matrix is nobody else's.
+        # The estimate's own matrix is not used elsewhere.
         sigma = add_motion(
             estimate.covariance, last.position, estimate.position, before, after,
             settings.stamp_sigma_s / seconds,

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 BOX_MARGIN_M = 0.1
-"""How far beyond the volume the solver may go, so that a tool there is said to be there."""
+"""How far beyond the volume the solver may go, so that a tool there counts as there."""
 GRID_TOLERANCE = 0.05
 """Relative change of the field up to which a grid may go on serving as a source of starts."""
 

@@ -9,7 +9,7 @@ TRACKED, OPTICAL = '/tracked/', '/optical/'
 ENDING = '/pose'
 """What the topics of poses end with."""
 BODY = 'body'
-"""What a body is called to which nobody gave a name."""
+"""What a body is called without a name."""
 SCHEMA = 'anser_poses/1'
 """Schema of the setup document of a session of poses."""
 

@@ -19,7 +19,7 @@ LARGEST_NUMBER = 1e300
 """Size from which on a number counts as infinite, in any unit."""
 LIKENESS = 0.8
 """Ratio of equal letters (`difflib`) from which an unknown key is taken for a misspelt one: one
-letter off in a short key, two in a long one. Smaller, and somebody's own keys are refused."""
+letter off in a short key, two in a long one. Smaller, and a user's own keys are refused."""
 NAME = re.compile(r'^[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*$')
 Vector = tuple[float, float, float]
 Winding = tuple[float, float, float, float]

@@ -25,7 +25,7 @@ FAULTS = {
     'duplicate_blocks': 'blocks that came twice',
     'system_clock_set': "the system's clock was set",
 }
-"""Counters that only faults raise, the gravest first, with their meaning."""
+"""Counters that only faults raise, the most serious first, with their meaning."""
 GRAVE = ('unplug', 'silence', 'wrong_baud')
 MOST = 3
 """Faults that are named in one line; the graver ones come first."""
@@ -54,7 +54,7 @@ class RecentFaults:
 
     @property
     def words(self) -> str:
-        """Return what happened lately with its count, the gravest first; empty if nothing did."""
+        """Return the recent faults with their counts, the most serious first; empty if none."""
         found = [name for name in FAULTS if name in self._recent]
         parts = [f'{name} {self._recent[name][1]} ({FAULTS[name]})' for name in found[:MOST]]
         return '; '.join(parts)

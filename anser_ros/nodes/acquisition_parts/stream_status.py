@@ -18,7 +18,7 @@ STATES = (
     (SATURATED, Level.WARN, 'saturated', ''),
     (DROPPED, Level.WARN, 'samples lost', ''),
 )
-"""Flag bits of a sensor, the gravest first, with what they mean."""
+"""Flag bits of a sensor, the most serious first, with what they mean."""
 
 
 def signal_troubles(

@@ -19,7 +19,7 @@ references has its first pose as much later."""
 
 
 def none_announced() -> int:
-    """Return 0: nobody announces references."""
+    """Return 0: no references are announced."""
     return 0
 
 

@@ -28,7 +28,7 @@ moves."""
 
 
 class _EndedError(Exception):
-    """Nobody wants the tables any more."""
+    """The tables are no longer needed."""
 
 
 class RefitStart:

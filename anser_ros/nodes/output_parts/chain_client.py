@@ -62,7 +62,7 @@ class ChainClient:
         Raises
         ------
         ChainError
-            When nobody offers it, answers in time, or when it refuses.
+            When no node offers it, answers in time, or when it refuses.
         """
         answer = await _ask(self._triggers[service], Trigger.Request(), ANSWER_S)
         if not answer.success:

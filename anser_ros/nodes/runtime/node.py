@@ -346,7 +346,7 @@ class AnserNode(Node):
     def _declare_table(self) -> Any:
         table = self.PARAMETERS
         values: dict[str, Any] = {}
-        # rclpy drops overrides that nobody declares; a misspelt name must not pass silently.
+        # rclpy drops overrides that are not declared; a misspelt name must not pass silently.
         others = {name for node in self._beside for name in parameters.types(node.PARAMETERS)}
         given = [name for name in self._parameter_overrides if name not in others]
         unknown = [name for name in given if not parameters.is_known(table, name)]

@@ -231,7 +231,7 @@ def channel_noise(lab, rng):
 
 
 def outliers(lab, rng):
-    """Frames of the tool that belong to no model."""
+    """Frames of the tool that fit no model."""
     fraction = rng.uniform(0.02, 0.05)
     seed = int(rng.integers(2**31))
 
