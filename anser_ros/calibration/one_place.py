@@ -239,6 +239,7 @@ def _held_out(
         error, error, float(np.mean((left / spread)[used] ** 2)), noise, noise,
         float(np.sqrt(max(excess, 0.0))), sum(len(one.moments) for one in fit.sources),
         mean.measured.position[:1], np.array([np.sqrt(np.mean(np.abs(error) ** 2))]),
+        gap_factor=1.0,
     )  # fmt: skip
 
 

@@ -182,7 +182,7 @@ def patch_in_fg(recording: Recording) -> tuple[Array, Array]:
 
 def setup_of(
     recording: Recording,
-    volume: tuple[Vector, Vector] = VOLUME,
+    volume: tuple[Vector, Vector] | None = VOLUME,
     stated: Mapping[str, float] = STATED,
     geometry: Mapping[str, float] = GEOMETRY,
 ) -> Setup:

@@ -1,7 +1,8 @@
 """Imports a large magnet that a robot carries past the patch of magnetometers, with its recipe.
 
-The file lies beside those of `magnet_patch` and has their layout. The magnet never turns, and the
-fields of the surroundings are not taken off: the data set has none for this file.
+The file lies beside those of `magnet_patch` and has their layout. The magnet never turns and
+passes beside the patch, so that no tracked volume above it is stated; the fields of the
+surroundings are not taken off, since the data set has none for this file.
 """
 
 from pathlib import Path
@@ -12,8 +13,6 @@ from anser_ros.measured import ReportRow, magnet_patch
 from anser_ros.measured.recipe import Recipe, figure, ran
 
 NAME, FILE = 'magnet_step', 'step1'
-VOLUME = ((-0.2, -0.2, 0.01), (0.2, 0.2, 0.3))
-"""Where the patch may be, m."""
 STATED = {'flux_noise_t': 3e-6, 'optical_position_m': 1e-5, 'optical_rotation_rad': 1e-4}
 """Noise of the magnetometers and jitter of the robot."""
 SPECIAL_UT = 5.67
@@ -28,7 +27,7 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
     parts, _ = magnet_patch.read_poses(table, 'M')
     recording = magnet_patch.as_recording(FILE, parts, np.zeros(3))
     path = into / f'magnet_{FILE}.mcap'
-    setup = magnet_patch.setup_of(recording, VOLUME, STATED, {})
+    setup = magnet_patch.setup_of(recording, None, STATED, {})
     magnet_patch.write_session(recording, path, setup)
     return [path]
 
