@@ -243,6 +243,41 @@ def test_a_gain_of_all_that_begins_within_a_window_is_over_when_it_is_over(
     assert (result.state, result.withheld, result.model) == ('frozen', '', world.model)
 
 
+def test_a_fault_of_all_is_over_when_metal_alone_explains_what_has_changed(refit):
+    """Metal goes on moving meanwhile, so no reading comes back to where it was."""
+    world, rng = anser_world(), np.random.default_rng(9)
+    faults = {
+        'noise': lambda flux: flux + 30.0 * world.noise(rng),
+        'gain': lambda flux: 1.01 * flux,
+    }
+    hold, lasts = refit.settings.hold_frames, 40
+    for name, fault in faults.items():
+        refit.reset()
+        for frame in range(20 + lasts + 2 * hold):
+            points = HEAD - [0.0, 0.0, 0.06 - 5e-4 * frame]
+            flux = world.baseline + world.metal(points) + world.noise(rng)
+            is_faulty = 20 <= frame < 20 + lasts
+            flux = fault(flux) if is_faulty else flux
+            result = refit.update((frame + 1) * STEP_NS, world.references.channel, flux)
+            if is_faulty:
+                assert result.withheld == REFERENCES_DOUBTFUL, (name, frame)
+            if frame >= 20 + lasts + hold + 5:
+                assert result.withheld == '', (name, frame - 20 - lasts)
+        before, after, _, _ = errors(world, result.model, points)
+        assert after < 0.1 * before, name
+
+
+def test_coils_that_recover_are_used_again_together(refit):
+    """A change of the coils in use takes longer than a frame."""
+    world, hold = anser_world(), refit.settings.hold_frames
+    for first in (2, 5, 8):
+        flags = np.zeros(len(world.baseline), dtype=int)
+        flags[:first] = 1
+        run(refit, world, 0.0, 4, first, 10 * first, flags=flags)
+    left_out = {len(run(refit, world, 0.0, 1, 7, 100 + k).left_out) for k in range(2 * hold)}
+    assert left_out == {8, 0}
+
+
 def test_frozen_references_are_left_out_however_many_they_are(refit):
     world, held = anser_world(), {}
     group = group_of(world, 11)

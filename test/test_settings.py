@@ -228,6 +228,7 @@ class TestEffect:
         for _ in range(3):
             assert brief._watch.excluded[0]
             brief._watch.agreed(0, True)
+            brief._watch.readmit()
         assert not brief._watch.excluded[0]
         usual.reset()
         odds = [refit.update(1, channels, flux).log_odds for refit in (usual, brief)]

@@ -211,15 +211,27 @@ class ReferenceWatch:
         return self.reason.count(DISAGREES) > self.count - int(self.excluded.sum())
 
     def agreed(self, coil: int, agrees: bool) -> None:
-        """Count a frame in which an excluded coil was compared; enough good ones readmit it."""
+        """Count a frame in which an excluded coil was compared."""
         self._good[coil] = self._good[coil] + 1 if agrees else 0
-        if self._good[coil] >= self.hold_frames:
-            self.excluded[coil], self.reason[coil] = False, OK
+
+    def readmit(self) -> None:
+        """Use the coils again that have had enough good frames; called once a frame.
+
+        Each change of the coils in use costs more than a frame's time, so they wait for those that
+        are on their way back too, for as long again at most.
+        """
+        ready = self.excluded & (self._good >= self.hold_frames)
+        awaited = self.excluded & (self._good > 0) & ~ready
+        if awaited.any() and self._good.max() < 2 * self.hold_frames:
+            return
+        for coil in np.flatnonzero(ready):
+            self.excluded[coil], self.reason[coil], self._good[coil] = False, OK, 0
 
     def wait(self, readable: NDArray[np.bool_]) -> None:
         """Count a frame with too few coils to compare; coils once unreadable return in time."""
         for coil in np.flatnonzero(self.excluded & readable):
             self.agreed(int(coil), self.reason[coil] != DISAGREES)
+        self.readmit()
 
     def suspects(self, chi2: Array, power: Array, freedom: int) -> list[NDArray[np.int64]]:
         """Return the coils in use whose fault is worth computing, often none; for `find_faults`.

@@ -9,6 +9,7 @@ not.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from anser_ros.refit.agreement import left_out
 from anser_ros.refit.evidence import STRENGTHS, FrameEvidence, log_sum, over_strengths
+from anser_ros.refit.frame import NoiseUnits
 from anser_ros.refit.health import FAULT_ODDS, FAULT_SCALES
 from anser_ros.refit.posterior import Bank
 from anser_ros.stamps import NANO
@@ -42,6 +44,10 @@ metal."""
 COMMON = 0.003
 """Relative step of all emitters at once from which on it is no drift of theirs. Currents drift
 slowly, each on its own; a gain that all references share, in their amplifier, steps like that."""
+SURE = 3.0
+"""Standard deviations that an emitter's step must stay below `COMMON` for a fault to be over."""
+BEND_VARIANCE = 6.0
+"""Variance of a reading less twice the one before plus the one before that, in units of one's."""
 RETURNED = 0.1
 """Part of a jump that may be left where a reference has jumped back: metal moved meanwhile."""
 
@@ -58,11 +64,14 @@ class Jumps:
         Noise of that, in units of a reading's.
     since_s : float
         Time since the last reading of most references, s; infinite where there was none.
+    bend : ndarray, shape (S, K), complex
+        T; how far the last reading is from the middle of this one and the one before it, doubled.
     """
 
     off: ComplexArray
     spread: Array
     since_s: float
+    bend: ComplexArray
 
 
 class Courses:
@@ -84,6 +93,8 @@ class Courses:
         self._before = np.zeros((2, count, width), dtype=np.complex128)
         self._away = np.zeros((count, width), dtype=np.complex128)
         self._farthest = np.zeros(count)
+        # All readings before the first of the present jumps, and when that was.
+        self._sound, self._sound_ns = self._last, 0.0
 
     def follow(self, stamp_ns: int, change: ComplexArray) -> Jumps:
         """Take in changes (S, K), T, and return how far they are off their courses.
@@ -97,6 +108,7 @@ class Courses:
         known = np.isfinite(self._last_ns)
         variance = np.where(known, 1.0 + (1.0 + steps) ** 2 + steps**2, 1.0)
         off = change - self._last - steps[:, None] * self._step
+        bend = change - 2.0 * self._last + self._before[1]
         read = np.isfinite(change).all(axis=1)
         new = read & known
         since_s = float(np.median(ahead_ns[new])) * NANO if new.any() else np.inf
@@ -105,10 +117,13 @@ class Courses:
         self._before[0, read], self._before[1, read] = self._before[1, read], self._last[read]
         self._last[read] = change[read]
         self._last_ns = np.where(read, float(stamp_ns), self._last_ns)
-        return Jumps(off, np.sqrt(variance), since_s)
+        return Jumps(off, np.sqrt(variance), since_s, bend)
 
     def note(self, jumps: Jumps, coils: NDArray[np.int64]) -> None:
         """Remember which references have jumped: a jump is no part of a course."""
+        if not self._is_away.any():
+            self._sound = self._before[0].copy()
+            self._sound_ns = float(np.nanmax(self._last_ns)) - 2.0 * jumps.since_s / NANO
         self._step_ns[coils] = np.nan
         first = ~self._is_away[coils]
         whole = (self._last - self._before[0])[coils]
@@ -123,6 +138,16 @@ class Courses:
     def away(self) -> NDArray[np.int64]:
         """Return the references that are off by jumps."""
         return np.flatnonzero(self._is_away)
+
+    def since_sound(self) -> tuple[ComplexArray, float]:
+        """Return the change (S, K), T, since before the first of the present jumps, and its s."""
+        return self._last - self._sound, (float(np.nanmax(self._last_ns)) - self._sound_ns) * NANO
+
+    def forget_jumps(self) -> NDArray[np.int64]:
+        """Take all references for back from their jumps, and return which were off."""
+        away = self.away()
+        self._away[away], self._farthest[away] = 0.0, 0.0
+        return away
 
     def returned(self, noise: Array) -> NDArray[np.int64]:
         """Return the references that are no longer off by jumps, which is then forgotten.
@@ -201,6 +226,51 @@ def jumped(
     if odds > FAULT_ODDS and not _is_predicted(bank, free, jumps):
         return np.flatnonzero((broad > quiet).any(axis=1))
     return np.empty(0, dtype=np.int64)
+
+
+def are_over(
+    courses: Courses,
+    jumps: Jumps,
+    units: NoiseUnits,
+    bank_of: Callable[[NDArray[np.bool_]], tuple[Bank, object]],
+    noise: Array,
+    drift: float,
+) -> bool:
+    """Return whether jumps are over: metal alone explains how all has changed since before them.
+
+    Near metal a common gain can pass for metal: then the answer is no.
+
+    Parameters
+    ----------
+    courses : Courses
+        Some references must be off by jumps.
+    jumps : Jumps
+        Of the present frame, which must go on from the two before it.
+    units : NoiseUnits
+    bank_of : callable
+        Returns the hypotheses for references (S,) first.
+    noise : ndarray, shape (S,)
+        Of a component of each, in units of the nominal one.
+    drift : float
+        Prior deviation of an emitter's strength.
+    """
+    readable = np.asarray(np.isfinite(jumps.bend).all(axis=1))
+    power = (units.of(jumps.bend)[readable] ** 2).mean(axis=(1, 2)) / BEND_VARIANCE
+    if not courses.away().size or not power.size:
+        return False
+    if (power > LEAST_JUMP_POWER * noise[readable] ** 2).any():
+        return False
+    change, seconds = courses.since_sound()
+    spread = math.sqrt(2.0)
+    parts = units.of(change)[readable] / spread
+    bank = bank_of(readable)[0]
+    seen = bank.evaluate(parts.reshape(-1, 2), float(noise.min()))
+    mean, variance = bank.drifts(seen, int(seen.log_evidence.argmax()))
+    step = np.hypot(*mean.T) + SURE * np.sqrt(variance.max(axis=1))
+    if (spread * drift * step > COMMON).any():
+        return False
+    largest = LARGEST_RATE * seconds * units.size
+    return not jumped(bank, seen, parts, spread, drift, largest).size
 
 
 def _is_common_gain(bank: Bank, seen: FrameEvidence, jumps: Array, drift: float) -> bool:

@@ -32,11 +32,12 @@ from anser_ros.refit.evidence import FrameEvidence
 from anser_ros.refit.excitation import FieldFunction
 from anser_ros.refit.frame import BaselineCheck, NoiseUnits
 from anser_ros.refit.health import ReferenceHealth, ReferenceWatch
-from anser_ros.refit.jumps import LARGEST_RATE, LEAST_JUMP_POWER, Courses, jumped
+from anser_ros.refit.jumps import LARGEST_RATE, LEAST_JUMP_POWER, Courses, are_over, jumped
 from anser_ros.refit.posterior import Bank
 from anser_ros.refit.result import (
     FEW_REFERENCES,
     FROZEN,
+    POOR,
     POOR_FIT,
     REFIT,
     RefitResult,
@@ -52,8 +53,6 @@ ComplexArray = NDArray[np.complex128]
 
 DRIFT_SIGMAS = 5.0
 """Standard deviations from which on a coil's drift counts as certain."""
-POOR = 4.0
-"""Typical left-out distance from which on the state is `POOR_FIT`."""
 
 
 class LiveRefit:
@@ -96,8 +95,7 @@ class LiveRefit:
         volume: TrackedVolume | None = None,
         tables: refit_tables.RefitTables | None = None,
     ) -> None:
-        self.model = model
-        self.references = references
+        self.model, self.references = model, references
         self.settings = settings or RefitSettings()
         self.baseline = checked_baseline(model, references, baseline)
         self._row_noise = checked_noise(noise, len(references), len(model.emitters))
@@ -249,7 +247,12 @@ class LiveRefit:
         if not (loud.any() or away.size):
             return
         self._courses.note(jumps, away[loud[away]])
-        for coil in self._courses.returned(noise * self.settings.accuracy.flux_noise_t).tolist():
+        back = self._courses.returned(noise * self.settings.accuracy.flux_noise_t)
+        few = coils.size < self.settings.min_references or self._watch.is_outvoted
+        drift = self.settings.emitter_drift
+        if few and are_over(self._courses, jumps, self._units, self._banks.of, noise, drift):
+            back = self._courses.forget_jumps()
+        for coil in back.tolist():
             self._watch.recover(coil)
         # The first frame has no course, and the second only the noise that was stated: metal may
         # be there, and `_judged` asks who disagrees.
@@ -258,7 +261,7 @@ class LiveRefit:
         bank, _ = self._bank()
         seen = bank.evaluate(parts[coils].reshape(-1, 2), level)
         largest = LARGEST_RATE * jumps.since_s * self._units.size
-        spread, drift = float(np.median(jumps.spread[coils])), self.settings.emitter_drift
+        spread = float(np.median(jumps.spread[coils]))
         found = coils[jumped(bank, seen, parts[coils], spread, drift, largest)]
         for coil in found.tolist():
             self._watch.exclude(coil)
@@ -308,6 +311,7 @@ class LiveRefit:
             rows = coil * k + np.arange(k)
             distance = distance_of(bank, seen, best, rows, values[coil], level)
             self._watch.agreed(int(coil), distance < health.AGREEMENT_CHI2 * 2 * k)
+        self._watch.readmit()
 
     def _result(self, stamp_ns: int, bank: Bank, seen: FrameEvidence, level: float) -> RefitResult:
         self._belief.update(seen.log_evidence)
@@ -321,11 +325,10 @@ class LiveRefit:
             drift[~sure] = 0.0
         model, state, reason = self.model, FROZEN, ''
         unit = self.settings.accuracy.flux_noise_t
-        if self._witness is not None:
-            if moving:
-                self._witness.predict(stamp_ns, bank, seen, weights, drift)
-            else:
-                self._witness.forget()
+        if self._witness is not None and moving:
+            self._witness.predict(stamp_ns, bank, seen, weights, drift)
+        elif self._witness is not None:
+            self._witness.forget()
         if moving or sure.any():
             phase = self._tables.excitation.phase
             model = self._assembly.model(
@@ -341,11 +344,10 @@ class LiveRefit:
         elif moving and typical > POOR:
             state = POOR_FIT
             reason = f'readings deviate {np.sqrt(typical):.1f} times as much as expected'
-        known = dict(zip(bank.names, weights.tolist(), strict=True))
         metal = (lambda: locate_metal(bank, seen, weights, unit)) if moving else None
         return self._finish(
-            stamp_ns, model, state, reason, level, log_odds=self._belief.log_odds, weights=known,
-            drift=drift, find=metal,
+            stamp_ns, model, state, reason, level, log_odds=self._belief.log_odds,
+            weights=dict(zip(bank.names, weights.tolist(), strict=True)), drift=drift, find=metal,
         )  # fmt: skip
 
     def enable_witnesses(self, flux_noise_t: float) -> None:
@@ -381,8 +383,7 @@ class LiveRefit:
         self._average.forget()
         if self._witness is not None:
             self._witness.forget()
-        count = int(self._in_use().sum())
-        need = self.settings.min_references
+        count, need = int(self._in_use().sum()), self.settings.min_references
         self._distance = self._residual = np.empty(0)
         state = REFERENCES_DOUBTFUL if self._watch.is_outvoted else FEW_REFERENCES
         reason = f'{count} usable references, {need} are needed'

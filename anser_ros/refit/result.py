@@ -25,6 +25,9 @@ STATES = (FROZEN, REFIT, FEW_REFERENCES, POOR_FIT, REFERENCES_DOUBTFUL)
 """No change; the model follows one; too few references to know; a change that
 nothing explains; references of which most jumped by themselves."""
 
+POOR = 4.0
+"""Typical left-out distance from which on the state is `POOR_FIT`."""
+
 WITHHELD = {
     FEW_REFERENCES: REFERENCES_LOST,
     POOR_FIT: REFERENCES_DOUBTFUL,
