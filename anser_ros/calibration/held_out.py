@@ -52,7 +52,8 @@ class HeldOut:
     frame_rmse_t : ndarray, shape (F,)
         Root mean square magnitude of each frame's ``error``, T.
     gap_factor : float
-        By which errors are larger than the covariance of the fitted moments makes them.
+        By which errors are larger than the covariance of the fitted moments makes them; one where
+        they were not compared.
     """
 
     error: ComplexArray
@@ -64,7 +65,7 @@ class HeldOut:
     n_dipoles: int
     place: Array
     frame_rmse_t: Array
-    gap_factor: float
+    gap_factor: float = 1.0
 
     @property
     def score_t(self) -> float:
