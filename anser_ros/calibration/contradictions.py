@@ -73,9 +73,7 @@ def contradictions(
     width = np.empty(len(parameters))
     for kind in parameters.kinds:
         width[parameters.rows(kind)] = PRIOR[kind]
-    # By the scatter of whole stretches; a contradiction scatters its own parameters' scores alone.
-    power = (rest.scores**2).sum(axis=0) / np.maximum(np.diag(rest.information), 1e-300)
-    inflation = max(1.0, float(np.median(power)))
+    inflation = max(1.0, rest.inflation)
     information = rest.information / inflation + parameters.rule()
     scaled = np.eye(width.size) + width[:, None] * information * width[None, :]
     covariance = width[:, None] * np.linalg.solve(scaled, np.diag(width))

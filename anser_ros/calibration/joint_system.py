@@ -257,6 +257,19 @@ class Eliminated:
     scores: Array
     field_variance: Array
 
+    @property
+    def inflation(self) -> float:
+        """Return by how much more the scores of whole stretches scatter than those of independent
+        readings would.
+
+        It is the median over the parameters, for a sensor that changes on the way scatters its own
+        alone; one without parameters.
+        """
+        count = len(self.scores)
+        power = (self.scores**2).sum(axis=0) * count / max(count - 1, 1)
+        size = np.maximum(np.diag(self.information), 1e-300)
+        return float(np.median(power / size)) if size.size else 1.0
+
     def field_step(self, step: Array, modes: int) -> Array:
         """Return the field's step (M, 2K) that goes with a step of the parameters (Q,)."""
         flat = self.inside[:, -1] - self.inside[:, :-1] @ step

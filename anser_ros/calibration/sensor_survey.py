@@ -295,13 +295,8 @@ class SensorSurveyor:
         # stretches tells how much less the data say than independent readings would. It has to be
         # known where they are weighed against the optical poses: else what the model misses is
         # made good by a shift of the field and of the tool, which no single frame contradicts.
-        # The median, for a sensor that changes on the way scatters its own parameters alone.
-        count = len(rest.scores)
-        power = (rest.scores**2).sum(axis=0) * count / max(count - 1, 1)
-        size = np.maximum(np.diag(rest.information), 1e-300)
-        told = np.median(power / size) if len(size) else 1.0
         before = self.inflation
-        self.inflation = max(1.0, float(told) * before) if inspect else 1.0
+        self.inflation = max(1.0, rest.inflation * before) if inspect else 1.0
         more = self.inflation / before
         self.likelihood = Likelihood(
             rest.information / more + self.parameters.rule(),
