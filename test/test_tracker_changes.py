@@ -206,6 +206,22 @@ def test_no_gate_is_the_same_however_it_is_said(gate):
     assert TrackerSettings(gate=NO_GATE / 2).margin(400.0) > 0.0
 
 
+def test_three_sigma_hold_where_no_gate_refuses_a_wrong_gain(rng):
+    """The gain is wrong in what one coil reads of one emitter, or of all."""
+    tracker, wrong = Tracker(MODEL, TOOL, TrackerSettings(gate=NO_GATE)), 0
+    for frame in range(60):
+        position, rotation = random_pose(rng)
+        flux = fluxes(MODEL, TOOL, position, rotation, rng)
+        coil = frame % 9
+        flux[coil, slice(None) if frame % 2 else frame % 8] *= 1.05
+        found = one_frame(tracker, flux, (frame + 1) * 10**9)
+        one, truth = found[TOOL.name[coil]], position + rotation @ TOOL.position[coil]
+        if one.state == states.OK:
+            error = float(np.linalg.norm(one.position - truth))
+            wrong += error > max(3.0 * one.sigma_position_m, 1e-3)
+    assert wrong == 0
+
+
 def test_hostile_fluxes_never_make_a_pose(rng):
     """Random garbage of all sizes: refused, and no exception."""
     tracker = Tracker(MODEL, TOOL)

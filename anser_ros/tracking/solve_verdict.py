@@ -24,11 +24,12 @@ RARE = 0.01
 It is smaller than that of a single coil, for many degrees of freedom make much of a small
 excess."""
 
-SYSTEMATIC = 4.0
-"""Factor on the variances of a pose that only a gate wider than the usual one lets pass. Such a
-misfit is no noise: a wrong gain moves the pose further than noise of the same residual, up to 3.1
-of its sigmas for 5 % on one coil (simulated). Smaller, and 3 sigma do not hold there; larger, and
-poses that are asked for in spite of their misfit are called more uncertain than they are."""
+SYSTEMATIC = 25.0
+"""Factor on the variances of a pose whose misfit is more than noise where no gate refuses it, and
+of one that only a gate wider than the usual one lets pass. A wrong gain moves a pose further than
+noise of the same residual: by up to 8 of its sigmas with a factor of 4 (2 to 20 %, on one coil,
+simulated). Smaller, and 3 sigma do not hold there; larger, and poses that are asked for in spite
+of their misfit are called more uncertain than they are."""
 
 
 def variance_scale(
@@ -63,7 +64,8 @@ def variance_scale(
     scale = noise.of_frame(
         ratio, usual, freedom / unknowns, context.model_share, context.modes is not None
     )
-    return scale if ratio <= USUAL_GATE**2 else SYSTEMATIC * scale
+    most = USUAL_GATE**2 if settings.has_gate else usual
+    return scale if ratio <= most else SYSTEMATIC * scale
 
 
 def verdict(
