@@ -10,9 +10,10 @@ from pose_world import World
 from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import ModelFileError
+from anser_ros.field.model import EffectRecord
 from anser_ros.poses.corrector import NO_POSE, OK, OUTSIDE, UNKNOWN, PoseCorrector
 from anser_ros.poses.diagnosis import diagnose_poses
-from anser_ros.poses.document import to_model
+from anser_ros.poses.document import MODEL_SCHEMA, to_model
 
 
 @pytest.fixture(scope='module')
@@ -54,6 +55,38 @@ def test_errors_fall_and_stamps_move_to_the_references_clock(bent):
     before, after = (misfit(p, true[inside]) for p in (world.bend(0, true)[inside], corrected))
     assert after < 0.5 * before
     assert poses[0].stamp_ns == pytest.approx(10**9 - 3e7, abs=1.5e6)
+
+
+def test_clocks_that_run_apart_are_corrected_where_their_rate_was_learnt():
+    mount = EffectRecord('hand_eye', {'sensor': 'tip'}, {})
+    rate = EffectRecord('clock_rate', {'rate_ppm': 1000.0, 'middle_s': 20.0, 'offset_s': 0.05}, {})
+    own = EffectRecord('time_offset', {'sensor': 'tip', 'offset_s': 0.01}, {})
+    second = 10**9
+    support = {
+        'low_m': [-1.0] * 3, 'high_m': [1.0] * 3,
+        'first_ns': 100 * second, 'last_ns': 140 * second,
+    }  # fmt: skip
+    document = {
+        'schema': MODEL_SCHEMA, 'held_out_position_rmse_m': 1e-3,
+        'held_out_orientation_rmse_rad': 1e-2, 'support': support,
+        'effects': [
+            {'name': r.name, 'parameters': r.parameters, 'uncertainty': {}}
+            for r in (mount, rate, own)
+        ],
+    }  # fmt: skip
+
+    def late(at):
+        stamp = round(at * second)
+        place, turn = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+        return stamp - PoseCorrector(document).correct('tip', stamp, place, turn).stamp_ns
+
+    assert late(120) == round(0.06 * second)  # the offset at the middle
+    # The reference's time of a stamp t is middle + (t - middle) / 1.001.
+    assert late(130) == pytest.approx(0.06 * second + 10 * second / 1001, abs=2)
+    assert late(3600) == late(140) and late(5) == late(100)  # held: who knows what was set since
+    for key in ('first_ns', 'last_ns'):
+        support.pop(key)
+    assert late(130) == round(0.06 * second)
 
 
 def test_outside_the_covariance_grows_and_the_state_says_so(bent):

@@ -14,7 +14,7 @@ from anser_ros.poses.effects.noise import power_law
 from anser_ros.poses.effects.stamps import stamp_step
 from anser_ros.poses.path import OpticalPath
 
-SETTING = PoseSetting(('sensor_0', 'sensor_1'), 40.0, np.zeros(3), 0.06)
+SETTING = PoseSetting(('sensor_0', 'sensor_1'), 0.0, 40.0, np.zeros(3), 0.06)
 
 
 def test_the_clock_undoes_a_rate_exactly():

@@ -11,7 +11,7 @@ from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.convention import PoseReading
 from anser_ros.poses.document import MODEL_SCHEMA
-from anser_ros.poses.effects.clock import PoseTimeOffset
+from anser_ros.poses.effects.clock import PoseClock
 from anser_ros.poses.effects.field_distortion import FieldDistortion
 from anser_ros.poses.point_model import SMOOTH, smooth_map
 from anser_ros.poses.sequence import FARTHEST, NO_TURN, PoseSequence
@@ -80,7 +80,7 @@ class PoseCorrector:
         except (KeyError, TypeError, ValueError) as error:
             raise ModelFileError(f'model of poses: {error!r} is missing or not a number') from None
         self.sensors = {str(r.parameters['sensor']) for r in records if r.name == 'hand_eye'}
-        self._offsets = [r for r in records if r.name == PoseTimeOffset.name]
+        self._clock = PoseClock(records, support)
         bend = FieldDistortion()
         maps = [r for r in records if r.name == bend.name]
         self._smooth = [smooth_map(r) for r in maps if r.parameters.get('kind') == SMOOTH]
@@ -121,8 +121,6 @@ class PoseCorrector:
             one = PoseSequence('', np.zeros(1), place[None], turn[None], np.zeros(0))
             read = self._reading.of_sequence(one)
             place, turn = read.position[0], read.quaternion[0]
-        late = sum(float(r.parameters['offset_s']) for r in self._offsets
-                   if r.parameters.get('sensor', sensor) == sensor)  # fmt: skip
         outside = np.maximum(np.maximum(self._low - place, place - self._high), 0.0)
         away = float(np.sqrt(outside @ outside))
         inside = np.clip(place, self._low, self._high)
@@ -137,4 +135,5 @@ class PoseCorrector:
             place = place + added(inside[None])[0]
         covariance = np.diag(np.repeat([variance, self._turn**2], 3))
         state = OK if away == 0.0 else OUTSIDE
-        return CorrectedPose(state, stamp_ns - round(1e9 * late), place, turn, covariance)
+        late_ns = self._clock.late_ns(sensor, stamp_ns)
+        return CorrectedPose(state, stamp_ns - late_ns, place, turn, covariance)

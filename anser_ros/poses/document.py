@@ -57,12 +57,22 @@ def to_model(found: PoseDiagnosis) -> dict[str, Any]:
     document = to_document(found)
     places = np.concatenate([s.position for s in found.session.sensors.values()])
     low, high = np.percentile(places, [1, 99], axis=0)
+    setting = found.fit.state.problem.setting
+    first, last = (
+        found.session.start_ns + round(1e9 * (setting.start + share * setting.duration))
+        for share in (0, 1)
+    )
     return {
         'schema': MODEL_SCHEMA,
         'provenance': {'session': found.session.path},
         'held_out_position_rmse_m': document['held_out']['position_rmse_after_m'],
         'held_out_orientation_rmse_rad': document['held_out']['orientation_rmse_after_rad'],
-        'support': {'low_m': low.tolist(), 'high_m': high.tolist()},
+        'support': {
+            'low_m': low.tolist(),
+            'high_m': high.tolist(),
+            'first_ns': first,
+            'last_ns': last,
+        },
         'effects': [
             {key: effect[key] for key in ('name', 'parameters', 'uncertainty')}
             for effect in document['effects']

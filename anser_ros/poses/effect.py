@@ -33,13 +33,14 @@ class PoseSetting:
     Attributes
     ----------
     sensors : tuple of str
-    duration : float
-        s.
+    start, duration : float
+        Time of the first tracked pose, and from it to the last, s.
     centre, size : ndarray (3,), float
         Middle of the tracked positions and their rms distance from it, m, tracker's frame.
     """
 
     sensors: tuple[str, ...]
+    start: float
     duration: float
     centre: Array
     size: float

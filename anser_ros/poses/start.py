@@ -33,6 +33,8 @@ MOST_POSES = 900
 """Poses of a sensor that are fitted at most, evenly over the session. More add nothing of errors
 that are alike for seconds, and a session of four sensors has to be done within seconds. Fewer make
 effects uncertain; more cost time."""
+GOLDEN = (5**0.5 - 1) / 2
+"""Multiples of it, less whole numbers, are spread evenly and fall into step with nothing."""
 COARSE_S, COARSE_STEP_S = 1.5, 0.05
 """Range and step of the first look for a time offset, s."""
 COARSE_POSES = 300  # poses of that look; it takes a regression at each of its steps
@@ -83,7 +85,7 @@ def pose_problem(session: PoseSession) -> PoseProblem:
     size = float(np.sqrt(np.mean(np.sum((everywhere - centre) ** 2, axis=1))))
     start = min(float(poses.time[0]) for poses in kept.values())
     end = max(float(poses.time[-1]) for poses in kept.values())
-    setting = PoseSetting(tuple(kept), max(end - start, 1e-3), centre, max(size, 1e-3))
+    setting = PoseSetting(tuple(kept), start, max(end - start, 1e-3), centre, max(size, 1e-3))
     values = tuple(kept.values())
     return PoseProblem(
         values,
@@ -101,10 +103,15 @@ def _seen(poses: PoseSequence, path: OpticalPath) -> int:
 
 
 def _thinned(poses: PoseSequence) -> PoseSequence:
-    """The poses that are no repeats, not more than `MOST_POSES`."""
+    """The poses that are no repeats, not more than `MOST_POSES`: one of each few neighbours.
+
+    Which of them changes from group to group: every third pose, say, falls into step with a poll,
+    and the mean error of its stamps is then not that of all.
+    """
     fresh = poses.rows(~poses.repeated)
     step = max(1, -(-fresh.size // MOST_POSES))
-    return fresh.rows(np.arange(0, fresh.size, step))
+    groups = np.arange(fresh.size // step)
+    return fresh.rows(step * groups + (step * (GOLDEN * groups % 1)).astype(np.int64))
 
 
 def _pauses(sensors: Sequence[PoseSequence]) -> Array:

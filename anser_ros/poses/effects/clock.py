@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +71,8 @@ class PoseClockRate(PoseEffect):
 
     def sites(self, setting: PoseSetting) -> Sequence[Term]:
         """Return one term, as one rate holds for all sensors."""
-        return [Term(self, {'middle_s': 0.5 * setting.duration}, np.zeros(1))]
+        middle = setting.start + 0.5 * setting.duration
+        return [Term(self, {'middle_s': middle}, np.zeros(1))]
 
     def prior(self, term: Term) -> Array:
         """Expect rates that err by some parts in a thousand."""
@@ -97,6 +98,45 @@ class PoseClockRate(PoseEffect):
         """Read the clock's rate, ppm, from a record."""
         rate = 1e-3 * float(needed(record, 'rate_ppm'))
         return Term(self, {'middle_s': float(needed(record, 'middle_s'))}, np.array([rate]))
+
+
+class PoseClock:
+    """Knows how late a tracker's stamps are by the records of its clock.
+
+    Parameters
+    ----------
+    records : sequence of EffectRecord
+        Those of the clock are used.
+    support : mapping
+        ``first_ns`` and ``last_ns``, the stamps between which a rate was learnt. Beyond them the
+        offset stays as it is at the nearer one, because nobody knows whether a clock was set
+        since.
+    """
+
+    def __init__(self, records: Sequence[EffectRecord], support: Mapping[str, Any]) -> None:
+        offsets = [r for r in records if r.name == PoseTimeOffset.name]
+        rate = next((r for r in records if r.name == PoseClockRate.name), None)
+        self._own = {
+            r.parameters['sensor']: _offset(r) for r in offsets if 'sensor' in r.parameters
+        }
+        # The record of a rate has the offset of all sensors with it, or instead.
+        shared = [r for r in offsets if 'sensor' not in r.parameters] if rate is None else [rate]
+        self._shared = sum(map(_offset, shared))
+        self._gain, self._first, self._last = 0.0, 0, 0
+        if rate is not None and 'first_ns' in support:
+            gain = 1e-6 * float(needed(rate, 'rate_ppm'))
+            self._gain = gain / (1 + gain)
+            self._first, self._last = int(support['first_ns']), int(support['last_ns'])
+
+    def late_ns(self, sensor: str, stamp_ns: int) -> int:
+        """Return by how much a sensor's stamp is late on the reference's clock, ns."""
+        since = min(max(stamp_ns, self._first), self._last) - (self._first + self._last) // 2
+        late = self._shared + self._own.get(sensor, 0.0)
+        return round(1e9 * late + self._gain * since)
+
+
+def _offset(record: EffectRecord) -> float:
+    return float(needed(record, 'offset_s'))
 
 
 def one_clock(records: Sequence[EffectRecord], duration: float) -> list[EffectRecord]:

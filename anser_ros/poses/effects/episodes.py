@@ -39,8 +39,7 @@ and up to which the others' must be lower."""
 
 def windows_of(sensing: Sensing, sight: PoseResiduals) -> NDArray[np.int64]:
     """Return the window of each pose of a sensor that counts; -1 for the others."""
-    start = min(float(s.view.time[0]) for s in sight.sensors)
-    share = (sensing.view.time - start) / max(sight.setting.duration, 1e-9)
+    share = (sensing.view.time - sight.setting.start) / max(sight.setting.duration, 1e-9)
     window = np.clip((WINDOWS * share).astype(np.int64), 0, WINDOWS - 1)
     return np.where(sensing.used | sensing.out, window, -1)
 
@@ -87,8 +86,7 @@ class PoseMovingMetal(PoseEffect):
         found = {name: windows for name, windows in found.items() if windows}
         if not found:
             return []
-        start = min(float(s.view.time[0]) for s in sight.sensors)
-        length = sight.setting.duration / WINDOWS
+        start, length = sight.setting.start, sight.setting.duration / WINDOWS
         first = min(min(w) for w in found.values())
         last = max(max(w) for w in found.values()) + 1
         values = {'t_start_s': start + first * length, 't_end_s': start + last * length,
