@@ -1,6 +1,7 @@
 """A sensor's noise is larger than the others', or grows with the distance."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -26,8 +27,12 @@ EXPONENTS = (2.8, 6.5)
 with the fourth; what is outside is something else."""
 SHARES = np.array([1, 4, 1]) / 6
 """Shares of the variances of three poses in that of their second difference."""
-NEW_SHARE = 1 / 3
-"""Share of squared second differences that is new: neighbours share values."""
+NEW_SHARE = 18 / 35
+"""Share of squared second differences that is new: neighbours share values. Their correlations are
+-2/3 and 1/6, those of squares 4/9 and 1/36, on both sides."""
+REACHED = 12.0
+"""Squared deviation over its variance by the law that noise does not reach: once in 1e5. A pose
+that the law does not reach has another cause, and one that it reaches is no outlier."""
 FEWEST = 60  # differences of neighbours that a power law is fitted to
 
 
@@ -71,32 +76,51 @@ def power_law(square: Array, distance: Array) -> tuple[float, float, float]:
     that of the three poses with their shares of a second difference.
     """
     place = np.log(distance / np.median(distance))
-    cut = np.minimum(square, 12 * np.median(square) * np.exp(8 * np.maximum(place[:, 1], 0)))
+    near = REACHED * np.median(square) * np.exp(8 * np.maximum(place[:, 1], 0))
+    first = _likeliest(np.minimum(square, near), place)
+    reached = square < REACHED * _variance(first, place)
+    square, place = square[reached], place[reached]
+    best = _likeliest(square, place)
+    least, step = _cost(best, square, place), 0.2
 
-    def cost(exponent: float, level: float, floor: float) -> float:
-        law = np.exp(np.clip(level + 2 * exponent * place, -60, 60)) @ SHARES
-        variance = law + np.exp(np.clip(floor, -60, 60))
-        return float(np.sum(np.log(variance) + cut / variance))
-
-    def profile(exponent: float, start: Array) -> float:
+    def beside(exponent: float) -> float:
         """Least cost with the exponent held: level and floor go with it."""
-        found = minimize(lambda v: cost(exponent, v[0], v[1]), start, method='Nelder-Mead')
+        found = minimize(
+            lambda v: _cost(np.array([exponent, *v]), square, place), best[1:],
+            method='Nelder-Mead',
+        )  # fmt: skip
         return float(found.fun)
 
-    level = float(np.log(np.mean(cut)))
-    best = min(
-        (
-            minimize(lambda v: cost(*v), np.array([n, level, level - 2]), method='Nelder-Mead')
-            for n in (3.0, 5.0)
-        ),
-        key=lambda result: float(result.fun),
-    )
-    exponent, least = float(best.x[0]), float(best.fun)
-    plain = cut.size * (level + 1)
-    step = 0.2
-    sides = [profile(exponent + way * step, best.x[1:]) for way in (-1, 1)]
+    sides = [beside(float(best[0]) + way * step) for way in (-1, 1)]
     curvature = max((sum(sides) - 2 * least) / step**2, 1e-9) * NEW_SHARE
-    return exponent, float(1 / np.sqrt(curvature)), 2 * NEW_SHARE * float(plain - least)
+    plain = square.size * float(np.log(np.mean(square)) + 1)
+    return float(best[0]), float(1 / np.sqrt(curvature)), 2 * NEW_SHARE * (plain - least)
+
+
+def _variance(law: Array, place: Array) -> Array:
+    """Variance (n,) of second differences by a law's exponent, level and floor.
+
+    ``place`` (n, 3) is the logarithm of the distances; level and floor are logarithms too.
+    """
+    exponent, level, floor = law
+    grown = np.exp(np.clip(level + 2 * exponent * place, -60, 60)) @ SHARES
+    return np.asarray(grown + np.exp(np.clip(floor, -60, 60)))
+
+
+def _cost(law: Array, square: Array, place: Array) -> float:
+    """Minus the log likelihood of squared deviations (n,), which are distributed exponentially."""
+    variance = _variance(law, place)
+    return float(np.sum(np.log(variance) + square / variance))
+
+
+def _likeliest(square: Array, place: Array) -> Array:
+    """The law (exponent, level, floor) that is likeliest."""
+    level = float(np.log(np.mean(square)))
+    tries = [
+        minimize(_cost, [n, level, level - 2], args=(square, place), method='Nelder-Mead')
+        for n in (3.0, 5.0)
+    ]
+    return np.asarray(min(tries, key=lambda result: float(result.fun)).x)
 
 
 class PoseExcessNoise(PoseEffect):
@@ -136,7 +160,9 @@ class RangeNoise(PoseEffect):
     def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
         """Return a power law of all sensors together, each with a level of its own."""
         # Each sensor has a level of its own, so only what changes within one tells a power.
-        pairs = [pair for pair in map(jitter, sight.sensors) if pair[0].size >= FEWEST]
+        # Poses far away stand out from a noise that is taken as one; the law judges them too.
+        every = [replace(one, used=one.used | one.out) for one in sight.sensors]
+        pairs = [pair for pair in map(jitter, every) if pair[0].size >= FEWEST]
         if not pairs:
             return []
         places = np.concatenate([distance for _, distance in pairs])
