@@ -259,13 +259,18 @@ def _with_lag(
 
 
 def _is_smoothing(before: PoseFit, after: PoseFit) -> bool:
-    """Whether a filter takes off no more than a smoother reference can: the noise of its poses."""
+    """Whether a filter takes off no more than a smoother reference can.
+
+    That is the noise of its poses, and what errors of its stamps make of its velocity where those
+    of the tracker have errors: one host stamps both.
+    """
     path, taken, noise = before.state.problem.path, 0.0, 0.0
     for old, new in zip(before.state.parts, after.state.parts, strict=True):
         both = old.used & new.used
         squares = [np.sum(part.residual[both, :3] ** 2) for part in (old, new)]
         taken += float(squares[0] - squares[1])
         noise += 3 * np.count_nonzero(both) * path.jitter(old.view.lever) ** 2
+        noise += float(np.sum((old.noise.stamp_s * old.view.velocity[both, :3]) ** 2))
     return taken < noise
 
 
