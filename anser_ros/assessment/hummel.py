@@ -264,16 +264,11 @@ def matching_error(place: Array, grid: Grid) -> float:
     return rigid_distance(true.astype(np.float64), place.reshape(-1, 3))
 
 
-def rigid_distances(true: Array, measured: Array) -> Array:
-    """Return the distances (n,), m, of points (n, 3) that are laid on each other rigidly."""
-    left, right = measured - measured.mean(axis=0), true - true.mean(axis=0)
-    turn = Rotation.align_vectors(left, right)[0]
-    return np.asarray(np.linalg.norm(turn.apply(right) - left, axis=1))
-
-
 def rigid_distance(true: Array, measured: Array) -> float:
-    """Return the root mean square of `rigid_distances`, m."""
-    return float(np.sqrt(np.mean(rigid_distances(true, measured) ** 2)))
+    """Return the rms distance, m, of points (n, 3) that are laid on each other rigidly."""
+    left, right = measured - measured.mean(axis=0), true - true.mean(axis=0)
+    root = Rotation.align_vectors(left, right)[1]  # of the sum of squares
+    return float(root / np.sqrt(len(true)))
 
 
 def rotation_errors(
