@@ -32,6 +32,11 @@ NEAR_M = 0.03
 size, centimetres. Smaller finds no pose to compare with; larger compares places where a constant
 distortion differs."""
 REVISITED_SHARE = 0.5  # share of the episode's places that must have been visited outside it
+STRETCH, FILLED = 6, 0.8
+"""Windows that an episode of one sensor alone must span where its places were visited at no other
+time, and the share of them that are in it: a hand does not stay so long where a smooth distortion
+is large. Smaller takes what is left of a distortion for metal; larger
+overlooks metal beside which a sensor stays for a seventh of the session."""
 LOOSE, FAST = 0.5, 0.25
 """Share of a sensor's squared error that shifts in the body's frame explain if its mount is loose,
 and up to which the others' must be lower."""
@@ -45,7 +50,10 @@ def windows_of(sensing: Sensing, sight: PoseResiduals) -> NDArray[np.int64]:
 
 
 def episode_windows(sensing: Sensing, sight: PoseResiduals) -> list[int]:
-    """Return windows in which a sensor is off that was right at other times at the same places."""
+    """Return windows in which a sensor is off that was right at other times at the same places.
+
+    Where it was there at no other time, the body shows it: all others on it are right meanwhile.
+    """
     window = windows_of(sensing, sight)
     square = np.sum(sensing.residual[:, :3] ** 2, axis=1)
     judged = [w for w in range(WINDOWS) if np.count_nonzero(window == w) >= FEWEST_POSES]
@@ -63,7 +71,26 @@ def episode_windows(sensing: Sensing, sight: PoseResiduals) -> list[int]:
         return []
     place = sensing.view.measured
     distance, _ = cKDTree(place[outside]).query(place[inside])
-    return runs if np.mean(distance < NEAR_M) > REVISITED_SHARE else []
+    if np.mean(distance < NEAR_M) > REVISITED_SHARE or _is_alone(sensing, sight, runs):
+        return runs
+    return []
+
+
+def _is_alone(sensing: Sensing, sight: PoseResiduals, runs: list[int]) -> bool:
+    """Whether a sensor is off for a long stretch in which the others on its body are right."""
+    if not runs:
+        return False
+    span = runs[-1] - runs[0] + 1
+    if span < STRETCH or len(runs) < FILLED * span:
+        return False
+
+    def error(one: Sensing) -> float:
+        rows = np.isin(windows_of(one, sight), runs)
+        square = np.sum(one.residual[rows, :3] ** 2, axis=1)
+        return float(np.median(square)) if square.size else np.inf
+
+    others = [error(one) for one in sight.sensors if one is not sensing]
+    return bool(others) and max(others) < FAST * error(sensing)
 
 
 def _is_shift(sensing: Sensing, inside: Mask) -> bool:
@@ -86,6 +113,13 @@ class PoseMovingMetal(PoseEffect):
         found = {name: windows for name, windows in found.items() if windows}
         if not found:
             return []
+        # A sensor that is off pulls the frames, and with them the others, a little way.
+        alone = {
+            s.view.sensor
+            for s in sight.sensors
+            if _is_alone(s, sight, found.get(s.view.sensor, []))
+        }
+        found = {name: windows for name, windows in found.items() if name in (alone or found)}
         start, length = sight.setting.start, sight.setting.duration / WINDOWS
         first = min(min(w) for w in found.values())
         last = max(max(w) for w in found.values()) + 1
