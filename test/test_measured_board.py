@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from anser_ros.calibration.error_map import learn_error_map
+from anser_ros.cli.main import main
 from anser_ros.errors import BagError, FitError
 from anser_ros.measured import anser_board
 
@@ -35,18 +37,20 @@ def test_a_bent_run_gains_and_a_scattered_one_does_not(tmp_path):
         told = 1e3 * (turn.apply(points + 1e-3 * rng.normal(size=points.shape)) + 0.2)
         lines = [f'id{i},{x:.3f},{y:.3f},{z:.3f}' for i, (x, y, z) in enumerate(told)]
         (tmp_path / f'{name}.fcsv').write_text('\n'.join(lines))
-    analysis = anser_board.analyse(tmp_path)
-    assert analysis['bent'].is_confirmed and not analysis['scattered'].is_confirmed
-    words = {row.figure.split(':')[0]: row.chosen_on for row in anser_board.rows(analysis)}
+    files = anser_board.write_sessions(tmp_path, tmp_path / 'files')
+    for command in anser_board.commands(files, tmp_path / 'out'):
+        assert main(command) == 0
+    rows = anser_board.rows(files, tmp_path / 'out')
+    words = {row.figure.split(':')[0]: row.chosen_on for row in rows}
     assert ': a gain' in words['bent'] and 'no gain is shown' in words['scattered']
-    assert 'across the board, not corrected' in anser_board.tables(analysis)
+    assert all('across the board, not corrected' in row.chosen_on for row in rows)
 
 
 @pytest.mark.long
 @needs_data
 def test_of_the_measured_runs_one_has_an_error_to_map():
     found = {
-        name: anser_board.learn_error_map(points, anser_board.places(), registers=True)
+        name: learn_error_map(points, anser_board.places(), registers=True)
         for name, points in anser_board.load(FOLDER).items()
         if name in ('standard_data_grid', 'steel_shield', 'finer_mesh_points')
     }

@@ -71,5 +71,5 @@ def test_json_alone_on_stdout(capsys, tmp_path):
     document = json.loads(out)
     assert document['schema'] == 'anser_measured/1'
     assert {row['dataset'] for row in document['rows']} == {'anser_board'}
-    assert (tmp_path / 'anser_board.txt').read_text().startswith('anser_board')
+    assert (tmp_path / 'anser_board' / 'standard_data_grid' / 'error_map.json').is_file()
     assert json.loads((tmp_path / 'measured.json').read_text()) == document

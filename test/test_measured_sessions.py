@@ -188,7 +188,7 @@ class TestHpi:
 def test_the_command_writes_bags_and_says_what_has_none(tmp_path, monkeypatch, capsys):
     (tmp_path / 'measured').mkdir()
     monkeypatch.setattr(
-        measured, 'STUDIES', dict.fromkeys(('navion', 'anser_board'), lambda f: ([], ''))
+        measured, 'STUDIES', dict.fromkeys(('navion', 'magnet_step'), lambda f: ([], ''))
     )
     monkeypatch.setattr(measured, 'RECIPES', {})
     monkeypatch.setattr(
@@ -196,4 +196,4 @@ def test_the_command_writes_bags_and_says_what_has_none(tmp_path, monkeypatch, c
     )
     assert main(['measured', '--shared', str(tmp_path), '--bags', str(tmp_path / 'bags')]) == 0
     out = capsys.readouterr().out
-    assert 'navion.mcap' in out and 'anser_board: positions only, no session' in out
+    assert 'navion.mcap' in out and 'magnet_step: has no session' in out

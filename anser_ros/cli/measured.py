@@ -32,24 +32,20 @@ from anser_ros.measured.recipe import Recipe
 Study = Callable[[Path], tuple[list[ReportRow], str]]
 
 
-def _anser_board(folder: Path) -> tuple[list[ReportRow], str]:
-    analysis = anser_board.analyse(folder)
-    return anser_board.rows(analysis), anser_board.tables(analysis)
-
-
-STUDIES: dict[str, Study] = {
-    anser_board.NAME: _anser_board,
-}
+STUDIES: dict[str, Study] = {}
 """Analysis of each data set without a recipe: rows of its figures, text of its candidates."""
 RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
-    for recipe in (navion.RECIPE, magnet_patch.RECIPE, magnet_step.RECIPE, hpi_coils.RECIPE)
-}
+    for recipe in (
+        navion.RECIPE, magnet_patch.RECIPE, magnet_step.RECIPE, hpi_coils.RECIPE,
+        anser_board.RECIPE,
+    )
+}  # fmt: skip
 """Data sets that the shipped commands are run on."""
 SESSIONS: dict[str, Callable[[Path, Path], list[Path]]] = {
     name: recipe.write_sessions for name, recipe in RECIPES.items()
 }
-"""Function of each data set with fluxes that writes its sessions as bags."""
+"""Function of each data set that writes its sessions, as bags or tables."""
 NAMES = (*RECIPES, *STUDIES)
 SHARED = 'ANSER_SHARED'
 SCHEMA = 'anser_measured/1'
@@ -145,10 +141,10 @@ def _last(said: io.StringIO) -> str:
 
 
 def _write_bags(names: Iterable[str], shared: Path, into: Path, console: Console) -> None:
-    """Write the sessions of all data sets that have fluxes, and print their paths."""
+    """Write the sessions of all data sets that have some, and print their paths."""
     for name in names:
         if name not in SESSIONS:
-            console.print(f'{name}: positions only, no session', highlight=False)
+            console.print(f'{name}: has no session', highlight=False)
             continue
         for path in SESSIONS[name](shared / 'measured' / name, into):
             console.print(f'wrote {path}', highlight=False)

@@ -4,6 +4,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+from anser_ros.calibration.error_map import learn_error_map
 from anser_ros.measured import anser_board
 
 
@@ -61,5 +62,8 @@ def board_runs(folder: Path) -> list[BoardRun]:
             found.is_confirmed,
             found.shape.describe(),
         )
-        for name, found in anser_board.analyse(folder).items()
+        for name, found in (
+            (name, learn_error_map(points, anser_board.places(), registers=True))
+            for name, points in anser_board.load(folder).items()
+        )
     ]

@@ -1,18 +1,18 @@
-"""Maps what a real Anser tracker reported at the places of a flat board, where it can be mapped.
+"""Imports what a real Anser tracker reported at the places of a flat board, and has its recipe.
 
 Positions only, no fluxes (github kilianod5150/Matlab-Anser, BSD-3; read where they lie). The
-places are those of a board with 41 holes; the tracker's points are registered to them, and an
-error map is learnt as `anser error_map --register` does.
+places are those of a board with 41 holes, in a frame of their own: `anser error_map --register`.
 """
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.calibration.error_map import ErrorMap, learn_error_map
 from anser_ros.errors import FitError
 from anser_ros.measured import ReportRow
+from anser_ros.measured.recipe import Recipe, figure, ran
 from anser_ros.wire.fiducials import read_fiducials
 
 Array = NDArray[np.float64]
@@ -51,36 +51,45 @@ def load(folder: Path) -> dict[str, Array]:
     return runs
 
 
-def analyse(folder: Path) -> dict[str, ErrorMap]:
-    """Return the map of every run, with its error in blocks that took no part in anything."""
-    there = places()
-    return {
-        name: learn_error_map(points, there, registers=True)
-        for name, points in load(folder).items()
-    }
+def write_sessions(folder: Path, into: Path) -> list[Path]:
+    """Write the places of the board as a table, and copy the runs; return the files."""
+    runs = load(folder)
+    into.mkdir(parents=True, exist_ok=True)
+    board = into / 'board.csv'
+    lines = [','.join(f'{value:.9g}' for value in place) for place in places()]
+    board.write_text('\n'.join(['x_m,y_m,z_m', *lines]) + '\n', encoding='utf-8')
+    return [board, *(
+        shutil.copyfile(folder / f'{name}.fcsv', into / f'{name}.fcsv') for name in runs
+    )]  # fmt: skip
 
 
-def rows(analysis: dict[str, ErrorMap]) -> list[ReportRow]:
-    """Return in-plane errors before and after; unconfirmed maps are not used."""
-    out = []
-    for name, found in analysis.items():
-        before, after = 1e3 * found.before_m, 1e3 * found.after_m
-        words = 'a gain' if found.is_confirmed else 'no gain is shown'
-        seen = (
-            f'{found.shape.describe()}: {words} ({found.clearness:+.1f} standard errors); '
-            'registration, choice, decision and fit without the scored block'
+def commands(files: list[Path], out: Path) -> list[list[str]]:
+    """Return the commands that learn a map of each run, and judge it where it was not learnt."""
+    board, *runs = files
+    return [
+        ['error_map', str(run), '--true', str(board), '--register', '--out', str(out / run.stem)]
+        for run in runs
+    ]
+
+
+def rows(files: list[Path], out: Path) -> list[ReportRow]:
+    """Return errors along the board before and after; maps that are not confirmed are not used."""
+    found = []
+    for run in files[1:]:
+        document = ran(out / run.stem, 'error_map.json')
+        before, after = (
+            1e3 * figure(document, key, 'in_plane_rmse_m') for key in ('before', 'after')
         )
-        figure = f'{name}: in-plane error, rms'
-        out.append(ReportRow(NAME, figure, before, after, 'mm', None, None, seen))
-    return out
+        across = 1e3 * figure(document, 'before', 'out_of_plane_rmse_m')
+        words = 'a gain' if document['confirmed'] else 'no gain is shown'
+        seen = (
+            f'{document["map"]}: {words} ({document["clearness"]:+.1f} standard errors); '
+            'registration, choice, decision and fit without the scored block; '
+            f'{across:.2f} mm across the board, not corrected'
+        )
+        what = f'{run.stem}: in-plane error, rms'
+        found.append(ReportRow(NAME, what, before, after, 'mm', None, None, seen))
+    return found
 
 
-def tables(analysis: dict[str, ErrorMap]) -> str:
-    """Return what was tried for each run, and what lies across the board, which no map touches."""
-    lines = []
-    for name, found in analysis.items():
-        across = 1e3 * (found.before.out_of_plane or 0.0)
-        lines.append(f'{NAME}, {name}: {across:.2f} mm rms across the board, not corrected')
-        best = sorted(found.tried, key=lambda item: item[1])[:3]
-        lines += [f'  {shape.describe():<28} {1e3 * error:.2f} mm' for shape, error in best]
-    return '\n'.join(lines)
+RECIPE = Recipe(NAME, write_sessions, commands, rows)
