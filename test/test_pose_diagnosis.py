@@ -232,7 +232,10 @@ def test_the_command_writes_the_documents_that_are_promised(tmp_path, capsys):
     assert document['held_out']['flux_rms_before_t'] is None
     assert document['held_out']['position_rmse_after_m'] < 1e-3
     assert [effect['name'] for effect in document['effects']] == ['hand_eye']
-    assert 'Bland' in (out / 'report.html').read_text()
+    page = (out / 'report.html').read_text()
+    assert 'Nothing was found.' in page and 'Bland' in page and page.count('<img') == 3
+    x, _, z = document['effects'][0]['parameters']['lever_arm_m']
+    assert f'{1e3 * x:.2f} ± ' in page and f'{1e3 * z:.2f} ± ' in page
     arguments = [str(bag), '--poses', '--out', str(out), '--tracked', 'tip=/tracked/sensor_0/pose']
     assert run_verb('evaluate', arguments) == 0
     evaluation = json.loads((out / 'evaluation.json').read_text())

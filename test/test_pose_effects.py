@@ -1,5 +1,7 @@
 """Single parts of the diagnosis of poses, each against what it has to be by definition."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from pose_world import World
@@ -9,6 +11,7 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.poses.effect import PoseSetting
 from anser_ros.poses.effects.clock import PoseClockRate, one_clock
+from anser_ros.poses.effects.episodes import PoseMovingMetal
 from anser_ros.poses.effects.field_distortion import FieldDistortion
 from anser_ros.poses.effects.noise import power_law
 from anser_ros.poses.effects.stamps import stamp_step
@@ -70,6 +73,30 @@ def test_a_map_of_one_sensor_may_shift_it_and_one_of_all_may_not():
     assert record.parameters['strain'] == 0.0  # a shift strains nothing
     again = effect.term(record)
     assert again.site == own.site and np.array_equal(again.theta, shift.theta)
+
+
+@pytest.mark.parametrize(
+    ('last', 'pulled_m', 'named'),
+    [
+        (40.0, 1e-3, ['sensor_2']),  # the body tells, though the places are visited once
+        (31.0, 1e-3, []),  # too short a stay to be told from a smooth distortion
+        (40.0, 4e-3, []),  # all are off: a distortion of the volume, or the reference
+    ],
+)
+def test_metal_deep_in_the_volume_is_told_by_the_other_sensors(last, pulled_m, named):
+    rng, time = np.random.default_rng(5), np.arange(0, 40, 0.1)
+    place = np.column_stack([0 * time, 0 * time, -0.01 * time])
+    inside = (time > 30) & (time < last)
+    sensors = []
+    for k, size in enumerate((pulled_m, pulled_m, 4e-3)):
+        residual = 3e-4 * rng.normal(size=(time.size, 6))
+        residual[inside, 0] += size
+        view = SimpleNamespace(sensor=f'sensor_{k}', time=time, measured=place)
+        every = np.ones(time.size, dtype=bool)
+        sensors.append(SimpleNamespace(view=view, residual=residual, used=every, out=~every))
+    setting = PoseSetting(('sensor_0', 'sensor_1', 'sensor_2'), 0.0, 40.0, np.zeros(3), 0.1)
+    records = PoseMovingMetal().observed(SimpleNamespace(sensors=sensors, setting=setting))
+    assert [name for r in records for name in r.parameters['sensors']] == named
 
 
 def test_the_exponent_of_noise_is_found_with_an_honest_sigma():

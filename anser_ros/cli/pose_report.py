@@ -1,6 +1,8 @@
 """Shows the diagnosis of a tracker of poses as a self-contained page for a clinic's engineer."""
 
 import html
+import re
+from itertools import pairwise
 from typing import Any
 
 import matplotlib
@@ -9,6 +11,7 @@ matplotlib.use('Agg')
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -20,14 +23,16 @@ from anser_ros.poses.problem import PosePart, PoseState
 
 Array = NDArray[np.float64]
 
-GROUPS = 5  # groups of equal numbers of poses in the tables by distance, speed and orientation
+GROUPS = 5  # groups of equal numbers of poses by distance, speed and orientation
+HAND_EYE = 'hand_eye'
+UNSHOWN = ('centre_m', 'size_m', 'lowest', 'middle_s')  # tell how a map is written, and not what
 LIMITS = 1.96  # standard deviations within which 95 % of normal differences lie
 
 
 def pose_verdict(document: dict[str, Any]) -> str:
     """State in one paragraph what was found and what stays unexplained."""
     held, rest = document['held_out'], document['unexplained']
-    found = [effect for effect in document['effects'] if effect['name'] != 'hand_eye']
+    found = [effect for effect in document['effects'] if effect['name'] != HAND_EYE]
     before, after = 1e3 * held['position_rmse_before_m'], 1e3 * held['position_rmse_after_m']
     if found:
         names = ', '.join(dict.fromkeys(str(effect['name']) for effect in found))
@@ -48,24 +53,38 @@ def render_poses(found: PoseDiagnosis, document: dict[str, Any], session: str) -
     sections = [
         f'<h1>Diagnosis of poses</h1><p class="note">session <code>{html.escape(session)}</code>'
         f'</p><p class="verdict">{html.escape(pose_verdict(document))}</p>',
-        '<h2>Before and after</h2><p>Root mean square errors of every fifth stretch of time, '
-            'which was used neither to choose nor to fit.</p>',
-        _by_sensor(document),
-        '<h2>Effects</h2>',
+        '<h2>What is wrong, and what to do</h2>',
         _effects(document),
-        '<h2>By distance, speed and orientation</h2>',
-        _groups(before, after),
+        '<h2>Error before and after</h2><p>Distance between both trackers, root mean square. '
+        'Every fifth stretch of time took no part in choosing or fitting; these are its errors. '
+        '<i>Before</i> is with the lever arm and mount of each sensor, <i>after</i> with what was '
+        'found as well.</p>',
+        _by_sensor(document),
+        image(_groups(before, after)),
         '<h2>Over time</h2>',
         image(_over_time(before, after)),
         '<h2>Agreement of both trackers (Bland and Altman)</h2><p>Difference of the two trackers '
-        'against their mean, by axis; the lines are the mean difference and the limits between '
-        'which 95% of differences lie.</p>',
+        'after correction against their mean, by axis of the tracker. The middle line is the mean '
+        'difference; 95% of differences lie between the others, the limits of agreement.</p>',
         image(_bland_altman(after)),
-        '<h2>What was tried and not named</h2>',
+        _agreement(after),
+        '<h2>Frames</h2><p>Where the optical frame is in that of the tracker, and where each '
+        'sensor is on the body; a dash is what the motion does not determine.</p>',
+        _frames(document),
+        '<details><summary>What was tried and not named</summary><p>The gain is by how much the '
+        'squared error falls on blocks that took no part, in units of the noise.</p>',
         table(['candidate', 'why not'],
-               [[row['candidate'], row['why']] for row in document['refused']]),
+              [[short_label(row['candidate']), row['why']] for row in document['refused']]),
+        '</details>',
     ]  # fmt: skip
-    return page('Diagnosis', sections)
+    return page('Diagnosis of poses', sections)
+
+
+def short_label(label: str) -> str:
+    """Return a candidate's label without where its polynomial is centred, which tells nobody."""
+    return re.sub(r',? ?(centre_m \[[^]]*\]|(size_m|middle_s) [-+.\de]+)', '', label).replace(
+        ' ()', ''
+    )
 
 
 def _mm(value: float | None) -> str:
@@ -94,39 +113,94 @@ def _by_sensor(document: dict[str, Any]) -> str:
 def _effects(document: dict[str, Any]) -> str:
     rows = []
     for effect in document['effects']:
-        evidence = effect['evidence']
+        if effect['name'] == HAND_EYE:
+            continue
+        evidence, sigma = effect['evidence'], effect['uncertainty']
+        values = [
+            f'{key} = {value_text(value)}'
+            + (f' ± {value_text(sigma[key])}' if sigma.get(key) is not None else '')
+            for key, value in short_ones(effect['parameters'])
+            if key not in UNSHOWN and value not in (None, [], {})
+        ]
+        error = ' to '.join(_mm(evidence.get(f'position_rmse_{k}_m')) for k in ('without', 'with'))
         rows.append([
-            effect['name'],
-            str(evidence.get('summary') or ''),
-            '\n'.join(f'{k} = {value_text(v)}' for k, v in short_ones(effect['parameters'])),
-            '\n'.join(f'{k} ± {value_text(v)}' for k, v in short_ones(effect['uncertainty'])),
-            _mm(evidence.get('position_rmse_without_m')),
+            effect['name'], str(evidence.get('summary') or ''),
+            '\n'.join(values).replace(' = ', '\xa0=\xa0').replace(' ± ', '\xa0±\xa0'),
+            '' if error == '- to -' else error, str(evidence.get('advice') or ''),
         ])  # fmt: skip
-    head = ['effect', 'what it is', 'parameters', '1 sigma', 'error without it, mm']
+    if not rows:
+        return '<p>Nothing was found.</p>'
+    head = ['name', 'what it is', 'how much, ± 1 sigma', 'takes the error from, mm', 'what to do']
     return table(head, rows).replace('\n', '<br>')
 
 
-def _groups(before: PoseState, after: PoseState) -> str:
+def _frames(document: dict[str, Any]) -> str:
+    """The lever arm and mount of each sensor, and the registration, which all of them share."""
     rows = []
-    for label, unit, measure in (
-        ('distance from the field generator', 'mm', _distance),
-        ('speed', 'mm/s', _speed),
-        ('turn from the mean orientation', 'deg', _turn),
+    for effect in document['effects']:
+        if effect['name'] == HAND_EYE:
+            values, sigma = effect['parameters'], effect['uncertainty']
+            rows.append([
+                values['sensor'], _triple(values, sigma, 'lever_arm_m', 1e3),
+                _triple(values, sigma, 'mount_rotation_deg', 1.0),
+            ])  # fmt: skip
+            shared = [
+                'optical frame', _triple(values, sigma, 'registration_translation_m', 1e3),
+                _triple(values, sigma, 'registration_rotation_deg', 1.0),
+            ]  # fmt: skip
+    if rows and shared[1]:
+        rows.append(shared)
+    return table(['', 'place x, y, z ± 1 sigma, mm', 'rotation vector ± 1 sigma, deg'], rows)
+
+
+def _triple(values: dict[str, Any], sigma: dict[str, Any], key: str, scale: float) -> str:
+    """Three numbers with their sigmas; nothing where there are none."""
+    if values.get(key) is None:
+        return ''
+    return ', '.join(
+        '-' if value is None else f'{scale * value:.2f} ± {scale * spread:.2f}'
+        for value, spread in zip(values[key], sigma[key], strict=True)
+    )
+
+
+def _groups(before: PoseState, after: PoseState) -> Figure:
+    """Errors by distance, speed and orientation, in groups of equal numbers of poses."""
+    figure, panels = plt.subplots(1, 3, figsize=(9, 3), layout='constrained', sharey=True)
+    for panel, (label, measure) in zip(
+        panels,
+        (
+            ('distance from the field generator, mm', _distance),
+            ('speed, mm/s', _speed),
+            ('turn from the mean orientation, deg', _turn),
+        ),
+        strict=True,
     ):
-        value = np.concatenate([measure(part)[part.used] for part in after.parts])
-        errors = [
-            np.concatenate([np.sum(p.residual[p.used, :3] ** 2, axis=1) for p in state.parts])
-            for state in (before, after)
-        ]
-        if value.size < 2 * GROUPS or errors[0].size != value.size:
-            continue
-        edges = np.quantile(value, np.linspace(0, 1, GROUPS + 1))
-        for k in range(GROUPS):
-            inside = (value >= edges[k]) & (value <= edges[k + 1])
-            one, other = (1e3 * float(np.sqrt(np.mean(e[inside]))) for e in errors)
-            where = f'{label} {edges[k]:.0f} to {edges[k + 1]:.0f} {unit}'
-            rows.append([where, str(int(inside.sum())), f'{one:.2f}', f'{other:.2f}'])
-    return table(['poses', 'number', 'before, mm', 'after, mm'], rows)
+        for state, colour, way, name in (
+            (before, BEFORE, -0.2, 'before'), (after, AFTER, 0.2, 'after'),
+        ):  # fmt: skip
+            value = np.concatenate([measure(part)[part.used] for part in state.parts])
+            square = np.concatenate(
+                [np.sum(p.residual[p.used, :3] ** 2, axis=1) for p in state.parts]
+            )
+            if value.size < 2 * GROUPS:
+                continue
+            edges = np.quantile(value, np.linspace(0, 1, GROUPS + 1))
+            group = np.clip(np.searchsorted(edges, value, side='right') - 1, 0, GROUPS - 1)
+            for k in np.unique(group):
+                size = 1e3 * float(np.sqrt(np.mean(square[group == k])))
+                panel.bar(
+                    k + way, size, 0.4, color=colour, label=name if k == group.min() else None
+                )
+                panel.annotate(
+                    f'{size:.1f}', (k + way, size), ha='center', va='bottom', fontsize=6
+                )
+            digits = 0 if np.ptp(edges) > 10 * GROUPS else 1
+            names = [f'{a:.{digits}f}-{b:.{digits}f}' for a, b in pairwise(edges)]
+            panel.set_xticks(range(GROUPS), names, fontsize=7)
+        panel.set(xlabel=label)
+    panels[0].set_ylabel('error, mm')
+    panels[0].legend(fontsize=7)
+    return figure
 
 
 def _distance(part: PosePart) -> Array:
@@ -150,24 +224,42 @@ def _over_time(before: PoseState, after: PoseState) -> Figure:
             axes.plot(part.view.time[part.used], size[part.used], '.', ms=2, color=colour,
                       label=label if k == 0 else None)  # fmt: skip
     axes.set(xlabel='time, s', ylabel='distance, mm', yscale='log')
-    axes.legend()
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.legend(markerscale=4)
     return figure
+
+
+def _differences(state: PoseState, axis: int) -> Array:
+    return 1e3 * np.concatenate([part.residual[part.used, axis] for part in state.parts])
+
+
+def _limits(values: Array) -> tuple[float, float, float]:
+    """The mean difference between the lower and the upper limit of agreement."""
+    middle, spread = float(values.mean()), LIMITS * float(values.std())
+    return middle - spread, middle, middle + spread
+
+
+def _agreement(state: PoseState) -> str:
+    rows = [
+        [name, *(f'{value:.2f}' for value in _limits(_differences(state, axis)))]
+        for axis, name in enumerate('xyz')
+    ]
+    return table(['axis', 'lower limit, mm', 'mean difference, mm', 'upper limit, mm'], rows)
 
 
 def _bland_altman(state: PoseState) -> Figure:
     figure, panels = plt.subplots(1, 3, figsize=(9, 3), layout='constrained', sharey=True)
     for axis, (panel, name) in enumerate(zip(panels, 'xyz', strict=True)):
-        every = []
         for part in state.parts:
             difference = 1e3 * part.residual[part.used, axis]
             mean = 1e3 * part.view.position[part.used, axis] + 0.5 * difference
-            panel.plot(mean, difference, '.', ms=2)
-            every.append(difference)
-        values = np.concatenate(every)
-        middle, spread = float(values.mean()), LIMITS * float(values.std())
-        for line in (middle - spread, middle, middle + spread):
+            panel.plot(mean, difference, '.', ms=2, label=part.view.sensor)
+        for line in _limits(_differences(state, axis)):
             panel.axhline(line, color='0.4', lw=0.8)
-        panel.set(xlabel=f'{name}, mm')
+        panel.set(xlabel=f'mean of both, {name}, mm')
         panel.locator_params(axis='x', nbins=5)
     panels[0].set_ylabel('tracked minus optical, mm')
+    panels[0].legend(markerscale=4, fontsize=7)
     return figure

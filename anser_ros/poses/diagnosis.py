@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.convention import read_rightly
-from anser_ros.poses.effect import PoseResiduals, Sensing
+from anser_ros.poses.effect import PoseResiduals, Sensing, effect_of
 from anser_ros.poses.effects.clock import one_clock
 from anser_ros.poses.effects.hand_eye import FrameTerm, Mount, OpticalFrame
 from anser_ros.poses.effects.noise import jitter
@@ -130,7 +130,8 @@ def diagnose_poses(
     sight = _sight(session, problem, whole)
     records = _records(whole, search.evidence, session)
     for effect in pose_effects().values():
-        records += list(effect.observed(sight))
+        words = {'summary': effect.summary, 'advice': effect.advice}
+        records += [replace(r, evidence={**words, **r.evidence}) for r in effect.observed(sight)]
     records += swapped
     if convention is not None:
         records.append(convention)
@@ -261,7 +262,8 @@ def _records(
             continue
         record = term.effect.record(term, spread)
         told = {
-            'summary': term.effect.summary, 'remedy': term.effect.remedy.value,
+            'summary': term.effect.summary, 'advice': effect_of(term).advice,
+            'remedy': term.effect.remedy.value,
             'parameters_spent': int(term.theta.size), 'held_out_gain': one.gain,
             'held_out_share': one.share,
             'position_rmse_without_m': one.position_rmse_without_m,

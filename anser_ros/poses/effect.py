@@ -102,6 +102,8 @@ class PoseEffect(Effect[Term]):
     """Changes nothing; it is the base of the effects on poses."""
 
     role = Role.PLAIN
+    advice = ''
+    """What somebody at the tracker can do about it, in a sentence."""
     blocks_in_space = False
     """Whether blocks of space and not of time decide on it."""
 

@@ -25,6 +25,7 @@ class PoseTimeOffset(PoseEffect):
 
     name = 'time_offset'
     summary = 'the tracked stamps are late (positive) or early by the optical clock'
+    advice = 'Correct the stamps by it; both streams stamped by one clock do not have it.'
     units: ClassVar[Mapping[str, str]] = {'offset_s': 's'}
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'offset_s': (-5.0, 5.0)}
     remedy = Remedy.OPTICAL
@@ -64,6 +65,9 @@ class PoseClockRate(PoseEffect):
 
     name = 'clock_rate'
     summary = 'the clocks of tracker and reference run apart'
+    advice = (
+        'Stamp both streams by one clock; the corrector removes it within this recording alone.'
+    )
     units: ClassVar[Mapping[str, str]] = {'rate_ppm': '1e-6'}
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'rate_ppm': (-3e3, 3e3)}
     remedy = Remedy.OPTICAL

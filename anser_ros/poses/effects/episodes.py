@@ -105,6 +105,7 @@ class PoseMovingMetal(PoseEffect):
 
     name = 'moving_metal'
     summary = 'metal comes near for a while'
+    advice = 'See what was near these sensors at that time, and do not use their poses of it.'
     units: ClassVar[Mapping[str, str]] = {'t_start_s': 's', 't_end_s': 's'}
 
     def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
@@ -133,6 +134,7 @@ class LooseMount(PoseEffect):
 
     name = 'loose_mount'
     summary = 'a sensor moves against the body and the other sensors'
+    advice = 'Fasten the sensor on its body, and record again.'
     units: ClassVar[Mapping[str, str]] = {'rms_m': 'm', 'rms_deg': 'deg'}
 
     def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:

@@ -58,6 +58,7 @@ class FieldDistortion(PoseEffect):
 
     name = 'field_distortion'
     summary = "the tracker's map of space is bent: metal at rest, or its field model"
+    advice = 'Take metal out of the volume and from the field generator, or apply the map.'
     units: ClassVar[Mapping[str, str]] = {'rms_m': 'm'}
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'strain': (0.0, 0.2)}
     remedy = Remedy.SENSORS

@@ -128,6 +128,7 @@ class PoseExcessNoise(PoseEffect):
 
     name = 'excess_noise'
     summary = "a sensor's noise is larger than the others'"
+    advice = 'Exchange the sensor or its cable, and record again.'
     units: ClassVar[Mapping[str, str]] = {'factor': '1'}
 
     def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
@@ -155,6 +156,7 @@ class RangeNoise(PoseEffect):
 
     name = 'range_noise'
     summary = 'jitter grows with the distance from the field generator'
+    advice = 'Work nearer to the field generator.'
     units: ClassVar[Mapping[str, str]] = {'exponent': '1', 'reference_m': 'm'}
 
     def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:

@@ -19,6 +19,7 @@ class PoseOpticalScale(PoseEffect):
 
     name = 'optical_scale'
     summary = "the optical tracker's millimetre is too long or too short for the tracker's"
+    advice = 'Measure a known length with both: it shows which of them is wrong.'
     units: ClassVar[Mapping[str, str]] = {'scale': '1'}
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'scale': (0.9, 1.1)}
     remedy = Remedy.OPTICAL

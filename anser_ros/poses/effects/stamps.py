@@ -80,6 +80,7 @@ class ReceiptJitter(PoseEffect):
 
     name = 'stamp_jitter'
     summary = 'stamps are those of receipt, and jitter'
+    advice = 'Use the counter of the device as stamp (import_poses --stamps device).'
     units: ClassVar[Mapping[str, str]] = {'rms_s': 's'}
 
     def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
@@ -97,6 +98,7 @@ class QuantisedStamps(PoseEffect):
 
     name = 'quantised_stamps'
     summary = 'stamps are those of a poll'
+    advice = 'Use the counter of the device as stamp, or poll more often.'
     units: ClassVar[Mapping[str, str]] = {'step_s': 's'}
 
     def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:

@@ -43,6 +43,7 @@ class StalePoses(PoseEffect):
 
     name = 'stale_poses'
     summary = 'the same pose again under a new stamp'
+    advice = 'Ask the device no more often than it measures, or leave the repeats out.'
     units: ClassVar[Mapping[str, str]] = {'fraction': '1', 'runs': '1'}
 
     def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
@@ -69,6 +70,7 @@ class MissingPoses(PoseEffect):
 
     name = 'missing_poses'
     summary = 'poses are missing, or marked as such by the device'
+    advice = 'Keep sensors within the volume and markers in view.'
     units: ClassVar[Mapping[str, str]] = {'fraction': '1', 'spans': 's'}
 
     def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
@@ -95,6 +97,7 @@ class PoseOutliers(PoseEffect):
 
     name = 'outliers'
     summary = 'poses that fit no model, such as those of a marker in its other solution'
+    advice = 'Do not use these poses; show the marker from another side.'
     units: ClassVar[Mapping[str, str]] = {'fraction': '1'}
 
     def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:

@@ -28,6 +28,7 @@ class TrackerLag(PoseEffect):
 
     name = 'tracker_lag'
     summary = 'the tracker filters its poses, which rounds off quick motions'
+    advice = 'Switch the filter of the tracker off, or move slowly.'
     units: ClassVar[Mapping[str, str]] = {'tau_s': 's'}
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'tau_s': (0.0, 1.0)}
     remedy = Remedy.NONE
