@@ -27,6 +27,11 @@ SCALE_SHARE, SCALE_M = 0.1, 0.8e-3
 """The same of a scale of one sensor alone, which is few numbers and follows hardly anything: this
 share, or more where that is less than `SCALE_M`."""
 
+CLEAR_SCALE = 5.0
+"""Standard deviations by which a scale of all sensors must differ from one. Of a few recordings at
+rest, each a block, these are uncertain themselves: of six blocks 1 in 250 such is chance. Smaller
+names a scale for what ten places have in common; larger misses slight ones in short sessions."""
+
 
 def price(term: Term, total: float, fit: PoseFit) -> float:
     """Return the gain, in units of the misfit, that a term needs; ``total`` is the squared sum."""
@@ -52,3 +57,14 @@ def _map_share(term: Term, parts: Sequence[PosePart]) -> float:
 def is_scale(term: Term) -> bool:
     """Return whether a map is that of one sensor's scale."""
     return is_of(term, Role.MAP) and term.site['degree'] == 0
+
+
+def doubt(fit: PoseFit, index: int) -> str:
+    """Return why the parameters of a term are not believed; empty where they are."""
+    term, covariance = fit.terms[index], fit.covariance_of(index)
+    if not term.effect.possible(term.effect.record(term, covariance)):
+        return 'implausible parameters'
+    sigma = float(np.sqrt(covariance[0, 0]))
+    if is_of(term, Role.SCALE) and abs(float(term.theta[0])) < CLEAR_SCALE * sigma:
+        return f'less than {CLEAR_SCALE:g} of its standard deviations'
+    return ''

@@ -17,7 +17,7 @@ from anser_ros.effects.term import Term
 from anser_ros.poses.effect import Role, effect_of, is_of
 from anser_ros.poses.effects.hand_eye import FrameTerm
 from anser_ros.poses.fit import LARGEST_STAMP_S, PoseFit, fit_poses, noise_of, unexplained_poses
-from anser_ros.poses.prices import LEAST_SHARE, is_scale, price
+from anser_ros.poses.prices import LEAST_SHARE, doubt, is_scale, price
 from anser_ros.poses.problem import PoseNoise, PosePart
 from anser_ros.poses.registry import pose_effects
 
@@ -197,9 +197,9 @@ def _accepted(
     if gain < need:
         refused.append((term.label, f'gain {gain:.0f} of {need:.0f}'))
         return None
-    last = len(trial.terms) - 1
-    if not term.effect.possible(term.effect.record(trial.terms[last], trial.covariance_of(last))):
-        refused.append((term.label, 'implausible parameters'))
+    why_not = doubt(trial, len(trial.terms) - 1)
+    if why_not:
+        refused.append((term.label, why_not))
         return None
     if is_of(term, Role.SCALE) and not _one_scale(trial):
         refused.append((term.label, 'sensors of one reference see different scales'))
@@ -384,9 +384,7 @@ def _settled(
             left = without.held_out()
             need = price(term, left, without)
             # Beside others the parameters may have become what no instrument has.
-            covariance = fit.covariance_of(index)
-            is_possible = term.effect.possible(term.effect.record(term, covariance))
-            share = gain / need if is_possible else min(gain / need, 0.0)
+            share = min(gain / need, 0.0) if doubt(fit, index) else gain / need
             if share < 1 and (weakest is None or share < weakest[0]):
                 weakest = share, term, without
             evidence.append(
