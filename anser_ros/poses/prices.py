@@ -27,10 +27,11 @@ SCALE_SHARE, SCALE_M = 0.1, 0.8e-3
 """The same of a scale of one sensor alone, which is few numbers and follows hardly anything: this
 share, or more where that is less than `SCALE_M`."""
 
-CLEAR_SCALE = 5.0
-"""Standard deviations by which a scale of all sensors must differ from one. Of a few recordings at
-rest, each a block, these are uncertain themselves: of six blocks 1 in 250 such is chance. Smaller
-names a scale for what ten places have in common; larger misses slight ones in short sessions."""
+CLEAR = 5.0
+"""Standard deviations by which a scale must differ from one, or a sensor's clock from the others'.
+Of a few recordings at rest, each a block, these are uncertain themselves: of six blocks 1 in 250
+such is chance. Smaller names a scale for what ten places have in common; larger misses slight ones
+in short sessions."""
 
 
 def price(term: Term, total: float, fit: PoseFit) -> float:
@@ -65,6 +66,8 @@ def doubt(fit: PoseFit, index: int) -> str:
     if not term.effect.possible(term.effect.record(term, covariance)):
         return 'implausible parameters'
     sigma = float(np.sqrt(covariance[0, 0]))
-    if is_of(term, Role.SCALE) and abs(float(term.theta[0])) < CLEAR_SCALE * sigma:
-        return f'less than {CLEAR_SCALE:g} of its standard deviations'
+    own_clock = is_of(term, Role.CLOCK) and 'sensor' in term.site
+    is_one_number = is_of(term, Role.SCALE) or is_scale(term) or own_clock
+    if is_one_number and abs(float(term.theta[0])) < CLEAR * sigma:
+        return f'less than {CLEAR:g} of its standard deviations'
     return ''

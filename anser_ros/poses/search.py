@@ -7,9 +7,11 @@ blocks of space, because a map looks too good on neighbours in time.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from anser_ros.calibration.blocks import FOLDS
 from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN
@@ -37,10 +39,10 @@ NOISE_ROUNDS = 3  # times that noise and what stands out, which depend on each o
 STAMP_GAIN = 25.0
 """Minus twice the log likelihood that an error of the stamps must take off, a sensor, to be
 believed; chance takes off one."""
-SAME_SCALE = 3.0
-"""Standard deviations by which the scales of two sensors may differ that see one reference: noise
-makes a pair differ more once in 370. Smaller takes noise for scales of their own; larger takes
-true differences for one scale."""
+SAME_SCALE = 1 / 370
+"""Chance that noise alone makes the scales of any two sensors differ as much as is taken for a
+difference, though they see one reference: of one pair that is three standard deviations. Larger
+takes noise for scales of their own; smaller takes true differences for one scale."""
 SCALE_DIFFERS = 0.003  # difference of scales that matters: 1 mm in a tracked volume
 
 
@@ -343,12 +345,12 @@ def _one_scale(fit: PoseFit) -> bool:
         index = next(k for k, t in enumerate(one.terms) if is_of(t, Role.SCALE))
         scale = 1e-3 * float(one.terms[index].theta[0])
         found.append((scale, 1e-3 * float(np.sqrt(one.covariance_of(index)[0, 0]))))
-    for scale, sigma in found:
-        for other, apart in found:
-            limit = max(SAME_SCALE * float(np.hypot(sigma, apart)), SCALE_DIFFERS)
-            if abs(scale - other) > limit:
-                return False
-    return True
+    pairs = list(combinations(found, 2))
+    times = -float(ndtri(SAME_SCALE / (2 * len(pairs))))
+    return all(
+        abs(scale - other) <= max(times * float(np.hypot(sigma, apart)), SCALE_DIFFERS)
+        for (scale, sigma), (other, apart) in pairs
+    )
 
 
 def _one_map(fit: PoseFit) -> PoseFit:

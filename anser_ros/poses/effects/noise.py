@@ -21,7 +21,9 @@ NEAR_S, NEAR_STEPS = 0.3, 3.0
 """Poses that are nearer in time, s or usual intervals, differ by noise and not by place."""
 WIDEST = 1.3
 """Ratio of far to near distances (95 to 5 %) without which no power law of it can be told."""
-CLEAR = 5.0  # standard deviations by which the noise must differ from a constant
+CLEAR = 5.0
+"""Standard deviations by which the noise must differ from a constant: by the likelihood, and by
+those of the exponent, which few distances leave large."""
 EXPONENTS = (2.8, 6.5)
 """Exponents of the noise that a field makes: the signal falls with the third power, the gradient
 with the fourth; what is outside is something else."""
@@ -174,7 +176,8 @@ class RangeNoise(PoseEffect):
         if high < WIDEST * low:
             return []
         exponent, spread, gain = power_law(square, distance)
-        if not EXPONENTS[0] <= exponent <= EXPONENTS[1] or gain < CLEAR**2:
+        is_clear = gain > CLEAR**2 and exponent > CLEAR * spread
+        if not (is_clear and EXPONENTS[0] <= exponent <= EXPONENTS[1]):
             return []
         middle = float(np.median(places))
         values = {'exponent': exponent, 'reference_m': middle}
