@@ -40,9 +40,8 @@ STAMP_GAIN = 25.0
 """Minus twice the log likelihood that an error of the stamps must take off, a sensor, to be
 believed; chance takes off one."""
 SAME_SCALE = 1 / 370
-"""Chance that noise alone makes the scales of any two sensors differ as much as is taken for a
-difference, though they see one reference: of one pair that is three standard deviations. Larger
-takes noise for scales of their own; smaller takes true differences for one scale."""
+"""Chance that noise makes the scales of any two sensors of one reference differ so much: of one
+pair, three standard deviations. Larger takes noise for a difference; smaller misses some."""
 SCALE_DIFFERS = 0.003  # difference of scales that matters: 1 mm in a tracked volume
 
 
