@@ -40,7 +40,7 @@ def test_a_bent_run_gains_and_a_scattered_one_does_not(tmp_path):
     files = anser_board.write_sessions(tmp_path, tmp_path / 'files')
     for command in anser_board.commands(files, tmp_path / 'out'):
         assert main(command) == 0
-    rows = anser_board.rows(files, tmp_path / 'out')
+    rows = anser_board.rows(tmp_path, files, tmp_path / 'out')
     words = {row.figure.split(':')[0]: row.chosen_on for row in rows}
     assert ': a gain' in words['bent'] and 'no gain is shown' in words['scattered']
     assert all('across the board, not corrected' in row.chosen_on for row in rows)

@@ -72,7 +72,7 @@ def commands(files: list[Path], out: Path) -> list[list[str]]:
     ]
 
 
-def rows(files: list[Path], out: Path) -> list[ReportRow]:
+def rows(folder: Path, files: list[Path], out: Path) -> list[ReportRow]:
     """Return errors along the board before and after; maps that are not confirmed are not used."""
     found = []
     for run in files[1:]:
