@@ -188,7 +188,7 @@ def _scan(posed: Measurements, frames: int, fit: StillFit, accuracy: Accuracy) -
         Posterior(values, width, np.diag(sigma**2), fit.log_evidence),
         tuple(kind for kind in POPULATIONS if kind not in evidence),
         evidence, fit.widths.noise_t, poses, {kind: np.zeros(0, np.int64) for kind in POPULATIONS},
-        (every,), (every,), 0.0, {}, accuracy.optical_position_m / np.sqrt(len(offsets)),
+        (every,), (every,), 0.0, {}, float(accuracy.optical_position_m / np.sqrt(len(offsets))),
     )  # fmt: skip
     flat = fit.model.unbent(fit.unknowns, fit.sites)
     sound = result.survey(posed.body).apply(flat)
