@@ -3,6 +3,7 @@
 import itertools
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -185,15 +186,18 @@ class TestHpi:
             hpi_coils.load(tmp_path)
 
 
-def test_the_command_writes_bags_and_says_what_has_none(tmp_path, monkeypatch, capsys):
+def test_the_command_writes_the_sessions_of_all_data_sets(tmp_path, monkeypatch, capsys):
     (tmp_path / 'measured').mkdir()
-    monkeypatch.setattr(
-        measured, 'STUDIES', dict.fromkeys(('navion', 'magnet_step'), lambda f: ([], ''))
-    )
-    monkeypatch.setattr(measured, 'RECIPES', {})
-    monkeypatch.setattr(
-        measured, 'SESSIONS', {'navion': lambda folder, into: [into / f'{folder.name}.mcap']}
-    )
+    made = {
+        name: replace(
+            recipe,
+            write_sessions=lambda folder, into: [into / f'{folder.name}.mcap'],
+            commands=lambda bags, out: [],
+            rows=lambda folder, bags, out: [],
+        )
+        for name, recipe in measured.RECIPES.items()
+    }
+    monkeypatch.setattr(measured, 'RECIPES', made)
     assert main(['measured', '--shared', str(tmp_path), '--bags', str(tmp_path / 'bags')]) == 0
     out = capsys.readouterr().out
-    assert 'navion.mcap' in out and 'magnet_step: has no session' in out
+    assert all(f'{name}.mcap' in out for name in made) and len(made) == 5

@@ -7,7 +7,7 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -29,11 +29,6 @@ from anser_ros.measured import (
 )
 from anser_ros.measured.recipe import Recipe
 
-Study = Callable[[Path], tuple[list[ReportRow], str]]
-
-
-STUDIES: dict[str, Study] = {}
-"""Analysis of each data set without a recipe: rows of its figures, text of its candidates."""
 RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
     for recipe in (
@@ -42,11 +37,6 @@ RECIPES: dict[str, Recipe] = {
     )
 }  # fmt: skip
 """Data sets that the shipped commands are run on."""
-SESSIONS: dict[str, Callable[[Path, Path], list[Path]]] = {
-    name: recipe.write_sessions for name, recipe in RECIPES.items()
-}
-"""Function of each data set that writes its sessions, as bags or tables."""
-NAMES = (*RECIPES, *STUDIES)
 SHARED = 'ANSER_SHARED'
 SCHEMA = 'anser_measured/1'
 
@@ -58,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'datasets',
         nargs='*',
         metavar='DATASET',
-        help=f'some of {", ".join(NAMES)}; all by default',
+        help=f'some of {", ".join(RECIPES)}; all by default',
     )
     parser.add_argument(
         '--shared',
@@ -68,40 +58,32 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--out',
         type=Path,
-        help='folder for measured.json and the candidates, made if missing',
+        help='folder for measured.json and what the commands write, made if missing',
     )
     parser.add_argument(
-        '--bags', type=Path, help='folder for MCAP sessions of the data, made if missing'
+        '--bags', type=Path, help='folder for sessions of the data, made if missing'
     )
     parser.add_argument(
-        '--quiet', action='store_true', help='print only the table, without candidates'
+        '--quiet', action='store_true', help='print only the table, without the commands'
     )
     parser.add_argument('--json', action='store_true', help='print measured.json on stdout')
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command and return the exit code."""
-    wrong = [name for name in args.datasets if name not in (*RECIPES, *STUDIES)]
+    wrong = [name for name in args.datasets if name not in RECIPES]
     if wrong:
-        raise ParameterError(f'no data set {wrong[0]!r}; there are {", ".join(NAMES)}')
+        raise ParameterError(f'no data set {wrong[0]!r}; there are {", ".join(RECIPES)}')
     shared = shared_folder(args.shared)
     console = Console(stderr=args.json, width=None if os.isatty(1) else 200)
     for folder in filter(None, (args.out, args.bags)):
         make_folder(folder)
     rows: list[ReportRow] = []
-    names = args.datasets or (*RECIPES, *STUDIES)
+    names = args.datasets or RECIPES
     if args.bags is not None:
         _write_bags(names, shared, args.bags, console)
     for name in names:
-        if name in RECIPES:
-            rows += _cook(RECIPES[name], shared / 'measured' / name, args, console)
-            continue
-        found, text = STUDIES[name](shared / 'measured' / name)
-        rows += found
-        if not args.quiet and not args.json:
-            console.print(text, markup=False, highlight=False, soft_wrap=True)
-        if args.out is not None:
-            (args.out / f'{name}.txt').write_text(text + '\n', encoding='utf-8')
+        rows += _cook(RECIPES[name], shared / 'measured' / name, args, console)
     document = json.dumps(to_document(rows), indent=1)
     if args.out is not None:
         (args.out / 'measured.json').write_text(document + '\n', encoding='utf-8')
@@ -141,12 +123,9 @@ def _last(said: io.StringIO) -> str:
 
 
 def _write_bags(names: Iterable[str], shared: Path, into: Path, console: Console) -> None:
-    """Write the sessions of all data sets that have some, and print their paths."""
+    """Write the sessions of data sets, and print their paths."""
     for name in names:
-        if name not in SESSIONS:
-            console.print(f'{name}: has no session', highlight=False)
-            continue
-        for path in SESSIONS[name](shared / 'measured' / name, into):
+        for path in RECIPES[name].write_sessions(shared / 'measured' / name, into):
             console.print(f'wrote {path}', highlight=False)
 
 

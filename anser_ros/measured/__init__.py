@@ -1,9 +1,7 @@
 """Imports other people's measurements, with recipes of commands that find what is in them.
 
 A data set has a ``RECIPE`` (`recipe.Recipe`): its sessions, the commands that are run on them, and
-the figures that these give. Sets that the commands do not reach yet have ``analyse(folder)``,
-``rows(analysis)``, which returns a `ReportRow` list, and ``tables(analysis)``, the text of all
-candidates, instead. `cli/measured.py` lists the data sets.
+the figures that these give. `cli/measured.py` lists the data sets.
 """
 
 from dataclasses import dataclass
