@@ -210,7 +210,7 @@ class _Pairs:
         return turn.as_matrix(), np.asarray(aim - turn.apply(middle))
 
     def errors(self, some: NDArray[np.bool_], rotation: Array, translation: Array) -> Array:
-        """What the tracked positions lack, m, in their frame; without what is not corrected."""
+        """Return truth minus tracked positions, m, in their frame; only what is corrected."""
         lacking = self.true[some] @ rotation.T + translation - self.tracked[some]
         if self.normal is None:
             return np.asarray(lacking)

@@ -142,7 +142,7 @@ class Calibration:
         Standard deviations of the sensors' places (m), axes (rad) and gains, where only these can
         be told.
     undetermined : tuple of str
-        A line for everything that was asked for, and that the readings do not determine.
+        Lines on what the readings of one place do not determine: the polarity of some sensors.
     """
 
     model: FieldModel

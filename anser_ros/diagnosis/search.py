@@ -149,7 +149,7 @@ class _Round:
         self._scorer = Scorer(self._before.state, fitter.blocks)
 
     def best(self) -> Fit | None:
-        """The fit with one effect more, or None when none pays."""
+        """Return the fit with one effect more, or None when none pays."""
         search, held_out = self._search, self._scorer.held_out
         fitted = self._fitted()
         if not fitted:

@@ -45,7 +45,7 @@ class CoilDriftTerm(Term):
 
 
 class CoilDrift(Effect[CoilDriftTerm]):
-    """The factor is 1 + a (1 - exp(-t/tau)); theta is a and log(tau / s)."""
+    """Multiplies an emitter by 1 + a (1 - exp(-t/tau)); theta is a and log(tau / s)."""
 
     name = 'coil_drift'
     summary = "an emitter's strength changes with time"

@@ -17,7 +17,7 @@ STATED = {'flux_noise_t': 3e-6, 'optical_position_m': 1e-5, 'optical_rotation_ra
 """Noise of the magnetometers and jitter of the robot."""
 SPECIAL_UT = 5.67
 """What code that was written for this file alone reached: constant fields of every channel and
-the size of the source, together."""
+the size of the source, together (docs/results/README.md)."""
 
 
 def write_sessions(folder: Path, into: Path) -> list[Path]:

@@ -311,7 +311,7 @@ class _ErrorBefore:
     errors: PosteriorModes
 
     def holds(self, change: _Change) -> bool:
-        """Whether the hypothesis is still there, and its dipoles are among the model's."""
+        """Return whether the hypothesis is still there, and the model has its dipoles."""
         bank = change.bank
         return (
             self.coils == bank.rows.tobytes()

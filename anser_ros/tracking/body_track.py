@@ -148,7 +148,7 @@ class _BodyFrame:
         return common_factor(np.concatenate([shared, gains], axis=1), weights)
 
     def nearer(self, start: Start, used: NDArray[np.int64]) -> Start:
-        """A start moved to where the coils' own good poses agree best."""
+        """Return a start moved to where the coils' own good poses agree best."""
         rows = [i for i in used.tolist() if self.single[i].estimate.state == states.OK]
         coils = self.coils.subset(np.array(rows, dtype=np.int64))
         if not coils.observable:

@@ -222,7 +222,7 @@ def start_from_coils(
 def start_from_grid(
     grid: SeedGrid, field: RealField, coils: BodyCoils, flux: Array
 ) -> list[tuple[Array, Array]]:
-    """Starts for a body whose single coils have no pose of their own (few emitters, many axes).
+    """Return starts for a body whose single coils have no poses (few emitters, many axes).
 
     At every grid point the emitters' fields are turned to fit all coils at once, the lever arms
     neglected; the poses with the least misfit come first.

@@ -98,7 +98,7 @@ class _Client:
             self._filled.notify()
 
     def is_due(self, now_s: float) -> bool:
-        """Whether a TDATA is wanted by now."""
+        """Return whether a TDATA message is due."""
         return self._tracking_s is not None and now_s >= self._due_s
 
     def put_tracking(self, data: bytes, now_s: float) -> None:
