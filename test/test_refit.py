@@ -179,16 +179,16 @@ def test_phases_of_the_emitters_are_turned_back():
 
 
 @pytest.mark.long
-def test_a_drawing_of_another_board_is_not_believed():
+def test_a_drawing_of_another_board_is_not_believed(refit):
     world, other = anser_world(), three_coil_world()
-    assert world.refit()._tables.excitation.source == 'board'
+    assert refit._tables.excitation.source == 'board'
 
     def shuffled(points):
         return world.board.field(points)[:, ::-1]
 
-    refit = LiveRefit(world.model, world.references, world.baseline, drawing=shuffled)
-    assert refit._tables.excitation.source == 'model'
-    result = run(refit, world, world.metal(HEAD))
+    other_way = LiveRefit(world.model, world.references, world.baseline, drawing=shuffled)
+    assert other_way._tables.excitation.source == 'model'
+    result = run(other_way, world, world.metal(HEAD))
     before, after, _, _ = errors(world, result.model, HEAD)
     assert after < 0.3 * before
     with pytest.raises(FitError, match='the drawing makes fields'):
