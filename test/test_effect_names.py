@@ -25,7 +25,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 ALLOWED = {
     'effects/': 'their own room',
     'simulation/': 'faults of a simulated nature, labelled with what a diagnosis should call them',
-    'measured/': 'models of other laboratories, with effects of their own that share some names',
+    'measured/': 'recipes count the effects that the commands named',
     'poses/effects/': 'of trackers that give poses alone, under the names of docs/interfaces.md',
     'calibration/sensor_parameters.py': 'parameters of a fit below the effects, as they are named',
     'calibration/survey_records.py': 'writes records as `docs/interfaces.md` names them, from '

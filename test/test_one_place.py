@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from anser_ros.calibration.one_place import KINDS, calibrate_at_one_place, is_at_one_place
+from anser_ros.calibration.one_place import calibrate_at_one_place, is_at_one_place
 from anser_ros.calibration.requirements import check_single_coils
+from anser_ros.calibration.sources import KINDS
 from anser_ros.cli.main import main
-from anser_ros.errors import FitError, SetupError, TrackingError
+from anser_ros.diagnosis.prepare import build_problem
+from anser_ros.diagnosis.whitening import Spread
+from anser_ros.errors import DiagnosisError, FitError, SetupError, TrackingError
 from anser_ros.field.measurements import Measurements
 from anser_ros.measured.session_file import vector, write_frames
 from anser_ros.physics.dipole import flux_basis
@@ -142,6 +145,16 @@ class TestSetup:
         assert 'windings' not in dump_setup(self.document(()))
         assert setup.identity.bodies != self.document(()).identity.bodies
 
+    def test_a_reference_is_a_single_coil(self):
+        text = dump_setup(self.document()).replace('body: t\n', 'body: fg\n')
+        with pytest.raises(SetupError, match='t/grad is a reference: it cannot have windings'):
+            parse_setup(text)
+
+    def test_a_diagnosis_takes_single_coils_only(self, rng):
+        measured = resting(rng, count=30)
+        with pytest.raises(DiagnosisError, match='has windings'):
+            build_problem((measured,), None, None, None, None, Spread(flux_t=1e-12))
+
     @pytest.mark.parametrize(
         ('windings', 'words'),
         [
@@ -194,8 +207,11 @@ class TestOnePlace:
 
     def test_a_field_of_zero_is_refused(self, rng):
         measured = resting(rng, count=30)
-        with pytest.raises(FitError, match='all fluxes are zero'):
-            calibrated(dataclasses.replace(measured, flux=0.0 * measured.flux))
+        for rows in (slice(None), slice(1, 2)):
+            flux = measured.flux.copy()
+            flux[:, :, rows] = 0.0
+            with pytest.raises(FitError, match=r'all fluxes of .* are zero'):
+                calibrated(dataclasses.replace(measured, flux=flux))
 
     def test_only_many_sensors_of_one_body_at_one_place(self, rng):
         measured = resting(rng, count=30)

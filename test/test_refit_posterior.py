@@ -157,7 +157,7 @@ def test_a_healthy_coil_is_not_at_fault_and_a_wild_one_is(bank, readings):
 
 def test_error_modes_have_the_posterior_s_power(bank, parts, drift, loudness, readings):
     seen = bank.evaluate(readings, NOISE)
-    level = error_level(bank, seen, 1)
+    level = error_level(seen, 1)
     assert level.noise >= NOISE
     modes = error_modes(bank, bank.posterior(1), level, 90)
     prior = parts[4][0]

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.calibration.blocks import FOLDS
 from anser_ros.calibration.dipole_sites import DipoleSites
 from anser_ros.calibration.factors import as_real
 from anser_ros.calibration.held_out import HeldOut
@@ -22,7 +23,7 @@ from anser_ros.calibration.population import LEAST_EVIDENCE
 from anser_ros.calibration.readings import with_pose
 from anser_ros.calibration.requirements import MANY_SENSORS
 from anser_ros.calibration.result import Calibration, Residuals, Scan, SourcePlace, provenance
-from anser_ros.calibration.sources import SourceReadings, SourcesFit, SourcesFitter
+from anser_ros.calibration.sources import KINDS, SourceReadings, SourcesFit, SourcesFitter
 from anser_ros.calibration.survey_records import noisy_sensors, reversed_sensors
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
@@ -33,11 +34,6 @@ from anser_ros.settings import Accuracy
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-KINDS = ('places', 'axes', 'gains')
-"""Kinds of errors whose widths are found, where they are asked for. Whenever any is, which way
-round each sensor is, is found as well."""
-FOLDS = 5
-"""Parts of the sensors that are predicted by the others in turn."""
 STILL = 5.0
 """Standard deviations of the optical jitter within which all poses are one place."""
 NOISY = 5.0
@@ -135,12 +131,14 @@ def calibrate_at_one_place(
     Raises
     ------
     FitError
-        When all fluxes are zero.
+        When all fluxes of an emitter are zero.
     """
     posed = with_pose(measurements)
     mean = _Mean.of(posed, accuracy)
-    if not mean.readings.flux[mean.readings.used].any():
-        raise FitError(f'{measurements.body}: all fluxes are zero')
+    heard = mean.readings.flux[mean.readings.used].any(axis=(0, 2))
+    if not heard.all():
+        silent = ', '.join(emitters[k] for k in np.flatnonzero(~heard))
+        raise FitError(f'{measurements.body}: all fluxes of {silent} are zero')
     looked_for = tuple(kind for kind in KINDS if kind in kinds)
     looked_for += ('polarity',) if looked_for else ()
     fold = np.arange(len(mean.readings.used)) % FOLDS
@@ -175,7 +173,7 @@ def calibrate_at_one_place(
         noisy_sensors(posed.sensors.channel[loud], mean.noise_ratio[loud]),
     )
     calibration = Calibration(
-        model, _moment_fit(mean, fit, model), held_out, None, (),
+        model, _moment_fit(mean, fit, sign, model), held_out, None, (),
         LayoutCandidate(_layout(fit), DipoleSites(model.positions, model.directions), 0.0,
                         held_out.score_t, ()),
         _layout(fit), 0.0, int(posed.usable.sum()), _residuals(mean, fit, sign), scan,
@@ -243,10 +241,10 @@ def _held_out(
     )  # fmt: skip
 
 
-def _moment_fit(mean: _Mean, fit: SourcesFit, model: FieldModel) -> MomentFit:
+def _moment_fit(mean: _Mean, fit: SourcesFit, sign: Array, model: FieldModel) -> MomentFit:
     basis = mean.readings.points.basis(model.positions, model.directions)
     size = np.linalg.svd(basis / np.linalg.norm(basis, axis=0), compute_uv=False)
-    left = (mean.readings.flux * fit.sign[:, None, None] - fit.predicted)[mean.readings.used]
+    left = (mean.readings.flux * sign[:, None, None] - fit.predicted)[mean.readings.used]
     noise = float(np.sqrt(np.mean(as_real(_phasors(left)) ** 2)))
     return MomentFit(
         model.moments, (mean.measured,), (mean.measured.usable.astype(np.float64),), noise, noise,
@@ -258,7 +256,7 @@ def _moment_fit(mean: _Mean, fit: SourcesFit, model: FieldModel) -> MomentFit:
 
 def _unclear(posed: Measurements, fit: SourcesFit, others: Mask) -> tuple[str, ...]:
     """A line for the sensors whose polarity the readings do not determine."""
-    rows = np.flatnonzero(others & (np.abs(fit.sign_evidence) <= LEAST_EVIDENCE))
+    rows = np.flatnonzero(others & (fit.sign_evidence >= -LEAST_EVIDENCE))
     if not rows.size:
         return ()
     names = ', '.join(posed.sensors.name[row] for row in rows)

@@ -23,8 +23,9 @@ from anser_ros.physics.windings import PlacedPoints
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-WIDTHS = ('places', 'axes', 'gains')
-"""Kinds of sensors' errors whose widths are found: m, rad, relative."""
+KINDS = ('places', 'axes', 'gains')
+"""Kinds of sensors' errors whose widths are found where they are asked for: m, rad, relative.
+Whenever any is, which way round each sensor is, is found as well."""
 START = {'places': 1e-3, 'axes': 0.03, 'gains': 0.03}
 """Their widths at the start; far too wide ones cost a few trials."""
 WIDTH_STEP = 2.0
@@ -104,7 +105,7 @@ class SourcesFit:
     sign_evidence : ndarray, shape (S,)
         Log likelihood of its being so over its not being so.
     widths : dict of str to float
-        Of the sensors' errors, of `WIDTHS`.
+        Of the sensors' errors, of `KINDS`.
     predicted, sigma : ndarray, shape (S, K, C)
         Readings of sound sensors, and how far a reading may be off, T.
     place_sigma_m : ndarray, shape (K,)
@@ -137,7 +138,7 @@ class SourcesFitter:
     volume : tuple of ndarray, shape (3,)
         Lowest and highest corner of where sources may be, m, frame fg.
     kinds : sequence of str
-        What sensors may be off in, of `WIDTHS`, and ``polarity``.
+        What sensors may be off in, of `KINDS`, and ``polarity``.
     """
 
     def __init__(
@@ -145,7 +146,7 @@ class SourcesFitter:
     ) -> None:
         self.readings, self.turns = readings, 'polarity' in kinds
         self.used = readings.used
-        self.kinds = tuple(kind for kind in WIDTHS if kind in kinds)
+        self.kinds = tuple(kind for kind in KINDS if kind in kinds)
         self.grid = self._grid(volume)
         sites = DipoleSites.of_any_direction(self.grid)
         rows = readings.points.basis(sites.positions, sites.directions)

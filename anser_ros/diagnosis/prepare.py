@@ -69,8 +69,13 @@ def build_problem(
     Raises
     ------
     DiagnosisError
-        When fewer than 30 frames have fluxes and a pose, or all poses are the same.
+        When a sensor is a sum of windings, fewer than 30 frames have fluxes and a pose, or all
+        poses are the same.
     """
+    for tool in tools:
+        if not tool.sensors.is_single.all():
+            name = tool.sensors.name[int(np.argmin(tool.sensors.is_single))]
+            raise DiagnosisError(f'{name} has windings: a diagnosis takes single coils only')
     posed = tuple(t for t in (_with_pose(tool) for tool in tools) if t.time.size)
     count = sum(tool.time.size for tool in posed)
     if count < FEWEST_FRAMES:

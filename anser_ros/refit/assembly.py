@@ -173,7 +173,7 @@ class Assembly:
         best = ranked[0]
         rival = next((h for h in ranked[1:] if float(weights[h]) > RIVAL), None)
         steps = max(0, round(np.log(max(typical, 1.0)) / (2.0 * np.log(INFLATION_STEP))))
-        level = error_level(bank, change.seen, best)
+        level = error_level(change.seen, best)
         names = tuple(bank.prior(h).name for h in ranked[:1] + ([] if rival is None else [rival]))
         key = (bank.rows.tobytes(), names, level, steps, place.name)
         self._count += 1

@@ -73,6 +73,11 @@ class Jumps:
     since_s: float
     bend: ComplexArray
 
+    @property
+    def readable(self) -> NDArray[np.bool_]:
+        """Return which references (S,) have been read in the present frame."""
+        return np.asarray(np.isfinite(self.bend).all(axis=1))
+
 
 class Courses:
     """Follows where each reference's change is on its way to, and how far those that jumped are
@@ -143,9 +148,9 @@ class Courses:
         """Return the change (S, K), T, since before the first of the present jumps, and its s."""
         return self._last - self._sound, (float(np.nanmax(self._last_ns)) - self._sound_ns) * NANO
 
-    def forget_jumps(self) -> NDArray[np.int64]:
-        """Take all references for back from their jumps, and return which were off."""
-        away = self.away()
+    def forget_jumps(self, readable: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Take references (S,) for back from their jumps, and return which of them were off."""
+        away = np.flatnonzero(self._is_away & readable)
         self._away[away], self._farthest[away] = 0.0, 0.0
         return away
 
@@ -233,6 +238,7 @@ def are_over(
     jumps: Jumps,
     units: NoiseUnits,
     bank_of: Callable[[NDArray[np.bool_]], tuple[Bank, object]],
+    level: float,
     noise: Array,
     drift: float,
 ) -> bool:
@@ -249,12 +255,12 @@ def are_over(
     units : NoiseUnits
     bank_of : callable
         Returns the hypotheses for references (S,) first.
-    noise : ndarray, shape (S,)
-        Of a component of each, in units of the nominal one.
+    level, noise : float and ndarray, shape (S,)
+        Noise of a usual reference and of each, of a component, in units of the nominal one.
     drift : float
         Prior deviation of an emitter's strength.
     """
-    readable = np.asarray(np.isfinite(jumps.bend).all(axis=1))
+    readable = jumps.readable
     power = (units.of(jumps.bend)[readable] ** 2).mean(axis=(1, 2)) / BEND_VARIANCE
     if not courses.away().size or not power.size:
         return False
@@ -264,7 +270,7 @@ def are_over(
     spread = math.sqrt(2.0)
     parts = units.of(change)[readable] / spread
     bank = bank_of(readable)[0]
-    seen = bank.evaluate(parts.reshape(-1, 2), float(noise.min()))
+    seen = bank.evaluate(parts.reshape(-1, 2), level)
     mean, variance = bank.drifts(seen, int(seen.log_evidence.argmax()))
     step = np.hypot(*mean.T) + SURE * np.sqrt(variance.max(axis=1))
     if (spread * drift * step > COMMON).any():

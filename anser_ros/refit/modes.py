@@ -52,7 +52,7 @@ class PosteriorModes:
     rest: float
 
 
-def error_level(bank: Bank, seen: FrameEvidence, hypothesis: int) -> ErrorLevel:
+def error_level(seen: FrameEvidence, hypothesis: int) -> ErrorLevel:
     """Return the noise and strengths, rounded up, for which an uncertainty is computed."""
     noise = 2.0 ** float(np.ceil(np.log2(seen.noise) - 0.1))
     real, imaginary = (int(part.argmax()) for part in seen.strength[hypothesis])

@@ -103,10 +103,10 @@ def _csv(path: Path) -> dict[str, NDArray[Any]]:
     for number, row in enumerate(rows, start=2):
         if len(row) != len(head):
             raise ValueError(f'row {number} has {len(row)} cells, the head {len(head)}')
-    return {name: _numbers([row[i].strip() for row in rows], name) for i, name in enumerate(head)}
+    return {name: _numbers([row[i].strip() for row in rows]) for i, name in enumerate(head)}
 
 
-def _numbers(cells: list[str], name: str) -> NDArray[Any]:
+def _numbers(cells: list[str]) -> NDArray[Any]:
     """Whole numbers as such: stamps in ns have more digits than a float keeps."""
     if all(re.fullmatch(r'[+-]?\d+', cell) for cell in cells):
         return np.array([int(cell) for cell in cells], dtype=np.int64)

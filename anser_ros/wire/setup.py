@@ -337,6 +337,9 @@ def parse_setup(text: str) -> Setup:
     refuse_repeats([sensor.channel for sensor in parsed], 'channel')
     refuse_repeats([sensor.name for sensor in parsed], 'sensor')
     tools = [sensor for sensor in parsed if sensor.body != FIELD_GENERATOR]
+    for sensor in parsed:
+        if sensor.windings and sensor not in tools:
+            raise SetupError(f'setup: {sensor.name} is a reference: it cannot have windings')
     bodies = list(dict.fromkeys(sensor.body for sensor in tools))
     refuse_repeats(
         [topic_of(name) for name in [s.name for s in tools] + bodies], 'topic of sensor or body'

@@ -10,7 +10,7 @@ from rig import BOARD_SEED, Rig
 
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.field.nominal import nominal_model
-from anser_ros.sessions.model_file import load_model, save_model
+from anser_ros.sessions.model_file import is_snapshot, load_model, save_model
 from anser_ros.sessions.starting_model import board_of
 from anser_ros.simulation.manufacture import manufactured
 
@@ -49,7 +49,11 @@ def _saved_near_metal(rig: Rig, _rng: np.random.Generator) -> Off:
     rig.call('field_model/save')
     if not path.is_file():
         return nothing
-    return _restarted(rig, model_file=path, refit=False)
+    if not is_snapshot(load_model(path, snapshot=True)):
+        return _restarted(rig, model_file=path, refit=False)
+    restore = rig.restored('field_model')
+    rig.try_refused('field_model', model_file=path, refit=False)
+    return restore
 
 
 def _baseline_near_metal(rig: Rig, _rng: np.random.Generator) -> Off:

@@ -34,6 +34,8 @@ WORLDS: dict[str, dict[str, object]] = {
 }  # fmt: skip
 """Parameters of the simulated unit in each of the worlds that faults are tried in."""
 
+REFUSED = 2  # exit code of a node that refuses a parameter or file
+
 
 class Rig:
     """The processes, the line between them, and the witness.
@@ -63,7 +65,6 @@ class Rig:
         self._supervisor.__enter__()
         self.children: dict[str, Child] = {}
         self._commands: dict[str, list[str]] = {}
-        self.dead: list[str] = []
         unit, host = self._ports / 'unit', self._ports / 'host'
         self.line = Line(unit, host)
         self.witness = Witness(self.setup, domain)
@@ -116,6 +117,15 @@ class Rig:
         self.wait_until(
             lambda: self.witness.heard_s.get(said, 0.0) > begin, PATIENCE_S, f'a word of {name}'
         )
+
+    def try_refused(self, name: str, **parameters: object) -> None:
+        """Start a node anew with what it has to refuse; raise unless it ends by doing so."""
+        self.kill(name)
+        self.start(name, **parameters)
+        child = self.children.pop(name)
+        self._supervisor.forget(child)
+        if child.process.wait(PATIENCE_S) != REFUSED:
+            raise RuntimeError(f'{name} ended with {child.process.returncode}, not by a refusal')
 
     def restored(self, name: str) -> Callable[[], None]:
         """Return what starts a node anew as it was before."""
