@@ -17,6 +17,7 @@ from anser_ros.calibration.readings import frame_blocks
 from anser_ros.field.gaps import ScanGaps
 from anser_ros.field.measurements import Measurements
 from anser_ros.physics.dipole import flux_basis
+from anser_ros.physics.sensor import along_each_axis
 
 Array = NDArray[np.float64]
 
@@ -95,11 +96,9 @@ def gaps_of(
     low, high = points.min(axis=0) - MARGIN_M, points.max(axis=0) + MARGIN_M
     lines = [np.linspace(a, b, n) for a, b, n in zip(low, high, GRID, strict=True)]
     places = np.stack(np.meshgrid(*lines, indexing='ij'), axis=-1).reshape(-1, 3)
-    axes = np.repeat(np.eye(3), len(places), axis=0)
+    at, axes = along_each_axis(places)
     sites = fitted.dipoles
-    basis = flux_basis(
-        np.tile(places, (3, 1)), axes, np.zeros(len(axes)), sites.positions, sites.directions
-    )
+    basis = flux_basis(at, axes, np.zeros(len(axes)), sites.positions, sites.directions)
     root = factor * open_moments(fitted, damping)
     turned = root @ np.linalg.svd(basis @ root, full_matrices=False)[2][:MOST_MODES].T
     made = basis @ turned

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from anser_ros.calibration.dipole_sites import DipoleSites
 from anser_ros.calibration.still_fit import DIPOLE_PAYS
-from anser_ros.calibration.still_system import FREEDOM
+from anser_ros.calibration.still_system import FREEDOM, student_weight
 from anser_ros.errors import FitError
 from anser_ros.physics.windings import PlacedPoints
 
@@ -210,7 +210,7 @@ class SourcesFitter:
             sums = [_solved(rows, weight, flux[:, c], rough[:, c]) for c in range(flux.shape[1])]
             left = np.stack(sums, axis=2)
             size = (left**2).sum(axis=2)
-            weight = (FREEDOM + flux.shape[1]) / (FREEDOM + size)
+            weight = student_weight(size, flux.shape[1])
         losses, found = np.log1p((left**2).sum(axis=2) / FREEDOM).sum(axis=1), []
         for best in np.argsort(losses)[:STARTS]:
             start = LocatedSource(self.grid[best][None], np.zeros((3, flux.shape[1])))
@@ -224,6 +224,12 @@ class SourcesFitter:
             rough = FIRST_GAIN * np.abs(self.readings.flux[:, k])
             return np.maximum(np.hypot(self.readings.noise_t[:, None], rough), 1e-300)
         return self._sigma(source, widths)
+
+    def _root(self, left: Array, sigma: Array) -> Array:
+        """Factors (S, C) that make residuals white, with Student's weights; 0 for the unused."""
+        size = ((left / sigma) ** 2).sum(axis=1)
+        root = np.sqrt(student_weight(size, left.shape[1]))[:, None] / sigma
+        return np.where(self.used[:, None], root, 0.0)
 
     def _loss(
         self, k: int, source: LocatedSource, sign: Array, widths: dict[str, float] | None
@@ -252,15 +258,10 @@ class SourcesFitter:
         """One step, and the covariance of the places (3D, 3D) that it has."""
         flux = self.readings.flux[:, k] * sign[:, None]
         basis, count, parts = self._basis(source), len(source.places), flux.shape[1]
-        if not source.moments.any():
-            sigma = self._spread(k, source, None)
-            left = np.zeros_like(flux)
-        else:
-            sigma = self._spread(k, source, widths)
-            left = flux - basis @ source.moments
-        size = ((left / sigma) ** 2).sum(axis=1)
-        root = np.sqrt((FREEDOM + parts) / (FREEDOM + size))[:, None] / sigma
-        root = np.where(self.used[:, None], root, 0.0)
+        known = bool(source.moments.any())
+        sigma = self._spread(k, source, widths if known else None)
+        left = flux - basis @ source.moments if known else np.zeros_like(flux)
+        root = self._root(left, sigma)
         slopes = np.zeros((len(flux), parts, 3 * count))
         if moving:
             sites, apart = source.sites, np.zeros((count, 3, count, parts))
@@ -363,10 +364,7 @@ class SourcesFitter:
     ) -> Array:
         """The place of the grid where one more dipole explains most of what is left."""
         left = self.readings.flux[:, k] * sign[:, None] - self._basis(source) @ source.moments
-        sigma = self._spread(k, source, widths)
-        size = ((left / sigma) ** 2).sum(axis=1)
-        root = np.sqrt((FREEDOM + left.shape[1]) / (FREEDOM + size))[:, None] / sigma
-        root = np.where(self.used[:, None], root, 0.0)
+        root = self._root(left, self._spread(k, source, widths))
         strength = (STRAY * float(np.linalg.norm(source.moments[:3]))) ** -2.0
         told = np.zeros(len(self.grid))
         for c in range(left.shape[1]):

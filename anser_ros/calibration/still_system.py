@@ -28,6 +28,11 @@ AT_ONCE = 64
 """Places of a dipole that are judged at a time; each takes three columns for each part."""
 
 
+def student_weight(size: Array, parts: int) -> Array:
+    """Return what readings of so many parts count, by their squared residuals in sigmas."""
+    return np.asarray((FREEDOM + parts) / (FREEDOM + size))
+
+
 @dataclass(frozen=True)
 class StillWidths:
     """Holds standard deviations of everything before any data; zero fixes what it belongs to.
@@ -170,7 +175,7 @@ class StillSystem:
         """Return weights (F, S) of the readings by what is left of them; 0 where unusable."""
         parts = self.model.parts
         size = (self.residual**2).sum(axis=2) / self.widths.noise_t**2
-        return np.where(usable, (FREEDOM + parts) / (FREEDOM + size), 0.0)
+        return np.where(usable, student_weight(size, parts), 0.0)
 
     def log_evidence(self, usable: NDArray[np.bool_]) -> float:
         """Return Laplace's approximation of the log evidence, up to a constant of the readings."""

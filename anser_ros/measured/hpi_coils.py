@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.errors import FitError
 from anser_ros.measured import ReportRow
-from anser_ros.measured.recipe import Recipe, figure, ran
+from anser_ros.measured.recipe import Recipe, calibrations, figure, ran
 from anser_ros.measured.session_file import vector, write_frames
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
@@ -161,13 +161,7 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
 
 def commands(bags: list[Path], out: Path) -> list[list[str]]:
     """Return the commands that find the coils, with sensors as stated and as found."""
-    return [
-        [
-            'calibrate', str(bags[0]), *options, '--out', str(out / f'{kind}.yaml'),
-            '--report', str(out / kind),
-        ]
-        for kind, options in (('plain', ['--estimate', 'none']), ('full', []))
-    ]  # fmt: skip
+    return calibrations(bags[0], out)
 
 
 def distance_mm(found: Array, digitised: Array) -> float:

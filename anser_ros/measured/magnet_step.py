@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from anser_ros.measured import ReportRow, magnet_patch
-from anser_ros.measured.recipe import Recipe, figure, ran
+from anser_ros.measured.recipe import Recipe, calibrations, figure, ran
 
 NAME, FILE = 'magnet_step', 'step1'
 STATED = {'flux_noise_t': 3e-6, 'optical_position_m': 1e-5, 'optical_rotation_rad': 1e-4}
@@ -34,13 +34,7 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
 
 def commands(bags: list[Path], out: Path) -> list[list[str]]:
     """Return the commands that model the file, with sensors as stated and as found."""
-    return [
-        [
-            'calibrate', str(bags[0]), *options, '--out', str(out / f'{kind}.yaml'),
-            '--report', str(out / kind),
-        ]
-        for kind, options in (('plain', ['--estimate', 'none']), ('full', []))
-    ]  # fmt: skip
+    return calibrations(bags[0], out)
 
 
 def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:

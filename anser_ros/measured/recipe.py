@@ -1,7 +1,7 @@
 """Defines a data set as a recipe: its sessions, the shipped commands run on them, the figures."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,20 @@ class Recipe:
     write_sessions: Callable[[Path, Path], list[Path]]
     commands: Callable[[list[Path], Path], list[list[str]]]
     rows: Callable[[Path, list[Path], Path], list[ReportRow]]
+
+
+def calibrations(bag: Path, out: Path, found: Sequence[str] = ()) -> list[list[str]]:
+    """Return the commands that calibrate a session with sensors as stated, and as found.
+
+    Their models and reports are ``plain`` and ``full``; ``found`` are the options of the second.
+    """
+    return [
+        [
+            'calibrate', str(bag), *options, '--out', str(out / f'{kind}.yaml'),
+            '--report', str(out / kind),
+        ]
+        for kind, options in (('plain', ('--estimate', 'none')), ('full', found))
+    ]  # fmt: skip
 
 
 def ran(folder: Path, name: str) -> dict[str, Any]:

@@ -64,19 +64,11 @@ class Jumps:
         Noise of that, in units of a reading's.
     since_s : float
         Time since the last reading of most references, s; infinite where there was none.
-    bend : ndarray, shape (S, K), complex
-        T; how far the last reading is from the middle of this one and the one before it, doubled.
     """
 
     off: ComplexArray
     spread: Array
     since_s: float
-    bend: ComplexArray
-
-    @property
-    def readable(self) -> NDArray[np.bool_]:
-        """Return which references (S,) have been read in the present frame."""
-        return np.asarray(np.isfinite(self.bend).all(axis=1))
 
 
 class Courses:
@@ -100,6 +92,7 @@ class Courses:
         self._farthest = np.zeros(count)
         # All readings before the first of the present jumps, and when that was.
         self._sound, self._sound_ns = self._last, 0.0
+        self._stamp_ns = 0.0
 
     def follow(self, stamp_ns: int, change: ComplexArray) -> Jumps:
         """Take in changes (S, K), T, and return how far they are off their courses.
@@ -113,7 +106,6 @@ class Courses:
         known = np.isfinite(self._last_ns)
         variance = np.where(known, 1.0 + (1.0 + steps) ** 2 + steps**2, 1.0)
         off = change - self._last - steps[:, None] * self._step
-        bend = change - 2.0 * self._last + self._before[1]
         read = np.isfinite(change).all(axis=1)
         new = read & known
         since_s = float(np.median(ahead_ns[new])) * NANO if new.any() else np.inf
@@ -121,14 +113,15 @@ class Courses:
         self._step_ns = np.where(new, ahead_ns, np.where(read, np.nan, self._step_ns))
         self._before[0, read], self._before[1, read] = self._before[1, read], self._last[read]
         self._last[read] = change[read]
-        self._last_ns = np.where(read, float(stamp_ns), self._last_ns)
-        return Jumps(off, np.sqrt(variance), since_s, bend)
+        self._stamp_ns = float(stamp_ns)
+        self._last_ns = np.where(read, self._stamp_ns, self._last_ns)
+        return Jumps(off, np.sqrt(variance), since_s)
 
     def note(self, jumps: Jumps, coils: NDArray[np.int64]) -> None:
         """Remember which references have jumped: a jump is no part of a course."""
         if not self._is_away.any():
             self._sound = self._before[0].copy()
-            self._sound_ns = float(np.nanmax(self._last_ns)) - 2.0 * jumps.since_s / NANO
+            self._sound_ns = self._stamp_ns - 2.0 * jumps.since_s / NANO
         self._step_ns[coils] = np.nan
         first = ~self._is_away[coils]
         whole = (self._last - self._before[0])[coils]
@@ -144,13 +137,22 @@ class Courses:
         """Return the references that are off by jumps."""
         return np.flatnonzero(self._is_away)
 
+    @property
+    def readable(self) -> NDArray[np.bool_]:
+        """Return which references (S,) have been read in the newest frame."""
+        return np.asarray(self._last_ns == self._stamp_ns)
+
+    def bend(self) -> ComplexArray:
+        """Return readings less twice those before plus those before that (S, K), T."""
+        return np.asarray(self._last - 2.0 * self._before[1] + self._before[0])
+
     def since_sound(self) -> tuple[ComplexArray, float]:
         """Return the change (S, K), T, since before the first of the present jumps, and its s."""
-        return self._last - self._sound, (float(np.nanmax(self._last_ns)) - self._sound_ns) * NANO
+        return self._last - self._sound, (self._stamp_ns - self._sound_ns) * NANO
 
-    def forget_jumps(self, readable: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Take references (S,) for back from their jumps, and return which of them were off."""
-        away = np.flatnonzero(self._is_away & readable)
+    def forget_jumps(self) -> NDArray[np.int64]:
+        """Take the readable references for back from jumps, and return which of them were off."""
+        away = np.flatnonzero(self._is_away & self.readable)
         self._away[away], self._farthest[away] = 0.0, 0.0
         return away
 
@@ -235,7 +237,6 @@ def jumped(
 
 def are_over(
     courses: Courses,
-    jumps: Jumps,
     units: NoiseUnits,
     bank_of: Callable[[NDArray[np.bool_]], tuple[Bank, object]],
     level: float,
@@ -249,9 +250,7 @@ def are_over(
     Parameters
     ----------
     courses : Courses
-        Some references must be off by jumps.
-    jumps : Jumps
-        Of the present frame, which must go on from the two before it.
+        Some references must be off by jumps, and the newest frame go on from the two before it.
     units : NoiseUnits
     bank_of : callable
         Returns the hypotheses for references (S,) first.
@@ -260,8 +259,8 @@ def are_over(
     drift : float
         Prior deviation of an emitter's strength.
     """
-    readable = jumps.readable
-    power = (units.of(jumps.bend)[readable] ** 2).mean(axis=(1, 2)) / BEND_VARIANCE
+    readable = courses.readable
+    power = (units.of(courses.bend())[readable] ** 2).mean(axis=(1, 2)) / BEND_VARIANCE
     if not courses.away().size or not power.size:
         return False
     if (power > LEAST_JUMP_POWER * noise[readable] ** 2).any():

@@ -250,8 +250,8 @@ class LiveRefit:
         back = self._courses.returned(noise * self.settings.accuracy.flux_noise_t)
         few = coils.size < self.settings.min_references or self._watch.is_outvoted
         drift, banks = self.settings.emitter_drift, self._banks.of
-        if few and are_over(self._courses, jumps, self._units, banks, level, noise, drift):
-            back = self._courses.forget_jumps(jumps.readable)
+        if few and are_over(self._courses, self._units, banks, level, noise, drift):
+            back = self._courses.forget_jumps()
         for coil in back.tolist():
             self._watch.recover(coil)
         # The first frame has no course, and the second only the noise that was stated: metal may
