@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import PoseTrack
+from anser_ros.poses.clock_records import one_clock
 from anser_ros.poses.effect import PoseSetting
-from anser_ros.poses.effects.clock import PoseClockRate, one_clock
+from anser_ros.poses.effects.clock import PoseClockRate
 from anser_ros.poses.effects.episodes import PoseMovingMetal
 from anser_ros.poses.effects.field_distortion import FieldDistortion
 from anser_ros.poses.effects.noise import power_law

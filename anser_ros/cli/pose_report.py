@@ -19,12 +19,14 @@ from anser_ros.cli.diagnosis_figures import AFTER, BEFORE, image
 from anser_ros.cli.diagnosis_words import short_ones, value_text
 from anser_ros.cli.html_page import page, table
 from anser_ros.poses.diagnosis import PoseDiagnosis
+from anser_ros.poses.effect import Role
 from anser_ros.poses.problem import PosePart, PoseState
+from anser_ros.poses.registry import effect_with
 
 Array = NDArray[np.float64]
 
 GROUPS = 5  # groups of equal numbers of poses by distance, speed and orientation
-HAND_EYE = 'hand_eye'
+HAND_EYE = effect_with(Role.MOUNT).name
 UNSHOWN = ('centre_m', 'size_m', 'lowest', 'middle_s')  # tell how a map is written, and not what
 LIMITS = 1.96  # standard deviations within which 95 % of normal differences lie
 

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import PlausibilityError
 from anser_ros.field.model import EffectRecord
+from anser_ros.poses.effect import Role
+from anser_ros.poses.registry import effect_with
 from anser_ros.poses.sequence import REFERENCE, PoseSequence, PoseSession
 from anser_ros.poses.start import coarse_offset, first_cost, first_fit, pose_problem
 from anser_ros.sessions.plausibility import check_positions
@@ -61,15 +63,16 @@ class PoseReading:
         ratio : float
             Extent of the tracked positions over that of the optical ones, as both are written.
         """
+        effect = effect_with(Role.READING)
         return EffectRecord(
-            'frame_convention',
+            effect.name,
             {
                 'stream': self.stream, 'quaternion': self.quaternion,
                 'handedness': self.handedness, 'unit': self.unit,
             },
             {},
             {'misfit_as_written_m': before, 'misfit_so_read_m': after, 'extent_ratio': ratio,
-             'summary': 'the poses follow another convention than the stream states'},
+             'summary': effect.summary},
         )  # fmt: skip
 
     def applied(self, session: PoseSession) -> PoseSession:

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
+from anser_ros.poses.clock_records import PoseClock
 from anser_ros.poses.convention import PoseReading
 from anser_ros.poses.document import MODEL_SCHEMA
-from anser_ros.poses.effects.clock import PoseClock
-from anser_ros.poses.effects.field_distortion import FieldDistortion
-from anser_ros.poses.point_model import SMOOTH, smooth_map
+from anser_ros.poses.effect import PoseMap, Role
+from anser_ros.poses.registry import effect_of_record
 from anser_ros.poses.sequence import FARTHEST, NO_TURN, PoseSequence
 
 Array = NDArray[np.float64]
@@ -79,21 +79,18 @@ class PoseCorrector:
             ]
         except (KeyError, TypeError, ValueError) as error:
             raise ModelFileError(f'model of poses: {error!r} is missing or not a number') from None
-        self.sensors = {str(r.parameters['sensor']) for r in records if r.name == 'hand_eye'}
+        self.sensors: set[str] = set()
         self._clock = PoseClock(records, support)
-        bend = FieldDistortion()
-        maps = [r for r in records if r.name == bend.name]
-        self._smooth = [smooth_map(r) for r in maps if r.parameters.get('kind') == SMOOTH]
-        self._maps = [
-            (bend.term(r), np.asarray(r.uncertainty.get('coefficients_mm', 0.0), dtype=np.float64))
-            for r in maps
-            if r.parameters.get('kind') != SMOOTH
-        ]
-        self._bend = bend
+        self._maps: list[PoseMap] = []
         self._reading = PoseReading()
         for record in records:
-            if record.name == 'frame_convention' and record.parameters['stream'] == 'tracked':
+            effect = effect_of_record(record)
+            if effect.role is Role.MOUNT:
+                self.sensors.add(str(record.parameters['sensor']))
+            elif effect.role is Role.READING and record.parameters['stream'] == 'tracked':
                 self._reading = PoseReading(**dict(record.parameters))
+            elif mapping := effect.mapping(record):
+                self._maps.append(mapping)
 
     def correct(
         self, sensor: str, stamp_ns: int, position: Array, quaternion: Array
@@ -125,14 +122,11 @@ class PoseCorrector:
         away = float(np.sqrt(outside @ outside))
         inside = np.clip(place, self._low, self._high)
         variance = self._sigma**2 + (GROWTH * away) ** 2
-        for term, sigma in self._maps:
-            if self._bend.acts_on(term, sensor):
-                # Outside it is held at the border: a polynomial knows nothing beyond it.
-                shift, spread = self._bend.shift_and_variance(term, inside[None], sigma)
-                variance += float(spread[0])
-                place = place + shift[0]
-        for added in self._smooth:
-            place = place + added(inside[None])[0]
+        for mapping in self._maps:
+            # Outside it is held at the border: a polynomial knows nothing beyond it.
+            shift, spread = mapping(sensor, inside)
+            variance += spread
+            place = place + shift
         covariance = np.diag(np.repeat([variance, self._turn**2], 3))
         state = OK if away == 0.0 else OUTSIDE
         late_ns = self._clock.late_ns(sensor, stamp_ns)

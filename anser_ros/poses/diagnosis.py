@@ -4,7 +4,7 @@ The stages are those of a diagnosis of fluxes: read and set up, search on four f
 of time, judge on the fifth that took no part; then the parameters are fitted to all poses.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,14 +13,21 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.effects.term import Term
 from anser_ros.field.model import EffectRecord
+from anser_ros.poses.clock_records import one_clock
 from anser_ros.poses.convention import read_rightly
-from anser_ros.poses.effect import PoseResiduals, Sensing, effect_of
-from anser_ros.poses.effects.clock import one_clock
-from anser_ros.poses.effects.hand_eye import FrameTerm, Mount, OpticalFrame
-from anser_ros.poses.effects.noise import jitter
+from anser_ros.poses.effect import (
+    Frames,
+    PoseResiduals,
+    Role,
+    Sensing,
+    effect_of,
+    frames_of,
+    is_of,
+)
 from anser_ros.poses.fit import PoseFit, fit_poses, noise_of, unexplained_poses
+from anser_ros.poses.jitter import jitter
 from anser_ros.poses.problem import PosePart, PoseProblem, PoseState
-from anser_ros.poses.registry import pose_effects
+from anser_ros.poses.registry import effect_with, pose_effects
 from anser_ros.poses.search import PoseEvidence, search_effects
 from anser_ros.poses.sequence import PoseSequence, PoseSession
 from anser_ros.poses.start import (
@@ -121,7 +128,7 @@ def diagnose_poses(
     search = search_effects(first, say)
     say('held out')
     found = search.fit
-    frames = fit_poses(_without_stamps(found.state.problem), _frames_of(found.terms))
+    frames = fit_poses(_without_stamps(found.state.problem), frame_terms(found.terms))
     whole = _whole(problem, found)
     unseen = _judged(replace(problem, noise=found.state.problem.noise).in_blocks(test), found)
     before, after = unseen.state(frames.terms), unseen.state(found.terms)
@@ -154,12 +161,9 @@ def diagnose_poses(
     )
 
 
-def _frames_of(terms: tuple[Term, ...]) -> list[Term]:
-    return [term for term in terms if isinstance(term, FrameTerm)]
-
-
-def _is_mount(term: Term) -> bool:
-    return isinstance(term.effect, Mount)
+def frame_terms(terms: Sequence[Term]) -> list[Term]:
+    """Return the terms of the two unknown frames, without the effects."""
+    return [term for term in terms if effect_of(term).role.is_frame]
 
 
 def _registered(frames: PoseFit, unseen: PoseProblem) -> HeldOutErrors:
@@ -245,18 +249,18 @@ def _records(
     """Hand-eye of each sensor, and the effects that were fitted."""
     covariance = fit.covariance()
     covariances = [fit.covariance_of(i, covariance) for i in range(len(fit.terms))]
-    base = next((i for i, t in enumerate(fit.terms) if isinstance(t.effect, OpticalFrame)), None)
+    base = next((i for i, t in enumerate(fit.terms) if is_of(t, Role.REGISTRATION)), None)
     reference = session.reference or max(session.sensors.values(), key=lambda p: p.size)
     shaking = turn_jitter(reference)
     records = []
     for i, term in enumerate(fit.terms):
-        if _is_mount(term) and isinstance(term, FrameTerm):
-            whole = None if base is None else fit.terms[base]
-            frame = whole if isinstance(whole, FrameTerm) else None
+        if is_of(term, Role.MOUNT):
+            name = term.site['sensor']
             spread = None if base is None else covariances[base]
-            part = next(p for p in fit.state.parts if p.view.sensor == term.site['sensor'])
+            part = next(p for p in fit.state.parts if p.view.sensor == name)
             is_determined = is_lever_determined(part, shaking)
-            records.append(hand_eye_record(term, covariances[i], frame, spread, is_determined))
+            frames = frames_of(fit.terms, name)
+            records.append(hand_eye_record(name, frames, covariances[i], spread, is_determined))
     for term, one, spread in zip(fit.terms, evidence, covariances, strict=True):
         if one is None:
             continue
@@ -331,14 +335,14 @@ def turn_jitter(reference: PoseSequence) -> float:
 
 
 def hand_eye_record(
-    mount: FrameTerm,
+    sensor: str,
+    frames: Frames,
     spread: Array,
-    frame: FrameTerm | None,
     frame_spread: Array | None,
     is_determined: NDArray[np.bool_],
 ) -> EffectRecord:
     """Return optical frame, lever arm and mount of a sensor; None where the motion does not
-    determine them.
+    determine them, and for the optical frame where it was not fitted.
     """
 
     def degrees(matrix: Array) -> list[float]:
@@ -348,12 +352,12 @@ def hand_eye_record(
     sigma = np.sqrt(np.maximum(np.diag(spread), 0.0))
     lever = [
         float(v) if s < LEAST_KNOWN_M and told else None
-        for v, s, told in zip(mount.translation, sigma[:3], is_determined, strict=True)
+        for v, s, told in zip(frames.lever, sigma[:3], is_determined, strict=True)
     ]
     values: dict[str, object] = {
-        'sensor': mount.site['sensor'],
+        'sensor': sensor,
         'lever_arm_m': lever,
-        'mount_rotation_deg': degrees(mount.rotation),
+        'mount_rotation_deg': degrees(frames.mount),
         'registration_rotation_deg': None,
         'registration_translation_m': None,
     }
@@ -361,15 +365,13 @@ def hand_eye_record(
         'lever_arm_m': sigma[:3].tolist(),
         'mount_rotation_deg': np.rad2deg(sigma[3:]).tolist(),
     }
-    if frame is not None and frame_spread is not None:
+    if frame_spread is not None:
         frame_sigma = np.sqrt(np.maximum(np.diag(frame_spread), 0.0))
-        values['registration_rotation_deg'] = degrees(frame.rotation)
-        values['registration_translation_m'] = frame.translation.tolist()
+        values['registration_rotation_deg'] = degrees(frames.rotation)
+        values['registration_translation_m'] = frames.translation.tolist()
         uncertainty['registration_rotation_deg'] = np.rad2deg(frame_sigma[3:]).tolist()
         uncertainty['registration_translation_m'] = frame_sigma[:3].tolist()
     known = all(v is not None for v in lever) and bool(np.all(sigma[3:] < LEAST_KNOWN_RAD))
-    evidence = {
-        'summary': 'the two unknown frames; no effect, always fitted',
-        'observable': known,
-    }
-    return EffectRecord('hand_eye', values, uncertainty, evidence)
+    effect = effect_with(Role.MOUNT)
+    evidence = {'summary': effect.summary, 'observable': known}
+    return EffectRecord(effect.name, values, uncertainty, evidence)

@@ -10,7 +10,7 @@ effects are those of `anser_ros.effects` seen through another observation: posit
 instead of fluxes. `Term`, records, priors and costs of parameters are the same.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.effect import Effect
-from anser_ros.effects.term import Term
+from anser_ros.effects.term import Site, Term
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.path import OpticalPath
 from anser_ros.poses.sequence import PoseSession
@@ -85,17 +85,65 @@ class PoseView:
 
 
 class Role(Enum):
-    """Names what an effect is to the search, which asks for this and for no effect by its name."""
+    """Names what an effect is to the others, who ask for this and for no effect by its name."""
 
     PLAIN = 'plain'
-    CLOCK = 'clock'
-    """Moves the times of poses; found before a filter is judged, whose first order is a delay."""
+    REGISTRATION = 'frame of the reference'
+    """Where the reference's frame lies in the tracker's; in every fit, and no error."""
+    MOUNT = 'frame of a sensor'
+    """Where and how a sensor sits on the body; in every fit, and no error. Records
+    both frames."""
+    OFFSET = 'offset'
+    """Moves the times of poses by a constant; every fit starts with it."""
+    RATE = 'rate'
+    """Moves the times of poses by a share of the time."""
+    READING = 'reading'
+    """Another convention than a stream states, by which it is read before anything is fitted."""
+    SWAP = 'swap'
+    """Sensors under each other's names, which are put back before anything is searched for."""
     FILTER = 'filter'
     """A low pass with a time constant: no slopes, tried at some of them when the rest is found."""
     SCALE = 'scale'
     """One scale of all positions, which is a part of a map."""
     MAP = 'map'
     """A map of the places, that a map of a higher degree contains."""
+
+    @property
+    def is_frame(self) -> bool:
+        """Return whether it is one of the two unknown frames, which are no effects."""
+        return self in (Role.REGISTRATION, Role.MOUNT)
+
+    @property
+    def is_clock(self) -> bool:
+        """Return whether it moves times.
+
+        Such an effect is found before a filter is judged, whose first order is a delay.
+        """
+        return self in (Role.OFFSET, Role.RATE)
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Holds the two frames between the reference and one sensor.
+
+    Attributes
+    ----------
+    rotation, translation : ndarray, shapes (3, 3) and (3,)
+        From the optical frame to the tracker's; m.
+    mount : ndarray, shape (3, 3)
+        Rotation from the sensor's frame to the body's.
+    lever : ndarray, shape (3,)
+        The sensor in the body's frame, m.
+    """
+
+    rotation: Array
+    translation: Array
+    mount: Array
+    lever: Array
+
+
+PoseMap = Callable[[str, Array], tuple[Array, float]]
+"""What a model adds to the position (3,), m, of a sensor of that name, and its variance, m^2."""
 
 
 class PoseEffect(Effect[Term]):
@@ -106,6 +154,8 @@ class PoseEffect(Effect[Term]):
     """What somebody at the tracker can do about it, in a sentence."""
     blocks_in_space = False
     """Whether blocks of space and not of time decide on it."""
+    makes_jitter = False
+    """Whether poses that jitter more than before are explained by it."""
 
     def sites(self, setting: PoseSetting) -> Sequence[Term]:
         """Return the effect at every site where it may sit, with parameters of zero."""
@@ -122,6 +172,20 @@ class PoseEffect(Effect[Term]):
     def clock(self, term: Term, sensor: str, time: Array) -> Array:
         """Return the times on the optical clock, s, at which a sensor's poses apply."""
         return time
+
+    def at_frame(self, site: Site, place: Array, turn: Array) -> Term:
+        """Return a frame at a place (3,), m, with a rotation (3, 3)."""
+        raise NotImplementedError
+
+    def framed(self, term: Term, sensor: str, frames: Frames) -> Frames:
+        """Return the frames of a sensor with the one that the term holds."""
+        return frames
+
+    def moved(self, before: Term, after: Term, middle: Array) -> EffectRecord:
+        """Return the record of a frame that has changed; ``middle`` (3,) is where the body is, m,
+        optical frame.
+        """
+        raise NotImplementedError
 
     def filter(self, term: Term, path: OpticalPath) -> OpticalPath:
         """Return the body's path as a tracker that filters sees it."""
@@ -140,6 +204,18 @@ class PoseEffect(Effect[Term]):
     def observed(self, sight: 'PoseResiduals') -> Sequence[EffectRecord]:
         """Return what is seen of the effect without a fit; nothing where parameters are fitted."""
         return ()
+
+    def frozen(self, session: PoseSession) -> Sequence[EffectRecord]:
+        """Return streams that have stopped while others go on, each with its ``since_s``."""
+        return ()
+
+    def noisier(self, factor: float) -> Sequence[EffectRecord]:
+        """Return what is said where poses jitter so many times as much as when a watch began."""
+        return ()
+
+    def mapping(self, record: EffectRecord) -> PoseMap | None:
+        """Return the map of a record, which a corrector applies; None for other effects."""
+        return None
 
     def bent(self, term: Term) -> Term:
         """Return a map without its linear part, which something else has."""
@@ -210,6 +286,14 @@ def effect_of(term: Term) -> PoseEffect:
     """Return the effect that a term of poses belongs to."""
     assert isinstance(term.effect, PoseEffect)
     return term.effect
+
+
+def frames_of(terms: Sequence[Term], sensor: str) -> Frames:
+    """Return the frames of a sensor that some terms hold; the identity where they hold none."""
+    frames = Frames(np.eye(3), np.zeros(3), np.eye(3), np.zeros(3))
+    for term in terms:
+        frames = effect_of(term).framed(term, sensor, frames)
+    return frames
 
 
 def is_of(term: Term, role: Role) -> bool:

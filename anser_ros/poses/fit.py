@@ -12,7 +12,6 @@ from anser_ros.diagnosis.fit import descended, stepped
 from anser_ros.diagnosis.scoring import BlockSums
 from anser_ros.effects.term import Term
 from anser_ros.poses.effect import Role, is_of
-from anser_ros.poses.effects.hand_eye import FrameTerm
 from anser_ros.poses.problem import PoseNoise, PosePart, PoseProblem, PoseState
 
 Array = NDArray[np.float64]
@@ -94,16 +93,12 @@ def fit_poses(problem: PoseProblem, terms: Sequence[Term], iterations: int = 10)
     """
     prior = np.concatenate([t.effect.prior(t) for t in terms] or [np.zeros(0)])
     state, sums, _ = descended(
-        problem.state(_rebased(terms)),
+        problem.state(terms),
         lambda state: (state.sums(), prior),
-        lambda state, step: problem.state(_rebased(stepped(state.terms, step))),
+        lambda state, step: problem.state(stepped(state.terms, step)),
         iterations,
     )
     return PoseFit(state, sums, prior)
-
-
-def _rebased(terms: Sequence[Term]) -> list[Term]:
-    return [t.rebased() if isinstance(t, FrameTerm) else t for t in terms]
 
 
 def robust_fit(problem: PoseProblem, terms: Sequence[Term]) -> PoseFit:

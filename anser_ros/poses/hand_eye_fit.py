@@ -19,14 +19,15 @@ from anser_ros.poses.convention import read_rightly
 from anser_ros.poses.diagnosis import (
     LEAST_KNOWN_M,
     LEAST_KNOWN_RAD,
+    frame_terms,
     hand_eye_record,
     is_lever_determined,
     turn_jitter,
 )
-from anser_ros.poses.effects.clock import PoseClockRate, PoseTimeOffset
-from anser_ros.poses.effects.hand_eye import FrameTerm, Mount, OpticalFrame
+from anser_ros.poses.effect import Role, frames_of, is_of
 from anser_ros.poses.fit import PoseFit, fit_poses
 from anser_ros.poses.problem import PoseProblem
+from anser_ros.poses.registry import effect_with
 from anser_ros.poses.search import with_noise
 from anser_ros.poses.sequence import PoseSession
 from anser_ros.poses.start import coarse_offset, first_fit, pose_problem, train_blocks
@@ -185,9 +186,8 @@ def _fitted(problem: PoseProblem) -> PoseFit:
     """The frames, and the clocks as far as the motion determines them."""
     fit = first_fit(problem, coarse_offset(problem), False)
     if problem.path.is_at_rest:
-        frames = [t for t in fit.terms if isinstance(t, FrameTerm)]
-        return with_noise(fit_poses(fit.state.problem, frames))
-    rate = PoseClockRate().sites(problem.setting)[0]
+        return with_noise(fit_poses(fit.state.problem, frame_terms(fit.terms)))
+    rate = effect_with(Role.RATE).sites(problem.setting)[0]
     whole = with_noise(fit_poses(fit.state.problem, [*fit.terms, rate]))
     if _sigma(whole, len(whole.terms) - 1) * 1e3 < LEAST_KNOWN_PPM:
         return whole
@@ -198,9 +198,9 @@ def _sigma(fit: PoseFit, index: int) -> float:
     return float(np.sqrt(fit.covariance_of(index)[0, 0]))
 
 
-def _clock(fit: PoseFit, kind: type, scale: float) -> tuple[float, float] | None:
+def _clock(fit: PoseFit, role: Role, scale: float) -> tuple[float, float] | None:
     for index, term in enumerate(fit.terms):
-        if isinstance(term.effect, kind):
+        if is_of(term, role):
             return scale * float(term.theta[0]), scale * _sigma(fit, index)
     return None
 
@@ -218,24 +218,23 @@ def _told(
     shaking = 0.0 if pairs else turn_jitter(reference)
     covariance = fit.covariance()
     spreads = [fit.covariance_of(i, covariance) for i in range(len(fit.terms))]
-    (base, frame), = (
-        (i, t) for i, t in enumerate(fit.terms) if isinstance(t.effect, OpticalFrame)
-    )  # fmt: skip
-    assert isinstance(frame, FrameTerm)
+    (base,) = (i for i, t in enumerate(fit.terms) if is_of(t, Role.REGISTRATION))
+    frames = frames_of(fit.terms, '')
     sensors, words = {}, []
     for index, term in enumerate(fit.terms):
-        if not (isinstance(term, FrameTerm) and isinstance(term.effect, Mount)):
+        if not is_of(term, Role.MOUNT):
             continue
         name = term.site['sensor']
+        frames = frames_of(fit.terms, name)
         part = next(p for p in fit.state.parts if p.view.sensor == name)
         record = hand_eye_record(
-            term, spreads[index], frame, spreads[base], is_lever_determined(part, shaking)
+            name, frames, spreads[index], spreads[base], is_lever_determined(part, shaking)
         )
         lever = [np.nan if v is None else float(v) for v in record.parameters['lever_arm_m']]
         sigma = np.sqrt(np.maximum(np.diag(spreads[index]), 0.0))
         known = bool(np.all(sigma[3:] < LEAST_KNOWN_RAD))
         sensors[name] = SensorFrames(
-            np.array(lever), sigma[:3], term.rotation if known else None, sigma[3:],
+            np.array(lever), sigma[:3], frames.mount if known else None, sigma[3:],
             int(np.count_nonzero(part.used)), fit.state.rms(name),
             held_out.get(name, (np.nan, np.nan)),
         )  # fmt: skip
@@ -243,14 +242,14 @@ def _told(
         if not known:
             words.append(f'{name}: its mount, known to {np.rad2deg(sigma[3:].max()):.0f} deg only')
     sigma = np.sqrt(np.maximum(np.diag(spreads[base]), 0.0))
-    place = np.where(sigma[:3] < LEAST_KNOWN_M, frame.translation, np.nan)
+    place = np.where(sigma[:3] < LEAST_KNOWN_M, frames.translation, np.nan)
     if np.isnan(place).any():
         words.append(
             'the origin of the optical frame, known to '
             f'{1e3 * sigma[:3].max():.0f} mm only; it goes with the lever arm'
         )
-    offset = _clock(fit, PoseTimeOffset, 1.0)
-    rate = _clock(fit, PoseClockRate, 1e3)
+    offset = _clock(fit, Role.OFFSET, 1.0)
+    rate = _clock(fit, Role.RATE, 1e3)
     if offset is None or offset[1] > LEAST_KNOWN_S:
         words.append('the offset of the clocks: the body was at rest, or moved too slowly')
         offset, rate = None, None
@@ -260,7 +259,7 @@ def _told(
             f'to more than {LEAST_KNOWN_PPM:.0f} ppm; record longer'
         )
     return HandEye(
-        session, convention, frame.rotation, sigma[3:], place, sigma[:3], offset, rate,
+        session, convention, frames.rotation, sigma[3:], place, sigma[:3], offset, rate,
         _middle(fit.terms), sensors, tuple(words), fit,
     )  # fmt: skip
 

@@ -9,25 +9,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from anser_ros.effects.term import Term
-from anser_ros.errors import DiagnosisError
 from anser_ros.field.model import EffectRecord
 from anser_ros.poses.diagnosis import PoseDiagnosis, diagnose_poses
-from anser_ros.poses.effects.episodes import LooseMount
-from anser_ros.poses.effects.hand_eye import FrameTerm, Mount, OpticalFrame
-from anser_ros.poses.effects.noise import PoseExcessNoise, RangeNoise
-from anser_ros.poses.effects.stamps import QuantisedStamps, ReceiptJitter
-from anser_ros.poses.effects.stream import StalePoses
+from anser_ros.poses.effect import Role, effect_of
 from anser_ros.poses.problem import PoseProblem, PoseState
+from anser_ros.poses.registry import effect_of_record, pose_effects
 from anser_ros.poses.sequence import REFERENCE, PoseSession
 from anser_ros.poses.start import pose_problem
-from anser_ros.sessions.plausibility import FROZEN_S
 
 Array = NDArray[np.float64]
 
-MOVED_M = 0.01  # way of another stream in that time, m: far more than any tracker's jitter
 FEWEST_S = 4.0
 """Time, s, that must be left before a stream froze for a diagnosis of the rest."""
 CHANGED, CHANGED_M = 2.5, 1.5e-3
@@ -37,9 +30,6 @@ EXPLAINED = 0.4
 """Share of the misfit that may be left when one frame is fitted again for that one to have
 changed."""
 STEPS = 12  # Gauss-Newton steps for one frame; a turn of 30 deg takes six
-NOISIER = 2.0
-"""Factor of the jitter over the one that was there first from which it is told: that of trackers
-grows by half over their volume."""
 FEWEST_POSES = 20  # poses of the later half of a window by which a change is judged
 
 
@@ -126,7 +116,7 @@ class PoseWatch:
             return PoseSighting((*frozen, *changed), poses, misfit_m=misfit, remark=remark)
         self.searches += 1
         found = diagnose_poses(session)
-        told = [record for record in found.records if record.name != 'hand_eye']
+        told = [r for r in found.records if not _is_hand_eye(r)]
         told += self._noisier(found, told)
         if self._known is None and not frozen:
             self._known = _learnt(session, found)
@@ -159,9 +149,8 @@ class PoseWatch:
         trials = []
         for index, term in enumerate(terms):
             # The reference's frame is every sensor's, a mount is its own.
-            is_frame = isinstance(term.effect, OpticalFrame) and len(off) == len(misfit)
-            is_mount = isinstance(term.effect, Mount) and off == [term.site['sensor']]
-            if is_frame or is_mount:
+            effect = effect_of(term)
+            if effect.role.is_frame and off == [s for s in misfit if effect.acts_on(term, s)]:
                 moved = _fitted_alone(problem, terms, index)
                 left = max(_misfits(problem.state(moved)).values())
                 trials.append((left, index, moved))
@@ -178,37 +167,16 @@ class PoseWatch:
         self, found: PoseDiagnosis, told: Sequence[EffectRecord]
     ) -> Sequence[EffectRecord]:
         """More jitter than at first, unless something that is named makes it."""
-        makers = ReceiptJitter, QuantisedStamps, PoseExcessNoise, RangeNoise
-        if self._known is None or {m.name for m in makers} & {r.name for r in told}:
+        if self._known is None or any(effect_of_record(r).makes_jitter for r in told):
             return ()
         factor = found.floor_m / max(self._known.jitter_m, 1e-9)
-        if factor < NOISIER:
-            return ()
-        return [EffectRecord(PoseExcessNoise.name, {'factor': factor}, {'factor': 0.1 * factor})]
+        return [r for effect in pose_effects().values() for r in effect.noisier(factor)]
 
 
 def frozen_streams(session: PoseSession) -> tuple[tuple[EffectRecord, ...], float]:
-    """Return streams that give one pose over and over while another moves, and since when (s)."""
-    streams, found, since = session.streams, [], np.inf
-    for name, poses in streams.items():
-        fresh = np.flatnonzero(~poses.repeated)
-        if not poses.size:
-            continue
-        begin, end = float(poses.time[fresh[-1]]), float(poses.time[-1])
-        if end - begin < FROZEN_S:
-            continue
-        ways = [
-            float(np.linalg.norm(np.ptp(other.position[other.time > begin], axis=0)))
-            for key, other in streams.items()
-            if key != name and np.count_nonzero(other.time > begin) > 1
-        ]
-        if max(ways, default=0.0) > MOVED_M:
-            again = poses.size - int(fresh[-1]) - 1
-            values = {'stream': name, 'fraction': again / poses.size, 'runs': 1,
-                      'since_s': begin}  # fmt: skip
-            found.append(EffectRecord(StalePoses.name, values, {}))
-            since = min(since, begin)
-    return tuple(found), float(since)
+    """Return streams that have stopped while another goes on, and since when (s)."""
+    found = tuple(r for effect in pose_effects().values() for r in effect.frozen(session))
+    return found, min((float(r.parameters['since_s']) for r in found), default=np.inf)
 
 
 def _until(session: PoseSession, end: float) -> PoseSession:
@@ -238,9 +206,13 @@ def _misfits(state: PoseState) -> dict[str, float]:
     return found
 
 
+def _is_hand_eye(record: EffectRecord) -> bool:
+    return effect_of_record(record).role is Role.MOUNT
+
+
 def _learnt(session: PoseSession, found: PoseDiagnosis) -> _Known | None:
     """What later windows are judged by; None where the motion does not determine the frames."""
-    eyes = [record for record in found.records if record.name == 'hand_eye']
+    eyes = [record for record in found.records if _is_hand_eye(record)]
     if session.reference is None or not all(e.evidence.get('observable') for e in eyes):
         return None
     misfit = _misfits(pose_problem(session).state(found.fit.terms))
@@ -254,7 +226,7 @@ def _fitted_alone(problem: PoseProblem, terms: Sequence[Term], index: int) -> li
     for _ in range(STEPS):
         sums = problem.state(trial).sums([trial[index]])
         moved = trial[index].with_theta(trial[index].theta + sums.step(prior, 0.0))
-        trial[index] = moved.rebased() if isinstance(moved, FrameTerm) else moved
+        trial[index] = moved.effect.bounded(moved)
     return trial
 
 
@@ -262,22 +234,7 @@ def _change(
     before: Term, after: Term, state: PoseState, worst: float, left: float
 ) -> EffectRecord:
     """The change of a frame as an effect, with the misfits (m) without and with it."""
-    if not isinstance(before, FrameTerm) or not isinstance(after, FrameTerm):
-        raise DiagnosisError(f'{before.label}: no frame')
-    turn = Rotation.from_matrix(after.rotation @ before.rotation.T).as_rotvec(degrees=True)
-    evidence = {'misfit_before_m': worst, 'misfit_after_m': left}
-    if isinstance(before.effect, Mount):
-        values = {
-            'sensor': before.site['sensor'],
-            'rms_m': float(np.linalg.norm(after.translation - before.translation)),
-            'rms_deg': float(np.linalg.norm(turn)),
-        }
-        summary = 'the sensor sits elsewhere on the body than when the watch began'
-        return EffectRecord(LooseMount.name, values, {}, {**evidence, 'summary': summary})
-    # Where the poses are: a turn about the far origin of a camera moves that by decimetres.
     middle = np.concatenate([p.view.optical[p.used] for p in state.parts]).mean(axis=0)
-    moved = after.rotation @ middle + after.translation
-    moved -= before.rotation @ middle + before.translation
-    values = {'rotation_deg': turn.tolist(), 'translation_m': moved.tolist()}
-    summary = 'tracker and reference have moved against each other since the watch began'
-    return EffectRecord(OpticalFrame.name, values, {}, {**evidence, 'summary': summary})
+    record = effect_of(before).moved(before, after, middle)
+    misfits = {'misfit_before_m': worst, 'misfit_after_m': left}
+    return replace(record, evidence={**misfits, **record.evidence})

@@ -6,14 +6,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from anser_ros.calibration.error_map import ErrorMap
-from anser_ros.calibration.position_map import PositionMap, Shape
-from anser_ros.effects.effect import needed
-from anser_ros.field.model import EffectRecord
 from anser_ros.poses.document import MODEL_SCHEMA
-from anser_ros.poses.effects.field_distortion import FieldDistortion
-
-SMOOTH = 'smooth'
-"""The kind of a map that is determined by the points that it was learnt from."""
+from anser_ros.poses.effect import Role
+from anser_ros.poses.registry import effect_with
+from anser_ros.poses.smooth_map import SMOOTH
 
 
 def to_point_model(found: ErrorMap, sensor: str, source: str) -> dict[str, Any]:
@@ -33,7 +29,7 @@ def to_point_model(found: ErrorMap, sensor: str, source: str) -> dict[str, Any]:
         'registration_rotation_deg': turn.tolist(),
         'registration_translation_m': found.translation.tolist(),
     }
-    effects = [{'name': 'hand_eye', 'parameters': frames, 'uncertainty': {}}]
+    effects = [{'name': effect_with(Role.MOUNT).name, 'parameters': frames, 'uncertainty': {}}]
     if found.is_confirmed:
         shape, moved = found.shape, found.correction(found.places)
         parameters = {
@@ -41,7 +37,9 @@ def to_point_model(found: ErrorMap, sensor: str, source: str) -> dict[str, Any]:
             'noise': shape.noise, 'rms_m': float(np.sqrt(np.mean(np.sum(moved**2, axis=1)))),
             'places_m': found.places.tolist(), 'errors_m': found.errors.tolist(),
         }  # fmt: skip
-        effects.append({'name': FieldDistortion.name, 'parameters': parameters, 'uncertainty': {}})
+        effects.append(
+            {'name': effect_with(Role.MAP).name, 'parameters': parameters, 'uncertainty': {}}
+        )
     best = found.after if found.is_confirmed else found.before
     return {
         'schema': MODEL_SCHEMA,
@@ -54,20 +52,3 @@ def to_point_model(found: ErrorMap, sensor: str, source: str) -> dict[str, Any]:
         },
         'effects': effects,
     }
-
-
-def smooth_map(record: EffectRecord) -> PositionMap:
-    """Return the map of a record: what is added to tracked positions.
-
-    Raises
-    ------
-    EffectError
-        When a parameter is missing.
-    """
-    places, errors = (
-        np.asarray(needed(record, key), dtype=np.float64).reshape(-1, 3)
-        for key in ('places_m', 'errors_m')
-    )
-    values = [needed(record, key) for key in ('trend', 'length_m', 'noise')]
-    shape = Shape(int(values[0]), float(values[1]), float(values[2]))
-    return PositionMap(places, errors, shape)

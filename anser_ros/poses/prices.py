@@ -66,7 +66,7 @@ def doubt(fit: PoseFit, index: int) -> str:
     if not term.effect.possible(term.effect.record(term, covariance)):
         return 'implausible parameters'
     sigma = float(np.sqrt(covariance[0, 0]))
-    own_clock = is_of(term, Role.CLOCK) and 'sensor' in term.site
+    own_clock = effect_of(term).role.is_clock and 'sensor' in term.site
     is_one_number = is_of(term, Role.SCALE) or is_scale(term) or own_clock
     if is_one_number and abs(float(term.theta[0])) < CLEAR * sigma:
         return f'less than {CLEAR:g} of its standard deviations'

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.diagnosis.scoring import BlockSums
 from anser_ros.effects.term import Term
-from anser_ros.poses.effect import PoseSetting, PoseView, Role, effect_of, is_of
-from anser_ros.poses.effects.hand_eye import FrameTerm, Mount, OpticalFrame
+from anser_ros.poses.effect import PoseSetting, PoseView, Role, effect_of, frames_of, is_of
 from anser_ros.poses.path import OpticalPath
 from anser_ros.poses.sequence import PoseSequence
 
@@ -111,32 +110,24 @@ def _predicted(
     path: OpticalPath, sensor: PoseSequence, terms: Sequence[Term]
 ) -> tuple[PoseView, Array, Mask]:
     """View, residual (n, 6) measured less predicted, and where the reference is known."""
-    time, frame, shift = sensor.time, np.eye(3), np.zeros(3)
-    mount, lever = np.eye(3), np.zeros(3)
-    position, rotation = sensor.position, sensor.rotation
+    time, position, rotation = sensor.time, sensor.position, sensor.rotation
+    frames = frames_of(terms, sensor.name)
+    frame, lever = frames.rotation, frames.lever
     for term in terms:
         effect = effect_of(term)
         path = effect.filter(term, path) if effect.acts_on(term, sensor.name) else path
         time = effect.clock(term, sensor.name, time)
         position, rotation = effect.corrected(term, sensor.name, position, rotation)
-        if isinstance(term, FrameTerm) and isinstance(effect, OpticalFrame):
-            frame, shift = term.rotation, term.translation
-        elif (
-            isinstance(term, FrameTerm)
-            and isinstance(effect, Mount)
-            and effect.acts_on(term, sensor.name)
-        ):
-            mount, lever = term.rotation, term.translation
     optical, turn, velocity, known = path.at(time)
     for term in terms:
         optical = effect_of(term).seen(term, optical)
     body = frame @ turn
     arm = body @ lever
-    said = optical @ frame.T + arm + shift
+    said = optical @ frame.T + arm + frames.translation
     moving = np.empty((time.size, 6))
     moving[:, 3:] = velocity[:, 3:] @ frame.T
     moving[:, :3] = velocity[:, :3] @ frame.T + np.cross(moving[:, 3:], arm)
-    said_turn = body @ mount
+    said_turn = body @ frames.mount
     view = PoseView(
         sensor.name, sensor.time, sensor.position, sensor.rotation, optical, turn, frame, lever,
         said, said_turn, moving,

@@ -17,7 +17,6 @@ from anser_ros.calibration.blocks import FOLDS
 from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN
 from anser_ros.effects.term import Term
 from anser_ros.poses.effect import Role, effect_of, is_of
-from anser_ros.poses.effects.hand_eye import FrameTerm
 from anser_ros.poses.fit import LARGEST_STAMP_S, PoseFit, fit_poses, noise_of, unexplained_poses
 from anser_ros.poses.prices import LEAST_SHARE, doubt, is_scale, price
 from anser_ros.poses.problem import PoseNoise, PosePart
@@ -127,7 +126,7 @@ def search_effects(start: PoseFit, say: Callable[[str], None] | None = None) -> 
 
 def effects_of(fit: PoseFit) -> list[Term]:
     """Return the terms that are effects, without the two frames."""
-    return [term for term in fit.terms if not isinstance(term, FrameTerm)]
+    return [term for term in fit.terms if not effect_of(term).role.is_frame]
 
 
 def _best_addition(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | None:
@@ -158,7 +157,7 @@ def _best_addition(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | No
         if found is not None:
             accepted.append(found)
     best = _simplest(accepted) if accepted else None
-    if best is not None and is_of(best.terms[-1], Role.CLOCK):
+    if best is not None and effect_of(best.terms[-1]).role.is_clock:
         return best
     # A filter rounds off turning points, which looks like a scale or a map.
     lagging, filtered = _with_lag(fit, refused)
@@ -374,7 +373,7 @@ def _settled(
         evidence: list[PoseEvidence | None] = []
         weakest: tuple[float, Term, PoseFit] | None = None
         for index, term in enumerate(fit.terms):
-            if isinstance(term, FrameTerm):
+            if effect_of(term).role.is_frame:
                 evidence.append(None)
                 continue
             rest = [t for t in fit.terms if t is not term]

@@ -8,14 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.calibration.blocks import fold_of_frames
 from anser_ros.diagnosis.prepare import BLOCKS, TEST_EVERY
-from anser_ros.effects.term import Term
+from anser_ros.effects.term import Site, Term
 from anser_ros.errors import DiagnosisError, FitError
-from anser_ros.poses.effect import PoseSetting
-from anser_ros.poses.effects.clock import PoseTimeOffset
-from anser_ros.poses.effects.hand_eye import Mount, OpticalFrame, frame_term
+from anser_ros.poses.effect import PoseSetting, Role
 from anser_ros.poses.fit import PoseFit, robust_fit
 from anser_ros.poses.path import OpticalPath
 from anser_ros.poses.problem import PoseNoise, PoseProblem
+from anser_ros.poses.registry import effect_with
 from anser_ros.poses.sequence import PoseSequence, PoseSession, jumping_poses
 
 Array = NDArray[np.float64]
@@ -244,7 +243,7 @@ def _product(left: Array, right: Array) -> Array:
 
 
 def started(problem: PoseProblem, offset: float, frame: Array | None = None) -> list[Term]:
-    """Return OpticalFrame, mounts and an offset to start from; a known frame is the identity."""
+    """Return both frames and an offset to start from; a known registration is the identity."""
     pairs = []
     for poses in problem.sensors:
         place, turn, _, known = problem.path.at(poses.time - offset)
@@ -257,12 +256,13 @@ def started(problem: PoseProblem, offset: float, frame: Array | None = None) -> 
         )
     terms: list[Term] = []
     if frame is not None:
-        terms.append(frame_term(OpticalFrame(), {}, shift, rotation))
+        terms.append(effect_with(Role.REGISTRATION).at_frame({}, shift, rotation))
     for poses, (_, turned, _, turn) in zip(problem.sensors, pairs, strict=True):
         mounts = Rotation.from_matrix(turn.transpose(0, 2, 1) @ (rotation.T @ turned))
         middle = _middle(mounts)
-        terms.append(frame_term(Mount(), {'sensor': poses.name}, np.zeros(3), middle))
-    return [*terms, Term(PoseTimeOffset(), {}, np.array([offset]))]
+        site: Site = {'sensor': poses.name}
+        terms.append(effect_with(Role.MOUNT).at_frame(site, np.zeros(3), middle))
+    return [*terms, Term(effect_with(Role.OFFSET), {}, np.array([offset]))]
 
 
 def _middle(turns: Rotation) -> Array:

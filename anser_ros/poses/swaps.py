@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.model import EffectRecord
+from anser_ros.poses.effect import Role
 from anser_ros.poses.fit import PoseFit
 from anser_ros.poses.problem import PoseProblem
+from anser_ros.poses.registry import effect_with
 from anser_ros.poses.sequence import PoseSequence, PoseSession
 
 Array = NDArray[np.float64]
@@ -90,8 +92,9 @@ def put_back(
         sensors[other] = _merged(right, ~masks[1], left, masks[0])
         share = float(np.mean(masks[0]))
         values = {'sensors': [one, other], 'fraction': share, 'spans': [list(s) for s in spans]}
-        evidence = {'summary': 'two sensors are exchanged', 'remedy': 'the names are put back'}
-        records.append(EffectRecord('swapped_sensors', values, {}, evidence))
+        effect = effect_with(Role.SWAP)
+        evidence = {'summary': effect.summary, 'remedy': 'the names are put back'}
+        records.append(EffectRecord(effect.name, values, {}, evidence))
     return replace(session, sensors=sensors), records
 
 

@@ -1,8 +1,7 @@
 """The clocks of the tracker and of the optical reference differ by an offset and a rate."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +13,6 @@ from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView, Role
 
 Array = NDArray[np.float64]
 
-AGREE_S = 3.0
-"""Time about a session's start or middle, s, at which clocks count as agreeing: programs set
-clocks when they start, and a rate by regression is about the middle. Smaller gives a clock that
-was set late in starting an offset as well; larger hides offsets in the rate."""
-
 
 class PoseTimeOffset(PoseEffect):
     """Applies the optical pose stamped t - theta at stamp t of a tracked pose, s."""
@@ -29,7 +23,7 @@ class PoseTimeOffset(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'offset_s': 's'}
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'offset_s': (-5.0, 5.0)}
     remedy = Remedy.OPTICAL
-    role = Role.CLOCK
+    role = Role.OFFSET
 
     def sites(self, setting: PoseSetting) -> Sequence[Term]:
         """Try one offset for all sensors, and one per sensor."""
@@ -71,7 +65,7 @@ class PoseClockRate(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'rate_ppm': '1e-6'}
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'rate_ppm': (-3e3, 3e3)}
     remedy = Remedy.OPTICAL
-    role = Role.CLOCK
+    role = Role.RATE
 
     def sites(self, setting: PoseSetting) -> Sequence[Term]:
         """Return one term, as one rate holds for all sensors."""
@@ -102,67 +96,6 @@ class PoseClockRate(PoseEffect):
         """Read the clock's rate, ppm, from a record."""
         rate = 1e-3 * float(needed(record, 'rate_ppm'))
         return Term(self, {'middle_s': float(needed(record, 'middle_s'))}, np.array([rate]))
-
-
-class PoseClock:
-    """Knows how late a tracker's stamps are by the records of its clock.
-
-    Parameters
-    ----------
-    records : sequence of EffectRecord
-        Those of the clock are used.
-    support : mapping
-        ``first_ns`` and ``last_ns``, the stamps between which a rate was learnt. Beyond them the
-        offset stays as it is at the nearer one, because nobody knows whether a clock was set
-        since.
-    """
-
-    def __init__(self, records: Sequence[EffectRecord], support: Mapping[str, Any]) -> None:
-        offsets = [r for r in records if r.name == PoseTimeOffset.name]
-        rate = next((r for r in records if r.name == PoseClockRate.name), None)
-        self._own = {
-            r.parameters['sensor']: _offset(r) for r in offsets if 'sensor' in r.parameters
-        }
-        # The record of a rate has the offset of all sensors with it, or instead.
-        shared = [r for r in offsets if 'sensor' not in r.parameters] if rate is None else [rate]
-        self._shared = sum(map(_offset, shared))
-        self._gain, self._first, self._last = 0.0, 0, 0
-        if rate is not None and 'first_ns' in support:
-            gain = 1e-6 * float(needed(rate, 'rate_ppm'))
-            self._gain = gain / (1 + gain)
-            self._first, self._last = int(support['first_ns']), int(support['last_ns'])
-
-    def late_ns(self, sensor: str, stamp_ns: int) -> int:
-        """Return by how much a sensor's stamp is late on the reference's clock, ns."""
-        since = min(max(stamp_ns, self._first), self._last) - (self._first + self._last) // 2
-        late = self._shared + self._own.get(sensor, 0.0)
-        return round(1e9 * late + self._gain * since)
-
-
-def _offset(record: EffectRecord) -> float:
-    return float(needed(record, 'offset_s'))
-
-
-def one_clock(records: Sequence[EffectRecord], duration: float) -> list[EffectRecord]:
-    """Return the records with one for the clock: a rate takes the offset of all sensors with it.
-
-    Clocks that agree about the start or the middle of a session of ``duration`` s have a rate and
-    no offset besides.
-    """
-    offset = next(
-        (r for r in records if r.name == PoseTimeOffset.name and 'sensor' not in r.parameters),
-        None,
-    )
-    rate = next((r for r in records if r.name == PoseClockRate.name), None)
-    if rate is None:
-        return list(records)
-    value = 0.0 if offset is None else float(offset.parameters['offset_s'])
-    gained = 1e-6 * float(rate.parameters['rate_ppm'])
-    # The offset is that at the middle, half a session after the start.
-    apart = min(abs(value), abs(value - 0.5 * gained * duration))
-    whole = replace(rate, parameters={**rate.parameters, 'offset_s': value})
-    kept = [whole if r is rate else r for r in records]
-    return [r for r in kept if r is not offset or apart > abs(gained) * AGREE_S]
 
 
 EFFECTS = (PoseTimeOffset(), PoseClockRate())

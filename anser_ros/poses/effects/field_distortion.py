@@ -12,7 +12,8 @@ from anser_ros.effects.effect import Remedy, needed, sigmas
 from anser_ros.effects.term import Site, Term
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
-from anser_ros.poses.effect import PoseEffect, PoseSetting, PoseView, Role
+from anser_ros.poses.effect import PoseEffect, PoseMap, PoseSetting, PoseView, Role
+from anser_ros.poses.smooth_map import SMOOTH, smooth_map
 
 Array = NDArray[np.float64]
 
@@ -128,14 +129,25 @@ class FieldDistortion(PoseEffect):
         """Return what is added to tracked positions (n, 3), m."""
         return self._derivative(term, position) @ term.theta
 
-    def shift_and_variance(self, term: Term, position: Array, sigma: Array) -> tuple[Array, Array]:
-        """Return what is added to positions (n, 3), m, and its variance per coordinate (n,), m^2.
+    def mapping(self, record: EffectRecord) -> PoseMap:
+        """Return what is added to a sensor's position (3,), m, and its variance a coordinate, m^2.
 
-        The parameters' standard deviations ``sigma``, mm, are taken as independent.
+        The parameters' standard deviations are taken as independent.
         """
-        moved = self._derivative(term, position)
-        spread = np.broadcast_to(sigma, term.theta.shape)
-        return moved @ term.theta, np.asarray(np.mean(moved**2 @ spread**2, axis=1))
+        if record.parameters.get('kind') == SMOOTH:
+            smooth = smooth_map(record)
+            return lambda sensor, position: (smooth(position[None])[0], 0.0)
+        term = self.term(record)
+        told = np.asarray(record.uncertainty.get('coefficients_mm', 0.0), dtype=np.float64)
+        variances = np.broadcast_to(told, term.theta.shape) ** 2
+
+        def added(sensor: str, position: Array) -> tuple[Array, float]:
+            if not self.acts_on(term, sensor):
+                return np.zeros(3), 0.0
+            moved = self._derivative(term, position[None])[0]
+            return moved @ term.theta, float(np.mean(moved**2 @ variances))
+
+        return added
 
     def corrected(
         self, term: Term, sensor: str, position: Array, rotation: Array

@@ -4,15 +4,16 @@ One term holds the registration (optical frame to the tracker's), one a sensor i
 mount on the body. Both are kept as a start and small turns about it.
 """
 
-from dataclasses import dataclass
-from typing import Any, Self
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from anser_ros.effects.term import Site, Term
-from anser_ros.poses.effect import PoseEffect, PoseView
+from anser_ros.field.model import EffectRecord
+from anser_ros.poses.effect import Frames, PoseEffect, PoseView, Role
+from anser_ros.poses.effects.episodes import LooseMount
 
 Array = NDArray[np.float64]
 
@@ -42,43 +43,88 @@ class FrameTerm(Term):
         """Return the translation of the frame, m."""
         return self.theta[:3]
 
-    def rebased(self) -> Self:
-        """Return the same frame with a turn of zero."""
-        return type(self)(
-            self.effect, self.site, np.array([*self.theta[:3], 0, 0, 0]), self.held,
-            start=self.rotation,
-        )  # fmt: skip
+    def turn_from(self, other: 'FrameTerm') -> Array:
+        """Return the turn from another frame to this one as a rotation vector, degrees."""
+        turn = Rotation.from_matrix(self.rotation @ other.rotation.T)
+        return np.asarray(turn.as_rotvec(degrees=True))
 
 
-class OpticalFrame(PoseEffect):
-    """Theta is the translation (m) and a turn (rad) from the optical frame to the tracker's."""
+class _Frame(PoseEffect):
+    """Theta is a translation (m) and a turn (rad)."""
 
-    name = 'registration'
-    summary = "the optical frame is not aligned with the tracker's"
+    def at_frame(self, site: Site, place: Array, turn: Array) -> Term:
+        """Return the frame with a turn of zero from a rotation matrix."""
+        return FrameTerm(self, site, np.array([*place, 0, 0, 0]), start=turn)
 
     def prior(self, term: Term) -> Array:
         """Return a wide prior, as nothing is known of the frame before."""
         return np.full(6, FREE)
 
+    def bounded(self, term: Term) -> Term:
+        """Return the same frame with a turn of zero."""
+        frame = _frame(term)
+        return replace(frame, theta=np.array([*frame.translation, 0, 0, 0]), start=frame.rotation)
+
+
+class OpticalFrame(_Frame):
+    """Theta is the translation (m) and a turn (rad) from the optical frame to the tracker's."""
+
+    name = 'registration'
+    summary = "the optical frame is not aligned with the tracker's"
+    role = Role.REGISTRATION
+
+    def framed(self, term: Term, sensor: str, frames: Frames) -> Frames:
+        """Return the frames with this one from the reference to the tracker."""
+        frame = _frame(term)
+        return replace(frames, rotation=frame.rotation, translation=frame.translation)
+
+    def moved(self, before: Term, after: Term, middle: Array) -> EffectRecord:
+        """Record the turn, and the shift where the poses are.
+
+        A turn about the far origin of a camera moves that by decimetres.
+        """
+        first, last = _frame(before), _frame(after)
+        shift = last.rotation @ middle + last.translation
+        shift -= first.rotation @ middle + first.translation
+        values = {
+            'rotation_deg': last.turn_from(first).tolist(), 'translation_m': shift.tolist(),
+        }  # fmt: skip
+        summary = 'tracker and reference have moved against each other since the watch began'
+        return EffectRecord(self.name, values, {}, {'summary': summary})
+
     def slopes(self, term: Term, view: PoseView) -> Array | None:
         """Return the derivative by a shift of all poses and a turn about the tracker's origin."""
-        assert isinstance(term, FrameTerm)
         out = np.zeros((view.time.size, 6, 6))
         out[:, :3, :3] = np.eye(3)
-        out[:, :3, 3:] = -_cross(view.position - term.translation)
+        out[:, :3, 3:] = -_cross(view.position - _frame(term).translation)
         out[:, 3:, 3:] = np.eye(3)
         return out
 
 
-class Mount(PoseEffect):
+class Mount(_Frame):
     """Theta is the sensor's place on the body (m) and a turn (rad) of its mount."""
 
-    name = 'mount'
-    summary = 'where and how the sensor sits on the body'
+    name = 'hand_eye'
+    summary = 'the two unknown frames; no effect, always fitted'
+    role = Role.MOUNT
 
-    def prior(self, term: Term) -> Array:
-        """Return a wide prior, as nothing is known of the mount before."""
-        return np.full(6, FREE)
+    def framed(self, term: Term, sensor: str, frames: Frames) -> Frames:
+        """Return the frames with the mount and lever arm of the term's own sensor."""
+        if not self.acts_on(term, sensor):
+            return frames
+        frame = _frame(term)
+        return replace(frames, mount=frame.rotation, lever=frame.translation)
+
+    def moved(self, before: Term, after: Term, middle: Array) -> EffectRecord:
+        """Record how far the sensor has moved on the body, as a mount that is loose."""
+        first, last = _frame(before), _frame(after)
+        values = {
+            'sensor': before.site['sensor'],
+            'rms_m': float(np.linalg.norm(last.translation - first.translation)),
+            'rms_deg': float(np.linalg.norm(last.turn_from(first))),
+        }
+        summary = 'the sensor sits elsewhere on the body than when the watch began'
+        return EffectRecord(LooseMount.name, values, {}, {'summary': summary})
 
     def slopes(self, term: Term, view: PoseView) -> Array | None:
         """Return the derivative of this sensor's poses by shift and turn in the body's frame."""
@@ -100,9 +146,9 @@ def _cross(vectors: Array) -> Array:
     return out
 
 
-def frame_term(effect: Any, site: Site, place: Array, turn: Array) -> FrameTerm:
-    """Return the term of a frame at a place (m) with a rotation matrix."""
-    return FrameTerm(effect, site, np.array([*place, 0, 0, 0]), start=turn)
+def _frame(term: Term) -> FrameTerm:
+    assert isinstance(term, FrameTerm)
+    return term
 
 
 EFFECTS = (OpticalFrame(), Mount())

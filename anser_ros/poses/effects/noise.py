@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from anser_ros.field.model import EffectRecord
-from anser_ros.poses.effect import PoseEffect, PoseResiduals, Sensing
+from anser_ros.poses.effect import PoseEffect, PoseResiduals
+from anser_ros.poses.jitter import jitter
 
 Array = NDArray[np.float64]
 
@@ -17,8 +18,9 @@ NOISIER = 2.0
 """Factor over the other sensors' median noise from which a sensor's is named; sensors of one kind
 at one place differ by a half. Smaller names a sensor for its place; larger misses one that is
 worn."""
-NEAR_S, NEAR_STEPS = 0.3, 3.0
-"""Poses that are nearer in time, s or usual intervals, differ by noise and not by place."""
+GROWN = 2.0
+"""Factor of the jitter over that of a watch's first look from which it is told: that of trackers
+grows by half over their volume."""
 WIDEST = 1.3
 """Ratio of far to near distances (95 to 5 %) without which no power law of it can be told."""
 CLEAR = 5.0
@@ -36,37 +38,6 @@ REACHED = 12.0
 """Squared deviation over its variance by the law that noise does not reach: once in 1e5. A pose
 that the law does not reach has another cause, and one that it reaches is no outlier."""
 FEWEST = 60  # differences of neighbours that a power law is fitted to
-
-
-def jitter(sensing: Sensing) -> tuple[Array, Array]:
-    """Return squared noise (n,) of poses beside near neighbours, and distances (n, 3).
-
-    Squares are m^2, a coordinate; the distances, m, are those of the pose before, of the pose and
-    of the one after it. Second differences of the residual across the velocity, so that neither a
-    slow course nor an error of the stamps is in it.
-    """
-    rows = np.flatnonzero(sensing.used)
-    time, velocity = sensing.view.time[rows], sensing.view.velocity[rows, :3]
-    residual = sensing.residual[rows, :3]
-    if rows.size < 3:
-        return np.zeros(0), np.zeros((0, 3))
-    along = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-9)
-    if sensing.stamp_s > 0:
-        # Neighbours move another way, and errors of their stamps lie along theirs.
-        residual = _across(residual, along)
-    second = residual[1:-1] - 0.5 * (residual[:-2] + residual[2:])
-    second = _across(second, along[1:-1])
-    usual = float(np.median(np.diff(time)))
-    near = time[2:] - time[:-2] < max(NEAR_S, NEAR_STEPS * usual)
-    square = np.sum(second**2, axis=1) / (1.5 * 2)
-    distance = np.linalg.norm(sensing.view.measured[rows], axis=1)
-    about = np.stack([distance[:-2], distance[1:-1], distance[2:]], axis=1)
-    return square[near], about[near]
-
-
-def _across(vectors: Array, along: Array) -> Array:
-    """Vectors (n, 3) without their part along unit vectors (n, 3)."""
-    return np.asarray(vectors - np.sum(vectors * along, axis=1, keepdims=True) * along)
 
 
 def power_law(square: Array, distance: Array) -> tuple[float, float, float]:
@@ -132,6 +103,13 @@ class PoseExcessNoise(PoseEffect):
     summary = "a sensor's noise is larger than the others'"
     advice = 'Exchange the sensor or its cable, and record again.'
     units: ClassVar[Mapping[str, str]] = {'factor': '1'}
+    makes_jitter = True
+
+    def noisier(self, factor: float) -> Sequence[EffectRecord]:
+        """Return a record without a sensor: all of them jitter more."""
+        if factor < GROWN:
+            return ()
+        return [EffectRecord(self.name, {'factor': factor}, {'factor': 0.1 * factor})]
 
     def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
         """Return each sensor that is noisier than the median of the others."""
@@ -160,6 +138,7 @@ class RangeNoise(PoseEffect):
     summary = 'jitter grows with the distance from the field generator'
     advice = 'Work nearer to the field generator.'
     units: ClassVar[Mapping[str, str]] = {'exponent': '1', 'reference_m': 'm'}
+    makes_jitter = True
 
     def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
         """Return a power law of all sensors together, each with a level of its own."""

@@ -82,6 +82,7 @@ class ReceiptJitter(PoseEffect):
     summary = 'stamps are those of receipt, and jitter'
     advice = 'Use the counter of the device as stamp (import_poses --stamps device).'
     units: ClassVar[Mapping[str, str]] = {'rms_s': 's'}
+    makes_jitter = True
 
     def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
         """Look for a residual that lies along the velocity and grows with it."""
@@ -100,6 +101,7 @@ class QuantisedStamps(PoseEffect):
     summary = 'stamps are those of a poll'
     advice = 'Use the counter of the device as stamp, or poll more often.'
     units: ClassVar[Mapping[str, str]] = {'step_s': 's'}
+    makes_jitter = True
 
     def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
         """Look for an error of the stamps that is that of their grid."""

@@ -11,7 +11,8 @@ from anser_ros.field.model import EffectRecord
 from anser_ros.physics.pose_track import LONGEST_GAP_S
 from anser_ros.poses.effect import PoseEffect, PoseResiduals, Sensing
 from anser_ros.poses.effects.episodes import episode_windows, windows_of
-from anser_ros.poses.sequence import PoseSequence, jumping_poses
+from anser_ros.poses.sequence import PoseSequence, PoseSession, jumping_poses
+from anser_ros.sessions.plausibility import FROZEN_S
 
 Array = NDArray[np.float64]
 
@@ -23,6 +24,9 @@ MOVING_M = 5e-4
 """Way between two poses, m, from which a body moves: trackers tell a tenth of it. Smaller takes
 jitter for motion, so that a tracker at rest seems to repeat poses; larger sees no motion in slow
 hands."""
+FROZEN_WAY_M = 0.01
+"""Way of another stream, m, while one stands still that is frozen: far more than any tracker's
+jitter."""
 NEAR = 3  # poses before and after that motion is judged by: one wrong neighbour decides nothing
 FEWEST_MISSING = 0.005  # share of poses, or of the time, from which missing ones are named
 FEWEST_MARKED, FEWEST_MARKED_SHARE = 5, 1e-3
@@ -62,6 +66,28 @@ class StalePoses(PoseEffect):
             values = {'stream': poses.name, 'fraction': share, 'runs': runs}
             found.append(_record(self.name, values,
                                  {'fraction': float(np.sqrt(share / count))}))  # fmt: skip
+        return found
+
+    def frozen(self, session: PoseSession) -> Sequence[EffectRecord]:
+        """Return streams that give one pose over and over while another moves."""
+        streams, found = session.streams, []
+        for name, poses in streams.items():
+            fresh = np.flatnonzero(~poses.repeated)
+            if not poses.size:
+                continue
+            begin, end = float(poses.time[fresh[-1]]), float(poses.time[-1])
+            if end - begin < FROZEN_S:
+                continue
+            ways = [
+                float(np.linalg.norm(np.ptp(other.position[other.time > begin], axis=0)))
+                for key, other in streams.items()
+                if key != name and np.count_nonzero(other.time > begin) > 1
+            ]
+            if max(ways, default=0.0) > FROZEN_WAY_M:
+                again = poses.size - int(fresh[-1]) - 1
+                values = {'stream': name, 'fraction': again / poses.size, 'runs': 1,
+                          'since_s': begin}  # fmt: skip
+                found.append(EffectRecord(self.name, values, {}))
         return found
 
 
