@@ -85,19 +85,39 @@ def test_a_map_of_one_sensor_may_shift_it_and_one_of_all_may_not():
     ],
 )
 def test_metal_deep_in_the_volume_is_told_by_the_other_sensors(last, pulled_m, named):
+    records = episodes_of(((30, last, (pulled_m, pulled_m, 4e-3)),))
+    assert [name for r in records for name in r.parameters['sensors']] == named
+
+
+def test_metal_at_one_sensor_leaves_the_episodes_of_others_at_other_times():
+    away, near = (30, 40, (0.0, 0.0, 4e-3)), (4, 8, (4e-3, 0.0, 0.0))
+    first, second = episodes_of((near, away), returns=True)
+    assert (first.parameters['sensors'], second.parameters['sensors']) == (
+        ['sensor_0'], ['sensor_2'],
+    )  # fmt: skip
+    assert first.parameters['t_start_s'] == pytest.approx(4.0, abs=1.0)
+    assert first.parameters['t_end_s'] == pytest.approx(8.0, abs=1.0)
+    assert second.parameters['t_start_s'] == pytest.approx(30.0, abs=1.0)
+
+
+def episodes_of(spans, *, returns=False):
+    """Moving metal of three sensors that are off by so much in some spans of 40 s.
+
+    A body that ``returns`` is at each place again, and the metal is not.
+    """
     rng, time = np.random.default_rng(5), np.arange(0, 40, 0.1)
-    place = np.column_stack([0 * time, 0 * time, -0.01 * time])
-    inside = (time > 30) & (time < last)
+    depth = 0.03 * np.sin(2 * time) if returns else 0.01 * time
+    place = np.column_stack([0 * time, 0 * time, -depth])
     sensors = []
-    for k, size in enumerate((pulled_m, pulled_m, 4e-3)):
+    for k in range(3):
         residual = 3e-4 * rng.normal(size=(time.size, 6))
-        residual[inside, 0] += size
+        for first, last, sizes in spans:
+            residual[(time > first) & (time < last), 0] += sizes[k]
         view = SimpleNamespace(sensor=f'sensor_{k}', time=time, measured=place)
         every = np.ones(time.size, dtype=bool)
         sensors.append(SimpleNamespace(view=view, residual=residual, used=every, out=~every))
     setting = PoseSetting(('sensor_0', 'sensor_1', 'sensor_2'), 0.0, 40.0, np.zeros(3), 0.1)
-    records = PoseMovingMetal().observed(SimpleNamespace(sensors=sensors, setting=setting))
-    assert [name for r in records for name in r.parameters['sensors']] == named
+    return PoseMovingMetal().observed(SimpleNamespace(sensors=sensors, setting=setting))
 
 
 def test_the_exponent_of_noise_is_found_with_an_honest_sigma():

@@ -1,6 +1,7 @@
 """Something comes and goes, or shifts, in a session: metal that moves, a mount that is loose."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -49,8 +50,24 @@ def windows_of(sensing: Sensing, sight: PoseResiduals) -> NDArray[np.int64]:
     return np.where(sensing.used | sensing.out, window, -1)
 
 
-def episode_windows(sensing: Sensing, sight: PoseResiduals) -> list[int]:
-    """Return windows in which a sensor is off that was right at other times at the same places.
+@dataclass(frozen=True)
+class Episode:
+    """Holds when a sensor is off.
+
+    Attributes
+    ----------
+    windows : tuple of int
+        Of time; none where it never is.
+    is_alone : bool
+        Whether the others on its body are right meanwhile.
+    """
+
+    windows: tuple[int, ...] = ()
+    is_alone: bool = False
+
+
+def episode(sensing: Sensing, sight: PoseResiduals) -> Episode:
+    """Return when a sensor is off that was right at other times at the same places.
 
     Where it was there at no other time, the body shows it: all others on it are right meanwhile.
     """
@@ -58,28 +75,26 @@ def episode_windows(sensing: Sensing, sight: PoseResiduals) -> list[int]:
     square = np.sum(sensing.residual[:, :3] ** 2, axis=1)
     judged = [w for w in range(WINDOWS) if np.count_nonzero(window == w) >= FEWEST_POSES]
     if len(judged) < WINDOWS // 3:
-        return []
+        return Episode()
     size = {w: float(np.median(square[window == w])) for w in judged}
     usual = float(np.median(list(size.values())))
     high = [w for w in judged if size[w] > TIMES * usual and _is_shift(sensing, window == w)]
     runs = [w for w in high if w - 1 in high or w + 1 in high]
     if not runs or len(runs) > LONGEST * len(judged):
-        return []
+        return Episode()
     inside = np.isin(window, runs)
     outside = (window >= 0) & ~inside & (square < TIMES * usual)
     if not outside.any():
-        return []
+        return Episode()
     place = sensing.view.measured
     distance, _ = cKDTree(place[outside]).query(place[inside])
-    if np.mean(distance < NEAR_M) > REVISITED_SHARE or _is_alone(sensing, sight, runs):
-        return runs
-    return []
+    is_alone = _is_alone(sensing, sight, runs)
+    is_revisited = bool(np.mean(distance < NEAR_M) > REVISITED_SHARE)
+    return Episode(tuple(runs), is_alone) if is_revisited or is_alone else Episode()
 
 
 def _is_alone(sensing: Sensing, sight: PoseResiduals, runs: list[int]) -> bool:
     """Whether a sensor is off for a long stretch in which the others on its body are right."""
-    if not runs:
-        return False
     span = runs[-1] - runs[0] + 1
     if span < STRETCH or len(runs) < FILLED * span:
         return False
@@ -109,24 +124,39 @@ class PoseMovingMetal(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'t_start_s': 's', 't_end_s': 's'}
 
     def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
-        """Return one record for all sensors that are off at the time."""
-        found = {s.view.sensor: episode_windows(s, sight) for s in sight.sensors}
-        found = {name: windows for name, windows in found.items() if windows}
-        if not found:
-            return []
-        # A sensor that is off pulls the frames, and with them the others, a little way.
-        alone = {
-            s.view.sensor
-            for s in sight.sensors
-            if _is_alone(s, sight, found.get(s.view.sensor, []))
-        }
-        found = {name: windows for name, windows in found.items() if name in (alone or found)}
+        """Return a record of the sensors that are off at one time, for each such time."""
+        found = {s.view.sensor: episode(s, sight) for s in sight.sensors}
+        alone = {w for one in found.values() if one.is_alone for w in one.windows}
+        groups: list[tuple[int, int, list[str]]] = []
+        for name, one in found.items():
+            # A sensor that is off pulls the frames, and with them the others, a little way.
+            windows = one.windows if one.is_alone else _apart(one.windows, alone)
+            if not windows:
+                continue
+            group = windows[0], windows[-1], [name]
+            for other in [g for g in groups if g[0] <= group[1] and group[0] <= g[1]]:
+                groups.remove(other)
+                ends = min(other[0], group[0]), max(other[1], group[1])
+                group = *ends, other[2] + group[2]
+            groups.append(group)
         start, length = sight.setting.start, sight.setting.duration / WINDOWS
-        first = min(min(w) for w in found.values())
-        last = max(max(w) for w in found.values()) + 1
-        values = {'t_start_s': start + first * length, 't_end_s': start + last * length,
-                  'sensors': list(found)}  # fmt: skip
-        return [EffectRecord(self.name, values, {'t_start_s': length, 't_end_s': length})]
+        return [
+            EffectRecord(
+                self.name,
+                {'t_start_s': start + first * length, 't_end_s': start + (last + 1) * length,
+                 'sensors': names},
+                {'t_start_s': length, 't_end_s': length},
+            )
+            for first, last, names in sorted(groups)
+        ]  # fmt: skip
+
+
+def _apart(windows: Sequence[int], others: set[int]) -> list[int]:
+    """The stretches of windows that have none in common with others."""
+    stretches = np.split(np.array(windows), np.flatnonzero(np.diff(windows) > 1) + 1)
+    return [
+        int(w) for stretch in stretches if others.isdisjoint(stretch.tolist()) for w in stretch
+    ]
 
 
 class LooseMount(PoseEffect):
@@ -150,7 +180,7 @@ class LooseMount(PoseEffect):
             if (
                 share < LOOSE
                 or max(others) > FAST * share * place
-                or episode_windows(sensing, sight)
+                or episode(sensing, sight).windows
             ):
                 continue
             values = {'sensor': name, 'rms_m': place, 'rms_deg': float(np.rad2deg(turn))}
