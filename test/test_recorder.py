@@ -117,9 +117,10 @@ def test_a_bag_is_complete_and_described(start, source, tmp_path):
 
 def test_a_kill_costs_less_than_a_second(start, source, tmp_path):
     process = begin(start, source, tmp_path)
-    end = time.monotonic() + 4.5
-    while time.monotonic() < end:
+    sent_s, end_s = [], time.time() + 4.5
+    while time.time() < end_s:
         source.send()
+        sent_s.append(time.time())
         time.sleep(0.02)
     last_s = time.time()
     process.interrupt(signal.SIGKILL)
@@ -128,7 +129,7 @@ def test_a_kill_costs_less_than_a_second(start, source, tmp_path):
     poses = [m for m in messages if m.topic == '/optical/tool_a/pose']
     assert salvage.lost
     assert last_s - max(m.log_time_ns for m in poses) * 1e-9 <= 1.0
-    assert len(poses) > 40
+    assert len(poses) > 0.9 * sum(moment_s < last_s - 1.0 for moment_s in sent_s)
     info = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
     info = info['rosbag2_bagfile_information']
     assert info['relative_file_paths'] == ['bag_0.mcap']

@@ -84,7 +84,10 @@ def test_the_nodes_give_the_same_poses(domain, followed, tmp_path, rate, length_
         live, estimates = received[topics[name]], followed.sensors[name].estimates[: stamps.size]
         good = np.array([estimate.state == OK for estimate in estimates])
         assert good.mean() > 0.99
-        np.testing.assert_array_equal(np.sort(live.stamp_ns), stamps[good], 'every frame, once')
+        assert np.unique(live.stamp_ns).size == live.stamp_ns.size, 'every frame once'
+        assert np.isin(live.stamp_ns, stamps[good]).all()
+        # In time, a busy machine skips frames in favour of newer ones.
+        assert live.stamp_ns.size >= (0.5 if rate else 1.0) * good.sum()
         offline = np.array([estimate.position for estimate in estimates])
         frames = np.searchsorted(stamps, live.stamp_ns)
         steps.append(np.linalg.norm(live.position - offline[frames], axis=1))

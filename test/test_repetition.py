@@ -54,6 +54,14 @@ class TestRings:
         assert (np.delete(ages, np.arange(3)[columns]) == 0).all()
         assert watch.repeats == (column is None)
 
+    def test_a_ring_of_all_columns_is_found_as_soon_as_it_proves_itself(self):
+        """One column's anchor is enough for all: a window may end just behind the first of it."""
+        watch = RepetitionWatch(42, RATE_HZ, TONES)
+        past = fresh(20_000, np.full(42, 2.4))
+        feed(watch, past, 400)
+        feed(watch, past[-4000 : -4000 + 48])
+        assert (watch.ages(20_000) == 4000).all()
+
     def test_a_ring_that_ends_is_forgotten_with_its_samples(self):
         watch = RepetitionWatch(2, RATE_HZ, TONES)
         past = fresh(8000, [2.4, 2.4])

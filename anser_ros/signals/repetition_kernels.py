@@ -60,6 +60,27 @@ def _run_length(history, row, column, lag, longest):  # type: ignore[no-untyped-
 
 
 @numba.njit(cache=True, error_model='numpy')
+def _begin(  # type: ignore[no-untyped-def]
+    history, row, at, found, known, needed, lag, run, until, age
+):
+    """Begin to follow, at a lag that one column has, all that have it; how many these are.
+
+    What a buffer repeats it repeats in all columns, of which most meet no anchor yet.
+    """
+    begun = 0
+    for c in range(history.shape[1]):
+        if lag[c] > 0:
+            continue
+        same = _run_length(history, row, c, found, min(needed[c], known))
+        if same >= FINGERPRINT_SAMPLES:
+            lag[c], run[c] = found, same
+            begun += 1
+            if same >= needed[c]:
+                until[c], age[c] = at + 1, found
+    return begun
+
+
+@numba.njit(cache=True, error_model='numpy')
 def search(  # type: ignore[no-untyped-def]
     history, first, count, position, contiguous, fingerprint, probes, probed_at, slots, needed,
     lag, run, until, age,
@@ -110,13 +131,9 @@ def search(  # type: ignore[no-untyped-def]
                 found = at - probed_at[0 if mark == short[c] else 1 if mark == middle[c] else 2]
             if found <= 0 or lag[c] > 0 or found >= rows - needed[c]:
                 continue
-            longest = min(needed[c], contiguous + i + 1)
-            same = _run_length(history, row, c, found, longest)
-            if same >= FINGERPRINT_SAMPLES:
-                lag[c], run[c] = found, same
-                followed += 1
-                if same >= needed[c]:
-                    until[c], age[c] = at + 1, found
+            if _run_length(history, row, c, found, FINGERPRINT_SAMPLES) == FINGERPRINT_SAMPLES:
+                known = contiguous + i + 1
+                followed += _begin(history, row, at, found, known, needed, lag, run, until, age)
         for k in range(probed_at.size):
             if (at + 1) % PROBE_SAMPLES[k] == 0:
                 probes[k] = fingerprint
