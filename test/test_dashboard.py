@@ -286,7 +286,7 @@ def test_the_loop_from_recording_to_undo(tmp_path, monkeypatch):
         assert loop.comparison() == []
         chain.refuses = 'tracker'
         await loop.load()
-        assert (loop.said, loop.is_trouble) == ('tracker: not a model', True)
+        assert (loop.message, loop.is_trouble) == ('tracker: not a model', True)
         assert chain.files == {'field_model': 'nominal', 'tracker': ''}, 'all or none'
         chain.refuses = ''
         await loop.load()

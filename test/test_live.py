@@ -184,7 +184,7 @@ def test_frames_are_handed_over_as_objects_while_two_senders_are_still_told(ros)
     assert got == [frame] and got[0] is frame
     stranger = ros.create_node('stranger')
     stranger.create_publisher(PointCloud2, '/anser/tool/flux', qos.STREAM)
-    assert spin_until(stranger, lambda: '2 publishers' in source.said)
+    assert spin_until(stranger, lambda: '2 publishers' in source.complaint)
     giver.hand_over(publisher, frame)
     assert len(got) == 1
     for node in (giver, taker, stranger):

@@ -85,7 +85,7 @@ def test_a_body_answers_alike_whoever_asks(scenery, kind):
     emitters = Dipoles(places, axes, np.eye(2).astype(complex))
     sources = shapes.sources(centre, couplings, emitters, omega)
     plain = sources.flux(places, axes, None)
-    ears = shapes.heard(centre, places, axes, np.zeros(2))
+    ears = shapes.received(centre, places, axes, np.zeros(2))
     drive = shapes.driven(emitters.field(centre + shapes.offsets))
     np.testing.assert_allclose(shapes.flux(ears, drive, couplings, omega), plain, rtol=1e-9)
     unit = shapes.mode_flux(ears, drive, np.eye(shapes.size), omega)
@@ -117,7 +117,7 @@ def test_a_coupled_body_is_a_sum_of_few_multipoles():
     axes /= np.linalg.norm(axes, axis=1)[:, None]
     wanted = sources.flux(places, axes, None)
     shapes = multipoles()
-    ears = shapes.heard(centre, places, axes, np.zeros(150))
+    ears = shapes.received(centre, places, axes, np.zeros(150))
     drive = shapes.driven(emitters.field(centre + shapes.offsets))
     unit = shapes.mode_flux(ears, drive, np.eye(shapes.size), np.full(6, 4e4))
     unit = (unit * body_spread(0.04, 1.0)).reshape(-1, shapes.size)

@@ -28,10 +28,10 @@ class Held:
         self.let, self.share = threading.Event(), 0.4
         build, refit = tables.build_tables, refit_start.LiveRefit
 
-        def held(*given, told, **named):
-            told(self.share)
+        def held(*given, report, **named):
+            report(self.share)
             assert self.let.wait(20.0)
-            return build(*given, told=told, **named)
+            return build(*given, report=report, **named)
 
         def held_refit(*given, **named):
             assert self.let.wait(20.0)
@@ -157,10 +157,10 @@ def test_tables_that_nobody_wants_any_more_are_given_up(ros, monkeypatch):
 
     world, begun, goes_on = anser_world(), threading.Event(), threading.Event()
 
-    def endless(*_given, told):
+    def endless(*_given, report):
         begun.set()
         while True:
-            told(0.5)
+            report(0.5)
             goes_on.wait(20.0)
 
     monkeypatch.setattr(tables, 'build_tables', endless)

@@ -21,7 +21,7 @@ def test_one_sender_is_believed_with_losses_pauses_and_from_any_number():
     now_s, believed = feed(sources, [700, 701, 705, 706, 900, 901], 1)
     assert all(believed)
     assert all(feed(sources, [950, 951], 1, now_s + 5.0)[1])
-    assert sources.said == ''
+    assert sources.complaint == ''
 
 
 @pytest.mark.parametrize('first', [1, 3, 499, 500, 502, 9000])
@@ -34,7 +34,7 @@ def test_no_message_of_a_second_is_believed_once_numbers_can_tell(first, publish
     _, believed = feed(sources, mixed, publishers, now_s)
     # Until the graph knows both, a jump ahead looks like a loss, till the first one goes on.
     assert not any(believed[0 if publishers == 2 or first <= 500 else 1 :])
-    assert sources.said == 'two publishers of tool/flux'
+    assert sources.complaint == 'two publishers of tool/flux'
 
 
 @pytest.mark.parametrize('publishers', [1, 2])
@@ -86,5 +86,5 @@ def test_without_numbers_the_graph_decides():
     sources = Senders('tool/flux')
     assert sources.take(None, 1, 0.0)
     assert not sources.take(None, 2, 0.1)
-    assert sources.said == '2 publishers of tool/flux'
+    assert sources.complaint == '2 publishers of tool/flux'
     assert sources.take(None, 1, 0.2)

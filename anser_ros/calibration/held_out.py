@@ -124,8 +124,8 @@ def predict_held_out(
             for block in frame_blocks(len(test.time), len(test.sensors)):
                 part = test.frames(block)
                 terms = pose_terms(part, part_fit.dipoles, part_fit.fit.moments)
-                told = None if left is None else expected_power(left, part_fit.dipoles, part)
-                tally.add(terms, usable_weights(part), part.position, told)
+                expected = None if left is None else expected_power(left, part_fit.dipoles, part)
+                tally.add(terms, usable_weights(part), part.position, expected)
     return tally.result()
 
 
@@ -149,10 +149,10 @@ class HeldOutTally:
         self.excess: list[Array] = []
         self.place: list[Array] = []
         self.frame_power: list[Array] = []
-        self.told: list[Array] = []
+        self.expected: list[Array] = []
 
     def add(
-        self, terms: PoseTerms, weights: Array, place: Array, told: Array | None = None
+        self, terms: PoseTerms, weights: Array, place: Array, expected: Array | None = None
     ) -> None:
         """Take in frames with weights (F, S) of their readings, places (F, 3), m, and the power
         (F,), T^2, that their errors should have.
@@ -169,8 +169,8 @@ class HeldOutTally:
         self.place.append(place)
         self.frame_power.append(power.sum(axis=1) / np.maximum(used.sum(axis=1), 1))
         self.excess.append(white.excess_power(terms.residual, self.flux_noise_t))
-        if told is not None:
-            self.told.append(told)
+        if expected is not None:
+            self.expected.append(expected)
 
     def result(self) -> HeldOut:
         """Return the figures of all frames that were taken in."""
@@ -189,7 +189,7 @@ class HeldOutTally:
             n_dipoles=self.n_dipoles,
             place=np.concatenate(self.place),
             frame_rmse_t=np.sqrt(np.concatenate(self.frame_power)),
-            gap_factor=factor_of(np.concatenate(self.told), found) if self.told else 1.0,
+            gap_factor=factor_of(np.concatenate(self.expected), found) if self.expected else 1.0,
         )
 
 

@@ -94,12 +94,12 @@ def _noise(
         return stated, np.ones(len(mean))
     left = np.where(measured.usable[:, :, None], measured.flux - mean, 0.0)
     power = (np.abs(left) ** 2).sum(axis=(0, 2))
-    told = freedom >= FEWEST_SCATTERS
+    is_measured = freedom >= FEWEST_SCATTERS
     scatter = np.sqrt(power / np.maximum(freedom, 1))
-    middle = float(np.median(scatter[told]))
+    middle = float(np.median(scatter[is_measured]))
     # Few numbers make a scatter too small by chance, and no sensor is that much better.
-    noise = np.where(told, np.maximum(scatter, middle), stated)
-    return noise, np.where(told, scatter / max(middle, 1e-300), 1.0)
+    noise = np.where(is_measured, np.maximum(scatter, middle), stated)
+    return noise, np.where(is_measured, scatter / max(middle, 1e-300), 1.0)
 
 
 def calibrate_at_one_place(
@@ -135,9 +135,9 @@ def calibrate_at_one_place(
     """
     posed = with_pose(measurements)
     mean = _Mean.of(posed, accuracy)
-    heard = mean.readings.flux[mean.readings.used].any(axis=(0, 2))
-    if not heard.all():
-        silent = ', '.join(emitters[k] for k in np.flatnonzero(~heard))
+    received = mean.readings.flux[mean.readings.used].any(axis=(0, 2))
+    if not received.all():
+        silent = ', '.join(emitters[k] for k in np.flatnonzero(~received))
         raise FitError(f'{measurements.body}: all fluxes of {silent} are zero')
     looked_for = tuple(kind for kind in KINDS if kind in kinds)
     looked_for += ('polarity',) if looked_for else ()

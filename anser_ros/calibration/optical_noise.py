@@ -88,17 +88,17 @@ def estimate_noise(
     present : OpticalNoise
         The jitter that the steps were found with.
     """
-    power, told, count, share_sum = np.zeros(2), np.zeros(2), 0, 0.0
+    power, information, count, share_sum = np.zeros(2), np.zeros(2), 0, 0.0
     for step, variance, share, keep in zip(steps, variances, shares, kept, strict=True):
         each = (step**2 / share[:, None])[keep]
         seen = (1.0 - variance / (present.jitter**2 * share[:, None]))[keep]
         power += [each[:, :3].sum(), each[:, 3:].sum()]
-        told += [seen[:, :3].sum(), seen[:, 3:].sum()]
+        information += [seen[:, :3].sum(), seen[:, 3:].sum()]
         count, share_sum = count + int(keep.sum()), share_sum + float(share[keep].sum())
-    sigma = np.sqrt(power / np.maximum(told, 1.0))
+    sigma = np.sqrt(power / np.maximum(information, 1.0))
     return OpticalNoise(
         max(float(sigma[0]), SMALLEST_M),
         max(float(sigma[1]), SMALLEST_RAD),
-        float(told.min()) / 3.0,
+        float(information.min()) / 3.0,
         share_sum / max(count, 1),
     )

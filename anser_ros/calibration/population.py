@@ -140,9 +140,9 @@ class Population:
                 if not rows.size:
                     continue
                 variance = np.diag(found.covariance)[rows]
-                told = rows.size - float((variance / width[rows] ** 2).sum())
+                freedom = rows.size - float((variance / width[rows] ** 2).sum())
                 power = float((found.values[rows] ** 2).sum())
-                new = np.sqrt(power / max(told, 1e-3))
+                new = np.sqrt(power / max(freedom, 1e-3))
                 width[rows] = np.clip(new, NARROWEST[kind], PRIOR[kind])
             found = solve(likelihood, width)
         return found
@@ -201,10 +201,10 @@ class Population:
 
     def undetermined(self, likelihood: Likelihood) -> dict[str, float]:
         """Return the kinds that the data do not usefully determine, with their uncertainty."""
-        told = self._told(likelihood)
-        return {kind: size for kind, size in told.items() if size > USEFUL[kind]}
+        sigmas = self._data_sigmas(likelihood)
+        return {kind: size for kind, size in sigmas.items() if size > USEFUL[kind]}
 
-    def _told(self, likelihood: Likelihood) -> dict[str, float]:
+    def _data_sigmas(self, likelihood: Likelihood) -> dict[str, float]:
         """How far the data by themselves determine each kind: its typical standard deviation."""
         width = self._start(())
         variance = np.maximum(np.diag(solve(likelihood, width).covariance), 0.0)
@@ -223,16 +223,16 @@ class Population:
         found : Posterior
             With all kinds.
         """
-        parameters, told = self.parameters, self._told(likelihood)
+        parameters, sigmas = self.parameters, self._data_sigmas(likelihood)
         if SHARED_SHIFT not in parameters.asked:
             return 0.0
-        if told.get(SHARED_SHIFT, np.inf) <= USEFUL[SHARED_SHIFT]:
+        if sigmas.get(SHARED_SHIFT, np.inf) <= USEFUL[SHARED_SHIFT]:
             variance = np.diag(found.covariance)[parameters.rows(SHARED_SHIFT)].reshape(-1, 3)
             return float(np.sqrt(variance.mean(axis=1).min()))
-        if 'places' not in told or all(len(table) < 2 for table in parameters.tables):
+        if 'places' not in sigmas or all(len(table) < 2 for table in parameters.tables):
             return SURVEYED_M
         width = np.sqrt(np.mean(found.width[parameters.rows('places')] ** 2))
-        return float(min(SURVEYED_M, AS_PLACES * np.hypot(width, told['places'])))
+        return float(min(SURVEYED_M, AS_PLACES * np.hypot(width, sigmas['places'])))
 
     def fixed(self, likelihood: Likelihood) -> tuple[str, ...]:
         """Return the kinds that the data do not determine: they stay at zero.

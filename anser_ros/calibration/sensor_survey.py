@@ -172,13 +172,13 @@ class SensorSurveyor:
             self.population = Population(self.parameters)
             self.values = np.zeros(0)
         for step in range(COARSE_STEPS):
-            self._tell(step / total)
+            self._report(step / total)
             moved = self._step(tools, inspect=step > 0)
             if step > 2 and moved < 10.0 * SMALL_STEP:
                 break
         tools = self._tools(MOST_ROWS)
         for step in range(FINE_STEPS):
-            self._tell((COARSE_STEPS + 3 * step) / total)
+            self._report((COARSE_STEPS + 3 * step) / total)
             # Metal is looked for once field and sensors fit: where neither is known yet, both look
             # as if something moved, and what is left out is not learnt.
             moved = self._step(tools, inspect=True, watch=step > 0)
@@ -233,7 +233,7 @@ class SensorSurveyor:
         wide = {kind: PRIOR[kind] for kind in self.parameters.asked if kind in not_tried}
         return {**self.population.undetermined(self.likelihood), **wide}
 
-    def _tell(self, share: float) -> None:
+    def _report(self, share: float) -> None:
         if self.progress is not None:
             self.progress('sensors and clock', share)
 
@@ -318,8 +318,8 @@ class SensorSurveyor:
         """Set the field's prior width to what makes its amplitudes most probable."""
         scale = (self.flux_rms * self.modes.size)[:, None]
         power = float((((self.field - self.middle) / scale) ** 2).sum())
-        told = self.field.size - float((variance / (self.field_width * scale) ** 2).sum())
-        self.field_width = max(float(np.sqrt(power / max(told, 1.0))), LEAST_FIELD_WIDTH)
+        freedom = self.field.size - float((variance / (self.field_width * scale) ** 2).sum())
+        self.field_width = max(float(np.sqrt(power / max(freedom, 1.0))), LEAST_FIELD_WIDTH)
 
     @property
     def flux_rms(self) -> float:
@@ -349,8 +349,8 @@ class SensorSurveyor:
             sound = tool.steady & ~bad
             tool.weights = outlier_weights(left, usable * sound[:, None])
             power += float((tool.weights * size).sum()) * left.shape[2]
-            told = min(6.0 / (usable.sum(axis=1).mean() * left.shape[2]), 0.9)
-            count += float(tool.weights.sum()) * left.shape[2] * (1.0 - told)
+            spent = min(6.0 / (usable.sum(axis=1).mean() * left.shape[2]), 0.9)
+            count += float(tool.weights.sum()) * left.shape[2] * (1.0 - spent)
             prior = 1.0 / (self.optical.jitter**2 * share[:, None])
             step, variance = self._pose_steps(terms, tool.weights, prior)
             steps.append(step)

@@ -366,13 +366,13 @@ class SourcesFitter:
         left = self.readings.flux[:, k] * sign[:, None] - self._basis(source) @ source.moments
         root = self._root(left, self._spread(k, source, widths))
         strength = (STRAY * float(np.linalg.norm(source.moments[:3]))) ** -2.0
-        told = np.zeros(len(self.grid))
+        gains = np.zeros(len(self.grid))
         for c in range(left.shape[1]):
             rows = self.grid_rows * root[None, :, c, None]
             normal = rows.transpose(0, 2, 1) @ rows + strength * np.eye(3)
             pull = rows.transpose(0, 2, 1) @ (left[:, c] * root[:, c])
-            told += (pull * np.linalg.solve(normal, pull[..., None])[..., 0]).sum(axis=1)
-        return np.asarray(self.grid[int(np.argmax(told))])
+            gains += (pull * np.linalg.solve(normal, pull[..., None])[..., 0]).sum(axis=1)
+        return np.asarray(self.grid[int(np.argmax(gains))])
 
     def _result(self, sources: Sequence[LocatedSource], widths: dict[str, float]) -> SourcesFit:
         sign = self._signs(sources, widths)

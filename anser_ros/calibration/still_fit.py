@@ -190,10 +190,10 @@ class StillFitter:
                 weights = system.student_weights(model.usable)
             if 2 <= step < STEPS - 2:
                 widths = self._learnt(system, beside)
-        told = 1.0 - system.moment_variance / widths.moments[:, None] ** 2
+        determined = 1.0 - system.moment_variance / widths.moments[:, None] ** 2
         return StillFit(
             model, sites, beside, now, np.sqrt(system.sensor_variance), widths, weights,
-            float(told.sum(axis=0).mean()), system.log_evidence(model.usable), {},
+            float(determined.sum(axis=0).mean()), system.log_evidence(model.usable), {},
         )  # fmt: skip
 
     def _moved(self, sites: DipoleSites, steps: Array) -> DipoleSites:

@@ -216,5 +216,5 @@ class StillSystem:
         size = widths[:, :, None, None]
         inner = np.eye(3 * parts) + normal[None] * size**2
         step = np.linalg.solve(inner, (pull[None] * widths[:, :, None])[..., None])[..., 0]
-        told = 0.5 * (pull[None] * widths[:, :, None] * step).sum(axis=2)
-        return np.asarray(told - 0.5 * np.linalg.slogdet(inner)[1])
+        explained = 0.5 * (pull[None] * widths[:, :, None] * step).sum(axis=2)
+        return np.asarray(explained - 0.5 * np.linalg.slogdet(inner)[1])

@@ -39,9 +39,9 @@ def undetermined_words(result: SurveyResult) -> tuple[str, ...]:
     words = []
     for kind, size in result.undetermined.items():
         factor, unit = UNITS[kind]
-        told = f'{_short(factor * size)} {unit}'
+        limit = f'{_short(factor * size)} {unit}'
         words.append(
-            f'{kind}: the scan determines it only to {told}; the value of the setup is kept'
+            f'{kind}: the scan determines it only to {limit}; the value of the setup is kept'
         )
     return tuple(words)
 
@@ -56,11 +56,11 @@ def reversed_sensors(
     """
     if not channels.size:
         return ()
-    told = {
+    found = {
         'log_probability': float(evidence.min()),
         'held_out_log_probability': float(held_out.min()),
     }
-    return (EffectRecord('sensor_polarity', {'channels': channels.tolist()}, {}, told),)
+    return (EffectRecord('sensor_polarity', {'channels': channels.tolist()}, {}, found),)
 
 
 def noisy_sensors(channels: NDArray[np.int64], ratios: Array) -> tuple[EffectRecord, ...]:

@@ -170,8 +170,10 @@ def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
         ('noise, T a component', f'{calibration.fit.noise_t:.3g}'),
     )
     if optical := document['optical_noise']:
-        told = f'{1e3 * optical["position_m"]:.3f} mm, {DEGREES * optical["rotation_rad"]:.4f} deg'
-        rows += (('optical jitter a component, at most', told),)
+        jitter = (
+            f'{1e3 * optical["position_m"]:.3f} mm, {DEGREES * optical["rotation_rad"]:.4f} deg'
+        )
+        rows += (('optical jitter a component, at most', jitter),)
     for name, value in rows:
         table.add_row(name, value)
     for effect in calibration.model.effects:

@@ -97,18 +97,18 @@ def verdict(found: Mapping[str, Mapping[str, Compared | ComparedShares]]) -> str
     parts = []
     for kind, all_of in found.items():
         count = Counter(one.verdict for one in all_of.values())
-        said = [f'{WORDS[key]} better for {count[key]}' for key in 'ab' if count[key]]
+        counted = [f'{WORDS[key]} better for {count[key]}' for key in 'ab' if count[key]]
         none = 'no difference' if any(one.n for one in all_of.values()) else 'nothing to compare'
-        parts.append(f'{words[kind]}: {", ".join(said) or none} of {len(all_of)}')
+        parts.append(f'{words[kind]}: {", ".join(counted) or none} of {len(all_of)}')
     return '; '.join(parts) + '. Errors are those of frames in which both have a pose.'
 
 
 def alone(found: Mapping[str, Compared]) -> str:
     """State how many errors only one of the two has, as the other gave no pose there."""
     counts = [sum(getattr(one, side) for one in found.values()) for side in ('only_a', 'only_b')]
-    said = [f'{count} only the {WORDS[key]}' for key, count in zip('ab', counts, strict=True)]
+    counted = [f'{count} only the {WORDS[key]}' for key, count in zip('ab', counts, strict=True)]
     pairs = sum(one.n for one in found.values())
-    return f'Both have {pairs} poses with an error; {", ".join(said)} has.'
+    return f'Both have {pairs} poses with an error; {", ".join(counted)} has.'
 
 
 def _errors(found: Mapping[str, Compared], title: str, scale: float) -> Table:

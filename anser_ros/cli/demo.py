@@ -23,7 +23,7 @@ from anser_ros.cli.supervisor import Supervisor, tail
 from anser_ros.cli.warm_up import compile_kernels
 from anser_ros.errors import ParameterError
 from anser_ros.tracking.estimate import NO_GATE
-from anser_ros.wire.bag_metadata import told
+from anser_ros.wire.bag_metadata import bag_summary
 from anser_ros.wire.config_folder import config_path
 from anser_ros.wire.tcp_ports import LIVE_VIEW
 
@@ -154,7 +154,7 @@ def _report(folder: Path, args: argparse.Namespace, *, interrupted: bool) -> int
     there = bag.is_dir()
     summary: dict[str, object] = {'bag': str(bag) if there else None, 'interrupted': interrupted}
     if there:
-        summary |= told(bag)
+        summary |= bag_summary(bag)
     results = load(data) if data.is_file() else None
     if results is not None:
         summary |= summarise(results)

@@ -263,8 +263,8 @@ def graph(seconds: float) -> list[Observation]:
         last = (done.stderr.strip().splitlines() or [f'exit code {done.returncode}'])[-1]
         last = re.sub(r'^(\[[^]]*\] *)+: *', '', last)  # a log's level, time and name
         return [Observation('ROS', BAD, last, _ros_remedy(last))]
-    told = json.loads(done.stdout.strip().splitlines()[-1])
-    return graph_findings(told)
+    graph = json.loads(done.stdout.strip().splitlines()[-1])
+    return graph_findings(graph)
 
 
 def _ros_remedy(last: str) -> str:
@@ -275,20 +275,19 @@ def _ros_remedy(last: str) -> str:
     return 'source /opt/ros/jazzy/setup.bash, or use the environment that `make` makes'
 
 
-def graph_findings(told: dict[str, Any]) -> list[Observation]:
+def graph_findings(graph: dict[str, Any]) -> list[Observation]:
     """Return what a look at the graph means."""
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
     reach = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')
-    words = f'{told["middleware"]}, domain {domain}, discovery {reach}'
+    words = f'{graph["middleware"]}, domain {domain}, discovery {reach}'
     found = [Observation('ROS', GOOD, words)]
-    for name in told['twice']:
+    for name in graph['twice']:
         remedy = 'end one, or give it a namespace or ROS_DOMAIN_ID of its own'
         found.append(Observation(name, BAD, 'runs more than once', remedy))
-    ours = [name for name in told['nodes'] if name.rsplit('/', 1)[-1] in NODES]
-    words = (
-        f'{len(told["nodes"])} nodes, {len(ours)} of them from anser_ros, {told["topics"]} topics'
-    )
+    ours = [name for name in graph['nodes'] if name.rsplit('/', 1)[-1] in NODES]
+    count, topics = len(graph['nodes']), graph['topics']
+    words = f'{count} nodes, {len(ours)} of them from anser_ros, {topics} topics'
     found.append(Observation('graph', GOOD, words))
-    for name, text in told['complaints'].items():
+    for name, text in graph['complaints'].items():
         found.append(Observation(name, NOTE, text, 'docs/faults.md explains the states'))
     return found

@@ -183,8 +183,8 @@ def _recorded(first: Path, second: Path) -> dict[str, Any]:
     kept = {name: kept_share(session) for name, session in sessions.items()}
     return {
         'watcher_said_after_s': {
-            name: NANO * (told_ns - sessions['first'].start_ns)
-            for name, told_ns in first_warnings(first, f'{AFTER}/watcher'.strip('/')).items()
+            name: NANO * (warned_ns - sessions['first'].start_ns)
+            for name, warned_ns in first_warnings(first, f'{AFTER}/watcher'.strip('/')).items()
         },
         'kept_share': kept,
         'too_busy': min(kept.values()) < LEAST_KEPT,

@@ -14,7 +14,7 @@ from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.recorded_poses import LiveErrors, live_errors
 from anser_ros.sessions.session import Session
 
-NAMED, PARTLY, SAID = 'named', 'named in part', 'said unexplained'
+NAMED, PARTLY, UNEXPLAINED = 'named', 'named in part', 'said unexplained'
 MISSED, WRONG = 'missed', 'wrong name'
 SITES = ('channel', 'channels', 'coil', 'coils')
 FIGURES = ('rmse', 'prc95')
@@ -37,7 +37,7 @@ def verdict(truth: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> str:
     Returns
     -------
     str
-        `NAMED`, `PARTLY`, `SAID`, `MISSED`, `WRONG` or the empty string.
+        `NAMED`, `PARTLY`, `UNEXPLAINED`, `MISSED`, `WRONG` or the empty string.
     """
     names = [effect['name'] for effect in diagnosis['effects']]
     unexplained = diagnosis['unexplained']['fraction'] > 0.0
@@ -48,7 +48,7 @@ def verdict(truth: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> str:
         same = all(_same_site(truth['parameters'], e['parameters']) for e in diagnosis['effects'])
         return NAMED if same else WRONG
     if not names:
-        return SAID if unexplained else MISSED
+        return UNEXPLAINED if unexplained else MISSED
     return PARTLY if unexplained and not answers else WRONG
 
 

@@ -107,19 +107,19 @@ def _cook(
         for command in recipe.commands(bags, out):
             if not args.quiet:
                 console.print(f'$ anser {" ".join(command)}', highlight=False, soft_wrap=True)
-            said = io.StringIO()
-            with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            printed = io.StringIO()
+            with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
                 code = main.main(command)
             if code:
                 raise ParameterError(
-                    f'{recipe.name}: anser {command[0]} ended with {code}: {_last(said)}'
+                    f'{recipe.name}: anser {command[0]} ended with {code}: {_last(printed)}'
                 )
         return recipe.rows(folder, bags, out)
 
 
-def _last(said: io.StringIO) -> str:
+def _last(printed: io.StringIO) -> str:
     """The last line that a command said."""
-    return (said.getvalue().strip().splitlines() or ['nothing said'])[-1]
+    return (printed.getvalue().strip().splitlines() or ['nothing said'])[-1]
 
 
 def _write_bags(names: Iterable[str], shared: Path, into: Path, console: Console) -> None:

@@ -85,7 +85,7 @@ class _Lines:
 
     def __init__(self, command: str) -> None:
         self._command, self._remaining = command, _Remaining()
-        self._begin_s = self._said_s = time.monotonic()
+        self._begin_s = self._shown_s = time.monotonic()
 
     def tell(self, stage: str, share: float | None = None) -> None:
         """Take in how far a stage is, and say it where it is time to."""
@@ -95,9 +95,9 @@ class _Lines:
                 self._say(f'{stage}, after {now_s - self._begin_s:.0f} s')
             return
         left = self._remaining.words(stage, share)
-        if now_s - self._said_s < LINE_INTERVAL_S:
+        if now_s - self._shown_s < LINE_INTERVAL_S:
             return
-        self._said_s = now_s
+        self._shown_s = now_s
         self._say(', '.join(filter(None, (f'{stage}, {share:.0%}', left))))
 
     def _say(self, words: str) -> None:

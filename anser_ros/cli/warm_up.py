@@ -79,15 +79,15 @@ def compile_kernels(
         if cache.is_full:
             return
         cache.begin()
-        begin_s = said_s = time.monotonic()
+        begin_s = shown_s = time.monotonic()
         say(f'compiling {cache.total} kernels, once after an installation')
         with _processes() as running:
             while any(process.poll() is None for process in running):
                 if is_stopped():
                     return
-                if time.monotonic() - said_s > LINE_INTERVAL_S:
-                    said_s = time.monotonic()
-                    say(f'{cache.done} of {cache.total} kernels, {said_s - begin_s:.0f} s')
+                if time.monotonic() - shown_s > LINE_INTERVAL_S:
+                    shown_s = time.monotonic()
+                    say(f'{cache.done} of {cache.total} kernels, {shown_s - begin_s:.0f} s')
                 time.sleep(POLL_S)
             for process in running:
                 if process.returncode:

@@ -185,8 +185,8 @@ def _without_dead(problem: Problem, known: Sequence[Term]) -> Problem:
     )
     references = problem.references
     if references is not None:
-        heard = ~np.isin(references.readings.sensors.channel, dead)
-        valid = references.readings.valid & heard
+        working = ~np.isin(references.readings.sensors.channel, dead)
+        valid = references.readings.valid & working
         references = replace(references, readings=replace(references.readings, valid=valid))
     return replace(problem, good=good, references=references)
 

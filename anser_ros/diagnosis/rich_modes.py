@@ -65,15 +65,15 @@ def rich_modes(
     values, vectors = np.linalg.eigh(
         _information(few, unit, widest.size) * widest[:, None] * widest
     )
-    told = np.argsort(values)[::-1][:MOST_SIZED_MODES]
-    told = told[values[told] > LEAST_INFORMATION]
-    if told.size == 0:
+    leading = np.argsort(values)[::-1][:MOST_SIZED_MODES]
+    leading = leading[values[leading] > LEAST_INFORMATION]
+    if leading.size == 0:
         return None
-    vectors = vectors[:, told]
+    vectors = vectors[:, leading]
     group = _both_phases(few, unit, widest[:, None] * vectors)
     columns, prior = known
     sums = block_sums(few, joined([columns, group]), blocks)
-    width, count = prior.size, told.size
+    width, count = prior.size, leading.size
     bare = sums.columns(np.arange(width))
     best: tuple[float, Array] = (bare.held_out(prior, FOLDS), np.zeros((0, 0)))
     for spread in spreads:
@@ -88,9 +88,9 @@ def rich_modes(
     if root.size == 0:
         return None
     total = sums.normal.sum(axis=0)[width : width + count, width : width + count]
-    told_by, turn = np.linalg.eigh(root.T @ total @ root)
-    order = np.argsort(told_by)[::-1][:most]
-    order = order[told_by[order] > LEAST_INFORMATION]
+    information, turn = np.linalg.eigh(root.T @ total @ root)
+    order = np.argsort(information)[::-1][:most]
+    order = order[information[order] > LEAST_INFORMATION]
     if not order.size:
         return None
     return best[0], (widest[:, None] * vectors) @ root @ turn[:, order]

@@ -97,12 +97,14 @@ def _likeness(seen: ComplexArray, wanted: ComplexArray, good: Mask) -> tuple[Com
     return gain, np.abs(cross) / np.sqrt(np.maximum(power * own[:, None], 1e-300))
 
 
-def _moved(alike: Array, heard: Mask) -> NDArray[np.int64]:
+def _moved(alike: Array, is_driven: Mask) -> NDArray[np.int64]:
     """Rows that are plainly another's; none when they are no permutation."""
     rows = np.arange(len(alike))
     order, own = np.argmax(alike, axis=1), np.diag(alike)
     best = alike[rows, order]
-    moved = rows[(order != rows) & heard & (best > ALIKE) & (1 - best**2 < BETTER * (1 - own**2))]
+    moved = rows[
+        (order != rows) & is_driven & (best > ALIKE) & (1 - best**2 < BETTER * (1 - own**2))
+    ]
     return np.asarray(moved if set(order[moved]) == set(moved) else moved[:0])
 
 

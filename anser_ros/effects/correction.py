@@ -128,8 +128,8 @@ class Correction:
 
         Relative, one standard deviation each; None if no effect contains any.
         """
-        told = [term.effect.gain_changes(term, self.surveyed) for term in self.terms]
-        known = [changes for changes in told if changes is not None]
+        every = [term.effect.gain_changes(term, self.surveyed) for term in self.terms]
+        known = [changes for changes in every if changes is not None]
         return np.concatenate(known) if known else None
 
     def optical(self, track: PoseTrack) -> PoseTrack:

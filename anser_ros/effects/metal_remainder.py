@@ -64,7 +64,7 @@ class Couplings:
     def unit(self, view: View) -> NDArray[np.inexact]:
         """Return the flux of each mode, (F, S, K, m)."""
         shapes = self.shapes
-        ears = shapes.heard(self.centre, view.centres, view.axes, view.sensors.length)
+        ears = shapes.received(self.centre, view.centres, view.axes, view.sensors.length)
         drive = shapes.driven(view.illumination.field(self.centre + shapes.offsets))
         return shapes.mode_flux(ears, drive, self.modes, view.omega)
 

@@ -86,7 +86,7 @@ class MovingTerm(BodyTerm):
         field = view.illumination.field(grid.reshape(-1, 3)).reshape(*grid.shape, -1)
         drive = CubicSpline(nodes, self.shapes.driven(field))(at)
         centre = self.centres(view.time) + shift
-        return self.shapes.heard(centre, view.centres, view.axes, view.sensors.length), drive
+        return self.shapes.received(centre, view.centres, view.axes, view.sensors.length), drive
 
     def flux(self, view: View, shift: Array) -> ComplexArray:
         """Return the flux (F, S, K) of the whole body, moved by a shift (m)."""

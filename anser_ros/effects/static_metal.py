@@ -122,7 +122,7 @@ class StaticMetal(Effect[Term]):
     def _seen(self, centre: Array, view: View) -> tuple[Array, ComplexArray]:
         """Amplitudes of the sensors (F, S, M) and of the emitters (K, M) about a centre."""
         shapes = multipoles()
-        ears = shapes.heard(centre, view.centres, view.axes, view.sensors.length)
+        ears = shapes.received(centre, view.centres, view.axes, view.sensors.length)
         return ears, shapes.driven(view.illumination.field(centre + shapes.offsets))
 
     def _flux(self, term: Term, centre: Array, view: View) -> ComplexArray:

@@ -321,10 +321,10 @@ def from_document(document: Any) -> FieldModel:
         references=None if references is None else parse_readings(references, k),
         gaps=None if gaps is None else parse_gaps(gaps),
     )
-    told = document.get('fingerprint')
-    if told is not None and str(told) != model.fingerprint:
+    stated = document.get('fingerprint')
+    if stated is not None and str(stated) != model.fingerprint:
         raise ModelFileError(
-            f'model: the file states the fingerprint {told}, but its content has '
+            f'model: the file states the fingerprint {stated}, but its content has '
             f'{model.fingerprint}; was it changed? Remove the key fingerprint to use it all the '
             'same'
         )

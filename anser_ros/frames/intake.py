@@ -116,7 +116,7 @@ class Intake:
     ) -> None:
         self._channels, self._count = np.asarray(channels, dtype=np.int64), count
         self._spares_dead, self._error = spares_dead, error
-        self._told: bytes | None = None
+        self._last_order: bytes | None = None
         self._rows = np.empty(0, dtype=np.int64)
         self.last_ns = 0
         self.dead: tuple[str, ...] = ()
@@ -227,31 +227,31 @@ class Intake:
         self._find_rows(number)
         count = len(self._channels)
         ordered = np.empty((count, width), dtype=np.complex128)
-        codes, heard = np.empty(count, dtype=np.int64), np.zeros(width, dtype=np.bool_)
+        codes, received = np.empty(count, dtype=np.int64), np.zeros(width, dtype=np.bool_)
         some_dead = fill_frame(
-            given, marks, self._rows, LARGEST_FLUX_T, self._spares_dead, ordered, codes, heard
+            given, marks, self._rows, LARGEST_FLUX_T, self._spares_dead, ordered, codes, received
         )
-        return Frame(stamp_ns, self._channels, ordered, codes, heard if some_dead else None)
+        return Frame(stamp_ns, self._channels, ordered, codes, received if some_dead else None)
 
     def _find_rows(self, number: Integers) -> None:
         """Find each channel's row of the frame, -1 for none; frames seldom differ in this."""
-        told = number.tobytes()
-        if told != self._told:
+        layout = number.tobytes()
+        if layout != self._last_order:
             row = {channel: i for i, channel in enumerate(number.tolist())}
             if len(row) != number.size:
                 raise self._error('a channel appears twice in the frame')
             wanted = self._channels.tolist()
             self._rows = np.array([row.get(c, -1) for c in wanted], dtype=np.int64)
-            self._told = told
+            self._last_order = layout
 
 
 @numba.njit(cache=True, error_model='numpy')
-def fill_frame(given, marks, rows, largest, spares_dead, flux, codes, heard):  # type: ignore[no-untyped-def]
+def fill_frame(given, marks, rows, largest, spares_dead, flux, codes, received):  # type: ignore[no-untyped-def]
     """Write a frame's fluxes (S, K) in a table's order, and what each reading is.
 
     ``rows`` (S,): each sensor's row of the frame, -1 for none. ``largest``: of a component, T.
-    ``codes`` (S,): places in `frames.faults.FAULTS`. ``heard`` (K,), False on entry: emitters that
-    a usable sensor hears. Returns whether some are heard and some are not.
+    ``codes`` (S,): places in `frames.faults.FAULTS`. ``received`` (K,), False on entry: emitters
+    that a usable sensor receives. Returns whether some are received and some are not.
     """
     count, width = flux.shape
     for s in range(count):
@@ -276,17 +276,17 @@ def fill_frame(given, marks, rows, largest, spares_dead, flux, codes, heard):  #
             flux[s, k] = value
             there = math.isfinite(value.real) and math.isfinite(value.imag) and value != 0.0
             if there and bits == 0:
-                heard[k] = True
+                received[k] = True
     number = 0
     for k in range(width):
-        number += heard[k]
+        number += received[k]
     some_dead = 0 < number < width
     for s in range(count):
         if rows[s] < 0:
             continue
         finite, sound = True, True
         for k in range(width):
-            if some_dead and spares_dead and not heard[k]:
+            if some_dead and spares_dead and not received[k]:
                 flux[s, k] = 0.0
                 continue
             real, imag = flux[s, k].real, flux[s, k].imag

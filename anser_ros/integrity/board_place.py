@@ -160,9 +160,9 @@ class BoardPlace:
         """
         found = self.misplacement(flux)
         if found is not None and found.is_certain:
-            told = ', '.join(f'{1e3 * v:+.1f}' for v in found.shift_m)
+            shift = ', '.join(f'{1e3 * v:+.1f}' for v in found.shift_m)
             raise FitError(
-                f'the model lies {1e3 * np.linalg.norm(found.shift_m):.1f} mm ({told} along x, '
+                f'the model lies {1e3 * np.linalg.norm(found.shift_m):.1f} mm ({shift} along x, '
                 'y, z) from where the references locate the board; is it in another frame?'
             )
         return found is not None

@@ -136,8 +136,8 @@ def distances(
         between the axes, rad.
     """
     found = np.empty((3, len(offsets)))
-    told = np.array([survey.position_m, survey.axis_rad, survey.gain])
-    fill_distances(*body, offsets, axes, *coils, took_part, told, found)
+    survey_errors = np.array([survey.position_m, survey.axis_rad, survey.gain])
+    fill_distances(*body, offsets, axes, *coils, took_part, survey_errors, found)
     return found
 
 

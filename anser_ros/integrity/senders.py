@@ -21,7 +21,7 @@ class _Run:
     """Consecutive messages of one sender: the last number, when it came, and what holds by it."""
 
     number: int
-    heard_s: float
+    received_s: float
     lasting: Hashable
 
 
@@ -31,14 +31,14 @@ class Senders:
     Parameters
     ----------
     topic : str
-        As it is called in `said`.
+        As it is called in `complaint`.
     is_constant : bool
         Whether what a sender says never changes: who says otherwise is another one, whatever
         number the message has.
 
     Attributes
     ----------
-    said : str
+    complaint : str
         Why the topic can't be believed now; empty while it has one sender.
     """
 
@@ -46,11 +46,11 @@ class Senders:
         self._topic, self._is_constant = topic, is_constant
         self._runs: list[_Run] = []
         self._is_numbered = True
-        self.said = ''
+        self.complaint = ''
 
     def forget(self) -> None:
         """Forget all that was heard."""
-        self._runs, self.said = [], ''
+        self._runs, self.complaint = [], ''
 
     def continues(self, number: int | None) -> bool:
         """Return whether a message is the next one of the only sender that is heard."""
@@ -84,21 +84,21 @@ class Senders:
                     self._runs.clear()  # it has gone, and this is its successor
                 self._runs.append(_Run(number, now_s, lasting))
             else:
-                run.number, run.heard_s, run.lasting = number, now_s, lasting
+                run.number, run.received_s, run.lasting = number, now_s, lasting
         return not self.look(publishers, now_s)
 
     def look(self, publishers: int, now_s: float) -> str:
-        """Return `said` as it is now, when no message has come."""
+        """Return `complaint` as it is now, when no message has come."""
         self._drop_silent(now_s)
-        said = {run.lasting for run in self._runs}
-        agree = len(said) == 1 and None not in said
+        complaint = {run.lasting for run in self._runs}
+        agree = len(complaint) == 1 and None not in complaint
         if not self._is_numbered and publishers > 1:
-            self.said = f'{publishers} publishers of {self._topic}'
+            self.complaint = f'{publishers} publishers of {self._topic}'
         elif len(self._runs) > 1 and not agree:
-            self.said = f'two publishers of {self._topic}'
+            self.complaint = f'two publishers of {self._topic}'
         else:
-            self.said = ''
-        return self.said
+            self.complaint = ''
+        return self.complaint
 
     def _drop_silent(self, now_s: float) -> None:
         """Drop the runs that have ended.
@@ -108,7 +108,9 @@ class Senders:
         again.
         """
         self._runs = [
-            run for run in self._runs if now_s - run.heard_s < SILENT_S or run.lasting is not None
+            run
+            for run in self._runs
+            if now_s - run.received_s < SILENT_S or run.lasting is not None
         ]
 
     def _is_ended(self, lasting: Hashable, now_s: float) -> bool:
@@ -120,7 +122,7 @@ class Senders:
         (run,) = self._runs
         if run.lasting is not None:
             return run.lasting == lasting
-        return now_s - run.heard_s >= SILENT_S
+        return now_s - run.received_s >= SILENT_S
 
     def _run_of(self, number: int, publishers: int) -> _Run | None:
         """Return the run that a message continues; None for the first of another."""

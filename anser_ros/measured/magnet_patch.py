@@ -236,13 +236,13 @@ def write_sessions(folder: Path, into: Path) -> list[Path]:
 
 def commands(bags: list[Path], out: Path) -> list[list[str]]:
     """Return the commands that model each file, with and without effects, and track the others."""
-    told = []
+    found = []
     for bag in bags:
         for kind, options in (('plain', ['--estimate', 'none']), ('full', [])):
             model = out / f'{bag.stem}_{kind}.yaml'
             report = ['--report', str(out / f'{bag.stem}_{kind}')]
-            told.append(['calibrate', str(bag), '--out', str(model), *report, *options])
-            told += [
+            found.append(['calibrate', str(bag), '--out', str(model), *report, *options])
+            found += [
                 [
                     'evaluate', str(other), '--model', str(model), '--resurveyed', BODY,
                     '--out', str(out / f'{bag.stem}_{kind}_{other.stem}'),
@@ -250,7 +250,7 @@ def commands(bags: list[Path], out: Path) -> list[list[str]]:
                 for other in bags
                 if other != bag
             ]  # fmt: skip
-    return told
+    return found
 
 
 def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:

@@ -73,7 +73,7 @@ class Shapes:
         flat = self.functionals.reshape(len(self.functionals), -1)
         return np.asarray(np.swapaxes(flat @ field.reshape(shape), -1, -2))
 
-    def heard(self, centre: Array, centres: Array, axes: Array, lengths: Array) -> Array:
+    def received(self, centre: Array, centres: Array, axes: Array, lengths: Array) -> Array:
         """Return amplitudes of unit dipoles in the sensors' places, T / (A m^2).
 
         Parameters

@@ -92,7 +92,7 @@ class Dashboard(AnserNode):
         values = {
             'pages': self._server.guard.pages,
             'command': '' if job is None else job.kind,
-            'last_trouble': self._loop.said if self._loop.is_trouble else '',
+            'last_trouble': self._loop.message if self._loop.is_trouble else '',
         }
         return Status('', Level.OK, f'{self._pages.count} pages open', values)
 

@@ -65,12 +65,12 @@ class FieldModelNode(AnserNode):
         self._base: FieldModel | None = None
         self._model: FieldModel | None = None
         self._frozen = self._unfit = False
-        self._told: tuple[bool, ...] = ()
+        self._announced: tuple[bool, ...] = ()
         self._place = PlaceWatch()
         self._trouble = Trouble()
         self._frames: Intake | None = None
         self._stamp_ns = 0
-        self._heard_s = 0.0
+        self._received_s = 0.0
         self._pace = Pace(table.refit_rate_hz)
         self._output = ModelOutput(self)
         self._metal = MetalView(self)
@@ -105,7 +105,7 @@ class FieldModelNode(AnserNode):
             self._refuse('setups_refused', error)
             if isinstance(error, ModelFileError) and self._model is not None:
                 self._unfit = True
-                self._tell_changes()
+                self._announce_changes()
             return
         self._setup_text, self._setup, table = message.data, setup, self.parameters
         self._trouble.forget()
@@ -119,7 +119,7 @@ class FieldModelNode(AnserNode):
         self._refit.prepare(setup, base, self._references, table.refit)
         if base is not self._model:
             self._serve(base, self.get_clock().now().nanoseconds)
-        self._tell_changes()
+        self._announce_changes()
         if self._baseline_bag is not None and len(self._references):
             try:
                 baseline = clean_flux(self._baseline_bag, self._references, base)
@@ -144,7 +144,7 @@ class FieldModelNode(AnserNode):
             for kind, many in frame.kinds.items():
                 self.count(f'readings_{kind}', many)
             window.add(frame)
-            self._heard_s = time.monotonic()
+            self._received_s = time.monotonic()
             if self._refit.is_awaited and not is_live(stamp_ns, time.time_ns()):
                 self._refit.wait()  # a recording that is played is worked off whole
             self._take_refit()
@@ -198,7 +198,7 @@ class FieldModelNode(AnserNode):
         The model of a frame of readings has their stamp, which may be of another day. ``withheld``
         is the state for which trackers should publish no poses, at once or soon.
         """
-        self._told = follows, is_waiting, *_ = self._state
+        self._announced = follows, is_waiting, *_ = self._state
         if self._unfit or self._place.misplaced:
             withheld = states.OTHER_MODEL
         elif is_waiting:
@@ -235,11 +235,11 @@ class FieldModelNode(AnserNode):
     def _look(self) -> None:
         """Notice what changes without a frame."""
         self._take_refit()
-        self._tell_changes()
+        self._announce_changes()
 
-    def _tell_changes(self) -> None:
+    def _announce_changes(self) -> None:
         """Let receivers know of another state than the one that they were told."""
-        if self._model is not None and self._told != self._state:
+        if self._model is not None and self._announced != self._state:
             withheld = self._refit.withheld if self._follows else ''
             self._serve(self._model, self.get_clock().now().nanoseconds, withheld)
 
@@ -247,7 +247,7 @@ class FieldModelNode(AnserNode):
         """Refit to what differs from a baseline, shape (S, K), T, as soon as that can be done."""
         self._refit.begin(baseline, is_awaited)
         self._no_baseline = ''
-        self._tell_changes()
+        self._announce_changes()
         self.count('baselines')
 
     def _take_refit(self) -> None:
@@ -255,10 +255,10 @@ class FieldModelNode(AnserNode):
         try:
             if not self._refit.take():
                 return
-            self._heard_s = time.monotonic()
+            self._received_s = time.monotonic()
         except FitError as error:
             self._refuse_baseline(error)
-        self._tell_changes()
+        self._announce_changes()
 
     def _exchange(self, file_model: FieldModel | None) -> None:
         """Start from another model; the baseline holds, as no model is in the readings.
@@ -277,7 +277,7 @@ class FieldModelNode(AnserNode):
         if setup is not None and references is not None:
             self._refit.prepare(setup, base, references, self.parameters.refit)
             self._refit.begin_again()
-        self._unfit, self._heard_s = False, time.monotonic()
+        self._unfit, self._received_s = False, time.monotonic()
         self._trouble.forget()
         self._output.name_origin(base)
         self._serve_start(base)
@@ -308,7 +308,7 @@ class FieldModelNode(AnserNode):
 
     def _on_freeze(self, request: Any, response: Any) -> Any:
         self._frozen = bool(request.data)
-        self._tell_changes()
+        self._announce_changes()
         response.success = True
         response.message = 'the model stays as it is' if self._frozen else 'the model may change'
         return response
@@ -338,15 +338,15 @@ class FieldModelNode(AnserNode):
         if old.model_file != new.model_file:
             self._exchange(model_of(new.model_file))
         self._pace.rate_hz = new.refit_rate_hz
-        self._tell_changes()
+        self._announce_changes()
 
     def status(self) -> Status:
         """Return which model is in force, where it comes from, and what the refit does."""
         model = self._model
         values: dict[str, object] = {'last_refusal': self._trouble.last}
-        said = sender_words(self._sources)
-        if said:
-            return Status('', Level.ERROR, f'{states.TWO_SOURCES}: {said}', values)
+        conflict = sender_words(self._sources)
+        if conflict:
+            return Status('', Level.ERROR, f'{states.TWO_SOURCES}: {conflict}', values)
         if self._unfit or self._place.misplaced:
             why = self._trouble.last if self._unfit else self._place.misplaced
             return Status('', Level.ERROR, f'{states.OTHER_MODEL}: {why}', values)
@@ -369,7 +369,7 @@ class FieldModelNode(AnserNode):
         lost = f'{states.REFERENCES_LOST}: no reference fluxes'
         if self._place.is_waiting:
             return Status('', Level.WARN, f'{lost} yet', values)
-        silent_s, setup = time.monotonic() - self._heard_s, self._setup
+        silent_s, setup = time.monotonic() - self._received_s, self._setup
         if setup is not None and self._follows and silent_s > setup.refit.references_age_s:
             return Status('', Level.ERROR, f'{lost} for {silent_s:.1f} s', values)
         is_troubled = values.get('refit_state') in refit_status.TROUBLED

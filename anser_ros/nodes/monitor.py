@@ -74,7 +74,7 @@ class Monitor(AnserNode):
         self._setup: Setup | None = None
         self._chains: dict[str, Traces] = {}
         self._optical: dict[str, OpticalTrace] = {}
-        self._told: dict[str, LastStatus] = {}
+        self._statuses: dict[str, LastStatus] = {}
         self._note = ''
         self._metal: list[tuple[float, float]] = []
         self._pose_subscriptions: list[Any] = []
@@ -142,7 +142,7 @@ class Monitor(AnserNode):
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             values = {pair.key: pair.value for pair in status.values}
-            self._told[status.name] = LastStatus(status.level[0], status.message, values)
+            self._statuses[status.name] = LastStatus(status.level[0], status.message, values)
             if status.name.endswith('cu_simulator') and 'metal_distance_m' in values:
                 self._metal.append((time.time(), float(values['metal_distance_m'])))
 
@@ -176,12 +176,12 @@ class Monitor(AnserNode):
 
     def _causes(self) -> list[str]:
         rate_hz = 0.0 if self._setup is None else self._setup.flux_rate_hz
-        return causes(self._told, self.get_namespace().strip('/'), rate_hz)
+        return causes(self._statuses, self.get_namespace().strip('/'), rate_hz)
 
     def _state(self, chain: str, name: str) -> tuple[int, str]:
         namespace = self.get_namespace().strip('/')
         prefix = f'{namespace}/{chain}' if chain else namespace
-        return self._told.get(f'{prefix}/tracker: {name}', LastStatus(1, 'waiting', {}))[:2]
+        return self._statuses.get(f'{prefix}/tracker: {name}', LastStatus(1, 'waiting', {}))[:2]
 
     def _table(self, rows: dict[str, list[Row]]) -> Table:
         """The table; one column for a position, and states only where they are not ok."""

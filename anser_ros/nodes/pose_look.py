@@ -22,13 +22,13 @@ def main(topic: str, seconds: float) -> None:
     rclpy.init()
     node = rclpy.create_node(NAME)
     end = time.monotonic() + max(seconds, FIRST_S)
-    heard = 0
+    received = 0
 
     def take(message: PoseStamped) -> None:
-        nonlocal heard, end
-        if not heard:
+        nonlocal received, end
+        if not received:
             end = time.monotonic() + seconds
-        heard += 1
+        received += 1
         stamp, p, q = message.header.stamp, message.pose.position, message.pose.orientation
         values = [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
         print(json.dumps([stamp.sec * SECOND_NS + stamp.nanosec, *values]), flush=True)
@@ -39,7 +39,7 @@ def main(topic: str, seconds: float) -> None:
     executor.add_node(node)
     while time.monotonic() < end:
         executor.spin_once(timeout_sec=SLICE_S)
-    if not heard:
+    if not received:
         known = [
             name for name, types in node.get_topic_names_and_types()
             if 'geometry_msgs/msg/PoseStamped' in types and node.count_publishers(name)

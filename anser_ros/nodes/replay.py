@@ -211,7 +211,7 @@ class Replay(AnserNode):
         readiness = Readiness(self, fluxes or list(self._outlets.values()), setup)
         self._poses = readiness.poses
         began_s = started_s = time.monotonic()
-        told = ''
+        reported = ''
         while not self._ending.wait(POLL_S):
             now_s, missing = time.monotonic(), readiness.missing()
             waited_s = now_s - began_s
@@ -222,8 +222,8 @@ class Replay(AnserNode):
             if now_s - started_s > self._wait_s:
                 self.warn('no_listeners', f'begins after {waited_s:.3g} s although {missing}')
                 break
-            if waited_s > REPORT_AFTER_S and missing != told:
-                told = missing
+            if waited_s > REPORT_AFTER_S and missing != reported:
+                reported = missing
                 self.get_logger().info(f'waits: {missing}')
         readiness.close()
 

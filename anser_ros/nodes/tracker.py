@@ -94,7 +94,7 @@ class TrackerNode(AnserNode):
         self._trouble = Trouble()
         self._solve_s = 0.0
         self._backlog = Backlog()
-        self._told_s = 0.0
+        self._diagnosed_s = 0.0
         self._load = Load()
         self._model_age_ns = 0
         self._transforms = transform_publisher(self) if table.publish_tf else None
@@ -253,9 +253,11 @@ class TrackerNode(AnserNode):
         begin_s = time.perf_counter()
         stamp_ns, points = frame
         estimates, changed = [], False
-        said = sender_words(self._sources)
-        if said:  # the frame may be another sender's, so the model's age is not told by its stamp
-            standing = FrameModel(None, Withheld(TWO_SOURCES, said))
+        conflict = sender_words(self._sources)
+        if (
+            conflict
+        ):  # the frame may be another sender's, so the model's age is not told by its stamp
+            standing = FrameModel(None, Withheld(TWO_SOURCES, conflict))
         else:
             standing = self._in_force.at(stamp_ns)
         self._withheld = standing.withheld
@@ -286,7 +288,7 @@ class TrackerNode(AnserNode):
         self.count('frames')
         self._solve_s = time.perf_counter() - begin_s
         self._backlog.worked(self._solve_s)
-        if changed and time.monotonic() - self._told_s > EARLIEST_DIAGNOSTICS_S:
+        if changed and time.monotonic() - self._diagnosed_s > EARLIEST_DIAGNOSTICS_S:
             self.publish_diagnostics()
 
     # What is told -------------------------------------------------------------------------
@@ -317,7 +319,7 @@ class TrackerNode(AnserNode):
 
     def status(self) -> Status:
         """Return what the tracker lacks, if anything, and its counters."""
-        self._told_s = time.monotonic()
+        self._diagnosed_s = time.monotonic()
         slow = self._load.words(self.counters['frames_skipped'], self.counters['frames'])
         if slow:
             self.warn('seconds_too_slow', slow)
@@ -330,9 +332,9 @@ class TrackerNode(AnserNode):
         values['pose_listeners'] = sum(topic.listeners for topic in self._topics.values())
         if tracker is not None:
             values |= {name: count for name, count in tracker.counters.items() if name != 'frames'}
-        said = sender_words(self._sources)
-        if said:
-            return Status('', Level.ERROR, f'{TWO_SOURCES}: {said}', values)
+        conflict = sender_words(self._sources)
+        if conflict:
+            return Status('', Level.ERROR, f'{TWO_SOURCES}: {conflict}', values)
         if self._setup is None:
             return Status('', Level.WARN, self._trouble.last or 'no setup yet', values)
         if tracker is None or tracker.model is None:

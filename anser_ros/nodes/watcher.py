@@ -128,7 +128,7 @@ class Watcher(AnserNode):
         self._trouble = ''
         self._known: dict[str, EffectRecord] = {}
         self._pose_subscriptions: dict[str, Any] = {}
-        self._heard_s = 0.0
+        self._received_s = 0.0
         self._next_s = 0.0
         self._look_s = 0.0
         self._busy = False
@@ -219,7 +219,7 @@ class Watcher(AnserNode):
         except AnserError as error:
             self._refuse('fluxes_refused', error)
             return
-        self._heard_s = time.monotonic()
+        self._received_s = time.monotonic()
         self.count('frames')
 
     def _refuse(self, counter: str, error: AnserError) -> None:
@@ -270,16 +270,16 @@ class Watcher(AnserNode):
     # What is told -------------------------------------------------------------------------
 
     def _is_silent(self, now_s: float) -> bool:
-        heard_s = self._heard_s if self._poses is None else self._poses.heard_s
-        return now_s - heard_s > SILENCE_S
+        received_s = self._received_s if self._poses is None else self._poses.received_s
+        return now_s - received_s > SILENCE_S
 
     def status(self) -> Status:
         """Return what is there, in one line, with its figures."""
         window, seen = self._window, self._sighting
         values: dict[str, object] = {'look_cpu_s': self._look_s, 'last_refusal': self._trouble}
-        said = sender_words(self._sources)
-        if said:
-            return Status('', Level.ERROR, f'{TWO_SOURCES}: {said}', values)
+        conflict = sender_words(self._sources)
+        if conflict:
+            return Status('', Level.ERROR, f'{TWO_SOURCES}: {conflict}', values)
         if window is None or self._watch is None:
             return Status('', Level.WARN, self._trouble or 'no setup yet', values)
         values |= {'searches': self._watch.searches, 'restarts': window.restarts}

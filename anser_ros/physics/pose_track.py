@@ -164,8 +164,8 @@ class _Bend:
     ) -> None:
         self.time, last = time, time.size - 1
         first, final = np.maximum(left - REACH[-1], 0), np.minimum(right + REACH[-1], last)
-        told = (left - first == REACH[-1]) & (final - right == REACH[-1]) & (left < right)
-        self.rows = np.flatnonzero(told & (time[final] - time[first] <= LONGEST_GAP_S))
+        is_whole = (left - first == REACH[-1]) & (final - right == REACH[-1]) & (left < right)
+        self.rows = np.flatnonzero(is_whole & (time[final] - time[first] <= LONGEST_GAP_S))
         self.left, self.right, self.count = left[self.rows], right[self.rows], at.size
         at, begin, end = at[self.rows], time[self.left], time[self.right]
         self.factor = -0.5 * (at - begin) * (end - at)

@@ -132,26 +132,25 @@ def read_rightly(session: PoseSession) -> tuple[PoseSession, EffectRecord | None
 
 def reading_words(record: EffectRecord) -> str:
     """Return how a stream was read if it means something else than it says, with the evidence."""
-    read, told = record.parameters, record.evidence
-    said = []
+    read, evidence = record.parameters, record.evidence
+    words = []
     if read['unit'] != 'm':
-        said.append(
-            f'positions in {read["unit"]}, as they extend {told["extent_ratio"]:.3g} times as '
+        words.append(
+            f'positions in {read["unit"]}, as they extend {evidence["extent_ratio"]:.3g} times as '
             "far as the reference's"
         )
     if read['quaternion'] != 'xyzw':
-        said.append(f'quaternions as {read["quaternion"].replace("_", ", ")}')
+        words.append(f'quaternions as {read["quaternion"].replace("_", ", ")}')
     if read['handedness'] != 'right':
-        said.append('left-handed')
-    before = told['misfit_as_written_m']
+        words.append('left-handed')
+    before = evidence['misfit_as_written_m']
     if np.isfinite(before):
-        said.append(
-            f'hand-eye is off by {1e3 * told["misfit_so_read_m"]:.1f} mm so, '
+        words.append(
+            f'hand-eye is off by {1e3 * evidence["misfit_so_read_m"]:.1f} mm so, '
             f'and by {1e3 * before:.0f} mm as written'
         )
-    return (
-        f'the {read["stream"]} poses are read in another convention than stated: {"; ".join(said)}'
-    )
+    stream = read['stream']
+    return f'the {stream} poses are read in another convention than stated: {"; ".join(words)}'
 
 
 def _readings(unit: str) -> Iterator[PoseReading]:

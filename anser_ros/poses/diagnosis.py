@@ -134,11 +134,13 @@ def diagnose_poses(
     before, after = unseen.state(frames.terms), unseen.state(found.terms)
     registered = _registered(frames, unseen)
     floor = _floor(after)
-    sight = _sight(session, problem, whole)
+    residuals = _residuals(session, problem, whole)
     records = _records(whole, search.evidence, session)
     for effect in pose_effects().values():
         words = {'summary': effect.summary, 'advice': effect.advice}
-        records += [replace(r, evidence={**words, **r.evidence}) for r in effect.observed(sight)]
+        records += [
+            replace(r, evidence={**words, **r.evidence}) for r in effect.observed(residuals)
+        ]
     records += swapped
     if convention is not None:
         records.append(convention)
@@ -173,11 +175,11 @@ def _registered(frames: PoseFit, unseen: PoseProblem) -> HeldOutErrors:
     """
     after, squares = unseen.state(frames.terms), {}
     for fitted, part in zip(frames.state.parts, after.parts, strict=True):
-        said, place = fitted.view.optical[fitted.used], fitted.view.measured[fitted.used]
+        optical, place = fitted.view.optical[fitted.used], fitted.view.measured[fitted.used]
         off = part.view.measured[part.used]
         if len(place):
-            rotation = frames_from_places(place, said)
-            shift = np.mean(place - said @ rotation.T, axis=0)
+            rotation = frames_from_places(place, optical)
+            shift = np.mean(place - optical @ rotation.T, axis=0)
             off = off - part.view.optical[part.used] @ rotation.T - shift
         squares[part.view.sensor] = np.sum(off**2, axis=1)
 
@@ -221,7 +223,7 @@ def _sensings(state: PoseState, out: tuple[NDArray[np.bool_], ...]) -> list[Sens
     return found
 
 
-def _sight(session: PoseSession, problem: PoseProblem, whole: PoseFit) -> PoseResiduals:
+def _residuals(session: PoseSession, problem: PoseProblem, whole: PoseFit) -> PoseResiduals:
     every = replace(problem, noise=whole.state.problem.noise)
     out = unexplained_poses(replace(whole, state=every.state(whole.terms)))
     # What stands out of this fit, and not of the one before it: every pose is used or out.
@@ -265,7 +267,7 @@ def _records(
         if one is None:
             continue
         record = term.effect.record(term, spread)
-        told = {
+        words = {
             'summary': term.effect.summary, 'advice': effect_of(term).advice,
             'remedy': term.effect.remedy.value,
             'parameters_spent': int(term.theta.size), 'held_out_gain': one.gain,
@@ -273,7 +275,7 @@ def _records(
             'position_rmse_without_m': one.position_rmse_without_m,
             'position_rmse_with_m': one.position_rmse_with_m,
         }  # fmt: skip
-        records.append(replace(record, evidence=told))
+        records.append(replace(record, evidence=words))
     return one_clock(records, fit.state.problem.setting.duration)
 
 
@@ -297,11 +299,11 @@ def is_lever_determined(part: PosePart, jitter_rad: float) -> NDArray[np.bool_]:
 def lever_reach(part: PosePart) -> Array:
     """Return the lever arm (3,), m, that makes the median error by the turns of the body alone."""
     far = np.linalg.norm(part.residual[part.used, :3], axis=1)
-    told = np.linalg.inv(_told(part) + LEAST_JITTER_RAD**2 * np.eye(3))
-    return np.asarray(np.median(far) * np.sqrt(np.diag(told)))
+    information = np.linalg.inv(_turn_information(part) + LEAST_JITTER_RAD**2 * np.eye(3))
+    return np.asarray(np.median(far) * np.sqrt(np.diag(information)))
 
 
-def _told(part: PosePart) -> Array:
+def _turn_information(part: PosePart) -> Array:
     """How much turns move a unit lever arm, shape (3, 3), squares, along the body's axes."""
     turns = Rotation.from_matrix(part.view.turn[part.used])
     tilt = np.cov((turns.mean().inv() * turns).as_rotvec().T)
@@ -314,9 +316,9 @@ def lever_blur(part: PosePart, jitter_rad: float) -> Array:
     Errors of the measured rotations make a lever arm too small by their share of the rotations'
     variance, whatever its formal uncertainty.
     """
-    told = _told(part)
+    information = _turn_information(part)
     error = 2 * max(jitter_rad, LEAST_JITTER_RAD) ** 2
-    return np.asarray(error * np.diag(np.linalg.inv(told + 1e-3 * error * np.eye(3))))
+    return np.asarray(error * np.diag(np.linalg.inv(information + 1e-3 * error * np.eye(3))))
 
 
 def turn_jitter(reference: PoseSequence) -> float:
@@ -351,8 +353,8 @@ def hand_eye_record(
 
     sigma = np.sqrt(np.maximum(np.diag(spread), 0.0))
     lever = [
-        float(v) if s < LEAST_KNOWN_M and told else None
-        for v, s, told in zip(frames.lever, sigma[:3], is_determined, strict=True)
+        float(v) if s < LEAST_KNOWN_M and is_known else None
+        for v, s, is_known in zip(frames.lever, sigma[:3], is_determined, strict=True)
     ]
     values: dict[str, object] = {
         'sensor': sensor,

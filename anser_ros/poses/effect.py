@@ -201,7 +201,7 @@ class PoseEffect(Effect[Term]):
         """Return tracked poses, (n, 3) m and (n, 3, 3), without what the effect does to them."""
         return position, rotation
 
-    def observed(self, sight: 'PoseResiduals') -> Sequence[EffectRecord]:
+    def observed(self, residuals: 'PoseResiduals') -> Sequence[EffectRecord]:
         """Return what is seen of the effect without a fit; nothing where parameters are fitted."""
         return ()
 

@@ -179,7 +179,7 @@ def fit_hand_eye(
     say('all poses', 0.7)
     fit = _fitted(problem)
     apart = {part.view.sensor: held_out.rms(part.view.sensor) for part in held_out.parts}
-    return _told(session, convention, fit, apart, pairs)
+    return _described(session, convention, fit, apart, pairs)
 
 
 def _fitted(problem: PoseProblem) -> PoseFit:
@@ -205,7 +205,7 @@ def _clock(fit: PoseFit, role: Role, scale: float) -> tuple[float, float] | None
     return None
 
 
-def _told(
+def _described(
     session: PoseSession,
     convention: EffectRecord | None,
     fit: PoseFit,

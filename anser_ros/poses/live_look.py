@@ -116,15 +116,15 @@ class PoseWatch:
             return PoseSighting((*frozen, *changed), poses, misfit_m=misfit, remark=remark)
         self.searches += 1
         found = diagnose_poses(session)
-        told = [r for r in found.records if not _is_hand_eye(r)]
-        told += self._noisier(found, told)
+        named = [r for r in found.records if not _is_hand_eye(r)]
+        named += self._noisier(found, named)
         if self._known is None and not frozen:
             self._known = _learnt(session, found)
         # Noise that is not quite alike among neighbours is no reason for a warning of its own.
-        depends = found.depends_on if not told else ()
+        depends = found.depends_on if not named else ()
         words = f'something depends on {", ".join(depends)}' if depends else ''
         return PoseSighting(
-            (*frozen, *told), poses, found.before.position_m, found.after.position_m,
+            (*frozen, *named), poses, found.before.position_m, found.after.position_m,
             found.floor_m, misfit, found.unexplained, found.depends_on, words,
         )  # fmt: skip
 
@@ -164,10 +164,10 @@ class PoseWatch:
         return worst, (_change(terms[index], moved[index], state, worst, left),), ''
 
     def _noisier(
-        self, found: PoseDiagnosis, told: Sequence[EffectRecord]
+        self, found: PoseDiagnosis, named: Sequence[EffectRecord]
     ) -> Sequence[EffectRecord]:
         """More jitter than at first, unless something that is named makes it."""
-        if self._known is None or any(effect_of_record(r).makes_jitter for r in told):
+        if self._known is None or any(effect_of_record(r).makes_jitter for r in named):
             return ()
         factor = found.floor_m / max(self._known.jitter_m, 1e-9)
         return [r for effect in pose_effects().values() for r in effect.noisier(factor)]

@@ -123,18 +123,18 @@ def _predicted(
         optical = effect_of(term).seen(term, optical)
     body = frame @ turn
     arm = body @ lever
-    said = optical @ frame.T + arm + frames.translation
+    predicted = optical @ frame.T + arm + frames.translation
     moving = np.empty((time.size, 6))
     moving[:, 3:] = velocity[:, 3:] @ frame.T
     moving[:, :3] = velocity[:, :3] @ frame.T + np.cross(moving[:, 3:], arm)
-    said_turn = body @ frames.mount
+    predicted_turn = body @ frames.mount
     view = PoseView(
         sensor.name, sensor.time, sensor.position, sensor.rotation, optical, turn, frame, lever,
-        said, said_turn, moving,
+        predicted, predicted_turn, moving,
     )  # fmt: skip
     residual = np.empty((time.size, 6))
-    residual[:, :3] = position - said
-    difference = rotation @ said_turn.transpose(0, 2, 1)
+    residual[:, :3] = position - predicted
+    difference = rotation @ predicted_turn.transpose(0, 2, 1)
     if time.size:
         residual[:, 3:] = Rotation.from_matrix(difference).as_rotvec()
     return view, residual, known

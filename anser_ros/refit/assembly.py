@@ -100,10 +100,10 @@ class Assembly:
 
     def _place(self, layers: Sequence[Layer]) -> Geometry:
         """Return the dipoles with some layers, in the same arrays while the layers stay."""
-        told = self._geometry
-        if told is None or told.name != tuple(layer.name for layer in layers):
-            told = self._geometry = Geometry.of(self.base, layers)
-        return told
+        geometry = self._geometry
+        if geometry is None or geometry.name != tuple(layer.name for layer in layers):
+            geometry = self._geometry = Geometry.of(self.base, layers)
+        return geometry
 
     def model(
         self,

@@ -56,19 +56,19 @@ class Belief:
         weights = np.exp(log_weight - log_weight.max())
         self.weights = weights / weights.sum()
 
-    def update_by(self, names: Sequence[str], told: Mapping[str, float]) -> None:
+    def update_by(self, names: Sequence[str], evidence: Mapping[str, float]) -> None:
         """Update the weights of the hypotheses by other evidence of the same frame.
 
         Parameters
         ----------
         names : sequence of str
             Of the hypotheses, in their order.
-        told : mapping of str to float
+        evidence : mapping of str to float
             Log evidence by name; hypotheses that are not in it are ruled out, unless all are.
         """
-        if not told:
+        if not evidence:
             return
-        gain = np.array([told.get(name, -np.inf) for name in names])
+        gain = np.array([evidence.get(name, -np.inf) for name in names])
         weights = self.weights * np.exp(gain - gain.max())
         if weights.sum() > 0.0:
             self.weights = weights / weights.sum()

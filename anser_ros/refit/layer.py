@@ -92,14 +92,14 @@ class Layer:
         """Return the layer's moments per unit moment of each source's component, (N, 3M)."""
         if self.inverse is None:
             return np.eye(3 * len(sources))
-        told = sources.tobytes()
-        if told not in self._projected:
+        key = sources.tobytes()
+        if key not in self._projected:
             # Clouds are asked for in turn, each for all of its responses.
             self._projected.clear()
-            self._projected[told] = np.hstack(
+            self._projected[key] = np.hstack(
                 [self.inverse @ _field_rows(self.points, part) for part in _parts(sources)]
             )
-        return self._projected[told]
+        return self._projected[key]
 
     def misfit(self, sources: Array, points: Array | None = None) -> float:
         """Return the relative rms error of the layer's field compared with the sources'.

@@ -100,11 +100,11 @@ class RefitTables:
 
     def reduced(self, prior: CloudPrior) -> ReducedPrior:
         """Return a hypothesis of these tables, or a body of theirs, in few numbers."""
-        told = {p.name: response for (_, response, _), p in
+        responses = {p.name: response for (_, response, _), p in
                 zip(self.hypotheses, self.priors, strict=True)}  # fmt: skip
         return reduced(
             prior,
-            told.get(prior.name, BODY),
+            responses.get(prior.name, BODY),
             self.excitation.field(prior.cloud.positions),
             np.array(self.frequencies_hz),
             np.random.default_rng(self.settings.seed),
@@ -117,16 +117,16 @@ def build_tables(
     settings: RefitSettings,
     drawing: FieldFunction | None,
     volume: TrackedVolume | None = None,
-    told: ReportShare = lambda share: None,
+    report: ReportShare = lambda share: None,
 ) -> RefitTables:
-    """Compute the tables; raises `FitError` as `excitation_for` does, and what ``told`` raises."""
+    """Compute the tables; raises `FitError` as `excitation_for` does, and what ``report`` does."""
     excitation, region = excitation_for(model, drawing, volume)
-    told(START)
+    report(START)
     clouds = default_clouds(region)
     bottom = bottom_layer(model, region, excitation, clouds[0].positions)
     box = box_layer(region, excitation)
     hypotheses = _hypotheses(clouds, bottom, box)
-    priors = _priors(hypotheses, references, excitation, model.frequencies_hz, settings, told)
+    priors = _priors(hypotheses, references, excitation, model.frequencies_hz, settings, report)
     around = bodies(region)
     return RefitTables(
         excitation,
@@ -171,12 +171,12 @@ def _priors(
     excitation: Excitation,
     frequencies_hz: tuple[float, ...],
     settings: RefitSettings,
-    told: ReportShare = lambda share: None,
+    report: ReportShare = lambda share: None,
 ) -> tuple[CloudPrior, ...]:
     rng, out = np.random.default_rng(settings.seed), []
     sizes = np.cumsum([0, *(len(cloud.positions) for cloud, _, _ in hypotheses)])
     for (cloud, response, layer), done in zip(hypotheses, sizes[:-1].tolist(), strict=True):
-        told(START + (1.0 - START) * done / float(sizes[-1]))
+        report(START + (1.0 - START) * done / float(sizes[-1]))
         out.append(
             build_prior(
                 cloud,

@@ -71,7 +71,7 @@ class CoilErrors:
             np.tile([gain, gain, place, place, place, axis, axis], len(table)), 1e-9
         )
         self._precision = np.diag(self._prior**-2.0)
-        self._told = np.zeros(len(self._prior))
+        self._pull = np.zeros(len(self._prior))
         self._solved: tuple[Array, Array] | None = None
 
     @property
@@ -79,7 +79,7 @@ class CoilErrors:
         """Return mean (7 S,) and covariance of gain (re, im), place (3, m) and axis (2, rad)."""
         if self._solved is None:
             covariance = np.linalg.inv(self._precision)
-            mean = covariance @ self._told
+            mean = covariance @ self._pull
             covariance[np.diag_indices_from(covariance)] += (KEPT * self._prior) ** 2
             self._solved = mean, covariance
         return self._solved
@@ -87,7 +87,7 @@ class CoilErrors:
     def learn(self, white: Array, values: Array) -> None:
         """Take in whitened readings (n,) that errors make by the matrix ``white`` (n, 7 S)."""
         self._precision += SHARE * white.T @ white
-        self._told += SHARE * white.T @ values
+        self._pull += SHARE * white.T @ values
         self._solved = None
 
 

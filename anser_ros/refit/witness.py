@@ -238,19 +238,19 @@ class Witness:
                 layer, length = bank.prior(h).layer, reading.table.length
                 basis = flux_basis(rows.at, rows.axes, length, layer.positions, layer.directions)
                 off = rows.left - (basis @ bank.moments(seen, h)).ravel()
-                told = basis @ self._reduced_of(bank, h).basis.astype(np.float64)
-                told = told.reshape(off.size, len(state.mean))
+                design = basis @ self._reduced_of(bank, h).basis.astype(np.float64)
+                design = design.reshape(off.size, len(state.mean))
                 for i, (values, (pose, own)) in enumerate(
                     zip((off.real, off.imag), parts, strict=True)
                 ):
                     if name == self._best:
-                        open_metal = lasting * told @ state.covariance[i] @ told.T
+                        open_metal = lasting * design @ state.covariance[i] @ design.T
                         factor = np.linalg.cholesky(noise + open_metal + pose @ pose.T)
                         known.append(
-                            _whitened(factor, own, np.asarray(values - told @ state.mean[:, i]))
+                            _whitened(factor, own, np.asarray(values - design @ state.mean[:, i]))
                         )
                     rest = values - own @ mean
-                    evidence[name] += _kalman(state, i, factors[i], told, rest)
+                    evidence[name] += _kalman(state, i, factors[i], design, rest)
             for white, values in known:
                 errors.learn(white, values)
             near.append((rows.at[:, None] + NEAR_M * _AROUND).reshape(-1, 3))

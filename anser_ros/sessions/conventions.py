@@ -134,13 +134,13 @@ def _fit(
     centres, axes = tool.sensors.placed(reading.scale * tool.position[frames], rotation)
     assert drawing.field is not None
     field = drawing.field(centres[where, columns])
-    said = np.einsum('pki,pi->pk', field, axes[where, columns])
-    size = np.einsum('pk,pk->p', said, said)
-    ratio = np.einsum('pk,pk->p', said, flux) / np.maximum(size, 1e-300)
+    predicted = np.einsum('pki,pi->pk', field, axes[where, columns])
+    size = np.einsum('pk,pk->p', predicted, predicted)
+    ratio = np.einsum('pk,pk->p', predicted, flux) / np.maximum(size, 1e-300)
     # All channels may lag by the same phase; their sign is left as it is.
     lag = 0.5 * float(np.angle(np.sum((ratio / np.maximum(np.abs(ratio), 1e-300)) ** 2)))
     gain = float(np.median(np.abs(ratio)))
-    miss = np.linalg.norm(flux - gain * np.exp(1j * lag) * said, axis=1)
+    miss = np.linalg.norm(flux - gain * np.exp(1j * lag) * predicted, axis=1)
     return float(np.mean(miss < MISFIT * np.linalg.norm(flux, axis=1))), gain
 
 

@@ -72,8 +72,8 @@ def plausible_tools(
     for tool in tools:
         words += _check_refused(path, tool, refused)
         _check_clocks(path, tool)
-        thawed, said = _thawed(path, tool)
-        words += said
+        thawed, remarks = _thawed(path, tool)
+        words += remarks
         check_conventions(path, setup, drawing, thawed)
         _check_distance(path, setup, thawed)
         kept.append(thawed)

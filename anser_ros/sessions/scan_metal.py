@@ -104,7 +104,7 @@ def without_resting_metal(
                 whole, flux=np.where(usable, whole.flux - flux, whole.flux)
             )
         found.append(metal)
-        reported_effects = [_told(record, metal, ends) for record in reported_effects]
+        reported_effects = [_completed(record, metal, ends) for record in reported_effects]
     if not found:
         return None
     sigma = float(np.sqrt(np.mean([metal.sigma_t**2 for metal in found])))
@@ -116,14 +116,16 @@ def without_resting_metal(
     )
 
 
-def _told(record: EffectRecord, metal: RestingMetal, ends: tuple[float, float]) -> EffectRecord:
+def _completed(
+    record: EffectRecord, metal: RestingMetal, ends: tuple[float, float]
+) -> EffectRecord:
     """The telling of a span in which this metal moved, with where it rested."""
-    told = record.parameters
-    if not ends[0] <= told['t_start_s'] <= ends[1]:
+    parameters = record.parameters
+    if not ends[0] <= parameters['t_start_s'] <= ends[1]:
         return record
     return replace(
         record,
-        parameters={**metal.record.parameters, **told},
+        parameters={**metal.record.parameters, **parameters},
         uncertainty={**record.uncertainty, **metal.record.uncertainty},
         evidence={**record.evidence, **metal.record.evidence},
     )

@@ -89,9 +89,9 @@ def measured_noise(setup: Setup) -> float:
     """
     if 'flux_noise_t' in setup.stated:
         return 0.0
-    told = setup.extra.get('flux_noise_t', 0.0)
-    is_number = isinstance(told, (int, float)) and not isinstance(told, bool)
-    return float(told) if is_number and 0.0 < told < MOST_NOISE_T else 0.0
+    stated = setup.extra.get('flux_noise_t', 0.0)
+    is_number = isinstance(stated, (int, float)) and not isinstance(stated, bool)
+    return float(stated) if is_number and 0.0 < stated < MOST_NOISE_T else 0.0
 
 
 def tracking_noise(setup: Setup) -> float:
@@ -105,10 +105,10 @@ def stamp_sigma(setup: Setup) -> float:
 
     If the setup has neither, it is the default of `anser_ros.settings.Accuracy`.
     """
-    told = setup.extra.get('stamp_sigma_s', -1.0)
-    is_number = isinstance(told, (int, float)) and not isinstance(told, bool)
-    if 'stamp_sigma_s' not in setup.stated and is_number and 0.0 <= told <= MOST_STAMP_SIGMA_S:
-        return float(told)
+    stated = setup.extra.get('stamp_sigma_s', -1.0)
+    is_number = isinstance(stated, (int, float)) and not isinstance(stated, bool)
+    if 'stamp_sigma_s' not in setup.stated and is_number and 0.0 <= stated <= MOST_STAMP_SIGMA_S:
+        return float(stated)
     return setup.accuracy.stamp_sigma_s
 
 

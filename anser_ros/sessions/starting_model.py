@@ -167,10 +167,10 @@ def _bodies_of(model: FieldModel, setup: Setup) -> set[str]:
     """Bodies of the setup whose sensors an effect of the model names."""
     found = set()
     for effect in model.effects:
-        told = effect.parameters
-        channels = [told.get('channel'), *_listed(told.get('channels'))]
+        parameters = effect.parameters
+        channels = [parameters.get('channel'), *_listed(parameters.get('channels'))]
         found |= {s.body for s in setup.sensors if s.channel in channels}
-        found |= {s.body for s in setup.sensors if s.body == told.get('body')}
+        found |= {s.body for s in setup.sensors if s.body == parameters.get('body')}
     return found
 
 

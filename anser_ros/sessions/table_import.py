@@ -71,8 +71,8 @@ def import_tables(document: Path, out: Path) -> ImportedTables:
         return _Import(_mapping(spec, 'the document'), document.parent).write(out)
     except ParameterError as error:
         text = str(error)
-        said = text if str(document.parent) in text else f'{document}: {text}'
-        raise ParameterError(said) from error
+        message = text if str(document.parent) in text else f'{document}: {text}'
+        raise ParameterError(message) from error
 
 
 class _Import:

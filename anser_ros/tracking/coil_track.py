@@ -165,19 +165,19 @@ class _CoilFrame:
 class CoilResult:
     """Holds an estimate with its solution and the errors reckoned with (None: not solved).
 
-    ``heard`` is whether the fluxes of a coil are good although nothing was solved for it.
+    ``is_received`` is whether the fluxes of a coil are good although nothing was solved for it.
     """
 
     estimate: PoseEstimate
     solution: CoilSolution | None
     cold: bool = False
     error: PoseErrors | None = None
-    heard: bool = False
+    is_received: bool = False
 
     @property
     def usable(self) -> bool:
         """Return whether a body may use the coil: it has a solution, and is not among metal."""
-        return (self.heard or self.solution is not None) and not (
+        return (self.is_received or self.solution is not None) and not (
             self.error and self.error.among_metal
         )
 
@@ -279,7 +279,7 @@ def track_coil(
     if context.readings < UNKNOWNS:
         reason = f'{context.readings} readings are too few for the {UNKNOWNS} unknowns of a pose'
         unknown = no_pose(name, stamp_ns, states.AMBIGUOUS, context.model_id, reason)
-        return CoilResult(unknown, None, heard=True)
+        return CoilResult(unknown, None, is_received=True)
     frame = _CoilFrame(name, length, stamp_ns, flux, context, settings)
     solution = _from_good(track, frame)
     if solution is not None:

@@ -96,7 +96,7 @@ class CorrectionLoop:
         What the last one that succeeded has found.
     names : tuple of str
         The recordings that there are, the newest first.
-    said, is_trouble : str, bool
+    message, is_trouble : str, bool
         How the last step went, and whether badly.
     model : str
         The file of the model in force, as ``field_model`` has it.
@@ -107,7 +107,7 @@ class CorrectionLoop:
         self.chosen, self.model = '', ''
         self.job: Job | None = None
         self.found: Found | None = None
-        self.said, self.is_trouble = '', False
+        self.message, self.is_trouble = '', False
         self.names: tuple[str, ...] = ()
         self._loaded: list[Loaded] = []
         self._busy = asyncio.Lock()
@@ -184,23 +184,23 @@ class CorrectionLoop:
     async def _step(self, step: Any) -> None:
         async with self._busy:  # one after the other, whoever clicks
             try:
-                self.said, self.is_trouble = await step, False
+                self.message, self.is_trouble = await step, False
             except AnserError as error:
-                self.said, self.is_trouble = ' '.join(str(error).split()), True
+                self.message, self.is_trouble = ' '.join(str(error).split()), True
 
     async def _record(self) -> str:
         return f'recording to {Path(await self._chain.trigger("recorder/start")).name}'
 
     async def _stop(self) -> str:
-        said = await self._chain.trigger('recorder/stop')
+        message = await self._chain.trigger('recorder/stop')
         self.refresh_names()
         if not self.names:
             raise ParameterError(
-                f'{said}; but {self.folder.path} holds no recording: give the live view and the '
-                'recorder the same directory'
+                f'{message}; but {self.folder.path} holds no recording: give the live view and '
+                'the recorder the same directory'
             )
         self.chosen = self.names[0]
-        return said
+        return message
 
     async def _set_baseline(self) -> str:
         return await self._chain.trigger('field_model/set_baseline')
@@ -228,12 +228,12 @@ class CorrectionLoop:
     async def _finish(self, job: Job, name: str) -> None:
         await job.run()
         if job.failure:
-            self.said, self.is_trouble = job.failure, True
+            self.message, self.is_trouble = job.failure, True
             return
         document = json.loads((job.folder / f'{_NOUN[job.kind]}.json').read_text('utf-8'))
         words, rows = _READ[job.kind](document)
         self.found = Found(job.kind, name, job.folder, words, rows)
-        self.said, self.is_trouble = f'{job.kind} {name}: done in {job.seconds:.0f} s', False
+        self.message, self.is_trouble = f'{job.kind} {name}: done in {job.seconds:.0f} s', False
 
     async def _load(self) -> str:
         if self.found is None:

@@ -116,7 +116,7 @@ class Screen:
             )
             self._cancel = _button('Cancel', self._end, 'close', flat=True)
         self._progress = ui.linear_progress(0.0, show_value=False).classes('progress')
-        self._said = ui.label().classes('words').mark('said')
+        self._message = ui.label().classes('words').mark('said')
         self._verdict = ui.label().classes('verdict').mark('verdict')
         self._held_out = ui.html(sanitize=False).mark('held_out')
         _heading('3  Use it')
@@ -202,8 +202,8 @@ class Screen:
         for label, key in zip(self._figures, FIGURES.values(), strict=True):
             self._text(label, status[key])
         self._html(self._nodes, ''.join(
-            f'<span class="dot {LEVELS[level]}" title="{escape(said)}">{escape(name)}</span>'
-            for name, level, said in status['nodes']
+            f'<span class="dot {LEVELS[level]}" title="{escape(text)}">{escape(name)}</span>'
+            for name, level, text in status['nodes']
         ))  # fmt: skip
         why = escape('  ·  '.join(status['why']))
         self._html(self._why, f'<span title="{why}">{why}</span>')
@@ -223,13 +223,13 @@ class Screen:
         self._enable(self._diagnose, ready)
         self._visible(self._cancel, loop.is_running)
         self._visible(self._progress, loop.is_running)
-        said = loop.said
+        message = loop.message
         if job is not None and loop.is_running:
             known = not math.isnan(job.share)
             self._once('share', job.share if known else -1.0, self._show_share)
-            said = f'{job.kind}: {job.stage or "begins"}, {job.seconds:.0f} s'
-        self._text(self._said, said)
-        self._once('trouble', loop.is_trouble, lambda bad: self._said.classes(
+            message = f'{job.kind}: {job.stage or "begins"}, {job.seconds:.0f} s'
+        self._text(self._message, message)
+        self._once('trouble', loop.is_trouble, lambda bad: self._message.classes(
             add='trouble' if bad else '', remove='' if bad else 'trouble'))  # fmt: skip
         self._text(self._verdict, '' if found is None else found.words)
         self._visible(self._verdict, found is not None)

@@ -98,7 +98,7 @@ def write_metadata(path: Path, record: BagRecord, ros_distro: str, is_closed: bo
         draft.unlink(missing_ok=True)
 
 
-def told(folder: Path) -> dict[str, Any]:
+def bag_summary(folder: Path) -> dict[str, Any]:
     """Return what a bag's ``metadata.yaml`` tells: ``duration_s``, ``messages``, ``closed``; {}
     without.
 

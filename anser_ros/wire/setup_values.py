@@ -32,8 +32,8 @@ def read_number(value: Any, where: str, low: float = -math.inf, high: float = ma
     # A whole number may be too large for a float; its digits then are too many to be told.
     number = float(value) if abs(value) < LARGEST_NUMBER else math.inf
     if not math.isfinite(number) or not low <= number <= high:
-        told = repr(value) if math.isfinite(number) else 'a number that is not finite'
-        raise SetupError(f'setup: {where} must be finite and in [{low:g}, {high:g}], got {told}')
+        shown = repr(value) if math.isfinite(number) else 'a number that is not finite'
+        raise SetupError(f'setup: {where} must be finite and in [{low:g}, {high:g}], got {shown}')
     return number
 
 

@@ -28,7 +28,7 @@ class MeasuredAccuracy:
         """Start again: the stream is another one."""
         self._noise_t: float | None = None
         self._begun_s = -math.inf
-        self._told_s = Accuracy.stamp_sigma_s
+        self._stated_s = Accuracy.stamp_sigma_s
         self._squares = 0.0
         self._frames = 0
 
@@ -46,9 +46,9 @@ class MeasuredAccuracy:
             return False
         mean_s = math.sqrt(self._squares / self._frames)
         self._begun_s, self._squares, self._frames = now_s, 0.0, 0
-        if 1 / _FACTOR <= mean_s / self._told_s <= _FACTOR:
+        if 1 / _FACTOR <= mean_s / self._stated_s <= _FACTOR:
             return False
-        self._told_s = float(f'{mean_s:.1g}')
+        self._stated_s = float(f'{mean_s:.1g}')
         return True
 
     def stated_in(self, setup: Setup, rate_hz: float) -> Setup:
@@ -56,6 +56,6 @@ class MeasuredAccuracy:
         measured: dict[str, float] = {}
         if self._noise_t:
             measured[FLUX_NOISE] = float(f'{self._noise_t:.2g}')
-        if self._told_s != Accuracy.stamp_sigma_s:
-            measured[STAMP_SIGMA] = self._told_s
+        if self._stated_s != Accuracy.stamp_sigma_s:
+            measured[STAMP_SIGMA] = self._stated_s
         return replace(setup, flux_rate_hz=rate_hz, extra={**setup.extra, **measured})

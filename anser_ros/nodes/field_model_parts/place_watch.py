@@ -43,7 +43,7 @@ class PlaceWatch:
         self, place: BoardPlace | None = None, announced: Callable[[], int] = none_announced
     ) -> None:
         self._place, self._announced = place, announced
-        self._has_heard = self._has_looked = False
+        self._has_frame = self._has_looked = False
         self._begin_s = time.monotonic()
         self.misplaced = ''
 
@@ -63,7 +63,7 @@ class PlaceWatch:
     @property
     def is_open(self) -> bool:
         """Return whether references could tell, and none has been received."""
-        return self._place is not None and not self._has_heard
+        return self._place is not None and not self._has_frame
 
     @property
     def is_waiting(self) -> bool:
@@ -77,7 +77,7 @@ class PlaceWatch:
         The first frame with enough readings decides; after that a model that was found to be
         displaced is checked again with every whole window.
         """
-        is_first, self._has_heard = self.is_open, True
+        is_first, self._has_frame = self.is_open, True
         if self._place is None or (self._has_looked and not (self.misplaced and window.full)):
             return False
         flux = window.mean() if self._has_looked else frame.readings

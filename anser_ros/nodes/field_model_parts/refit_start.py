@@ -126,10 +126,10 @@ class RefitStart:
         references = fixed if moving is None else fixed.joined(start_table(moving))
         settings = self._setup.refit
         return tables.build_tables(
-            self._model, references, settings, drawing, volume, told=self._tell
+            self._model, references, settings, drawing, volume, report=self._report
         )
 
-    def _tell(self, share: float) -> None:
+    def _report(self, share: float) -> None:
         if self._is_over:
             raise _EndedError
         self._share = share

@@ -24,12 +24,14 @@ class LastStatus(NamedTuple):
     values: Mapping[str, str]
 
 
-def causes(told: Mapping[str, LastStatus], namespace: str, flux_rate_hz: float = 0.0) -> list[str]:
+def causes(
+    statuses: Mapping[str, LastStatus], namespace: str, flux_rate_hz: float = 0.0
+) -> list[str]:
     """Name what is wrong: nodes that complain, then sensors without pose, by their reasons.
 
     Parameters
     ----------
-    told : mapping
+    statuses : mapping
         What was said last, by ``node`` or ``node: part``.
     namespace : str
         Of the nodes that are asked, without slashes around it.
@@ -38,7 +40,7 @@ def causes(told: Mapping[str, LastStatus], namespace: str, flux_rate_hz: float =
     """
     found: list[tuple[int, str]] = []
     silent: dict[tuple[int, str], list[str]] = {}
-    for name, one in told.items():
+    for name, one in statuses.items():
         node, _, part = name.partition(': ')
         home, _, short = node.rpartition('/')
         if home != namespace or not one.level:

@@ -79,7 +79,7 @@ class LiveView:
     ----------
     targets : list of Target
         Tool coils first, then the bodies with several.
-    told : dict
+    statuses : dict
         What nodes said last, by ``node`` or ``node: part``.
     """
 
@@ -87,11 +87,11 @@ class LiveView:
         self.setup, self.namespace = setup, namespace
         self.targets = targets_of(setup)
         self.bodies = {target.body for target in self.targets}
-        self.told: dict[str, LastStatus] = {}
-        self._told_s: dict[str, float] = {}
+        self.statuses: dict[str, LastStatus] = {}
+        self._status_s: dict[str, float] = {}
         count = len(self.targets)
         self._stamp_s = np.full(count, np.nan)
-        self._heard_s = np.full(count, -np.inf)
+        self._received_s = np.full(count, -np.inf)
         self._pose = np.full((count, POSE), np.nan)
         self._covariance = np.full((count, 3, 3), np.nan)
         self._number = {target.name: index for index, target in enumerate(self.targets)}
@@ -120,7 +120,7 @@ class LiveView:
             raise ValueError('a pose is not finite')
         self._stamp_s[number], self._pose[number] = stamp_s, values[:POSE]
         self._covariance[number] = values[POSE:].reshape(6, 6)[:3, :3]
-        self._heard_s[number] = time.monotonic()
+        self._received_s[number] = time.monotonic()
         if sent_ns:
             self._latency_s.append(latency_of(1e-9 * sent_ns, stamp_s))
         self._recent.append((number, stamp_s, values[:3]))
@@ -133,9 +133,9 @@ class LiveView:
             trace.add(stamp_s, tuple(values[:3]), tuple(values[3:POSE]))
         trace.forget(OPTICAL_KEPT)
 
-    def take_status(self, name: str, told: LastStatus) -> None:
+    def take_status(self, name: str, status: LastStatus) -> None:
         """Take the status of a node."""
-        self.told[name], self._told_s[name] = told, time.monotonic()
+        self.statuses[name], self._status_s[name] = status, time.monotonic()
 
     # What is shown ------------------------------------------------------------------------
 
@@ -144,7 +144,7 @@ class LiveView:
 
         A row has 16 numbers: x, y, z, qx, qy, qz, qw and three vectors, the half axes.
         """
-        fresh = time.monotonic() - self._heard_s < FRESH_S
+        fresh = time.monotonic() - self._received_s < FRESH_S
         rows: list[Any] = [None] * len(self.targets)
         index = np.flatnonzero(fresh)
         if index.size:
@@ -160,17 +160,17 @@ class LiveView:
     def sigma_m(self) -> Array:
         """Return the poses' own uncertainty, m; NaN where no pose came lately."""
         trace: Array = np.trace(self._covariance, axis1=1, axis2=2)
-        fresh = time.monotonic() - self._heard_s < FRESH_S
+        fresh = time.monotonic() - self._received_s < FRESH_S
         return np.where(fresh, np.sqrt(trace), np.nan)
 
     def last_status(self, name: str) -> LastStatus:
         """Return the last status of a target from the tracker."""
-        return self.told.get(f'{self.namespace}/tracker: {name}', LastStatus(1, 'waiting', {}))
+        return self.statuses.get(f'{self.namespace}/tracker: {name}', LastStatus(1, 'waiting', {}))
 
     def figure(self, node: str, key: str) -> float:
         """Return a number that a node of the chain told, NaN where it did not."""
-        told = self.told.get(f'{self.namespace}/{node}')
-        return _number(told, key)
+        status = self.statuses.get(f'{self.namespace}/{node}')
+        return _number(status, key)
 
     def residual_t(self) -> Array:
         """Return the residual of every target's fluxes, T."""
@@ -187,11 +187,11 @@ class LiveView:
 
     def reasons(self) -> list[str]:
         """Return the causes of what the statuses report."""
-        return causes(self.told, self.namespace, self.setup.flux_rate_hz)
+        return causes(self.statuses, self.namespace, self.setup.flux_rate_hz)
 
     def silent_s(self, name: str) -> float:
         """Return the time since something was said under a name, s."""
-        return time.monotonic() - self._told_s.get(name, -math.inf)
+        return time.monotonic() - self._status_s.get(name, -math.inf)
 
     def add_point(self) -> tuple[float, Array, Array, Array]:
         """Work out rates, and the next point of the curves: time, error, residual, tracked."""
@@ -262,8 +262,8 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _number(told: LastStatus | None, key: str) -> float:
+def _number(status: LastStatus | None, key: str) -> float:
     try:
-        return math.nan if told is None else float(told.values[key])
+        return math.nan if status is None else float(status.values[key])
     except (KeyError, ValueError):
         return math.nan

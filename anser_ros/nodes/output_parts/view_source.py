@@ -82,7 +82,7 @@ class ViewSource:
         self._metals = Polled(node, MarkerArray, 'metal', qos.LATCHED)
         self._poses: list[Polled] = []
         self._optical: dict[str, Polled] = {}
-        self._told: dict[str, LastStatus] = {}
+        self._statuses: dict[str, LastStatus] = {}
         self._balls: list[list[float]] = []
         self._marks: deque[tuple[float, str]] = deque(maxlen=MOST_MARKS)
         self._processor = Processor()
@@ -97,7 +97,7 @@ class ViewSource:
         """Take in what has come since the last time."""
         self._take_setup(self.setup_text)
         for message in self._diagnostics.messages(self._refused):
-            self._take_told(message)
+            self._take_statuses(message)
         if self.view is None:
             return
         for number, poses in enumerate(self._poses):
@@ -126,8 +126,8 @@ class ViewSource:
         for polled in (*self._poses, *self._optical.values()):
             polled.close()
         view = LiveView(setup, self.namespace)
-        for name, told in self._told.items():
-            view.take_status(name, told)
+        for name, status in self._statuses.items():
+            view.take_status(name, status)
         self._poses = [
             Polled(self._node, PoseWithCovarianceStamped,
                    f'{topic_of(target.name)}/pose_with_covariance', STREAM)
@@ -139,16 +139,18 @@ class ViewSource:
         }
         self.view, self.version = view, self.version + 1
 
-    def _take_told(self, message: DiagnosticArray) -> None:
+    def _take_statuses(self, message: DiagnosticArray) -> None:
         for status in message.status:
             is_ours = status.name.startswith(f'{self.namespace}/')
-            if not is_ours or (status.name not in self._told and len(self._told) >= MOST_STATUSES):
+            if not is_ours or (
+                status.name not in self._statuses and len(self._statuses) >= MOST_STATUSES
+            ):
                 continue
             values = {pair.key: pair.value for pair in status.values}
-            told = LastStatus(status.level[0], status.message, values)
-            self._told[status.name] = told
+            latest = LastStatus(status.level[0], status.message, values)
+            self._statuses[status.name] = latest
             if self.view is not None:
-                self.view.take_status(status.name, told)
+                self.view.take_status(status.name, latest)
 
     def add_point(self) -> None:
         """Take the next point of the curves, and see where the metal is."""
@@ -194,9 +196,9 @@ class ViewSource:
         view = self.view
         if view is None:
             return []
-        told = [view.last_status(target.name) for target in view.targets]
+        statuses = [view.last_status(target.name) for target in view.targets]
         columns = zip(
-            told, 1e3 * view.sigma_m(), 1e3 * view.error_m, 1e12 * view.residual_t(),
+            statuses, 1e3 * view.sigma_m(), 1e3 * view.error_m, 1e12 * view.residual_t(),
             view.rate_hz, strict=True,
         )  # fmt: skip
         return [
@@ -230,10 +232,10 @@ class ViewSource:
         }  # fmt: skip
         if view is None:
             return status
-        tracker = self._told.get(f'{space}/tracker', LastStatus(1, 'no tracker', {}))
+        tracker = self._statuses.get(f'{space}/tracker', LastStatus(1, 'no tracker', {}))
         good = sum(view.last_status(target.name).level == 0 for target in view.targets)
         rates = view.rate_hz[view.rate_hz > 0]
-        recorder = self._told.get(f'{space}/recorder')
+        recorder = self._statuses.get(f'{space}/recorder')
         is_recording = recorder is not None and recorder.message == 'recording'
         return status | {
             'tracked': f'{good} of {len(view.targets)} tracked',
@@ -248,24 +250,24 @@ class ViewSource:
 
     def _nodes(self, view: LiveView) -> list[tuple[str, int, str]]:
         found = []
-        for name, told in self._told.items():
+        for name, status in self._statuses.items():
             home, _, short = name.rpartition('/')
             if home == self.namespace and ':' not in name and name not in self._own:
                 if view.silent_s(name) > SILENT_S:
-                    told = LastStatus(3, 'silent', {})
-                found.append((short, told.level, told.message))
+                    status = LastStatus(3, 'silent', {})
+                found.append((short, status.level, status.message))
         return sorted(found)
 
     def _findings(self, view: LiveView) -> list[tuple[int, str]]:
         name = f'{self.namespace}/watcher'
-        if name not in self._told or view.silent_s(name) > SILENT_S:
+        if name not in self._statuses or view.silent_s(name) > SILENT_S:
             return [(1, 'no watcher runs')]
         parts = [
-            (told.level, f'{part.partition(": ")[2]}: {told.message}')
-            for part, told in self._told.items()
+            (status.level, f'{part.partition(": ")[2]}: {status.message}')
+            for part, status in self._statuses.items()
             if part.startswith(f'{name}: ') and view.silent_s(part) <= SILENT_S
         ]
-        own = self._told[name]
+        own = self._statuses[name]
         return [(own.level, own.message), *parts]
 
 

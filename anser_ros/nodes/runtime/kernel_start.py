@@ -38,11 +38,11 @@ def wait_for_kernels(say: Callable[[str], None]) -> str:
         command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
         text=True,
     )  # fmt: skip
-    said_s = -LINE_INTERVAL_S
+    shown_s = -LINE_INTERVAL_S
     try:
         while process.poll() is None:
-            if time.monotonic() - said_s >= LINE_INTERVAL_S:
-                said_s = time.monotonic()
+            if time.monotonic() - shown_s >= LINE_INTERVAL_S:
+                shown_s = time.monotonic()
                 say(
                     f'compiling kernels, once after an installation: {cache.done} of {cache.total}'
                 )

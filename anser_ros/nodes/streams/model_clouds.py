@@ -58,7 +58,7 @@ class ModelWriter:
 
     def __init__(self) -> None:
         self._maker = CloudMaker()
-        self._told: tuple[FieldModel, PointCloud2] | None = None
+        self._encoded: tuple[FieldModel, PointCloud2] | None = None
         self._uncertainty: tuple[object, float, int, bool, int, str, int] | None = None
         self._origin = '', 0
 
@@ -68,24 +68,24 @@ class ModelWriter:
 
     def dipoles(self, model: FieldModel, frame_id: str, stamp_ns: int) -> PointCloud2:
         """Return the ``field_model`` message; for the model of the last one, that one renamed."""
-        if self._told is not None and self._told[0] is model:
-            message = self._told[1]
+        if self._encoded is not None and self._encoded[0] is model:
+            message = self._encoded[1]
             message.header.frame_id = frame_id
             set_stamp(message.header.stamp, stamp_ns)
             return message
         points = DipolePoints(model.positions, model.directions, model.moments)
         message = self._maker.message(encode_field_model(points), frame_id, stamp_ns)
-        self._told = (model, message)
+        self._encoded = (model, message)
         return message
 
     def new_error(
         self, model: FieldModel, frame_id: str, stamp_ns: int, follows: bool, withheld: int = 0
     ) -> PointCloud2 | None:
         """Return the ``field_model_error`` message; None where the last one still holds."""
-        told = self._uncertainty
+        kept = self._uncertainty
         size = len(model.positions)
         now = (model.modes, model.flux_error_t, size, follows, withheld, *self._origin)
-        if told is not None and told[0] is now[0] and told[1:] == now[1:]:
+        if kept is not None and kept[0] is now[0] and kept[1:] == now[1:]:
             return None
         self._uncertainty = now
         return self.error(model, frame_id, stamp_ns, follows, withheld)

@@ -76,10 +76,10 @@ class OneSource:
         self.subscription = self._subscribed()
 
     @property
-    def said(self) -> str:
+    def complaint(self) -> str:
         """Return why the topic can't be believed now; empty while it has one sender."""
         now_s = time.monotonic()
-        said = self._sources.look(self._count(now_s), now_s)
+        complaint = self._sources.look(self._count(now_s), now_s)
         latched = self._arguments[1].durability == DurabilityPolicy.TRANSIENT_LOCAL
         if self._publishers > 1 and self._refused_s is not None:
             self._refused_s = now_s
@@ -89,7 +89,7 @@ class OneSource:
             self._sources.forget()
             self._node.destroy_subscription(self.subscription)
             self.subscription = self._subscribed()
-        return said
+        return complaint
 
     def publishers(self) -> int:
         """Return how many publishers the graph knows, idle ones included."""
@@ -103,7 +103,7 @@ class OneSource:
         is_good = self._sources.take(number, self._count(now_s), now_s, lasting)
         if not is_good:
             self._refused_s = now_s
-            self._node.warn('messages_of_two_sources', self._sources.said)
+            self._node.warn('messages_of_two_sources', self._sources.complaint)
         return is_good
 
     def _subscribed(self) -> Any:
@@ -138,4 +138,4 @@ def setup_source(node: 'AnserNode', callback: Callable[[Any], None]) -> OneSourc
 
 def sender_words(sources: list[OneSource]) -> str:
     """Return the topics with several senders, in words; empty if each has one."""
-    return '; '.join(filter(None, [source.said for source in sources]))
+    return '; '.join(filter(None, [source.complaint for source in sources]))

@@ -13,15 +13,15 @@ def too_slow(skipped: int, worked: int) -> str:
         return ''
     share = 100 * skipped / (skipped + worked)
     load, cores = os.getloadavg()[0], os.cpu_count() or 1
-    said = f'{share:.0f} %' if share >= 1 else 'less than 1 %'
-    return f'computer too slow: {said} of windows skipped, load {load:.1f} on {cores} cores'
+    percent = f'{share:.0f} %' if share >= 1 else 'less than 1 %'
+    return f'computer too slow: {percent} of windows skipped, load {load:.1f} on {cores} cores'
 
 
 class Load:
     """Finds words for what was skipped since one asked last, from the counters of a node."""
 
     def __init__(self) -> None:
-        self._told = 0, 0
+        self._counted = 0, 0
 
     def words(self, skipped: int, worked: int) -> str:
         """Return what `too_slow` says of the frames since the last call.
@@ -31,5 +31,5 @@ class Load:
         skipped, worked : int
             Frames that gave way, and that were worked on, since the start.
         """
-        before, self._told = self._told, (skipped, worked)
+        before, self._counted = self._counted, (skipped, worked)
         return too_slow(skipped - before[0], worked - before[1])

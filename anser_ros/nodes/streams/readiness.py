@@ -39,7 +39,7 @@ def digest_of(setup_text: str) -> str:
 
 
 @dataclass
-class _Told:
+class _Report:
     """What a node said last about itself, and when."""
 
     at_s: float
@@ -79,7 +79,7 @@ class Readiness:
             ]
         except SetupError:
             pass  # who listens may make more of it
-        self._told: dict[str, _Told] = {}
+        self._reports: dict[str, _Report] = {}
         self._seen: object = None
         self._since_s = time.monotonic()
         self.is_starting = False
@@ -103,7 +103,7 @@ class Readiness:
         seen = (listeners, matched, wanted, given, working, reached)
         if seen != self._seen:
             self._seen, self._since_s = seen, now_s
-        self.is_starting = any(name.strip('/') not in self._told for name in working)
+        self.is_starting = any(name.strip('/') not in self._reports for name in working)
         quiet_s = now_s - self._since_s
         if not any(matched):
             return 'nobody subscribes to the fluxes'
@@ -155,22 +155,22 @@ class Readiness:
 
     def _pose_listeners(self) -> int:
         """How many subscriptions the tracker reaches; it may not know all who are known here."""
-        told = self._told.get(f'{self._namespace}/{TRACKER}'.strip('/'))
-        return 0 if told is None else int(told.values.get('pose_listeners') or 0)
+        report = self._reports.get(f'{self._namespace}/{TRACKER}'.strip('/'))
+        return 0 if report is None else int(report.values.get('pose_listeners') or 0)
 
     def _is_ready(self, name: str, listeners: dict[str, tuple[str, ...]]) -> bool:
-        told = self._told.get(name.strip('/'))
+        report = self._reports.get(name.strip('/'))
         # It must have looked at the graph as it is now.
-        if told is None or told.at_s < self._since_s:
+        if report is None or report.at_s < self._since_s:
             return False
         is_listening = any(name in names for names in listeners.values())
         if name.endswith(FIELD_MODEL):
-            return is_listening and bool(told.values.get('stamp_ns'))
-        if told.values.get('ready_for') != self._digest or not is_listening:
+            return is_listening and bool(report.values.get('stamp_ns'))
+        if report.values.get('ready_for') != self._digest or not is_listening:
             return False
-        server = self._told.get(name.strip('/').removesuffix(TRACKER) + FIELD_MODEL)
+        server = self._reports.get(name.strip('/').removesuffix(TRACKER) + FIELD_MODEL)
         served = '' if server is None else server.values.get('stamp_ns', '')
-        return not served or told.values.get('model_stamp_ns') == served
+        return not served or report.values.get('model_stamp_ns') == served
 
     @property
     def poses(self) -> list[str]:
@@ -181,4 +181,4 @@ class Readiness:
         now_s = time.monotonic()
         for status in message.status:
             values = {item.key: item.value for item in status.values}
-            self._told[status.name] = _Told(now_s, values)
+            self._reports[status.name] = _Report(now_s, values)

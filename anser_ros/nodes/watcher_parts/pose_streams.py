@@ -36,7 +36,7 @@ class PoseStreams:
     ----------
     window : PoseWindow
     sources : list of OneSource
-    heard_s : float
+    received_s : float
         When the last tracked pose came, by the monotonic clock.
 
     Raises
@@ -57,9 +57,9 @@ class PoseStreams:
         if not reference and len(tracked) < 2:
             raise ParameterError('reference_pose: a single sensor needs a reference')
         self._topics = {**names, **({reference: REFERENCE} if reference else {})}
-        self._heard: dict[str, float] = dict.fromkeys(self._topics, 0.0)
+        self._received: dict[str, float] = dict.fromkeys(self._topics, 0.0)
         self.window = PoseWindow(list(names.values()), window_s)
-        self.heard_s = 0.0
+        self.received_s = 0.0
         self._node = node
         self.sources = [
             OneSource(node, PoseStamped, topic, self._taker(topic, name), qos.STREAM)
@@ -71,9 +71,9 @@ class PoseStreams:
             p, q = message.pose.position, message.pose.orientation
             pose = (p.x, p.y, p.z, q.x, q.y, q.z, q.w)
             self.window.take(name, stamp_of(message), pose)
-            self._heard[topic] = time.monotonic()
+            self._received[topic] = time.monotonic()
             if name != REFERENCE:
-                self.heard_s = self._heard[topic]
+                self.received_s = self._received[topic]
             self._node.count('poses')
 
         return take
@@ -81,7 +81,7 @@ class PoseStreams:
     def quiet_topics(self) -> tuple[str, ...]:
         """Return topics on which nothing comes now."""
         now_s = time.monotonic()
-        return tuple(topic for topic, at in self._heard.items() if now_s - at > QUIET_S)
+        return tuple(topic for topic, at in self._received.items() if now_s - at > QUIET_S)
 
     def session(self) -> PoseSession | None:
         """Return what is in the window, of the topics on which something comes."""

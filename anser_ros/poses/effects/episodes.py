@@ -43,9 +43,9 @@ LOOSE, FAST = 0.5, 0.25
 and up to which the others' must be lower."""
 
 
-def windows_of(sensing: Sensing, sight: PoseResiduals) -> NDArray[np.int64]:
+def windows_of(sensing: Sensing, residuals: PoseResiduals) -> NDArray[np.int64]:
     """Return the window of each pose of a sensor that counts; -1 for the others."""
-    share = (sensing.view.time - sight.setting.start) / max(sight.setting.duration, 1e-9)
+    share = (sensing.view.time - residuals.setting.start) / max(residuals.setting.duration, 1e-9)
     window = np.clip((WINDOWS * share).astype(np.int64), 0, WINDOWS - 1)
     return np.where(sensing.used | sensing.out, window, -1)
 
@@ -66,12 +66,12 @@ class Episode:
     is_alone: bool = False
 
 
-def episode(sensing: Sensing, sight: PoseResiduals) -> Episode:
+def episode(sensing: Sensing, residuals: PoseResiduals) -> Episode:
     """Return when a sensor is off that was right at other times at the same places.
 
     Where it was there at no other time, the body shows it: all others on it are right meanwhile.
     """
-    window = windows_of(sensing, sight)
+    window = windows_of(sensing, residuals)
     square = np.sum(sensing.residual[:, :3] ** 2, axis=1)
     judged = [w for w in range(WINDOWS) if np.count_nonzero(window == w) >= FEWEST_POSES]
     if len(judged) < WINDOWS // 3:
@@ -88,23 +88,23 @@ def episode(sensing: Sensing, sight: PoseResiduals) -> Episode:
         return Episode()
     place = sensing.view.measured
     distance, _ = cKDTree(place[outside]).query(place[inside])
-    is_alone = _is_alone(sensing, sight, runs)
+    is_alone = _is_alone(sensing, residuals, runs)
     is_revisited = bool(np.mean(distance < NEAR_M) > REVISITED_SHARE)
     return Episode(tuple(runs), is_alone) if is_revisited or is_alone else Episode()
 
 
-def _is_alone(sensing: Sensing, sight: PoseResiduals, runs: list[int]) -> bool:
+def _is_alone(sensing: Sensing, residuals: PoseResiduals, runs: list[int]) -> bool:
     """Whether a sensor is off for a long stretch in which the others on its body are right."""
     span = runs[-1] - runs[0] + 1
     if span < STRETCH or len(runs) < FILLED * span:
         return False
 
     def error(one: Sensing) -> float:
-        rows = np.isin(windows_of(one, sight), runs)
+        rows = np.isin(windows_of(one, residuals), runs)
         square = np.sum(one.residual[rows, :3] ** 2, axis=1)
         return float(np.median(square)) if square.size else np.inf
 
-    others = [error(one) for one in sight.sensors if one is not sensing]
+    others = [error(one) for one in residuals.sensors if one is not sensing]
     return bool(others) and max(others) < FAST * error(sensing)
 
 
@@ -123,9 +123,9 @@ class PoseMovingMetal(PoseEffect):
     advice = 'See what was near these sensors at that time, and do not use their poses of it.'
     units: ClassVar[Mapping[str, str]] = {'t_start_s': 's', 't_end_s': 's'}
 
-    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
+    def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Return a record of the sensors that are off at one time, for each such time."""
-        found = {s.view.sensor: episode(s, sight) for s in sight.sensors}
+        found = {s.view.sensor: episode(s, residuals) for s in residuals.sensors}
         alone = {w for one in found.values() if one.is_alone for w in one.windows}
         groups: list[tuple[int, int, list[str]]] = []
         for name, one in found.items():
@@ -139,7 +139,7 @@ class PoseMovingMetal(PoseEffect):
                 ends = min(other[0], group[0]), max(other[1], group[1])
                 group = *ends, other[2] + group[2]
             groups.append(group)
-        start, length = sight.setting.start, sight.setting.duration / WINDOWS
+        start, length = residuals.setting.start, residuals.setting.duration / WINDOWS
         return [
             EffectRecord(
                 self.name,
@@ -167,20 +167,20 @@ class LooseMount(PoseEffect):
     advice = 'Fasten the sensor on its body, and record again.'
     units: ClassVar[Mapping[str, str]] = {'rms_m': 'm', 'rms_deg': 'deg'}
 
-    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
+    def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Return the sensor whose shifts are its own; a single sensor's could be anything else."""
-        if len(sight.sensors) < 2:
+        if len(residuals.sensors) < 2:
             return []
-        shifts = {s.view.sensor: _shifts(s, sight) for s in sight.sensors}
+        shifts = {s.view.sensor: _shifts(s, residuals) for s in residuals.sensors}
         found = []
-        for sensing in sight.sensors:
+        for sensing in residuals.sensors:
             name = sensing.view.sensor
             share, place, turn = shifts[name]
             others = [shifts[other][0] * shifts[other][1] for other in shifts if other != name]
             if (
                 share < LOOSE
                 or max(others) > FAST * share * place
-                or episode(sensing, sight).windows
+                or episode(sensing, residuals).windows
             ):
                 continue
             values = {'sensor': name, 'rms_m': place, 'rms_deg': float(np.rad2deg(turn))}
@@ -188,9 +188,9 @@ class LooseMount(PoseEffect):
         return found
 
 
-def _shifts(sensing: Sensing, sight: PoseResiduals) -> tuple[float, float, float]:
+def _shifts(sensing: Sensing, residuals: PoseResiduals) -> tuple[float, float, float]:
     """Share of squared error that windows' means in the body's frame explain; rms, m, rad."""
-    window = windows_of(sensing, sight)
+    window = windows_of(sensing, residuals)
     back = (sensing.view.frame @ sensing.view.turn).transpose(0, 2, 1)
     body = np.concatenate(
         [np.einsum('nij,nj->ni', back, sensing.residual[:, k : k + 3]) for k in (0, 3)], axis=1

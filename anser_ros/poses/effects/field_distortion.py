@@ -138,8 +138,8 @@ class FieldDistortion(PoseEffect):
             smooth = smooth_map(record)
             return lambda sensor, position: (smooth(position[None])[0], 0.0)
         term = self.term(record)
-        told = np.asarray(record.uncertainty.get('coefficients_mm', 0.0), dtype=np.float64)
-        variances = np.broadcast_to(told, term.theta.shape) ** 2
+        sigmas_mm = np.asarray(record.uncertainty.get('coefficients_mm', 0.0), dtype=np.float64)
+        variances = np.broadcast_to(sigmas_mm, term.theta.shape) ** 2
 
         def added(sensor: str, position: Array) -> tuple[Array, float]:
             if not self.acts_on(term, sensor):

@@ -111,12 +111,12 @@ class PoseExcessNoise(PoseEffect):
             return ()
         return [EffectRecord(self.name, {'factor': factor}, {'factor': 0.1 * factor})]
 
-    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
+    def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Return each sensor that is noisier than the median of the others."""
         noise = {}
-        law = RangeNoise().observed(sight)
+        law = RangeNoise().observed(residuals)
         exponent = float(law[0].parameters['exponent']) if law else 0.0
-        for sensing in sight.sensors:
+        for sensing in residuals.sensors:
             square, distance = jitter(sensing)
             square = square / distance[:, 1] ** (2 * exponent)
             if square.size >= FEWEST:
@@ -140,11 +140,11 @@ class RangeNoise(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'exponent': '1', 'reference_m': 'm'}
     makes_jitter = True
 
-    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
+    def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Return a power law of all sensors together, each with a level of its own."""
         # Each sensor has a level of its own, so only what changes within one tells a power.
         # Poses far away stand out from a noise that is taken as one; the law judges them too.
-        every = [replace(one, used=one.used | one.out) for one in sight.sensors]
+        every = [replace(one, used=one.used | one.out) for one in residuals.sensors]
         pairs = [pair for pair in map(jitter, every) if pair[0].size >= FEWEST]
         if not pairs:
             return []

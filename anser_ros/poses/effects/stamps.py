@@ -60,16 +60,16 @@ def stamp_step(time: Array) -> float:
     return 0.0
 
 
-def _is_wide(sight: PoseResiduals) -> tuple[float, float]:
+def _is_wide(residuals: PoseResiduals) -> tuple[float, float]:
     """The median error of the stamps over the sensors, and what believing it gains."""
-    rms = float(np.median([s.stamp_s for s in sight.sensors]))
-    return rms, float(np.median([s.stamp_gain for s in sight.sensors]))
+    rms = float(np.median([s.stamp_s for s in residuals.sensors]))
+    return rms, float(np.median([s.stamp_gain for s in residuals.sensors]))
 
 
-def _step(sight: PoseResiduals, rms: float) -> float:
+def _step(residuals: PoseResiduals, rms: float) -> float:
     """The step of the stamps that makes an error of that size, or zero."""
-    for sensing in sight.sensors:
-        step = stamp_step(sight.session.sensors[sensing.view.sensor].time)
+    for sensing in residuals.sensors:
+        step = stamp_step(residuals.session.sensors[sensing.view.sensor].time)
         if step and STEP_SHARE[0] * step < rms < STEP_SHARE[1] * step:
             return step
     return 0.0
@@ -84,13 +84,15 @@ class ReceiptJitter(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'rms_s': 's'}
     makes_jitter = True
 
-    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
+    def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Look for a residual that lies along the velocity and grows with it."""
-        rms, gain = _is_wide(sight)
-        if rms < LEAST_S or gain < LEAST_LIKELIHOOD_GAIN or _step(sight, rms):
+        rms, gain = _is_wide(residuals)
+        if rms < LEAST_S or gain < LEAST_LIKELIHOOD_GAIN or _step(residuals, rms):
             return []
-        spread = max(float(np.std([s.stamp_s for s in sight.sensors])), rms / np.sqrt(2 * gain))
-        values = {'rms_s': rms, 'by_sensor': {s.view.sensor: s.stamp_s for s in sight.sensors}}
+        spread = max(
+            float(np.std([s.stamp_s for s in residuals.sensors])), rms / np.sqrt(2 * gain)
+        )
+        values = {'rms_s': rms, 'by_sensor': {s.view.sensor: s.stamp_s for s in residuals.sensors}}
         return [EffectRecord(self.name, values, {'rms_s': spread}, {'likelihood_gain': gain})]
 
 
@@ -103,10 +105,10 @@ class QuantisedStamps(PoseEffect):
     units: ClassVar[Mapping[str, str]] = {'step_s': 's'}
     makes_jitter = True
 
-    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
+    def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Look for an error of the stamps that is that of their grid."""
-        rms, gain = _is_wide(sight)
-        step = _step(sight, rms) if rms >= LEAST_S and gain >= LEAST_LIKELIHOOD_GAIN else 0.0
+        rms, gain = _is_wide(residuals)
+        step = _step(residuals, rms) if rms >= LEAST_S and gain >= LEAST_LIKELIHOOD_GAIN else 0.0
         if not step:
             return []
         values = {'step_s': step, 'rms_s': rms}

@@ -50,10 +50,10 @@ class StalePoses(PoseEffect):
     advice = 'Ask the device no more often than it measures, or leave the repeats out.'
     units: ClassVar[Mapping[str, str]] = {'fraction': '1', 'runs': '1'}
 
-    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
+    def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Return a record for each stream in which poses come again."""
         found = []
-        for poses in _streams(sight):
+        for poses in _streams(residuals):
             moving = _moving(poses)
             count = int(np.count_nonzero(moving))
             if count < 20:
@@ -99,10 +99,10 @@ class MissingPoses(PoseEffect):
     advice = 'Keep sensors within the volume and markers in view.'
     units: ClassVar[Mapping[str, str]] = {'fraction': '1', 'spans': 's'}
 
-    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
+    def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Return a record for each stream that lacks poses."""
         found = []
-        for poses in _streams(sight):
+        for poses in _streams(residuals):
             spans = _gaps(poses)
             lost = poses.missing.size / max(poses.missing.size + poses.size, 1)
             length = max(float(np.ptp(poses.time)), 1e-9)
@@ -126,21 +126,21 @@ class PoseOutliers(PoseEffect):
     advice = 'Do not use these poses; show the marker from another side.'
     units: ClassVar[Mapping[str, str]] = {'fraction': '1'}
 
-    def observed(self, sight: PoseResiduals) -> Sequence[EffectRecord]:
+    def observed(self, residuals: PoseResiduals) -> Sequence[EffectRecord]:
         """Return one record of the outlying poses of all sensors."""
-        found = list(self._leaping(sight))
-        outs = [_alone(sensing, sight) for sensing in sight.sensors]
+        found = list(self._leaping(residuals))
+        outs = [_alone(sensing, residuals) for sensing in residuals.sensors]
         out = np.concatenate(outs)
-        used = np.concatenate([s.used for s in sight.sensors])
+        used = np.concatenate([s.used for s in residuals.sensors])
         count = int(np.count_nonzero(out))
         share = count / max(count + int(np.count_nonzero(used)), 1)
         if found or share < FEWEST_OUTLIERS or count < FEWEST_POSES:
             return found
-        residual = np.concatenate([s.residual for s in sight.sensors])[out]
+        residual = np.concatenate([s.residual for s in residuals.sensors])[out]
         noise = np.concatenate(
             [
                 np.tile([s.position_m, s.orientation_rad], (int(mask.sum()), 1))
-                for s, mask in zip(sight.sensors, outs, strict=True)
+                for s, mask in zip(residuals.sensors, outs, strict=True)
             ]
         )
         far = np.linalg.norm(residual[:, :3], axis=1) / noise[:, 0]
@@ -152,14 +152,14 @@ class PoseOutliers(PoseEffect):
             'position_m': float(np.median(np.linalg.norm(residual[:, :3], axis=1))),
             'orientation_rad': float(np.median(np.linalg.norm(residual[:, 3:], axis=1))),
             'by_sensor': {
-                s.view.sensor: int(m.sum()) for s, m in zip(sight.sensors, outs, strict=True)
+                s.view.sensor: int(m.sum()) for s, m in zip(residuals.sensors, outs, strict=True)
             },
         }
         return [_record(self.name, values, {'fraction': float(np.sqrt(share / out.size))})]
 
-    def _leaping(self, sight: PoseResiduals) -> Iterator[EffectRecord]:
+    def _leaping(self, residuals: PoseResiduals) -> Iterator[EffectRecord]:
         """The reference's poses that leap."""
-        reference = sight.session.reference
+        reference = residuals.session.reference
         if reference is None:
             return
         away = jumping_poses(reference)
@@ -169,9 +169,9 @@ class PoseOutliers(PoseEffect):
             yield _record(self.name, values, {'fraction': float(np.sqrt(share / away.size))})
 
 
-def _alone(sensing: Sensing, sight: PoseResiduals) -> NDArray[np.bool_]:
+def _alone(sensing: Sensing, residuals: PoseResiduals) -> NDArray[np.bool_]:
     """Poses of a sensor that stand out, less those of an episode, which are off together."""
-    inside = np.isin(windows_of(sensing, sight), episode(sensing, sight).windows)
+    inside = np.isin(windows_of(sensing, residuals), episode(sensing, residuals).windows)
     return np.asarray(sensing.out & ~inside)
 
 
@@ -181,9 +181,9 @@ def _record(
     return EffectRecord(name, parameters, uncertainty)
 
 
-def _streams(sight: PoseResiduals) -> list[PoseSequence]:
-    reference = sight.session.reference
-    return [*sight.session.sensors.values(), *([reference] if reference else [])]
+def _streams(residuals: PoseResiduals) -> list[PoseSequence]:
+    reference = residuals.session.reference
+    return [*residuals.session.sensors.values(), *([reference] if reference else [])]
 
 
 def _moving(poses: PoseSequence) -> NDArray[np.bool_]:
