@@ -19,7 +19,7 @@ from anser_ros.calibration.result import Calibration, Scan, provenance, residual
 from anser_ros.calibration.scan_gaps import gaps_of
 from anser_ros.calibration.selection import (
     COUNTS,
-    THREE_TIMES,
+    LOSS_FOR_A_THIRD,
     Selection,
     choose_layout,
     thin_frames,
@@ -255,10 +255,11 @@ def best_damped(
 
 
 def _better(tested: Sequence[tuple[LayoutCandidate, HeldOut]]) -> tuple[LayoutCandidate, HeldOut]:
-    """Return the finalist whose error is least, three times the dipoles as `THREE_TIMES` worse."""
+    """Return the finalist whose error is least; a third of the dipoles is worth some error."""
 
     def cost(pair: tuple[LayoutCandidate, HeldOut]) -> float:
         held_out = pair[1]
-        return float(held_out.score_t * held_out.n_dipoles ** (np.log(THREE_TIMES) / np.log(3.0)))
+        exponent = np.log(LOSS_FOR_A_THIRD) / np.log(3.0)
+        return float(held_out.score_t * held_out.n_dipoles**exponent)
 
     return min(tested, key=cost)

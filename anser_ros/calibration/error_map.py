@@ -43,7 +43,7 @@ NOISES = (0.03, 0.1, 0.3, 1.0)
 that follows nearly every point to one that hardly follows any."""
 TRENDS = (0, 1)
 """Degrees of the polynomial trend that are tried: a constant shift and an affine map."""
-CLEAR = 2.0
+LEAST_GAIN_SIGMAS = 2.0
 """Standard errors by which the held-out error must fall for a gain to be claimed: with five blocks
 chance alone does so once in twenty."""
 PLANE = 0.02
@@ -133,7 +133,7 @@ class ErrorMap:
     @property
     def is_confirmed(self) -> bool:
         """Return whether unseen blocks confirm the map clearly, so that it may be used."""
-        return bool(self.helps and self.clearness > CLEAR)
+        return bool(self.helps and self.clearness > LEAST_GAIN_SIGMAS)
 
     def apply(self, tracked: Array) -> Array:
         """Return corrected positions (P, 3), m."""

@@ -65,7 +65,7 @@ LEAST_GAIN = 0.08
 """Fraction by which more dipoles must lower the predictive error to be chosen. Below the noise a
 lower error changes no pose, while tracking takes time in proportion to the dipoles. A smaller
 value chooses larger layouts, a larger one gives accuracy away."""
-THREE_TIMES = 1.15
+LOSS_FOR_A_THIRD = 1.15
 """Factor by which a finalist's predictive error may be larger if it has a third of the dipoles: as
 many as moved ones need for the error of a layer of fixed ones. A finalist with nearly as many
 dipoles must be nearly as good: where a scan has gaps, some percent of the error of blocks, most of

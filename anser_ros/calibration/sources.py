@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.calibration.dipole_sites import DipoleSites
-from anser_ros.calibration.still_fit import DIPOLE_PAYS
+from anser_ros.calibration.still_fit import DIPOLE_PAYS, LEAST_CLEARANCE
 from anser_ros.calibration.still_system import FREEDOM, student_weight
 from anser_ros.errors import FitError
 from anser_ros.physics.windings import PlacedPoints
@@ -36,9 +36,6 @@ FIRST_GAIN = 0.1
 """Relative error of readings before there is a field to tell what errors of sensors would do."""
 ALONG = 16
 """Places of a grid along the longest side of the volume, at which sources are looked for."""
-NEAREST = 0.05
-"""Least distance of a place from every sensor, as a fraction of the sensors' extent: a nearer
-dipole is felt by one sensor alone."""
 STARTS = 3
 """Best places of the grid from which a source is refined."""
 STRAY = 0.1
@@ -159,7 +156,7 @@ class SourcesFitter:
         places = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 3)
         points = self.readings.points.points
         away = np.linalg.norm(points[None] - places[:, None], axis=2).min(axis=1)
-        clear = away > NEAREST * float(np.ptp(points, axis=0).max())
+        clear = away > LEAST_CLEARANCE * float(np.ptp(points, axis=0).max())
         if not clear.any():
             raise FitError('the tracked volume has no place that is clear of the sensors')
         return np.asarray(places[clear])

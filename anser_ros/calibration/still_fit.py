@@ -47,9 +47,9 @@ GRID = 0.25
 """Distance of neighbouring places, as the same fraction; the best is then refined."""
 HALVINGS = 3
 """Refinements of a place, each by half the distance."""
-CLEAR = 0.05
-"""Least distance of such a dipole from every sensor, as the same fraction: a nearer one is felt by
-one sensor alone, and is that sensor's."""
+LEAST_CLEARANCE = 0.05
+"""Least distance of a dipole from every sensor, as a fraction of the sensors' extent: a nearer one
+is felt by one sensor alone, and is that sensor's."""
 SIZES = (1e-3, 1e-2, 1e-1, 1.0)
 """Expected sizes of a free dipole's field at the nearest sensor, relative to the fluxes."""
 
@@ -201,7 +201,7 @@ class StillFitter:
         if not len(steps):
             return sites
         places = sites.positions[-3 * len(steps) :: 3]
-        away = np.asarray(self.tree.query(places)[0]) - CLEAR * self.extent
+        away = np.asarray(self.tree.query(places)[0]) - LEAST_CLEARANCE * self.extent
         most = np.maximum(away, 0.0) / 2.0
         size = np.maximum(np.linalg.norm(steps, axis=1), 1e-12)
         moved = places + steps * np.minimum(1.0, most / size)[:, None]
@@ -269,7 +269,7 @@ class StillFitter:
         around = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing='ij'), -1).reshape(-1, 3)
         for _ in range(1 + HALVINGS):
             away = np.asarray(self.tree.query(places)[0])
-            clear = away > CLEAR * self.extent
+            clear = away > LEAST_CLEARANCE * self.extent
             if clear.any():
                 places, away = places[clear], away[clear]
                 sizes = np.outer(SIZES, self.flux_rms * away**3 / DIPOLE_CONSTANT)

@@ -7,9 +7,10 @@ from pathlib import Path
 from anser_ros.cli.output import check_new_file, say_written
 from anser_ros.cli.progress import progress_of
 from anser_ros.errors import ParameterError
-from anser_ros.poses.forms import ORDERS, UNITS
+from anser_ros.poses.forms import ORDERS
 from anser_ros.poses.importing import STAMPS, import_poses
 from anser_ros.poses.recording import write_pose_session
+from anser_ros.sessions.table_import import LENGTH_M
 from anser_ros.wire.setup_values import read_name
 
 SCHEMA = 'anser_import_poses/1'
@@ -40,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--stamps', choices=STAMPS, default='host', help='which of their times becomes the stamp'
     )
-    parser.add_argument('--unit', choices=list(UNITS), help='unit of the tracked positions')
+    parser.add_argument('--unit', choices=list(LENGTH_M), help='unit of the tracked positions')
     parser.add_argument(
         '--quaternion', choices=list(ORDERS), help='how the tracked quaternions are written'
     )

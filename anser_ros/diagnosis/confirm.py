@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from anser_ros.diagnosis.decisions import (
     CHANGED,
-    CLEAR,
     LARGEST_VARIATION,
     LEAST_OF_THE_REST,
+    LEAST_POWER_SIGMAS,
     MANY,
     MODEL_ERROR,
     SOMETHING_LEFT,
@@ -181,7 +181,7 @@ def _stays(state: State, columns: Sequence[Array | None], noise: float, expected
         stays = max(float(np.median(acted)) - model, 0.0) * acted.size
     else:
         stays = float(acted.sum() - np.median(others) * acted.size)
-    return stays if stays > CLEAR * spread * np.sqrt(acted.size) else 0.0
+    return stays if stays > LEAST_POWER_SIGMAS * spread * np.sqrt(acted.size) else 0.0
 
 
 def _checked_open(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmation:

@@ -22,7 +22,7 @@ Unless a number says otherwise, it was chosen by hand on injected effects with s
 """
 
 # --- whether an effect is accepted -------------------------------------------------------------
-FOLDS = 4
+TIME_FOLDS = 4
 """Parts of the cross-validation over time blocks: of the twenty blocks that are fitted each part
 holds out five, as many as take no part at all. More cost a fit each, fewer leave less to fit
 on."""
@@ -128,7 +128,7 @@ for another effect; smaller refuses effects whose model is only near the truth, 
 LEAST_OF_THE_REST = 0.2
 """An effect that takes off less than this share of what stays unexplained is not named: something
 larger is unknown, and the effect is probably its trace."""
-CLEAR = 6.0
+LEAST_POWER_SIGMAS = 6.0
 """Standard deviations of the noise's power from which a remainder counts. A normal variable passes
 it once in 1e9, the power of normal noise in one cell of 400 frames once in 5e7. Where the median
 cell is taken its spread is a quarter larger, and a normal variable passes once in 1e6. Noise that

@@ -31,7 +31,7 @@ from anser_ros.metal.body import COMPACT, SPACINGS, body_sizes
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-KNOTS = 9
+FIRST_KNOTS = 9
 """Knots of a path to begin with: three seconds apart in half a minute of moving. Fewer cannot
 follow a way that stops for some seconds; more start the fit with parameters that few of the
 `SOME_FRAMES` determine, of which each knot now has six or seven."""
@@ -184,7 +184,7 @@ def _starts(
     """Paths to try: along the best places block by block, and ways away from the strongest one."""
     duration, still = problem.apparatus.duration, effect.still
     assert still is not None and problem.references is not None
-    knots = np.linspace(0.0, duration, KNOTS)
+    knots = np.linspace(0.0, duration, FIRST_KNOTS)
     scorer = Scorer(state, blocks)
     scored = [
         (term, score)

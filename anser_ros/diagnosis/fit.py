@@ -7,7 +7,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.decisions import FOLDS
+from anser_ros.diagnosis.decisions import TIME_FOLDS
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.diagnosis.scoring import BlockSums, block_sums, joined
 from anser_ros.effects.effect import Family
@@ -81,7 +81,7 @@ class Fit:
 
     def held_out(self) -> float:
         """Return the cross-validated squares, linear about the optimum, plus what freedom cost."""
-        return self.sums.held_out(self.prior, FOLDS) + self.state.penalty
+        return self.sums.held_out(self.prior, TIME_FOLDS) + self.state.penalty
 
 
 @dataclass(frozen=True)

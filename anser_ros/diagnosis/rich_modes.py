@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.diagnosis.decisions import FOLDS
+from anser_ros.diagnosis.decisions import TIME_FOLDS
 from anser_ros.diagnosis.problem import Part, State
 from anser_ros.diagnosis.scoring import BlockSums, block_sums, joined
 from anser_ros.diagnosis.whitening import parts
@@ -75,12 +75,12 @@ def rich_modes(
     sums = block_sums(few, joined([columns, group]), blocks)
     width, count = prior.size, leading.size
     bare = sums.columns(np.arange(width))
-    best: tuple[float, Array] = (bare.held_out(prior, FOLDS), np.zeros((0, 0)))
+    best: tuple[float, Array] = (bare.held_out(prior, TIME_FOLDS), np.zeros((0, 0)))
     for spread in spreads:
         turned = vectors * (spread / widest)[:, None]
         root = np.linalg.cholesky(turned.T @ turned + 1e-12 * np.eye(count))
         left = _turned(sums, width, root).held_out(
-            np.concatenate([prior, np.ones(2 * count)]), FOLDS
+            np.concatenate([prior, np.ones(2 * count)]), TIME_FOLDS
         )
         if left < best[0]:
             best = (left, root)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from anser_ros.diagnosis.decisions import FOLDS
+from anser_ros.diagnosis.decisions import TIME_FOLDS
 from anser_ros.diagnosis.problem import State
 from anser_ros.effects.term import Term
 
@@ -213,7 +213,7 @@ class Scorer:
         self.prior = np.concatenate([t.effect.prior(t) for t in terms] or [np.zeros(0)])
         empty: list[Array | None] = [None] * len(state.parts)
         self.sums = block_sums(state, self._active or empty, blocks)
-        self.held_out = self.sums.held_out(self.prior, FOLDS) + state.penalty
+        self.held_out = self.sums.held_out(self.prior, TIME_FOLDS) + state.penalty
 
     def score(self, term: 'Term') -> Score | None:
         """Return the worth of a candidate; None when it touches no value, or is at a dipole's own
@@ -231,7 +231,7 @@ class Scorer:
         prior = np.where(scale > 0, 1e4 / np.maximum(scale, 1e-300), 1.0)
         full_prior = np.concatenate([self.prior, prior])
         estimate, _ = sums.solve(full_prior)
-        left = sums.held_out(full_prior, FOLDS) + self.state.penalty
+        left = sums.held_out(full_prior, TIME_FOLDS) + self.state.penalty
         return Score(left, estimate[-width:], own)
 
     def _beside(self, probe: Columns, own: BlockSums) -> BlockSums:

@@ -13,6 +13,7 @@ from anser_ros.poses.registry import effect_with
 from anser_ros.poses.sequence import REFERENCE, PoseSequence, PoseSession
 from anser_ros.poses.start import coarse_offset, first_cost, first_fit, pose_problem
 from anser_ros.sessions.plausibility import check_positions
+from anser_ros.sessions.table_import import LENGTH_M
 
 Array = NDArray[np.float64]
 
@@ -31,7 +32,7 @@ reading makes at least (`POOR_M`), so its files do not belong together, or mean 
 not known here. Smaller refuses sessions with much distortion; larger takes files that do not
 belong together for bad ones."""
 UNITS = {
-    'mm': 1e-3, 'cm': 1e-2, 'inch': 0.0254, 'km': 1e3,
+    **{unit: size for unit, size in LENGTH_M.items() if unit != 'm'}, 'km': 1e3,
     'inch taken for mm': 25.4, 'mm taken for inch': 1 / 25.4,
 }  # fmt: skip
 """What a unit of the numbers is in m when they are taken for m, or for what is said."""

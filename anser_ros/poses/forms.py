@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError
 from anser_ros.poses.sequence import REFERENCE
+from anser_ros.sessions.table_import import LENGTH_M
 
 Array = NDArray[np.float64]
 
-UNITS = {'m': 1.0, 'cm': 0.01, 'mm': 0.001, 'inch': 0.0254}  # m in a unit of length
 ORDERS = {
     'xyzw': ((0, 1, 2, 3), False),
     'wxyz': ((1, 2, 3, 0), False),
@@ -54,7 +54,7 @@ class RawRows:
     form : str
         How its quaternions are written, a key of `ORDERS`.
     unit : str
-        Unit of its lengths, a key of `UNITS`.
+        Unit of its lengths, a key of `LENGTH_M`.
     """
 
     host: list[float] = field(default_factory=list)
@@ -161,7 +161,7 @@ def _table(lines: Sequence[str], path: Path) -> dict[str, RawRows]:
     """CSV: ``stamp_ns`` or ``time_s``, positions with their unit, quaternions, ``sensor``."""
     reader = csv.DictReader(lines)
     names = reader.fieldnames or []
-    unit = next((u for u in UNITS if {f'{axis}_{u}' for axis in 'xyz'} <= set(names)), None)
+    unit = next((u for u in LENGTH_M if {f'{axis}_{u}' for axis in 'xyz'} <= set(names)), None)
     clock = next((c for c in ('stamp_ns', 'time_s') if c in names), None)
     turn = ('qx', 'qy', 'qz', 'qw')
     if unit is None or clock is None or not set(turn) <= set(names):

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError
-from anser_ros.poses.forms import ORDERS, UNITS, RawRows, read_form
+from anser_ros.poses.forms import ORDERS, RawRows, read_form
 from anser_ros.poses.sequence import REFERENCE, PoseSequence, PoseSession, sequence_of
+from anser_ros.sessions.table_import import LENGTH_M
 
 Array = NDArray[np.float64]
 
@@ -43,7 +44,7 @@ def import_poses(
         Several of each are recordings one after the other, the n-th of both together.
     stamps : {'host', 'device'}
     unit : str, optional
-        Unit of the tracked positions where the form does not state it correctly (`UNITS`).
+        Unit of the tracked positions where the form does not state it correctly (`LENGTH_M`).
     quaternion : str, optional
         How the tracked quaternions are written where it is not as usual in their form (`ORDERS`).
 
@@ -58,7 +59,7 @@ def import_poses(
     PlausibilityError
         When quaternions are not of unit length.
     """
-    for value, known in ((stamps, STAMPS), (unit, UNITS), (quaternion, ORDERS)):
+    for value, known in ((stamps, STAMPS), (unit, LENGTH_M), (quaternion, ORDERS)):
         if value is not None and value not in known:
             raise ParameterError(f'must be one of {", ".join(known)}, got {value!r}')
     if reference and len(reference) != len(tracked):
@@ -118,7 +119,7 @@ def _named(
         turn = table[:, 3:][:, list(order)]
         if is_inverse:
             turn = turn * np.array([-1.0, -1.0, -1.0, 1.0])
-        found[label] = one, table[:, :3] * UNITS[unit or one.unit], turn
+        found[label] = one, table[:, :3] * LENGTH_M[unit or one.unit], turn
     return found
 
 

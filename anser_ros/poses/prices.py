@@ -27,7 +27,7 @@ SCALE_SHARE, SCALE_M = 0.1, 0.8e-3
 """The same of a scale of one sensor alone, which is few numbers and follows hardly anything: this
 share, or more where that is less than `SCALE_M`."""
 
-CLEAR = 5.0
+LEAST_SCALE_SIGMAS = 5.0
 """Standard deviations by which a scale must differ from one, or a sensor's clock from the others'.
 Of a few recordings at rest, each a block, these are uncertain themselves: of six blocks 1 in 250
 such is chance. Smaller names a scale for what ten places have in common; larger misses slight ones
@@ -68,6 +68,6 @@ def doubt(fit: PoseFit, index: int) -> str:
     sigma = float(np.sqrt(covariance[0, 0]))
     own_clock = effect_of(term).role.is_clock and 'sensor' in term.site
     is_one_number = is_of(term, Role.SCALE) or is_scale(term) or own_clock
-    if is_one_number and abs(float(term.theta[0])) < CLEAR * sigma:
-        return f'less than {CLEAR:g} of its standard deviations'
+    if is_one_number and abs(float(term.theta[0])) < LEAST_SCALE_SIGMAS * sigma:
+        return f'less than {LEAST_SCALE_SIGMAS:g} of its standard deviations'
     return ''

@@ -46,7 +46,7 @@ AT_ONCE = 64
 into waiting for memory, with many fewer, into starting again."""
 MOST_MIDDLE = 60
 """Samples in the middle that tell what the uncertainty's modes leave."""
-CLEAR = 0.35
+LEAST_SAMPLE_DISTANCE = 0.35
 """Samples nearer to a body's sources than this part of its radius don't count."""
 INNER = 0.83
 """Part of the tracked volume that the box is fitted in: near the faces, the field of what is just
@@ -190,7 +190,7 @@ def body_layer(region: Region, weight: Array, cloud: Cloud) -> Layer:
     """
     points = region.volume.samples()
     away = np.linalg.norm(points[:, None] - cloud.positions, axis=2).min(axis=1)
-    clear = away > CLEAR * cloud.standoff_m
+    clear = away > LEAST_SAMPLE_DISTANCE * cloud.standoff_m
     points = points[clear]
     positions, directions = along_each_axis(cloud.positions)
     basis = component_rows(points, positions, directions)

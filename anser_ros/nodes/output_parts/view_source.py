@@ -24,7 +24,7 @@ from anser_ros.nodes.runtime import qos
 from anser_ros.wire.pose_topics import optical_topic
 from anser_ros.wire.setup import parse_setup, topic_of
 
-STREAM = QoSProfile(
+NEWEST = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=32, reliability=ReliabilityPolicy.BEST_EFFORT
 )
 """Poses as they come; the newest matters, and there is room for those of a tick at 200 Hz."""
@@ -130,11 +130,11 @@ class ViewSource:
             view.take_status(name, status)
         self._poses = [
             Polled(self._node, PoseWithCovarianceStamped,
-                   f'{topic_of(target.name)}/pose_with_covariance', STREAM)
+                   f'{topic_of(target.name)}/pose_with_covariance', NEWEST)
             for target in view.targets
         ]  # fmt: skip
         self._optical = {
-            body: Polled(self._node, PoseStamped, optical_topic(body, self._optical_space), STREAM)
+            body: Polled(self._node, PoseStamped, optical_topic(body, self._optical_space), NEWEST)
             for body in sorted(view.bodies)
         }
         self.view, self.version = view, self.version + 1

@@ -23,7 +23,7 @@ GROWN = 2.0
 grows by half over their volume."""
 WIDEST = 1.3
 """Ratio of far to near distances (95 to 5 %) without which no power law of it can be told."""
-CLEAR = 5.0
+LEAST_LAW_SIGMAS = 5.0
 """Standard deviations by which the noise must differ from a constant: by the likelihood, and by
 those of the exponent, which few distances leave large."""
 EXPONENTS = (2.8, 6.5)
@@ -155,7 +155,7 @@ class RangeNoise(PoseEffect):
         if high < WIDEST * low:
             return []
         exponent, spread, gain = power_law(square, distance)
-        is_clear = gain > CLEAR**2 and exponent > CLEAR * spread
+        is_clear = gain > LEAST_LAW_SIGMAS**2 and exponent > LEAST_LAW_SIGMAS * spread
         if not (is_clear and EXPONENTS[0] <= exponent <= EXPONENTS[1]):
             return []
         middle = float(np.median(places))
