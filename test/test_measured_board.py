@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from anser_ros.calibration.error_map import learn_error_map
+from anser_ros.calibration.error_map import LEAST_GAIN_SIGMAS, learn_error_map
 from anser_ros.cli.main import main
 from anser_ros.errors import BagError, FitError
 from anser_ros.measured import anser_board
@@ -41,9 +41,11 @@ def test_a_bent_run_gains_and_a_scattered_one_does_not(tmp_path):
     for command in anser_board.commands(files, tmp_path / 'out'):
         assert main(command) == 0
     rows = anser_board.rows(tmp_path, files, tmp_path / 'out')
-    words = {row.figure.split(':')[0]: row.chosen_on for row in rows}
+    errors, gains = rows[::2], [row.after for row in rows[1::2]]
+    words = {row.figure.split(':')[0]: row.chosen_on for row in errors}
     assert ': a gain' in words['bent'] and 'no gain is shown' in words['scattered']
-    assert all('across the board, not corrected' in row.chosen_on for row in rows)
+    assert all('across the board, not corrected' in row.chosen_on for row in errors)
+    assert gains[0] > LEAST_GAIN_SIGMAS > gains[1]
 
 
 @pytest.mark.long

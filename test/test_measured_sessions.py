@@ -110,12 +110,15 @@ class TestNavion:
                 for y, error in zip((-0.1, 0.0, 0.1), errors, strict=True)
             ]
             (tmp_path / kind).mkdir()
-            text = json.dumps({'heldout_by_pose': poses})
+            effects = [{'name': 'sensor_gain_spread', 'parameters': {'spread': 0.02}}]
+            text = json.dumps({'heldout_by_pose': poses, 'effects': effects})
             (tmp_path / kind / 'calibration.json').write_text(text)
-        every, inner = navion.rows(tmp_path, [], tmp_path)
+        every, inner, *heights, gains, tilts = navion.rows(tmp_path, [], tmp_path)
         assert inner.before == pytest.approx(0.3) and inner.after == pytest.approx(0.05)
         assert inner.met and not every.met
         assert every.after == pytest.approx(np.sqrt((0.2**2 + 0.05**2 + 0.1**2) / 3))
+        assert [row.after for row in heights] == pytest.approx([0.2, 0.05, 0.1])
+        assert (gains.after, gains.unit) == (2.0, '%') and np.isnan(tilts.after)
 
 
 class TestHpi:

@@ -79,7 +79,7 @@ def test_a_stream_that_stands_still_while_another_moves_is_frozen():
     assert record.name == 'stale_poses' and record.parameters['stream'] == 'sensor_0'
     assert since == pytest.approx(15.0, abs=0.1)
     assert frozen_streams(session)[0] == ()
-    seen = PoseWatch().look(filled(stuck, start=12.0), 0)
+    seen = PoseWatch().look(filled(stuck, start=12.0))
     assert [r.name for r in seen.findings] == ['stale_poses'] and not seen.is_clear
 
 
@@ -91,20 +91,20 @@ def test_a_stream_that_stands_still_while_another_moves_is_frozen():
 def test_what_changes_is_told_from_what_was_there(change, name, figure, size):
     session = moved(World(5, duration=32.0, sensors=2).session(), change)
     watch = PoseWatch()
-    assert watch.look(filled(session, end=15.0), 0).is_clear
-    seen = watch.look(filled(session, start=19.0), 0)
+    assert watch.look(filled(session, end=15.0)).is_clear
+    seen = watch.look(filled(session, start=19.0))
     (found,) = seen.findings
     assert found.name == name
     assert np.linalg.norm(found.parameters[figure]) == pytest.approx(size, rel=0.05)
     # While the window spans the change nothing has a name, and something is said.
-    between = watch.look(filled(session, start=13.0, end=17.5), 0)
+    between = watch.look(filled(session, start=13.0, end=17.5))
     assert not between.is_clear
 
 
 def test_too_few_poses_are_refused():
     session = World(3, duration=20.0, sensors=1).session()
     with pytest.raises(DiagnosisError):
-        PoseWatch().look(filled(session, end=1.2), 0)
+        PoseWatch().look(filled(session, end=1.2))
 
 
 @pytest.mark.timeout(240)

@@ -42,6 +42,11 @@ TARGETS_MT = {'all heights': 0.12, 'inner heights': 0.10}
 """What the error of the field should not exceed."""
 SPECIAL_MT = {'all heights': 0.110, 'inner heights': 0.0912}
 """What code for these data alone reached: see docs/results/README.md."""
+SPREADS = (
+    ('spread of the gains found', 'sensor_gain_spread', 1e2, '%'),
+    ('tilt of the axes found, along each tangent', 'sensor_axis_spread', 1e3, 'mrad'),
+)
+"""What `calibrate` finds of the sensors, by its effect; factor to the unit."""
 CHOSEN = 'everything on the other heights; scored on the height left out, at its nominal pose'
 
 
@@ -113,23 +118,35 @@ def commands(bags: list[Path], out: Path) -> list[list[str]]:
 
 def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
     """Return the errors of heights that took no part, without and with what was found."""
-    before, after = (_errors_mt(ran(out / kind, 'calibration.json')) for kind in ('plain', 'full'))
+    documents = [ran(out / kind, 'calibration.json') for kind in ('plain', 'full')]
+    before, after = map(_errors_mt, documents)
+    spreads = {e['name']: e['parameters'].get('spread') for e in documents[1]['effects']}
+    found = [
+        ReportRow(
+            NAME, what, float('nan'), scale * figure(spreads, name), unit, None, None,
+            'all heights',
+        )
+        for what, name, scale, unit in SPREADS
+    ]  # fmt: skip
     return [
         ReportRow(
             NAME, f'field of one coil at 35 A, component RMSE, {which}', before[which],
-            after[which], 'mT', goal, bool(after[which] <= goal), CHOSEN, SPECIAL_MT[which],
+            after[which], 'mT', goal, None if goal is None else bool(after[which] <= goal),
+            CHOSEN, SPECIAL_MT.get(which),
         )
-        for which, goal in TARGETS_MT.items()
-    ]  # fmt: skip
+        for which in before
+        for goal in [TARGETS_MT.get(which)]
+    ] + found  # fmt: skip
 
 
 def _errors_mt(document: dict[str, Any]) -> dict[str, float]:
-    """Error of all heights, and of those with others above and below."""
+    """Error of all heights, of those with others above and below, and of each."""
     poses = sorted(document['heldout_by_pose'], key=lambda pose: pose['position_m'][1])
     error = 1e3 * np.array([figure(pose, 'flux_rmse_t') for pose in poses])
     return {
         'all heights': float(np.sqrt(np.mean(error**2))),
         'inner heights': float(np.sqrt(np.mean(error[1:-1] ** 2))),
+        **{f'height {number} from below': float(one) for number, one in enumerate(error, 1)},
     }
 
 

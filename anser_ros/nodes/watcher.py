@@ -319,7 +319,7 @@ def _look(task: Task) -> Sighting | PoseSighting:
     """Look at a window as its kind of watch does."""
     if isinstance(task.watch, PoseWatch):
         assert isinstance(task.session, PoseSession)
-        return task.watch.look(task.session, task.first_ns)
+        return task.watch.look(task.session)
     assert isinstance(task.session, Session)
     return task.watch.look(task.session, task.first_ns)
 

@@ -94,7 +94,7 @@ class PoseWatch:
         self._known: _Known | None = None
         self.searches = 0
 
-    def look(self, session: PoseSession, first_ns: int) -> PoseSighting:
+    def look(self, session: PoseSession) -> PoseSighting:
         """Look at a window whose stamps count from its own beginning.
 
         Raises
