@@ -299,6 +299,10 @@ class TestControl:
         qa = session(9, 1.5e-3)[1]
         assert qa['state'] == ALERT and qa['figures'][name]['state'] == ALERT
         assert 'above the mean' in qa['figures'][name]['words']
+        out = tmp_path / 'stuck'
+        qa = session(10, 0.0, '--out', str(out))[1]
+        assert qa['state'] == ALERT and 'below' in qa['figures'][name]['words']
+        assert 'is the sensor stuck?' in (out / 'report.html').read_text(encoding='utf-8')
         # Neither what failed nor the alert makes limits wider; a repeat takes its own place.
         assert session(10, 2e-4)[1]['figures'][name]['sessions'] == 7
         assert session(10, 2e-4)[1]['earlier_sessions'] == 9

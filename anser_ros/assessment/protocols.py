@@ -34,6 +34,8 @@ Array = NDArray[np.float64]
 
 EVEN_ENOUGH = 0.9
 """Share of poses in the longest evenly spaced stretch below which it is said that poses lack."""
+STUCK_M = 1e-12
+"""Jitter, m, that only the rounding of numbers has."""
 
 
 @dataclass(frozen=True)
@@ -193,6 +195,8 @@ def _rest(
             'poses are missing: the Allan deviation is that of the longest stretch without a '
             f'gap, {found.even_share:.0%} of the poses'
         )
+    if found.estimates['position_jitter_rms_m'].value < STUCK_M:
+        notes.append('the position never changes at all: is the sensor stuck?')
     return replace(empty, estimates=found.estimates, allan=found.allan, notes=tuple(notes))
 
 

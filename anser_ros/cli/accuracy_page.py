@@ -30,7 +30,8 @@ def render(found: Assessment, document: dict[str, Any]) -> str:
         table(heads, [row[: len(heads)] for row in figure_rows(found, document)]),
         *(f'<p class="note">{html.escape(words)}</p>' for words in found.notes),
     ]
-    if found.allan:
+    # A stuck sensor has none, and nothing for logarithmic axes.
+    if any(np.any(curve.deviation > 0) for curve in found.allan.values()):
         sections += ['<h2>Allan deviation</h2>', image(_allan(found))]
     if found.groups:
         sections += ['<h2>Errors</h2>', image(_errors(found))]
