@@ -12,6 +12,7 @@ from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node, PushRosNamespace
+from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = 'anser_ros'
@@ -66,7 +67,10 @@ def generate_launch_description():
         output='screen',
         duration_s=value('duration'),
         compare='frozen',
-        compare_note='"gate off: what a tracker without a residual gate would publish"',
+        # As a text, since the colon would make a mapping of it.
+        compare_note=ParameterValue(
+            'gate off: what a tracker without a residual gate would publish', value_type=str
+        ),
     )
     shared = [(topic, f'/anser/{topic}') for topic in SHARED_TOPICS]
     return LaunchDescription(

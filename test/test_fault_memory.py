@@ -27,5 +27,5 @@ def test_what_stops_the_stream_is_an_error_and_comes_first():
 def test_the_device_complains_in_words():
     flags = StatusFlag.OVERRUN | StatusFlag.COIL_OPEN
     assert device_words(DeviceStatus(DeviceState.STREAMING, flags, 0, 12, 0, 30.0)) == (
-        'coil open, overrun, 12 blocks dropped'
+        'coil open, overrun, 12 blocks dropped (computer or line too slow)'
     )

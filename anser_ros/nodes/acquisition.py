@@ -364,13 +364,14 @@ class Acquisition(AnserNode):
         frames = interval.frames
         if interval.repeats == frames and max(frames, interval.duplicates) > 0:
             return Level.ERROR, 'the control unit keeps sending the same samples'
-        troubles = [(self._faults.level, self._faults.words)] if self._faults.words else []
         slow = too_slow(interval.skipped, frames)
         if slow:
             self.warn('seconds_too_slow', slow)
-            troubles.insert(0, (Level.WARN, slow))
-        if self._device is not None and self._device.flags:
-            troubles.append((Level.WARN, f'control unit: {device_words(self._device)}'))
+        own = device_words(self._device) if self._device is not None else ''
+        # Causes stand before the counters of what was lost, as long lines are cut.
+        said = (slow, f'control unit: {own}' if own else '')
+        troubles = [(Level.WARN, words) for words in said if words]
+        troubles += [(self._faults.level, self._faults.words)] if self._faults.words else []
         if self._stream is not None:
             coils = self._setup.emitter.coils
             troubles += clock_troubles(self._stream)
