@@ -65,6 +65,13 @@ def test_a_verdict_has_a_length(moving, count):
         assert 'moving_metal (7 times)' in verdict(document([moving] * 7))
 
 
+def test_what_stays_unexplained_has_its_size():
+    # All of very little is little: 61 pT over a noise of 60.
+    given = document([])
+    given['held_out']['flux_rms_after_t'] = 61e-12
+    assert 'above the noise stays unexplained, 11 pT rms; it depends on' in verdict(given)
+
+
 def test_a_path_is_drawn_with_its_uncertainty(moving):
     ((key, path),) = paths(moving['parameters'])
     assert key == 'path' and len(path['time_s']) == len(path['position_m'])

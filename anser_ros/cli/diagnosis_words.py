@@ -57,7 +57,11 @@ def _paragraph(document: dict[str, Any], names: str) -> str:
     if rest['fraction'] > 0:
         on = ', '.join(rest['depends_on']) or 'none of the variables examined'
         share = f'{rest["fraction"]:.0%}' if rest['fraction'] >= 0.01 else 'Less than 1%'
-        text += f' {share} of the power above the noise stays unexplained; it depends on {on}.'
+        left = 1e12 * max(after**2 - held['flux_rms_floor_t'] ** 2, 0.0) ** 0.5
+        text += (
+            f' {share} of the power above the noise stays unexplained, {left:.2g} pT rms; '
+            f'it depends on {on}.'
+        )
     else:
         text += ' Nothing above the noise stays unexplained.'
     return text
