@@ -94,7 +94,10 @@ def test_arrays_become_a_session(folder, moving, ending):
 
 
 def test_columns_of_csv_become_a_session_with_poses(folder, moving, capsys):
-    """Stamps are whole nanoseconds, quaternions have w first, lengths are millimetres."""
+    """Stamps are whole nanoseconds, quaternions have w first, lengths are millimetres.
+
+    The poses have a time base of their own.
+    """
     _, _, flux = arrays_of(moving)
     names = names_of(moving, moving.tool)
     head, columns, sensors = ['t'], [moving.tool.stamp_ns[:FRAMES].tolist()], {}
@@ -109,14 +112,15 @@ def test_columns_of_csv_become_a_session_with_poses(folder, moving, capsys):
     rows = [','.join(map(repr, row)) for row in zip(*columns, strict=True)]
     (folder / 'flux.csv').write_text('\n'.join([','.join(head), *rows]))
     track = moving.optical['tool_a']
-    lines = ['t,qw,qx,qy,qz,x,y,z']
+    lines, start = ['t,qw,qx,qy,qz,x,y,z'], int(track.stamp_ns[0]) - 7
     for stamp, p, q in zip(track.stamp_ns, 1e3 * track.position, track.quaternion, strict=True):
-        lines.append(f'{stamp},{q[3]},{q[0]},{q[1]},{q[2]},{p[0]},{p[1]},{p[2]}')
-    lines.append(f'{track.stamp_ns[-1] + 5},,,,,,,')  # the tracker saw nothing
+        lines.append(f'{stamp - start},{q[3]},{q[0]},{q[1]},{q[2]},{p[0]},{p[1]},{p[2]}')
+    lines.append(f'{track.stamp_ns[-1] - start + 5},,,,,,,')  # the tracker saw nothing
     (folder / 'poses.csv').write_text('\n'.join(lines))
     poses = [
         {'file': 'poses.csv', 'stamp': 't', 'body': 'tool_a', 'unit': 'mm', 'order': 'wxyz',
-         'position': ['x', 'y', 'z'], 'quaternion': ['qw', 'qx', 'qy', 'qz']}
+         'position': ['x', 'y', 'z'], 'quaternion': ['qw', 'qx', 'qy', 'qz'],
+         'time': {'unit': 'ns', 'start_ns': start}}
     ]  # fmt: skip
     fluxes = [{'file': 'flux.csv', 'stamp': 't', 'unit': 'nT', 'sensors': sensors}]
     assert main([*write_document(folder, fluxes, poses, {'unit': 'ns'}), '--json']) == 0
@@ -142,6 +146,7 @@ def test_columns_of_csv_become_a_session_with_poses(folder, moving, capsys):
         ({'colour': 'red'}, 'no key colour'),
         ({'stamp': 'B'}, 'so B is not a column'),
         ({'stamp': 'z'}, 'the same stamp twice'),
+        ({'time': {'unit': 'h'}}, 'fluxes[0]: time: unit must be among s, ms'),
     ],
 )
 def test_what_is_wrong_with_a_document_is_one_line(folder, moving, capsys, change, said):

@@ -96,12 +96,7 @@ class _Import:
             self._setup = parse_setup(self._setup_text)
         elif 'setup' in spec:
             raise ParameterError('a setup describes fluxes; tracked poses have none')
-        time = _mapping(spec.get('time', {}), 'time')
-        _known(time, ('unit', 'start_ns'), 'time')
-        self._time_ns = _choice(time, 'unit', TIME_NS, 's', 'time')
-        self._start_ns = time.get('start_ns', 0)
-        if not isinstance(self._start_ns, int) or isinstance(self._start_ns, bool):
-            raise ParameterError(f'time: start_ns must be a whole number, got {self._start_ns!r}')
+        self._time = _time_base(spec, 'time')
         self._entries: list[tuple[int, Callable[[SessionWriter], None]]] = []
         self._tables: dict[Path, NumberTable] = {}
         self._messages: Counter[str] = Counter()
@@ -140,13 +135,14 @@ class _Import:
 
     def _stamps(self, table: NumberTable, entry: Mapping[str, Any], what: str) -> list[int]:
         column = table.column(_needed(entry, 'stamp', what))
+        unit_ns, start_ns = _time_base(entry, f'{what}: time') if 'time' in entry else self._time
         if column.dtype.kind in 'iu':  # exact, as nanoseconds since 1970 have 19 digits
-            stamps = [self._start_ns + int(v) * int(self._time_ns) for v in column.tolist()]
+            stamps = [start_ns + int(v) * int(unit_ns) for v in column.tolist()]
         else:
             values = _real(column, table, str(entry['stamp']))
             if not np.isfinite(values).all():
                 raise ParameterError(f'{table.path}: {entry["stamp"]} has values not finite')
-            stamps = [self._start_ns + round(v * self._time_ns) for v in values.tolist()]
+            stamps = [start_ns + round(v * unit_ns) for v in values.tolist()]
         if not stamps:
             raise ParameterError(f'{table.path}: no rows')
         if min(stamps) <= 0:
@@ -157,7 +153,7 @@ class _Import:
 
     def _add_fluxes(self, entry: Mapping[str, Any], what: str, setup: Setup | None) -> None:
         assert setup is not None
-        _known(entry, ('file', 'stamp', 'unit', 'sensors', 'array'), what)
+        _known(entry, ('file', 'stamp', 'time', 'unit', 'sensors', 'array'), what)
         table = self._table(entry, what)
         scale = _choice(entry, 'unit', FLUX_T, 'T', what)
         stamps = self._stamps(table, entry, what)
@@ -191,7 +187,8 @@ class _Import:
 
     def _add_poses(self, entry: Mapping[str, Any], what: str, *, is_tracked: bool) -> None:
         key = 'sensor' if is_tracked else 'body'
-        _known(entry, ('file', 'stamp', key, 'position', 'unit', 'quaternion', 'order'), what)
+        others = ('position', 'unit', 'quaternion', 'order')
+        _known(entry, ('file', 'stamp', 'time', key, *others), what)
         table, name = self._table(entry, what), read_name(_needed(entry, key, what), what)
         if self._setup is not None and name not in self._setup.bodies:
             raise ParameterError(f'{what}: the setup has no body {name}')
@@ -233,6 +230,16 @@ def _pose_putter(
         writer.write_pose(topic, stamp, position.tolist(), quaternion.tolist())
 
     return put
+
+
+def _time_base(holder: Mapping[str, Any], what: str) -> tuple[float, int]:
+    """The unit of a column of stamps, ns, and the stamp of its zero."""
+    time = _mapping(holder.get('time', {}), what)
+    _known(time, ('unit', 'start_ns'), what)
+    start_ns = time.get('start_ns', 0)
+    if not isinstance(start_ns, int) or isinstance(start_ns, bool):
+        raise ParameterError(f'{what}: start_ns must be a whole number, got {start_ns!r}')
+    return _choice(time, 'unit', TIME_NS, 's', what), start_ns
 
 
 def _phasors(table: NumberTable, given: Any, emitters: int, name: str) -> Array:
