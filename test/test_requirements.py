@@ -99,6 +99,12 @@ def test_what_rosdep_does_not_know_is_asked_for_where_it_is_needed(monkeypatch, 
     said = capsys.readouterr().err
     assert said == 'anser recorder: mcap is not installed: pip install mcap\n'
     missing.check('tracker')
+    monkeypatch.setattr(missing, 'find_spec', lambda name: name != 'rclpy' and found(name))
+    for command in (['tracker', '--help'], ['demo'], ['pivot', '--live', '--topic', '/pose']):
+        assert cli.main(command) == 2
+        said = capsys.readouterr().err
+        assert said.startswith(f'anser {command[0]}: rclpy is not installed: source /opt/ros')
+        assert len(said.splitlines()) == 1
 
     def load(name):
         raise ModuleNotFoundError('No module named mcap.reader', name='mcap.reader')

@@ -87,8 +87,7 @@ def run(args: argparse.Namespace) -> int:
         raise ParameterError(f'--duration must be 1 to 3600 s, got {args.duration:g}')
     if not 1.0 <= args.rate <= 200.0:
         raise ParameterError(f'--rate must be 1 to 200 Hz, got {args.rate:g}')
-    if args.dashboard:
-        missing.check('dashboard')
+    missing.check('dashboard' if args.dashboard else 'recorder')
     stopped: list[int] = []
     before = {
         number: signal.signal(number, lambda got, _: stopped.append(got))

@@ -23,7 +23,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from anser_ros.cli.commands import NODES
-from anser_ros.cli.missing import OPTIONAL, PYPI
+from anser_ros.cli.missing import OPTIONAL, PYPI, ROS_REMEDY
 from anser_ros.cli.progress import progress_of
 from anser_ros.errors import ParameterError
 
@@ -272,7 +272,7 @@ def _ros_remedy(last: str) -> str:
     if 'rmw' in last.lower():
         chosen = os.environ.get('RMW_IMPLEMENTATION', '').replace('_', '-')
         return f'unset RMW_IMPLEMENTATION, or sudo apt install ros-jazzy-{chosen}'
-    return 'source /opt/ros/jazzy/setup.bash, or use the environment that `make` makes'
+    return ROS_REMEDY
 
 
 def graph_findings(graph: dict[str, Any]) -> list[Observation]:

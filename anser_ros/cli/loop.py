@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from anser_ros.cli import missing
 from anser_ros.cli.loop_result import parameter_errors, second_run, table, verdict
 from anser_ros.cli.loop_run import AFTER, LoopFiles, Run, make_world, record
 from anser_ros.cli.output import make_folder, say_written
@@ -79,6 +80,7 @@ def run(args: argparse.Namespace) -> int:
     seed = int(np.random.default_rng().integers(1, 2**31)) if args.seed is None else args.seed
     effects = [*sorted(CATALOGUE), NONE] if ALL in args.effect else list(args.effect)
     _check(args, seed, effects)
+    missing.check('recorder')
     for variable in ('OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
         os.environ.setdefault(variable, '1')
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')

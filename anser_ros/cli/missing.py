@@ -1,4 +1,4 @@
-"""Handles packages that rosdep does not know: a command that needs one says so in a line."""
+"""Handles packages that may be missing, ROS among them: what needs one says so in a line."""
 
 from importlib.util import find_spec
 
@@ -16,12 +16,15 @@ PYPI = {
 """Modules without a key of rosdep, and what they are called on PyPI."""
 OPTIONAL = ('nicegui',)
 """Of these, what only somebody needs who wants the live view in a browser."""
+ROS = 'rclpy'
+"""Module that every node needs, and that pip does not install with this package."""
+ROS_REMEDY = 'source /opt/ros/jazzy/setup.bash, or use the environment that `make` makes'
 NEEDED = {
     'dashboard': ('nicegui',),
     'recorder': ('mcap',),
     'replay': ('mcap', 'mcap_ros2', 'zstandard'),
 }
-"""Nodes that do nothing without one of these; all others start where they are missing."""
+"""Nodes that do nothing without one of these; all others need ROS alone."""
 
 
 class MissingPackageError(AnserError):
@@ -30,7 +33,7 @@ class MissingPackageError(AnserError):
 
 def check(node: str) -> None:
     """Raise `MissingPackageError` where a node lacks a package."""
-    for module in NEEDED.get(node, ()):
+    for module in (ROS, *NEEDED.get(node, ())):
         if not find_spec(module):
             raise MissingPackageError(words_of(module))
 
@@ -38,4 +41,5 @@ def check(node: str) -> None:
 def words_of(module: str) -> str:
     """Return what is missing, with its remedy; the module may be one inside a package."""
     package = module.split('.')[0]
-    return f'{package} is not installed: pip install {PYPI.get(package, package)}'
+    remedy = ROS_REMEDY if package == ROS else f'pip install {PYPI.get(package, package)}'
+    return f'{package} is not installed: {remedy}'

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from anser_ros.assessment.source import AssessedPoses, PoseSource
+from anser_ros.cli import missing
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.poses.sequence import PoseSession, sequence_of
 from anser_ros.sessions.plausibility import check_positions
@@ -70,12 +71,15 @@ def live_poses(
     ParameterError
         When the time is not one that can be waited.
     BagError
-        When there is no ROS, or no pose on the topic.
+        When there is no pose on the topic.
+    MissingPackageError
+        When there is no ROS.
     PlausibilityError
         When the positions cannot be in metres.
     """
     if not 0.0 < seconds <= LONGEST_LOOK_S:
         raise ParameterError(f'--seconds must be in (0, {LONGEST_LOOK_S:g}], got {seconds:g}')
+    missing.check('tracker')
     code = f'from anser_ros.nodes.pose_look import main; main({topic!r}, {seconds!r})'
     rows: list[list[float]] = []
     with subprocess.Popen(
