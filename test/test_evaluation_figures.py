@@ -44,7 +44,7 @@ def test_errors_and_lost_frames_over_time(evaluation):
     x = upper.lines[0].get_xydata()
     np.testing.assert_allclose(x[:, 0], 0.02 * np.arange(FRAMES), atol=1e-6)
     np.testing.assert_allclose(x[:, 1], 1e3 * evaluation.sensors['a/x'].position_error)
-    assert [len(line.get_xdata()) for line in lower.lines] == [0, 2, 0]
+    assert [len(line.get_xdata()) for line in lower.lines] == [0, 2, 0] and not lower.texts
     plt.close('all')
 
 
@@ -59,9 +59,10 @@ def test_the_place_of_every_pose_has_its_error(evaluation):
 
 def test_sigma_that_is_too_small_shows(evaluation):
     """Of half-normal errors 68 % lie within a sigma; of ones three times as large, 26 %."""
-    _, right = figures.against_sigma(evaluation).axes
+    left, right = figures.against_sigma(evaluation).axes
     at_one = int(np.argmin(np.abs(figures.COVERAGE_SIGMAS - 1.0)))
-    _, wider = figures.against_sigma(evaluation, jitter_m=1.0).axes
+    narrow, wider = figures.against_sigma(evaluation, jitter_m=1.0).axes
+    assert (left.get_xscale(), narrow.get_xscale()) == ('log', 'linear'), 'labels have room'
     assert wider.lines[2].get_ydata()[at_one] == 1.0, 'a jitter of 1 m explains all'
     shares = [line.get_ydata()[at_one] for line in right.lines]
     assert shares[0] == pytest.approx(0.68, abs=0.1) and shares[2] == pytest.approx(0.26, abs=0.1)

@@ -30,6 +30,9 @@ Array = NDArray[np.float64]
 MOST_POINTS = 4000
 """Most points that a figure shows of one coil: more cannot be distinguished, and make files
 large."""
+WIDE = 4.0
+"""Largest over smallest sigma from which their axis is logarithmic: on a shorter one, labels at 1,
+2 and 5 are too few."""
 COVERAGE_SIGMAS = np.linspace(0.0, 4.0, 81)
 """Multiples of sigma for which the share of errors within is drawn, to where all should be."""
 STYLE = """
@@ -80,6 +83,8 @@ def over_time(evaluation: Evaluation) -> Figure:
     spell_out(upper.yaxis)
     lower.set(xlabel='time, s', ylabel='no pose', ylim=(-0.8, len(found) - 0.2))
     lower.set_yticks([])
+    if all(series.ok.all() for series in found.values()):
+        lower.text(0.5, 0.5, 'every frame has a pose', transform=lower.transAxes, ha='center')
     upper.grid(alpha=0.3)
     _below(figure, upper)
     return figure
@@ -156,12 +161,16 @@ def against_sigma(evaluation: Evaluation, jitter_m: float = 0.0) -> Figure:
         within = [(error <= k * sigma).mean() for k in COVERAGE_SIGMAS]
         right.plot(COVERAGE_SIGMAS, within, color=colour)
     if high > 0:
-        line = np.array([low, high])
+        line = np.linspace(low, high)
         left.plot(line, line, '-', color='0.3', label='error = sigma')
         left.plot(line, 3 * line, '--', color='0.3', label='error = 3 sigma')
-        left.set(xscale='log', yscale='log')
-        for axis in (left.xaxis, left.yaxis):
-            spell_out(axis)
+        left.set(yscale='log')
+        spell_out(left.yaxis)
+        if high > WIDE * low:
+            left.set(xscale='log')
+            spell_out(left.xaxis)
+        else:
+            left.locator_params(axis='x', nbins=5)
     left.set(xlabel='sigma, with the optical jitter, mm', ylabel='position error, mm')
     right.set(xlabel='multiple of sigma', ylabel='share of the errors within', ylim=(0, 1.02))
     for panel in (left, right):
