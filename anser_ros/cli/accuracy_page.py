@@ -130,10 +130,14 @@ def _points(found: Assessment) -> Figure:
     figure, panels = plt.subplots(1, 2, figsize=(9, 4), layout='constrained')
     for panel, (a, b) in zip(panels, ((0, 1), (0, 2)), strict=True):
         panel.plot(place[:, a], place[:, b], 'o-', ms=4, lw=0.5)
-        for number in range(0, len(place), max(1, len(place) // 20)):
-            panel.annotate(str(number + 1), place[number, [a, b]], fontsize=7)
         panel.set(xlabel=f'{"xyz"[a]}, mm', ylabel=f'{"xyz"[b]}, mm')
         panel.grid(alpha=0.3)
+    # Not from the side, from where rows of holes cover each other.
+    for number in range(0, len(place), max(1, len(place) // 20)):
+        panels[0].annotate(
+            str(number + 1), place[number, :2], (4, 2), textcoords='offset points', fontsize=7
+        )
+    panels[0].margins(x=0.1)
     panels[0].set_aspect('equal')  # the heights of a board, which is flat, would be a line
     return figure
 

@@ -28,10 +28,11 @@ from anser_ros.field.plain_data import plain
 from anser_ros.physics.constants import DEGREES
 from anser_ros.poses.convention import reading_words
 from anser_ros.poses.document import finite
-from anser_ros.poses.forms import ORDERS, UNITS
+from anser_ros.poses.forms import ORDERS
 from anser_ros.poses.hand_eye_fit import HandEye, fit_hand_eye, matrix_of, turn_of
 from anser_ros.poses.importing import STAMPS, import_poses
 from anser_ros.poses.sequence import PoseSession, missing_words
+from anser_ros.sessions.table_import import LENGTH_M
 
 SCHEMA = 'anser_handeye/1'
 BAGS = ('.mcap', '.db3', '.bag')
@@ -68,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--stamps', choices=STAMPS, default='host', help='for files: which of their times to use'
     )
     parser.add_argument(
-        '--unit', choices=list(UNITS), help='for files: unit of the tracked positions'
+        '--unit', choices=list(LENGTH_M), help='for files: unit of the tracked positions'
     )
     parser.add_argument(
         '--quaternion',
@@ -197,11 +198,11 @@ HEAD = ('sensor', 'lever arm, mm', '1 sigma', 'mount, deg', '1 sigma', 'rms, mm'
         'held out, deg')  # fmt: skip
 
 
-def _rows(document: dict[str, Any]) -> list[list[str]]:
+def _rows(document: dict[str, Any], digits: int) -> list[list[str]]:
     def triple(values: list[float | None] | None, scale: float) -> str:
         if values is None:
             return '-'
-        return ' '.join('-' if v is None else f'{scale * v:.1f}' for v in values)
+        return ' '.join('-' if v is None else f'{scale * v:.{digits}f}' for v in values)
 
     def single(value: float | None, scale: float) -> str:
         return '-' if value is None else f'{scale * value:.2f}'
@@ -225,7 +226,7 @@ def _table(document: dict[str, Any]) -> Table:
     shown = Table()
     for column in SHOWN:
         shown.add_column(HEAD[column], no_wrap=True)
-    for row in _rows(document):
+    for row in _rows(document, 1):
         shown.add_row(*(row[column] for column in SHOWN))
     return shown
 
@@ -251,7 +252,7 @@ def render(found: HandEye, document: dict[str, Any]) -> str:
         f'<p class="verdict">{html.escape(clocks)}</p>'
         + (f'<p class="note">{html.escape(reading_words(found.convention))}</p>'
            if found.convention is not None else ''),
-        '<h2>Sensors on the body</h2>', table(HEAD, _rows(document)),
+        '<h2>Sensors on the body</h2>', table(HEAD, _rows(document, 2)),
         "<h2>From the optical frame to the tracker's</h2>",
         table(('axis', 'translation, mm', '1 sigma', 'rotation vector, deg', '1 sigma'), rows),
         f'<h2>Not determined</h2><ul>{open_ones}</ul>' if open_ones else '',

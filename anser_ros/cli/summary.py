@@ -10,11 +10,13 @@ from typing import Any
 
 from rich.table import Table
 
-from anser_ros.cli.html_page import page
+from anser_ros.cli.html_page import STYLE, page
 from anser_ros.physics.constants import DEGREES
 
 SCHEMA = 'anser_summary/1'
 """Name of the layout of what ``--json`` prints."""
+WIDE = 'body { max-width: 90em } td, th { padding: .25em .5em }'
+"""Style of a page whose table has many columns."""
 FILES = ('summary.csv', 'summary.html')
 MM, DEG, PT, PERCENT = 1e3, DEGREES, 1e12, 1e2
 """Factors from SI to the units of the table: mm a metre, degrees a radian, pT a tesla, percent."""
@@ -231,4 +233,4 @@ def _page(command: str, folder: Path, rows: Sequence[Row]) -> str:
         f'<table><tr>{head}</tr>{"".join(lines)}</table>',
         '<p class="note">The same in SI units: <code>summary.csv</code>.</p>',
     )
-    return page(f'anser {command}: summary', sections)
+    return page(f'anser {command}: summary', sections, STYLE + WIDE)
