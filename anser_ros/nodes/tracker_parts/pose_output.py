@@ -1,17 +1,19 @@
 """Publishes poses: one pair of topics per sensor or body, and /tf where it is installed."""
 
 import math
+import struct
 import time
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from rclpy.serialization import serialize_message
 
 from anser_ros.nodes.runtime import qos
 from anser_ros.nodes.runtime.diagnostics import Level, Status
 from anser_ros.pose_states import OK, STALE
-from anser_ros.stamps import SECOND_NS, is_live
+from anser_ros.stamps import SECOND_NS, is_live, set_stamp
 from anser_ros.tracking.estimate import PoseEstimate
 from anser_ros.tracking.rotations import quaternion_of_axis, quaternion_of_rotation
 from anser_ros.wire.setup import topic_of
@@ -33,8 +35,39 @@ class Tally:
     latest_s: float = -math.inf
 
 
+STAMP = struct.Struct('<iI')
+STAMP_OFFSET = 4
+"""Where the bytes of a message with a header have its stamp: after what says how it is packed."""
+
+
+class PackedMessage:
+    """Keeps the bytes of a message that begins with a header and ends with numbers.
+
+    Bytes are published in half the time of a message, whose fields are taken from Python objects
+    one by one.
+
+    Parameters
+    ----------
+    message : PoseStamped or PoseWithCovarianceStamped
+        With all that stays; the stamp and the numbers are written over.
+    count : int
+        Numbers at its end, in double precision.
+    """
+
+    def __init__(self, message: Any, count: int) -> None:
+        self._bytes = bytearray(serialize_message(message))
+        self._numbers = struct.Struct(f'<{count}d')
+        self._offset = len(self._bytes) - self._numbers.size
+
+    def packed(self, stamp_ns: int, *numbers: float) -> bytes:
+        """Return the message's bytes with a stamp, ns, and its numbers."""
+        STAMP.pack_into(self._bytes, STAMP_OFFSET, *divmod(stamp_ns, SECOND_NS))
+        self._numbers.pack_into(self._bytes, self._offset, *numbers)
+        return bytes(self._bytes)
+
+
 class PoseTopic:
-    """Publishes a sensor's or body's two pose topics; its messages are built once, refilled."""
+    """Publishes a sensor's or body's two pose topics; their bytes are made once, refilled."""
 
     def __init__(self, node: Any, name: str, frame_id: str, prefix: str = '') -> None:
         self.name = name
@@ -43,13 +76,14 @@ class PoseTopic:
         self._uncertain = node.create_publisher(
             PoseWithCovarianceStamped, f'{stem}/pose_with_covariance', qos.STREAM
         )
-        self._plain, self._full = PoseStamped(), PoseWithCovarianceStamped()
+        plain, full = PoseStamped(), PoseWithCovarianceStamped()
         board = f'{prefix}{frame_id}'
-        self._plain.header.frame_id = self._full.header.frame_id = board
+        plain.header.frame_id = full.header.frame_id = board
+        self._plain, self._full = PackedMessage(plain, 7), PackedMessage(full, 7 + 36)
         self.transform = TransformStamped()
         self.transform.header.frame_id = board
         self.transform.child_frame_id = f'{prefix}{stem}'
-        self._values: tuple[Any, ...] = ()
+        self._values: tuple[float, ...] = ()
         self.estimate: PoseEstimate | None = None
         self.states: Counter[str] = Counter()
         self.tally = Tally()
@@ -91,17 +125,8 @@ class PoseTopic:
             x, y, z, w = quaternion_of_axis(estimate.axis)
         else:
             x, y, z, w = quaternion_of_rotation(estimate.rotation)
-        px, py, pz = estimate.position.tolist()
-        sec, nanosec = divmod(estimate.stamp_ns, SECOND_NS)
-        self._values = sec, nanosec, px, py, pz, x, y, z, w
-        self._fill(self._plain.header.stamp, self._plain.pose)
-        self._pose.publish(self._plain)
-
-    def _fill(self, stamp: Any, pose: Any) -> None:
-        """Write the pose just taken into a message."""
-        place, turn = pose.position, pose.orientation
-        stamp.sec, stamp.nanosec, place.x, place.y, place.z, *_ = self._values
-        turn.x, turn.y, turn.z, turn.w = self._values[5:]
+        self._values = *estimate.position.tolist(), x, y, z, w
+        self._pose.publish(self._plain.packed(estimate.stamp_ns, *self._values))
 
     def publish_covariance(self) -> None:
         """Publish the good pose just taken once more, with its covariance.
@@ -111,13 +136,11 @@ class PoseTopic:
         """
         if self.estimate is None or self.estimate.state != OK:
             return
-        self._fill(self._full.header.stamp, self._full.pose.pose)
-        self._full.pose.covariance = self.estimate.covariance.ravel()
-        self._uncertain.publish(self._full)
-        header, move = self.transform.header, self.transform.transform
-        place, turn = move.translation, move.rotation
-        header.stamp.sec, header.stamp.nanosec, place.x, place.y, place.z, *_ = self._values
-        turn.x, turn.y, turn.z, turn.w = self._values[5:]
+        stamp_ns, covariance = self.estimate.stamp_ns, self.estimate.covariance.ravel().tolist()
+        self._uncertain.publish(self._full.packed(stamp_ns, *self._values, *covariance))
+        set_stamp(self.transform.header.stamp, stamp_ns)
+        place, turn = self.transform.transform.translation, self.transform.transform.rotation
+        place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w = self._values
 
     def state(self, stale_after_s: float) -> tuple[str, str]:
         """Return the state as it is now, silence included, and its reason."""
