@@ -72,6 +72,14 @@ def test_what_rests_keeps_its_certainty_until_it_is_given_up():
     assert age.at(10**12).withheld is None
 
 
+def test_the_same_answer_again_replaces_the_first():
+    """Its uncertainty may come after it; two answers of one moment tell no speed."""
+    age = ModelAge(LONGEST_S, TrackedVolume())
+    age.answered(1, model_with_metal(0.0))
+    age.answered(1, again := model_with_metal(0.1))
+    assert age.at(1).model is again is age.at(2).model
+
+
 def test_states_and_codes():
     assert [state_of_code(code_of(state)) for state in ('', *OF_MODEL)] == ['', *OF_MODEL]
     assert state_of_code(999) == OF_MODEL[-1]

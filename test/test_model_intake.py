@@ -102,6 +102,20 @@ def test_the_model_in_force_ages_by_the_clock_of_the_frames():
     assert force.at(first + 3 * second).withheld.state == 'references_lost'
 
 
+def test_the_model_for_the_next_frame_is_aged_before_it_comes():
+    maker, intake, now = ModelWriter(), ModelIntake(), 10**12
+    force = ModelInForce(setup_of(triaxial_tool()), TrackedVolume(), None)
+    assert force.soon() is None
+    for frame in range(2):
+        model = replace(MODEL, moments=(1.0 + 0.01 * frame) * MODEL.moments)
+        intake.take_error(maker.error(model, 'fg', now + frame, True))
+        given = intake.take(maker.dipoles(model, 'fg', now + frame))
+        force.put(given, force.field_of(given))
+    aged = force.soon()
+    assert aged is not force.field and aged.modes is not None
+    assert force.at(now + 20_000_000).model is aged
+
+
 @pytest.mark.parametrize('late_s', [1, 6, 60])
 def test_an_answer_to_an_old_frame_is_late_however_old_the_frame(late_s):
     """Beyond some age it was once taken for one by another clock, and trusted anew."""

@@ -86,6 +86,8 @@ class ModelAge:
         answers = self._answers
         if answers and stamp_ns < answers[-1][0]:
             answers.clear()
+        elif answers and stamp_ns == answers[-1][0]:
+            answers.pop()  # the same answer again, once its uncertainty has come
         while len(answers) > 1 and (stamp_ns - answers[1][0]) * NANO >= SPEED_S:
             answers.popleft()
         answers.append((stamp_ns, model))

@@ -182,9 +182,14 @@ class TrackerNode(AnserNode):
             field = in_force.field if given is None else in_force.field_of(given)
             if field is not None:
                 new = field is not in_force.field or given is None
-                self._track_with(field, given)
+                # Handed frames are younger than their model: it is aged for them here.
+                ages = given is not None and given.follows and self.hands_over
+                if not ages:
+                    self._track_with(field, given)
                 if given is not None:
                     in_force.put(given, field)
+                if ages:
+                    self._track_with(in_force.soon() or field, given)
                 self.count('models', new)
         except AnserError as error:
             self._refuse('models_refused', error)

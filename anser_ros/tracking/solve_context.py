@@ -202,6 +202,12 @@ class SolveContext:
         assert self.modes is not None
         return self.field.columns.take(self.modes.rows, axis=1)
 
+    def make_ready(self) -> None:
+        """Work out what a warm solve needs of the field and its uncertainty."""
+        _ = self.readings, self.symmetry, self.field.columns
+        if self.modes is not None:
+            _ = self._uncertain
+
     def error_whitening(
         self, points: Array, axes: Array, lengths: Array
     ) -> tuple[Array, Array, Array, Array]:

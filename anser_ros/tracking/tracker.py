@@ -155,6 +155,8 @@ class Tracker:
     def with_model(self, model: FieldModel, model_id: str | None = None) -> 'Tracker':
         """Return the same tracker with another field model; warm starts and counters go on.
 
+        What its first frame needs of the model is worked out here, in whatever thread that is.
+
         Raises
         ------
         TrackingError
@@ -163,6 +165,8 @@ class Tracker:
         other = Tracker.__new__(Tracker)
         other.__dict__.update(self.__dict__)
         other._use(model, model_id)
+        if other._context is not None:
+            other._context.make_ready()
         return other
 
     def renamed(self, model_id: str) -> 'Tracker':

@@ -108,3 +108,9 @@ class ModelInForce:
         if state and state != REFERENCES_LOST:
             return FrameModel(standing.model, Withheld(state, 'reported by field_model'))
         return standing
+
+    def soon(self) -> FieldModel | None:
+        """Return the model that a frame will be tracked with that comes just after the newest."""
+        if self._differs or not self._age.newest_ns:
+            return self.field
+        return self._age.at(self._age.newest_ns + 1).model or self.field
