@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+from conftest import REPO
 
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.signals import demodulation
@@ -58,6 +59,25 @@ def test_stated_noise_is_the_noise(milliseconds, motion):
     assert fit.noise.mean() == pytest.approx(3.0, rel=0.02)
     if milliseconds == 20:
         assert fit.sigma.mean() == pytest.approx(3.0 * np.sqrt(2 / samples), rel=0.1)
+
+
+def test_the_page_states_what_a_fit_costs_in_variance():
+    tones, noise = 5000 + 170 * np.arange(8), np.random.default_rng(3).standard_normal
+
+    def variance(milliseconds, **options):
+        """Of the mean phasor, over that of one tone alone."""
+        count = round(40 * milliseconds)
+        fit = Demodulator(40e3, tones, count, **options).demodulate(noise((count, 1)))
+        return float(np.mean((fit.sigma / fit.noise) ** 2) * count / 2)
+
+    motion = [variance(ms, follow_motion=True) - 1 for ms in (20, 10)]
+    plain = variance(5, follow_motion=False)
+    mains = variance(5, follow_motion=False, mains_hz=50.0) / plain - 1
+    page = ' '.join((REPO / 'docs' / 'acquisition.md').read_text().split())
+    slow, quick = (f'{100 * more:.0f} %' for more in motion)
+    assert f'{slow} of variance at 20 ms and {quick} at 10 ms' in page
+    assert f'Mains harmonics cost {100 * mains:.0f} % of variance at 5 ms' in page
+    assert f'170 Hz apart in 5 ms have {plain:.1f} times the variance of one' in page
 
 
 def test_a_moving_coil_does_not_leak_into_other_tones():
