@@ -257,7 +257,7 @@ def _records(
     records = []
     for i, term in enumerate(fit.terms):
         if is_of(term, Role.MOUNT):
-            name = term.site['sensor']
+            name = str(effect_of(term).sensor_of(term))
             spread = None if base is None else covariances[base]
             part = next(p for p in fit.state.parts if p.view.sensor == name)
             is_determined = is_lever_determined(part, shaking)

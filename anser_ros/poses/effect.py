@@ -217,21 +217,32 @@ class PoseEffect(Effect[Term]):
         """Return the map of a record, which a corrector applies; None for other effects."""
         return None
 
-    def bent(self, term: Term) -> Term:
-        """Return a map without its linear part, which something else has."""
+    def beside_scale(self, term: Term) -> Term | None:
+        """Return what is left of a term beside one scale of all sensors; None where nothing is."""
         return term
 
-    def whole(self, term: Term) -> Term:
-        """Return a map with its linear part, on all sensors, with parameters of zero."""
-        return term
+    def whole(self, term: Term) -> Term | None:
+        """Return a map with what it lacks beside a scale, with parameters of zero; None for a
+        term that lacks nothing.
+        """
+        return None
+
+    def is_scale(self, term: Term) -> bool:
+        """Return whether a term is one scale, of a sensor or of all."""
+        return False
 
     def rival(self, term: Term) -> Term:
         """Return a filter's smoothing without its delay: what a noisy reference asks for."""
         return term
 
+    def sensor_of(self, term: Term) -> str | None:
+        """Return the only sensor that a term is about; None where it is about all of them."""
+        name = term.site.get('sensor')
+        return None if name is None else str(name)
+
     def acts_on(self, term: Term, sensor: str) -> bool:
-        """Return whether a term is about a sensor: its own, or all where the site names none."""
-        return str(term.site.get('sensor', sensor)) == sensor
+        """Return whether a term is about a sensor."""
+        return self.sensor_of(term) in (None, sensor)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from anser_ros.poses.diagnosis import (
     is_lever_determined,
     turn_jitter,
 )
-from anser_ros.poses.effect import Role, frames_of, is_of
+from anser_ros.poses.effect import Role, effect_of, frames_of, is_of
 from anser_ros.poses.fit import PoseFit, fit_poses
 from anser_ros.poses.problem import PoseProblem
 from anser_ros.poses.registry import effect_with
@@ -224,7 +224,7 @@ def _described(
     for index, term in enumerate(fit.terms):
         if not is_of(term, Role.MOUNT):
             continue
-        name = term.site['sensor']
+        name = str(effect_of(term).sensor_of(term))
         frames = frames_of(fit.terms, name)
         part = next(p for p in fit.state.parts if p.view.sensor == name)
         record = hand_eye_record(
@@ -266,8 +266,10 @@ def _described(
 
 def _middle(terms: tuple[Term, ...]) -> float:
     """When the offset is the offset: at stamp zero where no rate is known."""
-    middles = [t.site['middle_s'] for t in terms if 'middle_s' in t.site]
-    return float(middles[0]) if middles else 0.0
+    for term in terms:
+        if is_of(term, Role.RATE):
+            return float(term.effect.record(term, np.zeros((1, 1))).parameters['middle_s'])
+    return 0.0
 
 
 def _open_lever(name: str, lever: Array, turn: Array) -> list[str]:

@@ -134,7 +134,8 @@ class PoseWatch:
         if known is None or session.reference is None:
             return float('nan'), (), ''
         problem = _later_half(pose_problem(session))
-        terms = [t for t in known.terms if 'sensor' not in t.site or _has(problem, t)]
+        present = {None, *(poses.name for poses in problem.sensors)}
+        terms = [t for t in known.terms if effect_of(t).sensor_of(t) in present]
         state = problem.state(terms)
         misfit = _misfits(state)
         if not misfit or not set(misfit) <= set(known.misfit):
@@ -190,10 +191,6 @@ def _later_half(problem: PoseProblem) -> PoseProblem:
     first = min(float(p.time[0]) for p in problem.sensors)
     last = max(float(p.time[-1]) for p in problem.sensors)
     return problem.rows([p.time > 0.5 * (first + last) for p in problem.sensors])
-
-
-def _has(problem: PoseProblem, term: Term) -> bool:
-    return term.site['sensor'] in {poses.name for poses in problem.sensors}
 
 
 def _misfits(state: PoseState) -> dict[str, float]:

@@ -51,13 +51,9 @@ def _map_share(term: Term, parts: Sequence[PosePart]) -> float:
     """Share of the squared error of its sensors' positions that a map must explain."""
     squares = [np.sum(p.residual[p.used, :3] ** 2, axis=1) for p in parts]
     error = float(np.mean(np.concatenate(squares)))
-    least, size = (SCALE_SHARE, SCALE_M) if is_scale(term) else (LARGE_SHARE, LARGE_M)
+    is_scale = effect_of(term).is_scale(term)
+    least, size = (SCALE_SHARE, SCALE_M) if is_scale else (LARGE_SHARE, LARGE_M)
     return float(np.clip(size**2 / max(error, 1e-18), least, MAP_SHARE))
-
-
-def is_scale(term: Term) -> bool:
-    """Return whether a map is that of one sensor's scale."""
-    return is_of(term, Role.MAP) and term.site['degree'] == 0
 
 
 def doubt(fit: PoseFit, index: int) -> str:
@@ -66,8 +62,9 @@ def doubt(fit: PoseFit, index: int) -> str:
     if not term.effect.possible(term.effect.record(term, covariance)):
         return 'implausible parameters'
     sigma = float(np.sqrt(covariance[0, 0]))
-    own_clock = effect_of(term).role.is_clock and 'sensor' in term.site
-    is_one_number = is_of(term, Role.SCALE) or is_scale(term) or own_clock
+    effect = effect_of(term)
+    own_clock = effect.role.is_clock and effect.sensor_of(term) is not None
+    is_one_number = effect.is_scale(term) or own_clock
     if is_one_number and abs(float(term.theta[0])) < LEAST_SCALE_SIGMAS * sigma:
         return f'less than {LEAST_SCALE_SIGMAS:g} of its standard deviations'
     return ''

@@ -18,7 +18,7 @@ from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN
 from anser_ros.effects.term import Term
 from anser_ros.poses.effect import Role, effect_of, is_of
 from anser_ros.poses.fit import LARGEST_STAMP_S, PoseFit, fit_poses, noise_of, unexplained_poses
-from anser_ros.poses.prices import LEAST_SHARE, doubt, is_scale, price
+from anser_ros.poses.prices import LEAST_SHARE, doubt, price
 from anser_ros.poses.problem import PoseNoise, PosePart
 from anser_ros.poses.registry import pose_effects
 
@@ -132,15 +132,10 @@ def effects_of(fit: PoseFit) -> list[Term]:
 def _best_addition(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | None:
     """The fit with the candidate that is worth most, or None; a lag is looked for at the end."""
     setting = fit.state.problem.setting
-    force = {term.name_and_site for term in fit.terms}
     promising: list[tuple[float, Term]] = []
     for effect in pose_effects().values():
         for term in _beside_scale(effect.sites(setting), fit.terms):
-            if (
-                term.name_and_site in force
-                or _is_part(term, fit.terms)
-                or is_of(term, Role.FILTER)
-            ):
+            if is_of(term, Role.FILTER) or _is_covered(term, fit.terms):
                 continue
             if 6 * POSES_A_PARAMETER * term.theta.size > fit.state.count:
                 continue
@@ -149,7 +144,7 @@ def _best_addition(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | No
                 promising.append((gain - AS_GOOD_PER_PARAMETER * term.complexity, term))
     promising.sort(key=lambda pair: -pair[0])
     # Of each effect the best is tried, so that many shapes of one do not crowd out the others.
-    kinds = {(t.effect.name, is_scale(t)): t for _, t in reversed(promising)}
+    kinds = {(t.effect.name, effect_of(t).is_scale(t)): t for _, t in reversed(promising)}
     chosen = list(kinds.values())
     accepted: list[tuple[float, PoseFit]] = []
     for term in [*chosen, *(t for _, t in promising[:FULL_FITS] if t not in chosen)]:
@@ -172,12 +167,10 @@ def _best_addition(fit: PoseFit, refused: list[tuple[str, str]]) -> PoseFit | No
 
 
 def _beside_scale(sites: Sequence[Term], force: Sequence[Term]) -> list[Term]:
-    """Maps beside a scale in force begin with the second degree: the first is the scale's."""
+    """What is left of some terms beside a scale in force."""
     if not any(is_of(term, Role.SCALE) for term in force):
         return list(sites)
-    maps = [t for t in sites if is_of(t, Role.MAP) and 'sensor' not in t.site]
-    bent = [effect_of(t).bent(t) for t in maps if t.site['degree'] > 1]
-    return [t for t in sites if t not in maps] + bent
+    return [left for t in sites if (left := effect_of(t).beside_scale(t)) is not None]
 
 
 def _simplest(accepted: list[tuple[float, PoseFit]]) -> PoseFit:
@@ -190,7 +183,7 @@ def _accepted(
     fit: PoseFit, term: Term, refused: list[tuple[str, str]]
 ) -> tuple[float, PoseFit] | None:
     """What a candidate gains when fitted in full, and that fit, if it pays for itself."""
-    rest = [t for t in fit.terms if not _is_part(t, [term])]
+    rest = [t for t in fit.terms if not term.effect.covers(term, t)]
     trial = fit_poses(fit.state.problem, [*rest, term])
     gain = _gain(fit, trial, term)
     need = price(term, fit.held_out(), fit)
@@ -207,20 +200,9 @@ def _accepted(
     return gain - AS_GOOD_PER_PARAMETER * term.complexity, trial
 
 
-def _is_part(term: Term, others: Sequence[Term]) -> bool:
-    """Whether one of some maps contains what a scale, or a map of a lower degree, is."""
-    if not is_of(term, Role.SCALE) and not is_of(term, Role.MAP):
-        return False
-    for other in others:
-        if other is term or not is_of(other, Role.MAP):
-            continue
-        if other.site.get('sensor') not in (None, term.site.get('sensor')):
-            continue
-        lowest = other.site.get('lowest', 1)
-        own = term.site.get('lowest', 1), term.site.get('degree', 1)
-        if lowest <= own[0] and other.site['degree'] >= own[1]:
-            return True
-    return False
+def _is_covered(term: Term, force: Sequence[Term]) -> bool:
+    """Whether a term in force stands for a candidate already."""
+    return any(one.effect.covers(one, term) for one in force)
 
 
 def _with_lag(
@@ -353,13 +335,13 @@ def _one_scale(fit: PoseFit) -> bool:
 
 def _one_map(fit: PoseFit) -> PoseFit:
     """A whole map instead of a scale and what is bent besides, where it explains as much."""
-    bent = [t for t in fit.terms if is_of(t, Role.MAP) and 'lowest' in t.site]
+    pairs = [(t, whole) for t in fit.terms if (whole := effect_of(t).whole(t)) is not None]
+    bent = [t for t, _ in pairs]
     rest = [t for t in fit.terms if t not in bent and not is_of(t, Role.SCALE)]
     if not bent or len(rest) + len(bent) == len(fit.terms):
         return fit
     problem = fit.state.problem
-    whole = effect_of(bent[0]).whole(bent[0])
-    trial = fit_poses(problem, [*rest, whole])
+    trial = fit_poses(problem, [*rest, pairs[0][1]])
     return trial if trial.held_out(True) < (1 + LEAST_SHARE) * fit.held_out(True) else fit
 
 

@@ -12,7 +12,7 @@ from anser_ros.effects.effect import Remedy, needed, sigmas
 from anser_ros.effects.term import Site, Term
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
-from anser_ros.poses.effect import PoseEffect, PoseMap, PoseSetting, PoseView, Role
+from anser_ros.poses.effect import PoseEffect, PoseMap, PoseSetting, PoseView, Role, is_of
 from anser_ros.poses.smooth_map import SMOOTH, smooth_map
 
 Array = NDArray[np.float64]
@@ -87,13 +87,31 @@ class FieldDistortion(PoseEffect):
             return Term(self, site, np.zeros(4))
         return Term(self, site, np.zeros(3 * _count(site)))
 
-    def bent(self, term: Term) -> Term:
-        """Return the map without its linear part, which something else has."""
+    def beside_scale(self, term: Term) -> Term | None:
+        """Return a map of all sensors without its linear part, which is the scale's."""
+        if self.sensor_of(term) is not None:
+            return term
         site: Site = {**term.site, 'lowest': 2}
-        return Term(self, site, np.zeros(3 * _count(site)))
+        return Term(self, site, np.zeros(3 * _count(site))) if site['degree'] > 1 else None
 
-    def whole(self, term: Term) -> Term:
+    def is_scale(self, term: Term) -> bool:
+        """Return whether the map is of degree zero, which only that of one sensor is."""
+        return int(term.site['degree']) == 0
+
+    def covers(self, term: Term, candidate: Term) -> bool:
+        """Return whether the map contains what a scale, or a map of a lower degree, is."""
+        if not (is_of(candidate, Role.SCALE) or is_of(candidate, Role.MAP)):
+            return False
+        own, site = term.site, candidate.site
+        if self.sensor_of(term) not in (None, self.sensor_of(candidate)):
+            return False
+        has_lowest = own.get('lowest', 1) <= site.get('lowest', 1)
+        return bool(has_lowest and own['degree'] >= site.get('degree', 1))
+
+    def whole(self, term: Term) -> Term | None:
         """Return the map of the same degree with its linear part, on all sensors."""
+        if 'lowest' not in term.site:
+            return None
         site: Site = {**term.site}
         site.pop('lowest', None)
         site.pop('sensor', None)

@@ -30,6 +30,10 @@ class PoseOpticalScale(PoseEffect):
         """Try one reference for all sensors, scaled about the middle of what it saw."""
         return [Term(self, {}, np.zeros(1))]
 
+    def is_scale(self, term: Term) -> bool:
+        """Return that it is a scale."""
+        return True
+
     def prior(self, term: Term) -> Array:
         """Return a prior spread of 3 %, as scales are off by some percent."""
         return np.full(1, 30.0)
