@@ -34,10 +34,12 @@ class World:
         if self.tau == 0.0:
             place, turn = self._place(time), self._turn(time)
         else:
-            ages = np.linspace(0, 16, 321) * self.tau  # cut at 8 tau, a mean age is 0.3 % short
-            weight = np.exp(-ages / self.tau)
-            weight[[0, -1]] *= 0.5
+            # A straight line between ages goes through the filter exactly: the mean age is tau.
+            step, steps = 0.05, np.arange(321)
+            weight = np.exp(-step * steps) * 2 * (np.cosh(step) - 1) / step
+            weight[0] = 1 - (1 - np.exp(-step)) / step
             weight /= weight.sum()
+            ages = step * steps * self.tau
             place = sum(w * self._place(time - a) for w, a in zip(weight, ages, strict=True))
             turn = sum(w * self._turn(time - a) for w, a in zip(weight, ages, strict=True))
         return place + [0.05, 0.02, -0.3], Rotation.from_rotvec(turn)

@@ -1,5 +1,6 @@
 """Single parts of the diagnosis of poses, each against what it has to be by definition."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,6 +18,9 @@ from anser_ros.poses.effects.field_distortion import FieldDistortion
 from anser_ros.poses.effects.noise import power_law
 from anser_ros.poses.effects.stamps import stamp_step
 from anser_ros.poses.path import OpticalPath
+from anser_ros.poses.sequence import PoseSession, sequence_of
+from anser_ros.poses.start import pose_problem, started
+from anser_ros.poses.structure import depends_on
 
 SETTING = PoseSetting(('sensor_0', 'sensor_1'), 0.0, 40.0, np.zeros(3), 0.06)
 
@@ -49,6 +53,28 @@ def test_a_poll_slower_than_its_tracker_is_told_by_poses_that_share_a_stamp():
     taken = np.arange(0, 20, 1 / 92)
     assert stamp_step(np.ceil(taken / 0.016) * 0.016) == pytest.approx(0.016)
     assert stamp_step(np.arange(0, 20, 0.016)) == 0.0  # the tracker's own rate
+
+
+@pytest.mark.parametrize('poses_a_step', [0.37161, 0.27639, 0.35, 0.25, 1 / 3])
+def test_poses_are_thinned_out_of_step_with_a_poll(poses_a_step):
+    # Two poses are 2 / 0.37161 = 5.38197 steps, which is 6 less the golden section.
+    step = 0.016
+    taken = np.arange(1800) * step / poses_a_step
+    stamp = np.ceil(taken / step - 1e-9) * step
+    place, turn = World(6, duration=float(taken[-1])).body(taken)
+    poses = sequence_of('sensor_0', stamp, place, turn.as_quat())
+    session = PoseSession('simulated', 10**9, {'sensor_0': poses}, poses)
+    kept = np.searchsorted(stamp, pose_problem(session).sensors[0].time)
+    late = stamp - taken
+    assert 500 < kept.size <= 900
+    assert late[kept].mean() == pytest.approx(late.mean(), abs=0.03 * step)
+
+
+def test_at_rest_nothing_depends_on_speed():
+    session = World(7, sensors=1).session()
+    problem = pose_problem(session)
+    still = replace(problem, path=replace(problem.path, is_at_rest=True))
+    assert 'speed' not in depends_on(still.state(started(still, 0.0)))
 
 
 def test_a_path_knows_the_noise_of_its_poses_at_a_point_of_the_body():

@@ -33,7 +33,8 @@ MOST_POSES = 900
 that are alike for seconds, and a session of four sensors has to be done within seconds. Fewer make
 effects uncertain; more cost time."""
 GOLDEN = (5**0.5 - 1) / 2
-"""Multiples of it, less whole numbers, are spread evenly and fall into step with nothing."""
+"""Squares of whole numbers times it, less whole numbers, are spread evenly and fall into step with
+nothing. Its multiples fall into step with a poll that goes on by as much from pose to pose."""
 COARSE_S, COARSE_STEP_S = 1.5, 0.05
 """Range and step of the first look for a time offset, s."""
 COARSE_POSES = 300  # poses of that look; it takes a regression at each of its steps
@@ -110,7 +111,7 @@ def _thinned(poses: PoseSequence) -> PoseSequence:
     fresh = poses.rows(~poses.repeated)
     step = max(1, -(-fresh.size // MOST_POSES))
     groups = np.arange(fresh.size // step)
-    return fresh.rows(step * groups + (step * (GOLDEN * groups % 1)).astype(np.int64))
+    return fresh.rows(step * groups + (step * (GOLDEN * groups**2 % 1)).astype(np.int64))
 
 
 def _pauses(sensors: Sequence[PoseSequence]) -> Array:

@@ -34,6 +34,8 @@ def _share(part: PosePart, name: str) -> float:
         speed = np.linalg.norm(part.view.velocity[used, :3], axis=1)
         size = np.sum(residual**2, axis=1)
         quick = speed > np.median(speed)
+        if not quick.any():  # all is at rest
+            return 0.0
         low, high = float(size[~quick].mean()), float(size[quick].mean())
         return max((high - low) / max(high + low, 1e-18), 0.0)
     groups = _groups(part, used, name)
