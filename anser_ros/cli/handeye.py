@@ -32,7 +32,7 @@ from anser_ros.poses.forms import ORDERS
 from anser_ros.poses.hand_eye_fit import HandEye, fit_hand_eye, matrix_of, turn_of
 from anser_ros.poses.importing import STAMPS, import_poses
 from anser_ros.poses.sequence import PoseSession, missing_words
-from anser_ros.sessions.table_import import LENGTH_M
+from anser_ros.sessions.units import LENGTH_M
 
 SCHEMA = 'anser_handeye/1'
 BAGS = ('.mcap', '.db3', '.bag')

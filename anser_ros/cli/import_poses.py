@@ -10,7 +10,7 @@ from anser_ros.errors import ParameterError
 from anser_ros.poses.forms import ORDERS
 from anser_ros.poses.importing import STAMPS, import_poses
 from anser_ros.poses.recording import write_pose_session
-from anser_ros.sessions.table_import import LENGTH_M
+from anser_ros.sessions.units import LENGTH_M
 from anser_ros.wire.setup_values import read_name
 
 SCHEMA = 'anser_import_poses/1'

@@ -13,7 +13,7 @@ from anser_ros.poses.registry import effect_with
 from anser_ros.poses.sequence import REFERENCE, PoseSequence, PoseSession
 from anser_ros.poses.start import coarse_offset, first_cost, first_fit, pose_problem
 from anser_ros.sessions.plausibility import check_positions
-from anser_ros.sessions.table_import import LENGTH_M
+from anser_ros.sessions.units import LENGTH_M
 
 Array = NDArray[np.float64]
 

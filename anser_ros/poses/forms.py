@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError
 from anser_ros.poses.sequence import REFERENCE
-from anser_ros.sessions.table_import import LENGTH_M
+from anser_ros.sessions.units import LENGTH_M
 
 Array = NDArray[np.float64]
 

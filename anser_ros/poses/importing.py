@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from anser_ros.errors import ParameterError
 from anser_ros.poses.forms import ORDERS, RawRows, read_form
 from anser_ros.poses.sequence import REFERENCE, PoseSequence, PoseSession, sequence_of
-from anser_ros.sessions.table_import import LENGTH_M
+from anser_ros.sessions.units import LENGTH_M
 
 Array = NDArray[np.float64]
 

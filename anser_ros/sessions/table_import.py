@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import ParameterError
 from anser_ros.sessions.tables import NumberTable, read_table
+from anser_ros.sessions.units import LENGTH_M
 from anser_ros.wire.bag_writer import FLUX_TOPICS, SessionWriter
 from anser_ros.wire.pose_topics import (
     BODY,
@@ -36,8 +37,6 @@ TIME_NS = {'s': 1e9, 'ms': 1e6, 'us': 1e3, 'ns': 1.0}
 """Nanoseconds in a unit of time."""
 FLUX_T = {'T': 1.0, 'mT': 1e-3, 'uT': 1e-6, 'nT': 1e-9, 'pT': 1e-12}
 """Tesla in a unit of flux density."""
-LENGTH_M = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'inch': 0.0254}
-"""Metres in a unit of length."""
 ORDERS = {'xyzw': (0, 1, 2, 3), 'wxyz': (1, 2, 3, 0)}
 """Where x, y, z, w stand in a quaternion of that order."""
 
