@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.problem import Part, State
+from anser_ros.diagnosis.residuals import tool_parts
 
 Array = NDArray[np.float64]
 
@@ -26,7 +27,7 @@ BEFORE, AFTER = '#c44e52', '#4c72b0'
 def strongest(state: State) -> str:
     """State in words on which channel and emitter the residual is largest."""
     largest = []
-    parts = _tools(state)
+    parts = tool_parts(state)
     emitters = state.problem.fields.omega.size
     for kind, axis in (('channel', 1), ('emitter', 2)):
         sizes: dict[int, float] = {}
@@ -43,10 +44,6 @@ def strongest(state: State) -> str:
             f'{kind} {worst} ({sizes[worst]:.1f} times the expected, the median is {usual:.1f}'
         )
     return f'It is largest on {") and on ".join(largest)}).'
-
-
-def _tools(state: State) -> list[Part]:
-    return [part for part in state.parts if not part.view.is_reference]
 
 
 def _rms(part: Part, axis: int) -> Array:
@@ -69,7 +66,7 @@ def time_line(before: State, after: State) -> Figure:
     """Draw the residual of every frame over time, without and with the effects."""
     figure, axes = plt.subplots(figsize=(9, 3), layout='constrained')
     for state, colour, label in ((before, BEFORE, 'before'), (after, AFTER, 'after')):
-        for part in _tools(state):
+        for part in tool_parts(state):
             axes.plot(part.view.time, _rms(part, 1), '.', ms=3, color=colour, label=label)
     axes.axhline(1.0, color='0.6', lw=0.8)
     axes.set(xlabel='time, s', ylabel='residual / expected', yscale='log')
@@ -86,12 +83,12 @@ def _legend_once(axes: Any) -> None:
 def maps(before: State, after: State) -> Figure:
     """Draw the residual of every frame where the tool was, seen from above."""
     figure, panels = plt.subplots(1, 2, figsize=(9, 4), layout='constrained', sharey=True)
-    sizes = [np.concatenate([_rms(part, 1) for part in _tools(s)]) for s in (before, after)]
+    sizes = [np.concatenate([_rms(part, 1) for part in tool_parts(s)]) for s in (before, after)]
     top = max(float(np.percentile(sizes[0], 98)), 1.5)
     for panel, state, size, title in zip(
         panels, (before, after), sizes, ('before', 'after'), strict=True
     ):
-        place = np.concatenate([part.view.position for part in _tools(state)])
+        place = np.concatenate([part.view.position for part in tool_parts(state)])
         shown = panel.scatter(1e3 * place[:, 0], 1e3 * place[:, 1], c=size, s=8, vmin=0, vmax=top)
         panel.set(title=title, xlabel='x, mm', aspect='equal')
     panels[0].set_ylabel('y, mm')
@@ -113,7 +110,7 @@ def course(path: dict[str, Any], sigma: Any, state: State) -> Figure:
     """
     figure, (above, over) = plt.subplots(1, 2, figsize=(9, 3.6), layout='constrained')
     time, place = np.asarray(path['time_s']), 1e3 * np.asarray(path['position_m'])
-    tool = 1e3 * np.concatenate([part.view.position for part in _tools(state)])
+    tool = 1e3 * np.concatenate([part.view.position for part in tool_parts(state)])
     above.plot(tool[:, 0], tool[:, 1], '.', ms=3, color='0.8', label='tool')
     above.plot(place[:, 0], place[:, 1], '.-', color=BEFORE, label='path')
     above.plot(*place[0, :2], 'o', ms=9, mfc='none', color=BEFORE, label='start')
@@ -153,7 +150,7 @@ def _by(state: State, axis: str) -> tuple[list[str], Array]:
     names: list[str] = []
     sizes: list[float] = []
     squares: Array | None = None
-    for part in _tools(state):
+    for part in tool_parts(state):
         sensors, emitters = part.view.flux.shape[1:]
         size = (_rms(part, 0) ** 2).reshape(2, sensors, emitters).mean(axis=0)
         if axis == 'channel':
@@ -163,5 +160,5 @@ def _by(state: State, axis: str) -> tuple[list[str], Array]:
             squares = size.mean(axis=0) if squares is None else squares + size.mean(axis=0)
             names = [str(k) for k in range(emitters)]
     if squares is not None:
-        sizes = np.sqrt(squares / len(_tools(state))).tolist()
+        sizes = np.sqrt(squares / len(tool_parts(state))).tolist()
     return names, np.array(sizes)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from anser_ros.diagnosis.problem import Part, State
+from anser_ros.diagnosis.residuals import tool_parts
 
 Array = NDArray[np.float64]
 
@@ -59,7 +60,7 @@ def structure_tests(state: State) -> list[StructureTest]:
     each phasor part of each sensor in each bin is compared with zero. For channel, emitter and
     frequency the spread over the groups is compared with the spread of all.
     """
-    tools = _tools(state)
+    tools = tool_parts(state)
     noise = _noise(tools)
     tests = [_binned(tools, name, noise) for name in _VARIABLES]
     tests += [_grouped(tools, name, noise) for name in ('channel', 'emitter', 'quadrature')]
@@ -84,7 +85,7 @@ def noise_scale(state: State) -> float:
     """Return the standard deviation of the white part of the tools' residuals, over the expected
     one.
     """
-    return float(np.sqrt(_noise(_tools(state))))
+    return float(np.sqrt(_noise(tool_parts(state))))
 
 
 def noise_t(state: State) -> float:
@@ -94,16 +95,12 @@ def noise_t(state: State) -> float:
     Along those six directions of a frame the residual is as large as the jitter's prior allows,
     whatever the noise; they are not counted.
     """
-    tools = _tools(state)
+    tools = tool_parts(state)
     count = sum(part.count for part in tools)
     frames = sum(int((part.whitener.weight > 0).any(axis=1).sum()) for part in tools)
     share = min(6 * frames / max(count, 1), 0.9)
     variance = max((_noise(tools) - share) / (1 - share), 1e-6)
     return float(np.sqrt(variance)) * state.problem.spread.flux_t
-
-
-def _tools(state: State) -> list[Part]:
-    return [part for part in state.parts if not part.view.is_reference]
 
 
 def _quantiles(values: Array, bins: int) -> NDArray[np.int64]:

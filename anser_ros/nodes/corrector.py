@@ -4,6 +4,7 @@ import sys
 import time
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,9 @@ class Corrector(AnserNode):
             )
             self._states[sensor] = Counter()
             topic = f'{self.parameters.tracked}/{stem}/pose'
-            self.create_subscription(PoseStamped, topic, self._taker(sensor), qos.STREAM)
+            self.create_subscription(
+                PoseStamped, topic, partial(self._on_pose, sensor), qos.STREAM
+            )
 
     def part_statuses(self) -> list[Status]:
         """Return the state of every sensor."""
@@ -68,12 +71,6 @@ class Corrector(AnserNode):
             values = {'sigma_position_m': sigma, **{f'poses_{k}': n for k, n in counts.items()}}
             statuses.append(Status(sensor, level, 'stale' if silent else state, values))
         return statuses
-
-    def _taker(self, sensor: str) -> Any:
-        def take(message: PoseStamped) -> None:
-            self._on_pose(sensor, message)
-
-        return take
 
     def _on_pose(self, sensor: str, message: PoseStamped) -> None:
         place, turn = message.pose.position, message.pose.orientation

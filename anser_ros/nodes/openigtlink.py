@@ -4,6 +4,7 @@ import math
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -123,14 +124,8 @@ class OpenIGTLink(AnserNode):
             if name not in self._pose_subscriptions:
                 self._set_state(name, 'no pose yet')
                 self._pose_subscriptions[name] = self.create_subscription(
-                    PoseStamped, f'{topic_of(name)}/pose', self._taker(name), qos.STREAM
+                    PoseStamped, f'{topic_of(name)}/pose', partial(self._on_pose, name), qos.STREAM
                 )
-
-    def _taker(self, name: str) -> Any:
-        def take(message: PoseStamped) -> None:
-            self._on_pose(name, message)
-
-        return take
 
     def _on_pose(self, name: str, message: PoseStamped) -> None:
         point, turn = message.pose.position, message.pose.orientation
