@@ -131,6 +131,12 @@ def test_who_comes_before_the_page_is_served_waits_for_it(tmp_path):
         server.end()
 
 
+def test_the_address_for_other_machines_has_the_name_of_this_one(tmp_path):
+    server = PageServer('0.0.0.0', 0, TOKEN, RecordingFolder(tmp_path))
+    server.end()
+    assert server.url == f'http://{socket.gethostname()}:{server.port}/?token={TOKEN}'
+
+
 def test_what_is_missing_is_said_in_a_line(monkeypatch, capsys):
     monkeypatch.setattr(missing, 'find_spec', lambda name: name != 'nicegui')
     assert main(['dashboard']) == 2

@@ -15,6 +15,8 @@ from anser_ros.errors import ParameterError
 from anser_ros.web.folder import RecordingFolder
 from anser_ros.web.guard import Guard, is_local
 
+EVERYWHERE = ('0.0.0.0', '::')
+"""Addresses that stand for all networks of a machine."""
 LEAST_TOKEN = 16
 """Characters of a token: a hundred bits where they are drawn by chance."""
 MOST_BYTES = 262_144
@@ -107,7 +109,9 @@ class PageServer:
     @property
     def url(self) -> str:
         """Return the address for a browser, the token included."""
-        host = f'[{self._host}]' if ':' in self._host else self._host
+        # A browser elsewhere needs this machine's name, not the address for all of its networks.
+        host = socket.gethostname() if self._host in EVERYWHERE else self._host
+        host = f'[{host}]' if ':' in host else host
         return f'http://{host}:{self.port}/' + (f'?token={self._token}' if self._token else '')
 
     def start(self) -> None:
