@@ -2,10 +2,12 @@
 
 import importlib
 import re
+import shlex
 from dataclasses import fields
 
 import pytest
 from conftest import REPO
+from rclpy.utilities import remove_ros_args
 
 from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE
 from anser_ros.cli.main import main
@@ -71,3 +73,5 @@ def test_the_help_of_a_node_has_an_example_that_holds(name, capsys):
     known = {field.name for field in fields(classes[0].PARAMETERS)}
     assert set(re.findall(r'-p (?:\w+:)?(\w+):=', line)) <= known
     assert '-p ' in line or name == 'replay'
+    # Raises where ROS cannot read what a shell makes of it.
+    remove_ros_args([name, *shlex.split(line)])

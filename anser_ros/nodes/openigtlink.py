@@ -63,7 +63,8 @@ class OpenIGTLink(AnserNode):
     """
 
     NAME = 'openigtlink'
-    EXAMPLE = "--ros-args -p host:=0.0.0.0 -p body_name:='{body}ToTracker'"
+    # ROS reads a value as YAML, where a brace begins a mapping: inner quotes make it a text.
+    EXAMPLE = """--ros-args -p host:=0.0.0.0 -p body_name:="'{body}ToTracker'\""""
     PARAMETERS = OpenIGTLinkParameters
 
     def __init__(self, **options: Any) -> None:
