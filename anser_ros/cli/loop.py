@@ -98,9 +98,13 @@ def run(args: argparse.Namespace) -> int:
     document: dict[str, Any] = {'data': 'simulated', 'folder': str(folder), 'rounds': []}
     for number, effect in enumerate(effects):
         where = f'round {number + 1} of {len(effects)}: '
+
+        def tell(text: str, where: str = where) -> None:
+            say.print(where + text)
+
         found = _round(
             folder / f'{number + 1:02d}', world, clean, effect, seed + number, args.duration,
-            args.watch, lambda text, where=where: say.print(where + text),
+            args.watch, tell,
         )  # fmt: skip
         document['rounds'].append(found)
         (folder / 'loop.json').write_text(json.dumps(document, indent=1) + '\n', encoding='utf-8')

@@ -41,16 +41,16 @@ def progress_of(command: str) -> Iterator[Tell]:
         TextColumn('{task.fields[left]}'),
     )  # fmt: skip
     with Progress(*columns, console=console) as bar:
-        task, stage = bar.add_task(command, total=None, left=''), command
+        task, shown = bar.add_task(command, total=None, left=''), command
         remaining = _Remaining()
 
-        def tell(name: str, share: float | None = None) -> None:
-            nonlocal stage
-            if name != stage:
-                stage = name
-                bar.reset(task, description=name)
+        def tell(stage: str, share: float | None = None) -> None:
+            nonlocal shown
+            if stage != shown:
+                shown = stage
+                bar.reset(task, description=stage)
             bar.tasks[0].total = None if share is None else 1.0  # without one the bar only moves
-            left = '' if share is None else remaining.words(name, share)
+            left = '' if share is None else remaining.words(stage, share)
             bar.update(task, completed=share or 0.0, left=left)
 
         yield tell

@@ -9,6 +9,7 @@ import matplotlib
 matplotlib.use('Agg')
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from anser_ros.sessions.drawing import Drawing
@@ -64,9 +65,7 @@ def _board(panel: Any, setup: Setup, across: int, up: int) -> None:
     low, high = 1e3 * np.array(volume.low), 1e3 * np.array(volume.high)
     size = high - low
     panel.add_patch(
-        plt.Rectangle(
-            (low[across], low[up]), size[across], size[up], fill=False, ls='--', color='0.5'
-        )
+        Rectangle((low[across], low[up]), size[across], size[up], fill=False, ls='--', color='0.5')
     )
     panel.annotate('tracked volume', (low[across], high[up]), fontsize=7, color='0.4', va='bottom')
 

@@ -1,6 +1,7 @@
 """Asks the questions of `anser setup`: answers are checked when given, and asked for again."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -92,16 +93,14 @@ def _emitter(ask: Callable[[str], str], say: Callable[[str], object]) -> Documen
         return anser_emitter()
     while True:
         geometry = {
-            key: _ask(ask, say, f'{key} (SI units)', lambda text, key=key: number_of(text, key))
+            key: _ask(ask, say, f'{key} (SI units)', partial(number_of, what=key))
             for key in GEOMETRY[kind]
         }
         count = int(_ask(ask, say, 'number of emitter coils [8]', _count(8, 1)))
         coils = []
         for rank in range(count):
             question = f'coil{rank}: x, y, z, turn about z in degrees, tone in Hz'
-            coils.append(
-                _ask(ask, say, question, lambda text, rank=rank: coil_of(f'coil{rank}', text))
-            )
+            coils.append(_ask(ask, say, question, partial(coil_of, f'coil{rank}')))
         emitter = emitter_of(kind, geometry, coils)
         try:
             check_document(document_of(emitter, [ONE_TOOL_COIL], 50.0, None, {}))

@@ -73,7 +73,7 @@ class Raster:
 
 
 def _tool_a() -> tuple[SensorSpec, ...]:
-    sensors = []
+    sensors: list[SensorSpec] = []
     for cluster in range(3):
         for axis, letter in enumerate('xyz'):
             unit = [0.0, 0.0, 0.0]

@@ -172,7 +172,8 @@ def distance_mm(found: Array, digitised: Array) -> float:
         moved = moved - moved.mean(axis=0)
         return float(Rotation.align_vectors(wanted, moved)[1])
 
-    return 1e3 * min(map(apart, itertools.permutations(range(len(found))))) / len(found) ** 0.5
+    least = min(apart(order) for order in itertools.permutations(range(len(found))))
+    return float(1e3 * least / len(found) ** 0.5)
 
 
 def inverted(epoch: Epoch) -> NDArray[np.bool_]:
@@ -222,8 +223,8 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
             bool((named[1] | ~truth).all()), chosen, SPECIAL_INVERTED,
         ),
         ReportRow(
-            NAME, 'a fifth of the channels predicted by the others, RMSE', *errors, 'pT', None,
-            None, 'field and signs on the others',
+            NAME, 'a fifth of the channels predicted by the others, RMSE', errors[0], errors[1],
+            'pT', None, None, 'field and signs on the others',
         ),
         ReportRow(
             NAME, 'channels falsely named inverted', float((named[0] & ~truth).sum()),

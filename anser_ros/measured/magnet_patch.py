@@ -25,7 +25,8 @@ from anser_ros.measured import ReportRow
 from anser_ros.measured.recipe import Recipe, figure, ran
 from anser_ros.measured.session_file import vector, write_frames
 from anser_ros.stamps import SECOND_NS
-from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup, Vector
+from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup
+from anser_ros.wire.setup_values import Vector
 
 Array = NDArray[np.float64]
 

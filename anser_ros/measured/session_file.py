@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.pose_topics import optical_topic
-from anser_ros.wire.setup import Setup, Vector, dump_setup
+from anser_ros.wire.setup import Setup, dump_setup
+from anser_ros.wire.setup_values import Vector
 
 Array = NDArray[np.float64]
 

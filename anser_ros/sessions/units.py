@@ -1,4 +1,4 @@
-"""Recognises units that are often used by mistake, by how much too large the numbers are."""
+"""Holds units of length, and recognises those used by mistake by how large the numbers are."""
 
 import math
 from collections.abc import Mapping

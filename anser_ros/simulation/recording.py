@@ -135,8 +135,8 @@ def record(
         for stamp, time in sorted(stamps | optical):
             if (stamp, time) in optical:
                 for body in world.setup.bodies:
-                    pose = _jittered(world.pose(body, time), errors, rng)
-                    writer.write_pose(optical_topic(body), stamp, *pose)
+                    place, turn = _jittered(world.pose(body, time), errors, rng)
+                    writer.write_pose(optical_topic(body), stamp, place.tolist(), turn.tolist())
             if (stamp, time) not in stamps:
                 continue
             flux = world.flux(time)

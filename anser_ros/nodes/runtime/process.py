@@ -263,6 +263,7 @@ def _run(
         # What is there now stays: looking through all of it for garbage takes up to 0.1 s.
         gc.collect()
         gc.freeze()
+        gc.enable()
         signals.is_node_made = True
         while not signals.caught and all(node.exit_code is None for node in nodes):
             executor.spin_once(timeout_sec=SPIN_SLICE_S)
