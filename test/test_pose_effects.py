@@ -16,7 +16,7 @@ from anser_ros.poses.effects.clock import PoseClockRate
 from anser_ros.poses.effects.episodes import PoseMovingMetal
 from anser_ros.poses.effects.field_distortion import FieldDistortion
 from anser_ros.poses.effects.noise import power_law
-from anser_ros.poses.effects.stamps import stamp_step
+from anser_ros.poses.effects.stamps import ReceiptJitter, stamp_step
 from anser_ros.poses.path import OpticalPath
 from anser_ros.poses.sequence import PoseSession, sequence_of
 from anser_ros.poses.start import pose_problem, started
@@ -75,6 +75,26 @@ def test_at_rest_nothing_depends_on_speed():
     problem = pose_problem(session)
     still = replace(problem, path=replace(problem.path, is_at_rest=True))
     assert 'speed' not in depends_on(still.state(started(still, 0.0)))
+
+
+@pytest.mark.parametrize('shared', [True, False])
+def test_jitter_of_stamps_is_known_as_well_as_that_of_so_many_poses_can_be(shared):
+    rng = np.random.default_rng(8)
+    sensors = []
+    for k in range(2):
+        time = np.sort(rng.uniform(0, 40, 300)) if k == 0 or not shared else sensors[0].view.time
+        velocity = np.tile([0.0, 0.2, 0.0, 0.0, 0.0, 0.0], (300, 1))  # 2 mm in 10 ms
+        sensors.append(SimpleNamespace(
+            view=SimpleNamespace(sensor=f'sensor_{k}', time=time, velocity=velocity),
+            used=np.ones(300, dtype=bool), position_m=1e-5, orientation_rad=1e-3, stamp_s=0.01,
+            stamp_gain=3000.0,
+        ))  # fmt: skip
+    streams = {s.view.sensor: s.view for s in sensors}
+    residuals = SimpleNamespace(sensors=sensors, session=SimpleNamespace(sensors=streams))
+    (record,) = ReceiptJitter().observed(residuals)
+    # A standard deviation of n values is known to its 1 / sqrt(2 n).
+    known = 0.01 / np.sqrt(2 * (300 if shared else 600))
+    assert record.uncertainty['rms_s'] == pytest.approx(known, rel=1e-3)
 
 
 def test_a_path_knows_the_noise_of_its_poses_at_a_point_of_the_body():

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.model import EffectRecord
-from anser_ros.poses.effect import PoseEffect, PoseResiduals
+from anser_ros.poses.effect import PoseEffect, PoseResiduals, Sensing
 
 Array = NDArray[np.float64]
 
@@ -66,6 +66,28 @@ def _is_wide(residuals: PoseResiduals) -> tuple[float, float]:
     return rms, float(np.median([s.stamp_gain for s in residuals.sensors]))
 
 
+def _sigma(residuals: PoseResiduals) -> float:
+    """Standard deviation of the median error of the stamps, s.
+
+    By Fisher's information about a variance: each pose has one degree of freedom along its
+    velocity, and tells as much of the stamps' error as that is of its error there. Sensors that
+    differ by more than this have errors of their own; those that share stamps share the error.
+    """
+    sensors = residuals.sensors
+    sigmas = [s.stamp_s / np.sqrt(2 * max(np.sum(_stamp_share(s) ** 2), 1.0)) for s in sensors]
+    apart = len({s.view.time.tobytes() for s in sensors})
+    scatter = np.std([s.stamp_s for s in sensors]) / np.sqrt(len(sensors))
+    return float(max(scatter, np.median(sigmas) / np.sqrt(apart)))
+
+
+def _stamp_share(sensing: Sensing) -> Array:
+    """Share (n,) of the variance along the velocity that errors of the stamps make."""
+    velocity = sensing.view.velocity[sensing.used]
+    scale = np.repeat([sensing.position_m, sensing.orientation_rad], 3)
+    moved = sensing.stamp_s**2 * np.sum((velocity / scale) ** 2, axis=1)
+    return np.asarray(moved / (1 + moved))
+
+
 def _step(residuals: PoseResiduals, rms: float) -> float:
     """The step of the stamps that makes an error of that size, or zero."""
     for sensing in residuals.sensors:
@@ -89,9 +111,7 @@ class ReceiptJitter(PoseEffect):
         rms, gain = _is_wide(residuals)
         if rms < LEAST_S or gain < LEAST_LIKELIHOOD_GAIN or _step(residuals, rms):
             return []
-        spread = max(
-            float(np.std([s.stamp_s for s in residuals.sensors])), rms / np.sqrt(2 * gain)
-        )
+        spread = _sigma(residuals)
         values = {'rms_s': rms, 'by_sensor': {s.view.sensor: s.stamp_s for s in residuals.sensors}}
         return [EffectRecord(self.name, values, {'rms_s': spread}, {'likelihood_gain': gain})]
 
