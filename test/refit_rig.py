@@ -55,7 +55,12 @@ class Rig:
 
         self.world = anser_world()
         save_model(folder / 'model.yaml', self.world.model)
-        values = {'model_file': str(folder / 'model.yaml'), 'baseline_s': 0.2, **parameters}
+        values = {
+            'model_file': str(folder / 'model.yaml'),
+            'baseline_s': 0.2,
+            'keep_state': False,
+            **parameters,
+        }
         self.node = FieldModelNode(
             parameter_overrides=[Parameter(name, value=value) for name, value in values.items()]
         )

@@ -20,6 +20,7 @@ from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
 from anser_ros.nodes.field_model_parts import refit_status
 from anser_ros.nodes.field_model_parts.field_model_parameters import FieldModelParameters
+from anser_ros.nodes.field_model_parts.kept_files import CONFIRM_S, KeptBaseline, kept_folder
 from anser_ros.nodes.field_model_parts.metal_view import MetalView
 from anser_ros.nodes.field_model_parts.model_output import ModelOutput
 from anser_ros.nodes.field_model_parts.moving_coils import MovingCoils
@@ -78,13 +79,16 @@ class FieldModelNode(AnserNode):
         self._fluxes = NewestSource(self, 'reference/flux', self._on_flux)
         topics = parse_patches(table.patches)
         self._moving = MovingCoils(self, topics, lambda: self._frame_id, self._refuse)
-        self._refit = RefitInForce(self._moving, self._pace, self.count)
+        name = self.get_fully_qualified_name()
+        kept = KeptBaseline(kept_folder(table.keep_state), name, self._fluxes.sender)
+        self._refit = RefitInForce(self._moving, self._pace, self.count, kept)
         self._sources = [setups, self._fluxes, *self._moving.sources]
         self.create_service(Trigger, 'field_model/reset', self._on_reset)
         self.create_service(Trigger, 'field_model/save', self._on_save)
         self.create_service(SetBool, 'field_model/freeze', self._on_freeze)
         self.create_service(Trigger, 'field_model/set_baseline', self._on_set_baseline)
         self.create_timer(LOOK_S, self._look, clock=self.steady_clock)
+        self.create_timer(CONFIRM_S, self._refit.confirm, clock=self.steady_clock)
         if self._file_model is not None:
             self._base = self._file_model
             self._output.name_origin(self._file_model)
@@ -126,8 +130,10 @@ class FieldModelNode(AnserNode):
                 self._follow(baseline, is_awaited=True)
             except AnserError as error:
                 self._refuse_baseline(error)
-        elif len(self._references) and table.refit and not table.baseline_at_start:
-            self.get_logger().warning(refit_status.no_baseline(self.get_namespace()))
+        elif len(self._references) and table.refit:
+            self._look()
+            if not (table.baseline_at_start or self._refit.is_making):
+                self.get_logger().warning(refit_status.no_baseline(self.get_namespace()))
 
     def _on_flux(self, message: PointCloud2) -> None:
         setup, window, frames = self._setup, self._window, self._frames
@@ -234,6 +240,7 @@ class FieldModelNode(AnserNode):
 
     def _look(self) -> None:
         """Notice what changes without a frame."""
+        self._refit.resume(self.parameters.refit)
         self._take_refit()
         self._announce_changes()
 
@@ -356,7 +363,8 @@ class FieldModelNode(AnserNode):
         values |= refit_status.model_values(model, self.parameters.model_file)
         values |= {'stamp_ns': self._stamp_ns, 'freeze': self._frozen}
         values['refit_time_s'] = self._refit.update_s
-        activity = self._activity(values)
+        is_wanted, refused = self.parameters.refit, self._no_baseline
+        activity = refit_status.activity(self._refit, self._frozen, is_wanted, refused, values)
         if self._is_uncalibrated:
             activity = f'{states.UNCALIBRATED}: calibrate, or set allow_uncalibrated; {activity}'
         dead = '' if self._frames is None else ', '.join(self._frames.dead)
@@ -374,16 +382,9 @@ class FieldModelNode(AnserNode):
             return Status('', Level.ERROR, f'{lost} for {silent_s:.1f} s', values)
         is_troubled = values.get('refit_state') in refit_status.TROUBLED
         is_troubled |= self._refit.is_awaited and self._follows
-        is_troubled |= bool(self._no_baseline and self.parameters.refit)
+        is_troubled |= bool(refused and is_wanted)
         level = Level.WARN if is_troubled or self._is_uncalibrated else Level.OK
         return Status('', level, activity, values)
-
-    def _activity(self, values: dict[str, object]) -> str:
-        result, making, refused = self._refit.result, self._refit.words, self._no_baseline
-        if self._refit.current is None or self._frozen or not self.parameters.refit:
-            return refit_status.rest_words(self._frozen, self.parameters.refit, refused, making)
-        values |= refit_status.refit_values(result)
-        return refit_status.refit_words(result, refused, making)
 
     def part_statuses(self) -> list[Status]:
         """Return a line for every reference sensor that the refit looks at."""

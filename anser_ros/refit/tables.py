@@ -125,7 +125,7 @@ def build_tables(
     clouds = default_clouds(region)
     bottom = bottom_layer(model, region, excitation, clouds[0].positions)
     box = box_layer(region, excitation)
-    hypotheses = _hypotheses(clouds, bottom, box)
+    hypotheses = hypotheses_of(clouds, bottom, box)
     priors = _priors(hypotheses, references, excitation, model.frequencies_hz, settings, report)
     around = bodies(region)
     return RefitTables(
@@ -153,7 +153,7 @@ def _factors(
     )
 
 
-def _hypotheses(clouds: Sequence[Cloud], bottom: Layer, box: Layer) -> tuple[Hypothesis, ...]:
+def hypotheses_of(clouds: Sequence[Cloud], bottom: Layer, box: Layer) -> tuple[Hypothesis, ...]:
     """Return every cloud with each response that is worth its time."""
     out: list[Hypothesis] = []
     for cloud in clouds:

@@ -32,6 +32,9 @@ class FieldModelParameters:
     baseline_s: float = parameter(
         1.0, 'time that a baseline is averaged over, s', minimum=0.05, maximum=60.0
     )
+    keep_state: bool = parameter(
+        True, 'whether baseline and tables are kept on disk for a node that is started again'
+    )
     refit_rate_hz: float = parameter(
         MOST_RATE_HZ, 'most refits a second, by the stamps', minimum=2.0, maximum=1000.0, live=True
     )

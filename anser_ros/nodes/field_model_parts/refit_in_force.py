@@ -11,13 +11,16 @@ from numpy.typing import NDArray
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame
+from anser_ros.nodes.field_model_parts.kept_files import KeptBaseline
 from anser_ros.nodes.field_model_parts.moving_coils import MovingCoils
-from anser_ros.nodes.field_model_parts.refit_start import RefitStart
+from anser_ros.nodes.field_model_parts.refit_start import RefitStart, warm_up
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.pose_states import REFERENCES_LOST
 from anser_ros.refit.change import Pace
+from anser_ros.refit.health import DISAGREES
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.result import RefitResult
+from anser_ros.stamps import is_live
 from anser_ros.wire.setup import Setup
 
 
@@ -32,6 +35,8 @@ class RefitInForce:
         How often there is to be a result.
     count : callable
         Counts an event by its name.
+    kept : KeptBaseline
+        What a process after this one takes up.
 
     Attributes
     ----------
@@ -42,8 +47,17 @@ class RefitInForce:
         Time that the last result took, s.
     """
 
-    def __init__(self, moving: MovingCoils, pace: Pace, count: Callable[[str], None]) -> None:
-        self._moving, self._pace, self._count = moving, pace, count
+    def __init__(
+        self,
+        moving: MovingCoils,
+        pace: Pace,
+        count: Callable[[str], None],
+        kept: KeptBaseline,
+    ) -> None:
+        warm_up()
+        self._moving, self._pace, self._count, self._kept = moving, pace, count, kept
+        self._has_looked = False
+        self._confirmed: RefitResult | None = None
         self._start: RefitStart | None = None
         self._baseline: NDArray[np.complex128] | None = None
         self.current: LiveRefit | None = None
@@ -56,8 +70,11 @@ class RefitInForce:
         """Be without a refit, and begin at once with what needs no baseline for the next one."""
         self.end()
         self.current = self.result = self._moving.patches = self._start = None
+        self._has_looked = False
+        self._kept.expect(setup, base)
         if len(references):
-            self._start = RefitStart(setup, base, references, self._moving.bodies)
+            bodies, folder = self._moving.bodies, self._kept.folder
+            self._start = RefitStart(setup, base, references, bodies, folder)
             if at_once:
                 self._start.prepare()
 
@@ -82,6 +99,7 @@ class RefitInForce:
         """
         if self._start is None:
             raise FitError('the setup has no reference sensors')
+        self._kept.drop()
         self._baseline = baseline
         self._start.begin(baseline, is_awaited)
 
@@ -89,6 +107,40 @@ class RefitInForce:
         """Begin to make one to the last baseline, if there is one; it is awaited."""
         if self._baseline is not None:
             self.begin(self._baseline, is_awaited=True)
+
+    def resume(self, is_wanted: bool) -> None:
+        """Begin with the baseline of a process before this one, where there is one.
+
+        It is looked for once for a setup and model, as soon as the sender is known. No pose is
+        given before the refit is there: metal may be near.
+        """
+        has_one = self.current is not None or self.is_making
+        if not is_wanted or self._start is None or self._has_looked or has_one:
+            return
+        self._has_looked, baseline = self._kept.is_known, self._kept.read()
+        if baseline is not None:
+            self.begin(baseline, is_awaited=True)
+            self._count('baselines_resumed')
+
+    def confirm(self) -> None:
+        """Keep the baseline for a process after this one, unless references contradict it.
+
+        One that jumped by itself may be recognised by what it read before, which the next process
+        does not know.
+        """
+        result, kept = self.result, self._kept
+        if self._baseline is None or result is None or result is self._confirmed:
+            return
+        self._confirmed = result
+        if not is_live(result.stamp_ns, time.time_ns()):
+            return  # a recording that is played begins with its own baseline each time
+        try:
+            if result.is_answer and all(one.state != DISAGREES for one in result.references):
+                kept.confirm(self._baseline)
+            else:
+                kept.drop()
+        except OSError:  # a full disk: the node goes on, and one after it begins without baseline
+            self._count('baselines_not_kept')
 
     def wait(self) -> None:
         """Wait until the refit is made that is being made, if there is one."""

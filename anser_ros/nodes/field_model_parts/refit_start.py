@@ -1,17 +1,22 @@
 """Makes a refit in the background, while the callbacks go on.
 
 Its tables, seconds of work, need the model and the references' places only, so they are begun
-before there is a baseline. What a baseline adds is half a second more, for each baseline again.
+before there is a baseline, and kept on disk. What a baseline adds is half a second more, for each
+baseline again.
 """
 
+import contextlib
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.model import FieldModel
+from anser_ros.nodes.field_model_parts.kept_files import KeptTables
 from anser_ros.nodes.field_model_parts.patches import Patches
 from anser_ros.physics.sensor import SensorTable
+from anser_ros.physics.tracks import loop_field
 from anser_ros.refit import tables
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.patches import start_table
@@ -25,6 +30,13 @@ WORKER = 'refit_start'
 Started = tuple[LiveRefit, Patches | None]
 """A refit, and the patches that its last coils are on; None where no sensor is on a body that
 moves."""
+
+
+def warm_up() -> None:
+    """Let the compiler load what it needs for its first kernel, half a second, while the graph is
+    still being discovered.
+    """
+    loop_field(np.eye(3), np.ones((1, 3)), 1.0)
 
 
 class _EndedError(Exception):
@@ -43,6 +55,8 @@ class RefitStart:
         The fixed ones.
     bodies : tuple of str
         Bodies whose coils are further references, while their poses are known.
+    folder : Path or None
+        Where tables are kept; None where they are not.
 
     Attributes
     ----------
@@ -51,14 +65,21 @@ class RefitStart:
     """
 
     def __init__(
-        self, setup: Setup, model: FieldModel, references: SensorTable, bodies: tuple[str, ...]
+        self,
+        setup: Setup,
+        model: FieldModel,
+        references: SensorTable,
+        bodies: tuple[str, ...],
+        folder: Path | None = None,
     ) -> None:
         self._setup, self._model, self._fixed = setup, model, references
+        self._folder = folder
         moving = tuple(s for s in setup.tool_sensors if s.body in bodies)
         self._moving = sensor_table(moving) if moving else None
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=WORKER)
         self._tables: Future[tables.RefitTables] | None = None
         self._made: Future[Started] | None = None
+        self._kept: Future[None] | None = None
         self._share, self._is_over = 0.0, False
         self.is_awaited = False
 
@@ -81,6 +102,8 @@ class RefitStart:
         if self._made is not None:
             self._made.cancel()
         self._made, self.is_awaited = self._worker.submit(self._make, baseline), is_awaited
+        if self._kept is None and self._folder is not None:
+            self._kept = self._worker.submit(self._keep, self._folder)  # nobody waits for it
 
     def taken(self) -> Started | None:
         """Return the refit once, as soon as it is made.
@@ -115,19 +138,34 @@ class RefitStart:
         """Give the work up; return whether it ended within some seconds."""
         self._is_over = True
         self._worker.shutdown(wait=False, cancel_futures=True)
-        works = (self._tables, self._made)
+        works = (self._tables, self._made, self._kept)
         # What was given up before it began is done, but `wait` would wait for it.
         going_on = [work for work in works if work is not None and not work.done()]
         return not wait(going_on, longest_s).not_done
 
-    def _work_tables_out(self) -> tables.RefitTables:
-        drawing, volume = Drawing.of(self._setup).field, stated_volume(self._setup)
+    @property
+    def _references(self) -> SensorTable:
+        """The fixed references and those that move, where tables begin with them."""
         fixed, moving = self._fixed, self._moving
-        references = fixed if moving is None else fixed.joined(start_table(moving))
+        return fixed if moving is None else fixed.joined(start_table(moving))
+
+    def _file(self, folder: Path) -> KeptTables:
+        return KeptTables(folder, self._setup, self._model, self._references)
+
+    def _work_tables_out(self) -> tables.RefitTables:
+        kept = None if self._folder is None else self._file(self._folder).read()
+        if kept is not None:
+            return kept
+        drawing, volume = Drawing.of(self._setup).field, stated_volume(self._setup)
         settings = self._setup.refit
         return tables.build_tables(
-            self._model, references, settings, drawing, volume, report=self._report
+            self._model, self._references, settings, drawing, volume, report=self._report
         )
+
+    def _keep(self, folder: Path) -> None:
+        assert self._tables is not None
+        with contextlib.suppress(OSError):  # a full disk only makes the next start slower
+            self._file(folder).write(self._tables.result())
 
     def _report(self, share: float) -> None:
         if self._is_over:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from anser_ros.field.model import FieldModel
+from anser_ros.nodes.field_model_parts.refit_in_force import RefitInForce
 from anser_ros.nodes.runtime.node import Level, Status
 from anser_ros.refit.result import WITHHELD, RefitResult
 
@@ -67,6 +68,17 @@ def rest_words(is_held: bool, is_wanted: bool, no_baseline: str, making: str = '
     if making:
         return f'constant, {making}'
     return f'constant, no baseline: {no_baseline}' if no_baseline else 'constant, no baseline yet'
+
+
+def activity(
+    refit: RefitInForce, is_held: bool, is_wanted: bool, refused: str, values: dict[str, object]
+) -> str:
+    """Return what the refit does, and add its figures to the values."""
+    result, making = refit.result, refit.words
+    if refit.current is None or is_held or not is_wanted:
+        return rest_words(is_held, is_wanted, refused, making)
+    values |= refit_values(result)
+    return refit_words(result, refused, making)
 
 
 def reference_statuses(result: RefitResult | None) -> list[Status]:

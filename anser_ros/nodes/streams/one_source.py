@@ -95,6 +95,13 @@ class OneSource:
         """Return how many publishers the graph knows, idle ones included."""
         return self._count(time.monotonic())
 
+    def sender(self) -> str:
+        """Return what identifies the only publisher in the graph; empty where there is another
+        number of them.
+        """
+        known = self._node.get_publishers_info_by_topic(self._name)
+        return bytes(known[0].endpoint_gid).hex() if len(known) == 1 else ''
+
     def accepts(self, info: Mapping[str, Any], lasting: Hashable = None) -> bool:
         """Take a message's information; return whether the message may be used."""
         now_s, number = time.monotonic(), info.get(NUMBER)

@@ -1,0 +1,228 @@
+"""Keeps on disk what a field_model that was killed needs to follow the references again at once.
+
+The tables of a refit take seconds to compute. A baseline cannot be taken while metal is near. The
+tables hold as long as model, setup and code are the same. A baseline holds as long as the sender
+of the references goes on and nothing speaks against it: the node confirms it every second, and
+whoever starts soon after the last time takes it up.
+"""
+
+import contextlib
+import json
+import os
+import time
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.errors import FitError
+from anser_ros.field.model import FieldModel
+from anser_ros.fingerprint import fingerprint_of
+from anser_ros.kernel_cache import PACKAGE
+from anser_ros.physics.sensor import SensorTable
+from anser_ros.refit.stored_tables import arrays_of, tables_of
+from anser_ros.refit.tables import RefitTables
+from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.volume import stated_volume
+from anser_ros.wire.setup import Setup
+
+MOST_TABLES = 3
+"""Files of tables that are kept, the last used: each has about 140 MB."""
+BASELINE_S = 60.0
+"""How long after it was last confirmed, s, a baseline is taken up. Shorter, and a process that a
+supervisor starts again on a busy machine is too late; longer, and coils that somebody moved
+meanwhile are taken for metal."""
+CONFIRM_S = 1.0
+"""Time from one confirmation of a baseline to the next, s. Smaller costs more; larger, and what
+the references said shortly before the process was killed is not known to the next one."""
+DAMAGED = (OSError, ValueError, KeyError, TypeError, FitError)
+"""What the reading of a file raises that is not there, cut, or another one's."""
+LONGEST_HEAD = 1_000_000
+"""Bytes of the first line, which lists the arrays: tables have 500."""
+ALIGNED = 64
+"""Multiple of bytes at which each array begins, for the processor's sake."""
+
+
+def kept_folder(is_wanted: bool = True) -> Path | None:
+    """Return the folder of this user in which files are kept; None where they are not to be."""
+    if not is_wanted:
+        return None
+    base = os.environ.get('XDG_CACHE_HOME') or '~/.cache'
+    return Path(base).expanduser() / 'anser_ros'
+
+
+class KeptTables:
+    """Keeps the tables of one model, setup and set of references.
+
+    Parameters
+    ----------
+    folder : Path
+    setup : Setup
+    model : FieldModel
+    references : SensorTable
+        The tables' own.
+    """
+
+    def __init__(
+        self, folder: Path, setup: Setup, model: FieldModel, references: SensorTable
+    ) -> None:
+        self._given = setup, model, references
+        places = [getattr(references, f.name) for f in fields(references)]
+        stated = dict(setup.stated)
+        key = fingerprint_of(
+            [_code(), setup.identity.board, setup.volume, stated, model.fingerprint, places]
+        )
+        self._folder, self._path = folder, folder / f'refit_tables_{key}'
+
+    def read(self) -> RefitTables | None:
+        """Return the tables; None where there are none, or the file is damaged."""
+        setup, model, references = self._given
+        drawing, volume = Drawing.of(setup).field, stated_volume(setup)
+        try:
+            arrays = _read(self._path)
+            os.utime(self._path)
+            return tables_of(arrays, model, references, setup.refit, drawing, volume)
+        except DAMAGED:
+            return None
+
+    def write(self, tables: RefitTables) -> None:
+        """Keep the tables if they are not, and drop those that were not used for longest.
+
+        Raises
+        ------
+        OSError
+            When the disk is full, or must not be written.
+        """
+        if not self._path.exists():
+            _write(self._path, arrays_of(tables))
+        files = sorted(self._folder.glob('refit_tables_*'), key=_used_s, reverse=True)
+        for old in files[MOST_TABLES:]:
+            old.unlink(missing_ok=True)
+
+
+class KeptBaseline:
+    """Keeps the baseline of a running node.
+
+    Attributes
+    ----------
+    folder : Path or None
+        Where files are kept; None where they are not.
+
+    Parameters
+    ----------
+    folder : Path or None
+    node : str
+        Whole name of the node.
+    sender : callable
+        Returns what identifies the only sender of the references; empty where there is none.
+    """
+
+    def __init__(self, folder: Path | None, node: str, sender: Callable[[], str]) -> None:
+        self.folder, self._node, self._sender = folder, node, sender
+        self._of: tuple[str, ...] = ()
+        self._kept: Path | None = None
+
+    def expect(self, setup: Setup, model: FieldModel) -> None:
+        """Have to do with the references of a setup and with a model from now on."""
+        identity = setup.identity
+        self._of = identity.board, *identity.bodies.values(), model.fingerprint
+        self._kept = None
+
+    @property
+    def is_known(self) -> bool:
+        """Return whether the references have one sender, and the setup is known."""
+        return self._path() is not None
+
+    def read(self) -> NDArray[np.complex128] | None:
+        """Return the baseline that another process confirmed lately; None where there is none."""
+        path = self._path()
+        with contextlib.suppress(*DAMAGED):
+            if path is not None and 0.0 <= time.time() - _used_s(path) <= BASELINE_S:
+                return np.asarray(_read(path)['flux'], dtype=np.complex128)
+        return None
+
+    def confirm(self, flux: NDArray[np.complex128]) -> None:
+        """Keep a baseline, shape (R, K), T, to which nothing is opposed at this moment.
+
+        Raises
+        ------
+        OSError
+            When the disk is full, or must not be written.
+        """
+        path = self._path()
+        if path != self._kept:
+            self.drop()
+        if path is not None and self._kept is None:
+            _write(path, {'flux': flux})
+            self._kept = path
+            for old in path.parent.glob('baseline_*'):
+                if time.time() - _used_s(old) > BASELINE_S:
+                    old.unlink(missing_ok=True)
+        elif path is not None:
+            os.utime(path)
+
+    def drop(self) -> None:
+        """Keep none: another one is in force, or something speaks against it."""
+        if self._kept is not None:
+            self._kept.unlink(missing_ok=True)
+        self._kept = None
+
+    def _path(self) -> Path | None:
+        sender = self._sender() if self.folder is not None and self._of else ''
+        if self.folder is None or not sender:
+            return None
+        key = fingerprint_of([self._node, sender, *self._of])
+        return self.folder / f'baseline_{key}'
+
+
+def _code() -> list[Any]:
+    """Return what changes with the code that tables are computed by."""
+    files = sorted(PACKAGE.rglob('*.py'))
+    return [np.__version__, *([str(f), f.stat().st_mtime_ns, f.stat().st_size] for f in files)]
+
+
+def _used_s(path: Path) -> float:
+    """Return when a file was last used, s since 1970; 0 if it has gone."""
+    try:
+        return path.stat().st_mtime
+    except FileNotFoundError:
+        return 0.0
+
+
+def _read(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a file; they share one memory, as reading them one by one is slow."""
+    with path.open('rb') as file:
+        head = json.loads(file.readline(LONGEST_HEAD))
+        data = np.fromfile(file, dtype=np.uint8)
+    if zlib.crc32(data) != head['crc32']:
+        raise ValueError(f'{path} is damaged')
+    return {
+        name: data[begin : begin + size].view(np.dtype(kind)).reshape(shape)
+        for name, (kind, shape, begin, size) in head['arrays'].items()
+    }
+
+
+def _write(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write a file that is whole or not there."""
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    rows, parts, begin = {}, [], 0
+    for name, array in arrays.items():
+        raw = array.tobytes()
+        rows[name] = array.dtype.str, array.shape, begin, len(raw)
+        parts.append(raw + bytes(-len(raw) % ALIGNED))
+        begin += len(parts[-1])
+    data = b''.join(parts)
+    head = json.dumps({'arrays': rows, 'crc32': zlib.crc32(data)}).encode()
+    head += b' ' * (-(len(head) + 1) % ALIGNED) + b'\n'
+    part = path.with_name(f'.{path.name}.{os.getpid()}')
+    try:
+        with part.open('wb') as file:
+            file.write(head)
+            file.write(data)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)

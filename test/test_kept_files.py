@@ -1,0 +1,165 @@
+"""A field_model that is started again uses the tables and the baseline of the one before."""
+
+import os
+import time
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from refit_rig import HEAD, Rig, setup_text
+from refit_world import anser_world
+from test_refit_start import given_baseline
+
+from anser_ros.nodes.field_model_parts.kept_files import (
+    BASELINE_S,
+    MOST_TABLES,
+    KeptBaseline,
+    KeptTables,
+)
+from anser_ros.pose_states import REFERENCES_LOST, code_of
+from anser_ros.refit import tables
+from anser_ros.sessions.drawing import Drawing
+from anser_ros.sessions.volume import stated_volume
+from anser_ros.wire.setup import parse_setup
+
+pytestmark = pytest.mark.usefixtures('shared_tables')
+
+
+def same(one, other):
+    if isinstance(one, np.ndarray):
+        return one.dtype == other.dtype and np.array_equal(one, other)
+    return one == other
+
+
+def test_tables_are_read_as_they_were_written(tmp_path):
+    world = anser_world()
+    setup = parse_setup(setup_text(world))
+    kept = KeptTables(tmp_path, setup, world.model, world.references)
+    assert kept.read() is None
+    made = tables.build_tables(
+        world.model, world.references, setup.refit, Drawing.of(setup).field, stated_volume(setup)
+    )
+    kept.write(made)
+    read = KeptTables(tmp_path, setup, world.model, world.references).read()
+    assert len(read.priors) == len(made.priors) and len(read.factors) == len(made.factors)
+    pairs = [
+        *zip(made.layers, read.layers, strict=True),
+        *zip(made.priors, read.priors, strict=True),
+    ]
+    for one, other in pairs:
+        names = [f.name for f in fields(one) if f.name not in ('cloud', 'layer', '_projected')]
+        assert all(same(getattr(one, name), getattr(other, name)) for name in names)
+    assert all(same(*pair) for pair in zip(made.factors, read.factors, strict=True))
+    stronger = replace(world.model, moments=1.001 * world.model.moments)
+    assert KeptTables(tmp_path, setup, stronger, world.references).read() is None
+
+    (path,) = tmp_path.iterdir()
+    whole = path.read_bytes()
+    for damaged in (whole[:-8], whole[:-1] + bytes([whole[-1] ^ 1]), whole[:100], b''):
+        path.write_bytes(damaged)
+        assert kept.read() is None
+    path.unlink()
+    for age in range(MOST_TABLES + 2):
+        (tmp_path / f'refit_tables_{age}').write_bytes(b'')
+        os.utime(tmp_path / f'refit_tables_{age}', (100.0 - age, 100.0 - age))
+    kept.write(made)
+    left = sorted(p.name for p in tmp_path.iterdir())
+    assert len(left) == MOST_TABLES and {'refit_tables_0', 'refit_tables_1', path.name} == set(
+        left
+    )
+
+
+def test_a_baseline_is_taken_up_soon_after_and_from_the_same_sender_only(tmp_path):
+    world = anser_world()
+    setup, flux = parse_setup(setup_text(world)), world.baseline
+
+    def baseline(node='/anser/field_model', sender='01ab', model=world.model):
+        kept = KeptBaseline(tmp_path, node, lambda: sender)
+        kept.expect(setup, model)
+        return kept
+
+    first = baseline()
+    assert first.read() is None
+    first.confirm(flux)
+    assert same(baseline().read(), flux)
+    stronger = replace(world.model, moments=1.001 * world.model.moments)
+    others = baseline(sender='02ab'), baseline(node='/other/field_model'), baseline(model=stronger)
+    assert all(other.read() is None for other in (*others, baseline(sender='')))
+    (path,) = tmp_path.iterdir()
+    for age in (BASELINE_S + 1.0, -10.0):
+        os.utime(path, (time.time() - age,) * 2)
+        assert baseline().read() is None
+    first.confirm(flux)
+    assert same(baseline().read(), flux), 'confirmed again'
+    first.drop()
+    assert baseline().read() is None and not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def started(ros, tmp_path, monkeypatch):
+    """Starts nodes one after the other, with one sender of references that goes on."""
+    from sensor_msgs.msg import PointCloud2
+
+    from anser_ros.nodes.runtime import qos
+
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path))
+    sender = ros.create_node('sender', namespace='anser')
+    sender.create_publisher(PointCloud2, 'reference/flux', qos.STREAM)
+    rigs = []
+
+    def start():
+        if rigs:
+            rigs.pop().close()
+        rigs.append(rig := Rig(ros, tmp_path, refit_rate_hz=1000.0, keep_state=True))
+        rig.stamp_ns = time.time_ns()
+        rig.codes, write = [], rig.node._output.new_error
+        rig.node._output.new_error = lambda *given: rig.codes.append(given[-1]) or write(*given)
+        rig.until(lambda: rig.node._refit._kept._sender() != '')
+        return rig
+
+    yield start
+    rigs[0].close()
+    sender.destroy_node()
+
+
+def test_a_node_that_is_started_near_metal_follows_the_references_again(started):
+    from std_msgs.msg import String
+
+    rig = started()
+    given_baseline(rig)
+    rig.until(lambda: rig.node.counters['refit_starts'] == 1)
+    for _ in range(3):
+        rig.say(0.0)
+    rig.node._refit.confirm()
+    metal = rig.world.metal(HEAD)
+
+    rig = started()
+    rig.node._on_setup(String(data=setup_text(rig.world)))
+    assert rig.node.counters['baselines_resumed'] == 1
+    rig.say(metal)
+    assert set(rig.codes[-2:]) == {code_of(REFERENCES_LOST)}, 'no pose before the refit is there'
+    rig.until(lambda: rig.node.counters['refit_starts'] == 1)
+    for _ in range(5):
+        rig.say(metal)
+    assert rig.node._refit.result.state == 'refit' and rig.codes[-1] == 0
+
+
+def test_a_baseline_that_references_contradict_is_not_taken_up(started):
+    from std_msgs.msg import String
+
+    rig = started()
+    given_baseline(rig)
+    rig.until(lambda: rig.node.counters['refit_starts'] == 1)
+    for _ in range(12):
+        rig.say(0.0)
+    rig.node._refit.confirm()
+    jump = np.zeros_like(rig.world.baseline)
+    jump[3] = 0.2 * rig.world.baseline[3]
+    for _ in range(3):
+        rig.say(jump)
+    assert 'disagrees' in {one.state for one in rig.node._refit.result.references}
+    rig.node._refit.confirm()
+
+    rig = started()
+    rig.node._on_setup(String(data=setup_text(rig.world)))
+    assert rig.node.counters['baselines_resumed'] == 0 and rig.node._refit.words == ''
