@@ -339,6 +339,26 @@ def test_control_that_may_not_set_tones_says_what_differs():
     assert '6170' in control.refusal and '7000' in control.refusal
 
 
+def test_control_asks_again_after_a_hello_that_contradicts_a_good_one():
+    control = StreamControl(HELLO.frequencies_hz)
+    other = Hello(**{**HELLO.__dict__, 'channels': HELLO.channels[::-1]})
+    control.take(Record(HELLO), 0)
+    control.take(Record(Reply(0x82, ReplyCode.OK)), 0)
+
+    def asked(hello, begin_ns, seconds):
+        """Return the commands of some seconds in which blocks come."""
+        control.take(Record(hello), begin_ns)
+        out = []
+        for now in range(begin_ns, begin_ns + seconds * SECOND, SECOND // 20):
+            control.take(Record(SampleBlock(0, 0, np.zeros((1, 2), np.int16))), now)
+            out += [command] if (command := control.due(now)) is not None else []
+        return out
+
+    assert asked(HELLO, 0, 3) == [], 'the same again'
+    assert asked(other, 3 * SECOND, 2) == [Identify()] * 8, 'four a second'
+    assert len(asked(HELLO, 5 * SECOND, 100)) == 4 * 60, 'a minute after the last change'
+
+
 def test_blocks_that_are_there_already_are_not_waited_for():
     """A receiver that worked while the last block of its window came gets it at once."""
     port = ControlUnitPort('nowhere')

@@ -17,6 +17,11 @@ from anser_ros.wire.records import (
 
 _REPEAT_NS = 500_000_000
 """Time (0.5 s) after which a command without effect is sent again; an answer takes far less."""
+_DOUBT_NS = 60_000_000_000
+"""Time (1 min) for which the unit is asked again after its hello has changed: by itself it says it
+once a second, and a wrong one has no poses until the next."""
+_ASK_NS = 250_000_000
+"""Time (0.25 s) from one such question to the next. Each costs a hello of some hundred bytes."""
 _TONE_TOLERANCE_HZ = 1.0
 """Difference up to which a frequency of the device is that of the setup, Hz; synthesisers
 round."""
@@ -26,8 +31,9 @@ class StreamControl:
     """Follows the records of one connection and determines the commands to send.
 
     The order is: hello, right tones, start, samples. Each command is repeated every half second
-    until the control unit does what it asks; a refusal is kept as text and not repeated. Samples
-    that arrive before the reply to the start command are left over from a buffer.
+    until the control unit does what it asks; a refusal is kept as text and not repeated. After a
+    hello that contradicts a good one, the unit is asked again for a minute. Samples that arrive
+    before the reply to the start command are left over from a buffer.
 
     Parameters
     ----------
@@ -43,6 +49,7 @@ class StreamControl:
         self.started = False
         self._refused = False
         self._last_block_ns = 0
+        self._doubted_ns: int | None = None
         self._last_sent: dict[type, int] = {}
 
     def reset(self) -> None:
@@ -52,6 +59,7 @@ class StreamControl:
         self.started = False
         self._refused = False
         self._last_block_ns = 0
+        self._doubted_ns = None
         self._last_sent.clear()
 
     @property
@@ -65,6 +73,8 @@ class StreamControl:
         if isinstance(payload, SampleBlock):
             self._last_block_ns = arrival_ns
         elif isinstance(payload, Hello):
+            if self.tones_agree and payload != self.hello:
+                self._doubted_ns = arrival_ns
             self.hello = payload
             if self._agree(payload):
                 self.refusal = ''
@@ -82,6 +92,7 @@ class StreamControl:
     def due(self, now_ns: int) -> Payload | None:
         """Return the command to send now, None when nothing is due."""
         command: Payload
+        pause_ns = _REPEAT_NS
         if self.hello is None:
             command = Identify()
         elif not self._agree(self.hello):
@@ -90,9 +101,11 @@ class StreamControl:
             command = SetFrequencies(self._wanted)
         elif not self.started or now_ns - self._last_block_ns > _REPEAT_NS:
             command = Start()
+        elif self._doubted_ns is not None and now_ns - self._doubted_ns < _DOUBT_NS:
+            command, pause_ns = Identify(), _ASK_NS
         else:
             return None
-        if now_ns - self._last_sent.get(type(command), -_REPEAT_NS) < _REPEAT_NS:
+        if now_ns - self._last_sent.get(type(command), -pause_ns) < pause_ns:
             return None
         self._last_sent[type(command)] = now_ns
         return command
