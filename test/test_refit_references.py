@@ -6,6 +6,7 @@ from refit_frames import HEAD, STEP_NS, errors, run
 from refit_world import anser_world
 
 from anser_ros.pose_states import REFERENCES_DOUBTFUL
+from anser_ros.refit.health import ReferenceWatch
 from anser_ros.refit.live_refit import LiveRefit
 
 # The refit that all share takes some five seconds to work out.
@@ -111,6 +112,24 @@ def test_one_that_works_again_comes_back_after_a_while(refit):
     assert result.left_out == ('ref/5',)
     result = run(refit, world, 0.0, frames=3, start=100)
     assert result.left_out == ()
+
+
+@pytest.mark.parametrize(
+    ('rate_hz', 'frames'), [(100.0, 25), (50.0, 25), (25.0, 13), (10.0, 12), (1.0, 25)]
+)
+def test_slow_streams_wait_for_half_a_second_at_most_for_one_that_works_again(rate_hz, frames):
+    watch, stamp_ns, good = ReferenceWatch(3, 25), 1, np.array([True, False, True])
+    for _ in range(5):
+        stamp_ns += round(1e9 / rate_hz)
+        watch.note(good, ['ok', 'silent', 'ok'], 0, stamp_ns)
+    for count in range(frames):
+        assert watch.excluded[1], count
+        # A frame that is lost, or a pause, does not change the rate.
+        stamp_ns += round((3.0 if count == 5 else 1.0) * 1e9 / rate_hz)
+        watch.note(good | True, ['ok'] * 3, 0, stamp_ns)
+        watch.agreed(1, True)
+        watch.readmit()
+    assert not watch.excluded[1]
 
 
 @pytest.mark.parametrize('reason', ['flagged', 'not finite', 'missing'])

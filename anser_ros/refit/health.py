@@ -7,6 +7,7 @@ odds against "all is well" come from the same evidence. A coil that is left out 
 returns when it has agreed with the others for a while.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -14,9 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.integrity.continuity import STREAM_GAP_S
 from anser_ros.refit.agreement import evidence_without
 from anser_ros.refit.evidence import FrameEvidence, log_sum
 from anser_ros.refit.posterior import Bank
+from anser_ros.stamps import NANO
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -47,6 +50,14 @@ AGREEMENT_CHI2 = 2.5
 """Left-out chi-square per degree of freedom below which an excluded coil agrees again."""
 RETRY_FRAMES = 25
 """Frames after which an excluded coil is looked at again."""
+HOLD_S = 0.5
+"""Time, s, of agreement after which an excluded coil is used again where that is sooner than its
+number of frames, as in slow streams. Shorter, and a loose plug comes and goes; longer, and all are
+without poses for more than a second after a fault of all references has ended."""
+FEWEST_HELD = 12
+"""Frames of agreement that are asked for at any rate, or the stated ones if these are fewer: noise
+that passes half of the time passes so many once in four thousand. Fewer, and it is believed; more,
+and slow streams wait."""
 OUTSTANDING = 8.0
 """A change this many times the median coil's is looked at as a possible fault."""
 MOST_AT_ONCE = 4
@@ -152,7 +163,8 @@ class ReferenceWatch:
     count : int
         Reference coils S.
     hold_frames : int
-        Frames for which a coil must be readable and agree before it is used again.
+        Frames for which a coil must be readable and agree before it is used again; at low rates
+        fewer, see `HOLD_S`.
     excluded : ndarray of bool, shape (S,)
         Which are not used.
     reason : list of str, length S
@@ -169,18 +181,28 @@ class ReferenceWatch:
     )
     _dismissed: tuple[float, int] = field(init=False, default=(0.0, 0))
     _since: int = field(init=False, default=0)
+    _last_ns: int = field(init=False, default=0)
+    _gap_s: float = field(init=False, default=math.inf)
 
     def __post_init__(self) -> None:
         self.excluded = np.zeros(self.count, dtype=bool)
         self.reason = [OK] * self.count
         self._good = np.zeros(self.count, dtype=np.int64)
 
-    def note(self, readable: NDArray[np.bool_], reasons: list[str], least: int = 0) -> None:
+    def note(
+        self,
+        readable: NDArray[np.bool_],
+        reasons: list[str],
+        least: int = 0,
+        stamp_ns: int | None = None,
+    ) -> None:
         """Exclude unreadable coils, whose waiting time starts again with every such frame.
 
         If fewer than `least` can be read, samples were lost and no coil is at fault: the next
-        frame continues as before.
+        frame continues as before. Frames without a stamp have no rate.
         """
+        if stamp_ns is not None:
+            self._take_pace(stamp_ns)
         if self._before is not None:
             self.excluded, self.reason, self._good = self._before
             self._before = None
@@ -190,6 +212,20 @@ class ReferenceWatch:
             self.excluded[coil] = True
             self.reason[coil] = reasons[coil]
             self._good[coil] = 0
+
+    def _take_pace(self, stamp_ns: int) -> None:
+        """Follow the time between frames; one that was lost, or points one by one, don't count."""
+        gap_s = (stamp_ns - self._last_ns) * NANO
+        self._last_ns = stamp_ns
+        if 0.0 < gap_s <= STREAM_GAP_S:
+            self._gap_s = min(gap_s, 1.1 * self._gap_s)
+
+    @property
+    def hold(self) -> int:
+        """Return the frames that a coil has to agree for at the present rate."""
+        if not math.isfinite(self._gap_s):
+            return self.hold_frames
+        return min(self.hold_frames, max(FEWEST_HELD, math.ceil(HOLD_S / self._gap_s)))
 
     def exclude(self, coil: int) -> None:
         """Exclude a coil that disagrees with the others."""
@@ -220,9 +256,9 @@ class ReferenceWatch:
         Each change of the coils in use costs more than a frame's time, so they wait for those that
         are on their way back too, for as long again at most.
         """
-        ready = self.excluded & (self._good >= self.hold_frames)
+        ready = self.excluded & (self._good >= self.hold)
         awaited = self.excluded & (self._good > 0) & ~ready
-        if awaited.any() and self._good.max() < 2 * self.hold_frames:
+        if awaited.any() and self._good.max() < 2 * self.hold:
             return
         for coil in np.flatnonzero(ready):
             self.excluded[coil], self.reason[coil], self._good[coil] = False, OK, 0

@@ -213,7 +213,7 @@ class LiveRefit:
         self._last_ns = stamp_ns
         frame = self._freshness.judged(frame, self.settings.accuracy.flux_noise_t)
         readable, reasons = self._baseline_check.read(frame, baseline)
-        self._watch.note(readable, reasons, self.settings.min_references)
+        self._watch.note(readable, reasons, self.settings.min_references, stamp_ns)
         usable = ordered if readable.all() else np.where(readable[:, None], ordered, np.nan)
         level = self._noise.update(self._watch.without_excluded(usable))
         clean = self.baseline if baseline is None else baseline
