@@ -100,7 +100,8 @@ def demodulated(samples: Array, rate_hz: float, reference: NDArray[np.bool_]) ->
     """Return phasors (S, 4), complex, of a stretch of samples, in their unit.
 
     Tones and drift are fitted together; a tone's phase is that of the reference channels, since
-    the current of the coil was not recorded.
+    the current of the coil was not recorded. Tones 2 Hz apart need half a second: a window of
+    `signals.demodulation`, for tools that move, is 50 ms long at most.
     """
     age = (np.arange(samples.shape[1]) - (samples.shape[1] - 1) / 2.0) / rate_hz
     angle = 2.0 * np.pi * np.outer(age, TONES_HZ)
