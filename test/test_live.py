@@ -191,6 +191,7 @@ def test_frames_are_handed_over_as_objects_while_two_senders_are_still_told(ros)
         node.destroy_node()
 
 
+@pytest.mark.realtime
 def test_the_chain_in_one_process_is_the_same_three_nodes(ros, start, tmp_path):
     from geometry_msgs.msg import PoseStamped
     from rcl_interfaces.srv import GetParameters
