@@ -182,13 +182,12 @@ class TrackerNode(AnserNode):
             field = in_force.field if given is None else in_force.field_of(given)
             if field is not None:
                 new = field is not in_force.field or given is None
-                # Handed frames are younger than their model: it is aged for them here.
                 ages = given is not None and given.follows and self.hands_over
                 if not ages:
                     self._track_with(field, given)
                 if given is not None:
                     in_force.put(given, field)
-                if ages:
+                if ages:  # frames that are handed over are younger than their model
                     self._track_with(in_force.soon() or field, given)
                 self.count('models', new)
         except AnserError as error:
@@ -257,7 +256,7 @@ class TrackerNode(AnserNode):
             return
         begin_s = time.perf_counter()
         stamp_ns, points = frame
-        estimates, changed = [], False
+        estimates, changed, now_ns = [], False, 0
         conflict = sender_words(self._sources)
         if (
             conflict
@@ -274,7 +273,7 @@ class TrackerNode(AnserNode):
             for estimate in self._tracker.estimates(
                 stamp_ns, points.channel, points.flux, points.flags, standing.withheld
             ):
-                now_ns = self.get_clock().now().nanoseconds
+                now_ns = now_ns or self.get_clock().now().nanoseconds
                 changed |= self._topics[estimate.name].take(estimate, now_ns)
                 estimates.append(estimate)
                 tip = self._tips.get(estimate.name)

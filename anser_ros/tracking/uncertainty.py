@@ -6,6 +6,7 @@ is not observable: the rotation covariance is that of the tilt plus ``roll_varia
 """
 
 import math
+from functools import lru_cache
 
 import numba
 import numpy as np
@@ -23,6 +24,7 @@ UNKNOWN_VARIANCE = 1.0
 """Upper bound (m^2 or rad^2) of a variance along a direction that the fluxes don't determine."""
 
 
+@lru_cache(maxsize=256)
 def chi2_limit(degrees_of_freedom: int, probability: float) -> float:
     """Return chi-square that noise alone exceeds with the given probability."""
     return float(chdtri(max(degrees_of_freedom, 1), probability))
