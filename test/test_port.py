@@ -139,6 +139,16 @@ def test_commands_reach_the_wire_with_their_tag(wire, port):
     assert port.sent_ns(tag + 1) is None
 
 
+def test_a_unit_that_takes_no_command_is_not_called_unplugged(wire, port):
+    while not port.counters.unwritten:
+        for _ in range(20):
+            port.send(SetFrequencies(TONES))
+        time.sleep(0.01)
+    wire.write(encode(HELLO))
+    assert receive(port, 1) == [HELLO]
+    assert port.counters.unplug == 0 and port.counters.opens == 1
+
+
 @pytest.mark.parametrize(
     ('device', 'why'),
     [

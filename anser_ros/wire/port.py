@@ -57,6 +57,7 @@ class PortCounters:
     wrong_baud: int = 0
     silence: int = 0
     unplug: int = 0
+    unwritten: int = 0
     overrun_blocks: int = 0
     open_failures: int = 0
     reader_failures: int = 0
@@ -250,7 +251,11 @@ class ControlUnitPort:
             while self._commands:
                 tag, command = self._commands.popleft()
                 self._sent_ns.append((tag, time.monotonic_ns()))
-                port.write(command)
+                try:
+                    port.write(command)
+                except serial.SerialTimeoutException:  # its sender misses the reply
+                    self.counters.unwritten += 1
+                    break  # what arrives must not wait for the next one
             data = receive()
             # The stamps hang on this time: it is taken before anything is made of the bytes.
             arrival_ns = time.monotonic_ns()

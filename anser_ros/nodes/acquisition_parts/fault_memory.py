@@ -10,6 +10,7 @@ MEMORY_S = 5.0
 FAULTS = {
     'unplug': 'cable pulled out',
     'silence': 'nothing arrived',
+    'unwritten': 'commands that the control unit did not take',
     'wrong_baud': 'bytes but no records: wrong baud rate?',
     'overrun_blocks': 'blocks lost: this computer is too slow',
     'gap_blocks': 'blocks missing in the stream',
