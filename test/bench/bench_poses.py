@@ -337,7 +337,8 @@ def summary(outcomes: Sequence[tuple[str, float, Outcome]]) -> Iterator[dict[str
     errors: dict[str, list[float]] = {'lever arm': [v for one in right for v in one.levers]}
     for one in right:
         for key, value in one.errors.items():
-            errors.setdefault(key, []).append(value)
+            is_poll = key.startswith('time_offset') and 'quantised_stamps' in one.expected
+            errors.setdefault(f'{key} beside a poll' if is_poll else key, []).append(value)
     for key, values in errors.items():
         if len(values) > 1:
             size = float(np.sqrt(np.mean(np.square(values))))
