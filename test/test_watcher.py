@@ -277,13 +277,12 @@ def test_over_dds_on_a_session_that_this_package_did_not_make(ros, start, shared
         'watcher', '--ros-args', '-p', f'model_file:={effects_model}',
         '-p', f'baseline_file:={folder / "factory.mcap"}', '-p', 'cpu_share:=1.0',
     )  # fmt: skip
-    start('replay', folder / 's04.mcap', '--rate', '4', '--loop', '--wait', '4')
-    title = 'anser/watcher: static_metal'
+    start('replay', folder / 's02.mcap', '--rate', '4', '--loop', '--wait', '4')
+    title = 'anser/watcher: sensor_gain (channel 0)'
     assert heard.until(lambda lines: lines.get(title, (0,))[0] == 1), (
         f'{heard.lines}\n{watcher.output}'
     )
-    place = [float(v) for v in heard.lines[title][2]['position_m'].strip('[]').split()]
-    assert np.linalg.norm(np.subtract(place, (0.0986, 0.0193, -0.0835))) < 0.015
+    assert float(heard.lines[title][2]['gain']) == pytest.approx(0.98242, abs=1e-3)
 
 
 def test_a_baseline_that_is_none_is_refused(start):
