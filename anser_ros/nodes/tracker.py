@@ -258,9 +258,7 @@ class TrackerNode(AnserNode):
         stamp_ns, points = frame
         estimates, changed, now_ns = [], False, 0
         conflict = sender_words(self._sources)
-        if (
-            conflict
-        ):  # the frame may be another sender's, so the model's age is not told by its stamp
+        if conflict:  # the frame may be another sender's: its stamp does not tell the model's age
             standing = FrameModel(None, Withheld(TWO_SOURCES, conflict))
         else:
             standing = self._in_force.at(stamp_ns)

@@ -139,8 +139,9 @@ class Courses:
 
     @property
     def readable(self) -> NDArray[np.bool_]:
-        """Return which references (S,) have been read in the newest frame."""
-        return np.asarray(self._last_ns == self._stamp_ns)
+        """Return which references (S,) have been read now, and twice before."""
+        is_read = self._last_ns == self._stamp_ns
+        return np.asarray(is_read & np.isfinite(self.bend()).all(axis=1))
 
     def bend(self) -> ComplexArray:
         """Return readings less twice those before plus those before that (S, K), T."""
