@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import REPO
 
 from anser_ros.wire.frame_reader import FrameReader
 from anser_ros.wire.frames import encode
@@ -125,6 +127,22 @@ def test_growth_is_a_trend_and_no_step():
         growth, error = series.hourly(1)
         assert abs(growth - hourly_mb) < max(1.0, 4.0 * error)
         assert series.hourly(2)[0] == 0.0
+
+
+def test_the_page_of_faults_has_the_kept_result(tmp_path):
+    from table import load, write_docs
+
+    page = (REPO / 'docs' / 'faults.md').read_text()
+    seed, rate_hz = re.search(r'ARGS=--write-docs` \(seed (\d+), (\S+) Hz\)', page).groups()
+    rows = load(REPO / 'docs' / 'results' / 'chaos.json')
+    copy = tmp_path / 'faults.md'
+    copy.write_text(page)
+    write_docs(copy, rows, int(seed), float(rate_hz))
+    assert copy.read_text() == page
+    poses, wrong = sum(row.poses for row in rows), sum(row.wrong for row in rows)
+    words = f'{wrong or "none"} of {poses:,} poses'
+    for said in (page, (REPO / 'README.md').read_text()):
+        assert words in ' '.join(said.split())
 
 
 @pytest.mark.processes
