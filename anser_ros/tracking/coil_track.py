@@ -311,7 +311,11 @@ def _finish(
             track.before = (track.good_ns, last.position, last.axis)
         track.good, track.good_ns = solution, frame.stamp_ns
         track.suspect, track.failures = None, 0
-        track.noise.add(judged.chi2)
+        place = solution.position, solution.axis
+        weights = _whitening(track, frame.context, *place, frame.length)
+        residual = solution.residual
+        whitened = weights[0] * residual if len(weights) == 1 else weights @ residual
+        track.noise.add(judged.chi2, whitened, frame.freedom)
     elif cold:
         wait_s = min(FIRST_RETRY_S * 2.0**track.failures, LAST_RETRY_S)
         track.suspect, track.failures = solution, track.failures + 1

@@ -32,6 +32,10 @@ smooth distortion looks more like a pose than like anything else: of a coil with
 five dimensions of the pose get four times what each of the eleven others gets. Smaller, and
 distorted poses say that they are certain; larger, and slight misfits widen poses that are
 right."""
+SLIGHT = 0.1
+"""Residual power that lasts from frame to frame, in units of the expected power, up to which it is
+no misfit. Of noise alone, a coil with eight emitters has 0 +- 0.02. Smaller, and chance widens
+poses; larger, and a coil that is a little wrong all the time counts as one with more noise."""
 
 
 @dataclass(frozen=True)
@@ -195,25 +199,47 @@ def no_pose(name: str, stamp_ns: int, state: str, model_id: str, reason: str) ->
 
 
 class NoiseScale:
-    """Estimates residual power over its expectation as frames pass: 1 when the noise is as told.
+    """Estimates residual power over its expectation as frames pass: 1 when the noise is as stated.
 
     An exponential mean over about `MEMORY_FRAMES` good frames; it starts as if `PRIOR_FRAMES` had
-    been as expected.
+    been as expected. Noise is new in each frame; what stays in the residuals from one frame to the
+    next is misfit.
     """
 
     def __init__(self) -> None:
-        self._weight = self._sum = PRIOR_FRAMES
+        self._weight = self._power = PRIOR_FRAMES
+        self._lasting = 0.0
+        self._last: Array | None = None
 
     @property
     def value(self) -> float:
-        """Return residual power over its expectation, by which variances are multiplied."""
-        return self._sum / self._weight
+        """Return residual power over its expectation."""
+        return self._power / self._weight
 
-    def add(self, ratio: float) -> None:
-        """Take in the residual power per degree of freedom of one more good frame."""
-        keep = 1.0 - 1.0 / MEMORY_FRAMES
+    def misfit(self, model_share: float) -> float:
+        """Return the part of it that lasts, beyond the model's own error; 0 where it is slight."""
+        return max(self._lasting / self._weight - model_share - SLIGHT, 0.0)
+
+    def add(self, ratio: float, whitened: Array | None = None, freedom: int = 1) -> None:
+        """Take in one more good frame.
+
+        Parameters
+        ----------
+        ratio : float
+            Residual power per degree of freedom, in units of the expected one.
+        whitened : ndarray, shape (2K,), optional
+            Residuals in units of their sigma; nothing is found to last without them.
+        freedom : int
+            Their degrees of freedom.
+        """
+        keep, most = 1.0 - 1.0 / MEMORY_FRAMES, 4.0 * self.value
+        last, self._last = self._last, whitened
+        lasting = 0.0
+        if last is not None and whitened is not None and last.shape == whitened.shape:
+            lasting = min(float(last @ whitened) / freedom, most)
         self._weight = keep * self._weight + 1.0
-        self._sum = keep * self._sum + min(ratio, 4.0 * self.value)
+        self._power = keep * self._power + min(ratio, most)
+        self._lasting = keep * self._lasting + lasting
 
     def of_frame(
         self, ratio: float, usual: float, share: float, model_share: float, follows: bool
@@ -235,10 +261,11 @@ class NoiseScale:
             metal does, and as much of it goes into the pose, however many readings there are.
         follows : bool
             Whether the model states its error by modes. Then no small residual takes that error
-            off the pose, and no persistent misfit is taken for noise.
+            off the pose, and no lasting misfit is taken for noise.
         """
-        hidden = HIDDEN * share
-        scale = max(self.value, 1.0) if follows else self.value
+        hidden, misfit = HIDDEN * share, self.misfit(model_share)
+        noise = max(self.value - misfit, SLIGHT)
+        scale = max(noise, 1.0) if follows else noise
         scale *= 1.0 + model_share * max(hidden - 1.0, 0.0)
-        expected = min(self.value, 1.0) if follows else self.value
-        return scale + hidden * max(0.0, ratio - usual * expected)
+        expected = min(noise, 1.0) if follows else noise
+        return scale + hidden * max(misfit, ratio - usual * expected)
