@@ -2,6 +2,7 @@
 
 import errno
 import io
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -188,3 +189,29 @@ def test_metadata_is_what_rosbag2_reads(tmp_path):
     (profile,) = only['topic_metadata']['offered_qos_profiles']
     assert profile['durability'] == 'transient_local' and profile['history'] == 'keep_last'
     assert only['topic_metadata']['type_description_hash'] == 'RIHS01_00'
+
+
+def test_the_index_of_a_long_recording_is_whole_and_takes_little_memory(tmp_path):
+    """Four chunks a second of forty topics: of an hour, less than 4 MB."""
+    path, chunks, topics = tmp_path / 'long.mcap', 400, 40
+    tracemalloc.start()
+    bag = BagWriter(path)
+    channels = [bag.add_topic(f'/t{k}', 'std_msgs/msg/String', '') for k in range(topics)]
+    before = 0
+    for k in range(chunks):
+        for channel in channels:
+            bag.write(channel, STAMP_NS + k, cdr.string_bytes(str(k)))
+        bag.flush()
+        if k == chunks // 4:
+            before = tracemalloc.get_traced_memory()[0]
+    grown = (tracemalloc.get_traced_memory()[0] - before) / (chunks - chunks // 4)
+    tracemalloc.stop()
+    bag.close()
+    assert grown * 4 * 3600 < 4e6
+    with open(path, 'rb') as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert len(summary.chunk_indexes) == chunks == summary.statistics.chunk_count
+        assert all(set(c.message_index_offsets) == set(channels) for c in summary.chunk_indexes)
+        found = [message.data for _, _, message in reader.iter_messages(['/t7'])]
+        assert found == [cdr.string_bytes(str(k)) for k in range(chunks)]
