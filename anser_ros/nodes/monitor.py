@@ -108,9 +108,9 @@ class Monitor(AnserNode):
                     f'{prefix}{topic_of(name)}/pose_with_covariance',
                     partial(self._on_pose, trace),
                 )
-        for body, trace in self._optical.items():
+        for body, seen in self._optical.items():
             topic = optical_topic(body, self.parameters.optical)
-            self._subscribe(PoseStamped, topic, partial(self._on_optical, trace))
+            self._subscribe(PoseStamped, topic, partial(self._on_optical, seen))
 
     def _subscribe(self, kind: type, topic: str, callback: Any) -> None:
         # rclpy wants a function, not a partial
@@ -293,9 +293,9 @@ class Monitor(AnserNode):
                 arrays[f'latency_{key}'] = np.array(trace.latency_s)
                 arrays[f'error_{key}'] = away
                 arrays[f'angle_{key}'] = angle
-        for body, trace in self._optical.items():
+        for body, seen in self._optical.items():
             arrays[f'optical_{body}'] = np.column_stack(
-                [np.array(trace.stamp_s), np.array(trace.position, float).reshape(-1, 3)]
+                [np.array(seen.stamp_s), np.array(seen.position, float).reshape(-1, 3)]
             )
         temporary = path.with_suffix('.part.npz')
         np.savez_compressed(temporary, **arrays)

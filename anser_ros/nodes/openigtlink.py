@@ -180,7 +180,7 @@ class OpenIGTLink(AnserNode):
 
     def _is_silent(self, name: str) -> bool:
         last_s = self._last_pose_s.get(name, -math.inf)
-        return time.monotonic() - last_s > self.parameters.stale_after_s
+        return bool(time.monotonic() - last_s > self.parameters.stale_after_s)
 
     def _watch(self) -> None:
         for name, state in self._states.items():

@@ -273,8 +273,8 @@ class CorrectionLoop:
             last = self._loaded[-1]
             now = self._chain.figures(last.at_s + SETTLING_S)
             for label, key, digits in LIVE_ROWS:
-                pair = [_text(figures.get(key), digits) for figures in (last.figures, now)]
-                rows.append((label, *pair))
+                before, after = last.figures.get(key), now.get(key)
+                rows.append((label, _text(before, digits), _text(after, digits)))
         return rows
 
 

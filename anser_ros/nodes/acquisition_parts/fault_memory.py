@@ -68,7 +68,9 @@ class RecentFaults:
 
 def device_words(status: DeviceStatus) -> str:
     """Return what the control unit itself complains of, with the count of what it lost."""
-    names = [flag.name.lower().replace('_', ' ') for flag in StatusFlag if flag & status.flags]
+    names = [
+        str(flag.name).lower().replace('_', ' ') for flag in StatusFlag if flag & status.flags
+    ]
     if StatusFlag.OVERRUN & status.flags:
         names.append(f'{status.dropped_blocks} blocks dropped (computer or line too slow)')
     return ', '.join(names)

@@ -168,7 +168,7 @@ class FluxStream:
         saturated = window.saturated[self._columns]
         stale = window.stuck[self._columns] | window.stuck[self._current_column]
         stale |= ((staleness.age_s > 0) | staleness.noiseless) & ~saturated
-        flags = np.where(saturated, SATURATED, 0) | np.where(stale, STALE, 0)
+        flags: NDArray[np.int64] = saturated * SATURATED | stale * STALE
         if window.dropped:
             flags |= DROPPED
         split = self._split

@@ -26,8 +26,10 @@ class Interval:
         self.frames += 1
         self.delay_sum_s += delay_s
         self.delay_max_s = max(self.delay_max_s, delay_s)
-        known = self.flags is not None and self.flags.shape == frame.flags.shape
-        self.flags = self.flags | frame.flags if known else frame.flags
-        now = frame.staleness
-        self.staleness = self.staleness | now if known and self.staleness else now
+        flags, now = self.flags, frame.staleness
+        if flags is not None and flags.shape == frame.flags.shape:
+            self.flags = flags | frame.flags
+            self.staleness = self.staleness | now if self.staleness else now
+        else:
+            self.flags, self.staleness = frame.flags, now
         self.repeats += frame.repeats

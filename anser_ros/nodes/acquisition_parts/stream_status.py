@@ -66,7 +66,7 @@ def signal_troubles(
 def _stuck(stream: FluxStream, flags: np.ndarray, staleness: Staleness) -> list[tuple[Level, str]]:
     """Name the stuck sensors, those of one reason together."""
     names: dict[str, list[str]] = {}
-    for row in np.flatnonzero(flags & STALE):
+    for row in np.flatnonzero(flags & STALE).tolist():
         names.setdefault(_why_stale(staleness, row), []).append(stream.sensors[row].name)
     return [(Level.ERROR, f'stuck: {_named(bad)} {why}'.strip()) for why, bad in names.items()]
 

@@ -42,7 +42,8 @@ def definition(type_name: str) -> str:
     BagError
         A definition is not installed.
     """
-    parts, seen, waiting = [], {type_name}, [type_name]
+    parts: list[str] = []
+    seen, waiting = {type_name}, [type_name]
     while waiting:
         current = waiting.pop(0)
         text = _file(current, 'msg').read_text(encoding='utf-8')

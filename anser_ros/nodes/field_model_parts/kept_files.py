@@ -198,7 +198,7 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
     with path.open('rb') as file:
         head = json.loads(file.readline(LONGEST_HEAD))
         data = np.fromfile(file, dtype=np.uint8)
-    if zlib.crc32(data) != head['crc32']:
+    if zlib.crc32(data.data) != head['crc32']:
         raise ValueError(f'{path} is damaged')
     return {
         name: data[begin : begin + size].view(np.dtype(kind)).reshape(shape)

@@ -73,7 +73,7 @@ def metal_markers(metal: Metal | None, frame_id: str, stamp_ns: int) -> MarkerAr
     density = np.abs(metal.polarisability) / metal.volumes
     rows = np.argsort(-density)[:MOST_SHOWN]
     rows = rows[density[rows] >= SHOWN * density[rows[0]]]
-    markers = []
+    markers: list[Marker] = []
     for volume in np.unique(metal.volumes[rows]).tolist():
         here = rows[metal.volumes[rows] == volume]
         spheres = _marker(frame_id, stamp_ns, len(markers))

@@ -8,6 +8,7 @@ baseline again.
 import contextlib
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,7 +139,7 @@ class RefitStart:
         """Give the work up; return whether it ended within some seconds."""
         self._is_over = True
         self._worker.shutdown(wait=False, cancel_futures=True)
-        works = (self._tables, self._made, self._kept)
+        works: tuple[Future[Any] | None, ...] = (self._tables, self._made, self._kept)
         # What was given up before it began is done, but `wait` would wait for it.
         going_on = [work for work in works if work is not None and not work.done()]
         return not wait(going_on, longest_s).not_done

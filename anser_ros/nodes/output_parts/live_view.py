@@ -183,7 +183,9 @@ class LiveView:
             for t in self.targets
         ]
         poses, frames = np.array(pairs).reshape(-1, 2).T
-        return np.divide(poses, frames, out=np.full(len(poses), np.nan), where=frames > 0)
+        shares = np.full(len(poses), np.nan)
+        np.divide(poses, frames, out=shares, where=frames > 0)
+        return shares
 
     def reasons(self) -> list[str]:
         """Return the causes of what the statuses report."""
@@ -240,7 +242,7 @@ class LiveView:
             return Figures(math.nan, math.nan, math.nan, 0.0)
         coils = len(self.setup.tool_sensors)
         error, residual, tracked = (
-            np.array([point[part][:coils] for point in points]) for part in (1, 2, 3)
+            np.array(values)[:, :coils] for values in list(zip(*points, strict=True))[1:]
         )
         return Figures(
             _middle(tracked, np.mean), _middle(error, _rms), _middle(residual, _rms),

@@ -41,6 +41,8 @@ from anser_ros.nodes.runtime.diagnostics import Level, Status, Throttle, diagnos
 from anser_ros.nodes.runtime.handover import DirectSubscription, Handover, NewestWorker
 from anser_ros.nodes.runtime.process import main
 
+Callback = Callable[..., Any]
+
 NAMESPACE = 'anser'
 DIAGNOSTICS_PERIOD_S = 1.0
 """Time between two messages in /diagnostics, s, as other ROS nodes have it."""
@@ -234,8 +236,15 @@ class AnserNode(Node):
     # Guarded callbacks --------------------------------------------------------------------
 
     def create_subscription(
-        self, msg_type, topic, callback, qos_profile, *, handed=None, **options
-    ):
+        self,
+        msg_type: Any,
+        topic: str,
+        callback: Callback,
+        qos_profile: Any,
+        *,
+        handed: Callback | None = None,
+        **options: Any,
+    ) -> Any:
         """Subscribe as rclpy does, with the callback guarded, and what is too large refused.
 
         An object handed over by a node of this process goes to ``handed``, by default to the
@@ -244,7 +253,7 @@ class AnserNode(Node):
         bounded = incoming.is_bounded(msg_type) and not options.get('raw', False)
 
         @functools.wraps(callback)
-        def opened(message, *info):
+        def opened(message: Any, *info: Any) -> Any:
             return callback(incoming.opened(message, msg_type) if bounded else message, *info)
 
         name = self.resolve_topic_name(topic)
@@ -254,7 +263,7 @@ class AnserNode(Node):
         guarded = self._guard(self._in_turn(opened))
 
         @functools.wraps(callback)
-        def unpacked(*args):
+        def unpacked(*args: Any) -> Any:
             # The events executor gives message and its information as one pair.
             if len(args) == 1 and isinstance(args[0], tuple):
                 args = args[0]
@@ -264,12 +273,16 @@ class AnserNode(Node):
             options['raw'] = True
         return super().create_subscription(msg_type, topic, unpacked, qos_profile, **options)
 
-    def create_timer(self, timer_period_sec, callback, *args, **options):
+    def create_timer(
+        self, timer_period_sec: float, callback: Callback, *args: Any, **options: Any
+    ) -> Any:
         """Make a timer as rclpy does, with the callback guarded."""
         guarded = self._guard(self._in_turn(callback, LONGEST_TURN_S))
         return super().create_timer(timer_period_sec, guarded, *args, **options)
 
-    def create_service(self, srv_type, srv_name, callback, **options):
+    def create_service(
+        self, srv_type: Any, srv_name: str, callback: Callback, **options: Any
+    ) -> Any:
         """Serve as rclpy does; an error becomes ``success = False`` with its message."""
         guarded = self._guard(self._in_turn(callback), is_service=True)
         return super().create_service(srv_type, srv_name, guarded, **options)
@@ -281,7 +294,7 @@ class AnserNode(Node):
             return True
         return super().destroy_subscription(subscription)
 
-    def _put_aside(self, topic: str, taker: Callable) -> Callable:
+    def _put_aside(self, topic: str, taker: Callback) -> Callback:
         if not self.WORKS_ASIDE:
             return taker
         aside = self._aside = self._aside or NewestWorker(lambda: self.count('frames_skipped'))
@@ -297,14 +310,14 @@ class AnserNode(Node):
         self.stop_working()
         super().destroy_node()
 
-    def _in_turn(self, callback: Callable, longest_s: float = -1.0) -> Callable:
+    def _in_turn(self, callback: Callback, longest_s: float = -1.0) -> Callback:
         """A callback that waits for another one of this node in another thread.
 
         One that comes again does not hold up other nodes for long, and is left out.
         """
 
         @functools.wraps(callback)
-        def in_turn(*args):
+        def in_turn(*args: Any) -> Any:
             if not self._turn.acquire(timeout=longest_s):
                 return None
             try:
@@ -314,9 +327,9 @@ class AnserNode(Node):
 
         return in_turn if self._handover is not None else callback
 
-    def _guard(self, callback: Callable, is_service: bool = False) -> Callable:
+    def _guard(self, callback: Callback, is_service: bool = False) -> Callback:
         @functools.wraps(callback)
-        def guarded(*args):
+        def guarded(*args: Any) -> Any:
             reason = ''
             try:
                 return callback(*args)

@@ -126,7 +126,7 @@ def check(name: str, kind: Any, rule: Rule, value: Any) -> Any:
     return _check_scalar(name, kind, rule, value)
 
 
-def _check_scalar(name: str, kind: type, rule: Rule, value: Any) -> Any:
+def _check_scalar(name: str, kind: type[Any], rule: Rule, value: Any) -> Any:
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if not isinstance(value, kind) or (kind is not bool and isinstance(value, bool)):

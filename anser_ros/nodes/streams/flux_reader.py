@@ -53,8 +53,7 @@ def read_frame(
     LayoutError
         When it is in another frame, has no stamp, or is no flux cloud.
     """
-    handed = isinstance(message, HandedFlux)
-    given_id = message.frame_id if handed else message.header.frame_id
+    given_id = message.frame_id if isinstance(message, HandedFlux) else message.header.frame_id
     if given_id != frame_id:
         count('fluxes_other_frame_id', 1)
         raise LayoutError(f'fluxes in the frame {given_id!r}, the setup is in {frame_id!r}')

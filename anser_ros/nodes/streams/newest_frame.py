@@ -91,7 +91,7 @@ def take_waiting(subscription: Any) -> list[Any]:
 
     This removes them from the queue.
     """
-    taken = []
+    taken: list[Any] = []
     with subscription.handle:
         while True:
             item = subscription.handle.take_message(subscription.msg_type, subscription.raw)
