@@ -16,7 +16,7 @@ from anser_ros.diagnosis.problem import Problem, State
 from anser_ros.diagnosis.residuals import rms, tool_parts
 from anser_ros.diagnosis.structure import noise_t
 from anser_ros.effects.effect import Family
-from anser_ros.effects.excess_noise import excess_noise_of
+from anser_ros.effects.excess_noise import EXCESS_NOISE
 from anser_ros.effects.outliers import known_share, outliers_of
 from anser_ros.field.model import EffectRecord
 
@@ -66,7 +66,7 @@ def noise_findings(whole: Problem, after: State) -> list[Finding]:
         factor = _factor_of(after, noisy)
         count = after.count * len(noisy) / len(whole.apparatus.tool_channels)
     sigma = factor / np.sqrt(2 * max(count, 1))
-    return [plain_finding(excess_noise_of(factor, sigma, noisy), rms(after))]
+    return [plain_finding(EXCESS_NOISE.seen(factor, sigma, noisy), rms(after))]
 
 
 def _factor_of(state: State, channels: tuple[int, ...]) -> float:
