@@ -67,7 +67,7 @@ ROOMS = {
     'mcap_ros2': ('wire/bag.py', 'wire/bag_writer.py'),
     'pyigtl': (),
     'rich': ('nodes/', 'cli/'),
-    'matplotlib': ('diagnosis/', 'experiments/', 'cli/'),
+    'matplotlib': ('pictures.py', 'experiments/', 'cli/'),
     'dask': ('cli/batch.py',),
     'distributed': ('cli/batch.py',),
     'magpylib': (),

@@ -3,17 +3,14 @@
 import html
 from typing import Any
 
-import matplotlib
-
-matplotlib.use('Agg')
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
 from anser_ros.assessment.protocols import PROTOCOLS, Assessment
 from anser_ros.cli.accuracy_document import figure_rows
-from anser_ros.cli.diagnosis_figures import image
 from anser_ros.cli.html_page import page, table
+from anser_ros.pictures import image
 
 MOST_ROWS = 500  # rows of a table of single errors; all are in accuracy.json
 

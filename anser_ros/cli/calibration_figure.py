@@ -2,13 +2,11 @@
 
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use('Agg')
 from matplotlib import pyplot as plt
 
 from anser_ros.calibration.result import Calibration
 from anser_ros.cli.populations import population_figure
+from anser_ros.pictures import save
 
 
 def draw_choice(calibration: Calibration, path: Path) -> None:
@@ -38,13 +36,11 @@ def draw_choice(calibration: Calibration, path: Path) -> None:
         # Below the axes, where it covers no curve.
         panel.legend(fontsize=7, loc='upper center', bbox_to_anchor=(0.5, -0.14))
     figure.suptitle('Choice by held-out error, pose marginalised', fontsize=10)
-    figure.savefig(path, dpi=110, metadata={'Software': None})
-    plt.close(figure)
+    save(figure, path)
 
 
 def draw_populations(calibration: Calibration, path: Path) -> None:
     """Draw how the sensors differ; nothing is drawn where the scan contains no population."""
     figure = population_figure(calibration.scan.corrections)
     if figure is not None:
-        figure.savefig(path, dpi=110, metadata={'Software': None})
-        plt.close(figure)
+        save(figure, path)

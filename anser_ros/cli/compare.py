@@ -8,17 +8,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-matplotlib.use('Agg')
-import matplotlib.pyplot as plt
-
 from anser_ros.cli.output import make_folder, say_written
 from anser_ros.cli.progress import progress_of
 from anser_ros.physics.constants import DEGREES
+from anser_ros.pictures import save
 from anser_ros.sessions.comparison import (
     Compared,
     ComparedShares,
@@ -177,5 +175,4 @@ def draw(
         panel.locator_params(axis='x', nbins=5)
         panel.set_ylim(len(names) - 0.5, -0.5)
     panels[0].set_yticks(np.arange(len(names)), names)
-    figure.savefig(path, dpi=110, metadata={'Software': None})
-    plt.close(figure)
+    save(figure, path)

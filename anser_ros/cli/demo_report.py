@@ -57,11 +57,11 @@ def summarise(results: Results) -> dict[str, object]:
 
 def draw(results: Results, path: Path) -> None:
     """Write the picture: true and tracked path from above and from the side, error over time."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    from anser_ros.pictures import save
+
     figure = Figure(figsize=(12, 7), layout='constrained')
-    FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.6))
     shown = _shown_target(results)
     views = []
@@ -77,7 +77,7 @@ def draw(results: Results, path: Path) -> None:
         fontsize='small',
     )  # fmt: skip
     figure.suptitle(f'{results["names"][shown]}: simulated control unit, true and tracked')
-    figure.savefig(path, dpi=110)
+    save(figure, path)
 
 
 def _shown_target(results: Results) -> int:

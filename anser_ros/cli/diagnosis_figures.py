@@ -3,13 +3,8 @@
 In all of them 1 is what noise alone would give.
 """
 
-import base64
-import io
 from typing import Any
 
-import matplotlib
-
-matplotlib.use('Agg')
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
@@ -51,15 +46,6 @@ def _rms(part: Part, axis: int) -> Array:
     return np.asarray(
         np.sqrt((part.white**2 * good).sum(axis=axis) / np.maximum(good.sum(axis=axis), 1))
     )
-
-
-def image(figure: Figure) -> str:
-    """Return the figure as an HTML element that holds the picture itself; the figure is closed."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format='png', dpi=110)
-    plt.close(figure)
-    data = base64.b64encode(buffer.getvalue()).decode('ascii')
-    return f'<img alt="figure" src="data:image/png;base64,{data}">'
 
 
 def time_line(before: State, after: State) -> Figure:

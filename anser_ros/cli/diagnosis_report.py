@@ -4,12 +4,13 @@ import html
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from anser_ros.cli.diagnosis_figures import bars, course, image, maps, strongest, time_line
+from anser_ros.cli.diagnosis_figures import bars, course, maps, strongest, time_line
 from anser_ros.cli.diagnosis_words import paths, short_ones, value_text, verdict
 from anser_ros.cli.html_page import page, table
 from anser_ros.cli.populations import population_figure, population_table
 from anser_ros.diagnosis.search import Candidate
 from anser_ros.physics.constants import DEGREES
+from anser_ros.pictures import image
 from anser_ros.sessions.diagnosis import SessionDiagnosis
 
 MOST_CANDIDATES = 40

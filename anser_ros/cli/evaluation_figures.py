@@ -10,18 +10,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use('Agg')
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from anser_ros.cli.html_page import page
 from anser_ros.physics.constants import DEGREES
+from anser_ros.pictures import legend_below, save, spell_out
 from anser_ros.sessions.evaluation import Evaluation
 from anser_ros.sessions.pose_errors import PoseSeries
 
@@ -56,14 +52,6 @@ def _thinned(count: int) -> slice:
     return slice(0, None, max(1, -(-count // MOST_POINTS)))
 
 
-def _below(figure: Figure, axes: Any) -> None:
-    """One legend below all panels, where it covers nothing."""
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc='outside lower center', ncols=min(len(labels), 5), fontsize=8
-    )
-
-
 def over_time(evaluation: Evaluation) -> Figure:
     """Draw the position error of every coil and body over time, and which of them had a pose."""
     found = _series(evaluation)
@@ -86,7 +74,7 @@ def over_time(evaluation: Evaluation) -> Figure:
     if all(series.ok.all() for series in found.values()):
         lower.text(0.5, 0.5, 'every frame has a pose', transform=lower.transAxes, ha='center')
     upper.grid(alpha=0.3)
-    _below(figure, upper)
+    legend_below(figure, upper)
     return figure
 
 
@@ -175,15 +163,8 @@ def against_sigma(evaluation: Evaluation, jitter_m: float = 0.0) -> Figure:
     right.set(xlabel='multiple of sigma', ylabel='share of the errors within', ylim=(0, 1.02))
     for panel in (left, right):
         panel.grid(alpha=0.3)
-    _below(figure, left)
+    legend_below(figure, left)
     return figure
-
-
-def spell_out(axis: Axis) -> None:
-    """Label a logarithmic axis with numbers at 1, 2 and 5 of each power, which have room."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(FormatStrFormatter('%g'))
-    axis.set_minor_formatter(NullFormatter())
 
 
 FIGURES = {
@@ -218,8 +199,7 @@ def write_figures(
     )  # fmt: skip
     for (name, title), figure in zip(FIGURES.items(), drawn, strict=True):
         path = folder / f'{name}.png'
-        figure.savefig(path, dpi=110, metadata={'Software': None})
-        plt.close(figure)
+        save(figure, path)
         data = base64.b64encode(path.read_bytes()).decode('ascii')
         parts.append(
             f'<h2>{html.escape(title)}</h2>'

@@ -7,18 +7,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import yaml
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-matplotlib.use('Agg')
-import matplotlib.pyplot as plt
-
 from anser_ros.assessment.source import PoseSource, read_poses
-from anser_ros.cli.diagnosis_figures import image
 from anser_ros.cli.html_page import page, table
 from anser_ros.cli.output import make_folder, say_written
 from anser_ros.cli.pose_session import add_topic_options, load_poses
@@ -26,6 +22,7 @@ from anser_ros.cli.progress import progress_of
 from anser_ros.errors import ParameterError
 from anser_ros.field.plain_data import plain
 from anser_ros.physics.constants import DEGREES
+from anser_ros.pictures import image
 from anser_ros.poses.convention import reading_words
 from anser_ros.poses.document import finite
 from anser_ros.poses.forms import ORDERS
@@ -218,16 +215,16 @@ def _rows(document: dict[str, Any], digits: int) -> list[list[str]]:
     ]  # fmt: skip
 
 
-SHOWN = (0, 1, 2, 3, 6)
+SHOWN_COLUMNS = (0, 1, 2, 3, 6)
 """Columns of `HEAD` that fit into a terminal of eighty letters."""
 
 
 def _table(document: dict[str, Any]) -> Table:
     shown = Table()
-    for column in SHOWN:
+    for column in SHOWN_COLUMNS:
         shown.add_column(HEAD[column], no_wrap=True)
     for row in _rows(document, 1):
-        shown.add_row(*(row[column] for column in SHOWN))
+        shown.add_row(*(row[column] for column in SHOWN_COLUMNS))
     return shown
 
 

@@ -7,23 +7,20 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import yaml
 from rich.console import Console
 from rich.table import Table
 
-matplotlib.use('Agg')
-import matplotlib.pyplot as plt
-
 from anser_ros.assessment.pivot import PivotFit, PivotLimits, fit_pivot
 from anser_ros.assessment.source import AssessedPoses, read_poses
-from anser_ros.cli.diagnosis_figures import image
 from anser_ros.cli.html_page import page, table
 from anser_ros.cli.output import make_folder, say_written
 from anser_ros.cli.pose_source import add_source_options, live_poses, source_of
 from anser_ros.cli.progress import progress_of
 from anser_ros.errors import FitError, ParameterError, SetupError
+from anser_ros.pictures import image
 from anser_ros.poses.sequence import missing_words
 from anser_ros.wire.setup import parse_setup, topic_of
 from anser_ros.wire.setup_tips import SCHEMA, UPPER, TipSpec, dump_tips, with_tips

@@ -21,13 +21,11 @@ def write_figure(
     random: Mapping[int, Sequence[Design]],
 ) -> None:
     """Draw the chosen coils from above and from the side, and the error against their number."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from anser_ros.cli.evaluation_figures import spell_out
+    from anser_ros.pictures import save, spell_out
 
     figure = Figure(figsize=(13.0, 4.2), layout='constrained')
-    FigureCanvasAgg(figure)
     chosen = list(designs[-1].coils)
     half = region.half
     for panel, (across, up, words) in enumerate(((0, 1, 'from above'), (0, 2, 'from the side'))):
@@ -71,4 +69,4 @@ def write_figure(
     for legend_of in (figure.axes[0], axes):
         # Below, where no place and no error lies.
         legend_of.legend(fontsize=8, loc='upper center', bbox_to_anchor=(0.5, -0.14), ncols=2)
-    figure.savefig(path, dpi=120)
+    save(figure, path)

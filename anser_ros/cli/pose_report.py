@@ -5,9 +5,6 @@ import re
 from itertools import pairwise
 from typing import Any
 
-import matplotlib
-
-matplotlib.use('Agg')
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
@@ -15,9 +12,10 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from anser_ros.cli.diagnosis_figures import AFTER, BEFORE, image
+from anser_ros.cli.diagnosis_figures import AFTER, BEFORE
 from anser_ros.cli.diagnosis_words import short_ones, value_text
 from anser_ros.cli.html_page import page, table
+from anser_ros.pictures import image
 from anser_ros.poses.diagnosis import PoseDiagnosis
 from anser_ros.poses.effect import Role
 from anser_ros.poses.problem import PosePart, PoseState

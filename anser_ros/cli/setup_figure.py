@@ -4,14 +4,12 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use('Agg')
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
+from anser_ros.pictures import save
 from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.volume import pose_volume
 from anser_ros.wire.setup import SensorSpec, Setup
@@ -45,8 +43,7 @@ def draw_setup(setup: Setup, path: Path) -> None:
             panel.set(xlabel=f'{"xyz"[across]}, mm', ylabel=f'{"xyz"[up]}, mm')
             panel.set_aspect('equal', adjustable='datalim')
             panel.grid(alpha=0.3)
-    figure.savefig(path, dpi=110, metadata={'Software': None})
-    plt.close(figure)
+    save(figure, path)
 
 
 def _board(panel: Any, setup: Setup, across: int, up: int) -> None:

@@ -4,17 +4,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
-from numpy.typing import NDArray
-
-matplotlib.use('Agg')
 from matplotlib import pyplot as plt
+from numpy.typing import NDArray
 
 from anser_ros.experiments.recordings import HEAD_DISTANCES_CM, MATERIALS, checkerboard
 from anser_ros.experiments.study import Study
 from anser_ros.experiments.tracking_errors import SensorErrors
 from anser_ros.field.model import FieldModel
+from anser_ros.pictures import legend_below, save
 from anser_ros.sessions.session import Session
 
 Array = NDArray[np.float64]
@@ -26,9 +24,6 @@ PROFILE_EMITTER = 3
 PROFILE_BAND_M = 0.006
 """Distance from the line y = 0, m, up to which readings are drawn beside a profile; it is about
 half the distance of neighbouring points."""
-DOTS_PER_INCH = 110
-"""Resolution of the figures, a compromise between legible text and the size of the files."""
-
 SAME = 0.05
 """Relative difference of medians below which a curve may hide an earlier one, and is dashed."""
 
@@ -73,9 +68,7 @@ def _save(figure: Any, path: Path, title: str) -> Path:
     figure.suptitle(f'{title} ({SIMULATED})', fontsize=10)
     if figure.get_layout_engine() is None:
         figure.tight_layout()
-    # No date and no version in the file: the same results give the same bytes.
-    figure.savefig(path, dpi=DOTS_PER_INCH, metadata={'Software': None})
-    plt.close(figure)
+    save(figure, path)
     return path
 
 
@@ -102,16 +95,8 @@ def _cdfs(path: Path, curves: Mapping[str, Mapping[str, SensorErrors]], title: s
         panel.set(xlabel='position error, mm', title=words)
         panel.grid(alpha=0.3)
     panels[0].set_ylabel('share of the points')
-    _legend_below(figure, panels[0])
+    legend_below(figure, panels[0])
     return _save(figure, path, title)
-
-
-def _legend_below(figure: Any, panel: Any) -> None:
-    """Put one legend for all panels below them, where it covers nothing."""
-    handles, labels = panel.get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc='outside lower center', ncols=min(len(labels), 4), fontsize=8
-    )
 
 
 def _training_points(study: Study, folder: Path) -> Path:
@@ -121,7 +106,7 @@ def _training_points(study: Study, folder: Path) -> Path:
         where = 1e3 * session.tools[0].position
         panel.plot(where[:, 0], where[:, 1], mark, ms=4, label=f'{name} ({len(where)})')
     panel.set(xlabel='x, mm', ylabel='y, mm', aspect='equal')
-    _legend_below(figure, panel)
+    legend_below(figure, panel)
     return _save(figure, folder / 'fig_2.png', 'Training and test points over a plate')
 
 

@@ -156,13 +156,13 @@ def plot(rows: Sequence[AblationRow], path: Path, titles: Mapping[str, str] | No
 
     ``titles`` tell readers what a session is, where its name does not.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter, ScalarFormatter
 
+    from anser_ros.pictures import legend_below, save
+
     sessions = list(dict.fromkeys(row.session for row in rows))
     figure = Figure(figsize=(4.2 * len(sessions), 3.9), layout='constrained')
-    FigureCanvasAgg(figure)
     for panel, session in enumerate(sessions):
         axes = figure.add_subplot(1, len(sessions), panel + 1)
         here = [row for row in rows if row.session == session]
@@ -181,6 +181,5 @@ def plot(rows: Sequence[AblationRow], path: Path, titles: Mapping[str, str] | No
         axes.set_xlabel('reference coils')
         axes.set_ylabel('position RMSE / mm')
         axes.grid(True, which='both', alpha=0.3)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc='outside lower center', ncols=len(labels))
-    figure.savefig(path, dpi=120)
+    legend_below(figure, figure.axes[0])
+    save(figure, path)
