@@ -370,6 +370,7 @@ class TestCommand:
         last = capsys.readouterr().err.strip().splitlines()[-1]
         assert words in last and last.startswith('anser accuracy: ')
 
+    @pytest.mark.long
     def test_points_against_the_optical_reference(self, tmp_path, capsys):
         """A bag with a body that rests now and then, seen by both trackers."""
         rng = rng_of(21)

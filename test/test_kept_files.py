@@ -31,6 +31,7 @@ def same(one, other):
     return one == other
 
 
+@pytest.mark.long
 def test_tables_are_read_as_they_were_written(tmp_path):
     world = anser_world()
     setup = parse_setup(setup_text(world))

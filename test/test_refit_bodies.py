@@ -113,6 +113,7 @@ def test_slots_follow_metal_that_moves_and_are_emptied_by_a_reset(refit):
     np.testing.assert_array_equal(once.model.moments, again.model.moments)
 
 
+@pytest.mark.long
 def test_a_body_that_comes_again_is_not_worked_out_again(refit, monkeypatch):
     """The last ones are kept, and there are no more of them than are said to be."""
     follow(refit, BESIDE)

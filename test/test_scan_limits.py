@@ -30,6 +30,7 @@ def test_a_camera_that_jitters_shifts_neither_field_nor_tool():
     assert 5e-6 < found.shift_sigma_m < 5e-5
 
 
+@pytest.mark.long
 def test_a_scan_without_turns_tells_no_lever_arm_and_poses_know_it():
     found, _ = surveyed(22, 3, 6.0, 0.01, Errors(), CENTRES)
     assert 'lever_arm' in found.undetermined
