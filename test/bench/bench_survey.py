@@ -3,7 +3,7 @@
 Coils of seven random dipoles each, no drawing. Of three coils, what is found is compared with what
 was put in, relative to the rules for what no data determine. Of eight, the coils are tracked
 singly on a path that the scan did not take, and their exact error is compared with that of a scan
-by a perfect tool and a camera that only jitters. Both tables go into docs/calibration.md.
+by a perfect tool and a camera that only jitters. Both tables are in docs/log.md.
 
     python test/bench/bench_survey.py              # parameters of all rows, one seed
     python test/bench/bench_survey.py --tracked    # errors of tracked coils
@@ -61,11 +61,11 @@ ROWS = (
 HEAD = (
     '| coils | scan, s | turns, deg | gains, % | offset, ms | jitter, mm | gain error, % '
     '| axis, mrad | place, mm | lever arm, mm | offset error, ms | jitter found, mm '
-    '| not to be told | CPU, s |'
+    '| reported as undetermined | CPU, s |'
 )
 TRACKED_HEAD = (
     '| coils | scan, s | turns, deg | gains, % | offset, ms | jitter, mm | ours, mm | worst, mm '
-    "| over 3 sigma, % | a perfect tool's, mm | not to be told | CPU, s |"
+    "| over 3 sigma, % | a perfect tool's, mm | reported as undetermined | CPU, s |"
 )
 CENTRES = np.array([[x, y, 0.0] for x in (-0.09, 0.0, 0.09) for y in (-0.09, 0.0, 0.09) if x or y])
 """Eight coils, since a single coil has five coordinates and every emitter tells one number, m."""
