@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from anser_ros.cli.commands import OFFLINE
-from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, ONE_THREAD, attempt
+from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, attempt
 from anser_ros.cli.output import make_folder
 from anser_ros.cli.progress import progress_of
 from anser_ros.cli.session_runs import SessionRun, finish, perform, runs_of
 from anser_ros.cli.summary import COMMANDS, Outcome, row_of, write_summary
 from anser_ros.errors import ParameterError
-from anser_ros.parallel import cores
+from anser_ros.parallel import ONE_THREAD, cores
 
 if TYPE_CHECKING:  # Dask is loaded where it is used: the help is there without it
     from distributed import Client

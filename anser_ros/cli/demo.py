@@ -104,8 +104,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _run_in(folder: Path, args: argparse.Namespace, stopped: list[int]) -> int:
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    for threads in ('OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
-        os.environ.setdefault(threads, '1')
     ports = Path(tempfile.mkdtemp(prefix='anser_demo_'))
     failed = ''
     try:

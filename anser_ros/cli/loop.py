@@ -81,8 +81,6 @@ def run(args: argparse.Namespace) -> int:
     effects = [*sorted(CATALOGUE), NONE] if ALL in args.effect else list(args.effect)
     _check(args, seed, effects)
     missing.check('recorder')
-    for variable in ('OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
-        os.environ.setdefault(variable, '1')
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     # A ROS system that runs already must neither receive nor be received by what is simulated
     # here.

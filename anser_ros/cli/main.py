@@ -17,14 +17,12 @@ from anser_ros.cli import missing
 from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE
 from anser_ros.errors import AnserError
 from anser_ros.one_line_parser import OneLineParser
-from anser_ros.parallel import cores, shared_among
+from anser_ros.parallel import ONE_THREAD, cores, shared_among
 
 # Exit codes, as docs/interfaces.md has them.
 EXIT_OK = 0  # done
 EXIT_DEFECT = 1  # an error of this program
 EXIT_BAD_INPUT = 2  # an error of the caller
-# For small matrices a second BLAS thread gains nothing, and waits milliseconds for a busy core.
-ONE_THREAD = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS')
 # The folder anser_ros, whose parent must be on a node's search path.
 PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 

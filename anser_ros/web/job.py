@@ -13,9 +13,7 @@ from pathlib import Path
 
 NICE = 10
 """Niceness of commands: poses go before a diagnosis."""
-ONE_THREAD = ('OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS')
-"""Variables that keep a command to one processor; the chain needs the others."""
-SHARE = re.compile(r'(\d+)%')
+PERCENT = re.compile(r'(\d+)%')
 KEPT_LINES = 20
 """Lines of what a command says that are kept, for the last ones say why it failed."""
 LONGEST_LINE = 65_536
@@ -72,12 +70,11 @@ class Job:
     async def run(self) -> None:
         """Run it to its end."""
         command = [sys.executable, '-P', '-m', 'anser_ros.cli.main', self.kind, *self._arguments]
-        environment = {**os.environ, **dict.fromkeys(ONE_THREAD, '1')}
         with (self.folder / 'output.txt').open('wb') as output:
             self._process = await asyncio.create_subprocess_exec(
                 'nice', '-n', str(NICE), *command, stdin=asyncio.subprocess.DEVNULL,
-                stdout=output, stderr=asyncio.subprocess.PIPE, env=environment,
-                start_new_session=True, limit=LONGEST_LINE,
+                stdout=output, stderr=asyncio.subprocess.PIPE, start_new_session=True,
+                limit=LONGEST_LINE,
             )  # fmt: skip
         try:
             await self._listen(self._process.stderr)
@@ -102,7 +99,7 @@ class Job:
         if not line:
             return
         self._lines = [*self._lines[-KEPT_LINES + 1 :], line]
-        words, found = line.partition(': ')[2], SHARE.search(line)
+        words, found = line.partition(': ')[2], PERCENT.search(line)
         self.share = int(found[1]) / 100 if found else math.nan
         self.stage = words or line
 
