@@ -16,9 +16,9 @@ from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.sensor_parameters import EXTRA_KINDS, KINDS
 from anser_ros.calibration.still import STILL_ONLY
 from anser_ros.cli.calibration_figure import draw_choice, draw_populations
-from anser_ros.cli.output import Result, check_file, loss_notes, make_folder, say
+from anser_ros.cli.carry_out import carry_out
+from anser_ros.cli.output import Result, check_file, loss_notes, make_folder
 from anser_ros.cli.populations import population_table, populations
-from anser_ros.cli.progress import progress_of
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.physics.constants import DEGREES
@@ -95,10 +95,7 @@ def _kinds(text: str) -> tuple[str, ...]:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command and return the exit code."""
-    with progress_of('calibrating') as tell:
-        result = work(args, tell)
-    say('calibrate', result, as_json=args.json)
-    return 0
+    return carry_out('calibrate', 'calibrating', work, args)
 
 
 def work(args: argparse.Namespace, tell: Callable[[str, float], None]) -> Result:

@@ -8,11 +8,11 @@ from typing import Any
 
 from rich.table import Table
 
+from anser_ros.cli.carry_out import carry_out
 from anser_ros.cli.diagnosis_report import render
 from anser_ros.cli.diagnosis_words import verdict
-from anser_ros.cli.output import Result, loss_notes, make_folder, say, snapshot_notes
+from anser_ros.cli.output import Result, loss_notes, make_folder, snapshot_notes
 from anser_ros.cli.pose_session import add_pose_options, diagnose_pose_session, need_model
-from anser_ros.cli.progress import progress_of
 from anser_ros.cli.stated_values import add_resurveyed, add_stated_values, stated_values
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.diagnosis import diagnose_session
@@ -44,10 +44,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
-    with progress_of('diagnosing') as tell:
-        result = work(args, tell)
-    say('diagnose', result, as_json=args.json)
-    return 0
+    return carry_out('diagnose', 'diagnosing', work, args)
 
 
 def work(args: argparse.Namespace, tell: Callable[[str], None]) -> Result:

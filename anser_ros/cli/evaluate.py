@@ -7,8 +7,9 @@ from typing import Any
 
 from rich.table import Table
 
+from anser_ros.cli.carry_out import carry_out
 from anser_ros.cli.evaluation_figures import write_figures
-from anser_ros.cli.output import Result, loss_notes, make_folder, say, snapshot_notes
+from anser_ros.cli.output import Result, loss_notes, make_folder, snapshot_notes
 from anser_ros.cli.pose_session import add_pose_options, evaluate_pose_session, need_model
 from anser_ros.cli.progress import Tell, progress_of
 from anser_ros.cli.session_runs import finish, perform, runs_of
@@ -103,10 +104,7 @@ def run(args: argparse.Namespace) -> int:
     if len(args.sessions) > 1:
         return _several(args)
     args.session = args.sessions[0]
-    with progress_of('evaluating') as tell:
-        result = work(args, tell)
-    say('evaluate', result, as_json=args.json)
-    return 0
+    return carry_out('evaluate', 'evaluating', work, args)
 
 
 def _several(args: argparse.Namespace) -> int:
