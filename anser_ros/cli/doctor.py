@@ -224,11 +224,11 @@ def kernel_clock() -> bool | None:
     return None if state < 0 else state != CLOCK_UNSET
 
 
-def disk(folder: Path, least: int = LEAST_FREE_BYTES) -> list[Observation]:
+def disk(folder: Path) -> list[Observation]:
     """Check the disk under a folder: whether a recording has room."""
     free = shutil.disk_usage(folder).free
     words = f'{free / 2**30:.1f} GB free in {folder}'
-    if free < least:
+    if free < LEAST_FREE_BYTES:
         return [Observation('disk', BAD, words, 'make room, or record elsewhere (directory:=...)')]
     return [Observation('disk', GOOD, words)]
 

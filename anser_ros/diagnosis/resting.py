@@ -51,10 +51,8 @@ def moves_or_rests(
         if term.effect.family.is_metal or term.effect.name in tried:
             continue
         # A linear score is only a promise: the fit may still bring down what is within these.
-        if (
-            len(tried) == MOST_EFFECTS_AT_REST
-            or score.held_out > 2.0 * limit + 0.5 * scorer.held_out
-        ):
+        hopeless = score.held_out > 2.0 * limit + 0.5 * scorer.held_out
+        if hopeless or len(tried) == MOST_EFFECTS_AT_REST:
             break
         tried.add(term.effect.name)
         for start in term.effect.started(term, score.solution):

@@ -242,10 +242,8 @@ def track_body(
     result = _judge(track, name, stamp_ns, fit, fits[1:], coils, context, settings)
     if result.state == states.OK:
         last, track.before = track.good, None
-        if (
-            last is not None
-            and math.dist(last.position, fit.solution.position) < SUSPICIOUS_JUMP_M
-        ):
+        moved = math.inf if last is None else math.dist(last.position, fit.solution.position)
+        if last is not None and moved < SUSPICIOUS_JUMP_M:
             track.before = (track.good_ns, last)
         track.good, track.good_ns = fit.solution, stamp_ns
         track.noise.add(fit.ratio)

@@ -222,12 +222,10 @@ def _promised(normal, gradient, step):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model='numpy')
 def descend(  # type: ignore[no-untyped-def]
-    position, axis, length, flux, whitening, dipoles, moments, low, high, budget, give_up, full,
-    residual,
+    position, axis, length, flux, whitening, dipoles, moments, low, high, budget, full, residual,
 ):  # fmt: skip
     """Move ``position`` and ``axis`` (in place) to the least chi-square near them.
 
-    ``give_up``: a chi-square that a start must have come below after half its budget.
     Returns chi-square, evaluations used, whether it converged.
     """
     width = flux.shape[0]
@@ -281,8 +279,6 @@ def descend(  # type: ignore[no-untyped-def]
                 growth *= 2.0
                 if damping > 1e12:
                     return chi2, used, False
-        if 2 * used > budget and chi2 > give_up:
-            break
     fill_tangent(axis, tangent)
     _normal_equations(white, tangent, full, normal, gradient)
     return chi2, used, converged

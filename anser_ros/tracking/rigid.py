@@ -142,7 +142,6 @@ def solve_body(
     rotation: NDArray[np.generic],
     low: Array,
     high: Array,
-    budget: int = MAX_EVALUATIONS,
 ) -> BodySolution:
     """Fit a rigid tool's pose from a start near it.
 
@@ -160,8 +159,6 @@ def solve_body(
         Start.
     low, high : ndarray, shape (3,)
         Box that the body's origin must not leave, m.
-    budget : int
-        Most evaluations of all coils.
 
     Returns
     -------
@@ -181,7 +178,8 @@ def solve_body(
     information = np.empty((6, 6))
     chi2, used, converged = descend_body(
         r, turn, coils.offsets, coils.axes, coils.lengths, flux, inverse_sigma, common,
-        field.columns, field.moments, low, high, budget, residual, white, information,
+        field.columns, field.moments, low, high, MAX_EVALUATIONS, residual, white,
+        information,
     )  # fmt: skip
     coil_chi2 = (white[0].reshape(count, width) ** 2).sum(axis=1)
     return BodySolution(r, turn, chi2, information, residual, coil_chi2, used, converged)

@@ -8,7 +8,6 @@ small against the pose's own uncertainty. The damping is Marquardt's (Nocedal an
 Optimization, section 10.3); each trial costs one evaluation of the field and of its gradient.
 """
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -145,8 +144,6 @@ def solve_coil(
     low: Array,
     high: Array,
     length_m: float = 0.0,
-    budget: int = MAX_EVALUATIONS,
-    give_up: float = math.inf,
 ) -> CoilSolution:
     """Fit a coil's pose from a start near it.
 
@@ -163,10 +160,6 @@ def solve_coil(
         Box that the position must not leave, m.
     length_m : float
         Coil length; 0 for a point sensor.
-    budget : int
-        Most field evaluations allowed.
-    give_up : float
-        Chi-square that must be undercut in half the budget.
 
     Returns
     -------
@@ -186,7 +179,7 @@ def solve_coil(
     r, n = np.array(position, dtype=np.float64), np.array(axis, dtype=np.float64)
     normal, residual = np.empty((6, 6)), np.empty(width)
     chi2, used, converged = descend(
-        r, n, length_m, flux, whitening, field.columns, field.moments, low, high, budget,
-        give_up, normal, residual,
+        r, n, length_m, flux, whitening, field.columns, field.moments, low, high,
+        MAX_EVALUATIONS, normal, residual,
     )  # fmt: skip
     return CoilSolution(r, n, chi2, normal, residual, used, converged)
