@@ -18,7 +18,7 @@ from scipy import stats
 PASS, NOTE, ALERT, FAIL = 'pass', 'note', 'alert', 'fail'
 STATES = (PASS, NOTE, ALERT, FAIL)
 """From good to bad; a whole session is as bad as its worst figure."""
-FEWEST = 5
+FEWEST_SESSIONS = 5
 """Earlier sessions without which there are no limits: those of fewer are chance."""
 WARNING, ACTION = 2.0, 3.0
 """Deviations of a known normal law from which a figure is a note, and an alert."""
@@ -94,7 +94,7 @@ def limits_of(earlier: Sequence[float]) -> ControlLimits | None:
     """Return limits from the figures of earlier sessions, in their order."""
     values = np.asarray(earlier, dtype=np.float64)
     values = values[np.isfinite(values)]
-    if values.size < FEWEST:
+    if values.size < FEWEST_SESSIONS:
         return None
     mean = float(values.mean())
     sigma = float(np.mean(np.abs(np.diff(values)))) / DIFFERENCE
@@ -122,7 +122,7 @@ def judged(
     if tolerance is not None and abs(value) > tolerance:
         return Verdict(FAIL, f'beyond the tolerance of {tolerance:.4g}', limits, tolerance)
     if limits is None:
-        words = f'{len(earlier)} of {FEWEST} sessions that control limits need'
+        words = f'{len(earlier)} of {FEWEST_SESSIONS} sessions that control limits need'
         return Verdict(PASS, words, None, tolerance)
     off = (value - limits.mean) / limits.sigma
     side = 'above' if off > 0 else 'below'

@@ -24,7 +24,8 @@ from anser_ros.poses.hand_eye_fit import HandEye
 Array = NDArray[np.float64]
 
 GROUPS = 5  # groups of speeds, with equal numbers of poses: a row of the table each
-FEWEST_POSES = 100  # fewer leave a group less than 20, whose 95th percentile would be one pose
+FEWEST_MOVING_POSES = 100
+"""Fewer leave a group less than 20, whose 95th percentile would be one pose."""
 SLOWEST_M_S = 0.02
 """Median speed below which a recording is of a rest, where a jitter of 0.1 mm is 5 ms of
 latency."""
@@ -82,9 +83,9 @@ def assess_motion(found: HandEye, sensor: str, rng: np.random.Generator) -> Dyna
     """
     part = next(p for p in found.fit.state.parts if p.view.sensor == sensor)
     used = part.used
-    if np.count_nonzero(used) < FEWEST_POSES:
+    if np.count_nonzero(used) < FEWEST_MOVING_POSES:
         raise FitError(
-            f'{np.count_nonzero(used)} poses with a reference; {FEWEST_POSES} are needed'
+            f'{np.count_nonzero(used)} poses with a reference; {FEWEST_MOVING_POSES} are needed'
         )
     rest, velocity, time = (
         part.residual[used, :3],

@@ -37,7 +37,7 @@ WRONG_ORDER = 0.5
 """Error of neighbours, in spacings, from which on points are not in the order they should be; and
 in the error of another order, below which that one is it."""
 NEIGHBOURS = '5 cm distance errors'
-STEPS = ((NEIGHBOURS, 1), ('15 cm distance errors', 3), ('30 cm distance errors', 6))
+DISTANCE_STEPS = ((NEIGHBOURS, 1), ('15 cm distance errors', 3), ('30 cm distance errors', 6))
 """Kinds of distances, and how many spacings of the board's points each is."""
 ACCUMULATED = 'accumulated distance errors'
 COMMON_ERROR_SIGMAS = 1.0
@@ -179,7 +179,7 @@ def distance_errors(place: Array, grid: Grid, rng: np.random.Generator) -> dict[
         Draws the intervals.
     """
     found, alike = {}, have_common_errors(place, grid)
-    for name, step in STEPS:
+    for name, step in DISTANCE_STEPS:
         rows = [(r, c, r, c + step) for r in range(grid.rows) for c in range(grid.columns - step)]
         across = [
             (r, c, r + step, c) for c in range(grid.columns) for r in range(grid.rows - step)
@@ -205,7 +205,7 @@ def have_common_errors(place: Array, grid: Grid) -> bool:
     grid : Grid
         The true layout.
     """
-    for _, step in STEPS:
+    for _, step in DISTANCE_STEPS:
         products, squares = [], []
         for axis, count in enumerate(place.shape[:2]):
             if count <= step:

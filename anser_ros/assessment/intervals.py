@@ -21,7 +21,8 @@ BLOCKS = 20
 hand's tilt takes about a second; with fewer the ends of an interval depend on single ones."""
 DRAWS = 1000  # resamples; the ends of an interval scatter by a few hundredths of its width
 CHUNK = 1_000_000  # numbers of a piece of the resamples, which takes 8 MB of memory
-FEWEST = 3  # clusters without which nothing is resampled: two have three different resamples
+FEWEST_CLUSTERS = 3
+"""Clusters without which nothing is resampled: two have three different resamples."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ def summarised(values: Array, weights: Array, clusters: int) -> dict[str, Interv
     order = np.argsort(values)
     ones = np.ones((1, values.size))
     whole = _statistics(values[order], ones)
-    if clusters < FEWEST or values.size < FEWEST:
+    if clusters < FEWEST_CLUSTERS or values.size < FEWEST_CLUSTERS:
         return {name: IntervalEstimate(float(v[0])) for name, v in whole.items()}
     step = max(1, CHUNK // values.size)
     pieces = [

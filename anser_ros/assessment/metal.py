@@ -14,7 +14,7 @@ from anser_ros.poses.sequence import PoseSequence
 
 Array = NDArray[np.float64]
 
-FEWEST_POSES = 10  # poses of a rest, without which its mean has no uncertainty
+FEWEST_REST_POSES = 10  # poses of a rest, without which its mean has no uncertainty
 
 
 def metal_shifts(
@@ -52,9 +52,10 @@ def metal_shifts(
 
 def _mean(poses: PoseSequence) -> tuple[Array, Array, Array, Array]:
     """Mean position and rotation, and the variances of both by axis."""
-    if poses.size < FEWEST_POSES:
+    if poses.size < FEWEST_REST_POSES:
         raise FitError(
-            f'{poses.name}: a tool at rest needs at least {FEWEST_POSES} poses, got {poses.size}'
+            f'{poses.name}: a tool at rest needs at least {FEWEST_REST_POSES} poses, '
+            f'got {poses.size}'
         )
     point = point_of(poses)
     turns = Rotation.from_quat(poses.quaternion)

@@ -20,7 +20,7 @@ from anser_ros.poses.sequence import PoseSequence
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-FEWEST_POSES = 30  # poses without which nothing is said; at 20 Hz a second and a half
+FEWEST_PIVOT_POSES = 30  # poses without which nothing is said; at 20 Hz a second and a half
 MOST_POSES = 3000  # poses that take part, evenly over the recording; more add nothing new
 DRAWS = 300
 """Samples drawn: with half of the poses wrong, one in sixteen has four right ones."""
@@ -31,8 +31,9 @@ MEDIAN_SIZE = 1.538
 CUT = 4.0
 """Distance, in standard deviations of a coordinate, from which a pose is not one of the pivot:
 of normal errors one in nine hundred."""
-ROUNDS = 8  # refits while the poses that agree still change: an end where two sets alternate
-LEAST_SHARE = 0.5
+AGREEMENT_ROUNDS = 8
+"""Refits while the poses that agree still change: an end where two sets alternate."""
+LEAST_AGREEING = 0.5
 """Share of poses that must agree. With fewer, the tip rested on two places or on none."""
 LEAST_TILT_DEG = 8.0
 """Root mean square of the turns that move a direction of the body, degrees, below which the tip's
@@ -119,9 +120,9 @@ def fit_pivot(
     """
     limits = limits or PivotLimits()
     fresh = poses.rows(~poses.repeated)
-    if fresh.size < FEWEST_POSES:
+    if fresh.size < FEWEST_PIVOT_POSES:
         raise FitError(
-            f'a pivot calibration needs at least {FEWEST_POSES} different poses, better 500 '
+            f'a pivot calibration needs at least {FEWEST_PIVOT_POSES} different poses, better 500 '
             f'over 20 s; got {fresh.size}'
         )
     jitter = turn_jitter(fresh)
@@ -133,7 +134,7 @@ def fit_pivot(
     tip, point, inverse = _solved(place[agrees], turn[agrees], jitter)
     distance = _distances(place, turn, tip, point)
     rms = float(np.sqrt(np.mean(distance[agrees] ** 2)))
-    if share < LEAST_SHARE:
+    if share < LEAST_AGREEING:
         raise FitError(
             f'only {share:.0%} of the poses agree on one tip: it slipped, or rested on several '
             'places; record again with the tip in one dimple'
@@ -175,7 +176,7 @@ def _consensus(place: Array, turn: Array, rng: np.random.Generator) -> Mask:
         if middle < smallest:
             best, smallest = (tip, point), middle
     agrees = np.zeros(count, dtype=bool)
-    for _ in range(ROUNDS):
+    for _ in range(AGREEMENT_ROUNDS):
         distance = _distances(place, turn, *best)
         sigma = max(float(np.median(distance[agrees] if agrees.any() else distance)), 1e-12)
         near = distance < CUT * max(sigma / MEDIAN_SIZE, SMALLEST_SIGMA_M)

@@ -19,7 +19,7 @@ from anser_ros.poses.sequence import PoseSequence
 
 Array = NDArray[np.float64]
 
-FEWEST_POSES = 50  # fewer determine a standard deviation to worse than 10 %
+FEWEST_STILL_POSES = 50  # fewer determine a standard deviation to worse than 10 %
 AXES = ('x', 'y', 'z')
 EVEN = 1.5
 """Interval of two poses, in median intervals, from which on the series is not evenly spaced."""
@@ -76,10 +76,10 @@ def assess_rest(poses: PoseSequence) -> Rest:
     FitError
         When there are too few, or the tool was moved.
     """
-    if poses.size < FEWEST_POSES:
+    if poses.size < FEWEST_STILL_POSES:
         raise FitError(
-            f'a tool at rest needs at least {FEWEST_POSES} poses, better some minutes of them; '
-            f'got {poses.size}'
+            f'a tool at rest needs at least {FEWEST_STILL_POSES} poses, '
+            f'better some minutes of them; got {poses.size}'
         )
     low, high = np.percentile(poses.position, [5, 95], axis=0)
     extent = float(np.linalg.norm(high - low))

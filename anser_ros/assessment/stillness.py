@@ -26,7 +26,7 @@ MOST_MOVE_M, MOST_MOVE_RAD = 2.5e-3, 0.05
 by its differences, and no rest."""
 LONGER = 1.5
 """Share of the shortest pause that the fewest windows of a noisy tracker may take."""
-LONGEST_GAP_S = 1.0  # silence that ends a pause: it is not known where the tool was meanwhile
+LONGEST_SILENCE_S = 1.0  # silence that ends a pause: it is not known where the tool was meanwhile
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ def _runs(
             is_near = np.linalg.norm(place[last + 1] - middle) < moved[0]
             turned = (turns[first + (last - first) // 2].inv() * turns[last + 1]).magnitude()
             is_near &= turned < moved[1]
-            if not is_near or begins[last + 1] - ends[last] > LONGEST_GAP_S:
+            if not is_near or begins[last + 1] - ends[last] > LONGEST_SILENCE_S:
                 break
             last += 1
         if ends[last] - begins[first] >= least_s and last - first + 1 >= FEWEST_WINDOWS:

@@ -38,7 +38,7 @@ EDGE = 3.0
 """The same, beside a stretch that something moved in: it comes and goes gradually, and noise alone
 reaches it in one stretch of 700. Smaller spreads a disturbance over quiet stretches next to it;
 larger leaves its beginning and end in the data."""
-ROUNDS = 6
+QUIET_ROUNDS = 6
 """Rounds in which the quiet stretches are distinguished from the others. Fewer may end before the
 stretches have settled; more cost a fit each."""
 
@@ -111,7 +111,7 @@ def unsteady_references(reference: Measurements) -> Mask:
     means = np.asarray(sums / np.maximum(size, 1)[:, None], dtype=np.float64)
     steady = np.median(means[size > 0], axis=0)
     excess = np.zeros(count)
-    for _ in range(ROUNDS):
+    for _ in range(QUIET_ROUNDS):
         power = np.asarray(((means - steady) ** 2).mean(axis=1) * size, dtype=np.float64)
         quiet_power = np.median(power[size > 0])
         scatter = max(1.4826 * float(np.median(np.abs(power - quiet_power))), 1e-6)

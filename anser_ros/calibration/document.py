@@ -8,7 +8,7 @@ from anser_ros.calibration.factors import as_real
 from anser_ros.calibration.held_out import HeldOut, rms
 from anser_ros.calibration.moments import MomentFit
 from anser_ros.calibration.optical_noise import OpticalNoise
-from anser_ros.calibration.requirements import FEWEST_FRAMES
+from anser_ros.calibration.requirements import FEWEST_SCAN_FRAMES
 from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.survey_records import undetermined_words
 from anser_ros.field.model import EffectRecord
@@ -101,7 +101,7 @@ def _sources(calibration: Calibration) -> dict[str, Any]:
 
 def _by_pose(held_out: HeldOut) -> dict[str, Any]:
     """Errors of single poses, where so few were recorded that each is worth a look."""
-    if len(held_out.place) >= FEWEST_FRAMES:
+    if len(held_out.place) >= FEWEST_SCAN_FRAMES:
         return {}
     order = np.lexsort(held_out.place.T)
     return {

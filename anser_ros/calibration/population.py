@@ -26,13 +26,13 @@ from anser_ros.calibration.sensor_parameters import (
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-ROUNDS = 40
+WIDTH_STEPS = 40
 """Fixed-point steps of the widths; they settle within some ten."""
 NARROWEST = {'gains': 1e-6, 'axes': 1e-6, 'places': 1e-7, 'offsets': 1e-9}
 """Least width of a population, in its own unit (relative, rad, m, relative): no spread at all."""
 LEAST_EVIDENCE = 5.0
 """Gain of the log probability for which a kind of error is kept: odds of 150 to 1."""
-LEAST_SHARE = 0.01
+LEAST_POWER = 0.01
 """Power of what a population does to the fluxes, relative to their noise, from which on it is one:
 smaller errors change no pose, and a field's model is not exact to so little."""
 FAR = 6.0
@@ -40,7 +40,7 @@ FAR = 6.0
 value of a Gaussian population of ten is that far out once in ten million."""
 FEWEST_PLACES = 4
 """Places with several sensors from which on it can be said what these have in common."""
-FEWEST = 4
+FEWEST_POPULATION = 4
 """Channels that a population needs for one of them to be judged by the others."""
 
 
@@ -135,7 +135,7 @@ class Population:
             if kind in POPULATIONS and kind not in fixed
         ]
         found = solve(likelihood, width)
-        for _ in range(ROUNDS if shared else 0):
+        for _ in range(WIDTH_STEPS if shared else 0):
             for kind, rows in shared:
                 if not rows.size:
                     continue
@@ -162,7 +162,7 @@ class Population:
             return found
         freedom, width = sum(rows.size - 1 for rows in places), found.width.copy()
         common = own = 0.5 * float(width[places[0][0]]) ** 2
-        for _ in range(ROUNDS):
+        for _ in range(WIDTH_STEPS):
             root = np.diag(width)
             for rows in places:
                 block = np.full((rows.size, rows.size), common) + own * np.eye(rows.size)
@@ -182,12 +182,12 @@ class Population:
         changed, each = False, self.parameters.each
         for kind in POPULATIONS:
             rows = self.parameters.rows(kind)
-            if kind not in self.parameters.kinds or rows.size < FEWEST * each[kind]:
+            if kind not in self.parameters.kinds or rows.size < FEWEST_POPULATION * each[kind]:
                 continue
             rows = rows.reshape(-1, each[kind])
             inside = ~np.isin(rows[:, 0], self.alone[kind])
             size = np.sqrt((found.values[rows] ** 2).mean(axis=1))
-            if inside.sum() < FEWEST:
+            if inside.sum() < FEWEST_POPULATION:
                 continue
             worst = int(np.argmax(np.where(inside, size, -1.0)))
             others = inside.copy()
@@ -273,7 +273,7 @@ class Population:
                 if kind not in left_out
             }
             for kind in POPULATIONS:
-                if kind in gains and self._power(likelihood, found, kind) < LEAST_SHARE:
+                if kind in gains and self._power(likelihood, found, kind) < LEAST_POWER:
                     gains[kind] = 0.0
             if not gains or min(gains.values()) >= LEAST_EVIDENCE:
                 return found, left_out, gains

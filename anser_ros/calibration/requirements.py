@@ -9,10 +9,10 @@ from anser_ros.calibration.moments import MomentFit
 from anser_ros.errors import FitError
 from anser_ros.field.measurements import Measurements
 
-FEWEST_FRAMES = 10
+FEWEST_SCAN_FRAMES = 10
 """Frames with poses below which no calibration is tried. It only catches recordings that are
 empty or cut; how many readings a model needs depends on its dipoles."""
-FEWEST_POSES, MANY_SENSORS = 3, 30
+FEWEST_FRAMES_OF_MANY, MANY_SENSORS = 3, 30
 """Frames that do where a body has many sensors: each of them is another reading. With fewer poses
 none could be held out and the others still tell how the field changes between them."""
 FLATTEST = 0.002
@@ -53,21 +53,21 @@ def check_measurements(
     """
     if not measurements:
         raise FitError(
-            f'a calibration needs at least {FEWEST_FRAMES} frames of tool fluxes with poses, '
+            f'a calibration needs at least {FEWEST_SCAN_FRAMES} frames of tool fluxes with poses, '
             'got 0: no session has tool fluxes'
         )
     for m in measurements:
         if not m.has_pose.any():
             raise FitError(
-                f'{m.body}: a calibration needs at least {FEWEST_FRAMES} frames with a pose, '
+                f'{m.body}: a calibration needs at least {FEWEST_SCAN_FRAMES} frames with a pose, '
                 f'got 0 of {len(m.time)} (is /optical/{m.body}/pose recorded?)'
             )
     frames = _usable_frames(measurements)
     many = all(len(m.sensors) >= MANY_SENSORS for m in measurements)
-    fewest = FEWEST_POSES if many and field_alone else FEWEST_FRAMES
+    fewest = FEWEST_FRAMES_OF_MANY if many and field_alone else FEWEST_SCAN_FRAMES
     if frames < fewest:
         hint = ''
-        if many and frames >= FEWEST_POSES:
+        if many and frames >= FEWEST_FRAMES_OF_MANY:
             hint = '; --estimate none fits the field alone to so few poses of so many sensors'
         raise FitError(
             f'a calibration needs at least {fewest} frames with poses and valid fluxes, '

@@ -27,12 +27,12 @@ MARGIN_M = 0.01
 """Way beyond that box, m: a session goes about as far as its scan, not exactly."""
 MOST_MODES = 24
 """Combinations of moments that are kept at most; each costs the model's file a number a dipole."""
-LEAST_SHARE = 0.1
+LEAST_MODE_FLUX = 0.1
 """Largest flux of a mode at any place, relative to the flux noise, below which it is left out."""
 DIGITS = 5
 """Digits after the first of the largest moment: an uncertainty needs no more, and the model's file
 is shorter."""
-FEWEST_FRAMES = 20
+FEWEST_HELD_OUT_FRAMES = 20
 """Held-out frames at least from which a factor is taken."""
 
 
@@ -65,7 +65,7 @@ def factor_of(expected: Array, found: Array) -> float:
         Variances of a phasor component, T^2. The half of the frames with the larger expected ones
         counts: elsewhere what is found is noise.
     """
-    if expected.size < FEWEST_FRAMES:
+    if expected.size < FEWEST_HELD_OUT_FRAMES:
         return 1.0
     large = expected >= np.median(expected)
     return float(np.sqrt(max(np.median(found[large] / expected[large]), 1.0)))
@@ -102,7 +102,7 @@ def gaps_of(
     root = factor * open_moments(fitted, damping)
     turned = root @ np.linalg.svd(basis @ root, full_matrices=False)[2][:MOST_MODES].T
     made = basis @ turned
-    keep = np.abs(made).max(axis=0) > LEAST_SHARE * fitted.fit.noise_t
+    keep = np.abs(made).max(axis=0) > LEAST_MODE_FLUX * fitted.fit.noise_t
     if not keep.any():
         return None
     moments = turned.T[keep]

@@ -47,9 +47,9 @@ IN_VAIN = 2
 CLEAR_SIGN = 10.0
 """Log likelihood of a sensor's sign over the other from which on it takes part: a sensor of a
 wrong sign would bend the field until it fits."""
-STEPS = 6
+SOURCE_STEPS = 6
 """Gauss-Newton steps between two looks at what else is off."""
-ROUNDS = 3
+SOURCE_ROUNDS = 3
 """Rounds of places, signs, widths and stray fields."""
 HELD_M = 0.02
 """How far a step may move a dipole, one standard deviation, m: the slopes hold about so far."""
@@ -166,7 +166,7 @@ class SourcesFitter:
         count = self.readings.flux.shape[1]
         sign, widths = np.ones(len(self.readings.flux)), {kind: START[kind] for kind in self.kinds}
         sources = [self._first(k) for k in range(count)]
-        for _ in range(ROUNDS):
+        for _ in range(SOURCE_ROUNDS):
             sources = [self._refined(k, one, sign, widths) for k, one in enumerate(sources)]
             sign = self._signs(sources, widths)
             widths = self._best_widths(sources, sign, widths)
@@ -203,7 +203,7 @@ class SourcesFitter:
         rough = np.where(used[:, None], np.maximum(rough, 1e-300), np.inf)
         rows, weight = self.grid_rows, np.ones((len(self.grid), len(flux)))
         left = np.zeros(0)
-        for _ in range(STEPS):
+        for _ in range(SOURCE_STEPS):
             sums = [_solved(rows, weight, flux[:, c], rough[:, c]) for c in range(flux.shape[1])]
             left = np.stack(sums, axis=2)
             size = (left**2).sum(axis=2)
@@ -239,7 +239,7 @@ class SourcesFitter:
         self, k: int, source: LocatedSource, sign: Array, widths: dict[str, float] | None
     ) -> LocatedSource:
         """Gauss-Newton steps of places and moments."""
-        for step in range(STEPS):
+        for step in range(SOURCE_STEPS):
             source, _ = self._step(k, source, sign, widths, moving=step > 0)
         return source
 

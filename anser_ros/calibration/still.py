@@ -24,14 +24,14 @@ from anser_ros.calibration.population import Posterior
 from anser_ros.calibration.pose_correction import pose_terms
 from anser_ros.calibration.readings import usable_weights, with_pose
 from anser_ros.calibration.requirements import (
-    FEWEST_FRAMES,
-    FEWEST_POSES,
+    FEWEST_FRAMES_OF_MANY,
+    FEWEST_SCAN_FRAMES,
     MANY_SENSORS,
     check_measurements,
 )
 from anser_ros.calibration.result import Calibration, Scan, provenance, residuals
 from anser_ros.calibration.sensor_parameters import SensorParameters, Survey
-from anser_ros.calibration.still_fit import STEPS, StillFit, StillFitter
+from anser_ros.calibration.still_fit import STILL_STEPS, StillFit, StillFitter
 from anser_ros.calibration.still_model import POSE
 from anser_ros.calibration.survey_records import corrections
 from anser_ros.calibration.survey_result import SurveyResult
@@ -53,7 +53,7 @@ def is_still(measurements: Sequence[Measurements]) -> bool:
     """Return whether there are few poses of one body with many sensors, and no more."""
     frames = sum(int(m.usable.any(axis=1).sum()) for m in measurements)
     many = len(measurements) == 1 and len(measurements[0].sensors) >= MANY_SENSORS
-    return many and FEWEST_POSES <= frames < FEWEST_FRAMES
+    return many and FEWEST_FRAMES_OF_MANY <= frames < FEWEST_SCAN_FRAMES
 
 
 def calibrate_still(
@@ -228,5 +228,5 @@ def _moment_fit(scan: Scan, fit: StillFit, moments: NDArray[np.complex128]) -> M
         rank=int((size > size[0] * len(basis) * np.finfo(float).eps).sum()),
         freedom=fit.freedom,
         condition=float(size[0] / max(size[-1], np.finfo(float).tiny)),
-        alternations=STEPS,
+        alternations=STILL_STEPS,
     )

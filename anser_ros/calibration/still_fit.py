@@ -26,7 +26,7 @@ from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 
-STEPS = 10
+STILL_STEPS = 10
 """Gauss-Newton steps of a fit; widths follow in all but the first and last two."""
 START = {'gains': 0.03, 'axes': 0.05}
 """Widths of the populations at the start; the fit finds their own."""
@@ -182,13 +182,13 @@ class StillFitter:
         now = model.nothing(len(sites))
         weights = model.usable.astype(np.float64)
         place_width = np.full(beside, GRID * self.extent)
-        for step in range(STEPS):
+        for step in range(STILL_STEPS):
             system = StillSystem(model, now, sites, widths, weights, place_width, moving=step > 0)
             now = system.solution
             sites = self._moved(sites, system.steps)
-            if step < STEPS - 1:
+            if step < STILL_STEPS - 1:
                 weights = system.student_weights(model.usable)
-            if 2 <= step < STEPS - 2:
+            if 2 <= step < STILL_STEPS - 2:
                 widths = self._learnt(system, beside)
         determined = 1.0 - system.moment_variance / widths.moments[:, None] ** 2
         return StillFit(

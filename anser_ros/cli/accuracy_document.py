@@ -14,7 +14,7 @@ from anser_ros.physics.constants import DEGREES
 from anser_ros.poses.document import finite
 
 SCHEMA = 'anser_accuracy/1'
-SHOWN = (
+SHOWN_UNITS = (
     ('_m_per_h', 1e3, 'mm/h'), ('_rad_per_h', DEGREES, 'deg/h'), ('_m_s', 1e3, 'mm/s'),
     ('_m', 1e3, 'mm'), ('_rad', DEGREES, 'deg'), ('_s', 1e3, 'ms'),
 )  # fmt: skip
@@ -112,7 +112,7 @@ def figure_rows(found: Assessment, document: Mapping[str, Any]) -> list[tuple[st
 
 
 def _shown(name: str) -> tuple[float, str]:
-    for ending, scale, unit in SHOWN:
+    for ending, scale, unit in SHOWN_UNITS:
         if name.endswith(ending):
             return scale, unit
     return 1.0, ''

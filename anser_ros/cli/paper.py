@@ -22,7 +22,7 @@ from anser_ros.experiments.report import write_report
 from anser_ros.experiments.simulated import simulate_recordings
 from anser_ros.experiments.study import Results, Study
 
-SHOWN = (
+SHOWN_TABLES = (
     'table_2',
     'table_3 aluminium',
     'table_3 mu-metal',
@@ -96,7 +96,7 @@ def _table(results: Results) -> Table:
     table = Table(title=f'position RMSE, mm; simulated data ({results.origin})')
     for name in ('experiment', 'method', 'Y', 'Z'):
         table.add_column(name)
-    for experiment in SHOWN:
+    for experiment in SHOWN_TABLES:
         for method, errors in results.tracking[experiment].items():
             values = [f'{errors[s].millimetres()["RMSE"]:.3f}' for s in ('Y', 'Z')]
             table.add_row(experiment.replace('_', ' '), method, *values)

@@ -2,9 +2,6 @@
 
 from collections.abc import Sequence
 
-import matplotlib
-
-matplotlib.use('Agg')
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
@@ -15,7 +12,7 @@ from anser_ros.field.model import EffectRecord
 
 Array = NDArray[np.float64]
 
-SHOWN = {'1': (100.0, '%'), 'rad': (1e3, 'mrad'), 'm': (1e3, 'mm'), 'T': (1e9, 'nT')}
+SHOWN_UNITS = {'1': (100.0, '%'), 'rad': (1e3, 'mrad'), 'm': (1e3, 'mm'), 'T': (1e9, 'nT')}
 """Factor and unit in which values of each SI unit are shown."""
 MOST_PARTS = 3
 """Values of a channel that a table has columns for; of more, their root mean square is shown."""
@@ -66,7 +63,7 @@ def population_figure(records: Sequence[EffectRecord]) -> Figure | None:
     )
     for panel, record in zip(panels[0], found, strict=True):
         names, unit, values, sigma = _shown(record)
-        factor = SHOWN[effect_named(record.name).units['values']][0]
+        factor = SHOWN_UNITS[effect_named(record.name).units['values']][0]
         spread = factor * float(record.parameters['spread'])
         panel.axhspan(-spread, spread, color='0.9', label='spread')
         places = np.arange(len(values))
@@ -83,7 +80,7 @@ def population_figure(records: Sequence[EffectRecord]) -> Figure | None:
 def _shown(record: EffectRecord) -> tuple[tuple[str, ...], str, Array, Array]:
     """Return names and unit of what is shown, and values and sigma (C, P) in that unit."""
     effect = effect_named(record.name)
-    factor, unit = SHOWN[effect.units['values']]
+    factor, unit = SHOWN_UNITS[effect.units['values']]
     values = np.array(record.parameters['values'], dtype=np.float64)
     # What all faultless channels have, one for a gain, is no error.
     values = factor * (values - np.median(values, axis=0).round())

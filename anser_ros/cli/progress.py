@@ -11,7 +11,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
 LINE_INTERVAL_S = 5.0
 """Time from one line to the next, s: enough to see that it goes on, few enough for a log."""
-LEAST_SHARE, LEAST_S = 0.1, 1.0
+LEAST_DONE, LEAST_S = 0.1, 1.0
 """Finished share of a stage, and time that its later half took, s, from which on the time that is
 left is told. Before, it would be that of loading and compiling, which do not come again."""
 
@@ -72,7 +72,7 @@ class _Remaining:
             self._past.append((share, now_s))
         done, since_s = next(one for one in reversed(self._past) if self._is_early(one, share))
         took_s = now_s - since_s
-        if share < LEAST_SHARE or took_s < LEAST_S or share <= done:
+        if share < LEAST_DONE or took_s < LEAST_S or share <= done:
             return ''
         return f'about {took_s * (1.0 - share) / (share - done):.0f} s left'
 

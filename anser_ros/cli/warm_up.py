@@ -126,7 +126,7 @@ class _Listener(numba.core.event.Listener):
         """Do nothing: a kernel counts when it is there."""
 
     def on_end(self, event: Any) -> None:
-        """Note a kernel."""
+        """Note the kernel that has been compiled, if it is of the package."""
         function = event.data['dispatcher'].py_func
         if function.__module__.startswith(PACKAGE):
             self._cache.add(f'{function.__module__}.{function.__qualname__}')

@@ -34,10 +34,10 @@ PER_PARAMETER = 6.0
 """Gain, in units of the misfit, that each parameter must have: a useless one gains about one on
 the data it is fitted to and costs about one on held-out data. It is paid by a new effect and by
 each further parameter of a course."""
-LEAST_SHARE = 0.002
+LEAST_GAIN_SHARE = 0.002
 """Gain over the number of values, in units of the misfit, that an effect must have on top: what a
 field model's own error lets an effect gain grows with the data, while chance doesn't."""
-LEAST_SHARE_BESIDE_METAL = 0.01
+LEAST_GAIN_SHARE_BESIDE_METAL = 0.01
 """The same with metal, whose shape is never known and leaves what other effects can take up."""
 LEAST_OF_EXCESS = 0.4
 """Share of what is left to explain that an explanation with freedom in time (a fluctuation, or

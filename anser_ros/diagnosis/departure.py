@@ -57,7 +57,7 @@ three, and a dozen in each of the 25 blocks of time. Fewer are faster and noisie
 in proportion and tell little, as neighbouring frames are alike."""
 BODY = Richness(90, (25,), SOMETHING_LEFT)
 """How finely the body is shaped, and the path divided beyond `FINE_KNOTS` where much is left."""
-STEPS = 6
+DEPARTURE_STEPS = 6
 """Steps of a fit at most: it ends by itself once it has settled (`fit.SETTLED`), and a path that
 creeps for longer is judged by what it predicts. Fewer cut fits that would settle; each further
 one costs as much time as the one before."""
@@ -134,10 +134,10 @@ def departure(problem: Problem, rest_s: float) -> Departure | None:
     known = [fit for fit in fits if fit is not None]
     if not known:
         return None
-    fitter = Fitter(some, blocks, STEPS)
+    fitter = Fitter(some, blocks, DEPARTURE_STEPS)
     best = Shaping(fitter, BODY).with_freer_course(min(known, key=fitter.held_out), 0)
     cleaned = without_outliers(problem, evaluate(problem, best.terms))
-    last = Fitter(cleaned.in_blocks(blocks).thinned(MANY_FRAMES), blocks, STEPS)
+    last = Fitter(cleaned.in_blocks(blocks).thinned(MANY_FRAMES), blocks, DEPARTURE_STEPS)
     fit = last.fit(best.terms)
     unseen = cleaned.in_blocks(test_blocks())
     return Departure(fit, _power(evaluate(unseen, ())), _power(evaluate(unseen, fit.terms)))
@@ -222,7 +222,7 @@ def _refined(
     problem: Problem, start: DepartedTerm, kind: str, blocks: NDArray[np.int64]
 ) -> Fit | None:
     """Body and path together, first coarsely; the body is reshaped for the finer path."""
-    fitter = Fitter(problem, blocks, STEPS)
+    fitter = Fitter(problem, blocks, DEPARTURE_STEPS)
     shaping = Shaping(fitter, BODY)
     fit = shaping.shaped_as(fitter.fit([start.hold()], 0), 0, start, [kind])
     if fit is None:

@@ -23,7 +23,7 @@ SCALES = np.geomspace(1e-3, 1.0, 7)
 """Spreads that are tried first, as multiples of what the constant effect expects: from a
 thousandth to all of it, a factor of 3.2 apart. Coarser or fewer leave expectation-maximisation,
 which starts at the best, farther to go; more cost time."""
-ROUNDS = 25
+EXPECTATION_ROUNDS = 25
 """Rounds of expectation-maximisation. It starts at the best of seven spreads, so it has less than
 a factor of two to go."""
 
@@ -75,7 +75,7 @@ def fluctuation_of(state: State, term: Term) -> tuple[float, Term] | None:
     if max(gains) <= 0.0:
         return None
     spread = SCALES[int(np.argmax(gains))] * unit
-    for _ in range(ROUNDS):
+    for _ in range(EXPECTATION_ROUNDS):
         inverse = np.linalg.inv(found.normal + np.diag(1 / spread**2))
         mean = np.einsum('fpq,fq->fp', inverse, found.right)
         variance = np.mean(mean**2 + np.einsum('fqq->fq', inverse), axis=0)

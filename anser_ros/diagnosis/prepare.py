@@ -25,7 +25,7 @@ TEST_EVERY = 5
 """One block of five never takes part in choosing or fitting."""
 BINS_PER_BLOCK = 2
 """Means of the references in each block of time: they don't move, so more add nothing."""
-FEWEST_FRAMES = 30
+FEWEST_POSED_FRAMES = 30
 """Frames with an optical pose that a diagnosis needs, about one in each block."""
 POINTS = 250
 """Places in the volume, about, at which the emitters' own field is fitted to the model."""
@@ -78,9 +78,10 @@ def build_problem(
             raise DiagnosisError(f'{name} has windings: a diagnosis takes single coils only')
     posed = tuple(t for t in (_with_pose(tool) for tool in tools) if t.time.size)
     count = sum(tool.time.size for tool in posed)
-    if count < FEWEST_FRAMES:
+    if count < FEWEST_POSED_FRAMES:
         raise DiagnosisError(
-            f'a diagnosis needs at least {FEWEST_FRAMES} frames with an optical pose, got {count}'
+            f'a diagnosis needs at least {FEWEST_POSED_FRAMES} frames with an optical pose, '
+            f'got {count}'
         )
     if not any(
         np.ptp(t.position, axis=0).any() or np.ptp(t.rotation, axis=0).any() for t in posed

@@ -25,7 +25,7 @@ from anser_ros.metal.scattering import Shapes
 
 Array = NDArray[np.float64]
 
-ROUNDS = 2
+MODE_ROUNDS = 2
 """Times that modes are made about where the metal then is; the second hardly ever moves it."""
 NEW_MODES_M = 2e-3
 """A centre that a fit moves farther than this (m) asks for new modes: modes about a centre that is
@@ -51,7 +51,7 @@ class Remainders:
         plain = fit.terms
         if plain[index].effect.resting(plain[index]) is None:
             return fit
-        for _ in range(ROUNDS):
+        for _ in range(MODE_ROUNDS):
             term = fit.terms[index]
             before = _resting(term)
             own = self._couplings(fit, term, plain, before.near)

@@ -135,7 +135,7 @@ def is_worthwhile(gain: float, parameters: int, fit: Fit) -> bool:
     """Return whether a gain is worth its parameters, by what this fit leaves."""
     left = max(misfit(fit), 1.0)
     metal = any(term.effect.family.is_metal for term in fit.terms)
-    share = decisions.LEAST_SHARE_BESIDE_METAL if metal else decisions.LEAST_SHARE
+    share = decisions.LEAST_GAIN_SHARE_BESIDE_METAL if metal else decisions.LEAST_GAIN_SHARE
     least = decisions.LEAST_GAIN + decisions.PER_PARAMETER * parameters + share * fit.state.count
     return gain > least * left
 

@@ -25,7 +25,7 @@ LEAST_DEPENDENCE = 0.005
 reported. Smaller reports what is certain only because there are many frames, as a model's small
 error; larger leaves a weak dependence unsaid. No more is known of its choice than that thresholds
 of the diagnosis were chosen on seeds below 100 (`docs/log.md`)."""
-FEWEST = 4
+FEWEST_CELL_VALUES = 4
 """Values that a cell needs for its mean to be compared: the mean of four is uncertain by half of
 what one value is, and cells of fewer would add more noise than they tell."""
 
@@ -166,7 +166,7 @@ def _binned(parts: list[Part], name: str, noise: float) -> StructureTest:
                 rows = number == cell
                 n = counted[rows].sum(axis=0)
                 sums = (white[rows] * counted[rows]).sum(axis=0)
-                use = n >= FEWEST
+                use = n >= FEWEST_CELL_VALUES
                 explained += float(np.sum(sums[use] ** 2 / n[use]))
                 cells += int(use.sum())
     return _verdict(name, explained, cells, total, noise)

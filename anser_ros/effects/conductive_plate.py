@@ -27,7 +27,7 @@ from anser_ros.metal.sheet import sheet_shapes, sheet_sizes, sheet_sources
 MESH = 12
 """Loops along an edge of the sheet's mesh: a loop is then as wide as a twelfth of the edge, less
 than the distance to the sensors for any sheet that is found."""
-STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])
+DIFFERENCE_STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])
 """Steps of the central differences, in theta's units: small compared with the distances and with
 a change of the resistance that shows."""
 TYPICAL_OHM = 3e-5
@@ -117,13 +117,13 @@ class ConductivePlate(Effect[Term]):
         return view.along(added.flux(*view.flat))
 
     def columns(self, term: Term, view: View) -> ComplexArray | None:
-        """Return the flux's derivatives, taken by central differences with `STEPS`."""
+        """Return the flux's derivatives, taken by central differences with `DIFFERENCE_STEPS`."""
         if term.held:
             return view.columns(5)
         parts = [
             (self._flux(term.theta + step, view) - self._flux(term.theta - step, view))
-            / (2 * STEPS[i])
-            for i, step in enumerate(np.diag(STEPS))
+            / (2 * DIFFERENCE_STEPS[i])
+            for i, step in enumerate(np.diag(DIFFERENCE_STEPS))
         ]
         return np.stack(parts, axis=-1)
 

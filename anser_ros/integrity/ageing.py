@@ -21,7 +21,7 @@ SPEED_S = 0.3
 """Time over which the last speed of the metal is taken, s. Shorter, and the noise of the refit is
 taken for speed; longer, and metal that comes near counts as slow: its effect grows with the sixth
 power of its distance, as it is driven less and heard less from afar."""
-STEPS = 10
+AGE_STEPS = 10
 """Steps that a model ages in, from fresh to given up. More make trackers lay the model out again
 more often; fewer make it older than it is."""
 FASTER = 2.0
@@ -114,9 +114,9 @@ class ModelAge:
             return FrameModel(model, Withheld(REFERENCES_LOST, reason))
         if age_ns <= 0:
             return FrameModel(model)
-        step = math.ceil(STEPS * age_ns / self._longest_ns)
+        step = math.ceil(AGE_STEPS * age_ns / self._longest_ns)
         if self._aged is None or self._aged[0] != step:
-            self._aged = step, self._older(step * self._longest_ns / STEPS)
+            self._aged = step, self._older(step * self._longest_ns / AGE_STEPS)
         return FrameModel(self._aged[1])
 
     def _older(self, age_ns: float) -> FieldModel:

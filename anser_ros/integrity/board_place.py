@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import FitError
 from anser_ros.field.model import FieldModel
-from anser_ros.integrity.clean_references import FEWEST_SENSORS, LEAST_SHARE, survey_errors
+from anser_ros.integrity.clean_references import DRAWING_ERROR, FEWEST_SENSORS, survey_errors
 from anser_ros.integrity.drawn_readings import DrawnReadings, FieldAt
 from anser_ros.physics.sensor import SensorTable, along_each_axis
 from anser_ros.physics.volume import TrackedVolume
@@ -62,7 +62,7 @@ PRIOR_M, PRIOR_RAD = 5e-3, 0.02
 """Standard deviations of how far a model lies aside before anything is known, m and rad: a board
 that was put down again by hand. Smaller pulls the distance towards nothing; larger lets noise find
 one where few references are read. With 32 references half and twice as much move it by 2 um."""
-ROUNDS = 12
+WEIGHT_ROUNDS = 12
 """Rounds in which sensors that do not fit lose weight. Fewer leave a sensor that is off some say
 in where the board lies; more cost time and change nothing: from the sixth on the distance stays
 within 1 um."""
@@ -204,7 +204,7 @@ def _of_model(
     difference = model.flux(points, axes, lengths).real - drawn.flux
     size = np.linalg.norm(drawn.flux, axis=1) / np.sqrt(drawn.flux.shape[1])
     weight = np.sqrt(EFFECTIVE_READINGS / len(points)) / np.maximum(
-        MODEL_SHARE * size, LEAST_SHARE * size.max()
+        MODEL_SHARE * size, DRAWING_ERROR * size.max()
     )
     return rows * weight[:, None, None], difference * weight[:, None]
 
@@ -219,7 +219,7 @@ def _solved(
     prior = np.ones(references[0].shape[2])
     weights = [np.ones(len(references[0])), np.ones(len(model[0]))]
     estimate, covariance, misfit = np.zeros(prior.size), np.diag(prior), 0.0
-    for _ in range(ROUNDS):
+    for _ in range(WEIGHT_ROUNDS):
         normal, right = np.diag(prior), np.zeros(prior.size)
         for (rows, values), weight in zip((references, model), weights, strict=True):
             flat = (rows * weight[:, None, None]).reshape(-1, prior.size)

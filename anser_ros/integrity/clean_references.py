@@ -33,7 +33,7 @@ FEWEST_SENSORS = RefitSettings.min_references
 """Sensors that have to be known: with fewer, the emitters' strengths explain what metal does."""
 PARTS = 3
 """Parts of a recording whose means must agree: metal may come and go, and be away at both ends."""
-FEWEST_FRAMES = 12
+FEWEST_FRAMES_OF_CHANGE = 12
 """Frames in which a change is looked for: four a part. In fewer, noise hides it."""
 NOTICEABLE = 2e-4
 """Change of a reading during a recording that counts, as a share of its size. Smaller refuses what
@@ -46,7 +46,7 @@ baseline."""
 SAME_PLACE_M = 1e-4
 """Farthest that a sensor may be from where it was at the calibration, m. A new survey tells of
 another place, where the old reading is worth nothing."""
-STEPS = 25
+STRENGTH_STEPS = 25
 """Steps in which sensors that changed most lose their say in the emitters' strengths. Fewer leave
 sensors beside metal some say; with a quarter of 32 sensors changed by up to 20 % the others seem
 to change by 5e-3 after 10 steps, and by 2e-5 after these, a tenth of what counts."""
@@ -54,7 +54,7 @@ DRAWN_GATE = 3.0
 """Root mean square of all readings' differences from the drawn board, in units of what survey and
 manufacture allow, from which on there is metal. It is 1 where these are stated as they are.
 Smaller, and a board that was made less well is refused; larger, and more metal passes."""
-LEAST_SHARE = 1e-4
+DRAWING_ERROR = 1e-4
 """Error of a drawn field relative to itself: turns and leads are not drawn to less."""
 
 
@@ -79,7 +79,7 @@ def change_without_gains(now: ComplexArray, before: ComplexArray) -> Array:
     size = np.maximum(np.linalg.norm(old, axis=1), 1e-300)
     weight = np.ones(len(new))
     relative = np.zeros(len(new))
-    for _ in range(STEPS if len(new) else 0):
+    for _ in range(STRENGTH_STEPS if len(new) else 0):
         across = weight[:, None] / size[:, None] ** 2
         gain = (across * old.conj() * new).sum(axis=0) / (across * np.abs(old) ** 2).sum(axis=0)
         relative = np.linalg.norm(new - gain * old, axis=1) / size
@@ -103,14 +103,14 @@ def check_steady(flux: ComplexArray) -> float | None:
     -------
     float or None
         Noise of a component of the mean reading, T, by the frames' scatter; None for fewer than
-        `FEWEST_FRAMES`, which are not judged.
+        `FEWEST_FRAMES_OF_CHANGE`, which are not judged.
 
     Raises
     ------
     FitError
         With how much a tenth of the sensors change at least.
     """
-    if len(flux) < FEWEST_FRAMES:
+    if len(flux) < FEWEST_FRAMES_OF_CHANGE:
         return None
     good = np.asarray(np.isfinite(flux).all(axis=2))
     whole = good.sum(axis=0) > len(flux) // 2
@@ -242,7 +242,7 @@ def check_as_drawn(
     for s, rows in enumerate(own):
         at = slice(s * size, (s + 1) * size)
         covariance[at, at] += rows.T @ rows
-    noise = accuracy.flux_noise_t**2 + (LEAST_SHARE * drawn.flux.ravel()) ** 2
+    noise = accuracy.flux_noise_t**2 + (DRAWING_ERROR * drawn.flux.ravel()) ** 2
     covariance += np.diag(noise)
     scale = np.sqrt(np.diag(covariance))
     whitened = difference.ravel() / scale

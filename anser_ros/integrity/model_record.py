@@ -18,7 +18,7 @@ DOUBTFUL = 0.8
 """Share of refused readings from which on the model is doubtful. Smaller, and metal near a part of
 the tools takes the poses of the others; larger, and a model that is a little wrong, of which every
 third pose passes, is believed."""
-FEWEST = 6
+FEWEST_JUDGED_READINGS = 6
 """Readings that a share is made of at least. Fewer, and a single bad coil is the whole chain."""
 GOOD_SHARE = 0.2
 """Share (0 to 1) of refused readings up to which a frame speaks for the model. It is one bad coil
@@ -74,7 +74,11 @@ class ModelRecord:
         if (total and refused > GOOD_SHARE * total) or not self._sound_since_ns:
             self._sound_since_ns = stamp_ns
         is_sound = stamp_ns - self._sound_since_ns >= RECOVERY_S / NANO
-        if self._total >= FEWEST and self.refused_share > DOUBTFUL and not is_sound:
+        if (
+            self._total >= FEWEST_JUDGED_READINGS
+            and self.refused_share > DOUBTFUL
+            and not is_sound
+        ):
             self.is_doubtful = True
         elif is_sound:
             self.is_doubtful = False

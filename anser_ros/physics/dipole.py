@@ -25,7 +25,7 @@ GAUSS_OFFSET = 0.5 / math.sqrt(3.0)
 AT_ONCE = 16
 """Points whose couplings to all dipoles are kept at once: some hundred kilobytes, which stay in
 the processor's cache until they are used."""
-SHARE = 512
+POINTS_A_THREAD = 512
 """Points that one thread works out, a millisecond's work."""
 
 
@@ -302,7 +302,7 @@ def dipole_field(
                 few.reshape(3 * len(few), len(m)), m, out=out[here].reshape(3 * len(few), -1)
             )
 
-    in_order(work, slices(len(r), SHARE))
+    in_order(work, slices(len(r), POINTS_A_THREAD))
     return out.view(np.complex128)
 
 
@@ -348,5 +348,5 @@ def flux_jacobian(
     def work(at: slice) -> None:
         _fill_flux_jacobian(r[at], n[at], spans[at], dipoles, m, flux[at], d_r[at], d_n[at])
 
-    in_order(work, slices(len(r), SHARE))
+    in_order(work, slices(len(r), POINTS_A_THREAD))
     return flux.view(np.complex128), d_r.view(np.complex128), d_n.view(np.complex128)

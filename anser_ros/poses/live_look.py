@@ -29,8 +29,8 @@ growth (m), from which something has changed."""
 EXPLAINED = 0.4
 """Share of the misfit that may be left when one frame is fitted again for that one to have
 changed."""
-STEPS = 12  # Gauss-Newton steps for one frame; a turn of 30 deg takes six
-FEWEST_POSES = 20  # poses of the later half of a window by which a change is judged
+FRAME_STEPS = 12  # Gauss-Newton steps for one frame; a turn of 30 deg takes six
+FEWEST_POSES_OF_CHANGE = 20  # poses of the later half of a window by which a change is judged
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ def _misfits(state: PoseState) -> dict[str, float]:
     found = {}
     for part in state.parts:
         far = np.linalg.norm(part.residual[part.used, :3], axis=1)
-        if far.size >= FEWEST_POSES:
+        if far.size >= FEWEST_POSES_OF_CHANGE:
             found[part.view.sensor] = float(np.median(far))
     return found
 
@@ -220,7 +220,7 @@ def _fitted_alone(problem: PoseProblem, terms: Sequence[Term], index: int) -> li
     """The terms with one of them fitted to the poses, all others as they are."""
     trial = list(terms)
     prior = trial[index].effect.prior(trial[index])
-    for _ in range(STEPS):
+    for _ in range(FRAME_STEPS):
         sums = problem.state(trial).sums([trial[index]])
         moved = trial[index].with_theta(trial[index].theta + sums.step(prior, 0.0))
         trial[index] = moved.effect.bounded(moved)

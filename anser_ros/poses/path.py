@@ -16,7 +16,7 @@ from anser_ros.physics.pose_track import LONGEST_GAP_S, PoseTrack
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-FEWEST_POSES = 4
+FEWEST_PATH_POSES = 4
 """Poses without which there is no path: a cubic piece needs the poses about it."""
 MEDIAN_GAPS = 2.5
 """Gap in median intervals over which a slow reference is interpolated: one pose may be lost."""
@@ -56,9 +56,9 @@ class OpticalPath:
             When there are too few poses.
         """
         time = track.time
-        if time.size < FEWEST_POSES:
+        if time.size < FEWEST_PATH_POSES:
             raise DiagnosisError(
-                f'the reference has {time.size} different poses, a path needs {FEWEST_POSES}'
+                f'the reference has {time.size} different poses, a path needs {FEWEST_PATH_POSES}'
             )
         turn = track.quaternion.copy()
         flips = np.sign(np.einsum('ij,ij->i', turn[1:], turn[:-1]))

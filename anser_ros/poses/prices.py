@@ -10,7 +10,7 @@ from anser_ros.poses.effect import Role, effect_of, is_of
 from anser_ros.poses.fit import PoseFit
 from anser_ros.poses.problem import PosePart
 
-LEAST_SHARE = 0.015
+LEAST_EXPLAINED = 0.015
 """Share of the sum of squares that an effect must explain on blocks that it has not seen. Errors
 of trackers are alike over seconds and centimetres, and any smooth course takes a trace of them.
 Smaller names traces of smooth errors; larger misses effects that matter to a tenth of the
@@ -36,7 +36,7 @@ in short sessions."""
 
 def price(term: Term, total: float, fit: PoseFit) -> float:
     """Return the gain, in units of the misfit, that a term needs; ``total`` is the squared sum."""
-    misfit, share = fit.misfit, LEAST_SHARE
+    misfit, share = fit.misfit, LEAST_EXPLAINED
     # Only the errors of its own sensor, and of positions where it is a map, can be explained.
     rows = slice(3) if is_of(term, Role.MAP) else slice(6)
     parts = [p for p in fit.state.parts if effect_of(term).acts_on(term, p.view.sensor)]

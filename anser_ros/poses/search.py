@@ -18,7 +18,7 @@ from anser_ros.diagnosis.decisions import AS_GOOD_PER_PARAMETER, LEAST_GAIN
 from anser_ros.effects.term import Term
 from anser_ros.poses.effect import Role, effect_of, is_of
 from anser_ros.poses.fit import LARGEST_STAMP_S, PoseFit, fit_poses, noise_of, unexplained_poses
-from anser_ros.poses.prices import LEAST_SHARE, doubt, price
+from anser_ros.poses.prices import LEAST_EXPLAINED, doubt, price
 from anser_ros.poses.problem import PoseNoise, PosePart
 from anser_ros.poses.registry import pose_effects
 
@@ -342,7 +342,7 @@ def _one_map(fit: PoseFit) -> PoseFit:
         return fit
     problem = fit.state.problem
     trial = fit_poses(problem, [*rest, pairs[0][1]])
-    return trial if trial.held_out(True) < (1 + LEAST_SHARE) * fit.held_out(True) else fit
+    return trial if trial.held_out(True) < (1 + LEAST_EXPLAINED) * fit.held_out(True) else fit
 
 
 def _settled(

@@ -25,7 +25,7 @@ AT_REST_M, POSES_AT_REST = 2e-3, 4
 """Extent of a recording at rest, m, and the poses of it that are kept."""
 AT_REST_SHARE = 0.3  # share of poses kept below which all is recordings at rest
 FEWEST_PARTS = 5  # recordings that make blocks of their own; fewer leave too few to hold out
-FEWEST_POSES = 8
+FEWEST_HAND_EYE_POSES = 8
 """Poses with a reference that hand-eye needs: it has twelve unknowns, a pose tells six, and as
 many again have to judge it."""
 MOST_POSES = 900
@@ -75,10 +75,13 @@ def pose_problem(session: PoseSession) -> PoseProblem:
         kept = few
         if rests:
             path = OpticalPath.through(reference.track(), is_at_rest=True)
-    kept = {name: poses for name, poses in kept.items() if _seen(poses, path) >= FEWEST_POSES}
+    kept = {
+        name: poses for name, poses in kept.items() if _seen(poses, path) >= FEWEST_HAND_EYE_POSES
+    }
     if not kept:
         raise DiagnosisError(
-            f'{session.path}: no sensor has {FEWEST_POSES} poses at times with a reference'
+            f'{session.path}: no sensor has {FEWEST_HAND_EYE_POSES} poses '
+            'at times with a reference'
         )
     everywhere = np.concatenate([poses.position for poses in kept.values()])
     centre = np.median(everywhere, axis=0)
@@ -182,7 +185,7 @@ def _misfit(path: OpticalPath, sensors: Sequence[PoseSequence], offset: float) -
     total = 0.0
     for poses in sensors:
         place, turn, _, known = path.at(poses.time - offset)
-        if np.count_nonzero(known) < FEWEST_POSES + 13:
+        if np.count_nonzero(known) < FEWEST_HAND_EYE_POSES + 13:
             continue
         columns = np.concatenate(
             [np.ones((known.sum(), 1)), place[known], turn[known].reshape(-1, 9)], axis=1

@@ -9,7 +9,7 @@ from anser_ros.poses.problem import PosePart, PoseState
 Array = NDArray[np.float64]
 
 GROUPS = 6  # groups of neighbours by which a dependence is looked for
-LEAST_SHARE = 0.1
+LEAST_OF_MEANS = 0.1
 """Share (0 to 1) of the squared residual that groups' means must explain beyond chance to be told.
 Without it the error would be 5 % less. Smaller tells of traces that any tracker has; larger leaves
 a dependence unsaid."""
@@ -23,7 +23,7 @@ def depends_on(state: PoseState) -> tuple[str, ...]:
         if found:
             shares[name] = float(np.median(found))
     ordered = sorted(shares, key=lambda name: -shares[name])
-    return tuple(name for name in ordered if shares[name] > LEAST_SHARE)
+    return tuple(name for name in ordered if shares[name] > LEAST_OF_MEANS)
 
 
 def _share(part: PosePart, name: str) -> float:

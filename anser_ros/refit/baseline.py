@@ -16,7 +16,7 @@ from anser_ros.physics.sensor import SensorTable
 
 ComplexArray = NDArray[np.complex128]
 
-FEWEST_FRAMES = 3
+FEWEST_BASELINE_FRAMES = 3
 """Frames that a baseline needs at least: their scatter is its noise."""
 MOST_FRAMES = 2000
 """Most recent frames that a baseline is averaged over, 40 s at 50 Hz."""
@@ -51,7 +51,7 @@ class ReadingWindow:
     @property
     def full(self) -> bool:
         """Return whether the readings reach back over (nearly) the whole span."""
-        if len(self._frames) < FEWEST_FRAMES:
+        if len(self._frames) < FEWEST_BASELINE_FRAMES:
             return False
         return self._frames[-1][0] - self._frames[0][0] >= 0.9 * self._span_ns
 
@@ -91,9 +91,9 @@ class ReadingWindow:
         FitError
             When there are too few frames, or no sensor has good readings.
         """
-        if len(self._frames) < FEWEST_FRAMES:
+        if len(self._frames) < FEWEST_BASELINE_FRAMES:
             raise FitError(
-                f'a baseline needs {FEWEST_FRAMES} frames of reference readings, '
+                f'a baseline needs {FEWEST_BASELINE_FRAMES} frames of reference readings, '
                 f'there are {len(self._frames)}'
             )
         stack = self.frames

@@ -13,8 +13,8 @@ from anser_ros.calibration.emitter_drift import at_strength, emitter_strength
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.one_place import calibrate_at_one_place, is_at_one_place
 from anser_ros.calibration.requirements import (
-    FEWEST_FRAMES,
-    FEWEST_POSES,
+    FEWEST_FRAMES_OF_MANY,
+    FEWEST_SCAN_FRAMES,
     MANY_SENSORS,
     check_single_coils,
 )
@@ -100,9 +100,9 @@ def calibrate_sessions(
         return _for_sessions(still, sessions)
     if not {*options.estimate}.isdisjoint(STILL_ONLY):
         raise FitError(
-            f'{", ".join(STILL_ONLY)}: can be determined only from {FEWEST_POSES} to '
-            f'{FEWEST_FRAMES - 1} poses of one body with at least {MANY_SENSORS} sensors, over '
-            'emitters without a drawing'
+            f'{", ".join(STILL_ONLY)}: can be determined only from {FEWEST_FRAMES_OF_MANY} to '
+            f'{FEWEST_SCAN_FRAMES - 1} poses of one body with at least {MANY_SENSORS} sensors, '
+            'over emitters without a drawing'
         )
     steady = [_steady(session, tool) for session in sessions for tool in session.tools]
     scan = survey(measurements, generator, options, nominal, progress, steady)

@@ -30,7 +30,7 @@ BLOCK_NS = 1_000_000_000
 """Length of a stretch that is resampled as one, ns: errors of a second ago are hardly related."""
 DRAWS = 2000
 """Resamples: the ends of a 95 % interval then vary by a few percent of its width."""
-SHARE = 0.95
+INTERVAL_SHARE = 0.95
 """Share of the resamples that lie in the interval, as is usual in the field's publications."""
 FEWEST_BLOCKS = 5
 """Stretches below which an interval means nothing: its ends would be those of single ones."""
@@ -237,6 +237,6 @@ def _interval(
     drawn = rng.integers(0, count, size=(DRAWS, count))
     means = sums[:, drawn].sum(axis=2) / sizes[drawn].sum(axis=1)
     difference = np.diff(shown(means), axis=0)[0]
-    tail = 50.0 * (1.0 - SHARE)
+    tail = 50.0 * (1.0 - INTERVAL_SHARE)
     low, high = np.percentile(difference, (tail, 100.0 - tail))
     return float(low), float(high)

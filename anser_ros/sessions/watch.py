@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.diagnosis.diagnose import diagnose
-from anser_ros.diagnosis.prepare import FEWEST_FRAMES
+from anser_ros.diagnosis.prepare import FEWEST_POSED_FRAMES
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.diagnosis.residuals import rms
 from anser_ros.diagnosis.search import SearchSettings
@@ -128,7 +128,7 @@ class Watch:
         """
         seen = self._corrected(session, (session.start_ns - first_ns) * NANO)
         truth = OPTICAL
-        if sum(int(tool.has_pose.sum()) for tool in seen.session.tools) < FEWEST_FRAMES:
+        if sum(int(tool.has_pose.sum()) for tool in seen.session.tools) < FEWEST_POSED_FRAMES:
             truth = RIGID
 
         def problem_with(model: FieldModel) -> Problem:

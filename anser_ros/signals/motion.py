@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 REACH_S = 0.03
 """Time over which the straight line is fitted, s. A tool's velocity hardly changes meanwhile; a
 shorter time makes the slopes noisier, a longer one makes them late."""
-LONGEST_GAP_S = 0.05
+LONGEST_WINDOW_GAP_S = 0.05
 """Longest time from one window to the next, s; after a longer gap the windows before it say
 nothing about the present motion."""
 FEWEST_WINDOWS = 3
@@ -33,7 +33,7 @@ class FluxRates:
         A gap or a step back in time discards the windows before.
         """
         past = self._past
-        if past and not 0 < time_s - past[-1][0] <= LONGEST_GAP_S:
+        if past and not 0 < time_s - past[-1][0] <= LONGEST_WINDOW_GAP_S:
             past.clear()
         past.append((time_s, flux))
         while len(past) > FEWEST_WINDOWS and time_s - past[0][0] > REACH_S:
@@ -42,7 +42,7 @@ class FluxRates:
     def at(self, time_s: float) -> NDArray[np.complex128] | None:
         """Return the rates (S, K), T/s, at a time, or None without enough recent windows."""
         past = self._past
-        if len(past) < FEWEST_WINDOWS or not 0 < time_s - past[-1][0] <= LONGEST_GAP_S:
+        if len(past) < FEWEST_WINDOWS or not 0 < time_s - past[-1][0] <= LONGEST_WINDOW_GAP_S:
             return None
         times = np.array([moment for moment, _ in past])
         weights = times - times.mean()

@@ -6,7 +6,13 @@ from anser_ros.errors import BagError
 
 RESULTS = 'results'
 """Folder inside it, in which every calibration and diagnosis gets a folder of its own."""
-SHOWN = ('report.html', 'choice.png', 'populations.png', 'calibration.json', 'diagnosis.json')
+SHOWN_FILES = (
+    'report.html',
+    'choice.png',
+    'populations.png',
+    'calibration.json',
+    'diagnosis.json',
+)
 """Files of a result that a browser may ask for."""
 MOST = 100
 """Recordings that are offered, the newest: more is no list to choose from."""
@@ -61,7 +67,7 @@ class RecordingFolder:
         """Return the path of a result's file that may be shown, None where there is none."""
         path = self.path / RESULTS / result / name
         is_inside = Path(result).name == result and result not in ('.', '..')
-        if not is_inside or name not in SHOWN or path.is_symlink() or not path.is_file():
+        if not is_inside or name not in SHOWN_FILES or path.is_symlink() or not path.is_file():
             return None
         return path
 

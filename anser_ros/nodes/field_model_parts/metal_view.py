@@ -12,7 +12,7 @@ from anser_ros.nodes.runtime import qos
 from anser_ros.refit.result import Metal, RefitResult
 from anser_ros.stamps import set_stamp
 
-SHOWN = 0.15
+LEAST_SHOWN_DENSITY = 0.15
 """Sources whose density is at least this part of the strongest one's are shown."""
 MOST_SHOWN = 400
 """Sources that are shown at most, the strongest ones: as many as a viewer draws with ease."""
@@ -72,7 +72,7 @@ def metal_markers(metal: Metal | None, frame_id: str, stamp_ns: int) -> MarkerAr
         return MarkerArray(markers=[gone])
     density = np.abs(metal.polarisability) / metal.volumes
     rows = np.argsort(-density)[:MOST_SHOWN]
-    rows = rows[density[rows] >= SHOWN * density[rows[0]]]
+    rows = rows[density[rows] >= LEAST_SHOWN_DENSITY * density[rows[0]]]
     markers: list[Marker] = []
     for volume in np.unique(metal.volumes[rows]).tolist():
         here = rows[metal.volumes[rows] == volume]

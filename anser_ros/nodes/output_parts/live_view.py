@@ -12,7 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.nodes.output_parts.causes import LastStatus, causes
-from anser_ros.nodes.output_parts.traces import LONGEST_GAP_S, OpticalTrace, latency_of, targets_of
+from anser_ros.nodes.output_parts.traces import (
+    LONGEST_OPTICAL_GAP_S,
+    OpticalTrace,
+    latency_of,
+    targets_of,
+)
 from anser_ros.wire.setup import Setup
 
 Array = NDArray[np.float64]
@@ -224,7 +229,9 @@ class LiveView:
             if not here or optical is None:
                 continue
             numbers = np.array([item[0] for item in here])
-            place, turn, _ = optical.at(np.array([item[1] for item in here]), LONGEST_GAP_S)
+            place, turn, _ = optical.at(
+                np.array([item[1] for item in here]), LONGEST_OPTICAL_GAP_S
+            )
             offset = np.array([self.targets[n].position_m for n in numbers])
             truth = place + np.einsum('nij,nj->ni', turn, offset)
             away = np.linalg.norm(np.array([item[2] for item in here]) - truth, axis=1)

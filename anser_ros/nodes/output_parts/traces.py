@@ -14,7 +14,7 @@ from anser_ros.stamps import LIVE_WITHIN_S
 from anser_ros.wire.setup import Setup
 
 Array = NDArray[np.float64]
-LONGEST_GAP_S = 0.1
+LONGEST_OPTICAL_GAP_S = 0.1
 """Gap between optical poses, s, over which none is interpolated to compare with."""
 
 
@@ -109,7 +109,7 @@ class PoseTrace:
         stamps = np.array(self.stamp_s[since:])
         if not stamps.size:
             return np.zeros(0), np.zeros(0)
-        position, rotation, _ = optical.at(stamps, LONGEST_GAP_S)
+        position, rotation, _ = optical.at(stamps, LONGEST_OPTICAL_GAP_S)
         true_position = position + rotation @ np.array(self.target.position_m)
         true_axis = rotation @ np.array(self.target.axis)
         away = np.linalg.norm(np.array(self.position[since:]) - true_position, axis=1)

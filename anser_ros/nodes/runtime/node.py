@@ -236,15 +236,9 @@ class AnserNode(Node):
     # Guarded callbacks --------------------------------------------------------------------
 
     def create_subscription(
-        self,
-        msg_type: Any,
-        topic: str,
-        callback: Callback,
-        qos_profile: Any,
-        *,
-        handed: Callback | None = None,
-        **options: Any,
-    ) -> Any:
+        self, msg_type: Any, topic: str, callback: Callback, qos_profile: Any, *,
+        handed: Callback | None = None, **options: Any,
+    ) -> Any:  # fmt: skip
         """Subscribe as rclpy does, with the callback guarded, and what is too large refused.
 
         An object handed over by a node of this process goes to ``handed``, by default to the

@@ -19,7 +19,7 @@ CATCH_UP_S = 1.0
 """A backlog that will be gone within this time is worked off."""
 MEMORY = 25
 """Messages that typical figures are taken of, so that a few slow ones say nothing."""
-FEWEST = 10
+FEWEST_MESSAGES = 10
 """Messages that must have been worked on before a backlog is judged: the first ones are slow."""
 
 
@@ -53,7 +53,7 @@ class Backlog:
 
     def is_hopeless(self, age_s: float) -> bool:
         """Return whether a message of this age shows a backlog that will not be gone soon."""
-        if age_s < SHORTEST_LATE_S or len(self._work_s) < FEWEST:
+        if age_s < SHORTEST_LATE_S or len(self._work_s) < FEWEST_MESSAGES:
             return False
         spacing_s, work_s = median(self._spacing_s), median(self._work_s)
         if age_s < LATE_WINDOWS * spacing_s:

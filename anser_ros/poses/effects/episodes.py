@@ -17,7 +17,7 @@ Mask = NDArray[np.bool_]
 WINDOWS = 40
 """Windows of time that a session is cut into: an episode of a twentieth is seen in two. Fewer miss
 short episodes; more leave too few poses in a window to judge it."""
-FEWEST_POSES = 4  # poses that a window needs to be judged: fewer may be outliers
+FEWEST_POSES_OF_WINDOW = 4  # poses that a window needs to be judged: fewer may be outliers
 TIMES = 9.0
 """Squared error over the median window's from which a window belongs to an episode: three times
 the error, which the range of places in a session hardly makes. Smaller takes the far side of the
@@ -73,7 +73,7 @@ def episode(sensing: Sensing, residuals: PoseResiduals) -> Episode:
     """
     window = windows_of(sensing, residuals)
     square = np.sum(sensing.residual[:, :3] ** 2, axis=1)
-    judged = [w for w in range(WINDOWS) if np.count_nonzero(window == w) >= FEWEST_POSES]
+    judged = [w for w in range(WINDOWS) if np.count_nonzero(window == w) >= FEWEST_POSES_OF_WINDOW]
     if len(judged) < WINDOWS // 3:
         return Episode()
     size = {w: float(np.median(square[window == w])) for w in judged}
@@ -177,11 +177,8 @@ class LooseMount(PoseEffect):
             name = sensing.view.sensor
             share, place, turn = shifts[name]
             others = [shifts[other][0] * shifts[other][1] for other in shifts if other != name]
-            if (
-                share < LOOSE
-                or max(others) > FAST * share * place
-                or episode(sensing, residuals).windows
-            ):
+            is_alone = share >= LOOSE and max(others) <= FAST * share * place
+            if not is_alone or episode(sensing, residuals).windows:
                 continue
             values = {'sensor': name, 'rms_m': place, 'rms_deg': float(np.rad2deg(turn))}
             found.append(EffectRecord(self.name, values, {'rms_m': 0.15 * place}))
@@ -198,7 +195,7 @@ def _shifts(sensing: Sensing, residuals: PoseResiduals) -> tuple[float, float, f
     explained, total, count, means = 0.0, 0.0, 0, []
     for number in np.unique(window[window >= 0]):
         rows = body[(window == number) & sensing.used]
-        if len(rows) < FEWEST_POSES:
+        if len(rows) < FEWEST_POSES_OF_WINDOW:
             continue
         mean = rows.mean(axis=0)
         means.append(mean)

@@ -37,7 +37,7 @@ NEW_SHARE = 18 / 35
 REACHED = 12.0
 """Squared deviation over its variance by the law that noise does not reach: once in 1e5. A pose
 that the law does not reach has another cause, and one that it reaches is no outlier."""
-FEWEST = 60  # differences of neighbours that a power law is fitted to
+FEWEST_DIFFERENCES = 60  # differences of neighbours that a power law is fitted to
 
 
 def power_law(square: Array, distance: Array) -> tuple[float, float, float]:
@@ -119,7 +119,7 @@ class PoseExcessNoise(PoseEffect):
         for sensing in residuals.sensors:
             square, distance = jitter(sensing)
             square = square / distance[:, 1] ** (2 * exponent)
-            if square.size >= FEWEST:
+            if square.size >= FEWEST_DIFFERENCES:
                 noise[sensing.view.sensor] = float(np.sqrt(np.median(square)))
         found = []
         for name, size in noise.items():
@@ -145,13 +145,15 @@ class RangeNoise(PoseEffect):
         # Each sensor has a level of its own, so only what changes within one tells a power.
         # Poses far away stand out from a noise that is taken as one; the law judges them too.
         every = [replace(one, used=one.used | one.out) for one in residuals.sensors]
-        pairs = [pair for pair in map(jitter, every) if pair[0].size >= FEWEST]
+        pairs = [pair for pair in map(jitter, every) if pair[0].size >= FEWEST_DIFFERENCES]
         if not pairs:
             return []
         places = np.concatenate([distance for _, distance in pairs])
         square = np.concatenate([one / np.median(one) for one, _ in pairs])
         distance = np.concatenate([one / np.median(one) for _, one in pairs])
-        low, high = np.percentile(distance, [5, 95]) if square.size >= FEWEST else (1.0, 1.0)
+        low, high = (
+            np.percentile(distance, [5, 95]) if square.size >= FEWEST_DIFFERENCES else (1.0, 1.0)
+        )
         if high < WIDEST * low:
             return []
         exponent, spread, gain = power_law(square, distance)

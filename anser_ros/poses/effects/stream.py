@@ -35,7 +35,7 @@ LONG_GAPS = 6.0
 """Gap in median intervals that counts as missing poses: a poll is late by one or two."""
 PAUSE_S, MANY_PAUSES = 2.0, 4
 """Pauses of this length, s, where there are so many, lie between recordings and are no gaps."""
-FEWEST_POSES = 3  # outliers that must be there at least: one or two are an accident
+FEWEST_OUTLYING_POSES = 3  # outliers that must be there at least: one or two are an accident
 FAR = 14.0
 """Distance of the median outlier in spreads of a coordinate from which it is one: errors of real
 trackers have tails of half that. Smaller names the tails of usual errors; larger misses
@@ -134,7 +134,7 @@ class PoseOutliers(PoseEffect):
         used = np.concatenate([s.used for s in residuals.sensors])
         count = int(np.count_nonzero(out))
         share = count / max(count + int(np.count_nonzero(used)), 1)
-        if found or share < FEWEST_OUTLIERS or count < FEWEST_POSES:
+        if found or share < FEWEST_OUTLIERS or count < FEWEST_OUTLYING_POSES:
             return found
         residual = np.concatenate([s.residual for s in residuals.sensors])[out]
         noise = np.concatenate(
@@ -164,7 +164,7 @@ class PoseOutliers(PoseEffect):
             return
         away = jumping_poses(reference)
         share = float(away.mean()) if away.size else 0.0
-        if share > FEWEST_OUTLIERS and np.count_nonzero(away) >= FEWEST_POSES:
+        if share > FEWEST_OUTLIERS and np.count_nonzero(away) >= FEWEST_OUTLYING_POSES:
             values = {'fraction': share, 'stream': reference.name}
             yield _record(self.name, values, {'fraction': float(np.sqrt(share / away.size))})
 
