@@ -44,7 +44,7 @@ def test_help_has_an_example_and_a_document_for_programs(name, capsys):
 @pytest.mark.parametrize('name', OFFLINE)
 def test_what_takes_long_says_how_far_it_is(name):
     text = (REPO / 'anser_ros' / 'cli' / f'{name}.py').read_text(encoding='utf-8')
-    told = re.search(r'^    with progress_of\(', text, re.MULTILINE)
+    told = re.search(r'^    (with progress_of|return carry_out)\(', text, re.MULTILINE)
     assert bool(told) != (name in OWN_WORDS)
 
 
