@@ -2,6 +2,7 @@
 
 import json
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from pose_world import World
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.assessment.control import ALERT, FAIL, NOTE, PASS, judged
 from anser_ros.assessment.dynamic import assess_motion
 from anser_ros.assessment.f2554 import point_to_point, single_point, standing_alone
+from anser_ros.assessment.history import EarlierFigure, SessionVerdict
 from anser_ros.assessment.hummel import (
     Grid,
     distance_errors,
@@ -17,8 +19,11 @@ from anser_ros.assessment.hummel import (
     have_common_errors,
     rotation_errors,
 )
+from anser_ros.assessment.intervals import IntervalEstimate
 from anser_ros.assessment.metal import metal_shifts
+from anser_ros.assessment.protocols import Assessment
 from anser_ros.assessment.stillness import StillPoint, still_points
+from anser_ros.cli.control_chart import control_chart
 from anser_ros.cli.main import run_verb
 from anser_ros.errors import FitError, ParameterError
 from anser_ros.poses.hand_eye_fit import fit_hand_eye
@@ -93,6 +98,13 @@ class TestPauses:
         turns = np.tile(STILL, (len(place), 1))
         scan = sequence_of('p', interval_s * np.arange(len(place)), place, turns)
         assert still_points(scan) == []
+
+    def test_all_poses_of_a_recording_at_rest_count(self):
+        """As in MITK, which averages all samples of a point."""
+        poses = visited(np.array([[0.1, 0.2, 0.3]]), [Rotation.identity()], 8)
+        (found,) = still_points(poses)
+        assert found.n == poses.size
+        np.testing.assert_array_equal(found.position, poses.position.mean(axis=0))
 
 
 class TestHummel:
@@ -302,7 +314,8 @@ class TestControl:
         out = tmp_path / 'stuck'
         qa = session(10, 0.0, '--out', str(out))[1]
         assert qa['state'] == ALERT and 'below' in qa['figures'][name]['words']
-        assert 'is the sensor stuck?' in (out / 'report.html').read_text(encoding='utf-8')
+        page = (out / 'report.html').read_text(encoding='utf-8')
+        assert 'is the sensor stuck?' in page and 'Over sessions' in page
         # Neither what failed nor the alert makes limits wider; a repeat takes its own place.
         assert session(10, 2e-4)[1]['figures'][name]['sessions'] == 7
         assert session(10, 2e-4)[1]['earlier_sessions'] == 9
@@ -310,6 +323,32 @@ class TestControl:
         assert code == 2 and "no figure 'speed'" in words
         (history / 'z.json').write_text('{}')
         assert 'not an entry of a history' in session(12, 2e-4)[1]
+
+    def test_the_chart_shows_every_session_with_its_state_and_all_limits(self):
+        figures = {'position_jitter_rms_m': 3e-4, 'orientation_jitter_rms_rad': 1e-3}
+        found = Assessment(
+            'rest', 'pen', ('a.mcap',), 10**18,
+            {name: IntervalEstimate(value) for name, value in figures.items()},
+        )  # fmt: skip
+        states = (PASS, NOTE, ALERT, FAIL, PASS)
+        past = tuple(
+            EarlierFigure(10**17 + k, 3e-4 + 1e-6 * k, state) for k, state in enumerate(states)
+        )
+        first, second = figures
+        verdict = judged(3e-4, [one.value for one in past] * 2, 5e-4)
+        session = SessionVerdict(
+            PASS, {first: verdict, second: judged(1e-3, [])}, 5, {first: past}
+        )
+        chart = control_chart(found, session)
+        (panel,) = chart.axes  # no earlier session has the other one
+        shown = [len(marks.get_offsets()) for marks in panel.collections]
+        assert shown == [3, 1, 1, 1], 'of pass, note, alert and fail, this session among them'
+        levels = [line.get_ydata()[0] for line in panel.lines if len(set(line.get_ydata())) == 1]
+        limits = verdict.limits
+        off = (0.0, -limits.note, limits.note, -limits.alert, limits.alert)
+        assert levels[:5] == pytest.approx([1e3 * (limits.mean + d) for d in off])
+        assert levels[5] == pytest.approx(0.5), 'the tolerance, in mm'
+        plt.close(chart)
 
 
 class TestCommand:

@@ -49,6 +49,14 @@ class TestSession:
         assert (cloud.point_step, cloud.row_step, bytes(cloud.data)) == (8, 16, data)
         assert messages['/optical/tool_a/pose'][1].pose.position.y == 0.2
 
+    @pytest.mark.parametrize('error', [ValueError, KeyboardInterrupt])
+    def test_a_session_that_is_not_finished_leaves_no_file(self, tmp_path, error):
+        path = tmp_path / 'half.mcap'
+        with pytest.raises(error), SessionWriter(path) as session:
+            session.write_setup('schema: anser_setup/1\n', STAMP_NS)
+            raise error
+        assert not path.exists()
+
     def test_a_sensor_without_a_reading_is_stale_and_an_emitter_without_current_is_not(
         self, tmp_path
     ):

@@ -1,6 +1,8 @@
 """Every command has help with an example, a document for programs, progress, and a page."""
 
+import argparse
 import importlib
+import json
 import re
 import shlex
 from dataclasses import fields
@@ -23,8 +25,58 @@ OWN_WORDS = {
     'warm_up': 'a line every five seconds',
 }
 """Commands that show how far they are by other means than `cli.progress`."""
+NOWHERE = '/nowhere/x'
+WRONG = {
+    'accuracy': ['rest', NOWHERE],
+    'bags': ['--setup', NOWHERE],
+    'batch': ['evaluate', 'bags/moving.mcap', '--model', 'nominal', '--out', '/proc/x'],
+    'calibrate': [NOWHERE, '--out', 'x.yaml'],
+    'compare': [NOWHERE, NOWHERE],
+    'demo': ['--duration', '-1'],
+    'diagnose': [NOWHERE, '--model', NOWHERE, '--out', 'x'],
+    'doctor': ['--seconds', 'nan'],
+    'error_map': [NOWHERE, '--out', 'x'],
+    'evaluate': [NOWHERE, '--model', 'nominal', '--out', 'x'],
+    'export': [NOWHERE, '--out', 'x'],
+    'handeye': [NOWHERE],
+    'import': [NOWHERE, '--out', 'x.mcap'],
+    'import_poses': [NOWHERE, '--out', 'x.mcap'],
+    'loop': ['--duration', '-1'],
+    'measured': ['gremlin'],
+    'paper': ['--sessions', NOWHERE, '--out', 'x'],
+    'pivot': [NOWHERE],
+    'place': [NOWHERE, '--references', '4', '--out', 'x'],
+    'setup': [NOWHERE, '--out', 'x'],
+    'views': [NOWHERE, '--out', 'x'],
+    'warm_up': ['--gremlin'],
+}
+"""Arguments of every command that it must refuse."""
+POINTS = 'x_m,y_m,z_m,true_x_m,true_y_m,true_z_m\n' + ''.join(
+    f'{x},{y},{z},{1.01 * x},{1.01 * y},{1.01 * z}\n'
+    for x in (0, 0.1, 0.2) for y in (0, 0.1) for z in (0.1, 0.2)
+)  # fmt: skip
+QUICK = {
+    'bag_export': ['export', 'BAGS/moving.mcap', '--out', 'out'],
+    'bag_import': ['import', 'BAGS/moving.mcap', '--out', 'out/a.mcap'],
+    'error_map': ['error_map', 'points.csv', '--out', 'out'],
+    'import_poses': ['import_poses', 'poses.tum', '--out', 'out/b.mcap'],
+    'setup': ['setup', 'demo_setup.yaml', '--out', 'out'],
+    'views': ['views', 'demo_setup.yaml', '--out', 'out'],
+}
+"""Calls that take less than a second; the documents of the others are tested with their work."""
 # Of a line of the table: the command and the page that tells more of it.
 ROW = re.compile(r'^\| `(\w+)` \| .+ \| \[.+\]\(([\w/.]*)(#[\w-]*)?\) \|$', re.MULTILINE)
+
+
+def examples_of(name):
+    """Yield the parser of a command, and the arguments of each of its examples."""
+    module = importlib.import_module(f'anser_ros.cli.{name}')
+    parser = argparse.ArgumentParser(prog=name, exit_on_error=False)
+    module.add_arguments(parser)
+    lines = re.split(rf'anser {name}\b', ' '.join(parser.epilog.split('example')[-1].split()))
+    for line in lines[1:]:
+        # Of several in a line, each but the last ends with a semicolon, or with words in brackets.
+        yield parser, shlex.split(re.sub(r'\([^)]*\)', '', line).rstrip('; '))
 
 
 def help_of(command, capsys):
@@ -39,6 +91,44 @@ def test_help_has_an_example_and_a_document_for_programs(name, capsys):
     verbs = ['calibrate', 'evaluate', 'diagnose'] if name == 'batch' else []
     for words in [help_of([name, verb], capsys) for verb in verbs] or [text]:
         assert '--json' in words
+
+
+@pytest.mark.parametrize('name', OFFLINE)
+def test_the_examples_are_taken_by_their_command(name):
+    found = list(examples_of(name))
+    assert found
+    for parser, arguments in found:
+        parser.parse_args(arguments)
+
+
+@pytest.mark.parametrize('name', OFFLINE)
+def test_what_is_wrong_is_one_line_and_exit_code_2(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main([name, *WRONG[name], '--json']) == 2
+    said = capsys.readouterr()
+    assert said.out == '' and said.err.count('\n') == 1, said
+    assert said.err.startswith(f'anser {name}') and 'Errno' not in said.err
+    assert [path for path in tmp_path.rglob('*') if path.is_file()] == []
+
+
+@pytest.mark.parametrize('arguments', QUICK.values(), ids=QUICK)
+def test_json_is_one_document_whose_schema_the_pages_name(
+    arguments, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'points.csv').write_text(POINTS)
+    (tmp_path / 'poses.tum').write_text(
+        ''.join(f'{1e9 + k} 0.1 0 {k} 0 0 0 1\n' for k in range(9))
+    )
+    words = [word.replace('BAGS', str(REPO / 'bags')) for word in arguments]
+    code = main([*words, '--json'])
+    said = capsys.readouterr()
+    assert code == 0, said.err
+    document = json.loads(said.out, parse_constant=pytest.fail)
+    pages = [
+        (DOCS / page).read_text(encoding='utf-8') for page in ('commands.md', 'interfaces.md')
+    ]
+    assert any(f'`{document["schema"]}`' in page for page in pages)
 
 
 @pytest.mark.parametrize('name', OFFLINE)

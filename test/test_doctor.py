@@ -144,4 +144,4 @@ def test_the_whole_on_this_machine(capsys, domain):
 @pytest.mark.parametrize('seconds', ['nan', '-1', '0', '1e9'])
 def test_a_look_that_is_no_time_is_refused(capsys, seconds):
     assert main(['doctor', '--seconds', seconds]) == 2
-    assert '--seconds must lie in 0 .. 60' in capsys.readouterr().err
+    assert '--seconds must be above 0 and at most 60' in capsys.readouterr().err

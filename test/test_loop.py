@@ -179,7 +179,7 @@ def test_a_busy_machine_is_told_and_no_figure_shown():
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
-        (['--effect', 'gremlin'], "no effect 'gremlin'"),
+        (['--effect', 'gremlin'], "invalid choice: 'gremlin'"),
         (['--duration', '3'], 'must be 10 to 600 s'),
         (['--seed', '0'], 'at least 1'),
         (['--clean', '1'], 'must be 0 or 2 to 600 s'),

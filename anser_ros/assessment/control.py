@@ -43,26 +43,21 @@ class ControlLimits:
     n : int
         Earlier sessions they are made from.
     mean, sigma : float
+    note, alert : float
+        Distance from the mean, in the figure's unit, from which on a session is a note, and an
+        alert.
     """
 
     n: int
     mean: float
     sigma: float
-
-    def reach(self, deviations: float, figures: int) -> float:
-        """Return how many deviations a figure in order may be off the mean, for one of so many.
-
-        Parameters
-        ----------
-        deviations : float
-            Where the limit would be with mean and deviation known, and a single figure.
-        figures : int
-        """
-        return _multiple(self.n, deviations, figures)
+    note: float
+    alert: float
 
 
 @cache
 def _multiple(count: int, deviations: float, figures: int) -> float:
+    """Deviations that a figure in order may be off the mean, for one of so many."""
     share = 2 * stats.norm.sf(deviations) / figures
     wide = stats.t.isf(share / 2, max(FREEDOMS * (count - 1), 1.0))
     return float(wide * np.sqrt(1 + 1 / count))
@@ -90,15 +85,24 @@ class Verdict:
     tolerance: float | None
 
 
-def limits_of(earlier: Sequence[float]) -> ControlLimits | None:
-    """Return limits from the figures of earlier sessions, in their order."""
+def limits_of(earlier: Sequence[float], figures: int = 1) -> ControlLimits | None:
+    """Return limits from the figures of earlier sessions, in their order.
+
+    Parameters
+    ----------
+    earlier : sequence of float
+    figures : int
+        How many figures are watched at once, this one with them.
+    """
     values = np.asarray(earlier, dtype=np.float64)
     values = values[np.isfinite(values)]
     if values.size < FEWEST_SESSIONS:
         return None
     mean = float(values.mean())
     sigma = float(np.mean(np.abs(np.diff(values)))) / DIFFERENCE
-    return ControlLimits(int(values.size), mean, max(sigma, SMALLEST_SHARE * abs(mean), 1e-12))
+    sigma = max(sigma, SMALLEST_SHARE * abs(mean), 1e-12)
+    note, alert = (sigma * _multiple(values.size, d, figures) for d in (WARNING, ACTION))
+    return ControlLimits(int(values.size), mean, sigma, note, alert)
 
 
 def judged(
@@ -116,7 +120,7 @@ def judged(
     figures : int
         How many figures are watched with it.
     """
-    limits = limits_of(earlier)
+    limits = limits_of(earlier, figures)
     if not np.isfinite(value):
         return Verdict(FAIL, 'no figure', limits, tolerance)
     if tolerance is not None and abs(value) > tolerance:
@@ -124,13 +128,13 @@ def judged(
     if limits is None:
         words = f'{len(earlier)} of {FEWEST_SESSIONS} sessions that control limits need'
         return Verdict(PASS, words, None, tolerance)
-    off = (value - limits.mean) / limits.sigma
+    off = value - limits.mean
     side = 'above' if off > 0 else 'below'
-    for state, deviations in ((ALERT, ACTION), (NOTE, WARNING)):
-        reach = limits.reach(deviations, figures)
+    for state, reach in ((ALERT, limits.alert), (NOTE, limits.note)):
         if abs(off) > reach:
             words = (
-                f'{abs(off):.1f} standard deviations {side} the mean ({state} from {reach:.1f} on)'
+                f'{abs(off) / limits.sigma:.1f} standard deviations {side} the mean '
+                f'({state} from {reach / limits.sigma:.1f} on)'
             )
             return Verdict(state, words, limits, tolerance)
     last = np.sign(np.array([*earlier, value])[-RUN:] - limits.mean)

@@ -3,16 +3,53 @@
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from anser_ros.assessment.control import ALERT, FAIL, Verdict, judged, worst
+from anser_ros.assessment.control import ALERT, FAIL, PASS, Verdict, judged, worst
 from anser_ros.assessment.protocols import WATCHED, Assessment
 from anser_ros.errors import ParameterError
 
 SCHEMA = 'anser_accuracy_history/1'
+
+
+@dataclass(frozen=True)
+class EarlierFigure:
+    """Holds a figure of an earlier session: when the session began, ns, value, and state there."""
+
+    start_ns: int
+    value: float
+    state: str
+
+    @property
+    def is_in_order(self) -> bool:
+        """Return whether limits are made with it."""
+        return self.state not in (ALERT, FAIL)
+
+
+@dataclass(frozen=True)
+class SessionVerdict:
+    """Holds the verdict on a session.
+
+    Attributes
+    ----------
+    state : str
+        That of its worst figure.
+    figures : dict of str to Verdict
+        By figure.
+    sessions : int
+        Earlier sessions of the same protocol and body.
+    past : dict of str to tuple of EarlierFigure
+        Watched figures in those sessions, the oldest first.
+    """
+
+    state: str
+    figures: dict[str, Verdict]
+    sessions: int
+    past: dict[str, tuple[EarlierFigure, ...]]
 
 
 def figures_of(found: Assessment) -> dict[str, float]:
@@ -28,13 +65,20 @@ def _is_watched(name: str, protocol: str) -> bool:
 
 
 def judge(
-    found: Assessment, folder: Path, tolerances: Mapping[str, float]
-) -> tuple[str, dict[str, Verdict], int]:
-    """Return a session's state, the verdict on each figure, and how many earlier sessions there
-    are.
+    found: Assessment, folder: Path | None, tolerances: Mapping[str, float]
+) -> SessionVerdict:
+    """Return the verdict on a session.
 
     Sessions of the same protocol and body count, but no later ones, and no figure that was an
     alert or failed in its session.
+
+    Parameters
+    ----------
+    found : Assessment
+    folder : Path or None
+        Of the history; None: tolerances alone.
+    tolerances : mapping of str to float
+        Largest size by figure.
 
     Raises
     ------
@@ -45,19 +89,24 @@ def judge(
     unknown = sorted(set(tolerances) - set(figures))
     if unknown:
         raise ParameterError(f'no figure {unknown[0]!r}; there are: {", ".join(figures)}')
-    earlier = [entry for entry in _entries(folder, found) if entry['start_ns'] < found.start_ns]
+    entries = [] if folder is None else _entries(folder, found)
+    earlier = [entry for entry in entries if entry['start_ns'] < found.start_ns]
     watched = [n for n in figures if _is_watched(n, found.protocol)]
+    past = {
+        name: tuple(
+            EarlierFigure(
+                int(e['start_ns']), float(e['figures'][name]), e['states'].get(name, PASS)
+            )
+            for e in earlier
+            if e['figures'].get(name) is not None
+        )
+        for name in watched
+    }
     verdicts = {}
     for name in [*watched, *(n for n in tolerances if n not in watched)]:
-        values = [
-            float(e['figures'][name])
-            for e in earlier
-            if name in watched
-            and e['figures'].get(name) is not None
-            and e['states'].get(name) not in (ALERT, FAIL)
-        ]
+        values = [one.value for one in past.get(name, ()) if one.is_in_order]
         verdicts[name] = judged(figures[name], values, tolerances.get(name), len(watched))
-    return worst(verdicts), verdicts, len(earlier)
+    return SessionVerdict(worst(verdicts), verdicts, len(earlier), past)
 
 
 def keep(found: Assessment, folder: Path, verdicts: Mapping[str, Verdict]) -> Path:

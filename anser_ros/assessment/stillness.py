@@ -127,7 +127,7 @@ def still_points(poses: PoseSequence, rule: PauseRule | None = None) -> list[Sti
     runs = _runs(place, turns, begins, ends, (moved_m, moved_rad), rule.least_s)
     points = [
         point_of(poses.rows(np.arange(rows[i][0], rows[j][1])))
-        for i, j in (_without_ends(i, j) for i, j in runs)
+        for i, j in (_without_ends(i, j, len(rows)) for i, j in runs)
     ]
     return _merged(poses, points, rule)
 
@@ -180,9 +180,12 @@ def _runs(
     return runs
 
 
-def _without_ends(first: int, last: int) -> tuple[int, int]:
-    """A run without its first and last window, in which the tool came and went."""
-    return (first + 1, last - 1) if last - first >= 3 else (first, last)
+def _without_ends(first: int, last: int, count: int) -> tuple[int, int]:
+    """A run without its first and last window, in which the tool came and went; one of all windows
+    is a recording in which it did not, and is kept whole.
+    """
+    is_all = last - first == count - 1
+    return (first, last) if is_all or last - first < 3 else (first + 1, last - 1)
 
 
 def _merged(

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from anser_ros.assessment.control import Verdict
 from anser_ros.assessment.history import judge, keep
 from anser_ros.assessment.hummel import ORDERS, RING_STEP_DEG, SPACING_M
 from anser_ros.assessment.protocols import PROTOCOLS, Assessment, ProtocolOptions, assess
@@ -115,52 +114,48 @@ def run(args: argparse.Namespace) -> int:
     found = replace(found, notes=(*found.notes, *missing))
     if found.start_ns < NO_DATE_NS:  # a device's own counter: the file tells when
         found = replace(found, start_ns=args.recordings[0].stat().st_mtime_ns)
-    verdicts: dict[str, Verdict] = {}
-    state, sessions = '', 0
-    if args.history is not None or tolerances:
-        folder = args.history or Path('/nonexistent')
-        state, verdicts, sessions = judge(found, folder, tolerances)
-    document = to_document(found, state, verdicts, sessions)
+    is_judged = args.history is not None or bool(tolerances)
+    verdict = judge(found, args.history, tolerances) if is_judged else None
+    document = to_document(found, verdict)
     text = json.dumps(document, indent=1)
     written = []
     if args.out is not None:
         for name, content in (
-            ('accuracy.json', text + '\n'), ('report.html', render(found, document))
+            ('accuracy.json', text + '\n'), ('report.html', render(found, document, verdict))
         ):  # fmt: skip
             (args.out / name).write_text(content, encoding='utf-8')
             written.append(args.out / name)
-    if args.history is not None:
-        written.append(keep(found, args.history, verdicts))
+    if verdict is not None and args.history is not None:
+        written.append(keep(found, args.history, verdict.figures))
     if args.json:
         print(text)
         return 0
-    _say(found, document, state, sessions)
+    _say(found, document)
     if written:
         say_written(*written)
     return 0
 
 
-def _say(found: Assessment, document: dict[str, Any], state: str, sessions: int) -> None:
+def _say(found: Assessment, document: dict[str, Any]) -> None:
     console = Console()
+    qa = document.get('qa')
     head = ['figure', 'value', '95 % interval']
-    shown = Table(*head, *(['state'] if state else []))
+    shown = Table(*head, *(['state'] if qa else []))
     for name, value, interval, judged in figure_rows(found, document):
         color = COLORS.get(judged, 'white')
-        shown.add_row(name, value, interval, *([f'[{color}]{judged}[/]'] if state else []))
+        shown.add_row(name, value, interval, *([f'[{color}]{judged}[/]'] if qa else []))
     console.print(shown)
     if found.points:
         console.print(f'{len(found.points)} points', highlight=False)
     for words in found.notes:
         console.print(words, highlight=False)
-    if state:
+    if qa:
         words = ', '.join(
-            f'{name}: {one["words"]}'
-            for name, one in document['qa']['figures'].items()
-            if one['words']
+            f'{name}: {one["words"]}' for name, one in qa['figures'].items() if one['words']
         )
         console.print(
-            f'[{COLORS[state]}]{state}[/], compared with {sessions} earlier sessions'
-            + (f': {words}' if words else ''), highlight=False,
+            f'[{COLORS[qa["state"]]}]{qa["state"]}[/], compared with {qa["earlier_sessions"]} '
+            'earlier sessions' + (f': {words}' if words else ''), highlight=False,
         )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from anser_ros.assessment.control import Verdict
+from anser_ros.assessment.history import SessionVerdict
 from anser_ros.assessment.hummel import ErrorGroup
 from anser_ros.assessment.intervals import IntervalEstimate, mitk_statistics
 from anser_ros.assessment.protocols import Assessment
@@ -21,10 +22,15 @@ SHOWN_UNITS = (
 """Endings of figures' names, with the factor to the unit that is shown."""
 
 
-def to_document(
-    found: Assessment, state: str, verdicts: Mapping[str, Verdict], sessions: int
-) -> dict[str, Any]:
-    """Return the assessment as plain data; null where there is no number."""
+def to_document(found: Assessment, verdict: SessionVerdict | None) -> dict[str, Any]:
+    """Return the assessment as plain data; null where there is no number.
+
+    Parameters
+    ----------
+    found : Assessment
+    verdict : SessionVerdict or None
+        None where nothing is judged.
+    """
     document: dict[str, Any] = {
         'schema': SCHEMA, 'protocol': found.protocol, 'body': found.body,
         'recordings': list(found.recordings), 'start_ns': found.start_ns,
@@ -57,11 +63,11 @@ def to_document(
         ],
         'notes': list(found.notes),
     }  # fmt: skip
-    if state:
+    if verdict is not None:
         document['qa'] = {
-            'state': state,
-            'earlier_sessions': sessions,
-            'figures': {name: _verdict(v) for name, v in verdicts.items()},
+            'state': verdict.state,
+            'earlier_sessions': verdict.sessions,
+            'figures': {name: _verdict(v) for name, v in verdict.figures.items()},
         }
     return dict(finite(document))
 
@@ -90,6 +96,8 @@ def _verdict(verdict: Verdict) -> dict[str, Any]:
         'state': verdict.state, 'words': verdict.words,
         'mean': None if limits is None else limits.mean,
         'sigma': None if limits is None else limits.sigma,
+        'note': None if limits is None else limits.note,
+        'alert': None if limits is None else limits.alert,
         'sessions': 0 if limits is None else limits.n,
         'tolerance': verdict.tolerance,
     }  # fmt: skip
@@ -100,9 +108,8 @@ def figure_rows(found: Assessment, document: Mapping[str, Any]) -> list[tuple[st
     judged = document.get('qa', {}).get('figures', {})
     rows = []
     for name, estimate in found.estimates.items():
-        scale, unit = _shown(name)
         state = judged.get(name, {}).get('state', '')
-        rows.append((name, *_texts(estimate, scale, unit), state))
+        rows.append((name, *_texts(estimate, *shown_unit(found, name)), state))
     for name, group in found.groups.items():
         for key, estimate in group.summary.items():
             label = f'{name}/{key}'
@@ -111,7 +118,13 @@ def figure_rows(found: Assessment, document: Mapping[str, Any]) -> list[tuple[st
     return rows
 
 
-def _shown(name: str) -> tuple[float, str]:
+def shown_unit(found: Assessment, name: str) -> tuple[float, str]:
+    """Return the factor from a figure, by its name, to the unit that it is shown in, and that
+    unit.
+    """
+    group = found.groups.get(name.rpartition('/')[0])
+    if group is not None:
+        return 1.0, group.unit
     for ending, scale, unit in SHOWN_UNITS:
         if name.endswith(ending):
             return scale, unit

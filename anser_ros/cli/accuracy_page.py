@@ -7,16 +7,27 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
+from anser_ros.assessment.history import SessionVerdict
 from anser_ros.assessment.protocols import PROTOCOLS, Assessment
 from anser_ros.cli.accuracy_document import figure_rows
+from anser_ros.cli.control_chart import control_chart
 from anser_ros.cli.html_page import page, table
 from anser_ros.pictures import image
 
 MOST_ROWS = 500  # rows of a table of single errors; all are in accuracy.json
 
 
-def render(found: Assessment, document: dict[str, Any]) -> str:
-    """Return the page of an assessment as HTML."""
+def render(found: Assessment, document: dict[str, Any], verdict: SessionVerdict | None) -> str:
+    """Return the page of an assessment as HTML.
+
+    Parameters
+    ----------
+    found : Assessment
+    document : dict
+        `accuracy.json`.
+    verdict : SessionVerdict or None
+        None where nothing is judged.
+    """
     files = ', '.join(found.recordings[:3]) + (' ...' if len(found.recordings) > 3 else '')
     heads = ('figure', 'value', '95 % interval', *(['state'] if 'qa' in document else []))
     sections = [
@@ -27,6 +38,8 @@ def render(found: Assessment, document: dict[str, Any]) -> str:
         table(heads, [row[: len(heads)] for row in figure_rows(found, document)]),
         *(f'<p class="note">{html.escape(words)}</p>' for words in found.notes),
     ]
+    if verdict is not None and any(verdict.past.values()):
+        sections += ['<h2>Over sessions</h2>', image(control_chart(found, verdict))]
     # A stuck sensor has none, and nothing for logarithmic axes.
     if any(np.any(curve.deviation > 0) for curve in found.allan.values()):
         sections += ['<h2>Allan deviation</h2>', image(_allan(found))]

@@ -27,6 +27,7 @@ from anser_ros.wire.bag_metadata import bag_summary
 from anser_ros.wire.config_folder import config_path
 from anser_ros.wire.tcp_ports import LIVE_VIEW
 
+SCHEMA = 'anser_demo/1'
 PATIENCE_S = 180.0
 """Longest wait for all nodes and the first pose, s; kernels may have to be compiled meanwhile."""
 # The board of the bags in bags/, from which config/demo_model.yaml is calibrated:
@@ -149,7 +150,9 @@ def _draw_left(folder: Path, args: argparse.Namespace) -> int:
 def _report(folder: Path, args: argparse.Namespace, *, interrupted: bool) -> int:
     bag, data = folder / 'bag', folder / DATA
     there = bag.is_dir()
-    summary: dict[str, object] = {'bag': str(bag) if there else None, 'interrupted': interrupted}
+    summary: dict[str, object] = {
+        'schema': SCHEMA, 'bag': str(bag) if there else None, 'interrupted': interrupted,
+    }  # fmt: skip
     if there:
         summary |= bag_summary(bag)
     results = load(data) if data.is_file() else None

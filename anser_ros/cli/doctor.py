@@ -75,7 +75,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command: 0 where nothing is wrong, 2 where something is."""
     if not 0.0 < args.seconds <= LONGEST_LOOK_S:
-        raise ParameterError(f'--seconds must lie in 0 .. {LONGEST_LOOK_S:g}, got {args.seconds}')
+        raise ParameterError(
+            f'--seconds must be above 0 and at most {LONGEST_LOOK_S:g}, got {args.seconds:g}'
+        )
     with progress_of('looking') as tell:
         findings: list[Observation] = []
         for name, look in looks(args.device, args.seconds):

@@ -27,6 +27,7 @@ from anser_ros.settings import Accuracy
 from anser_ros.simulation.effect_draw import CATALOGUE, NONE, RANDOM
 from anser_ros.stamps import NANO
 
+SCHEMA = 'anser_loop/1'
 ALL = 'all'
 CLEAN_S = 6.0
 """Duration of the clean recording, s: 150 frames, whose mean is the references' baseline."""
@@ -43,10 +44,11 @@ effect."""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.epilog = 'example: anser loop --effect coil_gain --seed 31'
+    parser.epilog = 'example: anser loop --effect sensor_gain --seed 31'
     known = ', '.join(sorted(CATALOGUE))
     parser.add_argument(
         '--effect', nargs='+', default=[RANDOM], metavar='NAME',
+        choices=[RANDOM, ALL, NONE, *sorted(CATALOGUE)],
         help=f'{RANDOM}, {ALL} (one after the other), {NONE}, or some of: {known}',
     )  # fmt: skip
     parser.add_argument('--seed', type=int, help='seed of the effect; random by default')
@@ -73,13 +75,13 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     ParameterError
-        When the duration or the seed is out of range, or an effect's name is unknown.
+        When the duration or the seed is out of range.
     DiagnosisError
         When a run records nothing or a diagnosis fails.
     """
     seed = int(np.random.default_rng().integers(1, 2**31)) if args.seed is None else args.seed
     effects = [*sorted(CATALOGUE), NONE] if ALL in args.effect else list(args.effect)
-    _check(args, seed, effects)
+    _check(args, seed)
     missing.check('recorder')
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     # A ROS system that runs already must neither receive nor be received by what is simulated
@@ -93,7 +95,9 @@ def run(args: argparse.Namespace) -> int:
     if args.clean:
         say.print(f'a clean recording, {args.clean:g} s')
         clean = record(Run(folder / 'clean', world.setup, args.clean))
-    document: dict[str, Any] = {'data': 'simulated', 'folder': str(folder), 'rounds': []}
+    document: dict[str, Any] = {
+        'schema': SCHEMA, 'data': 'simulated', 'folder': str(folder), 'rounds': [],
+    }  # fmt: skip
     for number, effect in enumerate(effects):
         where = f'round {number + 1} of {len(effects)}: '
 
@@ -114,16 +118,13 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _check(args: argparse.Namespace, seed: int, effects: list[str]) -> None:
+def _check(args: argparse.Namespace, seed: int) -> None:
     if not 10.0 <= args.duration <= 600.0:
         raise ParameterError(f'--duration must be 10 to 600 s, got {args.duration:g}')
     if args.clean and not 2.0 <= args.clean <= 600.0:
         raise ParameterError(f'--clean must be 0 or 2 to 600 s, got {args.clean:g}')
     if seed < 1:
         raise ParameterError(f'--seed must be at least 1, got {seed}')
-    for name in effects:
-        if name not in (*CATALOGUE, NONE, RANDOM):
-            raise ParameterError(f'no effect {name!r}; there are: {", ".join(sorted(CATALOGUE))}')
 
 
 def _round(

@@ -88,7 +88,6 @@ def import_bag(
     channels: dict[str, int] = {}
     types: dict[str, str] = {}
     seen: set[str] = set()
-    clash = ''
     with BagWriter(out) as writer:
         for message in read_foreign(path, salvage):
             seen.add(message.topic)
@@ -101,7 +100,7 @@ def import_bag(
                 continue
             if types.setdefault(topic, message.type_name) != message.type_name:
                 clash = f'{topic} would have {types[topic]} and {message.type_name}'
-                break
+                raise BagError(f'{os.fspath(path)}: {clash}')
             if topic not in channels:
                 text = cdr.DEFINITIONS.get(message.type_name, message.definition)
                 if not text:
@@ -110,14 +109,10 @@ def import_bag(
                 channels[topic] = _channel(writer, topic, message.type_name, text)
             writer.write(channels[topic], message.log_time_ns, message.data)
             written[topic] += 1
-    if clash:
-        out.unlink()
-        raise BagError(f'{os.fspath(path)}: {clash}')
-    missing = sorted(set(names) - seen)
-    if missing or not written:
-        out.unlink()
-        what = f'no topic {", ".join(missing)}; there are: {", ".join(sorted(seen))}'
-        raise BagError(f'{os.fspath(path)}: {what if missing else "no message can be read"}')
+        missing = sorted(set(names) - seen)
+        if missing or not written:
+            what = f'no topic {", ".join(missing)}; there are: {", ".join(sorted(seen))}'
+            raise BagError(f'{os.fspath(path)}: {what if missing else "no message can be read"}')
     return ImportedBag(dict(written), dict(left_out), salvage.lost)
 
 

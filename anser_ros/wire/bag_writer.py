@@ -95,11 +95,18 @@ class _PackedIndices:
 
 
 class _Closing(ABC):
-    """Is closed at the end of a ``with`` block."""
+    """Is closed at the end of a ``with`` block.
+
+    A block that fails leaves no file, as half of one would be taken for a whole session.
+    """
 
     @abstractmethod
     def close(self) -> None:
         """Write what is left and close the file."""
+
+    @abstractmethod
+    def _remove(self) -> None:
+        """Remove the closed file."""
 
     def __enter__(self) -> Self:
         return self
@@ -110,7 +117,11 @@ class _Closing(ABC):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self.close()
+        try:
+            self.close()
+        finally:
+            if kind is not None:
+                self._remove()
 
 
 class BagWriter(_Closing):
@@ -133,6 +144,7 @@ class BagWriter(_Closing):
         self.path = Path(path)
         self.record = BagRecord()
         self._reserve: int | None = None
+        self._is_made = raw is None
         try:
             if raw is None:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -244,6 +256,10 @@ class BagWriter(_Closing):
             raise
         return descriptor
 
+    def _remove(self) -> None:
+        if self._is_made:
+            self.path.unlink(missing_ok=True)
+
     def _free_space(self) -> None:
         if self._reserve is not None:
             os.close(self._reserve)
@@ -327,6 +343,9 @@ class SessionWriter(_Closing):
     def close(self) -> None:
         """Write the index and close the file."""
         self._bag.close()
+
+    def _remove(self) -> None:
+        self._bag._remove()
 
     def _channel(self, topic: str, type_name: str, latched: bool = False) -> int:
         if topic not in self._channels:

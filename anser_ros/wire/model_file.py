@@ -18,8 +18,10 @@ def read_document(path: str | os.PathLike[str]) -> Any:
     try:
         with open(name, encoding='utf-8') as stream:
             return read_yaml(stream.read(MOST_CHARACTERS + 1))
-    except (OSError, UnicodeError) as error:
-        raise ModelFileError(f'{name}: {error}') from error
+    except OSError as error:
+        raise ModelFileError(f'{name}: {error.strerror}') from error
+    except UnicodeError as error:
+        raise ModelFileError(f'{name}: not a text: {error}') from error
     except (yaml.YAMLError, ValueError) as error:
         raise ModelFileError(f'{name}: not YAML: {" ".join(str(error).split())}') from error
 
@@ -36,4 +38,4 @@ def write_document(path: str | os.PathLike[str], document: Any) -> None:
         os.chmod(temporary, 0o644)
         os.replace(temporary, name)
     except OSError as error:
-        raise ModelFileError(f'{name}: {error}') from error
+        raise ModelFileError(f'{name}: {error.strerror}') from error
