@@ -4,9 +4,13 @@ import io
 import json
 import sys
 
+import numpy as np
 import pytest
 from conftest import REPO
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
+from anser_ros.cli.labels import Label, name_points
 from anser_ros.cli.main import main
 from anser_ros.cli.setup_parts import GEOMETRY, coil_of, document_of, emitter_of, text_of
 from anser_ros.physics.board import KINDS
@@ -119,3 +123,21 @@ def test_a_folder_that_takes_no_file_is_found_before_the_work(capsys):
     ):
         assert main(command) == 2
         assert 'nothing can be written into /proc' in capsys.readouterr().err
+
+
+def test_names_of_close_points_cover_neither_each_other_nor_the_points():
+    figure = Figure(figsize=(5, 4), layout='constrained')
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.set(xlim=(-0.2, 0.2), ylim=(-0.2, 0.2))
+    places = np.random.default_rng(3).normal(0, 0.02, (14, 2))
+    labels = [Label(f'coil {k}', tuple(at), (0.1, 0.0)) for k, at in enumerate(places.tolist())]
+    figure.draw_without_rendering()
+    name_points(axes, labels, places, 6.0)
+    figure.draw_without_rendering()
+    boxes = [text.get_window_extent() for text in axes.texts if text.get_text()]
+    assert len(boxes) == len(labels)
+    for k, box in enumerate(boxes):
+        assert not any(box.overlaps(other) for other in boxes[:k])
+        assert not any(box.contains(*at) for at in axes.transData.transform(places))
+        assert axes.get_window_extent().contains(*box.min)

@@ -5,12 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
+from anser_ros.cli.labels import Label, name_points
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.clouds import Region
 from anser_ros.refit.design import Design
 
 ARROW = 0.15
 """Length of an axis in the picture, in halves of the board."""
+ARROW_POINTS = 8
+"""Points of an arrow that no number should cover."""
+LETTERS_PT = 8.0
+"""Size of the coils' numbers, points."""
 
 
 def write_figure(
@@ -27,7 +32,7 @@ def write_figure(
 
     figure = Figure(figsize=(13.0, 4.2), layout='constrained')
     chosen = list(designs[-1].coils)
-    half = region.half
+    half, named = region.half, []
     for panel, (across, up, words) in enumerate(((0, 1, 'from above'), (0, 2, 'from the side'))):
         axes = figure.add_subplot(1, 3, panel + 1)
         axes.plot(*candidates.position[:, (across, up)].T, '.', color='0.75', label='candidates')
@@ -36,8 +41,19 @@ def write_figure(
             at[:, across], at[:, up], axis[:, across], axis[:, up], angles='xy',
             scale_units='xy', scale=1.0 / (ARROW * half), color='tab:blue', width=0.006,
         )  # fmt: skip
-        for number, point in enumerate(at, start=1):
-            axes.annotate(str(number), point[[across, up]], fontsize=8)
+        sides = [across, up]
+        ends = at[:, sides] + ARROW * half * axis[:, sides]
+        axes.update_datalim(ends)
+        axes.margins(0.12)
+        labels = [
+            Label(str(number), tuple(point), tuple(-way))
+            for number, (point, way) in enumerate(
+                zip(at[:, sides].tolist(), axis[:, sides], strict=True), start=1
+            )
+        ]
+        steps = np.linspace(0.0, 1.0, ARROW_POINTS)[:, None, None]
+        arrows = (at[:, sides] + steps * (ends - at[:, sides])).reshape(-1, 2)
+        named.append((axes, labels, np.vstack([candidates.position[:, sides], arrows])))
         middle = region.centre[0]
         if up == 1:
             side = half * np.array([-1, 1, 1, -1, -1])
@@ -69,4 +85,7 @@ def write_figure(
     for legend_of in (figure.axes[0], axes):
         # Below, where no place and no error lies.
         legend_of.legend(fontsize=8, loc='upper center', bbox_to_anchor=(0.5, -0.14), ncols=2)
+    figure.draw_without_rendering()
+    for panel_axes, labels, drawn in named:
+        name_points(panel_axes, labels, drawn, LETTERS_PT)
     save(figure, path)

@@ -177,6 +177,7 @@ def _gains(metals: Sequence[StatedMetal], coils: Sequence[int], k: int) -> Array
             cross = cross - np.linalg.solve(factor, cross[:, rows].T).T @ half
             parts = half.reshape(len(rows), -1, k)
             blocks = blocks - np.einsum('rck,rcl->ckl', parts, parts, optimize=True)
+        blocks[list(coils)] = np.eye(k)  # nothing is left of what is chosen: these are singular
         each = cross.reshape(len(cross), -1, k).transpose(1, 2, 0)
         total += np.einsum('ckd,ckd->c', each, np.linalg.solve(blocks, each))
     total[list(coils)] = -np.inf
