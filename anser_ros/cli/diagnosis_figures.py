@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from anser_ros.cli.evaluation_figures import WIDE, spell_out
 from anser_ros.diagnosis.problem import Part, State
 from anser_ros.diagnosis.residuals import tool_parts
 
@@ -51,19 +52,27 @@ def _rms(part: Part, axis: int) -> Array:
 def time_line(before: State, after: State) -> Figure:
     """Draw the residual of every frame over time, without and with the effects."""
     figure, axes = plt.subplots(figsize=(9, 3), layout='constrained')
-    for state, colour, label in ((before, BEFORE, 'before'), (after, AFTER, 'after')):
+    # Larger below: where nothing is corrected, both lie on each other.
+    for state, colour, label, size in (
+        (before, BEFORE, 'before', 6), (after, AFTER, 'after', 3),
+    ):  # fmt: skip
         for part in tool_parts(state):
-            axes.plot(part.view.time, _rms(part, 1), '.', ms=3, color=colour, label=label)
+            axes.plot(part.view.time, _rms(part, 1), '.', ms=size, color=colour, label=label)
     axes.axhline(1.0, color='0.6', lw=0.8)
-    axes.set(xlabel='time, s', ylabel='residual / expected', yscale='log')
-    _legend_once(axes)
+    axes.set(xlabel='time, s', ylabel='residual / expected')
+    sizes = np.concatenate([_rms(part, 1) for one in (before, after) for part in tool_parts(one)])
+    if sizes.max() > WIDE * sizes.min():
+        axes.set(yscale='log')
+        spell_out(axes.yaxis)
+    _legend_beside(figure, axes)
     return figure
 
 
-def _legend_once(axes: Any) -> None:
+def _legend_beside(figure: Figure, axes: Any) -> None:
+    """One entry a label, where it covers nothing that is drawn."""
     handles, labels = axes.get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
-    axes.legend(unique.values(), unique.keys())
+    figure.legend(unique.values(), unique.keys(), loc='outside right upper', fontsize=8)
 
 
 def maps(before: State, after: State) -> Figure:
@@ -110,7 +119,7 @@ def course(path: dict[str, Any], sigma: Any, state: State) -> Figure:
             over.fill_between(time, low, high, color=BEFORE, alpha=0.12, lw=0)
     over.set(xlabel='time, s', ylabel='position, mm')
     for panel in (above, over):
-        panel.legend(fontsize=8)
+        panel.legend(fontsize=8, loc='upper center', bbox_to_anchor=(0.5, -0.16), ncols=3)
         panel.grid(alpha=0.3)
     return figure
 
@@ -127,7 +136,7 @@ def bars(before: State, after: State) -> Figure:
             panel.set_xticks(np.arange(len(names)), names)
             panel.set_xlabel(axis)
     panels[0].set_ylabel('residual / expected')
-    panels[0].legend()
+    _legend_beside(figure, panels[0])
     return figure
 
 

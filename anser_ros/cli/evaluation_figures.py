@@ -27,7 +27,7 @@ MOST_POINTS = 4000
 """Most points that a figure shows of one coil: more cannot be distinguished, and make files
 large."""
 WIDE = 4.0
-"""Largest over smallest sigma from which their axis is logarithmic: on a shorter one, labels at 1,
+"""Largest over smallest value from which their axis is logarithmic: on a shorter one, labels at 1,
 2 and 5 are too few."""
 COVERAGE_SIGMAS = np.linspace(0.0, 4.0, 81)
 """Multiples of sigma for which the share of errors within is drawn, to where all should be."""
