@@ -184,8 +184,9 @@ def clock_words(document: dict[str, Any]) -> list[str]:
             f'± {1e3 * clock["offset_sigma_s"]:.1f} ms {late}'
         )
     if clock['rate_ppm'] is not None:
+        gains = 'gains' if clock['rate_ppm'] > 0 else 'loses'
         lines.append(
-            f'clocks: the tracked one gains {clock["rate_ppm"]:.0f} '
+            f'clocks: the tracked one {gains} {abs(clock["rate_ppm"]):.0f} '
             f'± {clock["rate_sigma_ppm"]:.0f} ppm'
         )
     return lines
