@@ -2,16 +2,13 @@
 
 from datetime import datetime
 
-import matplotlib
-
-matplotlib.use('Agg')
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from anser_ros.assessment.control import ALERT, FAIL, FEWEST, NOTE, PASS, Verdict
+from anser_ros.assessment.control import ALERT, FAIL, FEWEST_SESSIONS, NOTE, PASS, Verdict
 from anser_ros.assessment.history import EarlierFigure, SessionVerdict, figures_of
 from anser_ros.assessment.protocols import Assessment
 from anser_ros.cli.accuracy_document import shown_unit
@@ -53,7 +50,7 @@ def control_chart(found: Assessment, session: SessionVerdict) -> Figure:
 
 
 def _lacking(verdict: Verdict) -> str:
-    return '' if verdict.limits else f' (no limits before {FEWEST} sessions)'
+    return '' if verdict.limits else f' (no limits before {FEWEST_SESSIONS} sessions)'
 
 
 def _draw_limits(panel: Axes, verdict: Verdict, scale: float, count: int) -> None:

@@ -10,9 +10,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from anser_ros.cli.evaluation_figures import WIDE, spell_out
+from anser_ros.cli.evaluation_figures import WIDE
 from anser_ros.diagnosis.problem import Part, State
 from anser_ros.diagnosis.residuals import tool_parts
+from anser_ros.pictures import spell_out
 
 Array = NDArray[np.float64]
 

@@ -103,6 +103,7 @@ class Acquisition(AnserNode):
         self._duplicates = self._skipped = 0
         self._backlog = Backlog()
         self._published_setup = ''
+        self._said: Level | None = None
         self._accuracy = MeasuredAccuracy()
         self._wall_clock = WallClock()
         self._asked_ns = 0
@@ -349,7 +350,19 @@ class Acquisition(AnserNode):
         counters = {name: int(values.get(name, 0)) for name in FAULTS}  # type: ignore[call-overload]
         self._faults.note(counters, time.monotonic())
         level, message = self._verdict(interval)
+        self._say(level, message)
         return Status('', level, message, values)
+
+    def _say(self, level: Level, message: str) -> None:
+        """Write on the console when an error begins, and when all is well (again)."""
+        if level is self._said or level not in (Level.OK, Level.ERROR):
+            return
+        self._said = level
+        device = self.parameters.device if self._port is None else self._port.device
+        if level is Level.OK:
+            self.get_logger().info(f'{device}: {message}')
+        else:  # a line of code has one severity
+            self.get_logger().error(f'{device}: {message}')
 
     def _verdict(self, interval: Interval) -> tuple[Level, str]:
         port = self._port
