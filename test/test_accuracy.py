@@ -30,6 +30,8 @@ from anser_ros.poses.hand_eye_fit import fit_hand_eye
 from anser_ros.poses.recording import write_pose_session
 from anser_ros.poses.sequence import sequence_of
 
+pytestmark = pytest.mark.long
+
 RATE = 20.0
 STILL = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -163,7 +165,6 @@ class TestHummel:
             hits.append(found.low < np.mean(many) < found.high)
         assert 0.83 < np.mean(hits) <= 1.0
 
-    @pytest.mark.long
     def test_a_distorted_field_makes_intervals_wide_enough(self):
         """Lines beside each other err alike then: drawing them again one by one is too sure."""
         grid, true = Grid.of(90, None, 0.05), board(9, 10)
@@ -409,7 +410,6 @@ class TestCommand:
         last = capsys.readouterr().err.strip().splitlines()[-1]
         assert words in last and last.startswith('anser accuracy: ')
 
-    @pytest.mark.long
     def test_points_against_the_optical_reference(self, tmp_path, capsys):
         """A bag with a body that rests now and then, seen by both trackers."""
         rng = rng_of(21)

@@ -8,6 +8,8 @@ import pytest
 from anser_ros.cli.main import main
 from anser_ros.sessions.session import load_session
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).resolve().parents[1]
 NAMES = ('factory', 'moving', 'metal', 'scan')
 

@@ -20,6 +20,8 @@ from anser_ros.cli.summary import Outcome, row_of, write_summary
 from anser_ros.errors import BagError, ParameterError
 from anser_ros.poses.recording import write_pose_session
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope='module')
 def sessions(tmp_path_factory):
@@ -70,7 +72,6 @@ def test_several_sessions_of_evaluate_are_a_table_with_their_failures(sessions, 
 
 
 @pytest.mark.processes
-@pytest.mark.long
 def test_a_worker_that_dies_loses_nothing(sessions, alone, tmp_path, capfd):
     """The only worker of a cluster is killed in the midst of its first session."""
     from distributed import LocalCluster

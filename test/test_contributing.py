@@ -10,6 +10,8 @@ from conftest import REPO
 
 from anser_ros.cli.commands import OFFLINE
 
+pytestmark = pytest.mark.long
+
 TEXT = (REPO / 'CONTRIBUTING.md').read_text()
 CHECK = REPO / '.ci' / 'check_yaml.py'
 

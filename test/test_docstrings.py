@@ -4,8 +4,11 @@ import ast
 import re
 from pathlib import Path
 
+import pytest
 from conftest import by_room
 from source_trees import nodes_of
+
+pytestmark = pytest.mark.long
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 

@@ -13,6 +13,8 @@ from anser_ros.assessment.intervals import (
 from anser_ros.assessment.stability import allan_deviation, assess_rest
 from anser_ros.poses.sequence import sequence_of
 
+pytestmark = pytest.mark.long
+
 STILL = np.array([0.0, 0.0, 0.0, 1.0])
 
 

@@ -24,6 +24,8 @@ from anser_ros.settings import Accuracy
 from anser_ros.tracking.tracker import Tracker
 from anser_ros.wire.setup import Coil, Emitter, SensorSpec, Setup, dump_setup, parse_setup
 
+pytestmark = pytest.mark.long
+
 BASE_M = 0.017
 ACCURACY = Accuracy(flux_noise_t=1e-14, optical_position_m=1e-6, optical_rotation_rad=1e-6)
 NAMES, TONES = ('one', 'two'), (70.0, 72.0)
@@ -191,12 +193,10 @@ class TestOnePlace:
         assert set(found.sensor_widths) == set(KINDS)
         assert np.median(np.abs(found.held_out.error)) < 1e-3 * found.residuals.span_t
 
-    @pytest.mark.long
     def test_sound_sensors_are_not_named(self):
         found = calibrated(resting(np.random.default_rng(5)))
         assert found.model.effects == () and found.scan.reported_effects == ()
 
-    @pytest.mark.long
     def test_without_anything_asked_for_sensors_are_as_stated(self):
         wrong = (3, 10, 17, 28, 41, 44, 51, 57)
         measured = resting(np.random.default_rng(6), inverted=wrong)
@@ -230,7 +230,6 @@ class TestOnePlace:
         with pytest.raises(TrackingError, match='single coil'):
             Tracker(None, measured.sensors)
 
-    @pytest.mark.long
     def test_the_command_writes_places_and_what_is_inverted(self, tmp_path, capsys):
         measured = resting(np.random.default_rng(8), inverted=(2, 21), count=40)
         table = measured.sensors

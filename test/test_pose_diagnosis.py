@@ -12,6 +12,8 @@ from anser_ros.errors import DiagnosisError, PlausibilityError
 from anser_ros.poses.diagnosis import diagnose_poses
 from anser_ros.poses.recording import write_pose_session
 
+pytestmark = pytest.mark.long
+
 
 def named(found):
     return {record.name: record for record in found.records if record.name != 'hand_eye'}
@@ -21,7 +23,6 @@ def hand_eyes(found):
     return [record for record in found.records if record.name == 'hand_eye']
 
 
-@pytest.mark.long
 def test_a_clean_session_has_hand_eye_alone_and_knows_how_well():
     world = World(1)
     found = diagnose_poses(world.session())
@@ -134,7 +135,6 @@ CASES = [
 ]
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(('change', 'expected'), CASES, ids=[c[0].__name__ for c in CASES])
 def test_one_thing_wrong_is_named_with_its_size(change, expected):
     world = World(2)
@@ -156,7 +156,6 @@ def read_as(order, sign=1):
     return change
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ('change', 'convention'),
     [
@@ -174,7 +173,6 @@ def test_another_order_or_sense_of_quaternions_is_named_and_undone(change, conve
     assert found.after.position_m < 1e-3
 
 
-@pytest.mark.long
 def test_inches_are_named():
     world = World(3, duration=20.0, sensors=1)
 
@@ -187,7 +185,6 @@ def test_inches_are_named():
     assert found['frame_convention'].parameters['unit'] == 'inch taken for mm'
 
 
-@pytest.mark.long
 def test_files_that_do_not_belong_together_are_refused():
     one, other = World(4, duration=20.0).session(), World(5, duration=20.0).session()
     with pytest.raises(PlausibilityError, match='do not belong together'):
@@ -222,7 +219,6 @@ def test_a_lever_arm_that_the_motion_does_not_tell_is_not_given():
     assert not record.evidence['observable']
 
 
-@pytest.mark.long
 def test_the_command_writes_the_documents_that_are_promised(tmp_path, capsys):
     bag, out = tmp_path / 'a.mcap', tmp_path / 'out'
     write_pose_session(bag, World(8, duration=15.0, sensors=1).session())

@@ -12,6 +12,8 @@ from anser_ros.calibration.sensor_survey import SensorSurveyor
 from anser_ros.calibration.survey_records import contradiction_words, undetermined_words
 from anser_ros.settings import Accuracy
 
+pytestmark = pytest.mark.long
+
 EIGHT = np.array([[x, y, 0.0] for x in (-0.09, 0.0, 0.09) for y in (-0.09, 0.0, 0.09) if x or y])
 
 
@@ -23,14 +25,12 @@ def surveyed(seed, coils, seconds, turn_rad, errors, centres=EIGHT, flat=False):
     return SensorSurveyor([told], KINDS, world.generator, Accuracy()).fit(), truth
 
 
-@pytest.mark.long
 def test_a_camera_that_jitters_shifts_neither_field_nor_tool():
     found, truth = surveyed(26, 3, 20.0, 0.6, Errors(jitter=4.3))
     assert np.abs(found.survey('tool').lever_arm - truth.lever).max() < 1e-4
     assert 5e-6 < found.shift_sigma_m < 5e-5
 
 
-@pytest.mark.long
 def test_a_scan_without_turns_tells_no_lever_arm_and_poses_know_it():
     found, _ = surveyed(22, 3, 6.0, 0.01, Errors(), CENTRES)
     assert 'lever_arm' in found.undetermined

@@ -168,6 +168,7 @@ def calibrated(world):
     )
 
 
+@pytest.mark.long
 def test_calibration_reaches_the_noise_and_says_so(world, calibrated):
     assert 0.8 * NOISE_T < calibrated.fit.noise_t < 2.5 * NOISE_T
     assert calibrated.model.flux_error_t == calibrated.held_out.flux_error_t < 3 * NOISE_T
@@ -180,6 +181,7 @@ def test_calibration_reaches_the_noise_and_says_so(world, calibrated):
     assert true_error < 1e-3 * rms(world.flux(points, axes))
 
 
+@pytest.mark.long
 def test_held_out_error_is_no_smaller_than_the_fit(calibrated):
     assert rms(calibrated.held_out.error) > calibrated.residuals.rmse_t
 

@@ -24,6 +24,8 @@ from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.tangent import tangents, tilted
 from anser_ros.settings import Accuracy
 
+pytestmark = pytest.mark.long
+
 FRAMES, RATE_HZ, OPTICAL_HZ = 500, 25.0, 60.0
 OFFSET_S, LEVER_M = 0.018, np.array([0.3e-3, -0.4e-3, 0.2e-3])
 GLITCHES = (100, 400, 777)
@@ -221,7 +223,6 @@ def test_tangents_are_across():
     assert np.allclose(np.einsum('stj,suj->stu', pair, pair), np.eye(2))
 
 
-@pytest.mark.long
 def test_sessions_that_say_different_things_of_a_sensor_are_told(dirty):
     told, whole, _ = dirty
     halves = [told.frames(np.arange(0, 250)), told.frames(np.arange(250, 500))]

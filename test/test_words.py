@@ -10,7 +10,10 @@ import tokenize
 from itertools import zip_longest
 from pathlib import Path
 
+import pytest
 from conftest import by_room
+
+pytestmark = pytest.mark.long
 
 PACKAGE = Path(__file__).resolve().parents[1] / 'anser_ros'
 FEWEST_WORDS = 4
