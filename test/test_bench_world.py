@@ -120,7 +120,7 @@ def test_two_scatterers_answer_to_each_other(world):
 
 
 @pytest.mark.long
-def test_a_session_reads_as_the_contract_says(world, tmp_path):
+def test_a_session_reads_as_the_interfaces_say(world, tmp_path):
     make, boards = world('make'), world('boards')
     board = boards.build(1, np.random.default_rng(7))
     (tmp_path / 'truth').mkdir()

@@ -68,7 +68,7 @@ def done(factory_calibration):
 
 
 @pytest.mark.long
-def test_calibration_json_is_the_contracts(done):
+def test_calibration_json_is_that_of_the_interfaces(done):
     document = json.loads((done / 'calibration.json').read_text())
     assert document['schema'] == 'anser_calibration/1'
     assert document['n_measurements'] == 169 * 9

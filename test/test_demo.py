@@ -251,8 +251,10 @@ def test_demo_runs_and_reports(start, tmp_path):
     unheard = max(10, round(0.1 * len(frames)))
     lost = count('acquisition', 'windows_withheld', 'windows_lost', 'windows_skipped')
     assert round((end - begin) * 50) + 1 - len(frames) <= lost + unheard
-    refused = [f'frames_{state}' for state in STATES if state != OK]
-    refused = count('tracker', 'frames_skipped') + count('tracker: tool_a', *refused)
+    refused = count('tracker: tool_a', *(f'frames_{state}' for state in STATES if state != OK))
+    # The disc comes after this, so none is refused for metal; a stall costs a few at its end.
+    assert refused < 0.2 * len(frames)
+    refused += count('tracker', 'frames_skipped')
     assert len(frames - tracked - recorded) <= refused + unheard
     assert min(len(of_one) for of_one in stamps) > 0.95 * len(tracked)
     assert len(stamps) == 10

@@ -16,6 +16,7 @@ from anser_ros.pose_states import STATES
 from anser_ros.sessions.diagnosis_document import DEPENDENCIES
 from anser_ros.sessions.starting_model import board_of
 from anser_ros.wire.points import flux_fields
+from anser_ros.wire.setup import KEYS
 
 DOCS = REPO / 'docs'
 # Builds the site where no socket can be opened.
@@ -90,7 +91,7 @@ sensors:
         keys = set(re.findall(r"\b_?(?:take|number|whole)\(\w+, '(\w+)'", code))
         keys |= set(re.findall(r"\.get\('(\w+)'", code))
         assert {'channel', 'pitch_m', 'rotation_deg', 'sides'} <= keys
-        for key in keys | set(KINDS):
+        for key in keys | set(KINDS) | set(KEYS):
             assert f'`{key}`' in page('setup'), key
 
 

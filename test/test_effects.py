@@ -17,7 +17,7 @@ from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 from anser_ros.physics.sensor import SensorTable
 
-CONTRACT = {
+REQUIRED = {
     'sensor_gain', 'sensor_axis', 'sensor_polarity', 'sensor_size', 'lever_arm', 'registration',
     'time_offset', 'channel_crosstalk', 'coil_crosstalk', 'coil_drift', 'coil_moved', 'pickup',
     'saturation', 'phase_delay', 'static_metal', 'conductive_plate', 'moving_metal',
@@ -32,9 +32,9 @@ def scenery():
     return made, made.problem()
 
 
-def test_every_name_of_the_contract_is_found():
+def test_every_name_of_the_interfaces_is_found():
     effects = all_effects()
-    assert set(effects) >= CONTRACT
+    assert set(effects) >= REQUIRED
     for name, effect in effects.items():
         assert effect.name == name
         assert effect.summary

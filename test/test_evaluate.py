@@ -86,7 +86,7 @@ def test_without_a_gate_a_drawn_board_has_its_figures_in_the_lab(shared):
 
 
 @pytest.mark.long
-def test_files_and_json_are_the_contracts(model, tmp_path, capsys):
+def test_files_and_json_are_those_of_the_interfaces(model, tmp_path, capsys):
     arguments = ['evaluate', str(BAGS / 'moving.mcap'), '--model', str(model), '--json']
     assert main([*arguments, '--out', str(tmp_path)]) == 0
     document = json.loads(capsys.readouterr().out)

@@ -212,7 +212,8 @@ def test_the_chain_in_one_process_is_the_same_three_nodes(ros, start, tmp_path):
     assert spin_until(node, lambda: len(poses) > 50, 60.0), live.output
     names = {f'{space}/{name}' for name, space in node.get_node_names_and_namespaces()}
     assert {'/x/acquisition', '/x/field_model', '/x/guide'} <= names
-    assert {'x/acquisition', 'x/field_model', 'x/guide'} <= set(levels)
+    # Each speaks once a second, and in a pause between two frames.
+    assert spin_until(node, lambda: {'x/acquisition', 'x/field_model', 'x/guide'} <= set(levels))
     client = node.create_client(GetParameters, '/x/guide/get_parameters')
     assert client.wait_for_service(10)
     future = client.call_async(GetParameters.Request(names=['gate']))

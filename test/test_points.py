@@ -46,7 +46,7 @@ def test_flag_bits_are_those_that_others_write_and_read():
     assert (SATURATED, STALE, DROPPED) == (1, 2, 4)
 
 
-def test_flux_layout_is_the_contracts():
+def test_flux_layout_is_that_of_the_interfaces():
     points = flux_points()
     fields, step, data = encode_flux(points)
     assert step == 92

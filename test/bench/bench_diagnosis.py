@@ -191,7 +191,7 @@ def judged(outcome: Outcome, unknown: bool, allowed: set[str]) -> str:
 
 
 def _compare(outcome: Outcome) -> None:
-    """Errors of the parameters against the contract's limits and against their sigmas."""
+    """Errors of the parameters against the limits asked for and against their sigmas."""
     for finding in outcome.found.findings:
         record = finding.record
         truth = outcome.truth.get(record.name, {})

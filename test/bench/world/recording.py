@@ -1,4 +1,4 @@
-"""Writes a laboratory's recordings as bags in the contract's layout.
+"""Writes a laboratory's recordings as bags in the layout of docs/interfaces.md.
 
 Of `anser_ros` only the writer of bags and the byte layout of the clouds are used.
 """
