@@ -29,7 +29,7 @@ from anser_ros.nodes.output_parts.live_view import LiveView, read_pose
 from anser_ros.nodes.output_parts.polled import polling_node
 from anser_ros.nodes.output_parts.traces import latency_of
 from anser_ros.nodes.output_parts.view_source import ViewSource
-from anser_ros.sessions.volume import pose_volume
+from anser_ros.sessions.volume import tracked_volume
 from anser_ros.web import loop as loop_module
 from anser_ros.web.folder import RESULTS, RecordingFolder
 from anser_ros.web.guard import COOKIE, MOST_PAGES, Guard
@@ -71,7 +71,7 @@ def test_the_drawn_volume_is_that_in_which_poses_are_accepted(ros, stated):
         setup = replace(parse_setup(ten_sensors()), volume=stated)
         source.setup_text = dump_setup(setup)
         source.look()
-        volume = pose_volume(setup)
+        volume = tracked_volume(setup)
         assert source.world()['volume_m'] == [list(volume.low), list(volume.high)]
     finally:
         node.destroy_node()

@@ -12,7 +12,7 @@ from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit.clouds import default_clouds
 from anser_ros.refit.excitation import region_of
 from anser_ros.sessions.drawing import Drawing
-from anser_ros.sessions.volume import pose_volume, stated_volume
+from anser_ros.sessions.volume import tracked_volume, stated_volume
 from anser_ros.wire.setup import dump_setup, parse_setup, topic_of
 
 DEMO = Path(__file__).resolve().parents[1] / 'config' / 'demo_setup.yaml'
@@ -149,19 +149,17 @@ def test_a_stated_volume_is_read_and_written():
 
 
 def test_without_a_stated_volume_it_follows_from_the_board():
-    """The tracker's box is the refit's with its fringe: to the digit what it always was."""
+    """Tracker, refit and views have the same box, to the digit."""
     setup = parse_setup(DEMO.read_text())
-    assert pose_volume(setup) == TrackedVolume()
     region = region_of(Drawing.of(setup).field)
-    np.testing.assert_allclose(region.volume.low, [-0.174, -0.174, 0.045], atol=5e-4)
-    np.testing.assert_allclose(region.volume.high, [0.174, 0.174, 0.302], atol=5e-4)
+    assert tracked_volume(setup) == TrackedVolume() == region.volume
     box = ((-0.1, -0.12, 0.06), (0.1, 0.1, 0.3))
     stated = replace(setup, volume=box)
-    assert pose_volume(stated) == stated_volume(stated) == TrackedVolume(*box)
+    assert tracked_volume(stated) == stated_volume(stated) == TrackedVolume(*box)
     samples = stated_volume(stated).samples()
     np.testing.assert_allclose([samples.min(axis=0), samples.max(axis=0)], box)
     around = [c.positions for c in default_clouds(replace(region, stated=stated_volume(stated)))
               if c.overhead]  # fmt: skip
     assert not any(stated_volume(stated).contains(p) for p in np.concatenate(around))
     other = replace(setup, emitter=replace(setup.emitter, kind='somebody'))
-    assert pose_volume(other) == TrackedVolume()
+    assert tracked_volume(other) == TrackedVolume()

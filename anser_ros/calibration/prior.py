@@ -26,10 +26,9 @@ second one along z). With three axes a point they are some 2000 equations for at
 dipoles; fewer would leave the field between the points free."""
 MARGIN = 0.3
 """How far beyond the measured volume the drawn field is followed, as a fraction of its half size,
-so that a model extrapolates as the drawing does: a scan as wide as the board then covers the box
-in which poses are accepted, 1.15 times 1.15 as wide (`volume.BESIDE`, `volume.FRINGE`). Smaller
-leaves the field beyond the edge of a scan free; larger spends dipoles on places where nothing
-was measured."""
+so that a model extrapolates as the drawing does: a scan as wide as the board then covers the
+default tracked volume (`volume.REACH`). Smaller leaves the field beyond the edge of a
+scan free; larger spends dipoles on places where nothing was measured."""
 LEAST_HALF_SIZE_M = 0.02
 """Half size of that volume at least, m, for measurements along a line or in a plane: over 2 cm a
 field 10 cm from its coils changes by half, which shows how it falls. Smaller gives a lattice so

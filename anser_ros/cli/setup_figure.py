@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from anser_ros.cli.labels import Label, name_points
 from anser_ros.pictures import save
 from anser_ros.sessions.drawing import Drawing
-from anser_ros.sessions.volume import pose_volume
+from anser_ros.sessions.volume import tracked_volume
 from anser_ros.wire.setup import SensorSpec, Setup
 
 Array = NDArray[np.float64]
@@ -78,7 +78,7 @@ def _board(panel: Any, setup: Setup, across: int, up: int) -> Array:
                 f'{coil.name}\n{coil.frequency_hz:g} Hz', centre[:2], fontsize=6, ha='center',
                 va='center',
             )  # fmt: skip
-    volume = pose_volume(setup)
+    volume = tracked_volume(setup)
     low, high = 1e3 * np.array(volume.low), 1e3 * np.array(volume.high)
     size = high - low
     panel.add_patch(

@@ -13,26 +13,23 @@ from anser_ros.errors import TrackingError
 
 Array = NDArray[np.float64]
 
-FLOOR, CEILING, BESIDE = 0.3, 2.0, 0.15
+FLOOR, CEILING, REACH = 0.345, 2.3, 1.3225
 """The default volume, in halves of the board's larger side: heights over the board from which and
-up to which tools are tracked, and how far they may be outside the board's edge. On the demo board
-that is 45 to 302 mm high and 347 mm wide. A larger volume spreads the refit's samples over where
-no tool is; tools outside a smaller one are tracked with a field that was fitted elsewhere."""
-FRINGE = 1.15
-"""Factor between the default volume and the box in which the tracker accepts poses. The board's
-size tells only about where tools are, so poses a little outside are accepted with the larger
-uncertainty that the field model has there."""
-FRINGE_STEP_M = 0.01
-"""The widened box is rounded to whole centimetres, so that boards of about the same size have the
-same box."""
+up to which tools are tracked, and how far to the side of its middle. On the demo board that is 50
+to 350 mm high and 400 mm wide. A larger volume spreads the refit's samples over where no tool is;
+poses of tools outside a smaller one are withheld. With a box 1.15 times smaller for the refit, the
+errors of `online/approach` and `online/sweep` are the same within 0.5 % (`docs/refit.md`)."""
+STEP_M = 0.01
+"""The default is rounded to whole centimetres, so that boards of about the same size have the same
+volume."""
 
 
 @dataclass(frozen=True)
 class TrackedVolume:
-    """Describes a box, m, frame fg; the default is the tracker's box over an Anser board.
+    """Describes a box, m, frame fg; the default is that over an Anser board.
 
-    It is what `over_board` and `with_fringe` make of the demo's board (`test/test_setup.py`), for
-    setups whose board cannot be drawn.
+    It is what `over_board` makes of the demo's board (`test/test_setup.py`), for setups whose
+    board cannot be drawn.
 
     Attributes
     ----------
@@ -66,22 +63,13 @@ class TrackedVolume:
         half : float
             Half of the board's larger side, m.
         """
-        x, y = (float(value) for value in centre)
-        reach = half + BESIDE * half
-        return cls((x - reach, y - reach, FLOOR * half), (x + reach, y + reach, CEILING * half))
-
-    def with_fringe(self) -> 'TrackedVolume':
-        """Return the box in which the tracker accepts poses if no volume is stated.
-
-        All lengths, seen from the middle of its footprint on the board, are `FRINGE` times as
-        large. The floor rises with them: nearest to the coils a field model is at its worst.
-        """
-        middle = np.array([*self.middle, 0.0])
-        corners = middle + FRINGE * (np.array([self.low, self.high]) - middle)
-        steps = np.round(corners / FRINGE_STEP_M)
+        middle, reach = np.asarray(centre, dtype=np.float64), REACH * half
+        low, high = (*(middle - reach), FLOOR * half), (*(middle + reach), CEILING * half)
+        steps = np.round(np.array([low, high]) / STEP_M)
         steps[0, 2] = max(steps[0, 2], 1.0)  # a small board's floor must stay over its plane
-        (x, y, z), (u, v, w) = np.round(steps * FRINGE_STEP_M, 9).tolist()
-        return TrackedVolume((x, y, z), (u, v, w))
+        steps[1] = np.maximum(steps[1], steps[0] + 1.0)
+        (x, y, z), (u, v, w) = np.round(steps * STEP_M, 9).tolist()
+        return cls((x, y, z), (u, v, w))
 
     @property
     def middle(self) -> Array:

@@ -21,7 +21,7 @@ from anser_ros.refit.baseline import ReadingWindow
 from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.session import Session
 from anser_ros.sessions.starting_model import is_nominal
-from anser_ros.sessions.volume import pose_volume
+from anser_ros.sessions.volume import tracked_volume
 from anser_ros.wire.setup import Setup
 
 ComplexArray = NDArray[np.complex128]
@@ -116,7 +116,7 @@ def board_place_of(model: FieldModel, sensors: SensorTable, setup: Setup) -> Boa
     if board is None or is_nominal(model) or not len(sensors) or not _is_without_metal(model):
         return None
     return BoardPlace(
-        model, board.field, board.centres, pose_volume(setup), sensors, setup.accuracy
+        model, board.field, board.centres, tracked_volume(setup), sensors, setup.accuracy
     )
 
 

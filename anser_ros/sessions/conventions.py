@@ -14,7 +14,7 @@ from anser_ros.errors import PlausibilityError
 from anser_ros.field.measurements import Measurements
 from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.units import FLUX_UNITS, LENGTH_UNITS, unit_words
-from anser_ros.sessions.volume import pose_volume
+from anser_ros.sessions.volume import tracked_volume
 from anser_ros.wire.setup import Setup
 
 Array = NDArray[np.float64]
@@ -183,7 +183,7 @@ def _check_size(path: str, setup: Setup, drawing: Drawing, tool: Measurements) -
     if not whole.any() or drawing.field is None:
         return
     median = float(np.median(np.linalg.norm(tool.flux[whole], axis=1)))
-    there = np.linalg.norm(drawing.field(pose_volume(setup).samples(4, 3)), axis=(1, 2))
+    there = np.linalg.norm(drawing.field(tracked_volume(setup).samples(4, 3)), axis=(1, 2))
     if median > TOO_LARGE * float(there.max()):
         usual = float(np.median(there))
         _check_flux(path, tool, median, median / usual, 'in the tracked volume')

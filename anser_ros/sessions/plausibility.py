@@ -15,7 +15,7 @@ from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.sessions.conventions import check_conventions
 from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.units import LENGTH_UNITS, unit_words
-from anser_ros.sessions.volume import pose_volume
+from anser_ros.sessions.volume import tracked_volume
 from anser_ros.wire.pose_topics import optical_stem
 from anser_ros.wire.setup import Setup, topic_of
 
@@ -226,7 +226,7 @@ def _change(tool: Measurements, begin: float, end: float) -> float:
 def _check_distance(path: str, setup: Setup, tool: Measurements) -> None:
     if tool.track is None:
         return
-    volume = pose_volume(setup)
+    volume = tracked_volume(setup)
     reach = float(np.linalg.norm(np.maximum(np.abs(volume.low), np.abs(volume.high))))
     distance = float(np.median(np.linalg.norm(tool.track.position, axis=1)))
     if distance > FAR * reach:

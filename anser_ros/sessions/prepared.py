@@ -19,7 +19,7 @@ from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.recorded_drift import is_recorded
 from anser_ros.sessions.session import Session, measured_noise
 from anser_ros.sessions.starting_model import check_fits
-from anser_ros.sessions.volume import pose_volume
+from anser_ros.sessions.volume import tracked_volume
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def prepare(
         model,
         Drawing.of(session.setup),
         measured_noise(session.setup),
-        pose_volume(session.setup),
+        tracked_volume(session.setup),
         clean,
         _correction(model, session),
         is_recorded(model, session),

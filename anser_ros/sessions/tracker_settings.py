@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from anser_ros.sessions.session import stamp_sigma, tracking_noise
-from anser_ros.sessions.volume import pose_volume
+from anser_ros.sessions.volume import tracked_volume
 from anser_ros.tracking.estimate import TrackerSettings
 from anser_ros.wire.setup import Setup
 
@@ -15,5 +15,5 @@ def settings_for(setup: Setup, settings: TrackerSettings) -> TrackerSettings:
         flux_noise_t=tracking_noise(setup),
         stamp_sigma_s=stamp_sigma(setup),
         tools=setup.refit.tools,
-        volume=settings.volume or pose_volume(setup),
+        volume=settings.volume or tracked_volume(setup),
     )

@@ -12,11 +12,10 @@ def stated_volume(setup: Setup) -> TrackedVolume | None:
     return None if setup.volume is None else TrackedVolume(*setup.volume)
 
 
-def pose_volume(setup: Setup) -> TrackedVolume:
-    """Return the box in which poses are accepted.
+def tracked_volume(setup: Setup) -> TrackedVolume:
+    """Return the stated volume, or else the default over the setup's board.
 
-    It is the stated volume, or else the default volume over the board with its fringe; a board
-    that can't be drawn from the setup gets the box of an Anser board.
+    A board that can't be drawn from the setup gets the box of an Anser board.
     """
     stated, drawing = stated_volume(setup), Drawing.of(setup).field
     if stated is not None:
@@ -24,6 +23,6 @@ def pose_volume(setup: Setup) -> TrackedVolume:
     if drawing is None:
         return TrackedVolume()
     try:
-        return region_of(drawing).volume.with_fringe()
+        return region_of(drawing).volume
     except FitError:  # a drawing without any field
         return TrackedVolume()

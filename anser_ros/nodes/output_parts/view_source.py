@@ -170,9 +170,9 @@ class ViewSource:
         side = float(side) if isinstance(side, int | float) else COIL_M
         reach = [max(abs(c.centre_m[axis]) for c in coils) + 0.75 * side for axis in (0, 1)]
         # Numba, which it needs, is half of the start of a node that has none; a page comes later.
-        from anser_ros.sessions.volume import pose_volume
+        from anser_ros.sessions.volume import tracked_volume
 
-        volume = pose_volume(view.setup)
+        volume = tracked_volume(view.setup)
         return {
             'board_m': reach,
             'reach_m': max(reach),
