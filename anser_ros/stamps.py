@@ -1,5 +1,6 @@
 """Converts stamps: whole nanoseconds, from a ROS message and back, and what makes them seconds."""
 
+from enum import Enum
 from typing import Any
 
 NANO = 1e-9
@@ -14,10 +15,36 @@ replay that begins again or a clock that was set, forwards a clock that was set 
 as old as a good pose may be to start the tracker's next one from. Smaller, and every short pause
 is called a jump; larger, and a clock that was set passes unnoticed."""
 
-
 LIVE_WITHIN_S = 60.0
 """A stamp further than this from the host's clock, s, is a recording's. Larger than any clock's
 error between two hosts that work together, smaller than the age of any recording."""
+
+
+class Order(Enum):
+    """Says how a stamp follows the last one of its stream."""
+
+    NEXT = 'next'
+    SAME = 'same'
+    LATE = 'late'
+    """Before the last one, by at most `JUMP_NS`."""
+    BACK = 'back'
+    """Farther before the last one: a replay that begins again, or a clock that was set."""
+    AHEAD = 'ahead'
+    """Farther after the last one than a stream may pause."""
+
+
+def order_of(stamp_ns: int, last_ns: int, jump_ns: int = JUMP_NS) -> Order:
+    """Return how a stamp follows the last one, ns; ``jump_ns`` is the longest pause.
+
+    A first stamp, after ``last_ns`` 0, is the next one.
+    """
+    if last_ns == 0 or last_ns < stamp_ns <= last_ns + jump_ns:
+        return Order.NEXT
+    if stamp_ns > last_ns:
+        return Order.AHEAD
+    if stamp_ns == last_ns:
+        return Order.SAME
+    return Order.LATE if stamp_ns >= last_ns - JUMP_NS else Order.BACK
 
 
 def stamp_of(message: Any) -> int:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from anser_ros.errors import LayoutError
-from anser_ros.frames.faults import FAULTS, value_codes
-from anser_ros.frames.intake import BACK, FORWARD, Intake
-from anser_ros.stamps import SECOND_NS
+from anser_ros.frames.faults import FAULTS, MISSING_CODE, reading_codes, value_codes
+from anser_ros.frames.intake import Intake
+from anser_ros.stamps import SECOND_NS, Order, order_of
 from anser_ros.wire.points import DROPPED, SATURATED, STALE
 
 CHANNELS = np.array([5, 3, 8, 1, 7, 2, 9, 4])
@@ -35,6 +35,32 @@ def test_every_fault_has_its_name_and_the_table_has_the_order():
     np.testing.assert_array_equal(value_codes(frame.flux[[0, 5, 6, 7]]), [0, 7, 6, 6])
 
 
+def test_a_recording_is_judged_as_live_frames_are():
+    rng = np.random.default_rng(40)
+    flux = 1e-7 * np.exp(2j * np.pi * rng.random((300, 8, 3)))
+    odd = rng.random(flux.shape) < 0.05
+    flux[odd] = rng.choice([np.nan, 2.0, 1j * np.inf, 0.0, -3j], odd.sum())
+    flags = rng.integers(0, 32, (300, 8)) * (rng.random((300, 8)) < 0.5)
+    intake = Intake(CHANNELS)
+    live = np.array(
+        [intake.judge(1, CHANNELS, f, m).codes for f, m in zip(flux, flags, strict=True)]
+    )
+    recorded = reading_codes(flux, flags)
+    assert set(np.unique(recorded)) == set(range(len(FAULTS) - 1)) - {MISSING_CODE}
+    np.testing.assert_array_equal(recorded, live)
+
+
+@pytest.mark.parametrize(
+    'stamp_s, last_s, order',
+    [
+        (7, 0, Order.NEXT), (7, 6.5, Order.NEXT), (7.5, 6.5, Order.NEXT), (7, 7, Order.SAME),
+        (7, 7.5, Order.LATE), (7, 8, Order.LATE), (7, 8.001, Order.BACK), (9, 7, Order.AHEAD),
+    ],
+)  # fmt: skip
+def test_a_stamp_follows_the_last_one_in_one_of_five_ways(stamp_s, last_s, order):
+    assert order_of(round(stamp_s * SECOND_NS), round(last_s * SECOND_NS)) is order
+
+
 @pytest.mark.parametrize('spares', [False, True])
 @pytest.mark.parametrize('silence', [0.0, np.nan, np.inf])
 def test_a_dead_emitter_is_no_fault_of_the_sensors_for_who_goes_on_without(spares, silence):
@@ -52,7 +78,8 @@ def test_the_order_of_stamps_is_judged_and_counted():
     intake = Intake(CHANNELS, lambda name, by: counts.update({name: by}))
     stamps = [10, 10, 11, 5, 5.5, 20]
     frames = [intake.admit(round(s * SECOND_NS), CHANNELS, flux) for s in stamps]
-    assert [None if f is None else f.jump for f in frames] == [0, None, 0, BACK, 0, FORWARD]
+    assert [f is None for f in frames] == [False, True, False, False, False, False]
+    assert [f.goes_back for f in frames if f is not None] == [False, False, True, False, False]
     assert counts == {'frames': 5, 'duplicates': 1, 'time_jumps': 1, 'time_jumps_forward': 1}
 
 

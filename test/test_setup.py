@@ -12,7 +12,7 @@ from anser_ros.physics.volume import TrackedVolume
 from anser_ros.refit.clouds import default_clouds
 from anser_ros.refit.excitation import region_of
 from anser_ros.sessions.drawing import Drawing
-from anser_ros.sessions.volume import tracked_volume, stated_volume
+from anser_ros.sessions.volume import stated_volume, tracked_volume
 from anser_ros.wire.setup import dump_setup, parse_setup, topic_of
 
 DEMO = Path(__file__).resolve().parents[1] / 'config' / 'demo_setup.yaml'

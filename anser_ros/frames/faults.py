@@ -4,13 +4,14 @@ A reading is one sensor's fluxes of all emitters in one frame. Its first fault i
 `FAULTS` counts. The flag bits are those of `wire.points`.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros import pose_states as states
 from anser_ros.physics.sensor import LARGEST_FLUX_T
+from anser_ros.wire import points
 
 
 class Fault(NamedTuple):
@@ -35,6 +36,12 @@ GOOD = 0
 """Code of a reading without a fault; the codes of faults are their places in `FAULTS`."""
 MISSING_CODE, SATURATED_CODE, STALE_CODE, DROPPED_CODE, FLAGGED_CODE = 1, 2, 3, 4, 5
 """Codes of what the frame itself says: no such channel, or a flag."""
+FLAG_CODES = (
+    (points.SATURATED, SATURATED_CODE),
+    (points.STALE, STALE_CODE),
+    (points.DROPPED, DROPPED_CODE),
+)
+"""Flag bits and their codes; the first that is set counts. Any other bit is `FLAGGED_CODE`."""
 NOT_FINITE_CODE, ABSURD_CODE = 6, 7
 """Codes of what the values say."""
 STUCK_CODE = 8
@@ -71,3 +78,26 @@ def value_codes(flux: NDArray[np.complex128]) -> NDArray[np.int64]:
         largest = np.maximum(np.abs(flux.real), np.abs(flux.imag)).max(axis=-1, initial=0.0)
     codes = np.where(largest < LARGEST_FLUX_T, GOOD, ABSURD_CODE)
     return np.where(np.isfinite(largest), codes, NOT_FINITE_CODE)
+
+
+def reading_codes(
+    flux: NDArray[np.complex128], flags: NDArray[np.integer[Any]]
+) -> NDArray[np.int64]:
+    """Return what is wrong with recorded readings, as `frames.intake` says it of live ones.
+
+    Parameters
+    ----------
+    flux : ndarray, shape (..., K), complex
+        T.
+    flags : ndarray, shape (...), int
+        Flag bits of `wire.points`; a channel that is not in its frame has `STALE` and NaN.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Places in `FAULTS`; `GOOD` for readings that can be used.
+    """
+    codes = np.where(flags == 0, value_codes(flux), FLAGGED_CODE)
+    for bit, code in reversed(FLAG_CODES):
+        codes[(flags & bit) != 0] = code
+    return codes

@@ -18,16 +18,12 @@ from anser_ros.errors import AnserError, LayoutError
 from anser_ros.frames import faults
 from anser_ros.frames.faults import FAULTS, GOOD
 from anser_ros.physics.sensor import LARGEST_FLUX_T
-from anser_ros.stamps import JUMP_NS, NANO
-from anser_ros.wire.points import DROPPED, SATURATED, STALE
+from anser_ros.stamps import JUMP_NS, NANO, Order, order_of
 
 Integers = NDArray[np.int64]
 ComplexArray = NDArray[np.complex128]
 Count = Callable[[str, int], None]
 """Takes a counter's name and by how much it rises."""
-
-BACK, FORWARD = -1, 1
-"""Values of `Frame.jump`."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +42,8 @@ class Frame:
         What is wrong with each reading: places in `frames.faults.FAULTS`, 0 for nothing.
     living : ndarray of bool, shape (K,), or None
         Emitters that a usable sensor hears; None when all are heard, or none at all.
-    jump : int
-        `BACK` or `FORWARD` where the stamp is not the next one, else 0.
+    goes_back : bool
+        Whether the stamp is before that of the frame before.
     """
 
     stamp_ns: int
@@ -55,7 +51,7 @@ class Frame:
     flux: ComplexArray
     codes: Integers
     living: NDArray[np.bool_] | None = None
-    jump: int = 0
+    goes_back: bool = False
 
     @property
     def usable(self) -> NDArray[np.bool_]:
@@ -153,16 +149,15 @@ class Intake:
         """
         frame = self.judge(stamp_ns, channels, flux, flags, None if emitters is None else
                            len(emitters))  # fmt: skip
-        last_ns = self.last_ns
-        if stamp_ns == last_ns:
+        order = order_of(stamp_ns, self.last_ns, round(jump_s / NANO))
+        if order is Order.SAME:
             self._note('duplicates')
             return None
-        jump = 0
-        if stamp_ns < last_ns:
-            jump = BACK
+        # A frame that is only a little late has no place in what was solved since either.
+        goes_back = order in (Order.LATE, Order.BACK)
+        if goes_back:
             self._note('time_jumps')
-        elif 0 < last_ns < stamp_ns - jump_s / NANO:
-            jump = FORWARD
+        elif order is Order.AHEAD:
             self._note('time_jumps_forward')
         self.last_ns = stamp_ns
         self._note('frames')
@@ -173,7 +168,7 @@ class Intake:
             self._note('frames_dead_emitter')
             silent = np.flatnonzero(~frame.living).tolist()
             self.dead = tuple(f'emitter {k}' if emitters is None else emitters[k] for k in silent)
-        return replace(frame, jump=jump) if jump else frame
+        return replace(frame, goes_back=True) if goes_back else frame
 
     def _note(self, name: str) -> None:
         if self._count is not None:
@@ -262,15 +257,11 @@ def fill_frame(given, marks, rows, largest, spares_dead, flux, codes, received):
                 flux[s, k] = complex(math.nan, math.nan)
             continue
         bits = marks[row]
-        codes[s] = GOOD
-        if bits & SATURATED:
-            codes[s] = faults.SATURATED_CODE
-        elif bits & STALE:
-            codes[s] = faults.STALE_CODE
-        elif bits & DROPPED:
-            codes[s] = faults.DROPPED_CODE
-        elif bits:
-            codes[s] = faults.FLAGGED_CODE
+        codes[s] = faults.FLAGGED_CODE if bits else GOOD
+        for bit, code in faults.FLAG_CODES:
+            if bits & bit:
+                codes[s] = code
+                break
         for k in range(width):
             value = given[row, k]
             flux[s, k] = value

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 
 from anser_ros.frames.faults import STUCK_CODE
-from anser_ros.frames.intake import BACK, Frame
+from anser_ros.frames.intake import Frame
 from anser_ros.stamps import NANO
 
 LEAST_NOISE = 0.1
@@ -139,7 +139,7 @@ class Freshness:
         noise_t : float
             Stated noise of a phasor component, T.
         """
-        if frame.jump == BACK or self._ring.shape[1:] != frame.flux.shape:
+        if frame.goes_back or self._ring.shape[1:] != frame.flux.shape:
             self._forget(frame.flux.shape)
         some = compare(
             frame.flux, frame.codes, self._ring, self._filled, self._newest, self._sums,

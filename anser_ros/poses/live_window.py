@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from anser_ros.poses.sequence import REFERENCE, PoseSequence, PoseSession, sequence_of
-from anser_ros.stamps import JUMP_NS, NANO
+from anser_ros.stamps import NANO, Order, order_of
 
 LIVE = 'live'
 """What stands in place of a path in the sessions of running trackers."""
@@ -41,7 +41,7 @@ class PoseWindow:
     def take(self, name: str, stamp_ns: int, pose: Sequence[float]) -> None:
         """Keep a pose (x y z in m, quaternion x y z w) of a stream; NaN where it has none."""
         rows = self._rows[name]
-        if rows and stamp_ns < rows[-1][0] - JUMP_NS:
+        if order_of(stamp_ns, rows[-1][0] if rows else 0) is Order.BACK:
             self.restarts, self.first_ns = self.restarts + 1, 0
             for one in self._rows.values():
                 one.clear()

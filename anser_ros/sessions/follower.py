@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from anser_ros.errors import BagError, FitError
-from anser_ros.frames.faults import GOOD, value_codes
+from anser_ros.frames.faults import GOOD, reading_codes
 from anser_ros.integrity.ageing import FrameModel, ModelAge
 from anser_ros.pose_states import OK, REFERENCES_LOST, Withheld
 from anser_ros.refit.baseline import check_enough
@@ -118,7 +118,7 @@ class ModelFollower:
         if correction.changes_flux:
             time = (stamp_ns - self._prepared.session.start_ns) * NANO
             flux = correction.flux(time, tools.channels, flux)
-        usable = (tools.flags == 0) & (value_codes(flux) == GOOD)
+        usable = reading_codes(flux, tools.flags) == GOOD
         sensors, readings = correction.sensors(), []
         for estimate in found:
             if estimate.state != OK or estimate.rotation is None:

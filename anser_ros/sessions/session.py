@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from anser_ros.errors import BagError
 from anser_ros.field.measurements import Measurements
-from anser_ros.frames.faults import GOOD, value_codes
+from anser_ros.frames.faults import GOOD, reading_codes
 from anser_ros.physics.pose_track import PoseTrack
 from anser_ros.physics.sensor import SensorTable, Windings
 from anser_ros.sessions.plausibility import plausible_tools
@@ -123,15 +123,13 @@ def _columns(
 ) -> tuple[NDArray[np.complex128], NDArray[np.bool_], NDArray[np.int64]]:
     """Flux (F, S, K), validity and flags (F, S) in the order of the sensor table."""
     flux = np.full((stream.stamp_ns.size, len(sensors), stream.flux.shape[2]), np.nan, complex)
-    valid = np.zeros(flux.shape[:2], dtype=bool)
     flags = np.full(flux.shape[:2], STALE, dtype=np.int64)
     place = {int(channel): i for i, channel in enumerate(stream.channel)}
     for column, channel in enumerate(sensors.channel.tolist()):
         if channel in place:
             flux[:, column] = stream.flux[:, place[channel]]
             flags[:, column] = stream.flags[:, place[channel]]
-            valid[:, column] = (flags[:, column] == 0) & (value_codes(flux[:, column]) == GOOD)
-    return flux, valid, flags
+    return flux, reading_codes(flux, flags) == GOOD, flags
 
 
 def _tool(

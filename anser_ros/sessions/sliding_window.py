@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.sessions.session import Session, session_of
-from anser_ros.stamps import JUMP_NS, NANO
+from anser_ros.stamps import NANO, Order, order_of
 from anser_ros.wire.points import FluxPoints
 from anser_ros.wire.quaternion import unit_quaternions
 from anser_ros.wire.recorded import Bag, PoseStream, RecordedFluxes
@@ -77,9 +77,10 @@ class SlidingWindow:
         if not np.isfinite(values).all():
             return
         rows = self._poses.setdefault(body, deque())
-        if rows and stamp_ns <= rows[-1][0]:
-            if stamp_ns > rows[-1][0] - JUMP_NS:
-                return  # late or twice
+        order = order_of(stamp_ns, rows[-1][0] if rows else 0)
+        if order in (Order.SAME, Order.LATE):
+            return
+        if order is Order.BACK:
             rows.clear()
         rows.append((stamp_ns, values))
         # The poses' clock may be ahead of the fluxes'.
@@ -89,7 +90,7 @@ class SlidingWindow:
     def _take(self, fluxes: _Fluxes, stamp_ns: int, points: FluxPoints) -> None:
         channel = np.asarray(points.channel, dtype=np.int64)
         rows = fluxes.rows
-        if rows and stamp_ns < rows[-1][0] - JUMP_NS:
+        if order_of(stamp_ns, rows[-1][0] if rows else 0) is Order.BACK:
             self._forget()
         elif rows and stamp_ns < rows[-1][0] + self._step_ns:
             return

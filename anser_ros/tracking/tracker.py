@@ -17,7 +17,7 @@ from anser_ros.effects.correction import Correction
 from anser_ros.errors import TrackingError
 from anser_ros.field.model import EffectRecord, FieldModel
 from anser_ros.frames.faults import FAULTS, GOOD, STUCK_CODE, value_codes
-from anser_ros.frames.intake import BACK, Frame, Intake
+from anser_ros.frames.intake import Frame, Intake
 from anser_ros.integrity.freshness import Freshness
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.pose_states import Withheld
@@ -259,7 +259,7 @@ class Tracker:
         withheld : Withheld, optional
             Why no pose may be given for it.
         """
-        if frame.jump == BACK:
+        if frame.goes_back:
             self.reset()
         frame = self._freshness.judged(frame, self.settings.flux_noise_t)
         if not self._first_ns:
