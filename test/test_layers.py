@@ -4,7 +4,9 @@ Every file's syntax tree is walked, imports inside functions included.
 """
 
 import ast
+import html
 import re
+import runpy
 import tomllib
 from pathlib import Path
 
@@ -129,6 +131,13 @@ def test_parts_of_a_node_import_no_other_node():
             if is_of_nodes and parts[2] not in WITHIN_NODES[room] | {room}:
                 faults.append(f'{place(path)} imports {name}')
     assert not faults, '\n'.join(faults)
+
+
+def test_the_picture_of_the_rooms_has_the_arrows_of_the_table():
+    repository = PACKAGE.parent
+    arrows = runpy.run_path(str(repository / '.ci' / 'draw_rooms.py'))['arrows_of'](ALLOWED)
+    picture = html.unescape((repository / 'docs' / 'rooms.svg').read_text(encoding='utf-8'))
+    assert set(re.findall(r'<title>(\w+)->(\w+)</title>', picture)) == arrows
 
 
 def test_the_page_has_the_same_table_and_every_file():

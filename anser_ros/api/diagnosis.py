@@ -63,12 +63,12 @@ def diagnose(
 
     Examples
     --------
-    A session that the model explains; this takes some ten seconds:
+    A session that the model explains:
 
     >>> from anser_ros import Model, diagnose, load_session
     >>> session = load_session('bags/moving.mcap')
-    >>> found = diagnose(session, Model.load('config/demo_model.yaml'))  # doctest: +SKIP
-    >>> found.effects  # doctest: +SKIP
+    >>> found = diagnose(session, Model.load('config/demo_model.yaml'))
+    >>> found.effects
     ()
     """
     found = diagnose_session(session, model.field, baseline, progress)
