@@ -211,7 +211,11 @@ def _bends(fit: StillFit) -> tuple[EffectRecord, ...]:
                 'largest_m': float(np.abs(lift).max()),
             },
             {},
-            {'log_probability': fit.evidence['bend']},
+            {
+                'log_probability': fit.evidence['bend'],
+                'summary': 'the body is not flat, and bent otherwise at each pose',
+                'remedy': 'none: at another pose the bend is another',
+            },
         ),
     )
 

@@ -5,10 +5,11 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from anser_ros.cli.diagnosis_figures import bars, course, maps, strongest, time_line
-from anser_ros.cli.diagnosis_words import paths, short_ones, value_text, verdict
+from anser_ros.cli.diagnosis_words import flux_unit, paths, short_ones, value_text, verdict
 from anser_ros.cli.html_page import page, table
 from anser_ros.cli.populations import population_figure, population_table
 from anser_ros.diagnosis.search import Candidate
+from anser_ros.field.model import EffectRecord
 from anser_ros.physics.constants import DEGREES
 from anser_ros.pictures import image
 from anser_ros.sessions.diagnosis import SessionDiagnosis
@@ -36,11 +37,11 @@ def render(result: SessionDiagnosis, document: dict[str, Any], *, session: str, 
         '<h2>Before and after</h2><p>Measured on every fifth stretch of time, which was used '
         'neither to choose nor to fit. Each frame&#39;s optical jitter, which moves all '
         'channels together, is taken out of the flux residual.</p>',
-        _held_out(document),
+        held_out_table(document),
         '<h2>Effects</h2>',
-        _effects(document),
+        effects_table(document),
         *_paths(document, result),
-        *_populations(result),
+        *population_sections(result.diagnosis.model.effects),
         '<h2>Residuals over time</h2><p>In the pictures 1 is what noise alone would give.</p>',
         image(time_line(found.before, found.after)),
         '<h2>Residuals over the volume</h2>',
@@ -56,21 +57,27 @@ def render(result: SessionDiagnosis, document: dict[str, Any], *, session: str, 
     return page('Diagnosis', sections)
 
 
-def _held_out(document: dict[str, Any]) -> str:
+def held_out_table(document: dict[str, Any]) -> str:
+    """Return the errors on held-out data before and after as a table."""
     held = document['held_out']
+    factor, shown = flux_unit(held['flux_rms_before_t'])
     rows = []
     for label, key, unit, scale in (
-        ('flux residual, pT rms', 'flux_rms', 't', 1e12),
+        (f'flux residual, {shown} rms', 'flux_rms', 't', factor),
         ('position RMSE of the coils, mm', 'position_rmse', 'm', 1e3),
         ('orientation RMSE of the coils, deg', 'orientation_rmse', 'rad', DEGREES),
     ):
         pair = [held[f'{key}_{when}_{unit}'] for when in ('before', 'after')]
-        rows.append([label, *('-' if v is None else f'{scale * v:.4g}' for v in pair)])
-    rows.append(['noise floor of the flux, pT rms', '', f'{1e12 * held["flux_rms_floor_t"]:.4g}'])
+        if pair != [None, None] or key == 'flux_rms':
+            rows.append([label, *('-' if v is None else f'{scale * v:.4g}' for v in pair)])
+    floor = f'{factor * held["flux_rms_floor_t"]:.4g}'
+    rows.append([f'noise floor of the flux, {shown} rms', '', floor])
     return table(['', 'before', 'after'], rows)
 
 
-def _effects(document: dict[str, Any]) -> str:
+def effects_table(document: dict[str, Any]) -> str:
+    """Return the effects as a table, or a paragraph where there are none."""
+    factor, unit = flux_unit(document['held_out']['flux_rms_before_t'])
     if not document['effects']:
         if document['unexplained']['fraction'] > 0:
             return (
@@ -91,12 +98,12 @@ def _effects(document: dict[str, Any]) -> str:
                 str(evidence.get('summary', '')),
                 values,
                 sigmas,
-                f'{1e12 * effect["flux_rms_without_t"]:.4g}',
+                f'{factor * effect["flux_rms_without_t"]:.4g}',
                 rivals,
                 str(evidence.get('remedy', '')),
             ]
         )
-    head = ['effect', 'what it is', 'parameters', '1 sigma', 'residual without it, pT',
+    head = ['effect', 'what it is', 'parameters', '1 sigma', f'residual without it, {unit}',
             'explains nearly as much', 'online']  # fmt: skip
     return table(head, rows).replace('\n', '<br>')
 
@@ -120,16 +127,16 @@ def _paths(document: dict[str, Any], result: SessionDiagnosis) -> Iterator[str]:
             )
 
 
-def _populations(result: SessionDiagnosis) -> Iterator[str]:
-    """How the sensors differ, as the model corrects it: those that it had, and those found."""
-    records = result.diagnosis.model.effects
+def population_sections(records: Sequence[EffectRecord]) -> Iterator[str]:
+    """Show how the sensors differ, as the model corrects it: what it had and what was found."""
     figure = population_figure(records)
     if figure is not None:
         yield '<h2>Errors of all sensors</h2><p>The error of each sensor with one standard '
         yield 'deviation, as the corrected model removes it; the grey band is the spread of all '
         yield 'sensors.</p>'
         yield image(figure)
-        yield table(*population_table(records))
+        yield f'<details><summary>all sensors</summary>{table(*population_table(records))}'
+        yield '</details>'
 
 
 def _structure(result: SessionDiagnosis) -> str:

@@ -10,6 +10,15 @@ MOST_CHARACTERS = 400
 """Characters that a verdict is kept below: about five lines of a terminal."""
 
 
+FLUX_UNITS = ((1e-8, 1e12, 'pT'), (1e-5, 1e9, 'nT'), (1e-2, 1e6, 'uT'), (1e9, 1e3, 'mT'))
+"""Up to which size, T, fluxes are shown with which factor in which unit."""
+
+
+def flux_unit(size_t: float) -> tuple[float, str]:
+    """Return factor and unit in which fluxes of a size, T, are shown."""
+    return next((factor, unit) for most, factor, unit in FLUX_UNITS if size_t < most)
+
+
 def verdict(document: dict[str, Any]) -> str:
     """State in one short paragraph what was found and what stays unexplained.
 
@@ -35,36 +44,43 @@ def _by_name(effects: list[dict[str, Any]]) -> str:
 def _paragraph(document: dict[str, Any], names: str) -> str:
     held, effects = document['held_out'], document['effects']
     before, after = held['flux_rms_before_t'], held['flux_rms_after_t']
+    factor, unit = flux_unit(before)
     if effects:
         text = (
             f'The model lacks {len(effects)} effect{"s" if len(effects) > 1 else ""}: {names}. '
             f'With {"them" if len(effects) > 1 else "it"} the residual on held-out data falls '
-            f'from {1e12 * before:.0f} to {1e12 * after:.0f} pT'
+            f'from {_number(factor * before)} to {_number(factor * after)} {unit}'
         )
         pair = held['position_rmse_before_m'], held['position_rmse_after_m']
         if None not in pair:
             text += f', and the position error from {1e3 * pair[0]:.3g} to {1e3 * pair[1]:.3g} mm'
         text += '.'
     else:
-        floor = 1e12 * held['flux_rms_floor_t']
+        floor = _number(factor * held['flux_rms_floor_t'])
         text = 'No known effect explains the residual of this session: '
         if document['unexplained']['fraction'] == 0:
             text = 'The model explains this session, and no effect is needed: '
         text += (
-            f'the residual on held-out data is {1e12 * after:.0f} pT, the noise {floor:.0f} pT.'
+            f'the residual on held-out data is {_number(factor * after)} {unit}, '
+            f'the noise {floor} {unit}.'
         )
     rest = document['unexplained']
     if rest['fraction'] > 0:
         on = ', '.join(rest['depends_on']) or 'none of the variables examined'
         share = f'{rest["fraction"]:.0%}' if rest['fraction'] >= 0.01 else 'Less than 1%'
-        left = 1e12 * max(after**2 - held['flux_rms_floor_t'] ** 2, 0.0) ** 0.5
+        left = factor * max(after**2 - held['flux_rms_floor_t'] ** 2, 0.0) ** 0.5
         text += (
-            f' {share} of the power above the noise stays unexplained, {left:.2g} pT rms; '
+            f' {share} of the power above the noise stays unexplained, {left:.2g} {unit} rms; '
             f'it depends on {on}.'
         )
     else:
         text += ' Nothing above the noise stays unexplained.'
     return text
+
+
+def _number(value: float) -> str:
+    """A size with at least three digits, and no decimals from a hundred on."""
+    return f'{value:.0f}' if value >= 100.0 else f'{value:.3g}'
 
 
 def _named(effect: dict[str, Any]) -> str:

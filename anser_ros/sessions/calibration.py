@@ -64,6 +64,17 @@ def generator_of(setup: Setup) -> Generator:
     return Generator(centres, turns, float(side))
 
 
+def is_estimated_jointly(session: Session) -> bool:
+    """Return whether a session has few poses, or one place, of a body of many sensors.
+
+    Emitters that can be drawn are left to a model of their drawing, whatever the session.
+    """
+    if Drawing.of(session.setup).model is not None:
+        return False
+    tools = session.tools
+    return is_still(tools) or is_at_one_place(tools, session.setup.accuracy)
+
+
 def calibrate_sessions(
     sessions: list[Session],
     options: Options,

@@ -1,0 +1,123 @@
+"""Shows the diagnosis of a session of few poses as a self-contained page."""
+
+import html
+from collections.abc import Iterator
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from anser_ros.cli.diagnosis_figures import AFTER, BEFORE
+from anser_ros.cli.diagnosis_report import effects_table, held_out_table, population_sections
+from anser_ros.cli.diagnosis_words import LONGEST, flux_unit, verdict
+from anser_ros.cli.html_page import page, table
+from anser_ros.pictures import image
+from anser_ros.sessions.few_poses import FewPosesDiagnosis, residual_power
+
+
+def render_few_poses(
+    result: FewPosesDiagnosis, document: dict[str, Any], *, session: str, model: str
+) -> str:
+    """Return the page as HTML with its figures inside.
+
+    Parameters
+    ----------
+    result : FewPosesDiagnosis
+    document : mapping
+        As it is in diagnosis.json.
+    session, model : str
+        What was diagnosed.
+    """
+    sections = [
+        f'<h1>Diagnosis</h1><p class="note">session <code>{html.escape(session)}</code>, '
+        f'model <code>{html.escape(model)}</code></p>',
+        f'<p class="verdict">{html.escape(verdict(document))}</p>',
+        '<h2>Before and after</h2><p>This session has too few poses to test a field model, so the '
+        'field is estimated anew from it, together with what is wrong with the sensors. What is '
+        'predicted takes no part: each pose is predicted from the others, or for a body at one '
+        'place each fifth of its sensors from the rest.</p>',
+        held_out_table(document),
+        *_by_pose(result),
+        '<h2>Effects</h2>',
+        effects_table(document),
+        *_poses(result),
+        *_sureness(result),
+        *population_sections(result.model.effects),
+        '<h2>What remains</h2><p>The held-out residual with everything corrected.</p>',
+        image(_remainder(result)),
+        *_undetermined(result),
+    ]
+    return page('Diagnosis', sections)
+
+
+def _by_pose(result: FewPosesDiagnosis) -> Iterator[str]:
+    """A table of each pose's prediction, where there are several."""
+    pair = [calibration.held_out for calibration in (result.before, result.after)]
+    if any(len(one.frame_rmse_t) < 2 for one in pair):
+        return
+    factor, unit = flux_unit(float(pair[0].frame_rmse_t.max()))
+    columns = []
+    for one in pair:
+        order = np.argsort(one.place[:, 2])
+        columns.append(zip(one.place[order], factor * one.frame_rmse_t[order], strict=True))
+    rows = [
+        [', '.join(f'{1e3 * v:.1f}' for v in place), f'{old:.4g}', f'{new:.4g}']
+        for (_, old), (place, new) in zip(*columns, strict=True)
+    ]
+    yield table(['pose at x, y, z, mm', f'before, {unit} rms', f'after, {unit} rms'], rows)
+
+
+def _poses(result: FewPosesDiagnosis) -> Iterator[str]:
+    """How far the poses are from where they were stated."""
+    survey = result.after.scan.survey
+    if survey is not None:
+        off = survey.optical
+        yield (
+            f'<p>The body stood {1e3 * off.position_m:.2f} mm and {1e3 * off.rotation_rad:.2f} '
+            'mrad (rms a component) from where its poses were stated.</p>'
+        )
+
+
+def _sureness(result: FewPosesDiagnosis) -> Iterator[str]:
+    """How sure each effect is, and the channels that are too many for the table of effects."""
+    for record in result.effects:
+        gain = record.evidence.get('log_probability')
+        channels = record.parameters.get('channels', [])
+        text = [] if gain is None else [f'raises the log probability of the readings by {gain:.1f}']
+        if len(channels) > LONGEST and 'values' not in record.parameters:
+            listed = ', '.join(str(channel) for channel in channels)
+            text.append(f'concerns {len(channels)} channels: {listed}')
+        if text:
+            yield f'<p>{html.escape(record.name)} {" and ".join(text)}.</p>'
+
+
+def _remainder(result: FewPosesDiagnosis) -> Figure:
+    """Draw what remains by channel, and by emitter and pose."""
+    power = residual_power(result.after)
+    before = float(np.sqrt(np.mean(np.abs(result.before.held_out.error) ** 2)))
+    factor, unit = flux_unit(before)
+    figure, (left, right) = plt.subplots(
+        1, 2, figsize=(10, 3.4), layout='constrained', width_ratios=(3, 1)
+    )
+    channel = result.after.scan.measurements[0].sensors.channel
+    left.plot(channel, factor * np.sqrt(np.nanmean(power, axis=(0, 2))), '.', color=AFTER)
+    left.axhline(factor * before, color=BEFORE, label='all channels before')
+    left.axhline(factor * result.floor_t, color='0.5', label='noise')
+    left.set(xlabel='channel', ylabel=f'residual, {unit} rms', ylim=(0.0, None))
+    left.legend(loc='upper center', bbox_to_anchor=(0.5, -0.2), ncols=2)
+    emitters = result.model.emitters
+    for frame, row in enumerate(np.sqrt(np.nanmean(power, axis=1))):
+        label = f'pose {frame + 1}' if len(power) > 1 else None
+        right.plot(emitters, factor * row, 'o', label=label)
+    right.set(xlabel='emitter', ylim=(0.0, None))
+    if len(power) > 1:
+        right.legend(loc='upper center', bbox_to_anchor=(0.5, -0.2), ncols=2)
+    for panel in (left, right):
+        panel.grid(alpha=0.3)
+    return figure
+
+
+def _undetermined(result: FewPosesDiagnosis) -> Iterator[str]:
+    for line in result.after.undetermined:
+        yield f'<p>{html.escape(line)}</p>'

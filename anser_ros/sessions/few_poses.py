@@ -1,0 +1,195 @@
+"""Diagnoses a session of few poses of many sensors, down to a body that rests at one place.
+
+A handful of poses cannot show how good a field model is, but hundreds of sensors can show what is
+wrong with themselves. The field is therefore estimated anew, together with the sensors and the
+body's shape, as a calibration does, after the effects that the given model knows have been
+corrected. What is predicted takes no part: each pose, or for one place each fifth of the sensors.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import f_oneway
+
+from anser_ros.calibration.calibrate import Options
+from anser_ros.calibration.held_out import rms
+from anser_ros.calibration.result import Calibration
+from anser_ros.calibration.sensor_parameters import KINDS
+from anser_ros.calibration.still import STILL_ONLY
+from anser_ros.diagnosis.decisions import UNSTRUCTURED
+from anser_ros.diagnosis.schema import SCHEMA
+from anser_ros.effects.registry import all_effects
+from anser_ros.field.model import EffectRecord, FieldModel
+from anser_ros.field.plain_data import plain
+from anser_ros.sessions.calibration import calibrate_sessions
+from anser_ros.sessions.prepared import correct, prepare
+from anser_ros.sessions.session import Session
+
+LOOKED_FOR = (*KINDS, *STILL_ONLY)
+"""Kinds of errors that are estimated."""
+KIND_OF = {'sensor_gain_spread': 'gains', 'sensor_axis_spread': 'axes', 'body_bend': 'bend'}
+"""Kinds by the effect that they become; without an entry, an effect goes with all kinds."""
+CHANCE = 1e-3
+"""Probability in noise alone below which what remains depends on a variable."""
+
+
+@dataclass(frozen=True)
+class FewPosesDiagnosis:
+    """Holds what is wrong with the sensors of a session of few poses.
+
+    Attributes
+    ----------
+    before, after : Calibration
+        With sensors as the given model has them, and with what was found.
+    effects : tuple of EffectRecord
+        What was found, with its evidence.
+    without_t : tuple of float
+        Held-out residual, T, with all effects but each of these.
+    model : FieldModel
+        The field as it was estimated, and the effects that were known and found.
+    """
+
+    before: Calibration
+    after: Calibration
+    effects: tuple[EffectRecord, ...]
+    without_t: tuple[float, ...]
+    model: FieldModel
+
+    @property
+    def floor_t(self) -> float:
+        """Return the magnitude of noise alone, T rms, at most what remains."""
+        is_constant = not self.after.held_out.error.imag.any()
+        noise = self.after.held_out.flux_noise_t * (1.0 if is_constant else np.sqrt(2.0))
+        return float(min(noise, rms(self.after.held_out.error)))
+
+    @property
+    def unexplained(self) -> float:
+        """Return the share of the power above the noise that remains, 0 where it may be noise."""
+        floor, after = self.floor_t**2, rms(self.after.held_out.error) ** 2
+        possible = max(rms(self.before.held_out.error) ** 2 - floor, after - floor)
+        return (after - floor) / possible if after - floor > UNSTRUCTURED * floor else 0.0
+
+    @property
+    def depends_on(self) -> tuple[str, ...]:
+        """Return the variables, of position, channel and emitter, that what remains follows."""
+        power = residual_power(self.after)
+        return tuple(
+            name
+            for name, axis in (('position', 0), ('channel', 1), ('emitter', 2))
+            if _differs(power, axis)
+        )
+
+
+def diagnose_few_poses(
+    session: Session, model: FieldModel, progress: Callable[[str], None] | None = None
+) -> FewPosesDiagnosis:
+    """Find what is wrong with the sensors of a session that `calibration.is_estimated_jointly`.
+
+    Parameters
+    ----------
+    session : Session
+    model : FieldModel
+        Of the session's emitters; the effects that it has are corrected first.
+    progress : callable, optional
+        Called with words on what goes on.
+
+    Raises
+    ------
+    ModelFileError
+        When the model's emitters are not the session's, or an effect of it is unknown.
+    FitError
+        When the readings don't determine the field.
+    """
+    say = progress or (lambda text: None)
+    known = correct(prepare(session, model)).session
+
+    def calibrated(kinds: tuple[str, ...], what: str) -> Calibration:
+        return calibrate_sessions(
+            [known],
+            Options(estimate=kinds),
+            lambda stage, share: say(f'{what}: {stage}, {share:.0%}'),
+        )
+
+    before = calibrated((), 'with the sensors as they are')
+    after = calibrated(LOOKED_FOR, 'with all errors')
+    found, without = [], []
+    for record in (*after.scan.corrections, *after.scan.reported_effects):
+        if record.name in KIND_OF:
+            rest = tuple(kind for kind in LOOKED_FOR if kind != KIND_OF[record.name])
+            without.append(rms(calibrated(rest, f'without {record.name}').held_out.error))
+        else:
+            is_corrected = record in after.scan.corrections
+            without.append(rms((before if is_corrected else after).held_out.error))
+        found.append(_described(record))
+    effects = (*model.effects, *after.scan.corrections)
+    return FewPosesDiagnosis(
+        before, after, tuple(found), tuple(without), replace(after.model, effects=effects)
+    )
+
+
+def _described(record: EffectRecord) -> EffectRecord:
+    """The record with words on what it is and what is done about it."""
+    effect = all_effects().get(record.name)
+    if effect is None:
+        return record
+    words = {'summary': effect.summary, 'remedy': effect.remedy.value}
+    return replace(record, evidence={**words, **record.evidence})
+
+
+def residual_power(calibration: Calibration) -> NDArray[np.float64]:
+    """Return the squared magnitude (F, S, K), T^2, of the held-out residual of each reading.
+
+    Of a body at one place its mean reading is predicted, F = 1. NaN where nothing was measured.
+    """
+    (measured,) = calibration.scan.measurements
+    error, used = calibration.held_out.error, measured.usable
+    if len(error) != int(used.sum()):
+        used = np.asarray(used.any(axis=0))[None]
+    power = np.full((*used.shape, error.shape[1]), np.nan)
+    power[used] = np.abs(error) ** 2
+    return power
+
+
+def _differs(power: NDArray[np.float64], axis: int) -> bool:
+    """Whether the logarithm of the power differs along an axis beyond chance."""
+    rows = np.log(np.maximum(np.moveaxis(power, axis, 0), 1e-300)).reshape(power.shape[axis], -1)
+    groups = [row[np.isfinite(row)] for row in rows]
+    groups = [group for group in groups if group.size > 1]
+    return len(groups) > 1 and bool(f_oneway(*groups).pvalue < CHANCE)
+
+
+def to_document(result: FewPosesDiagnosis) -> dict[str, Any]:
+    """Return what was found as plain data, as `diagnosis_document.to_document` does.
+
+    Poses are not compared: there are too few of them.
+    """
+    pose = ('position_rmse_before_m', 'position_rmse_after_m',
+            'orientation_rmse_before_rad', 'orientation_rmse_after_rad')  # fmt: skip
+    return {
+        'schema': SCHEMA,
+        'held_out': {
+            'flux_rms_before_t': rms(result.before.held_out.error),
+            'flux_rms_after_t': rms(result.after.held_out.error),
+            'flux_rms_floor_t': result.floor_t,
+            **dict.fromkeys(pose),
+        },
+        'effects': list(_effects(result)),
+        'unexplained': {
+            'fraction': result.unexplained,
+            'depends_on': list(result.depends_on) if result.unexplained else [],
+        },
+    }
+
+
+def _effects(result: FewPosesDiagnosis) -> Iterator[dict[str, Any]]:
+    for record, without in zip(result.effects, result.without_t, strict=True):
+        yield {
+            'name': record.name,
+            'parameters': plain(dict(record.parameters)),
+            'uncertainty': plain(dict(record.uncertainty)),
+            'evidence': plain(dict(record.evidence)),
+            'flux_rms_without_t': without,
+        }
