@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from anser_ros.api.model import Model
+from anser_ros.sessions import few_poses
+from anser_ros.sessions.calibration import is_estimated_jointly
 from anser_ros.sessions.diagnosis import diagnose_session
 from anser_ros.sessions.diagnosis_document import to_document
 from anser_ros.sessions.session import Session
@@ -55,7 +57,8 @@ def diagnose(
     Raises
     ------
     DiagnosisError
-        When fewer than 30 frames have fluxes and a pose.
+        When fewer than 30 frames have fluxes and a pose; few poses of a body of many sensors are
+        enough where the emitters have no drawing.
     ModelFileError
         When the model's emitters are not the session's.
     BagError
@@ -71,7 +74,11 @@ def diagnose(
     >>> found.effects
     ()
     """
-    found = diagnose_session(session, model.field, baseline, progress)
-    figures = to_document(found)
+    if is_estimated_jointly(session):
+        few = few_poses.diagnose_few_poses(session, model.field, progress)
+        corrected, figures = few.model, few_poses.to_document(few)
+    else:
+        found = diagnose_session(session, model.field, baseline, progress)
+        corrected, figures = found.diagnosis.model, to_document(found)
     names = tuple(effect['name'] for effect in figures['effects'])
-    return DiagnosisResult(Model(found.diagnosis.model), names, figures)
+    return DiagnosisResult(Model(corrected), names, figures)

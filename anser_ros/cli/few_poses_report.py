@@ -84,7 +84,7 @@ def _sureness(result: FewPosesDiagnosis) -> Iterator[str]:
     for record in result.effects:
         gain = record.evidence.get('log_probability')
         channels = record.parameters.get('channels', [])
-        text = [] if gain is None else [f'raises the log probability of the readings by {gain:.1f}']
+        text = [] if gain is None else [f'raises the log probability of all by {gain:.1f}']
         if len(channels) > LONGEST and 'values' not in record.parameters:
             listed = ', '.join(str(channel) for channel in channels)
             text.append(f'concerns {len(channels)} channels: {listed}')
