@@ -69,8 +69,9 @@ def _paragraph(document: dict[str, Any], names: str) -> str:
         on = ', '.join(rest['depends_on']) or 'none of the variables examined'
         share = f'{rest["fraction"]:.0%}' if rest['fraction'] >= 0.01 else 'Less than 1%'
         left = factor * max(after**2 - held['flux_rms_floor_t'] ** 2, 0.0) ** 0.5
+        rest_text = f'{left:.2g}' if left < 100.0 else f'{left:.0f}'
         text += (
-            f' {share} of the power above the noise stays unexplained, {left:.2g} {unit} rms; '
+            f' {share} of the power above the noise stays unexplained, {rest_text} {unit} rms; '
             f'it depends on {on}.'
         )
     else:

@@ -59,7 +59,7 @@ def _by_pose(result: FewPosesDiagnosis) -> Iterator[str]:
     factor, unit = flux_unit(float(pair[0].frame_rmse_t.max()))
     columns = []
     for one in pair:
-        order = np.argsort(one.place[:, 2])
+        order = np.lexsort(np.round(one.place, 6).T)
         columns.append(zip(one.place[order], factor * one.frame_rmse_t[order], strict=True))
     rows = [
         [', '.join(f'{1e3 * v:.1f}' for v in place), f'{old:.4g}', f'{new:.4g}']

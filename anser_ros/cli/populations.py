@@ -14,6 +14,8 @@ Array = NDArray[np.float64]
 
 SHOWN_UNITS = {'1': (100.0, '%'), 'rad': (1e3, 'mrad'), 'm': (1e3, 'mm'), 'T': (1e9, 'nT')}
 """Factor and unit in which values of each SI unit are shown."""
+MOST_TICKS = 9
+"""Channels that are named on the axis of a picture; of more, some at even steps."""
 MOST_PARTS = 3
 """Values of a channel that a table has columns for; of more, their root mean square is shown."""
 
@@ -68,12 +70,15 @@ def population_figure(records: Sequence[EffectRecord]) -> Figure | None:
         panel.axhspan(-spread, spread, color='0.9', label='spread')
         places = np.arange(len(values))
         for part, name in enumerate(names):
+            if not (values[:, part].any() or sigma[:, part].any()):
+                continue  # constant fields have no quadrature
             at = places + 0.15 * (part - (len(names) - 1) / 2.0)
             panel.errorbar(at, values[:, part], sigma[:, part], fmt='.', capsize=2, label=name)
-        panel.set_xticks(places, [str(c) for c in record.parameters['channels']])
+        named = places[:: -(-len(places) // MOST_TICKS)]
+        panel.set_xticks(named, [str(record.parameters['channels'][k]) for k in named])
         panel.set(title=f'{record.name}: {spread:.3g} {unit}', xlabel='channel', ylabel=unit)
         panel.grid(alpha=0.3)
-        panel.legend(fontsize=7)
+        panel.legend(fontsize=7, loc='upper center', bbox_to_anchor=(0.5, -0.17), ncols=3)
     return figure
 
 
