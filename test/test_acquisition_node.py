@@ -1,5 +1,6 @@
 """Acquisition and the simulated control unit as processes, joined by a pseudo-terminal and DDS."""
 
+import os
 import re
 import time
 
@@ -374,12 +375,26 @@ def test_pseudo_port_drops_what_nobody_reads_and_removes_only_its_own_link(tmp_p
     port = PseudoPort(link)
     piece = Piece(bytes(4000), is_block=True)
     assert port.write([piece] * 800) > 100
-    other = PseudoPort(link)
+    link.unlink()
+    link.symlink_to('/dev/null')
     port.unplug()
     assert link.is_symlink() and not port.plugged
     assert port.write([piece]) == 1 and port.read() == b''
-    other.unplug()
+    port.plug()
+    assert os.readlink(link) != '/dev/null'
+    port.close()
     assert not link.is_symlink()
+
+
+def test_pseudo_port_is_not_taken_from_another_one_that_runs(tmp_path):
+    link = tmp_path / 'cu'
+    port = PseudoPort(link)
+    terminal = os.readlink(link)
+    with pytest.raises(PortError, match='another simulated control unit'):
+        PseudoPort(link)
+    assert os.readlink(link) == terminal
+    port.close()
+    PseudoPort(link).close()
 
 
 def test_faults_damage_what_they_say():

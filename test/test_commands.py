@@ -55,6 +55,19 @@ POINTS = 'x_m,y_m,z_m,true_x_m,true_y_m,true_z_m\n' + ''.join(
     f'{x},{y},{z},{1.01 * x},{1.01 * y},{1.01 * z}\n'
     for x in (0, 0.1, 0.2) for y in (0, 0.1) for z in (0.1, 0.2)
 )  # fmt: skip
+NOT_TEXT = [
+    ['accuracy', 'single-point', 'poses.tum', '--tip', 'noise.yaml'],
+    ['accuracy', 'point-to-point', 'poses.tum', '--truth', 'noise.yaml'],
+    ['bags', '--setup', 'noise.yaml'],
+    ['error_map', 'noise.yaml'],
+    ['import', 'noise.yaml'],
+    ['import', 'BAGS/moving.mcap', '--setup', 'noise.yaml'],
+    ['pivot', 'poses.tum', '--setup', 'noise.yaml'],
+    ['place', 'noise.yaml', '--references', '4'],
+    ['setup', 'noise.yaml'],
+    ['views', 'noise.yaml'],
+]
+"""Calls whose file `noise.yaml` is no text."""
 QUICK = {
     'bag_export': ['export', 'BAGS/moving.mcap', '--out', 'out'],
     'bag_import': ['import', 'BAGS/moving.mcap', '--out', 'out/a.mcap'],
@@ -108,7 +121,30 @@ def test_what_is_wrong_is_one_line_and_exit_code_2(name, tmp_path, monkeypatch, 
     said = capsys.readouterr()
     assert said.out == '' and said.err.count('\n') == 1, said
     assert said.err.startswith(f'anser {name}') and 'Errno' not in said.err
-    assert [path for path in tmp_path.rglob('*') if path.is_file()] == []
+    assert list(tmp_path.iterdir()) == [], 'not even an empty folder is left'
+
+
+@pytest.mark.parametrize('words', NOT_TEXT, ids=' '.join)
+def test_a_file_that_is_no_text_is_one_line_and_exit_code_2(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'noise.yaml').write_bytes(bytes(range(256)) * 8)
+    (tmp_path / 'poses.tum').write_text(''.join(f'{k} 0.1 0 {k} 0 0 0 1\n' for k in range(9)))
+    before = sorted(tmp_path.iterdir())
+    arguments = [word.replace('BAGS', str(REPO / 'bags')) for word in words]
+    assert main([*arguments, '--out', 'out/x']) == 2
+    assert capsys.readouterr().err == f'anser {words[0]}: noise.yaml: not a text in UTF-8\n'
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_an_export_says_what_the_bag_has_lost(tmp_path, capsys):
+    whole = (REPO / 'bags' / 'moving.mcap').read_bytes()
+    (tmp_path / 'half.mcap').write_bytes(whole[: 7 * len(whole) // 10])
+    assert (
+        main(['export', str(tmp_path / 'half.mcap'), '--out', str(tmp_path / 'out'), '--json'])
+        == 0
+    )
+    said = capsys.readouterr()
+    assert said.err.count('breaks off') == 1 and json.loads(said.out)['lost'] in said.err
 
 
 @pytest.mark.parametrize('arguments', QUICK.values(), ids=QUICK)

@@ -1,6 +1,7 @@
 """Two evaluations are compared by the frames that both have, and noise alone decides nothing."""
 
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -150,6 +151,13 @@ def test_the_command(tmp_path, capsys):
     assert 'frames with a pose: no difference of 1' in out
     assert main(['compare', folders[0], str(tmp_path)]) == 2
     assert 'is it a folder of anser evaluate?' in capsys.readouterr().err
+    for folder, recording in zip(folders, ('1a', '2b'), strict=True):
+        document = json.dumps({'recording': recording})
+        (Path(folder) / 'evaluation.json').write_text(document, encoding='utf-8')
+    assert main(['compare', *folders, '--out', str(tmp_path / 'none')]) == 2
+    assert 'two different recordings (1a, 2b)' in capsys.readouterr().err
+    assert not (tmp_path / 'none').exists()
+    (Path(folders[1]) / 'evaluation.json').unlink()
     (tmp_path / 'two' / ERRORS_FILE).write_text('a,b\n1,2\n')
     assert main(['compare', *folders]) == 2
     assert 'columns must be' in capsys.readouterr().err

@@ -13,8 +13,11 @@ import pytest
 from conftest import spin_until
 
 from anser_ros.cli.demo_report import draw, load, summarise
+from anser_ros.cli.folders import make_new_folder, remove_empty_folders
 from anser_ros.cli.main import main
+from anser_ros.cli.ros_domain import own_domain
 from anser_ros.cli.supervisor import Supervisor, tail
+from anser_ros.errors import ParameterError
 from anser_ros.nodes.output_parts.traces import OpticalTrace, PoseTrace, Traces, targets_of
 from anser_ros.nodes.streams.backlog import CATCH_UP_S
 from anser_ros.pose_states import OK, STATES
@@ -93,6 +96,25 @@ class TestSupervisor:
         while running(mark) and time.monotonic() < end:
             time.sleep(0.05)
         assert running(mark) == []
+
+
+def test_simulations_at_the_same_time_have_a_domain_and_a_folder_each(tmp_path, monkeypatch):
+    monkeypatch.delenv('ROS_DOMAIN_ID')
+    with own_domain([3, 5]) as first, pytest.raises(ParameterError, match='another demo'):
+        assert os.environ['ROS_DOMAIN_ID'] == str(first)
+        with own_domain([]):  # where a domain is stated, as the first has, it is that one or none
+            pass
+    assert 'ROS_DOMAIN_ID' not in os.environ
+    with own_domain([3, 5]) as first:
+        monkeypatch.delenv('ROS_DOMAIN_ID')
+        with own_domain([3, 5]) as second:
+            assert (first, second) == (3, 5)
+        monkeypatch.setenv('ROS_DOMAIN_ID', '3')
+    folders = [make_new_folder(tmp_path / 'recordings', 'demo') for _ in range(3)]
+    assert [folder.name for folder in folders] == ['demo', 'demo_2', 'demo_3']
+    (folders[1] / 'bag').touch()
+    remove_empty_folders()
+    assert list((tmp_path / 'recordings').iterdir()) == [folders[1]]
 
 
 class TestTraces:

@@ -37,9 +37,12 @@ def test_ports_that_are_missing_or_closed(tmp_path, monkeypatch):
     monkeypatch.setattr(doctor.os, 'access', lambda name, _mode: name != closed)
     first, second = doctor.ports(None, pattern)
     assert (first.state, second.state) == (doctor.GOOD, doctor.BAD)
-    assert 'usermod -aG' in second.remedy
+    assert 'chmod a+rw' in second.remedy, 'the group may not read and write it either'
+    (tmp_path / 'ttyACM1').chmod(0o660)
+    monkeypatch.setattr(doctor.grp, 'getgrgid', lambda _: mock.Mock(gr_name='dialout'))
+    assert 'usermod -aG dialout' in doctor.ports(None, pattern)[1].remedy
     assert doctor.ports(str(tmp_path / 'ttyX'))[0].state == doctor.BAD
-    for name in ('/dev/null', str(tmp_path / 'ttyACM2')):
+    for name in ('/dev/null', str(tmp_path), str(tmp_path / 'ttyACM2')):
         (tmp_path / 'ttyACM2').touch()
         (other,) = doctor.ports(name)
         assert (other.state, other.found) == (doctor.BAD, 'is not a serial port') and other.remedy

@@ -64,10 +64,14 @@ def test_questions_ask_again_until_the_answer_is_right(tmp_path, capsys, monkeyp
     assert main(options(tmp_path / 'stated')) == 0
     asked, stated = ((tmp_path / n / 'setup.yaml').read_text() for n in ('asked', 'stated'))
     assert asked == stated
+    capsys.readouterr()
+    assert main([*options(tmp_path / 'stated'), '--rate=25']) == 2
+    assert 'setup.yaml is there already' in capsys.readouterr().err
+    assert (tmp_path / 'stated' / 'setup.yaml').read_text() == stated
     monkeypatch.setattr(sys, 'stdin', io.StringIO('anser\n'))
     assert main(['setup', '--out', str(tmp_path / 'cut')]) == 2
     assert 'no answer to: name of a tool' in capsys.readouterr().err
-    assert not (tmp_path / 'cut' / 'setup.yaml').exists()
+    assert not (tmp_path / 'cut').exists()
 
 
 def test_tables_are_taken_as_rows(tmp_path, capsys):

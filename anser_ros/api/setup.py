@@ -2,13 +2,12 @@
 
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import yaml
 
-from anser_ros.errors import SetupError
 from anser_ros.wire.setup import Setup, parse_setup
+from anser_ros.wire.text_files import read_text
 
 SetupSource = Setup | Mapping[str, Any] | str | os.PathLike[str]
 
@@ -40,7 +39,4 @@ def load_setup(source: SetupSource) -> Setup:
         return parse_setup(yaml.safe_dump(dict(source), sort_keys=False))
     if isinstance(source, str):
         return parse_setup(source)
-    try:
-        return parse_setup(Path(source).read_text(encoding='utf-8'))
-    except (OSError, UnicodeError) as error:
-        raise SetupError(f'{os.fspath(source)}: {error}') from error
+    return parse_setup(read_text(source))

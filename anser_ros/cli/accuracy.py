@@ -1,7 +1,6 @@
 """Assess a tracker by the protocols that the field publishes, and watch it over sessions."""
 
 import argparse
-import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -19,11 +18,13 @@ from anser_ros.assessment.source import read_poses
 from anser_ros.assessment.stillness import PauseRule
 from anser_ros.cli.accuracy_document import figure_rows, to_document
 from anser_ros.cli.accuracy_page import render
-from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.folders import make_folder
+from anser_ros.cli.output import say_written
 from anser_ros.cli.pose_source import add_source_options, source_of
 from anser_ros.cli.progress import progress_of
 from anser_ros.errors import ParameterError
 from anser_ros.poses.sequence import missing_words
+from anser_ros.wire.text_files import read_rows
 
 SEED = 1
 """Seed of the resamples, so that the same recordings give the same intervals."""
@@ -192,8 +193,7 @@ def _options(args: argparse.Namespace) -> ProtocolOptions:
 
 def _truth(path: Path) -> Array:
     """Points of a CSV, m, shape (n, 3)."""
-    with path.open(encoding='utf-8-sig', newline='') as stream:
-        rows = list(csv.DictReader(stream))
+    _, rows = read_rows(path)
     for unit, scale in (('m', 1.0), ('mm', 1e-3)):
         names = [f'{axis}_{unit}' for axis in 'xyz']
         if rows and all(name in rows[0] for name in names):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from anser_ros.cli.output import make_folder
+from anser_ros.cli.folders import make_folder
 from anser_ros.cli.progress import progress_of
 from anser_ros.simulation.board_source import board_source
 from anser_ros.simulation.manufacture import manufactured
@@ -18,6 +18,7 @@ from anser_ros.simulation.recording import STATIC_NOISE_T, Errors, GridScan, rec
 from anser_ros.simulation.world import World
 from anser_ros.wire.bag import bag_file
 from anser_ros.wire.setup import parse_setup
+from anser_ros.wire.text_files import read_text
 
 SCHEMA = 'anser_bags/1'
 RATE_HZ = 25.0
@@ -54,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write factory, moving, metal and scan.mcap; bags of those names are replaced."""
-    setup = parse_setup(args.setup.read_text(encoding='utf-8'))
+    setup = parse_setup(read_text(args.setup))
     rng = np.random.default_rng(args.seed)
     source = board_source(manufactured(setup, rng))
     make_folder(args.out)

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from anser_ros.cli.commands import OFFLINE
+from anser_ros.cli.folders import make_folder
 from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, attempt
-from anser_ros.cli.output import make_folder
 from anser_ros.cli.progress import progress_of
 from anser_ros.cli.session_runs import SessionRun, finish, perform, runs_of
 from anser_ros.cli.summary import COMMANDS, Outcome, row_of, write_summary

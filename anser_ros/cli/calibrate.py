@@ -17,7 +17,8 @@ from anser_ros.calibration.sensor_parameters import EXTRA_KINDS, KINDS
 from anser_ros.calibration.still import STILL_ONLY
 from anser_ros.cli.calibration_figure import draw_choice, draw_populations
 from anser_ros.cli.carry_out import carry_out
-from anser_ros.cli.output import Result, check_file, loss_notes, make_folder
+from anser_ros.cli.folders import make_folder
+from anser_ros.cli.output import Result, check_file, loss_notes
 from anser_ros.cli.populations import population_table, populations
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.errors import FitError, ParameterError

@@ -13,13 +13,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.folders import make_folder
+from anser_ros.cli.output import say_written
 from anser_ros.cli.progress import progress_of
 from anser_ros.physics.constants import DEGREES
 from anser_ros.pictures import save
 from anser_ros.sessions.comparison import (
     Compared,
     ComparedShares,
+    check_same_recording,
     compare_errors,
     compare_shares,
     read_errors,
@@ -54,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         make_folder(args.out)
     with progress_of('comparing') as tell:
+        check_same_recording(args.first, args.second)
         one, two = read_errors(args.first), read_errors(args.second)
         tell('resampling')
         rng = np.random.default_rng(SEED)
@@ -169,6 +172,8 @@ def draw(
             panel.plot(scale * (second - first), row, 'o', color='C0')
             if np.isfinite(one.low):
                 panel.hlines(row, scale * one.low, scale * one.high, color='C0')
+        if not any(one.sign or one.low != one.high for one in all_of.values()):
+            panel.set_xlim(-1.0, 1.0)  # no difference at all has no scale of its own
         panel.axvline(0.0, color='0.5')
         panel.set_xlabel(label)
         panel.grid(alpha=0.3, axis='x')

@@ -17,8 +17,9 @@ import time
 from pathlib import Path
 
 from anser_ros.cli import missing
-from anser_ros.cli.demo_report import FROZEN, MEANINGS, draw, load, summarise
-from anser_ros.cli.output import make_folder
+from anser_ros.cli.demo_report import FROZEN, LIVE, MEANINGS, draw, load, summarise
+from anser_ros.cli.folders import make_new_folder
+from anser_ros.cli.ros_domain import LAST_DOMAIN, VARIABLE, own_domain
 from anser_ros.cli.supervisor import Supervisor, tail
 from anser_ros.cli.warm_up import compile_kernels
 from anser_ros.errors import ParameterError
@@ -80,7 +81,8 @@ def run(args: argparse.Namespace) -> int:
     Raises
     ------
     ParameterError
-        When the duration or the rate is out of range, or the folder to draw from has no demo.
+        When the duration or the rate is out of range, the folder to draw from has no demo, or
+        another demo has the stated ROS domain.
     """
     if args.draw is not None:
         return _draw_left(args.draw, args)
@@ -94,10 +96,13 @@ def run(args: argparse.Namespace) -> int:
         number: signal.signal(number, lambda got, _: stopped.append(got))
         for number in (signal.SIGINT, signal.SIGTERM)
     }
-    folder = args.out / time.strftime('demo_%Y%m%d_%H%M%S')
-    make_folder(folder)
+    is_stated = VARIABLE in os.environ
     try:
-        return _run_in(folder, args, stopped)
+        with own_domain(range(LAST_DOMAIN + 1)) as domain:
+            if domain and not is_stated:
+                _say(f'another demo runs: this one has {VARIABLE}={domain}', args)
+            folder = make_new_folder(args.out, time.strftime('demo_%Y%m%d_%H%M%S'))
+            return _run_in(folder, args, stopped)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -172,7 +177,10 @@ def _report(folder: Path, args: argparse.Namespace, *, interrupted: bool) -> int
         print(json.dumps(summary, indent=1))
     else:
         _print(summary)
-    return 0
+    if interrupted or results is None or LIVE in summarise(results)['chains']:
+        return 0
+    print('anser demo: the live chain gave no pose; the table says why', file=sys.stderr)
+    return 1
 
 
 def _print(summary: dict[str, object]) -> None:

@@ -32,9 +32,9 @@ def load(path: Path) -> Results:
         return {name: stored[name] for name in stored.files}
 
 
-def summarise(results: Results) -> dict[str, object]:
+def summarise(results: Results) -> dict[str, dict[str, Any]]:
     """Return the errors, rates and latencies of each chain over all its sensors and bodies."""
-    chains: dict[str, object] = {}
+    chains: dict[str, Any] = {}
     for rank, chain in enumerate(results['chains']):
         error = _joined(results, 'error', rank)
         error = error[np.isfinite(error)]

@@ -12,7 +12,8 @@ from anser_ros.cli.carry_out import carry_out
 from anser_ros.cli.diagnosis_report import render
 from anser_ros.cli.diagnosis_words import flux_unit, verdict
 from anser_ros.cli.few_poses_report import render_few_poses
-from anser_ros.cli.output import Result, loss_notes, make_folder, snapshot_notes
+from anser_ros.cli.folders import make_folder
+from anser_ros.cli.output import Result, loss_notes, snapshot_notes
 from anser_ros.cli.pose_session import add_pose_options, diagnose_pose_session, need_model
 from anser_ros.cli.stated_values import add_resurveyed, add_stated_values, stated_values
 from anser_ros.field.model import FieldModel

@@ -9,6 +9,7 @@ import json
 import os
 import re
 import shutil
+import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -166,13 +167,21 @@ def ports(device: str | None, patterns: tuple[str, ...] = PORTS) -> list[Observa
     return [_port(name) for name in names]
 
 
+NO_PORT, PORT_NAME = 'is not a serial port', 'see dmesg for the name of the port'
+
+
 def _port(name: str) -> Observation:
     """One port; it is opened for a moment, as only so it shows whether it is one."""
     if not os.path.exists(name):
         return Observation(name, BAD, 'not there', 'plug it in; see dmesg for its name')
     if not os.access(name, os.R_OK | os.W_OK):
-        remedy = f'sudo usermod -aG {_group(name)} $USER, then log out and in again'
+        group = _group(name)
+        remedy = f'sudo usermod -aG {group} $USER, then log out and in again'
+        if not group:
+            remedy = f'sudo chmod a+rw {name}; a udev rule with MODE="0666" makes that last'
         return Observation(name, BAD, 'no permission to read and write it', remedy)
+    if not stat.S_ISCHR(os.stat(name).st_mode):
+        return Observation(name, BAD, NO_PORT, PORT_NAME)
     try:
         handle = os.open(name, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     except OSError as error:
@@ -186,16 +195,18 @@ def _port(name: str) -> Observation:
             return Observation(name, GOOD, 'can be opened')
     finally:
         os.close(handle)
-    return Observation(name, BAD, 'is not a serial port', 'see dmesg for the name of the port')
+    return Observation(name, BAD, NO_PORT, PORT_NAME)
 
 
 def _group(name: str) -> str:
-    """The group that may use a port."""
+    """The group that may use a port, to which users can be added; empty for none."""
+    about = os.stat(name)
     try:
-        group = grp.getgrgid(os.stat(name).st_gid).gr_name
-    except (KeyError, OSError):
-        return 'dialout'
-    return 'dialout' if group == 'root' else group
+        group = grp.getgrgid(about.st_gid).gr_name
+    except KeyError:
+        return ''
+    needed = stat.S_IRGRP | stat.S_IWGRP
+    return group if about.st_mode & needed == needed and group != 'root' else ''
 
 
 def clock(tool: str = 'timedatectl') -> list[Observation]:

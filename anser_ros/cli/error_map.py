@@ -11,12 +11,14 @@ import yaml
 from numpy.typing import NDArray
 
 from anser_ros.calibration.error_map import ErrorMap, HeldOutError, learn_error_map
-from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.folders import make_folder
+from anser_ros.cli.output import say_written
 from anser_ros.cli.progress import progress_of
 from anser_ros.errors import FitError, ParameterError, PlausibilityError
 from anser_ros.poses.point_model import to_point_model
 from anser_ros.sessions.plausibility import check_points
 from anser_ros.wire.fiducials import read_fiducials
+from anser_ros.wire.text_files import read_rows
 
 SCHEMA = 'anser_error_map/1'
 TRACKED = ('x_m', 'y_m', 'z_m')
@@ -158,10 +160,7 @@ def _plain(error: HeldOutError) -> dict[str, float | None]:
 
 
 def _read(path: Path) -> tuple[list[dict[str, str]], list[str]]:
-    with path.open(encoding='utf-8', newline='') as stream:
-        reader = csv.DictReader(stream)
-        rows = list(reader)
-        names = list(reader.fieldnames or [])
+    names, rows = read_rows(path)
     if not rows:
         raise FitError(f'{path}: no rows')
     return rows, names

@@ -9,7 +9,8 @@ from rich.table import Table
 
 from anser_ros.cli.carry_out import carry_out
 from anser_ros.cli.evaluation_figures import write_figures
-from anser_ros.cli.output import Result, loss_notes, make_folder, snapshot_notes
+from anser_ros.cli.folders import make_folder
+from anser_ros.cli.output import Result, loss_notes, snapshot_notes
 from anser_ros.cli.pose_session import add_pose_options, evaluate_pose_session, need_model
 from anser_ros.cli.progress import Tell, progress_of
 from anser_ros.cli.session_runs import finish, perform, runs_of
@@ -18,7 +19,7 @@ from anser_ros.errors import ParameterError
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.chosen_references import parse_references, with_references
 from anser_ros.sessions.evaluation import track_session
-from anser_ros.sessions.evaluation_document import to_document
+from anser_ros.sessions.evaluation_document import recording_of, to_document
 from anser_ros.sessions.patches import parse_patches
 from anser_ros.sessions.pose_table import (
     BODIES_FILE,
@@ -153,7 +154,7 @@ def work(args: argparse.Namespace, tell: Tell) -> Result:
         witnesses=args.witnesses,
         progress=lambda share: tell('tracking', share),
     )
-    document = to_document(evaluation)
+    document = {**to_document(evaluation), 'recording': recording_of(session)}
     text = json.dumps(document, indent=1)
     (args.out / 'evaluation.json').write_text(text + '\n', encoding='utf-8')
     write_poses(args.out / POSES_FILE, evaluation)

@@ -15,8 +15,9 @@ from rich.console import Console
 from rich.table import Table
 
 from anser_ros.assessment.source import PoseSource, read_poses
+from anser_ros.cli.folders import make_folder
 from anser_ros.cli.html_page import page, table
-from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.output import say_written
 from anser_ros.cli.pose_session import add_topic_options, load_poses
 from anser_ros.cli.progress import progress_of
 from anser_ros.errors import ParameterError

@@ -10,6 +10,7 @@ from anser_ros.cli.progress import progress_of
 from anser_ros.errors import ParameterError
 from anser_ros.sessions.bag_import import import_bag, parse_remaps
 from anser_ros.sessions.table_import import import_tables
+from anser_ros.wire.text_files import read_text
 
 SCHEMA = 'anser_import_result/1'
 DOCUMENTS = ('.yaml', '.yml')
@@ -56,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
         if is_document:
             counts = import_tables(args.source, args.out).messages
         else:
-            setup = '' if args.setup is None else args.setup.read_text(encoding='utf-8')
+            setup = None if args.setup is None else read_text(args.setup)
             bag = import_bag(args.source, args.out, parse_remaps(args.remap), setup)
             counts, lost, left_out = bag.messages, bag.lost, bag.left_out
     if lost:

@@ -14,9 +14,11 @@ import numpy as np
 from rich.console import Console
 
 from anser_ros.cli import missing
+from anser_ros.cli.folders import make_new_folder
 from anser_ros.cli.loop_result import parameter_errors, second_run, table, verdict
 from anser_ros.cli.loop_run import AFTER, LoopFiles, Run, make_world, record
-from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.output import say_written
+from anser_ros.cli.ros_domain import LAST_DOMAIN, own_domain
 from anser_ros.cli.warm_up import compile_kernels
 from anser_ros.effects.correction import Correction
 from anser_ros.errors import DiagnosisError, ParameterError
@@ -35,8 +37,6 @@ SECOND_SHARE = 0.6
 """Duration of the second run as a fraction of the first one's."""
 OTHER_PATH_RAD = 2.0
 """Phase of the second run's path, rad, so that the correction is tested at other poses."""
-LAST_DOMAIN = 101
-"""Largest ROS domain used. The ports of domains up to this are no ephemeral ports of Linux."""
 LEAST_KEPT = 0.85
 """Fraction of whole frames below which a recording shows the load of the machine rather than the
 effect."""
@@ -86,9 +86,14 @@ def run(args: argparse.Namespace) -> int:
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     # A ROS system that runs already must neither receive nor be received by what is simulated
     # here.
-    os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % LAST_DOMAIN))
-    folder = args.out / time.strftime('loop_%Y%m%d_%H%M%S')
-    make_folder(folder)
+    ours = os.getpid() % LAST_DOMAIN
+    domains = [1 + (ours + k) % LAST_DOMAIN for k in range(LAST_DOMAIN)]
+    with own_domain(domains):
+        return _run(args, effects, seed)
+
+
+def _run(args: argparse.Namespace, effects: list[str], seed: int) -> int:
+    folder = make_new_folder(args.out, time.strftime('loop_%Y%m%d_%H%M%S'))
     say = Console(stderr=True, highlight=False)
     compile_kernels(say.print)
     world, clean = make_world(folder), None

@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 
 from anser_ros.cli import missing
 from anser_ros.cli.commands import COMPOSED, NODES, OFFLINE
+from anser_ros.cli.folders import remove_empty_folders
 from anser_ros.errors import AnserError
 from anser_ros.one_line_parser import OneLineParser
 from anser_ros.parallel import ONE_THREAD, cores, shared_among
@@ -110,6 +111,8 @@ def run_verb(name: str, arguments: Sequence[str]) -> int:
         return leaving.code if isinstance(leaving.code, int) else EXIT_BAD_INPUT
     except KeyboardInterrupt:
         code, done, words = EXIT_BAD_INPUT, None, 'interrupted'
+    finally:
+        remove_empty_folders()
     if done is not None:
         return int(done)
     print(words if code == EXIT_DEFECT else f'anser {name}: {words}', file=sys.stderr)

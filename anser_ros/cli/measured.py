@@ -17,7 +17,8 @@ from rich.console import Console
 from rich.table import Table
 
 from anser_ros.cli import main
-from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.folders import make_folder
+from anser_ros.cli.output import say_written
 from anser_ros.errors import ParameterError
 from anser_ros.measured import (
     ReportRow,

@@ -3,13 +3,13 @@
 import json
 import os
 import sys
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
+from anser_ros.cli.folders import make_folder
 from anser_ros.errors import ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.sessions.model_file import SNAPSHOT, is_snapshot
@@ -72,27 +72,6 @@ def say(command: str, result: Result, *, as_json: bool) -> None:
         else:
             Console().print(item)
     say_written(*result.written)
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder for results before the work begins.
-
-    Raises
-    ------
-    ParameterError
-        When the folder cannot be made, or nothing can be written there.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ParameterError(f'no folder {folder}: {error.strerror}') from error
-    try:  # permissions alone do not tell: a file system may be full, or no place for files
-        with tempfile.TemporaryFile(dir=folder) as stream:
-            stream.write(b'x')
-            stream.flush()
-    except OSError as error:
-        words = os.strerror(error.errno or 0)
-        raise ParameterError(f'nothing can be written into {folder}: {words}') from error
 
 
 def say_written(*paths: Path) -> None:

@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.folders import make_folder
+from anser_ros.cli.output import say_written
 from anser_ros.experiments.figures import draw_all
 from anser_ros.experiments.recordings import (
     Recordings,

@@ -15,8 +15,9 @@ from rich.table import Table
 
 from anser_ros.assessment.pivot import PivotFit, PivotLimits, fit_pivot
 from anser_ros.assessment.source import AssessedPoses, read_poses
+from anser_ros.cli.folders import make_folder
 from anser_ros.cli.html_page import page, table
-from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.output import say_written
 from anser_ros.cli.pose_source import add_source_options, live_poses, source_of
 from anser_ros.cli.progress import progress_of
 from anser_ros.errors import FitError, ParameterError, SetupError
@@ -24,6 +25,7 @@ from anser_ros.pictures import image
 from anser_ros.poses.sequence import missing_words
 from anser_ros.wire.setup import parse_setup, topic_of
 from anser_ros.wire.setup_tips import SCHEMA, UPPER, TipSpec, dump_tips, with_tips
+from anser_ros.wire.text_files import read_text
 
 DOCUMENT = 'anser_pivot/1'
 SEED = 1
@@ -75,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
         raise ParameterError('--live needs the --topic of the poses')
     if not (args.max_sigma_mm > 0 and args.max_rms_mm > 0):
         raise ParameterError('--max-sigma-mm and --max-rms-mm must be positive')
-    text = args.setup.read_text(encoding='utf-8') if args.setup else ''
+    text = read_text(args.setup) if args.setup else ''
     if args.out is not None:
         make_folder(args.out)
     with progress_of('pivot') as progress:

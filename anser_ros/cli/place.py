@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.folders import make_folder
+from anser_ros.cli.output import say_written
 from anser_ros.cli.place_figure import write_figure
 from anser_ros.cli.progress import progress_of
 from anser_ros.cli.stated_values import add_stated_values, stated_values
@@ -28,6 +29,7 @@ from anser_ros.sessions.units import LENGTH_UNITS, unit_words
 from anser_ros.sessions.volume import stated_volume
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import FIELD_GENERATOR, Setup, parse_setup
+from anser_ros.wire.text_files import read_rows
 
 Array = NDArray[np.float64]
 
@@ -242,8 +244,7 @@ def _coils(places: Array, axes: Array, length_m: float | Array) -> SensorTable:
 
 def _read(path: Path) -> SensorTable:
     """Return the coils of a list of places."""
-    with path.open(encoding='utf-8', newline='') as stream:
-        rows = list(csv.DictReader(stream))
+    _, rows = read_rows(path)
     if not rows:
         raise ParameterError(f'{path}: no rows')
     places = _numbers(path, rows, ('x_m', 'y_m', 'z_m'))

@@ -11,7 +11,8 @@ import numpy as np
 import yaml
 from rich.table import Table
 
-from anser_ros.cli.output import Result, loss_notes, make_folder
+from anser_ros.cli.folders import make_folder
+from anser_ros.cli.output import Result, loss_notes
 from anser_ros.cli.pose_report import pose_verdict, render_poses
 from anser_ros.errors import ParameterError
 from anser_ros.poses.diagnosis import PoseDiagnosis, diagnose_poses

@@ -15,6 +15,7 @@ from anser_ros.errors import BagError, ParameterError
 from anser_ros.poses.sequence import PoseSession, sequence_of
 from anser_ros.sessions.plausibility import check_positions
 from anser_ros.wire.setup_tips import read_tips
+from anser_ros.wire.text_files import read_text
 
 PATIENCE_S = 20.0
 """Time, s, that the look at the graph may take beyond what it was asked for: ROS has to start."""
@@ -51,7 +52,7 @@ def source_of(args: argparse.Namespace) -> PoseSource:
     """
     place = None
     if getattr(args, 'tip', None) is not None:
-        tips = read_tips(args.tip.read_text(encoding='utf-8'))
+        tips = read_tips(read_text(args.tip))
         if args.body not in tips and (args.body or len(tips) != 1):
             raise ParameterError(f'{args.tip}: name the body, one of {", ".join(tips)}')
         place = np.array((tips[args.body] if args.body else next(iter(tips.values()))).position_m)

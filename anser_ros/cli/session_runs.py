@@ -17,8 +17,9 @@ from pathlib import Path
 
 from rich.console import Console
 
+from anser_ros.cli.folders import make_folder
 from anser_ros.cli.main import EXIT_BAD_INPUT, EXIT_DEFECT, EXIT_OK, attempt
-from anser_ros.cli.output import Result, make_folder, say_written
+from anser_ros.cli.output import Result, say_written
 from anser_ros.cli.summary import SCHEMA, Outcome, row_of, table_of, write_summary
 from anser_ros.errors import ParameterError
 from anser_ros.parallel import shared_among

@@ -5,7 +5,8 @@ import json
 import sys
 from pathlib import Path
 
-from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.folders import make_folder
+from anser_ros.cli.output import say_written
 from anser_ros.cli.setup_figure import draw_setup
 from anser_ros.cli.setup_parts import (
     ANSER,
@@ -39,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = (
         'examples: anser setup --out my_setup/ (asks); anser setup --board anser '
-        '--sensor "0,pen/tip,pen,0,0,0,z" --sensor "16,ref/0,fg,150,0,20,1 0 1" --out my_setup/; '
+        '--sensor "0,pen/0,pen,0,0,0,z" --sensor "16,ref/0,fg,150,0,20,1 0 1" --out my_setup/; '
         'anser setup config/demo_setup.yaml --out picture/ (checks and draws it)'
     )
     parser.add_argument('document', nargs='?', help='a setup document to check and draw')
@@ -89,6 +90,11 @@ def run(args: argparse.Namespace) -> int:
     """Run the command; the exit code."""
     parts = [args.board, args.geometry, args.coil, args.coils, args.sensor, args.sensors]
     make_folder(args.out)
+    if args.document is None and (args.out / DOCUMENT).exists():
+        raise ParameterError(
+            f'{args.out / DOCUMENT} is there already, perhaps with tips and changes by hand: give '
+            f'another folder, or remove it'
+        )
     if args.document is not None:
         if any(parts) or args.volume or args.stated:
             raise ParameterError(

@@ -1,6 +1,5 @@
 """Makes a setup document of its parts: texts that people type, in mm and degrees."""
 
-import csv
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from anser_ros.errors import ParameterError
 from anser_ros.settings import SECTIONS
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import FIELD_GENERATOR, SCHEMA, Setup, parse_setup
+from anser_ros.wire.text_files import read_rows
 from anser_ros.wire.yaml_text import read_yaml
 
 ANSER, ANSER_FILE = 'anser', 'demo_setup.yaml'
@@ -145,17 +145,14 @@ def rows_of(path: Path, columns: Sequence[str]) -> list[str]:
     ParameterError
         When the head is another one, or there is no row.
     """
-    with path.open(encoding='utf-8-sig', newline='') as stream:
-        reader = csv.DictReader(stream)
-        extra = [name for name in reader.fieldnames or () if name == 'length_mm']
-        found = [name for name in reader.fieldnames or () if name not in extra]
-        if set(found) != set(columns):
-            raise ParameterError(
-                f'{path}: columns must be {",".join(columns)}, got {",".join(found)}'
-            )
-        rows = [
-            ','.join((row[name] or '').strip() for name in (*columns, *extra)) for row in reader
-        ]
+    names, found_rows = read_rows(path)
+    extra = [name for name in names if name == 'length_mm']
+    found = [name for name in names if name not in extra]
+    if set(found) != set(columns):
+        raise ParameterError(f'{path}: columns must be {",".join(columns)}, got {",".join(found)}')
+    rows = [
+        ','.join((row[name] or '').strip() for name in (*columns, *extra)) for row in found_rows
+    ]
     if not rows:
         raise ParameterError(f'{path}: no rows')
     return [row.rstrip(',') for row in rows]

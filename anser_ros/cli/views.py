@@ -11,7 +11,8 @@ from typing import Any
 
 import yaml
 
-from anser_ros.cli.output import make_folder, say_written
+from anser_ros.cli.folders import make_folder
+from anser_ros.cli.output import say_written
 from anser_ros.errors import ParameterError
 from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import SensorSpec, Setup, parse_setup, topic_of

@@ -65,6 +65,8 @@ class Dashboard(AnserNode):
         )
         self.create_subscription(String, 'setup', self._on_setup, qos.LATCHED)
         folder = RecordingFolder(Path(table.directory))
+        if words := folder.trouble():
+            self.get_logger().warning(f'directory {folder.path}: {words}: no result can be kept')
         self._loop = CorrectionLoop(self._client, folder)
         self._pages = Pages(self._source, self._loop, self._guard)
         self._pages.register()

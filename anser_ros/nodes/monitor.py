@@ -16,6 +16,7 @@ from rich.markup import escape
 from rich.table import Table
 from std_msgs.msg import String
 
+from anser_ros.errors import ParameterError
 from anser_ros.nodes.output_parts.causes import LastStatus, causes
 from anser_ros.nodes.output_parts.traces import OpticalTrace, Row, Traces, latency_of, targets_of
 from anser_ros.nodes.runtime import qos
@@ -67,6 +68,8 @@ class Monitor(AnserNode):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         table = self.parameters
+        if table.output:
+            _check(Path(table.output))
         self._console = Console()
         self._live: Live | None = None
         if self._console.is_terminal:
@@ -297,9 +300,23 @@ class Monitor(AnserNode):
             arrays[f'optical_{body}'] = np.column_stack(
                 [np.array(seen.stamp_s), np.array(seen.position, float).reshape(-1, 3)]
             )
-        temporary = path.with_suffix('.part.npz')
+        temporary = _part(path)
         np.savez_compressed(temporary, **arrays)
         temporary.replace(path)
+
+
+def _part(path: Path) -> Path:
+    """Where an output file is written, before it takes its place as a whole."""
+    return path.with_suffix('.part.npz')
+
+
+def _check(path: Path) -> None:
+    """Refuse an output file that cannot be written before anything is recorded for it."""
+    try:
+        _part(path).touch()
+        _part(path).unlink()
+    except OSError as error:
+        raise ParameterError(f'parameter output: {path}: {error.strerror}') from error
 
 
 def _z_axis(q: Any) -> tuple[float, ...]:

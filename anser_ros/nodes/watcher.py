@@ -33,6 +33,7 @@ from anser_ros.pose_states import TWO_SOURCES
 from anser_ros.poses.live_look import PoseSighting, PoseWatch
 from anser_ros.poses.live_window import PoseWindow
 from anser_ros.poses.sequence import PoseSession
+from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.session import Session, empty_session, load_session
 from anser_ros.sessions.sliding_window import LIVE, SlidingWindow
@@ -120,6 +121,8 @@ class Watcher(AnserNode):
         super().__init__(**options)
         table = self.parameters
         self._stated = stated_by(table)
+        if not table.tracked_poses and table.model_file != NOMINAL:
+            load_model(table.model_file)  # refused now, not when fluxes come
         self._baseline_bag = load_session(table.baseline_file) if table.baseline_file else None
         self._setup_text = self._offered = ''
         self._window: SlidingWindow | PoseWindow | None = None

@@ -3,6 +3,7 @@
 import csv
 import os
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,24 @@ FORMATS = (CSV, TUM, MAT)
 POSE_COLUMNS = ('stamp_ns', 'x_m', 'y_m', 'z_m', 'qx', 'qy', 'qz', 'qw')
 
 
-def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> dict[str, int]:
-    """Write a file for each topic of poses and of fluxes; the rows of each by its name.
+@dataclass(frozen=True)
+class ExportedBag:
+    """States what came of an export.
+
+    Attributes
+    ----------
+    rows : dict of str to int
+        Written rows by the file's name.
+    lost : str
+        What of the bag could not be read, in words.
+    """
+
+    rows: dict[str, int]
+    lost: str
+
+
+def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> ExportedBag:
+    """Write a file for each topic of poses and of fluxes.
 
     Raises
     ------
@@ -34,7 +51,8 @@ def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> dict[str, 
     # Nodes that read no bag run where the packages that read bags are not installed.
     from anser_ros.wire.bag import POSE_TYPE, Salvage, iter_messages, read_fluxes
 
-    topics = sorted({m.topic for m in iter_messages(path, Salvage()) if m.type_name == POSE_TYPE})
+    salvage = Salvage()
+    topics = sorted({m.topic for m in iter_messages(path, salvage) if m.type_name == POSE_TYPE})
     written: dict[str, int] = {}
     for topic, poses in published_poses(path, topics).items():
         if poses.stamp_ns.size:
@@ -49,7 +67,7 @@ def export_bag(path: str | os.PathLike[str], out: Path, form: str) -> dict[str, 
             written[name] = int(fluxes.stamp_ns.size)
     if not written:
         raise BagError(f'{os.fspath(path)}: nothing to export as {form}')
-    return written
+    return ExportedBag(written, salvage.lost)
 
 
 def _file_name(topic: str) -> str:

@@ -58,7 +58,7 @@ def import_bag(
     path: str | os.PathLike[str],
     out: Path,
     remaps: Mapping[str, str] | None = None,
-    setup_text: str = '',
+    setup_text: str | None = None,
 ) -> ImportedBag:
     """Write the messages of any ROS 2 bag as one MCAP file that every command reads.
 
@@ -70,7 +70,7 @@ def import_bag(
         The file to write; it must not exist yet.
     remaps : mapping, optional
         New names of topics.
-    setup_text : str
+    setup_text : str, optional
         Setup document that is written at the start, in place of any in the bag.
 
     Raises
@@ -80,7 +80,7 @@ def import_bag(
     SetupError
         When the text is not a setup document.
     """
-    if setup_text:
+    if setup_text is not None:
         parse_setup(setup_text)
     names, salvage = dict(remaps or {}), Salvage()
     written: Counter[str] = Counter()
@@ -92,11 +92,15 @@ def import_bag(
         for message in read_foreign(path, salvage):
             seen.add(message.topic)
             topic = names.get(message.topic, message.topic)
-            if setup_text and SETUP_TOPIC not in channels:
+            if setup_text is not None and SETUP_TOPIC not in channels:
                 channels[SETUP_TOPIC] = _channel(writer, SETUP_TOPIC, SETUP_TYPE, '')
                 data = cdr.string_bytes(setup_text)
                 writer.write(channels[SETUP_TOPIC], message.log_time_ns, data)
-            if setup_text and topic.endswith('/setup') and message.type_name == SETUP_TYPE:
+            if (
+                setup_text is not None
+                and topic.endswith('/setup')
+                and message.type_name == SETUP_TYPE
+            ):
                 continue
             if types.setdefault(topic, message.type_name) != message.type_name:
                 clash = f'{topic} would have {types[topic]} and {message.type_name}'

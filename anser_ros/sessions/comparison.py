@@ -4,7 +4,7 @@ Frames close in time share the causes of their errors, so whole stretches of tim
 (the moving-block idea of Künsch, Annals of Statistics 17, 1989), all coils of a stretch together.
 """
 
-import csv
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +22,7 @@ from anser_ros.sessions.pose_table import (
     POSE_COLUMNS,
     POSES_FILE,
 )
+from anser_ros.wire.text_files import read_rows, read_text
 
 Array = NDArray[np.float64]
 Key = tuple[int, str]
@@ -105,6 +106,33 @@ class ComparedShares(Difference):
         return {1: 'b', 0: 'neither', -1: 'a'}[self.sign]
 
 
+def check_same_recording(first: Path, second: Path) -> None:
+    """Refuse evaluations of two recordings, of which equal stamps mean nothing.
+
+    Raises
+    ------
+    ParameterError
+        When both state what they are of, and it is not the same.
+    """
+    one, two = _recording(first), _recording(second)
+    if one and two and one != two:
+        raise ParameterError(
+            f'{first} and {second} are evaluations of two different recordings ({one}, {two}), '
+            f'whose frames cannot be paired'
+        )
+
+
+def _recording(folder: Path) -> str:
+    """What an evaluation says that it is of; empty where it does not, as older ones."""
+    path = folder / 'evaluation.json'
+    if not path.is_file():
+        return ''
+    try:
+        return str(json.loads(read_text(path)).get('recording', ''))
+    except (ValueError, AttributeError) as error:
+        raise ParameterError(f'{path}: not a document of anser evaluate') from error
+
+
 def read_errors(folder: Path) -> dict[str, dict[Key, float]]:
     """Return errors of position (m) and orientation (rad) by stamp and name, of an evaluation.
 
@@ -151,13 +179,12 @@ def _each_row(
     path = folder / name
     if not path.is_file():
         raise ParameterError(f'{folder}: no {name}; is it a folder of anser evaluate?')
+    names, rows = read_rows(path)
     try:
-        with path.open(encoding='utf-8', newline='') as stream:
-            reader = csv.DictReader(stream)
-            if tuple(reader.fieldnames or ()) != columns:
-                raise ValueError(f'columns must be {", ".join(columns)}')
-            for row in reader:
-                take(row)
+        if tuple(names) != columns:
+            raise ValueError(f'columns must be {", ".join(columns)}')
+        for row in rows:
+            take(row)
     except (ValueError, TypeError) as error:
         raise ParameterError(f'{path}: {error}') from error
 

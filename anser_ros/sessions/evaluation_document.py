@@ -2,11 +2,18 @@
 
 from typing import Any
 
+from anser_ros.fingerprint import fingerprint_of
 from anser_ros.sessions.evaluation import Evaluation
 from anser_ros.sessions.pose_errors import metrics
+from anser_ros.sessions.session import Session
 
 SCHEMA = 'anser_evaluation/1'
 """Name of the document's layout, which stands in every such document."""
+
+
+def recording_of(session: Session) -> str:
+    """Return the fingerprint of what was recorded, whatever the file is called."""
+    return fingerprint_of([tool.flux[:, :1] for tool in session.tools])
 
 
 def to_document(evaluation: Evaluation) -> dict[str, Any]:

@@ -30,6 +30,7 @@ from anser_ros.wire.pose_topics import (
 from anser_ros.wire.quaternion import unit_quaternions
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup, parse_setup
 from anser_ros.wire.setup_values import read_name
+from anser_ros.wire.text_files import read_text
 from anser_ros.wire.yaml_text import read_yaml
 
 SCHEMA = 'anser_import/1'
@@ -62,9 +63,10 @@ def import_tables(document: Path, out: Path) -> ImportedTables:
     BagError
         When the file to write is there already.
     """
+    text = read_text(document)
     try:
-        spec = read_yaml(document.read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        spec = read_yaml(text)
+    except yaml.YAMLError as error:
         raise ParameterError(f'{document}: {" ".join(str(error).split())}') from error
     try:
         return _Import(_mapping(spec, 'the document'), document.parent).write(out)
@@ -91,7 +93,7 @@ class _Import:
         self._setup: Setup | None = None
         self._setup_text = ''
         if tables['fluxes']:
-            self._setup_text = _text_of(folder / str(_needed(spec, 'setup', 'the document')))
+            self._setup_text = read_text(folder / str(_needed(spec, 'setup', 'the document')))
             self._setup = parse_setup(self._setup_text)
         elif 'setup' in spec:
             raise ParameterError('a setup describes fluxes; tracked poses have none')
@@ -267,13 +269,6 @@ def _tables(spec: Mapping[str, Any], key: str) -> list[Any]:
     if not isinstance(tables, list):
         raise ParameterError(f'{key} must be a list of tables')
     return tables
-
-
-def _text_of(path: Path) -> str:
-    try:
-        return path.read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as error:
-        raise ParameterError(f'setup {path}: {error}') from error
 
 
 def _mapping(value: Any, what: str) -> Mapping[str, Any]:

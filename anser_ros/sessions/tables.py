@@ -79,7 +79,7 @@ def read_table(path: Path) -> NumberTable:
         When it is of another kind, or cannot be read.
     """
     if not path.is_file():
-        raise ParameterError(f'{path}: no such file')
+        raise ParameterError(f'{path}: {"is a folder" if path.is_dir() else "no such file"}')
     try:
         if path.suffix == '.csv':
             return NumberTable(path, _csv(path))

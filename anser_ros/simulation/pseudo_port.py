@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from anser_ros.errors import PortError
+from anser_ros.held_names import hold
 from anser_ros.simulation.control_unit import Piece
 
 _PENDING_LIMIT_BYTES = 1 << 20
@@ -29,14 +30,22 @@ class PseudoPort:
     Raises
     ------
     PortError
-        When something other than a link has that path, or the link cannot be made.
+        When something other than a link has that path, another simulated device has it, or the
+        link cannot be made.
     """
 
     def __init__(self, link: Path) -> None:
         self.link = link
         self._fds: tuple[int, int] | None = None
         self._pending = b''
-        self.plug()
+        self._holder = hold(f'port {os.path.abspath(link)}')
+        if self._holder is None:
+            raise PortError(f'{link} is the port of another simulated control unit that runs')
+        try:
+            self.plug()
+        except PortError:
+            self._holder.close()
+            raise
 
     @property
     def plugged(self) -> bool:
@@ -70,8 +79,10 @@ class PseudoPort:
         self._fds, self._pending = None, b''
 
     def close(self) -> None:
-        """Pull the cable out for good."""
+        """Pull the cable out for good, and leave the path to others."""
         self.unplug()
+        if self._holder is not None:
+            self._holder.close()
 
     def write(self, pieces: Sequence[Piece]) -> int:
         """Send records and return the number of blocks dropped because the line was full."""

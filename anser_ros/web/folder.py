@@ -1,5 +1,6 @@
 """Keeps the folder of recordings: all that the page can read or write lies in it."""
 
+import os
 from pathlib import Path
 
 from anser_ros.errors import BagError
@@ -29,6 +30,15 @@ class RecordingFolder:
 
     def __init__(self, path: Path) -> None:
         self.path = path.expanduser().resolve()
+
+    def trouble(self) -> str:
+        """Return why nothing can be written there, in words; empty where it can."""
+        place = self.path
+        while not place.exists():
+            place = place.parent
+        if not place.is_dir():
+            return f'{place} is no folder'
+        return '' if os.access(place, os.W_OK | os.X_OK) else f'no permission to write {place}'
 
     def recordings(self) -> list[str]:
         """Return names of the bags, the newest first."""

@@ -122,10 +122,8 @@ def _records(stream: io.BufferedReader, salvage: Salvage, size: int) -> Iterator
                 continue
             yield from inner
     except _BROKEN as error:
-        salvage.lost = (
-            f'the bag breaks off after {whole} of {size} bytes '
-            f'({type(error).__name__}: {" ".join(str(error).split())[:120]})'
-        )
+        why = ': '.join(filter(None, (type(error).__name__, ' '.join(str(error).split())[:120])))
+        salvage.lost = f'the bag breaks off after {whole} of {size} bytes ({why})'
     if salvage.bad_chunks:
         text = f'{salvage.bad_chunks} chunks with a bad checksum or size left out'
         salvage.lost = f'{salvage.lost}; {text}' if salvage.lost else text

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from anser_ros.errors import SetupError
+from anser_ros.wire.text_files import read_text
 
 _PACKAGE = 'anser_ros'
 
@@ -34,10 +35,8 @@ def read_config(name: str) -> str:
     Raises
     ------
     SetupError
-        When there is none, or it is no text.
+        When there is none.
+    ParameterError
+        When it cannot be read, or is no text.
     """
-    path = config_path(name)
-    try:
-        return path.read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as error:
-        raise SetupError(f'cannot read {path}: {error}') from error
+    return read_text(config_path(name))

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.errors import BagError
+from anser_ros.wire.text_files import read_text
 
 
 def read_fiducials(path: Path) -> NDArray[np.float64]:
@@ -16,7 +17,7 @@ def read_fiducials(path: Path) -> NDArray[np.float64]:
     BagError
         When the file has no table of fiducials.
     """
-    lines = path.read_text(encoding='utf-8').splitlines()
+    lines = read_text(path).splitlines()
     rows = [line.split(',') for line in lines if line.strip() and not line.startswith('#')]
     try:
         places = np.array([[float(value) for value in row[1:4]] for row in rows])

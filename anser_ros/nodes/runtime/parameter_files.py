@@ -3,13 +3,13 @@
 import difflib
 import itertools
 from collections.abc import Collection, Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import yaml
 
 from anser_ros.errors import ParameterError
 from anser_ros.wire.config_folder import config_path, read_config
+from anser_ros.wire.text_files import read_text
 from anser_ros.wire.yaml_text import read_yaml
 
 OPTION = '--params-file'
@@ -26,8 +26,8 @@ def _documents(arguments: Sequence[str]) -> Iterator[tuple[str, Any]]:
         if option != OPTION:
             continue
         try:
-            document = read_yaml(Path(value).read_text(encoding='utf-8'))
-        except (OSError, ValueError, yaml.YAMLError):
+            document = read_yaml(read_text(value))
+        except (ParameterError, yaml.YAMLError):
             continue
         yield value, document
 

@@ -1,14 +1,14 @@
 """Lists the parameters of the tracker, and makes the core's settings of them."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
-from anser_ros.errors import ParameterError
+from anser_ros.errors import AnserError, ParameterError
 from anser_ros.nodes.runtime.parameters import parameter
 from anser_ros.nodes.runtime.stated_parameters import stated
 from anser_ros.physics.volume import TrackedVolume
 from anser_ros.tracking.estimate import NO_GATE, TrackerSettings
 from anser_ros.wire.setup_tips import TipSpec, read_tips
+from anser_ros.wire.text_files import read_text
 
 
 @dataclass(frozen=True)
@@ -128,6 +128,6 @@ def tips_of_file(path: str) -> dict[str, TipSpec]:
         When it has no tips.
     """
     try:
-        return read_tips(Path(path).read_text(encoding='utf-8')) if path else {}
-    except OSError as error:
-        raise ParameterError(f'parameter tips_file: {path}: {error.strerror}') from error
+        return read_tips(read_text(path)) if path else {}
+    except AnserError as error:
+        raise type(error)(f'parameter tips_file: {error}') from error

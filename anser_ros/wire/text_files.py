@@ -1,0 +1,40 @@
+"""Reads text files from anybody: one clear line for a file that is no text, or cannot be read."""
+
+import csv
+import io
+import os
+from pathlib import Path
+
+from anser_ros.errors import ParameterError
+
+
+def read_text(path: str | os.PathLike[str]) -> str:
+    """Return the text of a file, without the mark that some editors put at its beginning.
+
+    Raises
+    ------
+    ParameterError
+        When it cannot be read, or is no text in UTF-8.
+    """
+    try:
+        return Path(path).read_text(encoding='utf-8-sig')
+    except OSError as error:
+        raise ParameterError(f'{os.fspath(path)}: {error.strerror}') from error
+    except UnicodeDecodeError as error:
+        raise ParameterError(f'{os.fspath(path)}: not a text in UTF-8') from error
+
+
+def read_rows(path: str | os.PathLike[str]) -> tuple[list[str], list[dict[str, str]]]:
+    """Return the names in the head of a CSV file, and its rows by these names.
+
+    Raises
+    ------
+    ParameterError
+        When it cannot be read, or is no CSV in UTF-8.
+    """
+    reader = csv.DictReader(io.StringIO(read_text(path), newline=''))
+    try:
+        rows = list(reader)
+    except csv.Error as error:
+        raise ParameterError(f'{os.fspath(path)}: no table: {error}') from error
+    return list(reader.fieldnames or []), rows
