@@ -114,7 +114,7 @@ def test_damage_inside_never_crashes_and_never_reads_wrong(whole, tmp_path):
 @pytest.mark.parametrize(
     ('make', 'message'),
     [
-        (lambda p: p.write_bytes(b''), 'not an MCAP file'),
+        (lambda p: p.write_bytes(b''), 'the file is empty'),
         (lambda p: p.write_bytes(b'hello world, no bag at all'), 'not an MCAP file'),
         (lambda p: p.write_bytes(b'\x89MCAP0\r\n'), 'no message can be read'),
         (lambda p: write(p, setup=None), 'no setup'),

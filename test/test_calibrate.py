@@ -210,14 +210,16 @@ def test_a_model_worse_than_the_nominal_one_is_only_written_when_forced(factory,
 
 
 def test_missing_folders_are_made_before_the_work(tmp_path, capsys, monkeypatch):
+    out = tmp_path / 'a' / 'b' / 'm.yaml'
+
     def work(*_):
+        assert out.parent.is_dir() and (tmp_path / 'c' / 'd').is_dir()
         raise FitError('begun')
 
     monkeypatch.setattr(command, 'calibrate_sessions', work)
-    out = tmp_path / 'a' / 'b' / 'm.yaml'
     assert calibrate(FACTORY, '--out', out, '--report', tmp_path / 'c' / 'd') == 2
     assert 'begun' in capsys.readouterr().err
-    assert out.parent.is_dir() and (tmp_path / 'c' / 'd').is_dir()
+    assert list(tmp_path.iterdir()) == [], 'what stays empty is taken back'
     (tmp_path / 'file').write_text('')
     assert calibrate(FACTORY, '--out', tmp_path / 'file' / 'm.yaml') == 2
     assert capsys.readouterr().err == f'anser calibrate: no folder {tmp_path}/file: File exists\n'

@@ -5,6 +5,7 @@ import importlib
 import json
 import re
 import shlex
+import shutil
 from dataclasses import fields
 
 import pytest
@@ -55,6 +56,10 @@ POINTS = 'x_m,y_m,z_m,true_x_m,true_y_m,true_z_m\n' + ''.join(
     f'{x},{y},{z},{1.01 * x},{1.01 * y},{1.01 * z}\n'
     for x in (0, 0.1, 0.2) for y in (0, 0.1) for z in (0.1, 0.2)
 )  # fmt: skip
+RUN = ['accuracy', 'error_map', 'evaluate', 'compare', 'export', 'handeye', 'import',
+       'import_poses', 'pivot', 'setup', 'views']  # fmt: skip
+"""Commands whose examples are quick; those of the others are run by tests of their own, or of
+the documents."""
 NOT_TEXT = [
     ['accuracy', 'single-point', 'poses.tum', '--tip', 'noise.yaml'],
     ['accuracy', 'point-to-point', 'poses.tum', '--truth', 'noise.yaml'],
@@ -86,10 +91,12 @@ def examples_of(name):
     module = importlib.import_module(f'anser_ros.cli.{name}')
     parser = argparse.ArgumentParser(prog=name, exit_on_error=False)
     module.add_arguments(parser)
-    lines = re.split(rf'anser {name}\b', ' '.join(parser.epilog.split('example')[-1].split()))
+    lines = re.split(
+        rf'anser {name}\b', ' '.join(re.split(r'\bexamples?: ', parser.epilog)[-1].split())
+    )
     for line in lines[1:]:
-        # Of several in a line, each but the last ends with a semicolon, or with words in brackets.
-        yield parser, shlex.split(re.sub(r'\([^)]*\)', '', line).rstrip('; '))
+        # Each but the last ends with a semicolon, or with words in brackets.
+        yield parser, shlex.split(re.sub(r'\([^)]*\)', '', line).partition(';')[0])
 
 
 def help_of(command, capsys):
@@ -112,6 +119,22 @@ def test_the_examples_are_taken_by_their_command(name):
     assert found
     for parser, arguments in found:
         parser.parse_args(arguments)
+
+
+@pytest.mark.long
+def test_the_first_example_runs_as_it_is_written(tmp_path, monkeypatch, capsys):
+    for folder in ('bags', 'config', 'examples'):
+        (tmp_path / folder).symlink_to(REPO / folder)
+    monkeypatch.chdir(tmp_path)
+    for name in RUN:
+        _, arguments = next(examples_of(name))
+        assert main([name, *arguments]) == 0, (name, capsys.readouterr().err)
+        for made in set(tmp_path.iterdir()) - {tmp_path / kept for kept in ('refit', 'frozen')}:
+            if not made.is_symlink():
+                shutil.rmtree(made) if made.is_dir() else made.unlink()
+        if name == 'evaluate':
+            words = ['bags/metal.mcap', '--model', 'config/demo_model.yaml', '--out', 'frozen/']
+            assert main([name, *words]) == 0
 
 
 @pytest.mark.parametrize('name', OFFLINE)

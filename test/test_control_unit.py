@@ -382,5 +382,5 @@ def test_config_files_are_found_or_named(tmp_path):
         config_path('nothing.yaml')
     binary = tmp_path / 'binary.yaml'
     binary.write_bytes(b'\xff\xfe')
-    with pytest.raises(SetupError, match='cannot read'):
+    with pytest.raises(SetupError, match='not a text'):
         read_config(str(binary))

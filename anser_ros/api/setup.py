@@ -6,6 +6,7 @@ from typing import Any
 
 import yaml
 
+from anser_ros.errors import SetupError
 from anser_ros.wire.setup import Setup, parse_setup
 from anser_ros.wire.text_files import read_text
 
@@ -39,4 +40,4 @@ def load_setup(source: SetupSource) -> Setup:
         return parse_setup(yaml.safe_dump(dict(source), sort_keys=False))
     if isinstance(source, str):
         return parse_setup(source)
-    return parse_setup(read_text(source))
+    return parse_setup(read_text(source, SetupError))

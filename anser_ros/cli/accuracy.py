@@ -42,8 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     lines = '\n'.join(f'  {name:<15} {words}' for name, words in PROTOCOLS.items())
     parser.epilog = (
         f'protocols:\n{lines}\n\n'
-        'example: anser accuracy grid board.mcap --topic /anser/pen/tip/pose --out result/\n'
-        '         anser accuracy rest daily.mcap --history qa/ --limit position_jitter_rms_m=5e-4'
+        'example: anser accuracy dynamic bags/moving.mcap --model config/demo_model.yaml '
+        '--out result/;\n'
+        'with a recording of a board: '
+        'anser accuracy grid board.mcap --topic /anser/pen/tip/pose --out result/;\n'
+        'every day: anser accuracy rest daily.mcap --history qa/ '
+        '--limit position_jitter_rms_m=5e-4'
     )
     parser.add_argument('protocol', choices=list(PROTOCOLS), help='what was recorded, see below')
     parser.add_argument(

@@ -39,8 +39,8 @@ WORKERS = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = (
-        'example: anser batch evaluate bags/moving.mcap bags/metal.mcap --model model.yaml '
-        '--out results/ (made if missing)'
+        'example: anser batch evaluate bags/moving.mcap bags/metal.mcap '
+        '--model config/demo_model.yaml --out results/ (made if missing)'
     )
     verbs = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
     for name in COMMANDS:
@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             help=f'{OFFLINE[name]}, each session by itself',
             description=f'anser {name} on each session by itself',
             epilog=f'example: anser batch {name} bags/*.mcap '
-            f'{"" if name == "calibrate" else "--model model.yaml "}--out results/',
+            f'{"" if name == "calibrate" else "--model config/demo_model.yaml "}--out results/',
         )
         verb.add_argument('sessions', nargs='+', metavar='BAG', help='.mcap files or bag folders')
         verb.add_argument(

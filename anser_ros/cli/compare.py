@@ -40,7 +40,11 @@ WORDS = {'a': 'first', 'b': 'second', 'neither': '-'}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.epilog = 'example: anser compare frozen/ refit/ --out compared/'
+    parser.epilog = (
+        'example: anser compare frozen/ refit/ --out compared/ (after anser evaluate '
+        'bags/metal.mcap --model config/demo_model.yaml --out frozen/, and the same with '
+        '--refit --baseline bags/scan.mcap --out refit/)'
+    )
     parser.add_argument('first', type=Path, help='folder that anser evaluate has written')
     parser.add_argument('second', type=Path, help='another one, of the same session')
     parser.add_argument(

@@ -29,7 +29,9 @@ from anser_ros.sessions.starting_model import model_for
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.epilog = 'example: anser diagnose bags/moving.mcap --model model.yaml --out result/'
+    parser.epilog = (
+        'example: anser diagnose bags/moving.mcap --model config/demo_model.yaml --out result/'
+    )
     parser.add_argument('session', help='bag to diagnose (.mcap file or bag folder)')
     parser.add_argument(
         '--out', required=True, type=Path, help='folder for the results, made if missing'

@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = (
-        'examples: anser error_map points.csv --out map/ --apply poses.csv; '
+        'example: anser error_map examples/data/points.csv --out map/; with lists of points: '
         'anser error_map tracked.fcsv --true board.csv --register --out map/'
     )
     parser.add_argument(

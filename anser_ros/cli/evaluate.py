@@ -41,8 +41,8 @@ FILES = ('evaluation.json', POSES_FILE, BODIES_FILE, ERRORS_FILE)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = (
-        'example: anser evaluate bags/metal.mcap --model model.yaml'
-        ' --refit --baseline bags/scan.mcap --out result/'
+        'example: anser evaluate bags/metal.mcap --model config/demo_model.yaml'
+        ' --refit --baseline bags/scan.mcap --out refit/'
     )
     parser.add_argument(
         'sessions', nargs='+', metavar='BAG', help='bags to track (.mcap files or bag folders)'

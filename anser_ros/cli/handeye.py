@@ -40,8 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = (
-        'example: anser handeye session.mcap --out result/\n'
-        '         anser handeye em.csv --reference optical.tum --out result/'
+        'example: anser handeye bags/moving.mcap --model config/demo_model.yaml --out result/;\n'
+        'with files of poses: anser handeye em.csv --reference optical.tum --out result/'
     )
     parser.add_argument(
         'tracked', nargs='+', type=Path,

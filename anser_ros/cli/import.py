@@ -19,9 +19,9 @@ DOCUMENTS = ('.yaml', '.yml')
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = (
-        'examples: anser import my_tables.yaml --out session.mcap; '
-        'anser import rosbag2_folder/ --remap /em/flux:=/anser/tool/flux --setup board.yaml '
-        '--out session.mcap'
+        'example: anser import examples/data/tables.yaml --out session.mcap; with the bag of '
+        'another program: anser import rosbag2_folder/ --remap /em/flux:=/anser/tool/flux '
+        '--setup board.yaml --out session.mcap'
     )
     parser.add_argument(
         'source',

@@ -18,7 +18,10 @@ SCHEMA = 'anser_import_poses/1'
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.epilog = 'example: anser import_poses EM.tsv --reference OT.tsv --out session.mcap'
+    parser.epilog = (
+        'example: anser import_poses examples/data/pivot.csv --out session.mcap; '
+        'with a reference: anser import_poses EM.tsv --reference OT.tsv --out session.mcap'
+    )
     parser.add_argument(
         'tracked',
         nargs='+',

@@ -36,8 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = (
-        'example: anser pivot pivot.mcap --topic /anser/pen/pose --setup setup.yaml --out out/\n'
-        '         anser pivot --live --topic /anser/pen/pose --seconds 20 --setup setup.yaml'
+        'example: anser pivot examples/data/pivot.csv --out result/;\n'
+        'while the tracker runs: anser pivot --live --topic /anser/pen/pose --seconds 20 '
+        '--setup setup.yaml'
     )
     parser.add_argument(
         'recording', nargs='?', help='bag, or file of poses (CSV, TUM, ...), of the pivot'

@@ -67,7 +67,9 @@ class Proposal:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.epilog = 'example: anser place setup.yaml --references 8 --from frame --out places/'
+    parser.epilog = (
+        'example: anser place config/demo_setup.yaml --references 8 --from frame --out places/'
+    )
     parser.add_argument('setup', help='setup document: a path, or a file of config/')
     parser.add_argument('--references', type=int, required=True, metavar='N', help='coils wanted')
     parser.add_argument(

@@ -29,7 +29,7 @@ NAMESPACE = re.compile(r'^[A-Za-z_]\w*(/[A-Za-z_]\w*)*$')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.epilog = 'example: anser views left.yaml --namespace left --out views/'
+    parser.epilog = 'example: anser views config/demo_setup.yaml --namespace left --out views/'
     parser.add_argument('setup', help='setup document: a path, or a file of config/')
     parser.add_argument('--out', required=True, type=Path, help='folder, made if missing')
     parser.add_argument('--namespace', default='anser', help='of the nodes (%(default)s)')

@@ -274,7 +274,7 @@ def from_document(document: Any) -> FieldModel:
         With the rule that the document breaks.
     """
     if not isinstance(document, dict) or document.get('schema') != SCHEMA:
-        got = document.get('schema') if isinstance(document, dict) else type(document).__name__
+        got = document.get('schema') if isinstance(document, dict) else document
         raise ModelFileError(f'model: schema must be {SCHEMA!r}, got {got!r}')
     emitters = document.get('emitters')
     if not isinstance(emitters, list) or not emitters:

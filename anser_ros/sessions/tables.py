@@ -91,6 +91,8 @@ def read_table(path: Path) -> NumberTable:
         if path.suffix == '.mat':
             return NumberTable(path, _mat(path))
     except (OSError, ValueError, EOFError, OverflowError, BadZipFile) as error:
+        if 'pickle' in str(error):  # numpy's advice would be to load it all the same
+            raise ParameterError(f'{path}: no arrays of numbers') from error
         raise ParameterError(f'{path}: cannot be read: {" ".join(str(error).split())}') from error
     raise ParameterError(f'{path}: ends with none of {", ".join(ENDINGS)}')
 

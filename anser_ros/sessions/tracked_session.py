@@ -75,7 +75,10 @@ def track(
         When the session has no tool fluxes.
     """
     if not prepared.session.tools:
-        raise BagError(f'{prepared.session.path}: the session has no tool fluxes to track')
+        raise BagError(
+            f'{prepared.session.path}: the session has no tool fluxes to track, on a topic '
+            f'that ends with /tool/flux; anser import --remap gives topics other names'
+        )
     tracker = _tracker(prepared, settings or TrackerSettings(), follows=follower is not None)
     estimates: dict[str, list[PoseEstimate]] = {}
     sources: dict[str, list[PoseEstimate]] = {}

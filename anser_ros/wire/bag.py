@@ -9,7 +9,7 @@ import io
 import os
 import struct
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -60,6 +60,15 @@ class Salvage:
     bad_chunks: int = 0
 
 
+def _import_words(name: str) -> str:
+    """Return how a bag of another form becomes one of this form, where it is such a bag."""
+    is_folder = os.path.isdir(name)
+    files = os.listdir(name) if is_folder else [name]
+    ends = ('.db3', '.zstd', '.mcap') if is_folder else ('.db3', '.zstd')
+    is_other = any(file.endswith(ends) for file in files)
+    return f'; make one of it by: anser import {name} --out session.mcap' if is_other else ''
+
+
 def bag_file(path: str | os.PathLike[str]) -> str:
     """Return the MCAP file that ``path`` names, the file itself or the one in a bag's folder.
 
@@ -72,7 +81,8 @@ def bag_file(path: str | os.PathLike[str]) -> str:
     if os.path.isdir(name):
         files = sorted(f for f in os.listdir(name) if f.endswith('.mcap'))
         if len(files) != 1:
-            raise BagError(f'{name}: a bag folder holds one .mcap file, found {len(files)}')
+            words = f'a bag folder holds one .mcap file, found {len(files)}'
+            raise BagError(f'{name}: {words}{_import_words(name)}')
         name = os.path.join(name, files[0])
     if not os.path.isfile(name):
         raise BagError(f'{name}: no such bag')
@@ -168,7 +178,8 @@ def iter_messages(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[Ra
     name = bag_file(path)
     with open(name, 'rb') as stream:
         if stream.read(8) != b'\x89MCAP0\r\n':
-            raise BagError(f'{name}: not an MCAP file')
+            words = 'not an MCAP file' if os.path.getsize(name) else 'the file is empty'
+            raise BagError(f'{name}: {words}{_import_words(name)}')
         stream.seek(0)
         count = 0
         messages = _indexed(stream)
@@ -230,8 +241,10 @@ class _Collector:
         self.flux: dict[str, list[tuple[int, FluxPoints]]] = {'tool': [], 'reference': []}
         self.poses: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
         self.refused: Counter[str] = Counter()
+        self.topics: set[str] = set()
 
     def add(self, raw: RawMessage) -> None:
+        self.topics.add(raw.topic)
         try:
             if raw.topic.endswith('/setup') and raw.type_name == 'std_msgs/msg/String':
                 self.setups.append(str(self.decoder.decode(raw).data))
@@ -298,6 +311,11 @@ class _Collector:
         return streams
 
 
+def _rename_words(topics: Iterable[str]) -> str:
+    """Return the topics of a bag that lacks some, and what gives them the names that are read."""
+    return f'; its topics are {", ".join(sorted(topics))}; anser import --remap renames them'
+
+
 def read_bag(path: str | os.PathLike[str]) -> Bag:
     """Read a recorded session.
 
@@ -310,7 +328,8 @@ def read_bag(path: str | os.PathLike[str]) -> Bag:
     for raw in iter_messages(path, salvage):
         collector.add(raw)
     if not collector.setups:
-        raise BagError(f'{os.fspath(path)}: the bag has no setup')
+        words = 'the bag has no setup'
+        raise BagError(f'{os.fspath(path)}: {words}{_rename_words(collector.topics)}')
     text = collector.setups[-1]  # acquisition tells rate and noise once its stream is there
     try:
         setup = parse_setup(text)
@@ -319,6 +338,7 @@ def read_bag(path: str | os.PathLike[str]) -> Bag:
     tool, reference = collector.flux_stream('tool'), collector.flux_stream('reference')
     if tool is None and reference is None:
         reasons = ''.join(f'; {text}' for text in list(collector.refused)[:1])
+        reasons = reasons or _rename_words(collector.topics)
         raise BagError(f'{os.fspath(path)}: the bag has no readable flux{reasons}')
     return Bag(
         os.fspath(path), setup, text, tool, reference, collector.pose_streams(),

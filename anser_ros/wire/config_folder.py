@@ -35,8 +35,6 @@ def read_config(name: str) -> str:
     Raises
     ------
     SetupError
-        When there is none.
-    ParameterError
-        When it cannot be read, or is no text.
+        When there is none, or it is no text.
     """
-    return read_text(config_path(name))
+    return read_text(config_path(name), SetupError)

@@ -65,9 +65,12 @@ def read_foreign(path: str | os.PathLike[str], salvage: Salvage) -> Iterator[For
         with tempfile.TemporaryDirectory() as folder:
             plain = _unpacked(file, Path(folder))
             messages = _sqlite(plain) if plain.suffix == '.db3' else _mcap(plain, salvage)
-            for message in messages:
-                data = _unpack(message, file) if parts.by_message else message.data
-                yield message._replace(data=data)
+            try:
+                for message in messages:
+                    data = _unpack(message, file) if parts.by_message else message.data
+                    yield message._replace(data=data)
+            except BagError as error:  # about what was unpacked, which nobody knows
+                raise BagError(str(error).replace(str(plain), str(file))) from error
 
 
 def _parts(path: Path) -> _Parts:

@@ -116,10 +116,10 @@ def read_tips(text: str) -> dict[str, TipSpec]:
         When it is no YAML, or has no tips.
     """
     try:
-        root = read_mapping(read_yaml(text), 'the document')
+        root = read_yaml(text)
     except (yaml.YAMLError, UnicodeError, ValueError) as error:
         raise SetupError(f'tips: not YAML: {" ".join(str(error).split())}') from error
-    if KEY not in root:
+    if not isinstance(root, dict) or KEY not in root:
         raise SetupError(f'tips: the document has no key {KEY}')
     return parse_tips(root[KEY])
 

@@ -74,7 +74,8 @@ def read_windings(value: Any, where: str) -> tuple[Winding, ...]:
 def read_mapping(value: Any, where: str) -> dict[str, Any]:
     """Return what has to be a mapping."""
     if not isinstance(value, dict):
-        raise SetupError(f'setup: {where} must be a mapping, got {type(value).__name__}')
+        got = 'nothing' if value is None else type(value).__name__
+        raise SetupError(f'setup: {where} must be a mapping, got {got}')
     return value
 
 

@@ -5,23 +5,23 @@ import io
 import os
 from pathlib import Path
 
-from anser_ros.errors import ParameterError
+from anser_ros.errors import AnserError, ParameterError
 
 
-def read_text(path: str | os.PathLike[str]) -> str:
+def read_text(path: str | os.PathLike[str], kind: type[AnserError] = ParameterError) -> str:
     """Return the text of a file, without the mark that some editors put at its beginning.
 
     Raises
     ------
-    ParameterError
-        When it cannot be read, or is no text in UTF-8.
+    AnserError
+        Of the kind that is asked for, when it cannot be read, or is no text in UTF-8.
     """
     try:
         return Path(path).read_text(encoding='utf-8-sig')
     except OSError as error:
-        raise ParameterError(f'{os.fspath(path)}: {error.strerror}') from error
+        raise kind(f'{os.fspath(path)}: {error.strerror}') from error
     except UnicodeDecodeError as error:
-        raise ParameterError(f'{os.fspath(path)}: not a text in UTF-8') from error
+        raise kind(f'{os.fspath(path)}: not a text in UTF-8') from error
 
 
 def read_rows(path: str | os.PathLike[str]) -> tuple[list[str], list[dict[str, str]]]:
