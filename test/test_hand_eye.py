@@ -188,6 +188,14 @@ def test_the_command_takes_a_bag_or_files(tmp_path, capsys):
     assert run_verb('handeye', [*files, '--json']) == 0
     (one,) = json.loads(capsys.readouterr().out)['sensors'].values()
     np.testing.assert_allclose(one['lever_arm_m'], world.levers[1], atol=1e-3)
+    wild = np.loadtxt(tmp_path / 'em.tum')
+    wild[40:60, 1] += 0.1
+    np.savetxt(tmp_path / 'em.tum', wild, fmt='%.9f')
+    assert run_verb('handeye', [*files, '--out', str(tmp_path / 'wild')]) == 0
+    document = json.loads((tmp_path / 'wild' / 'handeye.json').read_text())
+    left_out = document['sensors']['em']['n_compared'] - document['sensors']['em']['n']
+    assert 20 <= left_out < 40
+    assert f'em: {left_out} of ' in capsys.readouterr().out
     assert run_verb('handeye', [files[0]]) == 2
     assert 'no second stream' in capsys.readouterr().err
     assert run_verb('handeye', [str(bag), *files[1:]]) == 2

@@ -110,7 +110,8 @@ def run(args: argparse.Namespace) -> int:
         return 0
     console = Console()
     console.print(_table(document))
-    for line in (*clock_words(document), *(f'not determined: {w}' for w in found.undetermined)):
+    lines = (*clock_words(document), *left_out_words(document))
+    for line in (*lines, *(f'not determined: {w}' for w in found.undetermined)):
         console.print(line, highlight=False)
     if args.out is not None:
         say_written(*(args.out / name for name in files))
@@ -167,12 +168,22 @@ def to_document(found: HandEye) -> dict[str, Any]:
             'mount_rotation_deg': turned[0],
             'mount_rotation_sigma_deg': np.rad2deg(one.mount_sigma_rad).tolist(),
             'mount_quaternion_xyzw': turned[1],
-            'n': one.n,
+            'n': one.n, 'n_compared': one.n_compared,
             'position_rmse_m': one.rms[0], 'orientation_rmse_rad': one.rms[1],
             'heldout_position_rmse_m': one.held_out[0],
             'heldout_orientation_rmse_rad': one.held_out[1],
         }  # fmt: skip
     return dict(finite(document))
+
+
+def left_out_words(document: dict[str, Any]) -> list[str]:
+    """Return how many poses of each sensor contradict the others, where some do."""
+    return [
+        f'{name}: {one["n_compared"] - one["n"]} of {one["n_compared"]} poses contradict the '
+        f'others, and are counted only in the held-out error'
+        for name, one in document['sensors'].items()
+        if one['n'] < one['n_compared']
+    ]
 
 
 def clock_words(document: dict[str, Any]) -> list[str]:
@@ -244,7 +255,8 @@ def render(found: HandEye, document: dict[str, Any]) -> str:
         for k, axis in enumerate('xyz')
     ]
     open_ones = ''.join(f'<li>{html.escape(words)}</li>' for words in found.undetermined)
-    clocks = '; '.join(clock_words(document)) or 'the clocks were not compared'
+    lines = [*clock_words(document), *left_out_words(document)]
+    clocks = '; '.join(lines) or 'the clocks were not compared'
     return page('Hand-eye', [
         '<h1>Hand-eye calibration</h1>'
         f'<p class="note"><code>{html.escape(found.session.path)}</code></p>'

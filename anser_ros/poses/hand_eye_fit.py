@@ -55,12 +55,13 @@ class SensorFrames:
     mount : ndarray, shape (3, 3), or None
         Rotation from the sensor's frame to the body's; None where it is not determined.
     mount_sigma_rad : ndarray, shape (3,)
-    n : int
-        Poses that took part.
+    n, n_compared : int
+        Poses that took part, of those that could be compared with an optical pose; the others
+        contradict them.
     rms : tuple of float
-        Distance (m) and angle (rad) that are left, root mean square, on all poses.
+        Distance (m) and angle (rad) that are left, root mean square, on those that took part.
     held_out : tuple of float
-        The same on the fifth of the recording that took no part in a fit of its own.
+        The same on all of the fifth of the recording that took no part in a fit of its own.
     """
 
     lever_m: Array
@@ -68,6 +69,7 @@ class SensorFrames:
     mount: Array | None
     mount_sigma_rad: Array
     n: int
+    n_compared: int
     rms: tuple[float, float]
     held_out: tuple[float, float]
 
@@ -235,7 +237,7 @@ def _described(
         known = bool(np.all(sigma[3:] < LEAST_KNOWN_RAD))
         sensors[name] = SensorFrames(
             np.array(lever), sigma[:3], frames.mount if known else None, sigma[3:],
-            int(np.count_nonzero(part.used)), fit.state.rms(name),
+            int(np.count_nonzero(part.used)), len(part.used), fit.state.rms(name),
             held_out.get(name, (np.nan, np.nan)),
         )  # fmt: skip
         words += _open_lever(name, np.array(lever), part.view.turn[part.used])
