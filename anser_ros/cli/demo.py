@@ -177,7 +177,7 @@ def _report(folder: Path, args: argparse.Namespace, *, interrupted: bool) -> int
         print(json.dumps(summary, indent=1))
     else:
         _print(summary)
-    if interrupted or results is None or LIVE in summarise(results)['chains']:
+    if interrupted or args.draw or results is None or LIVE in summarise(results)['chains']:
         return 0
     print('anser demo: the live chain gave no pose; the table says why', file=sys.stderr)
     return 1
