@@ -3,9 +3,12 @@
 import argparse
 import importlib
 import json
+import os
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 from dataclasses import fields
 
 import pytest
@@ -73,6 +76,15 @@ NOT_TEXT = [
     ['views', 'noise.yaml'],
 ]
 """Calls whose file `noise.yaml` is no text."""
+SECRET = [
+    ['export', 'secret.mcap', '--out', 'out'],
+    ['import', 'secret.mcap', '--out', 'out/a.mcap'],
+    ['import', 'secret.yaml', '--out', 'out/a.mcap'],
+    ['pivot', 'secret.csv', '--out', 'out'],
+    ['views', 'secret.yaml', '--out', 'out'],
+    ['export', 'BAGS/moving.mcap', '--out', 'closed/out'],
+]
+"""Calls with a file that may not be read, or a folder that may not be written."""
 QUICK = {
     'bag_export': ['export', 'BAGS/moving.mcap', '--out', 'out'],
     'bag_import': ['import', 'BAGS/moving.mcap', '--out', 'out/a.mcap'],
@@ -157,6 +169,35 @@ def test_a_file_that_is_no_text_is_one_line_and_exit_code_2(words, tmp_path, mon
     assert main([*arguments, '--out', 'out/x']) == 2
     assert capsys.readouterr().err == f'anser {words[0]}: noise.yaml: not a text in UTF-8\n'
     assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize('words', SECRET, ids=' '.join)
+def test_a_file_without_permission_is_one_line_and_exit_code_2(words, tmp_path):
+    for name in ('secret.mcap', 'secret.csv', 'secret.yaml'):
+        (tmp_path / name).touch(mode=0)
+    (tmp_path / 'closed').mkdir(mode=0o555)
+    as_plain_user = []
+    if (
+        os.geteuid() == 0
+    ):  # may do everything, unless these rights are taken away and it is not his
+        for path in tmp_path.iterdir():
+            os.chown(path, 1, 1)
+        as_plain_user = ['setpriv', '--bounding-set=-all']
+    call = [sys.executable, '-m', 'anser_ros.cli.main', *words]
+    call = [word.replace('BAGS', str(REPO / 'bags')) for word in call]
+    search = {**os.environ, 'PYTHONPATH': str(REPO)}
+    done = subprocess.run(
+        [*as_plain_user, *call],
+        cwd=tmp_path,
+        env=search,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.count('\n') == 1 and 'Permission denied' in done.stderr
+    assert len(list(tmp_path.iterdir())) == 4, 'nothing is left behind'
 
 
 def test_an_export_says_what_the_bag_has_lost(tmp_path, capsys):
