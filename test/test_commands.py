@@ -178,9 +178,7 @@ def test_a_file_without_permission_is_one_line_and_exit_code_2(words, tmp_path):
         (tmp_path / name).touch(mode=0)
     (tmp_path / 'closed').mkdir(mode=0o555)
     as_plain_user = []
-    if (
-        os.geteuid() == 0
-    ):  # may do everything, unless these rights are taken away and it is not his
+    if os.geteuid() == 0:  # who may do everything, unless that right is taken away
         for path in tmp_path.iterdir():
             os.chown(path, 1, 1)
         as_plain_user = ['setpriv', '--bounding-set=-all']
@@ -198,6 +196,21 @@ def test_a_file_without_permission_is_one_line_and_exit_code_2(words, tmp_path):
     assert done.returncode == 2, done.stderr
     assert done.stderr.count('\n') == 1 and 'Permission denied' in done.stderr
     assert len(list(tmp_path.iterdir())) == 4, 'nothing is left behind'
+
+
+def test_a_bag_of_another_form_or_with_other_names_is_refused_with_what_mends_it(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'other').mkdir()
+    (tmp_path / 'other' / 'other.db3').touch()
+    assert main(['export', 'other', '--out', 'out']) == 2
+    assert 'found 0; make one of it by: anser import other --out' in capsys.readouterr().err
+    names = ['/anser/tool/flux:=/em/flux', '/anser/reference/flux:=/em/still']
+    remaps = [word for name in names for word in ('--remap', name)]
+    assert main(['import', str(REPO / 'bags/moving.mcap'), *remaps, '--out', 'a.mcap']) == 0
+    assert main(['evaluate', 'a.mcap', '--model', 'nominal', '--out', 'out']) == 2
+    assert '--remap /em/flux:=/anser/tool/flux' in capsys.readouterr().err
 
 
 def test_an_export_says_what_the_bag_has_lost(tmp_path, capsys):

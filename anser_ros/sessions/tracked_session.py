@@ -76,8 +76,8 @@ def track(
     """
     if not prepared.session.tools:
         raise BagError(
-            f'{prepared.session.path}: the session has no tool fluxes to track, on a topic '
-            f'that ends with /tool/flux; anser import --remap gives topics other names'
+            f'{prepared.session.path}: the session has no tool fluxes to track, on a topic that '
+            f'ends with /tool/flux'
         )
     tracker = _tracker(prepared, settings or TrackerSettings(), follows=follower is not None)
     estimates: dict[str, list[PoseEstimate]] = {}

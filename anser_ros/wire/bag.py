@@ -9,7 +9,7 @@ import io
 import os
 import struct
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -241,10 +241,10 @@ class _Collector:
         self.flux: dict[str, list[tuple[int, FluxPoints]]] = {'tool': [], 'reference': []}
         self.poses: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
         self.refused: Counter[str] = Counter()
-        self.topics: set[str] = set()
+        self.topics: dict[str, str] = {}
 
     def add(self, raw: RawMessage) -> None:
-        self.topics.add(raw.topic)
+        self.topics[raw.topic] = raw.type_name
         try:
             if raw.topic.endswith('/setup') and raw.type_name == 'std_msgs/msg/String':
                 self.setups.append(str(self.decoder.decode(raw).data))
@@ -311,9 +311,14 @@ class _Collector:
         return streams
 
 
-def _rename_words(topics: Iterable[str]) -> str:
-    """Return the topics of a bag that lacks some, and what gives them the names that are read."""
-    return f'; its topics are {", ".join(sorted(topics))}; anser import --remap renames them'
+def _rename_words(topics: Mapping[str, str]) -> str:
+    """Return which topics of a bag may be fluxes under another name, and what renames them."""
+    known = ('/tool/flux', '/reference/flux', '/field_model', '/field_model_error')
+    others = [t for t, kind in topics.items() if kind == FLUX_TYPE and not t.endswith(known)]
+    if not others:
+        return ''
+    words = f'anser import BAG --remap {others[0]}:=/anser/tool/flux --out session.mcap'
+    return f'; if {", ".join(others)} are fluxes: {words}'
 
 
 def read_bag(path: str | os.PathLike[str]) -> Bag:
@@ -328,8 +333,7 @@ def read_bag(path: str | os.PathLike[str]) -> Bag:
     for raw in iter_messages(path, salvage):
         collector.add(raw)
     if not collector.setups:
-        words = 'the bag has no setup'
-        raise BagError(f'{os.fspath(path)}: {words}{_rename_words(collector.topics)}')
+        raise BagError(f'{os.fspath(path)}: the bag has no setup; anser import --setup adds one')
     text = collector.setups[-1]  # acquisition tells rate and noise once its stream is there
     try:
         setup = parse_setup(text)
