@@ -16,7 +16,7 @@ from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.requirements import check_kept, check_measurements
 from anser_ros.calibration.sensor_survey import SensorSurveyor
 from anser_ros.calibration.survey_records import corrections, reported_effects
-from anser_ros.diagnosis import outlying
+from anser_ros.diagnosis import decisions, outlying
 from anser_ros.effects.apparatus import Apparatus
 from anser_ros.effects.correction import Correction
 from anser_ros.effects.registry import effect_named
@@ -345,9 +345,9 @@ class TestGainsInADiagnosis:
         white = np.zeros((3000, 2 * 6))
         white[:, :6] = np.random.default_rng(1).normal(size=(3000, 6))
         readings = outlying._by_reading(white**2, 6, 1)
-        ratio = outlying._ratio(outlying.READING_RATIO, outlying._values(white**2, 6, 1))
+        ratio = outlying._ratio(decisions.READING_RATIO, outlying._values(white**2, 6, 1))
         assert not outlying._stands_out(readings, ratio).any()
-        assert outlying._ratio(outlying.READING_RATIO, 16) == outlying.READING_RATIO
+        assert outlying._ratio(decisions.READING_RATIO, 16) == decisions.READING_RATIO
 
 
 class TestNewSurvey:

@@ -21,6 +21,48 @@ Unless a number says otherwise, it was chosen by hand on injected effects with s
 (`test/injection.py`); cases of later seeds that led to a rule are named in `docs/log.md`.
 """
 
+# --- what is seen without a fit: wiring, and frames that stand out ------------------------------
+OWN_CORRELATION = 0.9
+"""Correlation (0 to 1) with its own prediction from which a reading is its own, whatever its sign:
+the prediction then leaves less than a fifth of its power. Smaller calls a reading reversed that is
+hardly like its prediction; larger misses a reversed plug if there is another effect."""
+POLARITY_GAIN = 0.3
+"""A gain within this of -1 is a polarity: as far as a gain is expected from one (the prior of
+`sensor_gain`). Smaller misses a turned sensor whose gain is off as well; larger takes a weak
+sensor with a turned phase for one."""
+OTHERS_CORRELATION, BETTER = 0.95, 0.1
+"""Correlation (0 to 1) with another's prediction, and share of the power that its own leaves which
+the other's may leave, from which a plug is in its socket. A looser pair takes neighbours that read
+alike for exchanged ones; a stricter one misses an exchange if there are other effects."""
+DEAD = 0.02
+"""Share of the expected reading below which a channel hears nothing: a fifth of the leak that
+`channel_crosstalk` expects, so that one that still hears its neighbours is not called dead.
+Smaller, and a dead channel that hears its neighbours is taken for a weak one; larger, and a weak
+one is given up."""
+READING_RATIO, FRAME_RATIO = 6.0, 2.5
+"""Mean squares over the neighbours' median from which a reading (16 values with 8 emitters) or a
+frame (ten times as many) is no member of the same distribution; normal noise in 8 values
+or more passes less than once in 1e6. Of fewer values the ratio of so rare a noise is larger."""
+RARE = 1e-6
+"""Probability that noise alone makes so large a reading or frame: a session of 1000 frames of nine
+readings then has one in a hundred sessions."""
+JUMP_RATIO = 40.0
+"""Mean square over the neighbours' median from which a frame stands out whose pose's own
+directions are left in: the optical jitter along them is larger than the noise and differs from
+pose to pose, so only a glitch stands out so far. Smaller takes jitter for glitches, larger keeps
+glitches in the fit."""
+PLACE_RATIO = 40.0
+"""The same for readings and frames of a body that rested at each place for seconds: its neighbours
+in time are centimetres away, and what the field's model misses differs between them. Over the
+middle of a simulated board single readings of an older model had 6 to 18; a contact that fails
+has thousands. Smaller takes a model's errors for loose contacts."""
+WHOLE_FRAME_SHARE = 0.5
+"""Share of a frame's readings, and of frames that lost any, from which whole frames are out: more
+bad than good, so that what is left of the frame is not to be believed either."""
+LEAST_CHANNEL_SHARE = 0.2
+"""Share of the frames with an outlier from which a channel that has it is named: of nine channels
+that are hit by chance each has a ninth."""
+
 # --- whether an effect is accepted -------------------------------------------------------------
 TIME_FOLDS = 4
 """Parts of the cross-validation over time blocks: of the twenty blocks that are fitted each part
@@ -156,6 +198,35 @@ MOST_EXCESS_OF_OUTLIERS = 0.3
 """Unexplained power over the floor's up to which frames that stand out are outliers: a model that
 is wrong by more makes some itself. Larger names outliers that are another effect's; smaller leaves
 true ones unnamed if there is a small unknown."""
+
+# Each of the next four lies above all that normal noise reached in 200 draws of 100 frames with 48
+# readings, the fewest of a watch on two clusters and four coils; more frames or readings reach
+# less.
+LEAST_CORRELATION = 0.06
+"""Correlation (-1 to 1) with a frame before from which residuals have a memory, just above the
+0.053 that normal noise reached. Smaller refuses true noise; larger lets a hum pass for it."""
+SHARED = 1.6
+"""Largest eigenvalue of the readings' correlations, over the edge for independent ones, from which
+they share something. Noise reached 1.03, and the rest is room for a field model's error, which is
+alike in a few readings: smaller takes that for a disturbance, larger takes a common disturbance
+for noise."""
+WITH_SIZE = 0.08
+"""Correlation of squared residuals with the squared reading from which they depend on it, twice
+the 0.036 that normal noise reached. Smaller refuses true noise; larger lets a gain that rattles
+pass for it."""
+NOT_NORMAL = 0.35
+"""Excess kurtosis (0 for a normal variable) from which residuals are not normal, half as much
+again as the 0.22 that normal noise reached. Smaller refuses true noise; larger lets rounding pass
+for it."""
+
+# --- what a remainder depends on ---------------------------------------------------------------
+SIGNIFICANT = 1e-5
+"""Probability in noise below which a dependence is one; eight variables are tested, on residuals
+whose noise is only estimated. Larger reports chance, smaller needs more frames to see anything."""
+LEAST_DEPENDENCE = 0.005
+"""Share (0 to 1) of the residual power that a dependence must explain, beyond chance, to be
+reported. Smaller reports what is certain only because there are many frames, as a model's small
+error; larger leaves a weak dependence unsaid."""
 STRUCTURED, UNSTRUCTURED = 0.03, 0.1
 """Unexplained power over the floor's from which it is reported: where it depends on something, and
 where no test finds on what. Smaller reports a correct model's own error; larger keeps silent about

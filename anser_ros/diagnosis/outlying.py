@@ -7,6 +7,15 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.special import chdtri
 
+from anser_ros.diagnosis.decisions import (
+    FRAME_RATIO,
+    JUMP_RATIO,
+    LEAST_CHANNEL_SHARE,
+    PLACE_RATIO,
+    RARE,
+    READING_RATIO,
+    WHOLE_FRAME_SHARE,
+)
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.effects.effect import Family
 
@@ -16,29 +25,6 @@ Mask = NDArray[np.bool_]
 WINDOW = 11
 """Neighbouring frames, this one among them, whose median an outlier stands out from: up to five
 bad ones in a row are seen, and motion changes little over so many."""
-READING_RATIO, FRAME_RATIO = 6.0, 2.5
-"""Mean squares over the neighbours' median from which a reading (16 values with 8 emitters) or a
-frame (ten times as many) is no member of the same distribution; normal noise in 8 values
-or more passes less than once in 1e6. Of fewer values the ratio of so rare a noise is larger."""
-RARE = 1e-6
-"""Probability that noise alone makes so large a reading or frame."""
-JUMP_RATIO = 40.0
-"""Mean square over the neighbours' median from which a frame stands out whose pose's own
-directions are left in: the optical jitter along them is larger than the noise and differs from
-pose to pose, so only a glitch stands out so far. Smaller takes jitter for glitches, larger keeps
-glitches in the fit. No more is known of its choice than that thresholds of the diagnosis were
-chosen on seeds below 100 (`docs/log.md`)."""
-PLACE_RATIO = 40.0
-"""The same for readings and frames of a body that rested at each place for seconds: its neighbours
-in time are centimetres away, and what the field's model misses differs between them. Over the
-middle of a simulated board single readings of an older model had 6 to 18; a contact that fails
-has thousands. Smaller takes a model's errors for loose contacts."""
-WHOLE_FRAME_SHARE = 0.5
-"""Share of a frame's readings, and of frames that lost any, from which whole frames are out: more
-bad than good, so that what is left of the frame is not to be believed either."""
-LEAST_CHANNEL_SHARE = 0.2
-"""Share of the frames with an outlier from which a channel that has it is named: of nine channels
-that are hit by chance each has a ninth."""
 
 
 def find_outliers(state: State) -> tuple[Mask, ...]:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from anser_ros.diagnosis.decisions import LEAST_DEPENDENCE, SIGNIFICANT
 from anser_ros.diagnosis.problem import Part, State
 from anser_ros.diagnosis.residuals import tool_parts
 
@@ -15,16 +16,6 @@ BINS = 12
 """Cells into which frames are binned by one variable, so that each has tens of frames in a session
 of some hundreds. Fewer blur what changes quickly with the variable; more leave fewer frames for
 each mean."""
-SIGNIFICANT = 1e-5
-"""Probability in noise below which a dependence is one; eight variables are tested, on residuals
-whose noise is only estimated. Larger reports chance, smaller needs more frames to see anything. No
-more is known of its choice than that thresholds of the diagnosis were chosen on seeds below 100
-(`docs/log.md`)."""
-LEAST_DEPENDENCE = 0.005
-"""Share (0 to 1) of the residual power that a dependence must explain, beyond chance, to be
-reported. Smaller reports what is certain only because there are many frames, as a model's small
-error; larger leaves a weak dependence unsaid. No more is known of its choice than that thresholds
-of the diagnosis were chosen on seeds below 100 (`docs/log.md`)."""
 FEWEST_CELL_VALUES = 4
 """Values that a cell needs for its mean to be compared: the mean of four is uncertain by half of
 what one value is, and cells of fewer would add more noise than they tell."""

@@ -10,31 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.diagnosis.decisions import LEAST_CORRELATION, NOT_NORMAL, SHARED, WITH_SIZE
 from anser_ros.diagnosis.problem import Part, State
 
 Array = NDArray[np.float64]
 
-# Each bound lies above all that normal noise reached in 200 draws of 100 frames with 48 readings,
-# the fewest of a watch on two clusters and four coils; more frames or readings reach less.
 LAGS = 12
 """Frames back to which a memory is looked for: half a second at 25 Hz. Fewer overlook a slow
 course, and each further one is one more chance for noise to pass the bound."""
-LEAST_CORRELATION = 0.06
-"""Correlation (-1 to 1) with a frame before from which residuals have a memory, just above the
-0.053 that normal noise reached. Smaller refuses true noise; larger lets a hum pass for it."""
-SHARED = 1.6
-"""Largest eigenvalue of the readings' correlations, over the edge for independent ones, from which
-they share something. Noise reached 1.03, and the rest is room for a field model's error, which is
-alike in a few readings: smaller takes that for a disturbance, larger takes a common disturbance
-for noise."""
-WITH_SIZE = 0.08
-"""Correlation of squared residuals with the squared reading from which they depend on it, twice
-the 0.036 that normal noise reached. Smaller refuses true noise; larger lets a gain that rattles
-pass for it."""
-NOT_NORMAL = 0.35
-"""Excess kurtosis (0 for a normal variable) from which residuals are not normal, half as much
-again as the 0.22 that normal noise reached. Smaller refuses true noise; larger lets rounding pass
-for it."""
 OUTLYING = 4.5
 """Standard deviations beyond which a value is not used here, which a normal one is once in
 150,000: outliers are judged elsewhere, and one alone would make a kurtosis. Smaller takes the

@@ -3,6 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.diagnosis.decisions import (
+    BETTER,
+    DEAD,
+    OTHERS_CORRELATION,
+    OWN_CORRELATION,
+    POLARITY_GAIN,
+)
 from anser_ros.diagnosis.problem import Problem, State, evaluate
 from anser_ros.effects.sensor_polarity import SENSOR_POLARITY
 from anser_ros.effects.term import Site, Term
@@ -11,28 +18,6 @@ from anser_ros.effects.wiring import DEAD_CHANNEL, SWAPPED_CHANNELS, SWAPPED_COI
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 Mask = NDArray[np.bool_]
-
-OWN_CORRELATION = 0.9
-"""Correlation (0 to 1) with its own prediction from which a reading is its own, whatever its sign:
-the prediction then leaves less than a fifth of its power. Smaller calls a reading reversed that is
-hardly like its prediction; larger misses a reversed plug if there is another effect. No more is
-known of its choice than that thresholds of the diagnosis were chosen on seeds below 100
-(`docs/log.md`)."""
-POLARITY_GAIN = 0.3
-"""A gain within this of -1 is a polarity: as far as a gain is expected from one (the prior of
-`sensor_gain`). Smaller misses a turned sensor whose gain is off as well; larger takes a weak
-sensor with a turned phase for one."""
-ALIKE, BETTER = 0.95, 0.1
-"""Correlation (0 to 1) with another's prediction, and share of the power that its own leaves which
-the other's may leave, from which a plug is in its socket. A looser pair takes neighbours that read
-alike for exchanged ones; a stricter one misses an exchange if there are other effects. No more is
-known of the choice than that thresholds of the diagnosis were chosen on seeds below 100
-(`docs/log.md`)."""
-DEAD = 0.02
-"""Share of the expected reading below which a channel hears nothing: a fifth of the leak that
-`channel_crosstalk` expects, so that one that still hears its neighbours is not called dead.
-Smaller, and a dead channel that hears its neighbours is taken for a weak one; larger, and a weak
-one is given up."""
 
 
 def wiring_faults(problem: Problem) -> list[Term]:
@@ -103,7 +88,10 @@ def _moved(alike: Array, is_driven: Mask) -> NDArray[np.int64]:
     order, own = np.argmax(alike, axis=1), np.diag(alike)
     best = alike[rows, order]
     moved = rows[
-        (order != rows) & is_driven & (best > ALIKE) & (1 - best**2 < BETTER * (1 - own**2))
+        (order != rows)
+        & is_driven
+        & (best > OTHERS_CORRELATION)
+        & (1 - best**2 < BETTER * (1 - own**2))
     ]
     return np.asarray(moved if set(order[moved]) == set(moved) else moved[:0])
 
