@@ -13,6 +13,7 @@ ROOMS = ('diagnosis', 'effects')
 DECISIONS = REPO / 'anser_ros' / 'diagnosis' / 'decisions.py'
 ELSEWHERE = {
     'departure.EXPLAINED': 'asked by a calibration about its own scan',
+    'departure.NEAR_NOISE': 'the same',
     'fit.SETTLED': 'ends a fit',
     'prepare.FEWEST_POSED_FRAMES': 'what a diagnosis needs at all',
     'prepare.MARGIN_S': 'frames that take part',

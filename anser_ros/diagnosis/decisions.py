@@ -153,6 +153,11 @@ NO_RIVAL = 0.25
 """Metal at rest that by itself explains less than this share (0 to 1) of what moving metal
 explains is no rival to it. Smaller spends fits on metal at rest that cannot win; larger lets
 moving metal be named without asking whether rest and one more effect would do."""
+LIMITS_LEFT, REST_LEFT = 2.0, 0.5
+"""What the linear score of an effect beside metal at rest may leave for it to be fitted: so many
+times what the two must come down to, and such a share (0 to 1) of what metal at rest leaves alone.
+Smaller passes over effects whose fit explains more than their score; larger spends fits in
+vain."""
 MOST_EFFECTS_AT_REST = 3
 """Effects that are tried together with metal at rest before metal counts as moving. Fewer let
 metal move for what rest and one more effect explain; each further one costs a full fit."""

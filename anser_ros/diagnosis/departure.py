@@ -66,6 +66,10 @@ EXPLAINED = 0.1
 what then is wrong of the metal's field, as much as `KNOWN` allows; with more, the body is no
 picture of this metal, and what it does at rest would be a guess. Smaller leaves metal in the field
 that is nearly understood."""
+NEAR_NOISE = 2.0
+"""Mean whitened square of the median frame, which noise alone brings to about one, below which
+the metal is known whatever it was before: what is then left of it is no larger than the noise.
+Smaller keeps metal in the field that hardly showed; larger takes off guesses at weak metal."""
 KNOWN = 0.3
 """Standard deviation of what the metal does at rest, relative to that, from which on it is not
 taken off. Below it a third stays at most, typically, and taking it off makes a field worse less
@@ -97,7 +101,7 @@ class Departure:
     @property
     def is_predictive(self) -> bool:
         """Return whether body and path predict the held-out blocks."""
-        return self.after < max(2.0, EXPLAINED * self.before)
+        return self.after < max(NEAR_NOISE, EXPLAINED * self.before)
 
     def rest_flux(self, view: View) -> tuple[ComplexArray, Array]:
         """Return what resting metal adds to a view (F, S, K), and its standard deviation, T."""

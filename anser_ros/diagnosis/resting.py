@@ -2,7 +2,14 @@
 
 from collections.abc import Callable, Sequence
 
-from anser_ros.diagnosis.decisions import ALIKE, LEAST_MOTION_GAIN, MOST_EFFECTS_AT_REST, NO_RIVAL
+from anser_ros.diagnosis.decisions import (
+    ALIKE,
+    LEAST_MOTION_GAIN,
+    LIMITS_LEFT,
+    MOST_EFFECTS_AT_REST,
+    NO_RIVAL,
+    REST_LEFT,
+)
 from anser_ros.diagnosis.fit import Fit, Fitter, misfit
 from anser_ros.diagnosis.refine import settled
 from anser_ros.diagnosis.scoring import Score, Scorer
@@ -51,7 +58,7 @@ def moves_or_rests(
         if term.effect.family.is_metal or term.effect.name in tried:
             continue
         # A linear score is only a promise: the fit may still bring down what is within these.
-        hopeless = score.held_out > 2.0 * limit + 0.5 * scorer.held_out
+        hopeless = score.held_out > LIMITS_LEFT * limit + REST_LEFT * scorer.held_out
         if hopeless or len(tried) == MOST_EFFECTS_AT_REST:
             break
         tried.add(term.effect.name)

@@ -28,6 +28,11 @@ POINTS, GENERATOR = 1021, 331
 SHAPES = ('cubic', 'tanh')
 FLUX, VOLTAGE = 'flux', 'voltage'
 """What the amplifier may see."""
+CURVE = 0.2
+"""Share (0 to 1) of a saturation's power that its model may miss: the true curve is none of those
+that are tried, and tones mix into each other's place. Smaller refuses a saturation of another
+curve; larger confirms what only grows with the reading. It was chosen by hand on injected effects
+(`docs/log.md`)."""
 
 
 def third_order(flux: ComplexArray) -> ComplexArray:
@@ -81,7 +86,7 @@ class Saturation(Effect[SaturationTerm]):
     }
     plausible: ClassVar[Mapping[str, tuple[float, float]]] = {'full_scale_t': (1e-8, 1e-3)}
     remedy = Remedy.FLUX
-    inexact = 0.2  # the curve, and tones that mix into each other's place
+    inexact = CURVE
 
     def candidates(self, apparatus: Apparatus) -> Sequence[SaturationTerm]:
         """Try every channel of a tool; references don't see signals of different size."""
