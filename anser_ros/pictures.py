@@ -35,12 +35,16 @@ def image(figure: Figure) -> str:
     return f'<img alt="figure" src="data:image/png;base64,{data}">'
 
 
-def legend_below(figure: Figure, panel: Axes) -> None:
-    """Put one legend below all panels, where it covers nothing, with what one of them labels."""
+def legend_below(figure: Figure, panel: Axes, markers: float = 1.0) -> None:
+    """Put one legend below all panels, where it covers nothing, with what one of them labels.
+
+    Its markers are larger than the panel's by a factor, as dots are too small to tell apart.
+    """
     handles, labels = panel.get_legend_handles_labels()
     figure.legend(
-        handles, labels, loc='outside lower center', ncols=min(len(labels), 5), fontsize=8
-    )
+        handles, labels, loc='outside lower center', ncols=min(len(labels), 5), fontsize=8,
+        markerscale=markers,
+    )  # fmt: skip
 
 
 def spell_out(axis: Axis) -> None:

@@ -12,7 +12,7 @@ from anser_ros.assessment.protocols import PROTOCOLS, Assessment
 from anser_ros.cli.accuracy_document import figure_rows
 from anser_ros.cli.control_chart import control_chart
 from anser_ros.cli.html_page import page, table
-from anser_ros.pictures import image
+from anser_ros.pictures import image, legend_below
 
 MOST_ROWS = 500  # rows of a table of single errors; all are in accuracy.json
 
@@ -110,14 +110,17 @@ def _speeds(found: Assessment) -> Figure:
                      ('offset taken out', [g.error_m for g in found.speeds])]),
         (right, 1e3, [('', [g.latency_s for g in found.speeds])]),
     ):  # fmt: skip
-        for label, estimates in series:
+        for rank, (label, estimates) in enumerate(series, start=1):
+            width = 1.5 + 2.5 * (len(series) - rank)  # the last does not hide those that equal it
             value = scale * np.array([e.value for e in estimates])
             bars = scale * np.array([[e.value - e.low, e.high - e.value] for e in estimates]).T
-            panel.errorbar(speed, value, yerr=np.maximum(bars, 0.0), fmt='o-', ms=3, label=label)
+            panel.errorbar(
+                speed, value, yerr=np.maximum(bars, 0.0), fmt='o-', ms=3, lw=width, label=label
+            )
         panel.set_xlabel('speed, mm/s')
         panel.grid(alpha=0.3)
     left.set_ylabel('error, rms mm')
-    left.legend()
+    legend_below(figure, left)
     right.set_ylabel('latency against the reference, ms')
     return figure
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from anser_ros.cli.diagnosis_figures import AFTER, BEFORE
 from anser_ros.cli.diagnosis_words import short_ones, value_text
 from anser_ros.cli.html_page import page, table
-from anser_ros.pictures import image
+from anser_ros.pictures import image, legend_below
 from anser_ros.poses.diagnosis import PoseDiagnosis
 from anser_ros.poses.effect import Role
 from anser_ros.poses.problem import PosePart, PoseState
@@ -191,15 +191,14 @@ def _groups(before: PoseState, after: PoseState) -> Figure:
                 panel.bar(
                     k + way, size, 0.4, color=colour, label=name if k == group.min() else None
                 )
-                panel.annotate(
-                    f'{size:.1f}', (k + way, size), ha='center', va='bottom', fontsize=6
-                )
+                words = f'{size:.2g}' if size < 10 else f'{size:.0f}'
+                panel.annotate(words, (k + way, size), ha='center', va='bottom', fontsize=6)
             digits = 0 if np.ptp(edges) > 10 * GROUPS else 1
-            names = [f'{a:.{digits}f}-{b:.{digits}f}' for a, b in pairwise(edges)]
+            names = [f'{a:.{digits}f} to\n{b:.{digits}f}' for a, b in pairwise(edges)]
             panel.set_xticks(range(GROUPS), names, fontsize=7)
         panel.set(xlabel=label)
     panels[0].set_ylabel('error, mm')
-    panels[0].legend(fontsize=7)
+    legend_below(figure, panels[0])
     return figure
 
 
@@ -227,7 +226,7 @@ def _over_time(before: PoseState, after: PoseState) -> Figure:
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
     axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.legend(markerscale=4)
+    legend_below(figure, axes, markers=4.0)
     return figure
 
 
@@ -261,5 +260,5 @@ def _bland_altman(state: PoseState) -> Figure:
         panel.set(xlabel=f'mean of both, {name}, mm')
         panel.locator_params(axis='x', nbins=5)
     panels[0].set_ylabel('tracked minus optical, mm')
-    panels[0].legend(markerscale=4, fontsize=7)
+    legend_below(figure, panels[0], markers=4.0)
     return figure
