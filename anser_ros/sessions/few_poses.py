@@ -19,6 +19,7 @@ from anser_ros.calibration.held_out import rms
 from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.calibration.still import STILL_ONLY
+from anser_ros.calibration.survey_records import SPREADS
 from anser_ros.diagnosis.decisions import UNSTRUCTURED
 from anser_ros.diagnosis.schema import SCHEMA
 from anser_ros.effects.registry import all_effects
@@ -30,7 +31,7 @@ from anser_ros.sessions.session import Session
 
 LOOKED_FOR = (*KINDS, *STILL_ONLY)
 """Kinds of errors that are estimated."""
-KIND_OF = {'sensor_gain_spread': 'gains', 'sensor_axis_spread': 'axes', 'body_bend': 'bend'}
+KIND_OF = {SPREADS['gains']: 'gains', SPREADS['axes']: 'axes', 'body_bend': 'bend'}
 """Kinds by the effect that they become; without an entry, an effect goes with all kinds."""
 CHANCE = 1e-3
 """Probability in noise alone below which what remains depends on a variable."""
