@@ -17,8 +17,8 @@ from anser_ros.simulation.motion import Approach, Lissajous
 from anser_ros.simulation.recording import STATIC_NOISE_T, Errors, GridScan, record
 from anser_ros.simulation.world import World
 from anser_ros.wire.bag import bag_file
+from anser_ros.wire.config_folder import read_config
 from anser_ros.wire.setup import parse_setup
-from anser_ros.wire.text_files import read_text
 
 SCHEMA = 'anser_bags/1'
 RATE_HZ = 25.0
@@ -42,9 +42,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.epilog = 'example: anser bags --out bags/'
     parser.add_argument(
-        '--setup', type=Path, default=Path('config/demo_setup.yaml'),
-        help='setup document (%(default)s)',
-    )  # fmt: skip
+        '--setup',
+        default='demo_setup.yaml',
+        help='setup document: a path, or a file of config/ (%(default)s)',
+    )
     parser.add_argument(
         '--out', type=Path, default=Path('bags'), metavar='DIR',
         help='folder for the bags, made if missing (%(default)s)',
@@ -55,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write factory, moving, metal and scan.mcap; bags of those names are replaced."""
-    setup = parse_setup(read_text(args.setup))
+    setup = parse_setup(read_config(args.setup))
     rng = np.random.default_rng(args.seed)
     source = board_source(manufactured(setup, rng))
     make_folder(args.out)

@@ -73,7 +73,7 @@ class Acquisition(AnserNode):
     """Publishes ``setup``, ``tool/flux`` and ``reference/flux``."""
 
     NAME = 'acquisition'
-    EXAMPLE = '--ros-args -p device:=/dev/ttyACM0 -p setup_file:=my_setup.yaml'
+    EXAMPLE = '--ros-args -p device:=/dev/ttyACM0 -p setup_file:=config/demo_setup.yaml'
     PARAMETERS = AcquisitionParameters
 
     def __init__(self, **options: Any) -> None:

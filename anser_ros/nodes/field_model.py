@@ -48,7 +48,7 @@ class FieldModelNode(AnserNode):
     """Publishes ``field_model``, and answers ``field_model/reset`` and its like."""
 
     NAME = 'field_model'
-    EXAMPLE = '--ros-args -p model_file:=model.yaml -p baseline_file:=clean.mcap'
+    EXAMPLE = '--ros-args -p model_file:=config/demo_model.yaml -p baseline_file:=bags/scan.mcap'
     PARAMETERS = FieldModelParameters
     HAS_KERNELS = True
     WORKS_ASIDE = True  # its first answer takes seconds

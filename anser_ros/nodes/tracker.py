@@ -68,7 +68,7 @@ class TrackerNode(AnserNode):
     """Subscribes to ``setup``, ``field_model`` and ``tool/flux``; publishes poses."""
 
     NAME = 'tracker'
-    EXAMPLE = '--ros-args -p model_file:=model.yaml'
+    EXAMPLE = '--ros-args -p model_file:=config/demo_model.yaml'
     PARAMETERS = TrackerParameters
     HAS_KERNELS = True
 

@@ -113,7 +113,7 @@ class Watcher(AnserNode):
     """
 
     NAME = 'watcher'
-    EXAMPLE = '--ros-args -p model_file:=model.yaml -p window_s:=20.0'
+    EXAMPLE = '--ros-args -p model_file:=config/demo_model.yaml -p window_s:=20.0'
     PARAMETERS = WatcherParameters
     HAS_KERNELS = True
 
