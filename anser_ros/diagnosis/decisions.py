@@ -84,15 +84,15 @@ LEAST_GAIN_SHARE_BESIDE_METAL = 0.01
 LEAST_OF_EXCESS = 0.4
 """Share of what is left to explain that an explanation with freedom in time (a fluctuation, or
 metal at another place in each block) must explain: less than that is another effect's trace along
-its columns. Tried on 45 runs (`docs/log.md`): twice as much called a low pass a gain, half changed
+its columns. On unused seeds (`docs/log.md`) twice as much called a low pass a gain, half changed
 no name, and the marginal likelihood alone gave one wrong name less. It was not put in its place,
 as on metal that moves it fits fluctuations that are all refused, for two thirds more time."""
 LEAST_OF_NOISE = 0.05
 """Share of the noise's power that a fluctuation must explain: a field model's own error is alike
-in neighbouring frames and channels, and any freedom takes some of it. Tried on 45 runs
-(`docs/log.md`): half as much, and the marginal likelihood alone, named a ripple rightly that is
-missed, and twice as much changed no name. It stays, as models wrong by about as much as the noise,
-for which it is made, were not among them."""
+in neighbouring frames and channels, and any freedom takes some of it. On unused seeds
+(`docs/log.md`) twice as much changed no name; half as much, and the marginal likelihood alone,
+named small effects rightly that are missed, and nothing wrongly, also with models wrong by as much
+as the noise. So it may go once other boards were tried without it."""
 REMNANT = 0.01
 """Further metal with less than this share of the strongest metal's gain is what the model of that
 one left."""
@@ -130,7 +130,7 @@ ALIKE = 0.02
 """Share of a gain by which two explanations may differ that the data do not distinguish: metal of
 an unknown shape leaves about as much. Within it a rival is listed, and metal rests. Half, twice as
 much, and Laplace's evidence of both explanations in its place, changed no name, but the two runs
-of 45 that asked were far from it (`docs/log.md`)."""
+that asked were far from it (`docs/log.md`)."""
 STEADY = 0.8
 """Share of a fluctuation's gain from which a constant, or a curve, of the same coil or channel is
 tried first: freedom in every frame also takes off what is another effect's."""
@@ -209,9 +209,9 @@ chance alone does in one session of 700."""
 MOST_EXCESS_OF_OUTLIERS = 0.3
 """Unexplained power over the floor's up to which frames that stand out are outliers: a model that
 is wrong by more makes some itself. Larger names outliers that are another effect's; smaller leaves
-true ones unnamed if there is a small unknown. Tried on 45 runs (`docs/log.md`): half and twice as
-much changed no name. With no bound the outliers of six would be named that are not now, and none
-of ten without outliers would get the name, though a hum comes to half of `FEWEST_OUTLIERS`."""
+true ones unnamed if there is a small unknown. On unused seeds (`docs/log.md`) half and twice as
+much changed no name. With no bound the outliers of six runs would be named that are not now, and a
+hum would be called outliers, of which there are none."""
 
 # Each of the next four lies above all that normal noise reached in 200 draws of 100 frames with 48
 # readings, the fewest of a watch on two clusters and four coils; more frames or readings reach
