@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from conftest import spin_until
 
+from anser_ros import pose_states as states
 from anser_ros.cli.demo_report import draw, load, summarise
 from anser_ros.cli.folders import make_new_folder, remove_empty_folders
 from anser_ros.cli.main import main
@@ -32,7 +33,7 @@ STUBBORN = 'import signal, time; signal.signal(signal.SIGTERM, lambda *_: 0); ti
 
 
 def running(mark):
-    """Command lines of living processes that contain a mark."""
+    """Command lines of living processes of this environment that contain a mark."""
     found = []
     for folder in Path('/proc').glob('[0-9]*'):
         try:
@@ -40,7 +41,12 @@ def running(mark):
             state = (folder / 'stat').read_text().rsplit(')', 1)[1].split()[0]
         except OSError:
             continue
-        if mark in line and state != 'Z' and folder.name != str(os.getpid()):
+        if (
+            mark in line
+            and sys.prefix in line
+            and state != 'Z'
+            and folder.name != str(os.getpid())
+        ):
             found.append(line)
     return found
 
@@ -274,8 +280,9 @@ def test_demo_runs_and_reports(start, tmp_path):
     lost = count('acquisition', 'windows_withheld', 'windows_lost', 'windows_skipped')
     assert round((end - begin) * 50) + 1 - len(frames) <= lost + unheard
     refused = count('tracker: tool_a', *(f'frames_{state}' for state in STATES if state != OK))
-    # The disc comes after this, so none is refused for metal; a stall costs a few at its end.
-    assert refused < 0.2 * len(frames)
+    # The disc comes after this, so none is judged wrong; the start and each stall cost others.
+    judged = (states.RESIDUAL, states.INCONSISTENT, states.AMBIGUOUS, states.OUTSIDE_VOLUME)
+    assert count('tracker: tool_a', *(f'frames_{state}' for state in judged)) < 0.2 * len(frames)
     refused += count('tracker', 'frames_skipped')
     assert len(frames - tracked - recorded) <= refused + unheard
     assert min(len(of_one) for of_one in stamps) > 0.95 * len(tracked)
