@@ -83,7 +83,7 @@ COMMANDS = (
             _session('diagnose', _first), 'same'),
     Command('evaluate-microtesla', 'evaluate with fluxes in microtesla',
             _session('evaluate', None, 1e6), 'microtesla'),
-    Command('bag-empty', 'an empty bag', _bytes(lambda b: b''), 'MCAP'),
+    Command('bag-empty', 'an empty bag', _bytes(lambda b: b''), 'empty'),
     Command('bag-random', 'a bag of random bytes behind its magic', _bytes(
         lambda b: b[:8] + np.random.default_rng(1).bytes(200_000)), 'message'),
     Command('bag-length', 'a bag that declares a record of 2^62 bytes',
