@@ -31,9 +31,7 @@ def render(result: SessionDiagnosis, document: dict[str, Any], *, session: str, 
     """
     found = result.diagnosis
     sections = [
-        f'<h1>Diagnosis</h1><p class="note">session <code>{html.escape(session)}</code>, '
-        f'model <code>{html.escape(model)}</code></p>',
-        f'<p class="verdict">{html.escape(verdict(document))}</p>',
+        page_head(document, session, model),
         '<h2>Before and after</h2><p>Measured on every fifth stretch of time, which was used '
         'neither to choose nor to fit. Each frame&#39;s optical jitter, which moves all '
         'channels together, is taken out of the flux residual.</p>',
@@ -55,6 +53,15 @@ def render(result: SessionDiagnosis, document: dict[str, Any], *, session: str, 
         _left_out(result),
     ]
     return page('Diagnosis', sections)
+
+
+def page_head(document: dict[str, Any], session: str, model: str) -> str:
+    """Return the heading of a diagnosis' page: what was diagnosed, and the verdict."""
+    return (
+        f'<h1>Diagnosis</h1><p class="note">session <code>{html.escape(session)}</code>, '
+        f'model <code>{html.escape(model)}</code></p>'
+        f'<p class="verdict">{html.escape(verdict(document))}</p>'
+    )
 
 
 def held_out_table(document: dict[str, Any]) -> str:

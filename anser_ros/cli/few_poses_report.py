@@ -9,8 +9,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from anser_ros.cli.diagnosis_figures import AFTER, BEFORE
-from anser_ros.cli.diagnosis_report import effects_table, held_out_table, population_sections
-from anser_ros.cli.diagnosis_words import LONGEST, flux_unit, verdict
+from anser_ros.cli.diagnosis_report import (
+    effects_table,
+    held_out_table,
+    page_head,
+    population_sections,
+)
+from anser_ros.cli.diagnosis_words import LONGEST, flux_unit
 from anser_ros.cli.html_page import page, table
 from anser_ros.pictures import image
 from anser_ros.sessions.few_poses import FewPosesDiagnosis, residual_power
@@ -30,9 +35,7 @@ def render_few_poses(
         What was diagnosed.
     """
     sections = [
-        f'<h1>Diagnosis</h1><p class="note">session <code>{html.escape(session)}</code>, '
-        f'model <code>{html.escape(model)}</code></p>',
-        f'<p class="verdict">{html.escape(verdict(document))}</p>',
+        page_head(document, session, model),
         '<h2>Before and after</h2><p>This session has too few poses to test a field model, so the '
         'field is estimated anew from it, together with what is wrong with the sensors. What is '
         'predicted takes no part: each pose is predicted from the others, or for a body at one '

@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from anser_ros.diagnosis.finding import Finding
 from anser_ros.diagnosis.schema import SCHEMA
+from anser_ros.field.model import EffectRecord
 from anser_ros.field.plain_data import plain
 from anser_ros.sessions.diagnosis import SessionDiagnosis
 
@@ -30,7 +30,10 @@ def to_document(result: SessionDiagnosis) -> dict[str, Any]:
             'orientation_rmse_before_rad': result.before.orientation_rmse_rad,
             'orientation_rmse_after_rad': result.after.orientation_rmse_rad,
         },
-        'effects': [_effect(finding) for finding in found.findings],
+        'effects': [
+            effect_figures(finding.record, finding.flux_rms_without_t)
+            for finding in found.findings
+        ],
         'unexplained': {
             'fraction': found.unexplained,
             'depends_on': [name for name in found.depends_on if name in DEPENDENCIES],
@@ -38,13 +41,13 @@ def to_document(result: SessionDiagnosis) -> dict[str, Any]:
     }
 
 
-def _effect(finding: Finding) -> dict[str, Any]:
-    record = finding.record
+def effect_figures(record: EffectRecord, without_t: float) -> dict[str, Any]:
+    """Return an effect as plain data; ``without_t``: held-out residual with all but it, T."""
     short = {key: value for key, value in record.parameters.items() if key not in MODEL_FILE_ONLY}
     return {
         'name': record.name,
         'parameters': plain(short),
         'uncertainty': plain(dict(record.uncertainty)),
         'evidence': plain(dict(record.evidence)),
-        'flux_rms_without_t': finding.flux_rms_without_t,
+        'flux_rms_without_t': without_t,
     }

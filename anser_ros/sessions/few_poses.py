@@ -6,7 +6,7 @@ body's shape, as a calibration does, after the effects that the given model know
 corrected. What is predicted takes no part: each pose, or for one place each fifth of the sensors.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,8 +24,8 @@ from anser_ros.diagnosis.decisions import UNSTRUCTURED
 from anser_ros.diagnosis.schema import SCHEMA
 from anser_ros.effects.registry import all_effects
 from anser_ros.field.model import EffectRecord, FieldModel
-from anser_ros.field.plain_data import plain
 from anser_ros.sessions.calibration import calibrate_sessions
+from anser_ros.sessions.diagnosis_document import effect_figures
 from anser_ros.sessions.prepared import correct, prepare
 from anser_ros.sessions.session import Session
 
@@ -177,20 +177,12 @@ def to_document(result: FewPosesDiagnosis) -> dict[str, Any]:
             'flux_rms_floor_t': result.floor_t,
             **dict.fromkeys(pose),
         },
-        'effects': list(_effects(result)),
+        'effects': [
+            effect_figures(record, without)
+            for record, without in zip(result.effects, result.without_t, strict=True)
+        ],
         'unexplained': {
             'fraction': result.unexplained,
             'depends_on': list(result.depends_on) if result.unexplained else [],
         },
     }
-
-
-def _effects(result: FewPosesDiagnosis) -> Iterator[dict[str, Any]]:
-    for record, without in zip(result.effects, result.without_t, strict=True):
-        yield {
-            'name': record.name,
-            'parameters': plain(dict(record.parameters)),
-            'uncertainty': plain(dict(record.uncertainty)),
-            'evidence': plain(dict(record.evidence)),
-            'flux_rms_without_t': without,
-        }
