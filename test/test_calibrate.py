@@ -20,8 +20,8 @@ from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import load_session
-from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
+from anser_ros.wire.session_writer import SessionWriter
 from anser_ros.wire.setup import dump_setup
 
 BAGS = Path(__file__).resolve().parents[1] / 'bags'

@@ -19,8 +19,8 @@ from anser_ros.sessions.plausibility import check_points, plausible_tools
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.units import FLUX_UNITS, LENGTH_UNITS, unit_words
 from anser_ros.wire.bag import read_bag
-from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
+from anser_ros.wire.session_writer import SessionWriter
 
 ROOT = Path(__file__).resolve().parents[1]
 MODEL = ROOT / 'config' / 'demo_model.yaml'

@@ -15,8 +15,8 @@ from anser_ros.sessions.model_file import save_model
 from anser_ros.sessions.patches import PatchFollower, parse_patches
 from anser_ros.sessions.prepared import prepare
 from anser_ros.sessions.session import load_session
-from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
+from anser_ros.wire.session_writer import SessionWriter
 
 pytestmark = pytest.mark.usefixtures('shared_tables')
 

@@ -17,8 +17,8 @@ from anser_ros.sessions.sliding_window import LIVE, SlidingWindow
 from anser_ros.sessions.watch import OPTICAL, RIGID, Watch
 from anser_ros.stamps import SECOND_NS
 from anser_ros.wire.bag import read_bag
-from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.points import FluxPoints, encode_flux
+from anser_ros.wire.session_writer import SessionWriter
 
 MODEL = REPO / 'config' / 'demo_model.yaml'
 MOVING, FACTORY = (REPO / 'bags' / f'{name}.mcap' for name in ('moving', 'factory'))

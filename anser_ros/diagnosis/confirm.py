@@ -109,7 +109,7 @@ def _checked(problem: Problem, fit: Fit, term: Term, noise: float) -> Confirmati
     return Confirmation(
         power,
         varying / max(power, 1e-300),
-        power / max(left_tools, 1e-3 * fit.state.count),
+        power / max(left_tools, 1e-300),
         0.0
         if np.isinf(term.effect.inexact)
         else _stays(fit.state, columns, noise, max(1.0, MODEL_ERROR * noise)) / max(power, 1e-300),

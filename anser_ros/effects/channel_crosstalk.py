@@ -24,6 +24,10 @@ from anser_ros.effects.view import View
 from anser_ros.errors import ModelFileError
 from anser_ros.field.model import EffectRecord
 
+MOST_PAIRS = 300
+"""Pairs of channels that are tried at most, those of the lowest numbers: all pairs of 25 channels.
+Each is a linear fit; 48 channels would have a thousand, for a fault that is rare in any one."""
+
 
 def _pairs(count: int) -> list[tuple[int, int]]:
     """Places of the off-diagonal entries, row by row."""
@@ -44,7 +48,7 @@ class ChannelCrosstalk(Effect[Term]):
         groups = [g for g in apparatus.clusters() if len(g) <= 4]
         inside = {pair for g in groups if len(g) > 2 for pair in combinations(sorted(g), 2)}
         pairs = [p for p in combinations(sorted(apparatus.tool_channels), 2) if p not in inside]
-        groups += [p for p in pairs if p not in groups][:300]
+        groups += [p for p in pairs if p not in groups][:MOST_PAIRS]
         return [Term(self, {'channels': g}, np.zeros(len(g) * (len(g) - 1))) for g in groups]
 
     def prior(self, term: Term) -> Array:

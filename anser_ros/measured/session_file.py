@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.pose_topics import optical_topic
+from anser_ros.wire.session_writer import SessionWriter
 from anser_ros.wire.setup import Setup, dump_setup
 from anser_ros.wire.setup_values import Vector
 

@@ -11,7 +11,6 @@ from anser_ros.errors import BagError
 from anser_ros.poses.sequence import REFERENCE, PoseSequence, PoseSession, sequence_of
 from anser_ros.stamps import NANO, stamp_of
 from anser_ros.wire.bag import POSE_TYPE, MessageDecoder, Salvage, iter_messages
-from anser_ros.wire.bag_writer import SessionWriter
 from anser_ros.wire.pose_topics import (
     BODY,
     ENDING,
@@ -21,6 +20,7 @@ from anser_ros.wire.pose_topics import (
     pose_setup,
     tracked_topic,
 )
+from anser_ros.wire.session_writer import SessionWriter
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from anser_ros.errors import ParameterError
 from anser_ros.sessions.tables import NumberTable, read_table
 from anser_ros.sessions.units import LENGTH_M
-from anser_ros.wire.bag_writer import FLUX_TOPICS, SessionWriter
 from anser_ros.wire.pose_topics import (
     BODY,
     ENDING,
@@ -28,6 +27,7 @@ from anser_ros.wire.pose_topics import (
     tracked_topic,
 )
 from anser_ros.wire.quaternion import unit_quaternions
+from anser_ros.wire.session_writer import FLUX_TOPICS, SessionWriter
 from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec, Setup, parse_setup
 from anser_ros.wire.setup_values import read_name
 from anser_ros.wire.text_files import read_text

@@ -1,0 +1,124 @@
+"""Writes sessions without ROS: setup, fluxes and poses, as the nodes would have published them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.wire import cdr
+from anser_ros.wire.bag_metadata import qos_profile
+from anser_ros.wire.bag_writer import BagWriter, Closing
+from anser_ros.wire.points import STALE, FluxPoints, PointFieldTuple, encode_flux
+from anser_ros.wire.setup import FIELD_GENERATOR, SensorSpec
+
+FLUX_TOPICS = {'/anser/tool/flux': False, '/anser/reference/flux': True}
+"""Topics of a session's fluxes, and whether their sensors are fixed to the field generator."""
+
+
+class SessionWriter(Closing):
+    """Writes a session without ROS: setup, fluxes and poses, log time = stamp.
+
+    Parameters
+    ----------
+    path : str or Path
+        The ``.mcap`` file; it must not exist yet.
+    frame_id : str
+        Frame of the fluxes and poses.
+
+    Raises
+    ------
+    BagError
+        The file exists already, or cannot be made.
+    """
+
+    def __init__(self, path: str | Path, frame_id: str = 'fg') -> None:
+        self._bag = BagWriter(path)
+        self._frame_id = frame_id
+        self._channels: dict[str, int] = {}
+
+    def write_setup(self, text: str, stamp_ns: int) -> None:
+        """Write the setup document."""
+        channel = self._channel('/anser/setup', 'std_msgs/msg/String', latched=True)
+        self._bag.write(channel, stamp_ns, cdr.string_bytes(text))
+
+    def write_readings(
+        self, sensors: Sequence[SensorSpec], stamp_ns: int, flux: NDArray[np.complex128]
+    ) -> None:
+        """Write one window: a message of the tools' sensors and one of the references, if any.
+
+        Parameters
+        ----------
+        sensors : sequence of SensorSpec
+            The S sensors that the window is of.
+        stamp_ns : int
+            Its middle.
+        flux : ndarray, shape (S, K), complex
+            T; NaN where there is no reading, and for emitters without current.
+        """
+        for topic, fixed in FLUX_TOPICS.items():
+            rows = [i for i, s in enumerate(sensors) if (s.body == FIELD_GENERATOR) == fixed]
+            if rows:
+                points = _points([sensors[i] for i in rows], flux[rows], fixed)
+                fields, step, data = encode_flux(points)
+                self.write_flux(topic, stamp_ns, fields, step, len(rows), data)
+
+    def write_flux(
+        self,
+        topic: str,
+        stamp_ns: int,
+        fields: Sequence[PointFieldTuple],
+        point_step: int,
+        width: int,
+        data: bytes,
+    ) -> None:
+        """Write one window's cloud, as `anser_ros.wire.points.encode_flux` packs it."""
+        channel = self._channel(topic, 'sensor_msgs/msg/PointCloud2')
+        frame = self._frame_id
+        message = cdr.cloud_bytes(stamp_ns, frame, fields, point_step, width, data)
+        self._bag.write(channel, stamp_ns, message)
+
+    def write_pose(
+        self,
+        topic: str,
+        stamp_ns: int,
+        position: Sequence[float],
+        quaternion_xyzw: Sequence[float],
+    ) -> None:
+        """Write one pose: position in m, unit quaternion."""
+        channel = self._channel(topic, 'geometry_msgs/msg/PoseStamped')
+        message = cdr.pose_bytes(stamp_ns, self._frame_id, position, quaternion_xyzw)
+        self._bag.write(channel, stamp_ns, message)
+
+    def close(self) -> None:
+        """Write the index and close the file."""
+        self._bag.close()
+
+    def remove(self) -> None:
+        self._bag.remove()
+
+    def _channel(self, topic: str, type_name: str, latched: bool = False) -> int:
+        if topic not in self._channels:
+            qos = [qos_profile(latched=latched, depth=1 if latched else 100)]
+            definition = cdr.DEFINITIONS[type_name]
+            self._channels[topic] = self._bag.add_topic(topic, type_name, definition, qos)
+        return self._channels[topic]
+
+
+def _points(
+    sensors: Sequence[SensorSpec], flux: NDArray[np.complex128], fixed: bool
+) -> FluxPoints:
+    """One window's cloud; a sensor lacks its reading where it has none of an emitter in force.
+
+    The place of a sensor that moves is not known to its fluxes.
+    """
+    known = np.isfinite(flux)
+    lacks = (known != known.any(axis=0)).any(axis=1) | ~known.any()
+    nothing = np.full((len(sensors), 3), np.nan)
+    return FluxPoints(
+        channel=np.array([sensor.channel for sensor in sensors]),
+        flags=np.where(lacks, STALE, 0),
+        flux=flux,
+        position=np.array([sensor.position_m for sensor in sensors]) if fixed else nothing,
+        axis=np.array([sensor.axis for sensor in sensors]) if fixed else nothing,
+    )
