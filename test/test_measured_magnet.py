@@ -41,7 +41,7 @@ def made_up(frames):
 class TestStep:
     @needs_data
     def test_the_session_has_the_robots_poses(self, tmp_path):
-        (path,) = magnet_step.write_sessions(FOLDER.with_name('magnet_step'), tmp_path)
+        (path,) = magnet_step.write_sessions(FOLDER, tmp_path)
         session = load_session(path)
         (tool,) = session.tools
         assert tool.flux.shape == (40, 48, 1) and tool.has_pose.all()

@@ -27,6 +27,7 @@ from anser_ros.measured import (
     magnet_patch,
     magnet_step,
     navion,
+    transformer,
 )
 from anser_ros.measured.recipe import Recipe
 
@@ -34,7 +35,7 @@ RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
     for recipe in (
         navion.RECIPE, magnet_patch.RECIPE, magnet_step.RECIPE, hpi_coils.RECIPE,
-        anser_board.RECIPE,
+        anser_board.RECIPE, transformer.RECIPE,
     )
 }  # fmt: skip
 """Data sets that the shipped commands are run on."""
@@ -80,11 +81,11 @@ def run(args: argparse.Namespace) -> int:
     for folder in filter(None, (args.out, args.bags)):
         make_folder(folder)
     rows: list[ReportRow] = []
-    names = args.datasets or RECIPES
+    names = args.datasets or _present(shared, console)
     if args.bags is not None:
         _write_bags(names, shared, args.bags, console)
     for name in names:
-        rows += _cook(RECIPES[name], shared / 'measured' / name, args, console)
+        rows += _cook(RECIPES[name], shared, args, console)
     document = json.dumps(to_document(rows), indent=1)
     if args.out is not None:
         (args.out / 'measured.json').write_text(document + '\n', encoding='utf-8')
@@ -97,10 +98,22 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _present(shared: Path, console: Console) -> list[str]:
+    """The data sets whose folders are there; says of the others that they are left out."""
+    names = []
+    for name, recipe in RECIPES.items():
+        if recipe.data(shared).is_dir():
+            names.append(name)
+        else:
+            console.print(f'{name} left out: no {recipe.data(shared)}', highlight=False)
+    return names
+
+
 def _cook(
-    recipe: Recipe, folder: Path, args: argparse.Namespace, console: Console
+    recipe: Recipe, shared: Path, args: argparse.Namespace, console: Console
 ) -> list[ReportRow]:
     """Run a recipe's commands; the figures that they give."""
+    folder = recipe.data(shared)
     with tempfile.TemporaryDirectory(prefix='anser_measured_') as made:
         out = Path(made) if args.out is None else args.out / recipe.name
         make_folder(out)
@@ -126,7 +139,7 @@ def _last(printed: io.StringIO) -> str:
 def _write_bags(names: Iterable[str], shared: Path, into: Path, console: Console) -> None:
     """Write the sessions of data sets, and print their paths."""
     for name in names:
-        for path in RECIPES[name].write_sessions(shared / 'measured' / name, into):
+        for path in RECIPES[name].write_sessions(RECIPES[name].data(shared), into):
             console.print(f'wrote {path}', highlight=False)
 
 

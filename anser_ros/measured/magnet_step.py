@@ -23,7 +23,7 @@ the size of the source, together (docs/results/README.md)."""
 def write_sessions(folder: Path, into: Path) -> list[Path]:
     """Write the file as a session; return its file. Raises `BagError` when it exists."""
     into.mkdir(parents=True, exist_ok=True)
-    table = folder.with_name(magnet_patch.NAME) / f'{FILE}.csv'
+    table = folder / f'{FILE}.csv'
     parts, _ = magnet_patch.read_poses(table, 'M')
     recording = magnet_patch.as_recording(FILE, parts, np.zeros(3))
     path = into / f'magnet_{FILE}.mcap'
@@ -52,4 +52,4 @@ def rows(folder: Path, bags: list[Path], out: Path) -> list[ReportRow]:
     ]  # fmt: skip
 
 
-RECIPE = Recipe(NAME, write_sessions, commands, rows)
+RECIPE = Recipe(NAME, write_sessions, commands, rows, folder=magnet_patch.NAME)

@@ -16,7 +16,7 @@ class Recipe:
     Attributes
     ----------
     name : str
-        Folder of the data.
+        As `anser measured` calls the data set.
     write_sessions : callable
         From the folder of the data and that of the bags to the bags written there.
     commands : callable
@@ -25,12 +25,19 @@ class Recipe:
     rows : callable
         From the folder of the data, the bags and the folder for results to the figures, read from
         what the commands wrote.
+    folder : str
+        Of the data, below ``measured/``; the name, unless another is given.
     """
 
     name: str
     write_sessions: Callable[[Path, Path], list[Path]]
     commands: Callable[[list[Path], Path], list[list[str]]]
     rows: Callable[[Path, list[Path], Path], list[ReportRow]]
+    folder: str = ''
+
+    def data(self, shared: Path) -> Path:
+        """Return the folder of the data in the one that contains ``measured/``."""
+        return shared / 'measured' / (self.folder or self.name)
 
 
 def calibrations(bag: Path, out: Path, found: Sequence[str] = ()) -> list[list[str]]:
