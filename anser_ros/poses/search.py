@@ -28,10 +28,6 @@ POSES_A_PARAMETER = 6
 """Poses that a parameter needs: neighbours in time are hardly new. More leave metal unnamed on a
 hundred poses that a slow tracker gives in a minute; blocks judge what fewer would do."""
 LAST_STEP = 1.02  # factor of a time constant about which what is left is a parabola
-SMOOTH_STEPS = 2.0
-"""Intervals of the reference up to which a filter may only smooth its noise, where it takes off no
-more than that noise: a low pass of two intervals leaves half of white noise. Fewer call smoothing
-a lag; more take a lag for smoothing."""
 MOST_EFFECTS = 6  # effects in force after which the search ends: more would be stand-ins
 FULL_FITS = 3  # candidates fitted in full in each round, which takes most of the time
 NOISE_ROUNDS = 3  # times that noise and what stands out, which depend on each other, are found
@@ -222,8 +218,7 @@ def _with_lag(
     ]
     trial = _finest_lag(min(trials, key=lambda t: t.state.sum_of_squares))
     term = trial.terms[-1]
-    interval = float(np.median(np.diff(fit.state.problem.path.knots)))
-    noisy = float(term.theta[0]) < SMOOTH_STEPS * interval and _is_smoothing(fit, trial)
+    noisy = _is_smoothing(fit, trial)
     widths = [term.with_theta(factor * term.theta) for factor in (0.5, 1.0, 2.0) if noisy]
     rivals = [fit_poses(fit.state.problem, [*fit.terms, effect_of(t).rival(t)], 3) for t in widths]
     best = min([fit, *rivals], key=lambda f: f.held_out())
