@@ -5,6 +5,7 @@ from pathlib import Path
 from matplotlib import pyplot as plt
 
 from anser_ros.calibration.result import Calibration
+from anser_ros.cli.diagnosis_words import flux_unit
 from anser_ros.cli.populations import population_figure
 from anser_ros.pictures import save
 
@@ -15,6 +16,8 @@ def draw_choice(calibration: Calibration, path: Path) -> None:
     """
     if not calibration.candidates:
         return
+    picked = calibration.chosen
+    factor, unit = flux_unit(picked.score)
     figure, (left, right) = plt.subplots(1, 2, figsize=(10, 5.4), layout='constrained')
     for mark, name, chosen in (
         ('o', 'placed', lambda layout: not layout.moved),
@@ -22,14 +25,13 @@ def draw_choice(calibration: Calibration, path: Path) -> None:
     ):
         found = [c for c in calibration.candidates if chosen(c.layout)]
         left.plot(
-            [len(c.dipoles) for c in found], [1e12 * c.score for c in found], mark, label=name
+            [len(c.dipoles) for c in found], [factor * c.score for c in found], mark, label=name
         )
-    picked = calibration.chosen
-    left.plot(len(picked.dipoles), 1e12 * picked.score, 's', ms=12, mfc='none', label='chosen')
-    left.set(xlabel='dipoles', ylabel='predictive error of held-out blocks, pT', yscale='log')
+    left.plot(len(picked.dipoles), factor * picked.score, 's', ms=12, mfc='none', label='chosen')
+    left.set(xlabel='dipoles', ylabel=f'predictive error of held-out blocks, {unit}', yscale='log')
     for candidate in sorted(calibration.candidates, key=lambda c: c.score)[:6]:
         damping, score = zip(*candidate.curve, strict=True)
-        right.plot(damping, [1e12 * s for s in score], '.-', label=candidate.layout.describe())
+        right.plot(damping, [factor * s for s in score], '.-', label=candidate.layout.describe())
     right.set(xlabel='damping', xscale='log', yscale='log')
     for panel in (left, right):
         panel.grid(alpha=0.3)
