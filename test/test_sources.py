@@ -14,6 +14,7 @@ from anser_ros.calibration.coaxial import coaxial, fit_coaxial
 from anser_ros.calibration.dipole_sites import DipoleSites, basis_rows
 from anser_ros.calibration.layouts import Generator, Layout, place
 from anser_ros.calibration.requirements import check_kept, check_measurements
+from anser_ros.calibration.sensor_parameters import KINDS
 from anser_ros.calibration.sensor_survey import SensorSurveyor
 from anser_ros.calibration.survey_records import corrections, reported_effects
 from anser_ros.diagnosis import decisions, outlying
@@ -129,6 +130,25 @@ class TestCoaxial:
         np.testing.assert_allclose(sites.positions[1], other.positions[0], atol=1e-6)
         np.testing.assert_allclose(np.abs(sites.directions[1]), [1.0, 0.0, 0.0], atol=1e-5)
         assert np.linalg.norm(sites.positions[0] - CENTRE) < 2e-3
+
+
+@pytest.mark.parametrize('seed', [5, 6])
+def test_gains_of_an_array_are_found_and_no_lever_arm_that_it_does_not_have(seed):
+    rng = np.random.default_rng(seed)
+    gains = np.repeat(1.0 + 0.02 * rng.normal(size=7), 3)
+    measured = recorded(array_of_sensors(rng), rng, 63, gains)
+    track = PoseTrack(
+        measured.time, measured.position, Rotation.from_matrix(measured.rotation).as_quat()
+    )
+    generator = Generator(np.zeros((1, 3)), np.zeros(1), 0.02)
+    surveyor = SensorSurveyor(
+        [replace(measured, track=track)], KINDS, generator, Accuracy(NOISE_T, 2e-4, 2e-3)
+    )
+    found = surveyor.fit()
+    survey = found.survey('array')
+    assert 'gains' in found.evidence
+    assert np.std(survey.gain.real / gains) < np.std(gains) / 3.0
+    assert np.abs(survey.lever_arm).max() < 1e-4
 
 
 @pytest.mark.parametrize('rate_hz', [0.2, 25.0])

@@ -205,13 +205,18 @@ class Population:
         return {kind: size for kind, size in sigmas.items() if size > USEFUL[kind]}
 
     def _data_sigmas(self, likelihood: Likelihood) -> dict[str, float]:
-        """How far the data by themselves determine each kind: its typical standard deviation."""
-        width = self._start(())
-        variance = np.maximum(np.diag(solve(likelihood, width).covariance), 0.0)
-        return {
-            kind: float(np.sqrt(np.mean(variance[self.parameters.rows(kind)])))
-            for kind in self.parameters.kinds
-        }
+        """How far the data determine each kind, whatever it is: its typical standard deviation.
+
+        The other populations are as wide as the data make them: places that are free by
+        millimetres would leave gains open that places of a few micrometres determine.
+        """
+        found, start, out = self.fit(likelihood).width, self._start(()), {}
+        for kind in self.parameters.kinds:
+            width, rows = found.copy(), self.parameters.rows(kind)
+            width[rows] = start[rows]
+            variance = np.maximum(np.diag(solve(likelihood, width).covariance)[rows], 0.0)
+            out[kind] = float(np.sqrt(np.mean(variance)))
+        return out
 
     def shift_sigma_m(self, likelihood: Likelihood, found: Posterior) -> float:
         """Return how well a shift of all of a body's sensors is known, m along each axis.

@@ -73,6 +73,10 @@ holds only what they do not determine."""
 FIELD_WIDTH = 0.3
 """Prior width of the field's deviation from the drawing, relative to the flux, to begin with.
 Smaller holds the first steps to a poor drawing; larger lets it take up what is the sensors'."""
+WIDTH_ALONE = 5.0
+"""The same without a drawing, where the prior's middle is no field at all. It is learnt from the
+first step on. Smaller shrinks the field until then, and a shift of all sensors makes up for it:
+0.3 gave a patch of magnetometers a lever arm of 2.5 mm that it did not have."""
 LEAST_FIELD_WIDTH = 1e-3
 """Least such width: no board is made more exactly than that."""
 FEWEST_READINGS = 7.0
@@ -151,7 +155,8 @@ class SensorSurveyor:
         self.posterior: Posterior
         self.noise_t = FIT_NOISE * accuracy.flux_noise_t
         self.optical = LOOSE
-        self.field_width, self.inflation = FIELD_WIDTH, 1.0
+        self.field_width = WIDTH_ALONE if nominal is None else FIELD_WIDTH
+        self.inflation = 1.0
 
     def survey(self, body: str) -> Survey:
         """Return the survey of a body's sensors by the present estimate."""
