@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from anser_ros.errors import BagError, FitError
-from anser_ros.sessions.baseline import board_place_of, clean_flux
+from anser_ros.errors import BagError, FitError, ModelFileError
+from anser_ros.sessions.baseline import board_place_of, check_place, clean_flux
+from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.model_file import load_model
 from anser_ros.sessions.session import load_session
 from anser_ros.sessions.starting_model import model_for
@@ -48,6 +49,16 @@ def test_a_model_that_lies_aside_is_refused_and_its_shift_is_told(recorded, shif
     assert placed.is_certain
     with pytest.raises(BagError, match='from where the references locate the board'):
         clean_flux(session, session.reference.sensors, aside)
+
+
+def test_a_session_is_not_tracked_with_a_model_that_its_references_contradict(recorded):
+    _, model = recorded
+    near_metal = load_session(ROOT / 'bags' / 'metal.mcap')
+    check_place(model, near_metal)
+    aside = replace(model, positions=model.positions + np.array([2e-3, 0.0, 0.0]))
+    with pytest.raises(ModelFileError, match=r'2\.\d mm .* from where the references locate'):
+        track_session(near_metal, aside)
+    check_place(aside, replace(near_metal, reference=None))
 
 
 def test_metal_is_no_board_that_lies_elsewhere(recorded):

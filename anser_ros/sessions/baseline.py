@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.effects.correction import needs_correction
-from anser_ros.errors import BagError, FitError
+from anser_ros.errors import BagError, FitError, ModelFileError
 from anser_ros.field.model import FieldModel
 from anser_ros.field.reference_readings import ReferenceReadings
 from anser_ros.integrity.board_place import BoardPlace
@@ -118,6 +118,29 @@ def board_place_of(model: FieldModel, sensors: SensorTable, setup: Setup) -> Boa
     return BoardPlace(
         model, board.field, board.centres, tracked_volume(setup), sensors, setup.accuracy
     )
+
+
+def check_place(model: FieldModel, session: Session) -> None:
+    """Raise `ModelFileError` when a model lies beside the board that a session's references see.
+
+    Nothing is compared without references, nor where `board_place_of` has nothing to compare.
+    """
+    reference = session.reference
+    if reference is None or not reference.flux.size:
+        return
+    place = board_place_of(model, reference.sensors, session.setup)
+    if place is None:
+        return
+    # The median, as metal may come for a while, and a sensor fail.
+    readings = np.where(reference.valid[:, :, None], reference.flux, np.nan)
+    known = reference.valid.any(axis=0)
+    flux = np.full(readings.shape[1:], np.nan, dtype=complex)
+    real, imag = readings[:, known].real, readings[:, known].imag
+    flux[known] = np.nanmedian(real, axis=0) + 1j * np.nanmedian(imag, axis=0)
+    try:
+        place.check(flux)
+    except FitError as error:
+        raise ModelFileError(f'{session.path}: {error}') from error
 
 
 def _is_without_metal(model: FieldModel) -> bool:

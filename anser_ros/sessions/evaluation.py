@@ -10,6 +10,7 @@ import numpy as np
 
 from anser_ros.field.model import FieldModel
 from anser_ros.field.symmetry import symmetry_axis
+from anser_ros.sessions.baseline import check_place
 from anser_ros.sessions.follower import ModelFollower, RefitSummary
 from anser_ros.sessions.pose_errors import PoseSeries, body_series, sensor_series
 from anser_ros.sessions.prepared import PreparedSession, prepare, with_truth
@@ -83,8 +84,11 @@ def track_session(
     BagError
         When the session has no tool fluxes, or a refit lacks references or a baseline.
     ModelFileError
-        When the model's emitters are not the session's.
+        When the model's emitters are not the session's, or the session's references locate the
+        board elsewhere. With the gate switched off the latter is not checked.
     """
+    if (settings or TrackerSettings()).has_gate:
+        check_place(model, session)
     used = in_phase_model(model) if in_phase else model
     prepared = prepare(session, used, baseline if refit else None)
     follower = ModelFollower(prepared, patches, witnesses) if refit else None
