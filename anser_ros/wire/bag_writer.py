@@ -279,6 +279,7 @@ class BagWriter(Closing):
         return descriptor
 
     def remove(self) -> None:
+        """Remove the closed file, unless the caller gave the stream."""
         if self._is_made:
             self.path.unlink(missing_ok=True)
 

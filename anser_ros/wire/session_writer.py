@@ -95,6 +95,7 @@ class SessionWriter(Closing):
         self._bag.close()
 
     def remove(self) -> None:
+        """Remove the closed file."""
         self._bag.remove()
 
     def _channel(self, topic: str, type_name: str, latched: bool = False) -> int:
