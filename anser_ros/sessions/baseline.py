@@ -131,12 +131,11 @@ def check_place(model: FieldModel, session: Session) -> None:
     place = board_place_of(model, reference.sensors, session.setup)
     if place is None:
         return
-    # The median, as metal may come for a while, and a sensor fail.
-    readings = np.where(reference.valid[:, :, None], reference.flux, np.nan)
-    known = reference.valid.any(axis=0)
-    flux = np.full(readings.shape[1:], np.nan, dtype=complex)
-    real, imag = readings[:, known].real, readings[:, known].imag
-    flux[known] = np.nanmedian(real, axis=0) + 1j * np.nanmedian(imag, axis=0)
+    flux = np.full(reference.flux.shape[1:], np.nan, dtype=complex)
+    for row, good in enumerate(reference.valid.T):
+        if good.any():  # the median, as metal may come for a while, and a sensor fail
+            parts = reference.flux[good, row].view(float)
+            flux[row] = np.nanmedian(parts, axis=0).view(complex)
     try:
         place.check(flux)
     except FitError as error:

@@ -87,7 +87,7 @@ def track_session(
         When the model's emitters are not the session's, or the session's references locate the
         board elsewhere. With the gate switched off the latter is not checked.
     """
-    if (settings or TrackerSettings()).has_gate:
+    if settings is None or settings.has_gate:
         check_place(model, session)
     used = in_phase_model(model) if in_phase else model
     prepared = prepare(session, used, baseline if refit else None)

@@ -21,15 +21,13 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import numpy as np
-from bench_refit import LAYOUT, recordings
+from bench_refit import JITTER_M, LAYOUT, recordings
 
 from anser_ros.calibration.calibrate import Options
 from anser_ros.sessions.calibration import calibrate_sessions
 from anser_ros.sessions.evaluation import track_session
 from anser_ros.sessions.session import Session, load_session
 
-JITTER_M = 0.07e-3 * 3**0.5
-"""Jitter of the reference's poses, m, in space."""
 WRONG_M = 1e-3
 BEFORE_S, AFTER_S = 4.0, 8.0
 """Time before the failure and after it that a case has, s."""

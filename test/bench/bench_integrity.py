@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -11,8 +12,11 @@ from unittest import mock
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from bench_refit import LAYOUT
+
 from anser_ros.calibration.calibrate import Options
-from anser_ros.calibration.layouts import Layout
 from anser_ros.frames.intake import Intake
 from anser_ros.integrity.freshness import Freshness
 from anser_ros.sessions.calibration import calibrate_sessions
@@ -58,9 +62,8 @@ class Clock:
 
 def rows() -> Iterator[dict[str, Any]]:
     """Yield the rows of the benchmark table."""
-    layout = Layout('coils', 3, 1.0, 0.0, prior='nominal', moved=True)
     scan = load_session(BAGS / 'factory.mcap')
-    model = calibrate_sessions([scan], Options(layout=layout, estimate=())).model
+    model = calibrate_sessions([scan], Options(layout=LAYOUT, estimate=())).model
     tool = load_session(BAGS / 'moving.mcap').tools[0]
     tracker = Tracker(model, tool.sensors)
     clocks = {name: Clock() for name in (WHOLE, *CHECKS)}
