@@ -1,10 +1,13 @@
 """Terms of every effect for tests: candidates, metal on its way, and what is plainly there."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from anser_ros.effects.metal_path import FreePath, StraightPath
 from anser_ros.effects.registry import all_effects
 from anser_ros.effects.term import Term
+from anser_ros.field.dipoles import Dipoles
 from anser_ros.metal.body import (
     lattice,
 )
@@ -30,11 +33,18 @@ def visiting(scene) -> Term:
     return rich.with_theta(np.concatenate([theta, rng.normal(size=6)]))
 
 
+def undrawn(scene):
+    """The same apparatus with one dipole for each emitter, as no drawing has it."""
+    light, moments = scene.illumination, np.eye(scene.emitters, dtype=complex)
+    places, axes = light.positions[: scene.emitters], np.tile([0.6, 0.0, 0.8], (scene.emitters, 1))
+    return replace(scene, illumination=Dipoles(places, axes, moments))
+
+
 def candidates(scene) -> list[Term]:
     """The first candidate of every kind of site of every effect."""
     terms, seen = [], set()
     for effect in all_effects().values():
-        for term in effect.candidates(scene):
+        for term in [*effect.candidates(scene), *effect.candidates(undrawn(scene))]:
             kind = (effect.name, tuple(sorted(term.site)))
             if term.theta.size and kind not in seen:
                 seen.add(kind)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from diagnosis_world import world
-from effects_scene import candidates, in_force
+from effects_scene import candidates, in_force, undrawn
 
 from anser_ros.effects.correction import Correction
 from anser_ros.effects.effect import Effect, Family, Remedy
@@ -50,7 +50,7 @@ def test_effects_declare_what_the_search_needs(scenery):
         1000 + np.arange(39), tuple(map(str, range(39))), ('array',) * 39, places,
         np.tile(np.eye(3), (13, 1)), np.zeros(39),
     )  # fmt: skip
-    apparatus = replace(apparatus, tools=(*apparatus.tools, array))
+    apparatus = replace(undrawn(apparatus), tools=(*apparatus.tools, array))
     for name, effect in all_effects().items():
         terms = [*effect.candidates(apparatus)]
         if effect.still is not None:

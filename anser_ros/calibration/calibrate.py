@@ -25,7 +25,13 @@ from anser_ros.calibration.selection import (
     thin_frames,
 )
 from anser_ros.calibration.sensor_survey import SensorSurveyor
-from anser_ros.calibration.survey_records import contradiction_words, corrections, reported_effects
+from anser_ros.calibration.source_size import source_sizes
+from anser_ros.calibration.survey_records import (
+    contradiction_words,
+    corrections,
+    reported_effects,
+    size_records,
+)
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import FieldModel
 from anser_ros.settings import Accuracy
@@ -116,6 +122,11 @@ def fit_scan(
         posed, chosen.layout, damping, generator, options.accuracy, nominal, progress=progress
     )
     dipoles, fit = whole.dipoles, whole.fit
+    sizes = source_sizes(
+        chosen.layout, selection.candidates, whole, posed,
+        fold_of_frames([m.position for m in posed]), options.accuracy,
+    )  # fmt: skip
+    scan = replace(scan, reported_effects=(*scan.reported_effects, *size_records(sizes)))
     if not _is_explained(scan):
         check_agreement(posed, names, fit, _fitter(chosen, generator, options, nominal))
     model = FieldModel(

@@ -8,9 +8,11 @@ from numpy.typing import NDArray
 from anser_ros.calibration.disturbances import spans_of
 from anser_ros.calibration.population import FAR
 from anser_ros.calibration.sensor_parameters import SensorParameters
+from anser_ros.calibration.source_size import SourceSize
 from anser_ros.calibration.survey_result import SurveyResult
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord
+from anser_ros.field.symmetry import size_parameters
 from anser_ros.physics.tangent import tilted
 
 Array = NDArray[np.float64]
@@ -81,6 +83,18 @@ def drift_records(strength: NDArray[np.complex128]) -> tuple[EffectRecord, ...]:
         falls = int(np.argmax(course)) < int(np.argmin(course))
         records.append(
             EffectRecord('coil_drift', {'coil': coil, 'amount': -way if falls else way})
+        )
+    return tuple(records)
+
+
+def size_records(sizes: Sequence[SourceSize]) -> tuple[EffectRecord, ...]:
+    """Return a record of each emitter whose size the scan tells."""
+    records = []
+    for found in sizes:
+        figures, sigmas = size_parameters(found.second_moment_m2, found.sigma_m2)
+        evidence = {'heldout_point_t': found.point_t, 'heldout_sized_t': found.sized_t}
+        records.append(
+            EffectRecord('emitter_size', {'coil': found.emitter, **figures}, sigmas, evidence)
         )
     return tuple(records)
 

@@ -1,15 +1,26 @@
-"""Finds the axis about which a field model may be turned without a change of its field."""
+"""Finds the axis about which a field model may be turned without a change of its field.
+
+The octupole of sources on an axis, about their middle, is that of their second moment: the mean
+square distance from the middle, weighted by the moments. It is negative where moments beside the
+middle are of the opposite sign, as those are that stand for a flat coil.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from anser_ros.field.dipoles import Dipoles
+
 Array = NDArray[np.float64]
 
 OFF_AXIS = 1e-6
 """Moment across the axis, as a fraction of the whole, and distance from the axis as a fraction of
 a metre, up to which a dipole is on it: far below what anybody can measure."""
+STEP_M = 1e-3
+"""Way along the axis over which a second derivative is a difference, m. Its relative error is 2.5
+times the square of the way over the distance of the sensor, 0.3 % at 3 cm; a far smaller way makes
+moments so large that rounding is seen."""
 
 
 @dataclass(frozen=True)
@@ -23,10 +34,13 @@ class SymmetryAxis:
         field has no quadrupole.
     direction : ndarray, shape (3,)
         Unit vector; the first emitter's moment points along it.
+    second_moment_m2 : float
+        Of the sources about the middle, along the axis, m^2.
     """
 
     point: Array
     direction: Array
+    second_moment_m2: float
 
 
 def symmetry_axis(
@@ -55,7 +69,8 @@ def symmetry_axis(
     weight = vectors[used] @ axis
     middle = weight @ places / weight.sum()
     away = places - middle
-    away -= np.outer(away @ axis, axis)
+    along = away @ axis
+    away -= np.outer(along, axis)
     if np.abs(away).max() > OFF_AXIS:
         return None
     # Dipoles at one place count together: three components of one vector may point anywhere.
@@ -67,4 +82,39 @@ def symmetry_axis(
         across = vector - np.einsum('ki,i->k', vector, axis)[:, None] * axis
         if np.linalg.norm(across) > OFF_AXIS * np.linalg.norm(whole):
             return None
-    return SymmetryAxis(middle, axis)
+    return SymmetryAxis(middle, axis, float(weight @ along**2 / weight.sum()))
+
+
+def spread_along(base: Dipoles, emitter: int, axis: Array, second_moment_m2: float) -> Dipoles:
+    """Return dipoles that give an emitter a second moment along an axis besides its own.
+
+    Their field is half the second moment times the second derivative, along the axis, of the
+    field that the emitter has by ``base``: three dipoles, without a moment together, for each.
+    """
+    only = np.zeros_like(base.moments)
+    only[:, emitter] = base.moments[:, emitter] * (second_moment_m2 / (2.0 * STEP_M**2))
+    used = np.flatnonzero(only.any(axis=1))
+    place, moments, step = base.positions[used], only[used], STEP_M * axis
+    return Dipoles(
+        np.concatenate([place + step, place, place - step]),
+        np.tile(base.directions[used], (3, 1)),
+        np.concatenate([moments, -2.0 * moments, moments]),
+    )
+
+
+def size_parameters(
+    second_moment_m2: float, sigma_m2: float
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return a second moment with the size of a source that has it, and their uncertainties.
+
+    A positive one is that of a thin magnet, along its axis, of length L, L^2 / 12; a negative one
+    that of a flat disc of diameter D, magnetised across, -D^2 / 16.
+    """
+    key, share = ('length_m', 12.0) if second_moment_m2 >= 0.0 else ('diameter_m', 16.0)
+    size = float(np.sqrt(share * abs(second_moment_m2)))
+    # Near zero a size is known only to be below the root of its square's uncertainty.
+    sigma = share * sigma_m2 / max(2.0 * size, np.sqrt(share * sigma_m2), 1e-300)
+    return (
+        {'second_moment_m2': second_moment_m2, key: size},
+        {'second_moment_m2': sigma_m2, key: float(sigma)},
+    )

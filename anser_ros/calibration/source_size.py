@@ -1,0 +1,204 @@
+"""Tells how large an emitter without a drawing is, with every pose marginalised.
+
+Moments of several dipoles on an axis are fitted in turn with the poses, and a size is close to a
+shift of all poses: it would take very many turns. Here place, axis, moment and size of each
+emitter are fitted by Gauss-Newton to fluxes of which the part that poses explain counts as little
+as the jitter is large (`pose_whitening`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from anser_ros.calibration.dipole_sites import DipoleSites
+from anser_ros.calibration.factors import as_real
+from anser_ros.calibration.layout_fit import LayoutFit
+from anser_ros.calibration.layout_score import LayoutCandidate
+from anser_ros.calibration.layouts import Layout
+from anser_ros.calibration.pose_correction import pose_precision, pose_terms
+from anser_ros.calibration.pose_whitening import PoseWhitener
+from anser_ros.calibration.readings import frame_blocks
+from anser_ros.calibration.selection import COAXIAL, LEAST_GAIN
+from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.measurements import Measurements
+from anser_ros.field.symmetry import spread_along
+from anser_ros.physics.tangent import tilted
+from anser_ros.settings import Accuracy
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+POINT, SIZED = COAXIAL[:2]
+"""Layouts of emitters without a size, and of those that have no more than a size."""
+LEAST_SIGMAS = 5.0
+"""Standard deviations from zero at which a size is told. They come from five blocks, so that
+chance alone reaches so many in one of 130 emitters without a size."""
+STEPS = 4
+"""Steps of the fit, which starts where the dipoles were fitted: each leaves a small part of the
+error before it."""
+WAYS = np.array([1e-5, 1e-5, 1e-5, 1e-4, 1e-4, 1e-4, 1e-4, 1e-7])
+"""Steps of the differences by an emitter's centre (m), the tilt of its axis (rad), the real and
+imaginary part of its moment (relative) and its second moment (m^2): small beside the distance of
+any sensor, and far above rounding."""
+
+
+@dataclass(frozen=True)
+class SourceSize:
+    """States how large an emitter was found to be.
+
+    Attributes
+    ----------
+    emitter : int
+    second_moment_m2, sigma_m2 : float
+        Its second moment along its axis, m^2, and the standard deviation of that.
+    point_t, sized_t : float
+        Held-out scores (`LayoutCandidate`) of emitters without and with a size, T.
+    """
+
+    emitter: int
+    second_moment_m2: float
+    sigma_m2: float
+    point_t: float
+    sized_t: float
+
+
+@dataclass(frozen=True)
+class _SizedSources:
+    """K emitters, each on an axis of its own: centres and axes (K, 3), moments and sizes (K,)."""
+
+    centres: Array
+    axes: Array
+    moments: ComplexArray
+    sizes_m2: Array
+
+    @staticmethod
+    def of(fitted: LayoutFit, count: int) -> '_SizedSources':
+        """Those of ``count`` fitted dipoles each, still without a size."""
+        sites, moments = fitted.dipoles, fitted.fit.moments
+        middle = slice((count - 1) // 2, None, count)
+        total = [moments[count * k : count * (k + 1), k].sum() for k in range(moments.shape[1])]
+        return _SizedSources(
+            sites.positions[middle], sites.directions[middle], np.array(total),
+            np.zeros(len(total)),
+        )  # fmt: skip
+
+    def moved(self, step: Array) -> '_SizedSources':
+        """The sources after a step (K, 8), in the order of `WAYS`."""
+        return _SizedSources(
+            self.centres + step[:, :3], tilted(self.axes, step[:, 3:5]),
+            self.moments * (1.0 + step[:, 5] + 1j * step[:, 6]), self.sizes_m2 + step[:, 7],
+        )  # fmt: skip
+
+    def dipoles(self) -> Dipoles:
+        """Dipoles that have the sources' field."""
+        base = Dipoles(self.centres, self.axes, np.diag(self.moments))
+        for k, (axis, size) in enumerate(zip(self.axes, self.sizes_m2, strict=True)):
+            base = base.joined(spread_along(base, k, axis, size))
+        return base
+
+
+def source_sizes(
+    chosen: Layout,
+    candidates: Sequence[LayoutCandidate],
+    fitted: LayoutFit,
+    measurements: Sequence[Measurements],
+    folds: Sequence[NDArray[np.int64]],
+    accuracy: Accuracy,
+) -> tuple[SourceSize, ...]:
+    """Return the sizes that a scan tells, none where emitters without one predict it as well.
+
+    Parameters
+    ----------
+    chosen : Layout
+        The chosen layout; only dipoles on an axis of each emitter have a size.
+    candidates : sequence of LayoutCandidate
+        Every layout that was scored.
+    fitted : LayoutFit
+        The fit of the chosen one.
+    measurements : sequence of Measurements
+        What it was fitted to, at measured poses.
+    folds : sequence of ndarray, shape (F,)
+        Block of space of each frame.
+    accuracy : Accuracy
+        Jitter of the poses.
+    """
+    scored = {one.layout: one for one in candidates}
+    if chosen.kind != SIZED.kind or not {POINT, SIZED} <= scored.keys():
+        return ()
+    point, sized = scored[POINT], scored[SIZED]
+    if point.score < sized.score * (1.0 + LEAST_GAIN):
+        return ()
+    sources, blocks = (
+        _SizedSources.of(fitted, chosen.count),
+        np.unique(np.concatenate(list(folds))),
+    )
+    for _ in range(STEPS):
+        normal, right = _sums(sources, fitted, measurements, folds, blocks, accuracy)
+        sources = sources.moved(_solved(normal.sum(axis=0), right.sum(axis=0)))
+    normal, right = _sums(sources, fitted, measurements, folds, blocks, accuracy)
+    # The jackknife: each block is left out in turn.
+    whole, at = normal.sum(axis=0), right.sum(axis=0)
+    parts = [_solved(whole - n, at - r)[:, 7] for n, r in zip(normal, right, strict=True)]
+    sigma = np.sqrt((blocks.size - 1) * np.var(parts, axis=0))
+    return tuple(
+        SourceSize(k, float(size), float(sigma[k]), point.score, sized.score)
+        for k, size in enumerate(sources.sizes_m2)
+        if abs(size) > LEAST_SIGMAS * sigma[k]
+    )
+
+
+def _solved(normal: Array, right: Array) -> Array:
+    """The step (K, 8) that normal equations give."""
+    scale = 1.0 / np.sqrt(np.diag(normal))
+    scaled = np.linalg.lstsq(normal * np.outer(scale, scale), right * scale, rcond=1e-12)[0]
+    return np.asarray((scaled * scale).reshape(-1, len(WAYS)))
+
+
+def _sums(
+    sources: _SizedSources,
+    fitted: LayoutFit,
+    measurements: Sequence[Measurements],
+    folds: Sequence[NDArray[np.int64]],
+    blocks: NDArray[np.int64],
+    accuracy: Accuracy,
+) -> tuple[Array, Array]:
+    """Normal equations of each block, (B, 8K, 8K) and (B, 8K)."""
+    ways = np.diag(np.tile(WAYS, len(sources.sizes_m2)))
+    here, size = sources.dipoles(), len(ways)
+    sites = DipoleSites(here.positions, here.directions)
+    normal, right = np.zeros((blocks.size, size, size)), np.zeros((blocks.size, size))
+    for measured, weights, fold in zip(measurements, fitted.fit.weights, folds, strict=True):
+        for some in frame_blocks(*weights.shape):
+            part = measured.frames(some)
+            terms = pose_terms(part, sites, here.moments)
+            white = PoseWhitener(
+                terms.slope, weights[some], fitted.fit.noise_t, pose_precision(accuracy)
+            )
+            columns = [_slope(sources, way, part) for way in ways]
+            left = np.stack([white.left_over(one) for one in [*columns, terms.residual]], axis=-1)
+            left = left.reshape(*white.root.shape, -1) / white.noise_t
+            rows = np.stack(columns, axis=-1).reshape(*white.root.shape, -1)
+            rows *= white.root[:, :, None] / white.noise_t
+            sums = np.einsum('fri,frj->fij', rows, left, optimize=True)
+            for place, block in enumerate(blocks):
+                total = sums[fold[some] == block].sum(axis=0)
+                normal[place] += total[:, :-1]
+                right[place] += total[:, -1]
+    return normal, right
+
+
+def _slope(sources: _SizedSources, way: Array, measured: Measurements) -> Array:
+    """Derivative of the fluxes, (F, S, 2K), by the parameter that a way of (8K,) changes."""
+    step = way.reshape(-1, len(WAYS))
+    ahead, behind = (_flux(sources.moved(sign * step), measured) for sign in (1.0, -1.0))
+    return np.asarray((ahead - behind) / (2.0 * way.sum()))
+
+
+def _flux(sources: _SizedSources, measured: Measurements) -> Array:
+    """Modelled fluxes, (F, S, 2K), T."""
+    points, axes = measured.placed()
+    lengths = np.tile(measured.sensors.length, len(points))
+    flux = sources.dipoles().flux(points.reshape(-1, 3), axes.reshape(-1, 3), lengths)
+    return as_real(flux).reshape(*points.shape[:2], -1)

@@ -1,0 +1,123 @@
+"""An emitter without a drawing is larger, or flatter, than its model's dipoles are."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from anser_ros.effects.apparatus import Apparatus
+from anser_ros.effects.effect import Array, ComplexArray, Effect, Remedy, needed
+from anser_ros.effects.term import Term
+from anser_ros.effects.view import View
+from anser_ros.field.dipoles import Dipoles
+from anser_ros.field.model import EffectRecord
+from anser_ros.field.symmetry import size_parameters, spread_along, symmetry_axis
+
+UNIT = 1e-4
+"""theta counts second moments in units of (10 mm)^2."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EmitterSizeTerm(Term):
+    """Holds an emitter that is the same all around an axis.
+
+    Attributes
+    ----------
+    axis : ndarray, shape (3,)
+        Unit vector, frame fg.
+    modelled_m2 : float
+        Second moment of the model's own dipoles of this emitter, m^2.
+    """
+
+    axis: Array
+    modelled_m2: float
+
+    @property
+    def second_moment_m2(self) -> float:
+        """Return the second moment of the whole emitter, m^2."""
+        return self.modelled_m2 + UNIT * float(self.theta[0])
+
+
+class EmitterSize(Effect[EmitterSizeTerm]):
+    """Theta is what the second moment of an emitter has beside its model's, in (10 mm)^2.
+
+    An emitter that is the same all around an axis has, after its dipole, the field of an octupole
+    about its centre: that of dipoles spread along the axis, whose mean square distance from the
+    centre, weighted by their moments, is its second moment s^2. The field is linear in it: s^2 / 2
+    times the second derivative of the emitter's own field along the axis. A uniformly magnetised
+    cylinder of length L and radius a has L^2 / 12 - a^2 / 4, a flat coil less than nothing.
+
+    Metal sees the emitter as the model has it: what its size changes there is a small part of what
+    metal changes at the sensors.
+    """
+
+    name = 'emitter_size'
+    summary = 'an emitter is longer or flatter than its model'
+    units: ClassVar[Mapping[str, str]] = {
+        'coil': '1', 'second_moment_m2': 'm^2', 'length_m': 'm', 'diameter_m': 'm',
+    }  # fmt: skip
+    plausible: ClassVar[Mapping[str, tuple[float, float]]] = {
+        'length_m': (0.0, 1.0),
+        'diameter_m': (0.0, 1.0),
+    }
+    remedy = Remedy.FIELD
+
+    def candidates(self, apparatus: Apparatus) -> Sequence[EmitterSizeTerm]:
+        """Return a candidate for each emitter whose dipoles lie on one axis and point along it.
+
+        Those of a drawn emitter do not, so that one whose size is known is no candidate.
+        """
+        light, found = apparatus.illumination, []
+        for k in range(apparatus.emitters):
+            axis = symmetry_axis(light.positions, light.directions, light.moments[:, k : k + 1])
+            if axis is not None:
+                found.append(
+                    EmitterSizeTerm(
+                        self, {'coil': k}, np.zeros(1), axis=axis.direction,
+                        modelled_m2=axis.second_moment_m2,
+                    )
+                )  # fmt: skip
+        return found
+
+    def prior(self, term: EmitterSizeTerm) -> Array:
+        """Return a prior spread that allows magnets and coils of some decimetres."""
+        return np.full(1, 100.0)
+
+    def columns(self, term: EmitterSizeTerm, view: View) -> ComplexArray:
+        """Return the flux that a unit of second moment adds."""
+        unit = spread_along(view.illumination, term.site['coil'], term.axis, UNIT)
+        return view.along(unit.flux(*view.flat))[..., None]
+
+    def sources(
+        self, term: EmitterSizeTerm, base: Dipoles, illumination: Dipoles, omega: Array
+    ) -> Dipoles | None:
+        """Return dipoles on the axis that have the second moment and no moment together."""
+        return spread_along(base, term.site['coil'], term.axis, UNIT * float(term.theta[0]))
+
+    def record(self, term: EmitterSizeTerm, covariance: Array) -> EffectRecord:
+        """Record the second moment, m^2, and a thin magnet or a flat disc that has it."""
+        sigma_m2 = UNIT * float(np.sqrt(covariance[0, 0]))
+        figures, sigmas = size_parameters(term.second_moment_m2, sigma_m2)
+        return EffectRecord(
+            self.name,
+            {
+                'coil': term.site['coil'],
+                **figures,
+                'model_second_moment_m2': term.modelled_m2,
+                'axis': term.axis.tolist(),
+            },
+            sigmas,
+        )
+
+    def term(self, record: EffectRecord) -> EmitterSizeTerm:
+        """Read an emitter's second moment, and that of its model, from a record."""
+        modelled = float(needed(record, 'model_second_moment_m2'))
+        theta = (float(needed(record, 'second_moment_m2')) - modelled) / UNIT
+        return EmitterSizeTerm(
+            self, {'coil': int(needed(record, 'coil'))}, np.array([theta]),
+            axis=np.asarray(needed(record, 'axis'), dtype=np.float64), modelled_m2=modelled,
+        )  # fmt: skip
+
+
+EFFECTS = (EmitterSize(),)
