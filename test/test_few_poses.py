@@ -62,19 +62,23 @@ def diagnosed(bag, folder):
 
 
 def test_a_plate_at_four_heights_has_its_errors_named(tmp_path):
-    measured, gains, _ = recorded(7, per_side=4)
-    stated = {'flux_noise_t': 1e-5, 'optical_position_m': 1e-3, 'optical_rotation_rad': 5e-3}
+    # Every other height is 2.5 mm too high and turned, the others are the other way round.
+    off = np.outer([1.0, -1.0, 1.0, -1.0], [0.0, 0.0, 2.5e-3, 5e-3, 0.0, 0.0])
+    measured, gains, _ = recorded(7, per_side=4, off=off)
+    stated = {'flux_noise_t': 1e-5, 'optical_position_m': 2e-3, 'optical_rotation_rad': 5e-3}
     bag = written(tmp_path / 'plate.mcap', measured, 'abc', (1.0, 2.0, 3.0), CENTRES, stated)
     document, page = diagnosed(bag, tmp_path)
     found = {effect['name']: effect for effect in document['effects']}
-    assert list(found) == ['sensor_gain_spread', 'sensor_axis_spread', 'body_bend']
+    spreads = ['sensor_gain_spread', 'sensor_axis_spread']
+    assert list(found) == [*spreads, 'body_bend', 'body_placement']
     assert abs(found['sensor_gain_spread']['parameters']['spread'] / np.std(gains) - 1.0) < 0.3
     held = document['held_out']
     assert held['flux_rms_after_t'] < 0.7 * held['flux_rms_before_t']
     assert all(e['flux_rms_without_t'] > held['flux_rms_after_t'] for e in found.values())
     assert 'raises the log probability of all' in page and 'before, uT rms' in page
+    assert 'stood further by x, mm' in page
     kept = Model.load(tmp_path / 'out' / 'model.yaml').field.effects
-    assert [effect.name for effect in kept] == ['sensor_gain_spread', 'sensor_axis_spread']
+    assert [effect.name for effect in kept] == spreads
 
 
 def test_a_helmet_at_rest_has_its_inverted_channels_named(tmp_path):

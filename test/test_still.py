@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from anser_ros.calibration.dipole_sites import DipoleSites
 from anser_ros.calibration.document import to_document
+from anser_ros.calibration.held_out import rms
 from anser_ros.calibration.layouts import Generator
 from anser_ros.calibration.smooth_bend import SmoothBend
-from anser_ros.calibration.still import calibrate_still, is_still
+from anser_ros.calibration.still import PLACEMENT, calibrate_still, is_still
 from anser_ros.calibration.still_fit import StillFitter
 from anser_ros.calibration.still_model import POSE, StillModel, StillUnknowns
 from anser_ros.errors import FitError
@@ -58,8 +59,11 @@ def field(points, emitter, iron):
     return dipole_field(points, places, along, moments)[..., 0].real
 
 
-def recorded(seed, *, gain=0.02, tilt=0.03, bend=5e-4, iron=True, turn=2e-3, per_side=5):
-    """The plate's frames with these errors, and what they were."""
+def recorded(seed, *, gain=0.02, tilt=0.03, bend=5e-4, iron=True, off=None, per_side=5):
+    """The plate's frames with these errors, and what they were.
+
+    By ``off`` (F, 6) it is shifted (m) and turned (rad) from where it is stated, or drawn.
+    """
     rng = np.random.default_rng(seed)
     sensors, frames = plate(per_side), len(HEIGHTS_M)
     gains = 1.0 + gain * rng.normal(size=len(sensors))
@@ -70,9 +74,11 @@ def recorded(seed, *, gain=0.02, tilt=0.03, bend=5e-4, iron=True, turn=2e-3, per
     axes = tilted(sensors.axis, tilts)[None] + np.zeros((frames, 1, 1))
     axes = axes + np.cross(turned, axes)
     stated = np.column_stack([np.zeros((frames, 2)), HEIGHTS_M])
-    true = stated + 5e-4 * rng.normal(size=(frames, 3))
-    rotation = Rotation.from_rotvec(turn * rng.normal(size=(frames, 3))).as_matrix()
-    points = np.einsum('fij,fsj->fsi', rotation, sensors.position + shift) + true[:, None]
+    drawn = [size * rng.normal(size=(frames, 3)) for size in (5e-4, 2e-3)]
+    off = np.hstack(drawn) if off is None else off
+    rotation = Rotation.from_rotvec(off[:, 3:]).as_matrix()
+    points = np.einsum('fij,fsj->fsi', rotation, sensors.position + shift)
+    points = points + (stated + off[:, :3])[:, None]
     axes = np.einsum('fij,fsj->fsi', rotation, axes)
     fields = [field(points.reshape(-1, 3), k, iron).reshape(axes.shape) for k in range(3)]
     flux = np.stack([np.einsum('psi,psi->ps', axes, one) for one in fields], axis=2)
@@ -161,10 +167,13 @@ class TestFit:
 
     @pytest.mark.long
     def test_a_sound_plate_has_nothing(self):
-        measured, _, _ = recorded(12, gain=0.0, tilt=0.0, bend=0.0, iron=False)
-        fit = StillFitter(measured, CENTRES, KINDS, STATED).fit()
+        measured, _, _ = recorded(
+            12, gain=0.0, tilt=0.0, bend=0.0, iron=False, off=np.zeros((4, 6))
+        )
+        fitter = StillFitter(measured, CENTRES, KINDS, STATED)
+        fit = fitter.fit()
         assert fit.evidence == {} and not fit.unknowns.sensors.any()
-        assert fit.beside == 0
+        assert fit.beside == 0 and fitter.evidence_of_poses(fit) < 0.0
 
     def test_zeros_are_refused(self):
         measured, _, _ = recorded(13)
@@ -188,3 +197,20 @@ def test_a_pose_that_took_no_part_is_foretold():
     assert found.model.effects[0].parameters['spread'] == pytest.approx(gains.std(), rel=0.25)
     # The model that is written explains the sensors so corrected.
     assert found.residuals.rmse_t < 0.2 * plain.residuals.rmse_t
+
+
+@pytest.mark.long
+def test_a_body_that_stands_elsewhere_than_stated_is_told():
+    off = np.random.default_rng(5).normal(size=(len(HEIGHTS_M), 6)) * ([2e-3] * 3 + [4e-3] * 3)
+    measured, _, _ = recorded(21, iron=False, bend=0.0, per_side=4, off=off)
+    found = calibrated(measured, ('gains', 'axes', 'poses'))
+    (told,) = found.scan.reported_effects
+    assert told.name == PLACEMENT
+    keys = 'shift_m', 'rotation_rad'
+    error = np.hstack([told.parameters[key] for key in keys]) - (off - off.mean(axis=0))
+    ratio = error / np.hstack([told.uncertainty[key] for key in keys])
+    assert np.abs(error[:, :3]).max() < 8e-4 < 0.3 * told.parameters['largest_m']
+    assert 0.3 < np.sqrt(np.mean(ratio**2)) < 1.5 and np.abs(ratio).max() < 4.0
+    # The others' field explains the readings at the pose that was found, though not as stated.
+    at_stated = calibrated(measured, ('gains', 'axes')).held_out
+    assert rms(found.held_out.error) < 0.4 * rms(at_stated.error)

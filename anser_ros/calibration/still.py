@@ -4,10 +4,11 @@ A plate of a hundred three-axis sensors laid at four heights has more readings t
 but nothing that a scan has: no poses to average over, and each sensor saw as many places as there
 are poses. Field, sensors, poses and a bend of the plate are found jointly (`still_fit`). The
 held-out error is that of each pose predicted, where it is stated to be, by all the others: field,
-sensors, noise and what is chosen come from those alone.
+sensors, noise and what is chosen come from those alone. Where errors of the stated poses are
+looked for and found, each half of the sensors is predicted at the pose that the other half finds.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,13 +16,19 @@ from numpy.typing import NDArray
 
 from anser_ros.calibration.dipole_sites import basis_rows
 from anser_ros.calibration.factors import as_complex
-from anser_ros.calibration.held_out import HeldOut, HeldOutTally
+from anser_ros.calibration.held_out import HeldOut, HeldOutTally, rms
 from anser_ros.calibration.layout_score import LayoutCandidate
 from anser_ros.calibration.layouts import Generator, Layout
 from anser_ros.calibration.moments import MomentFit, Progress
 from anser_ros.calibration.optical_noise import OpticalNoise
-from anser_ros.calibration.population import Posterior
-from anser_ros.calibration.pose_correction import pose_terms
+from anser_ros.calibration.population import LEAST_EVIDENCE, Posterior
+from anser_ros.calibration.pose_correction import (
+    PoseTerms,
+    most_probable_step,
+    moved,
+    pose_precision,
+    pose_terms,
+)
 from anser_ros.calibration.readings import usable_weights, with_pose
 from anser_ros.calibration.requirements import (
     FEWEST_FRAMES_OF_MANY,
@@ -37,16 +44,24 @@ from anser_ros.calibration.survey_records import corrections
 from anser_ros.calibration.survey_result import SurveyResult
 from anser_ros.field.measurements import Measurements
 from anser_ros.field.model import EffectRecord, FieldModel
+from anser_ros.physics.sensor import clusters_of
 from anser_ros.settings import Accuracy
 
 Array = NDArray[np.float64]
 
-STILL_KINDS = ('gains', 'axes', 'bend')
-"""Kinds of errors that few poses of many sensors tell."""
-STILL_ONLY = ('bend',)
+STILL_KINDS = ('gains', 'axes', 'bend', 'poses')
+"""Kinds of errors that few poses of many sensors tell. The poses' errors are part of every fit;
+looked for, they are told, and what is predicted is predicted where they are."""
+STILL_ONLY = ('bend', 'poses')
 """Those of them that nothing else determines."""
+BEND, PLACEMENT = 'body_bend', 'body_placement'
+"""Names of the effects that the last two of them become."""
+AS_STATED = 'flux_rms_as_stated_t'
+"""The evidence of the second that is the held-out error at the poses as they were stated."""
 POPULATIONS = ('gains', 'axes')
 """Those of them that every sensor has a value of."""
+POSE_STEPS = 4
+"""Gauss-Newton steps of a held-out pose from where it is stated: errors are millimetres."""
 
 
 def is_still(measurements: Sequence[Measurements]) -> bool:
@@ -94,18 +109,26 @@ def calibrate_still(
     posed = with_pose(measurements)
     looked_for = tuple(kind for kind in STILL_KINDS if kind in kinds)
 
-    def fitted(part: Measurements) -> StillFit:
-        return StillFitter(part, generator.centres, looked_for, accuracy).fit()
+    def fitter(part: Measurements) -> StillFitter:
+        return StillFitter(part, generator.centres, looked_for, accuracy)
 
     frames = np.arange(len(posed.time))
     folds = []
     for frame in frames:
         if progress is not None:
             progress('each pose from the others', frame / (len(frames) + 1.0))
-        folds.append(fitted(posed.frames(frames != frame)))
-    fit = fitted(posed)
-    held_out = _held_out(posed, folds, accuracy)
-    scan = _scan(posed, len(measurements.time), fit, accuracy)
+        folds.append(fitter(posed.frames(frames != frame)).fit())
+    whole = fitter(posed)
+    fit = whole.fit()
+    held_out = _held_out(posed, folds, accuracy, _as_stated)
+    told = []
+    if 'poses' in looked_for:
+        gain = whole.evidence_of_poses(fit)
+        elsewhere = _held_out(posed, folds, accuracy, _where_the_other_half_finds_it)
+        if gain >= LEAST_EVIDENCE and rms(elsewhere.error) < rms(held_out.error):
+            evidence = {'log_probability': gain, AS_STATED: rms(held_out.error)}
+            held_out, told = elsewhere, [_misplaced(fit, folds, evidence)]
+    scan = _scan(posed, len(measurements.time), fit, accuracy, (*_bends(fit), *told))
     moments = _moments(fit)
     layout = Layout('free', fit.beside, 1.0, 0.0)
     model = FieldModel(
@@ -153,19 +176,61 @@ def _survey(measured: Measurements, fit: StillFit) -> Survey:
     return parameters.survey(measured.body, values)
 
 
-def _held_out(posed: Measurements, folds: Sequence[StillFit], accuracy: Accuracy) -> HeldOut:
+def _held_out(
+    posed: Measurements,
+    folds: Sequence[StillFit],
+    accuracy: Accuracy,
+    predicted: Callable[[Measurements, StillFit, Accuracy], PoseTerms],
+) -> HeldOut:
     """Sum up each frame's residual, its sensors and its field as the other frames predict them."""
     noise = min(fit.widths.noise_t for fit in folds)
     tally = HeldOutTally(noise, noise, accuracy, max(len(fit.sites) for fit in folds))
     for frame, fit in enumerate(folds):
         part = posed.frames(np.array([frame]))
         sound = _survey(part, fit).apply(part)
-        terms = pose_terms(sound, fit.sites, _moments(fit))
-        tally.add(terms, usable_weights(sound), sound.position)
+        tally.add(predicted(sound, fit, accuracy), usable_weights(sound), sound.position)
     return tally.result()
 
 
-def _scan(posed: Measurements, frames: int, fit: StillFit, accuracy: Accuracy) -> Scan:
+def _as_stated(sound: Measurements, fit: StillFit, accuracy: Accuracy) -> PoseTerms:
+    """A frame's readings less those at its stated pose; how good that is plays no part."""
+    return pose_terms(sound, fit.sites, _moments(fit))
+
+
+def _where_the_other_half_finds_it(
+    sound: Measurements, fit: StillFit, accuracy: Accuracy
+) -> PoseTerms:
+    """Readings of each half of the sensors less those at the pose that the other half finds.
+
+    A sensor of several channels is in one half as a whole; the halves take turns over the body.
+    """
+    halves = np.zeros(len(sound.sensors), dtype=bool)
+    for sensor, channels in enumerate(clusters_of(sound.sensors)):
+        halves[channels] = sensor % 2 == 1
+    one, other = (
+        pose_terms(_at_best_pose(sound, fit, accuracy, half), fit.sites, _moments(fit))
+        for half in (halves, ~halves)
+    )
+    residual = np.where(halves[:, None], other.residual, one.residual)
+    return PoseTerms(residual, np.where(halves[:, None, None], other.slope, one.slope))
+
+
+def _at_best_pose(
+    sound: Measurements, fit: StillFit, accuracy: Accuracy, seen: NDArray[np.bool_]
+) -> Measurements:
+    """The frame at the pose that the readings of these sensors make most probable."""
+    weights, precision = usable_weights(sound) * seen, pose_precision(accuracy)
+    offset = np.zeros((len(sound.time), POSE))
+    for _ in range(POSE_STEPS):
+        terms = pose_terms(moved(sound, offset), fit.sites, _moments(fit))
+        offset += most_probable_step(terms, weights, fit.widths.noise_t, precision, offset)[0]
+    return moved(sound, offset)
+
+
+def _scan(
+    posed: Measurements, frames: int, fit: StillFit, accuracy: Accuracy,
+    told: tuple[EffectRecord, ...],
+) -> Scan:  # fmt: skip
     """The frames as ideal sensors on a flat body would have given them, and what was not ideal;
     ``frames`` are those of the session, without a pose too.
     """
@@ -192,7 +257,7 @@ def _scan(posed: Measurements, frames: int, fit: StillFit, accuracy: Accuracy) -
     )  # fmt: skip
     flat = fit.model.unbent(fit.unknowns, fit.sites)
     sound = result.survey(posed.body).apply(flat)
-    return Scan((sound,), accuracy, corrections(result), _bends(fit), result)
+    return Scan((sound,), accuracy, corrections(result), told, result)
 
 
 def _bends(fit: StillFit) -> tuple[EffectRecord, ...]:
@@ -204,7 +269,7 @@ def _bends(fit: StillFit) -> tuple[EffectRecord, ...]:
     lift = bend.shape(fit.unknowns.frames[:, POSE:])[0] @ bend.normal
     return (
         EffectRecord(
-            'body_bend',
+            BEND,
             {
                 'body': fit.model.measured.body,
                 'rms_m': np.sqrt(np.mean(lift**2, axis=1)).tolist(),
@@ -218,6 +283,44 @@ def _bends(fit: StillFit) -> tuple[EffectRecord, ...]:
             },
         ),
     )
+
+
+def _misplaced(
+    fit: StillFit, folds: Sequence[StillFit], evidence: dict[str, float]
+) -> EffectRecord:
+    """How far the body stood from each stated pose, in frame fg."""
+    offset = fit.unknowns.frames[:, :POSE]
+    sigma = np.maximum(fit.frame_sigma[:, :POSE], _jackknifed(offset, folds))
+    return EffectRecord(
+        PLACEMENT,
+        {
+            'body': fit.model.measured.body,
+            'largest_m': float(np.linalg.norm(offset[:, :3], axis=1).max()),
+            'shift_m': offset[:, :3].tolist(),
+            'rotation_rad': offset[:, 3:].tolist(),
+        },
+        {'shift_m': sigma[:, :3].tolist(), 'rotation_rad': sigma[:, 3:].tolist()},
+        {
+            **evidence,
+            'summary': 'the body does not stand where its poses are stated; the mean over all '
+            'poses is kept, since the field could be shifted as well',
+            'remedy': 'none: at another pose the error is another; measure the poses',
+        },
+    )
+
+
+def _jackknifed(offset: Array, folds: Sequence[StillFit]) -> Array:
+    """Standard deviation of poses' errors (F, 6) by how they change when one pose is left out.
+
+    It knows of what the model of field and bend misses, which the posterior does not (Efron, The
+    Jackknife, the Bootstrap and Other Resampling Plans, 1982, equation 3.5).
+    """
+    count, power = len(offset), np.zeros_like(offset)
+    for frame, fit in enumerate(folds):
+        rest = np.arange(count) != frame
+        change = fit.unknowns.frames[:, :POSE] - (offset[rest] - offset[rest].mean(axis=0))
+        power[rest] += change**2
+    return np.asarray(np.sqrt((count - 1) / count * power))
 
 
 def _moment_fit(scan: Scan, fit: StillFit, moments: NDArray[np.complex128]) -> MomentFit:

@@ -70,6 +70,8 @@ class StillFit:
         Moments, errors of the frames and of the sensors.
     sensor_sigma : ndarray, shape (S, G + 2)
         Standard deviation of the sensors' own.
+    frame_sigma : ndarray, shape (F, 6 + B)
+        Standard deviation of the frames' own, m and rad.
     widths : StillWidths
         Noise, and widths as found.
     weights : ndarray, shape (F, S)
@@ -86,6 +88,7 @@ class StillFit:
     beside: int
     unknowns: StillUnknowns
     sensor_sigma: Array
+    frame_sigma: Array
     widths: StillWidths
     weights: Array
     freedom: float
@@ -166,6 +169,13 @@ class StillFitter:
             best = more
         return replace(self._best_noise(best), evidence=evidence)
 
+    def evidence_of_poses(self, fit: StillFit) -> float:
+        """Return the log evidence that the errors of the stated poses add to a fit."""
+        frames = fit.widths.frames.copy()
+        frames[:POSE] = 0.0
+        held = self._solve(fit.sites, fit.beside, replace(fit.widths, frames=frames))
+        return fit.log_evidence - self._best_noise(held).log_evidence
+
     def _start(self, noise_t: float, kinds: Sequence[str]) -> StillWidths:
         jitter = self.accuracy.pose_jitter
         bend = jitter[0] if 'bend' in kinds else 0.0
@@ -192,7 +202,8 @@ class StillFitter:
                 widths = self._learnt(system, beside)
         determined = 1.0 - system.moment_variance / widths.moments[:, None] ** 2
         return StillFit(
-            model, sites, beside, now, np.sqrt(system.sensor_variance), widths, weights,
+            model, sites, beside, now, np.sqrt(system.sensor_variance),
+            np.sqrt(system.frame_variance), widths, weights,
             float(determined.sum(axis=0).mean()), system.log_evidence(model.usable), {},
         )  # fmt: skip
 

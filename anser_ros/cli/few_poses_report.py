@@ -8,6 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
+from anser_ros.calibration.still import PLACEMENT
 from anser_ros.cli.diagnosis_figures import AFTER, BEFORE
 from anser_ros.cli.diagnosis_report import (
     effects_table,
@@ -39,7 +40,9 @@ def render_few_poses(
         '<h2>Before and after</h2><p>This session has too few poses to test a field model, so the '
         'field is estimated anew from it, together with what is wrong with the sensors. What is '
         'predicted takes no part: each pose is predicted from the others, or for a body at one '
-        'place each fifth of its sensors from the rest.</p>',
+        'place each fifth of its sensors from the rest. Where poses were not as stated '
+        f'({PLACEMENT}), each half of the sensors is predicted at the pose that the other half '
+        'finds.</p>',
         held_out_table(document),
         *_by_pose(result),
         '<h2>Effects</h2>',
@@ -72,14 +75,33 @@ def _by_pose(result: FewPosesDiagnosis) -> Iterator[str]:
 
 
 def _poses(result: FewPosesDiagnosis) -> Iterator[str]:
-    """How far the poses are from where they were stated."""
+    """How far the poses are from where they were stated, in a table where that is an effect."""
     survey = result.after.scan.survey
-    if survey is not None:
-        off = survey.optical
-        yield (
-            f'<p>The body stood {1e3 * off.position_m:.2f} mm and {1e3 * off.rotation_rad:.2f} '
-            'mrad (rms a component) from where its poses were stated.</p>'
-        )
+    if survey is None:
+        return
+    off = survey.optical
+    yield (
+        f'<p>The body stood {1e3 * off.position_m:.2f} mm and {1e3 * off.rotation_rad:.2f} '
+        'mrad (rms a component) from where its poses were stated.</p>'
+    )
+    (measured,) = result.after.scan.measurements
+    for record in result.effects:
+        if record.name != PLACEMENT:
+            continue
+        cells = [
+            [f'{1e3 * value:.2f} ± {1e3 * sigma:.2f}' for value, sigma in zip(*pair, strict=True)]
+            for pair in zip(
+                np.hstack([record.parameters['shift_m'], record.parameters['rotation_rad']]),
+                np.hstack([record.uncertainty['shift_m'], record.uncertainty['rotation_rad']]),
+                strict=True,
+            )
+        ]
+        stated = [', '.join(f'{1e3 * v:.1f}' for v in place) for place in measured.position]
+        yield table(
+            ['stated at x, y, z, mm', 'stood further by x, mm', 'y', 'z',
+             'turned about x, mrad', 'y', 'z'],
+            [[at, *row] for at, row in zip(stated, cells, strict=True)],
+        )  # fmt: skip
 
 
 def _sureness(result: FewPosesDiagnosis) -> Iterator[str]:

@@ -18,7 +18,7 @@ from anser_ros.calibration.calibrate import Options
 from anser_ros.calibration.held_out import rms
 from anser_ros.calibration.result import Calibration
 from anser_ros.calibration.sensor_parameters import KINDS
-from anser_ros.calibration.still import STILL_ONLY
+from anser_ros.calibration.still import AS_STATED, BEND, PLACEMENT, STILL_ONLY
 from anser_ros.calibration.survey_records import SPREADS
 from anser_ros.diagnosis.decisions import UNSTRUCTURED
 from anser_ros.diagnosis.schema import SCHEMA
@@ -31,7 +31,7 @@ from anser_ros.sessions.session import Session
 
 LOOKED_FOR = (*KINDS, *STILL_ONLY)
 """Kinds of errors that are estimated."""
-KIND_OF = {SPREADS['gains']: 'gains', SPREADS['axes']: 'axes', 'body_bend': 'bend'}
+KIND_OF = {SPREADS['gains']: 'gains', SPREADS['axes']: 'axes', BEND: 'bend'}
 """Kinds by the effect that they become; without an entry, an effect goes with all kinds."""
 CHANCE = 1e-3
 """Probability in noise alone below which what remains depends on a variable."""
@@ -121,6 +121,8 @@ def diagnose_few_poses(
         if record.name in KIND_OF:
             rest = tuple(kind for kind in LOOKED_FOR if kind != KIND_OF[record.name])
             without.append(rms(calibrated(rest, f'without {record.name}').held_out.error))
+        elif record.name == PLACEMENT:
+            without.append(record.evidence[AS_STATED])
         else:
             is_corrected = record in after.scan.corrections
             without.append(rms((before if is_corrected else after).held_out.error))
