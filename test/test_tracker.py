@@ -1,5 +1,7 @@
 """The tracker as a whole: states and their reasons, honest uncertainty, bad readings."""
 
+import gc
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -48,6 +50,22 @@ def test_errors_are_what_their_sigma_says(rng):
     assert set(seen) == {'ok'}
     for name, values in ratios.items():
         assert 1.3 < np.percentile(values, 95) < 2.3, name
+
+
+def test_a_tracker_that_was_replaced_is_gone_at_once(rng):
+    """No cycle keeps its tables of megabytes until the next collection of garbage."""
+    gc.disable()
+    try:
+        tracker = Tracker(MODEL, TOOL, EXACT)
+        run(tracker, 3, rng)
+        old = weakref.ref(tracker)
+        tracker = tracker.with_model(MODEL)
+        assert old() is None
+        last = weakref.ref(tracker)
+        del tracker
+        assert last() is None
+    finally:
+        gc.enable()
 
 
 @pytest.mark.long

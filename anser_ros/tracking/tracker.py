@@ -8,6 +8,7 @@ frame's solve, and a warm solve that misses the gate is repeated without any gue
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,10 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 __all__ = ['PoseEstimate', 'Tracker', 'TrackerSettings']
+
+
+def _add(counters: Counter[str], name: str, by: int) -> None:
+    counters[name] += by
 
 
 class Tracker:
@@ -89,7 +94,10 @@ class Tracker:
         self._body_tracks = {name: BodyTrack() for name in dict.fromkeys(sensors.body)}
         self._source_tracks: dict[str, SourceTrack] = {}
         self.sources: dict[str, PoseEstimate] = {}
-        self._intake = Intake(sensors.channel, self._count, spares_dead=True, error=TrackingError)
+        # It holds the counters and not the tracker: in a cycle, a tracker that was replaced would
+        # keep its tables until a collection of garbage, of which a running node makes few.
+        count = partial(_add, self.counters)
+        self._intake = Intake(sensors.channel, count, spares_dead=True, error=TrackingError)
         self._freshness = Freshness()
         self._judgement = Judgement()
         self._first_ns: list[int] = []
@@ -365,9 +373,6 @@ class Tracker:
     @property
     def _emitters(self) -> tuple[str, ...]:
         return () if self._model is None else self._model.emitters
-
-    def _count(self, name: str, by: int) -> None:
-        self.counters[name] += by
 
     def _corrected(self, frame: Frame) -> tuple[ComplexArray, NDArray[np.int64]]:
         """Fluxes (S, K) without what the model's effects did to them, and the readings' codes."""
