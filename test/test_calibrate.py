@@ -15,6 +15,7 @@ from anser_ros.calibration.layouts import Layout
 from anser_ros.cli import calibrate as command
 from anser_ros.cli.main import main
 from anser_ros.errors import FitError, ParameterError
+from anser_ros.field.model import EffectRecord
 from anser_ros.sessions.calibration import calibrate_sessions, generator_of
 from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.evaluation import track_session
@@ -106,6 +107,20 @@ def test_json_is_all_of_stdout(tmp_path, capsys):
     assert calibrate(*arguments, '--estimate', 'none') == 0
     out = capsys.readouterr().out
     assert json.loads(out)['n_dipoles'] == 81
+
+
+def test_what_a_scan_contained_is_shown_though_no_model_has_it(tmp_path, capsys, monkeypatch):
+    metal = EffectRecord('moving_metal', {'t_start_s': 12.5, 't_end_s': 20.0})
+
+    def with_metal(*arguments):
+        found = calibrate_sessions(*arguments)
+        return replace(found, scan=replace(found.scan, reported_effects=(metal,)))
+
+    monkeypatch.setattr(command, 'calibrate_sessions', with_metal)
+    arguments = (FACTORY, '--out', tmp_path / 'm.yaml', '--dipoles', '9x9', '--estimate', 'none')
+    assert calibrate(*arguments) == 0
+    (row,) = [line for line in capsys.readouterr().out.splitlines() if 'moving_metal' in line]
+    assert 'not in the model' in row and 't_start_s 12.5' in row
 
 
 @pytest.mark.long

@@ -22,6 +22,7 @@ from anser_ros.cli.output import Result, check_file, loss_notes
 from anser_ros.cli.populations import population_table, populations
 from anser_ros.cli.stated_values import add_stated_values, stated_values
 from anser_ros.errors import FitError, ParameterError
+from anser_ros.field.model import EffectRecord
 from anser_ros.physics.constants import DEGREES
 from anser_ros.sessions.calibration import calibrate_sessions, check_same_board
 from anser_ros.sessions.model_file import save_model
@@ -175,9 +176,15 @@ def _table(calibration: Calibration, document: dict[str, Any]) -> Table:
     for name, value in rows:
         table.add_row(name, value)
     for effect in calibration.model.effects:
-        found = {k: v for k, v in effect.parameters.items() if k not in LONG}
-        table.add_row(effect.name, ', '.join(f'{k} {_short(v)}' for k, v in found.items()))
+        table.add_row(effect.name, _parameters(effect))
+    for effect in calibration.scan.reported_effects:
+        table.add_row(f'{effect.name}, not in the model', _parameters(effect))
     return table
+
+
+def _parameters(effect: EffectRecord) -> str:
+    found = {k: v for k, v in effect.parameters.items() if k not in LONG}
+    return ', '.join(f'{k} {_short(v)}' for k, v in found.items())
 
 
 def _populations(calibration: Calibration) -> Iterator[Table]:
