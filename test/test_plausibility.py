@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from anser_ros.cli.main import main
 from anser_ros.errors import DiagnosisError, PlausibilityError
@@ -88,6 +89,21 @@ def test_quaternions_in_another_order(moving):
     says(moving, first, 'quaternions with w first', '100 %')
     inverse = with_track(tool, quaternion=tool.track.quaternion * [-1, -1, -1, 1])
     says(moving, inverse, 'rotations from fg to the body')
+
+
+def test_axes_that_are_exchanged_or_reversed(moving):
+    (tool,) = moving.tools
+    place, turned = tool.track.position, Rotation.from_quat(tool.track.quaternion)
+    says(moving, with_track(tool, position=place[:, [1, 0, 2]]), 'positions with the axes y, x, z')
+    mirror = np.diag([1.0, 1.0, -1.0])
+    left_handed = Rotation.from_matrix(mirror @ turned.as_matrix() @ mirror).as_quat()
+    flat = with_track(tool, position=place @ mirror, quaternion=left_handed)
+    says(moving, flat, 'poses in a frame of the axes x, y, -z')
+    sideways = Rotation.from_matrix([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    other = with_track(
+        tool, position=sideways.apply(place), quaternion=(sideways * turned).as_quat()
+    )
+    says(moving, other, 'poses in a frame of the axes z, x, y')
 
 
 def test_what_cannot_be_decided_is_not_said(moving):

@@ -1,10 +1,12 @@
-"""Finds units and order in which optical poses and fluxes were written, from the fluxes.
+"""Finds units, order and axes in which optical poses and fluxes were written, from the fluxes.
 
 Poses predict the fluxes of the drawn board. If they do not fit as they are, but fit when read in
-another unit or another order, they were written in that convention. If nothing fits (an optical
-frame that is not the board's, a board that cannot be drawn), nothing is reported.
+another unit, in another order or with other axes, they were written in that convention. If nothing
+fits (an optical frame that is not the board's, a board that cannot be drawn), nothing is reported.
 """
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,12 +54,40 @@ class Reading:
         Whether the rotation is from fg to the body.
     scale : float
         m in a unit of length.
+    axes : tuple of int
+        Which of the numbers, counted from one, are x, y and z; negative where they are reversed.
+    is_frame : bool
+        Whether rotations have these axes too, and not positions alone.
     """
 
     words: str
     order: tuple[int, int, int, int] = (0, 1, 2, 3)
     is_inverse: bool = False
     scale: float = 1.0
+    axes: tuple[int, int, int] = (1, 2, 3)
+    is_frame: bool = False
+
+    def placed(self, position: Array, rotation: Array) -> tuple[Array, Array]:
+        """Return positions (F, 3), m, and rotations (F, 3, 3) that are written so."""
+        turn = np.eye(3)[np.abs(self.axes) - 1] * np.sign(self.axes)[:, None]
+        position = self.scale * position @ turn.T
+        if not self.is_frame:
+            return position, rotation
+        # A left-handed tracker states rotations of a body that it has mirrored as well.
+        back = turn.T if np.linalg.det(turn) < 0.0 else np.eye(3)
+        return position, turn @ rotation @ back
+
+
+def _other_axes() -> Iterator[Reading]:
+    """Exchanged and reversed axes: of positions alone, and of the whole frame."""
+    for order in itertools.permutations((1, 2, 3)):
+        for signs in itertools.product((1, -1), repeat=3):
+            x, y, z = (sign * axis for sign, axis in zip(signs, order, strict=True))
+            if (x, y, z) == (1, 2, 3):
+                continue
+            named = ', '.join(f'{"-" * (a < 0)}{"xyz"[abs(a) - 1]}' for a in (x, y, z))
+            for is_frame, what in ((False, 'positions with'), (True, 'poses in a frame of')):
+                yield Reading(f'{what} the axes {named}', axes=(x, y, z), is_frame=is_frame)
 
 
 AS_WRITTEN = Reading('')
@@ -73,6 +103,7 @@ OTHER_READINGS = (
         Reading(f'positions in {unit} and quaternions with w first', W_FIRST, scale=1 / size)
         for unit, size in LENGTH_UNITS.items()
     ),
+    *_other_axes(),
 )
 """What people write instead; the first that fits is named."""
 
@@ -131,7 +162,7 @@ def _fit(
         Rotation.from_matrix(tool.rotation[frames]).as_quat()[:, list(reading.order)]
     )
     rotation = (turn.inv() if reading.is_inverse else turn).as_matrix()
-    centres, axes = tool.sensors.placed(reading.scale * tool.position[frames], rotation)
+    centres, axes = tool.sensors.placed(*reading.placed(tool.position[frames], rotation))
     assert drawing.field is not None
     field = drawing.field(centres[where, columns])
     predicted = np.einsum('pki,pi->pk', field, axes[where, columns])
