@@ -21,6 +21,10 @@ from anser_ros.cli.html_page import page, table
 from anser_ros.pictures import image
 from anser_ros.sessions.few_poses import FewPosesDiagnosis, residual_power
 
+FAR = 3.0
+"""Times the residual of the median channel from which on a channel is named: noise alone does not
+make it, even where a channel has a dozen readings."""
+
 
 def render_few_poses(
     result: FewPosesDiagnosis, document: dict[str, Any], *, session: str, model: str
@@ -52,6 +56,7 @@ def render_few_poses(
         *population_sections(result.model.effects),
         '<h2>What remains</h2><p>The held-out residual with everything corrected.</p>',
         image(_remainder(result)),
+        *_largest(result),
         *_undetermined(result),
     ]
     return page('Diagnosis', sections)
@@ -141,6 +146,21 @@ def _remainder(result: FewPosesDiagnosis) -> Figure:
     for panel in (left, right):
         panel.grid(alpha=0.3)
     return figure
+
+
+def _largest(result: FewPosesDiagnosis) -> Iterator[str]:
+    """Which sensors what remains is mostly of."""
+    size = np.sqrt(np.nanmean(residual_power(result.after), axis=(0, 2)))
+    sensors = result.after.scan.measurements[0].sensors
+    far = np.flatnonzero(size > FAR * np.nanmedian(size))
+    if far.size:
+        first = far[np.argsort(-size[far])][:LONGEST]
+        named = ', '.join(f'{sensors.name[k]} (channel {sensors.channel[k]})' for k in first)
+        yield (
+            f'<p>{far.size} channels leave more than {FAR:g} times as much as the median channel: '
+            f'{html.escape(named)}{" and others" if far.size > first.size else ""}. Look at these '
+            'sensors, at what is next to them, and at how they are mounted.</p>'
+        )
 
 
 def _undetermined(result: FewPosesDiagnosis) -> Iterator[str]:

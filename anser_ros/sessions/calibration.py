@@ -79,12 +79,15 @@ def calibrate_sessions(
     sessions: list[Session],
     options: Options,
     progress: Callable[[str, float], None] | None = None,
+    is_joint: bool = False,
 ) -> Calibration:
     """Calibrate on all tool sensors of the sessions.
 
     Reference sensors are left out: their survey is less accurate than the field model becomes. The
     first session's setup states how accurate fluxes and poses are. What the references of the
-    first session that has them read is kept with the model, for baselines to be compared.
+    first session that has them read is kept with the model, for baselines to be compared. With
+    ``is_joint``, few poses of many sensors are fitted jointly (`still`) though nothing is looked
+    for.
     """
     setup, drifts = sessions[0].setup, []
     if options.estimate:
@@ -103,17 +106,22 @@ def calibrate_sessions(
         )  # fmt: skip
         return _for_sessions(found, sessions)
     check_single_coils(measurements)
-    if options.estimate and alone and is_still(measurements):
+    if (options.estimate or is_joint) and alone and is_still(measurements):
+        if options.damping is not None:
+            raise FitError(
+                'damping: few poses of many sensors are fitted with sizes of moments that the '
+                'readings give; only --estimate none takes a damping'
+            )
         still = calibrate_still(
             measurements[0], names[0], generator, setup.emitter_names, setup.frequencies_hz,
             options.estimate, options.accuracy, progress,
         )  # fmt: skip
         return _for_sessions(still, sessions)
-    if not {*options.estimate}.isdisjoint(STILL_ONLY):
+    if asked := [kind for kind in options.estimate if kind in STILL_ONLY]:
         raise FitError(
-            f'{", ".join(STILL_ONLY)}: can be determined only from {FEWEST_FRAMES_OF_MANY} to '
+            f'{", ".join(asked)}: can be determined only from {FEWEST_FRAMES_OF_MANY} to '
             f'{FEWEST_SCAN_FRAMES - 1} poses of one body with at least {MANY_SENSORS} sensors, '
-            'over emitters without a drawing'
+            'over emitters without a drawing, and with no layout of dipoles stated'
         )
     steady = [_steady(session, tool) for session in sessions for tool in session.tools]
     scan = survey(measurements, generator, options, nominal, progress, steady)

@@ -4,6 +4,7 @@ A handful of poses cannot show how good a field model is, but hundreds of sensor
 wrong with themselves. The field is therefore estimated anew, together with the sensors and the
 body's shape, as a calibration does, after the effects that the given model knows have been
 corrected. What is predicted takes no part: each pose, or for one place each fifth of the sensors.
+What does not help to predict it is not named.
 """
 
 from collections.abc import Callable
@@ -112,24 +113,35 @@ def diagnose_few_poses(
             [known],
             Options(estimate=kinds),
             lambda stage, share: say(f'{what}: {stage}, {share:.0%}'),
+            is_joint=True,
         )
 
     before = calibrated((), 'with the sensors as they are')
-    after = calibrated(LOOKED_FOR, 'with all errors')
-    found, without = [], []
-    for record in (*after.scan.corrections, *after.scan.reported_effects):
-        if record.name in KIND_OF:
-            rest = tuple(kind for kind in LOOKED_FOR if kind != KIND_OF[record.name])
-            without.append(rms(calibrated(rest, f'without {record.name}').held_out.error))
-        elif record.name == PLACEMENT:
-            without.append(record.evidence[AS_STATED])
-        else:
+    kinds: tuple[str, ...] = LOOKED_FOR
+    while True:
+        after = calibrated(kinds, 'with all errors')
+        records = (*after.scan.corrections, *after.scan.reported_effects)
+        without = {}
+        for kind, name in ((KIND_OF[r.name], r.name) for r in records if r.name in KIND_OF):
+            rest = tuple(other for other in kinds if other != kind)
+            without[name] = rms(calibrated(rest, f'without {name}').held_out.error)
+        idle = [KIND_OF[name] for name, t in without.items() if t <= rms(after.held_out.error)]
+        if not idle:
+            break
+        kinds = tuple(kind for kind in kinds if kind not in idle)
+    for record in records:
+        if record.name == PLACEMENT:
+            without[record.name] = record.evidence[AS_STATED]
+        elif record.name not in KIND_OF:
             is_corrected = record in after.scan.corrections
-            without.append(rms((before if is_corrected else after).held_out.error))
-        found.append(_described(record))
+            without[record.name] = rms((before if is_corrected else after).held_out.error)
     effects = (*model.effects, *after.scan.corrections)
     return FewPosesDiagnosis(
-        before, after, tuple(found), tuple(without), replace(after.model, effects=effects)
+        before,
+        after,
+        tuple(map(_described, records)),
+        tuple(without[record.name] for record in records),
+        replace(after.model, effects=effects),
     )
 
 
