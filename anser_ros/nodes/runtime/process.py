@@ -20,7 +20,7 @@ from rclpy.utilities import remove_ros_args
 
 from anser_ros.errors import AnserError, ParameterError
 from anser_ros.nodes.runtime import parameter_files, parameters
-from anser_ros.nodes.runtime.allocator import keep_large_blocks_apart
+from anser_ros.nodes.runtime.allocator import keep_in_one_piece
 from anser_ros.nodes.runtime.handover import Handover
 from anser_ros.one_line_parser import OneLineParser
 from anser_ros.wire.config_folder import config_path
@@ -248,7 +248,7 @@ def _run(
 ) -> int:
     nodes: list[AnserNode] = []
     code = 0
-    keep_large_blocks_apart()
+    keep_in_one_piece()
     executor = make_executor()
     handover = Handover()
     try:
