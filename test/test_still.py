@@ -194,6 +194,7 @@ def test_a_pose_that_took_no_part_is_foretold():
     assert mean == pytest.approx(document['heldout_flux_rmse_t'])
     names = [effect['name'] for effect in document['effects']]
     assert names == ['sensor_gain_spread', 'sensor_axis_spread']
+    assert document['unobservable'] == []
     assert found.model.effects[0].parameters['spread'] == pytest.approx(gains.std(), rel=0.25)
     # The model that is written explains the sensors so corrected.
     assert found.residuals.rmse_t < 0.2 * plain.residuals.rmse_t
@@ -213,6 +214,8 @@ def test_a_body_that_stands_elsewhere_than_stated_is_told():
     assert 0.3 < np.sqrt(np.mean(ratio**2)) < 1.5 and np.abs(ratio).max() < 4.0
     three = calibrated(measured.frames(np.arange(3)), ('gains', 'axes', 'poses'))
     assert three.scan.reported_effects == ()  # so few poses don't tell it
+    (line,) = to_document(three)['unobservable']
+    assert line.startswith('poses:') and '4' in line
     # The others' field explains the readings at the pose that was found, though not as stated.
     at_stated = calibrated(measured, ('gains', 'axes')).held_out
     assert rms(found.held_out.error) < 0.4 * rms(at_stated.error)

@@ -153,8 +153,20 @@ def calibrate_still(
         model, _moment_fit(scan, fit, moments), held_out, None, (),
         LayoutCandidate(layout, fit.sites, 0.0, held_out.score_t, ()), layout, 0.0,
         int(posed.usable.sum()), residuals(scan.measurements, model), scan,
+        undetermined=_not_told(kinds, len(posed.time)),
     )  # fmt: skip
     return replace(calibration, model=replace(model, provenance=provenance(calibration, [name])))
+
+
+def _not_told(kinds: Sequence[str], poses: int) -> tuple[str, ...]:
+    """A line for what was asked for and cannot be found in this way."""
+    others = ', '.join(kind for kind in kinds if kind not in STILL_KINDS)
+    lines = []
+    if others:
+        lines.append(f'{others}: not determined by few poses of many sensors; the setup is kept')
+    if 'poses' in kinds and poses < FEWEST_PLACED:
+        lines.append(f'poses: determined from {FEWEST_PLACED} poses on; there are {poses}')
+    return tuple(lines)
 
 
 def _moments(fit: StillFit) -> NDArray[np.complex128]:
