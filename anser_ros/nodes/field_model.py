@@ -15,7 +15,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from anser_ros import pose_states as states
-from anser_ros.errors import AnserError, FitError, ModelFileError
+from anser_ros.errors import AnserError, FitError, ModelFileError, ParameterError
 from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
 from anser_ros.nodes.field_model_parts import refit_status
@@ -26,6 +26,7 @@ from anser_ros.nodes.field_model_parts.model_output import ModelOutput
 from anser_ros.nodes.field_model_parts.moving_coils import MovingCoils
 from anser_ros.nodes.field_model_parts.place_watch import PlaceWatch
 from anser_ros.nodes.field_model_parts.refit_in_force import RefitInForce
+from anser_ros.nodes.field_model_parts.tool_witnesses import ToolWitnesses
 from anser_ros.nodes.runtime.diagnostics import Trouble
 from anser_ros.nodes.runtime.node import LONGEST_END_S, AnserNode, Level, Status, main
 from anser_ros.nodes.runtime.stated_parameters import stated_by
@@ -81,8 +82,11 @@ class FieldModelNode(AnserNode):
         self._moving = MovingCoils(self, topics, lambda: self._frame_id, self._refuse)
         name = self.get_fully_qualified_name()
         kept = KeptBaseline(kept_folder(table.keep_state), name, self._fluxes.sender)
-        self._refit = RefitInForce(self._moving, self._pace, self.count, kept)
-        self._sources = [setups, self._fluxes, *self._moving.sources]
+        if table.witnesses and topics:
+            raise ParameterError('witnesses: tools cannot be witnesses where patches move')
+        witnesses = ToolWitnesses(self, table.witnesses, lambda: self._frame_id, self._refuse)
+        self._refit = RefitInForce(self._moving, witnesses, self._pace, self.count, kept)
+        self._sources = [setups, self._fluxes, *self._moving.sources, *witnesses.sources]
         self.create_service(Trigger, 'field_model/reset', self._on_reset)
         self.create_service(Trigger, 'field_model/save', self._on_save)
         self.create_service(SetBool, 'field_model/freeze', self._on_freeze)

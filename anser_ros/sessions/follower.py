@@ -4,24 +4,20 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from anser_ros.errors import BagError, FitError
-from anser_ros.frames.faults import GOOD, reading_codes
 from anser_ros.integrity.ageing import FrameModel, ModelAge
 from anser_ros.pose_states import OK, REFERENCES_LOST, Withheld
 from anser_ros.refit.baseline import check_enough
 from anser_ros.refit.change import Pace
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.result import RefitResult
-from anser_ros.refit.tool_readings import ToolReading
 from anser_ros.sessions.baseline import Baseline
 from anser_ros.sessions.frames import FrameReadings, SessionFrame
 from anser_ros.sessions.patches import PatchFollower
 from anser_ros.sessions.prepared import PreparedSession
 from anser_ros.sessions.session import tracking_noise
+from anser_ros.sessions.tool_readings import tool_readings
 from anser_ros.sessions.volume import stated_volume
-from anser_ros.stamps import NANO
 from anser_ros.tracking.estimate import PoseEstimate
 
 
@@ -108,30 +104,19 @@ class ModelFollower:
             return FrameModel(standing.model, Withheld(result.withheld, result.reason))
         return standing
 
-    def witnessed(
-        self, stamp_ns: int, tools: FrameReadings, found: Sequence[PoseEstimate]
-    ) -> None:
+    def witnessed(self, tools: FrameReadings, found: Sequence[PoseEstimate]) -> None:
         """Let a frame's tools tell of metal, at the poses that were found for their bodies."""
         if not self._uses_witnesses or not isinstance(self._refit, LiveRefit):
             return
-        correction, flux = self._prepared.correction, tools.flux
-        if correction.changes_flux:
-            time = (stamp_ns - self._prepared.session.start_ns) * NANO
-            flux = correction.flux(time, tools.channels, flux)
-        usable = reading_codes(flux, tools.flags) == GOOD
-        sensors, readings = correction.sensors(), []
-        for estimate in found:
-            if estimate.state != OK or estimate.rotation is None:
-                continue
-            table = sensors.of_body(estimate.name)
-            rows = np.array([np.flatnonzero(tools.channels == c)[0] for c in table.channel])
-            kept = np.flatnonzero(usable[rows])
-            readings.append(
-                ToolReading(
-                    table.select(kept), flux[rows[kept]], estimate.position, estimate.rotation
-                )
-            )
-        self._refit.witnessed(readings)
+        poses = {
+            one.name: (one.position, one.rotation)
+            for one in found
+            if one.state == OK and one.rotation is not None
+        }
+        correction = self._prepared.correction
+        self._refit.witnessed(
+            tool_readings(correction, tools.channels, tools.flux, tools.flags, poses)
+        )
 
     def _follow(self, stamp_ns: int, reference: FrameReadings) -> None:
         """Take in one frame of the references."""

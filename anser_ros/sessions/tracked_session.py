@@ -94,7 +94,7 @@ def track(
                 frame.stamp_ns, seen.channels, seen.flux, seen.flags, standing.withheld
             )
             if follower is not None:
-                follower.witnessed(frame.stamp_ns, seen, found)
+                follower.witnessed(seen, found)
             for estimate in found:
                 estimates.setdefault(estimate.name, []).append(estimate)
             for body, source in tracker.sources.items():

@@ -41,6 +41,9 @@ class FieldModelParameters:
     patches: tuple[str, ...] = parameter(
         (), 'reference coils that move: entries body=topic, the topic a PoseStamped of that body'
     )
+    witnesses: bool = parameter(
+        False, 'whether contradictions among the coils of rigid tools tell of metal, too'
+    )
     save_file: str = parameter(
         'field_model.yaml', 'where the service save writes the model', live=True
     )

@@ -11,14 +11,12 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
 
-from anser_ros.errors import FrameError
+from anser_ros.nodes.field_model_parts.pose_messages import pose_in
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.refit.live_refit import LiveRefit
 from anser_ros.refit.patches import PatchCoils
 from anser_ros.settings import RefitSettings
 from anser_ros.stamps import stamp_of
-from anser_ros.tracking.rotations import rotation_of_quaternion
-from anser_ros.wire.quaternion import unit_quaternions
 
 ComplexArray = NDArray[np.complex128]
 
@@ -61,18 +59,8 @@ class Patches(PatchCoils):
         FrameError
             When it is given in another frame, or is no pose.
         """
-        if message.header.frame_id != self._frame_id:
-            raise FrameError(
-                f'the pose of {body} is in {message.header.frame_id!r}, not {self._frame_id!r}'
-            )
-        p, q = message.pose.position, message.pose.orientation
-        quaternion = unit_quaternions((q.x, q.y, q.z, q.w))
-        position = np.array([p.x, p.y, p.z])
-        if not (np.isfinite(position).all() and np.isfinite(quaternion).all()):
-            raise FrameError(
-                f'the pose of {body} is not finite, or its quaternion has no unit length'
-            )
-        self.put(body, stamp_of(message), position, rotation_of_quaternion(quaternion))
+        position, rotation = pose_in(message, self._frame_id, body)
+        self.put(body, stamp_of(message), position, rotation)
 
     def moved_refit(self, refit: LiveRefit, stamp_ns: int) -> LiveRefit | None:
         """Return a refit for where the patches are now, when it is needed and has been worked out.

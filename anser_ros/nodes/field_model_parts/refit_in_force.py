@@ -14,6 +14,7 @@ from anser_ros.frames.intake import Frame
 from anser_ros.nodes.field_model_parts.kept_files import KeptBaseline
 from anser_ros.nodes.field_model_parts.moving_coils import MovingCoils
 from anser_ros.nodes.field_model_parts.refit_start import RefitStart, warm_up
+from anser_ros.nodes.field_model_parts.tool_witnesses import ToolWitnesses
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.pose_states import REFERENCES_LOST
 from anser_ros.refit.change import Pace
@@ -31,6 +32,8 @@ class RefitInForce:
     ----------
     moving : MovingCoils
         Gets the patches of the refit.
+    witnesses : ToolWitnesses
+        Tells of metal what the tools read.
     pace : Pace
         How often there is to be a result.
     count : callable
@@ -50,12 +53,14 @@ class RefitInForce:
     def __init__(
         self,
         moving: MovingCoils,
+        witnesses: ToolWitnesses,
         pace: Pace,
         count: Callable[[str], None],
         kept: KeptBaseline,
     ) -> None:
         warm_up()
-        self._moving, self._pace, self._count, self._kept = moving, pace, count, kept
+        self._moving, self._witnesses = moving, witnesses
+        self._pace, self._count, self._kept = pace, count, kept
         self._has_looked = False
         self._confirmed: RefitResult | None = None
         self._start: RefitStart | None = None
@@ -72,6 +77,7 @@ class RefitInForce:
         self.current = self.result = self._moving.patches = self._start = None
         self._has_looked = False
         self._kept.expect(setup, base)
+        self._witnesses.expect(setup, base)
         if len(references):
             bodies, folder = self._moving.bodies, self._kept.folder
             self._start = RefitStart(setup, base, references, bodies, folder)
@@ -160,6 +166,7 @@ class RefitInForce:
             return False
         self.current, self._moving.patches = started
         self.result = None
+        self._witnesses.join(self.current)
         self._count('refit_starts')
         return True
 
@@ -202,6 +209,8 @@ class RefitInForce:
             return None
         begin_s = time.monotonic()
         if patches is None:
+            if self.result is not None:
+                self._witnesses.tell(refit, self.result.stamp_ns)
             self.result = refit.follow(frame)
         else:
             moved = patches.moved_refit(refit, frame.stamp_ns)

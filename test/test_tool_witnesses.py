@@ -1,0 +1,98 @@
+"""What the node hands to the refit: readings and poses of the same frame, once."""
+
+import numpy as np
+import pytest
+from tracked_tool import CHANNELS, MODEL, TOOL
+
+from anser_ros.nodes.runtime.handover import HandedFlux
+from anser_ros.wire.config_folder import read_config
+from anser_ros.wire.points import FluxPoints
+from anser_ros.wire.setup import parse_setup
+
+pytest.importorskip('rclpy')
+
+
+class Refit:
+    """Stands for the refit: notes what it is given."""
+
+    def __init__(self):
+        self.given, self.noise_t = [], 0.0
+
+    def enable_witnesses(self, noise_t):
+        self.noise_t = noise_t
+
+    def witnessed(self, readings):
+        self.given.append(readings)
+
+
+@pytest.fixture
+def witnesses(ros):
+    from anser_ros.nodes.field_model_parts.tool_witnesses import ToolWitnesses
+    from anser_ros.nodes.runtime.node import AnserNode
+
+    class Server(AnserNode):
+        NAME = 'server'
+
+    node, refused = Server(), []
+    made = ToolWitnesses(node, True, lambda: 'fg', lambda *why: refused.append(why))
+    made.expect(parse_setup(read_config('demo_setup.yaml')), MODEL)
+    made.refused = refused
+    yield made
+    node.destroy_node()
+
+
+def flux(stamp_ns, level):
+    """A frame of all of the tool's channels, each emitter with the same flux."""
+    values = np.full((len(CHANNELS), 8), level, dtype=np.complex128)
+    values[2] = np.nan
+    flags, nowhere = np.zeros(len(CHANNELS), np.int64), np.full((len(CHANNELS), 3), np.nan)
+    points = FluxPoints(np.asarray(CHANNELS), flags, values, nowhere, nowhere)
+    return HandedFlux(stamp_ns, 'fg', points)
+
+
+def pose(stamp_ns, x, frame_id='fg'):
+    from geometry_msgs.msg import PoseStamped
+
+    message = PoseStamped()
+    message.header.frame_id, message.header.stamp.nanosec = frame_id, stamp_ns
+    message.pose.position.x, message.pose.orientation.w = x, 1.0
+    return message
+
+
+def test_readings_and_poses_of_one_frame_come_together_in_any_order(witnesses):
+    refit, found = Refit(), witnesses._pose_taker('tool_a')
+    witnesses.join(refit)
+    assert refit.noise_t > 0
+    witnesses._on_flux(flux(100, 1e-9))
+    found(pose(100, 0.01))
+    found(pose(200, 0.02))  # the next frame is here before the references of this one
+    witnesses._on_flux(flux(200, 2e-9))
+    for stamp_ns in (100, 100, 200, 300):
+        witnesses.tell(refit, stamp_ns)
+    assert len(refit.given) == 2, 'no frame twice, none without readings'
+    for (reading,), x, level in zip(refit.given, (0.01, 0.02), (1e-9, 2e-9), strict=True):
+        assert reading.position[0] == x and np.array_equal(reading.rotation, np.eye(3))
+        assert (reading.flux == level).all()
+        assert len(reading.table) == len(TOOL) - 1, 'the one without a reading is left out'
+
+
+def test_what_has_no_partner_is_forgotten_and_an_earlier_recording_is_taken(witnesses):
+    refit, found = Refit(), witnesses._pose_taker('tool_a')
+    for stamp_ns in range(1000, 3000, 100):
+        found(pose(stamp_ns, 0.01))
+        witnesses._on_flux(flux(stamp_ns + 1, 1e-9))
+    assert len(witnesses._frames) < 10 and len(witnesses._poses) < 10
+    found(pose(5, 0.03))
+    witnesses._on_flux(flux(5, 3e-9))
+    witnesses.tell(refit, 5)
+    assert refit.given[0][0].position[0] == 0.03
+
+
+def test_poses_of_another_frame_are_refused(witnesses):
+    refit = Refit()
+    witnesses._on_flux(flux(100, 1e-9))
+    witnesses._pose_taker('tool_a')(pose(100, 0.01, 'world'))
+    witnesses.tell(refit, 100)
+    assert not refit.given
+    ((counter, error),) = witnesses.refused
+    assert counter == 'tool_poses_refused' and "'world'" in str(error)
