@@ -179,8 +179,8 @@ class Acquisition(AnserNode):
     def _wake_after(self, port: ControlUnitPort) -> int:
         """Blocks after which to go on: those of a window, the last of many apart.
 
-        While that one is on its way the others are processed, and the last window is demodulated
-        once more: this keeps the processor awake, which then needs a third of the time.
+        Meanwhile the last window is demodulated and tracked once more, for nothing but to have the
+        processor awake and its caches full: the real one then needs a third of the time.
         """
         if self._stream is None:
             return 1
@@ -192,7 +192,11 @@ class Acquisition(AnserNode):
             self._woken_early = False
             if not port.has_more:
                 self._stream.warm_up()
-        return wanted - 1 if self._woken_early and wanted > 1 else wanted
+        if self._woken_early and wanted > 1:
+            if not port.has_more:
+                self.frame_is_due()
+            return wanted - 1
+        return wanted
 
     def _dispatch(self, record: Record, arrival_ns: int) -> None:
         payload = record.payload

@@ -35,6 +35,7 @@ from anser_ros.nodes.tracker_parts.pose_output import (
     transform_message,
     transform_publisher,
 )
+from anser_ros.nodes.tracker_parts.rehearsal import Rehearsal
 from anser_ros.nodes.tracker_parts.tracker_parameters import (
     TrackerParameters,
     settings_of,
@@ -83,6 +84,7 @@ class TrackerNode(AnserNode):
         self._setup_text = ''
         self._setup: Setup | None = None
         self._tracker: Tracker | None = None
+        self._rehearsal: Rehearsal | None = None
         self._topics: dict[str, PoseTopic] = {}
         self._intake = ModelIntake()
         self._in_force: ModelInForce | None = None
@@ -112,6 +114,7 @@ class TrackerNode(AnserNode):
             informed=True,
         )  # fmt: skip
         self._sources = [setups, models, self._fluxes]
+        self.prepare(self._rehearse)
         self._wait = self.create_timer(WAIT_PERIOD_S, self._on_wait, clock=self.steady_clock)
         self._wait.cancel()
 
@@ -132,6 +135,7 @@ class TrackerNode(AnserNode):
             self._refuse('setups_refused', error)
             return
         self._setup_text, self._setup, self._tracker = message.data, setup, tracker
+        self._rehearsal = Rehearsal(sensors, settings) if self.hands_over else None
         self._in_force = ModelInForce(
             setup, settings.box, self._file_model, self.parameters.allow_uncalibrated
         )
@@ -289,9 +293,17 @@ class TrackerNode(AnserNode):
                 self._transforms.publish(transform_message(moved))
         self.count('frames')
         self._solve_s = time.perf_counter() - begin_s
+        if self._rehearsal is not None:
+            has_poses = standing.withheld is None
+            self._rehearsal.note(stamp_ns, points, self._solve_s, has_poses=has_poses)
         self._backlog.worked(self._solve_s)
         if changed and time.monotonic() - self._diagnosed_s > EARLIEST_DIAGNOSTICS_S:
             self.publish_diagnostics()
+
+    def _rehearse(self) -> None:
+        """Prepare for a frame that is due."""
+        if self._tracker is not None and self._rehearsal is not None:
+            self._rehearsal.play(self._tracker)
 
     # What is told -------------------------------------------------------------------------
 

@@ -37,6 +37,12 @@ ComplexArray = NDArray[np.complex128]
 
 __all__ = ['PoseEstimate', 'Tracker', 'TrackerSettings']
 
+PAST = (
+    'counters', '_coil_tracks', '_body_tracks', '_source_tracks', 'sources', '_intake',
+    '_freshness', '_judgement', '_first_ns',
+)  # fmt: skip
+"""Attributes of a tracker that hold what it has seen so far."""
+
 
 def _add(counters: Counter[str], name: str, by: int) -> None:
     counters[name] += by
@@ -194,6 +200,16 @@ class Tracker:
             model_id, other._context, other._reduced = self._context.model_id, None, None
             other._use(self._model, model_id)
         return other
+
+    def with_past_of(self, other: 'Tracker') -> 'Tracker':
+        """Return a tracker like this one that goes on from where another one of its sensors is.
+
+        What it sees from now on, the other one has seen, and this one has not.
+        """
+        new = Tracker.__new__(Tracker)
+        new.__dict__.update(self.__dict__)
+        new.__dict__.update({name: other.__dict__[name] for name in PAST})
+        return new
 
     def reset(self) -> None:
         """Forget all warm starts, and what was seen of the sensors and bodies so far."""

@@ -50,7 +50,7 @@ PRIORITY = -15
 """Niceness of the thread that stands for the device, where the system allows it."""
 
 LISTENER = """
-import signal, sys, time
+import gc, signal, sys, time
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -83,6 +83,7 @@ def main():
     node.create_subscription(DiagnosticArray, '/diagnostics', note, qos.EVENTS)
     executor = make_executor()
     executor.add_node(node)
+    gc.disable()  # the instrument's own pauses are not the chain's
     while not ending:
         executor.spin_once(timeout_sec=0.1)
     np.save(output, np.array(got, np.int64).reshape(-1, 3))

@@ -92,11 +92,13 @@ class Handover:
     """Keeps the topics that nodes of this process offer each other, by their full names.
 
     The node that hands over frames reports when there is a pause before the next: diagnostics are
-    put off until then, so that no pose waits for them.
+    put off until then, so that no pose waits for them. It reports too when a frame is due within
+    milliseconds: who prepares for frames does so then.
     """
 
     def __init__(self) -> None:
         self._put_off: deque[Callable[[], bool]] = deque()
+        self._preparations: list[Callable[[], object]] = []
         self._paused_s = -math.inf
         self._takings: defaultdict[str, list[DirectSubscription]] = defaultdict(list)
         self._offered: dict[str, bool] = {}
@@ -143,6 +145,15 @@ class Handover:
             work = self._put_off.popleft()
             if not work():
                 self._put_off.append(work)
+
+    def prepare(self, work: Callable[[], object]) -> None:
+        """Do some work each time that a frame is due, in the thread that hands it over."""
+        self._preparations.append(work)
+
+    def frame_is_due(self) -> None:
+        """Do what prepares for a frame."""
+        for work in self._preparations:
+            work()
 
     def give(self, topic: str, what: Any) -> None:
         """Give something to all who take a topic."""

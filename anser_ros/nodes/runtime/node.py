@@ -169,6 +169,16 @@ class AnserNode(Node):
         if self._handover is not None:
             self._handover.pause()
 
+    def prepare(self, work: Callable[[], object]) -> None:
+        """Do some work each time that a node of this process is about to hand over a frame."""
+        if self._handover is not None:
+            self._handover.prepare(self._guard(work))
+
+    def frame_is_due(self) -> None:
+        """Let the nodes of this process prepare for a frame that comes within milliseconds."""
+        if self._handover is not None:
+            self._handover.frame_is_due()
+
     @property
     def hands_over(self) -> bool:
         """Return whether other nodes of this process get what this one publishes directly."""
