@@ -3,6 +3,7 @@
 import os
 import time
 from dataclasses import fields, replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -10,11 +11,13 @@ from refit_rig import HEAD, Rig, setup_text
 from refit_world import anser_world
 from test_refit_start import given_baseline
 
+from anser_ros.nodes.field_model_parts import kept_files
 from anser_ros.nodes.field_model_parts.kept_files import (
     BASELINE_S,
     MOST_TABLES,
     KeptBaseline,
     KeptTables,
+    ReadAhead,
 )
 from anser_ros.pose_states import REFERENCES_LOST, code_of
 from anser_ros.refit import tables
@@ -55,10 +58,20 @@ def test_tables_are_read_as_they_were_written(tmp_path):
     assert KeptTables(tmp_path, setup, stronger, world.references).read() is None
 
     (path,) = tmp_path.iterdir()
+    ahead = ReadAhead(tmp_path, world.model)
+    again = KeptTables(tmp_path, setup, world.model, world.references, ahead)
+    with patch.object(kept_files, '_read', side_effect=OSError('read twice')):
+        early = again.read()
+        assert again.read() is None, 'what was read early is used once'
+    assert all(same(*pair) for pair in zip(made.factors, early.factors, strict=True))
+    for folder, model in ((None, world.model), (tmp_path, None), (tmp_path, stronger)):
+        assert ReadAhead(folder, model)._read is None, 'nothing is read in vain'
     whole = path.read_bytes()
     for damaged in (whole[:-8], whole[:-1] + bytes([whole[-1] ^ 1]), whole[:100], b''):
         path.write_bytes(damaged)
         assert kept.read() is None
+        ahead = ReadAhead(tmp_path, world.model)
+        assert KeptTables(tmp_path, setup, world.model, world.references, ahead).read() is None
     path.unlink()
     for age in range(MOST_TABLES + 2):
         (tmp_path / f'refit_tables_{age}').write_bytes(b'')

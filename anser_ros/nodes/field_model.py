@@ -20,7 +20,12 @@ from anser_ros.field.model import FieldModel
 from anser_ros.frames.intake import Frame, Intake
 from anser_ros.nodes.field_model_parts import refit_status
 from anser_ros.nodes.field_model_parts.field_model_parameters import FieldModelParameters
-from anser_ros.nodes.field_model_parts.kept_files import CONFIRM_S, KeptBaseline, kept_folder
+from anser_ros.nodes.field_model_parts.kept_files import (
+    CONFIRM_S,
+    KeptBaseline,
+    ReadAhead,
+    kept_folder,
+)
 from anser_ros.nodes.field_model_parts.metal_view import MetalView
 from anser_ros.nodes.field_model_parts.model_output import ModelOutput
 from anser_ros.nodes.field_model_parts.moving_coils import MovingCoils
@@ -81,7 +86,9 @@ class FieldModelNode(AnserNode):
         topics = parse_patches(table.patches)
         self._moving = MovingCoils(self, topics, lambda: self._frame_id, self._refuse)
         name = self.get_fully_qualified_name()
-        kept = KeptBaseline(kept_folder(table.keep_state), name, self._fluxes.sender)
+        folder = kept_folder(table.keep_state)
+        ahead = ReadAhead(folder, self._file_model) if table.refit else None
+        kept = KeptBaseline(folder, name, self._fluxes.sender, ahead)
         if table.witnesses and topics:
             raise ParameterError('witnesses: tools cannot be witnesses where patches move')
         witnesses = ToolWitnesses(self, table.witnesses, lambda: self._frame_id, self._refuse)

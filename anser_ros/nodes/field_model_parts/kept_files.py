@@ -12,6 +12,7 @@ import os
 import time
 import zlib
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,8 @@ from anser_ros.sessions.drawing import Drawing
 from anser_ros.sessions.volume import stated_volume
 from anser_ros.wire.setup import Setup
 
+TABLES = 'refit_tables_'
+"""How the names of files with tables begin; the model's fingerprint follows."""
 MOST_TABLES = 3
 """Files of tables that are kept, the last used: each has about 140 MB."""
 BASELINE_S = 60.0
@@ -55,6 +58,41 @@ def kept_folder(is_wanted: bool = True) -> Path | None:
     return Path(base).expanduser() / 'anser_ros'
 
 
+class ReadAhead:
+    """Reads the tables of a model that were used last, before references and setup are known.
+
+    Fresh memory of their size may take a third of a second, in which the graph is discovered.
+
+    Parameters
+    ----------
+    folder : Path or None
+        Where tables are kept.
+    model : FieldModel or None
+        Without one, or without a folder, nothing is read.
+    """
+
+    def __init__(self, folder: Path | None, model: FieldModel | None) -> None:
+        self._path: Path | None = None
+        self._read: Future[dict[str, NDArray[Any]]] | None = None
+        if folder is not None and model is not None:
+            kept = folder.glob(f'{_tables_name(model)}*')
+            self._path = max(kept, key=_used_s, default=None)
+        if self._path is not None:
+            worker = ThreadPoolExecutor(1, thread_name_prefix='read_ahead')
+            self._read = worker.submit(_read, self._path)
+            worker.shutdown(wait=False)
+
+    def arrays_of(self, path: Path) -> dict[str, NDArray[Any]]:
+        """Return the arrays of a file, which may have been read; raises what `_read` does."""
+        read = self._read
+        self.drop()
+        return _read(path) if read is None or path != self._path else read.result()
+
+    def drop(self) -> None:
+        """Forget what was read: it is used once, or not wanted."""
+        self._read = None
+
+
 class KeptTables:
     """Keeps the tables of one model, setup and set of references.
 
@@ -65,25 +103,32 @@ class KeptTables:
     model : FieldModel
     references : SensorTable
         The tables' own.
+    ahead : ReadAhead, optional
     """
 
     def __init__(
-        self, folder: Path, setup: Setup, model: FieldModel, references: SensorTable
+        self,
+        folder: Path,
+        setup: Setup,
+        model: FieldModel,
+        references: SensorTable,
+        ahead: ReadAhead | None = None,
     ) -> None:
         self._given = setup, model, references
+        self._ahead = ahead or ReadAhead(None, None)
         places = [getattr(references, f.name) for f in fields(references)]
         stated = dict(setup.stated)
         key = fingerprint_of(
             [_code(), setup.identity.board, setup.volume, stated, model.fingerprint, places]
         )
-        self._folder, self._path = folder, folder / f'refit_tables_{key}'
+        self._folder, self._path = folder, folder / f'{_tables_name(model)}{key}'
 
     def read(self) -> RefitTables | None:
         """Return the tables; None where there are none, or the file is damaged."""
         setup, model, references = self._given
         drawing, volume = Drawing.of(setup).field, stated_volume(setup)
         try:
-            arrays = _read(self._path)
+            arrays = self._ahead.arrays_of(self._path)
             os.utime(self._path)
             return tables_of(arrays, model, references, setup.refit, drawing, volume)
         except DAMAGED:
@@ -99,7 +144,7 @@ class KeptTables:
         """
         if not self._path.exists():
             _write(self._path, arrays_of(tables))
-        files = sorted(self._folder.glob('refit_tables_*'), key=_used_s, reverse=True)
+        files = sorted(self._folder.glob(f'{TABLES}*'), key=_used_s, reverse=True)
         for old in files[MOST_TABLES:]:
             old.unlink(missing_ok=True)
 
@@ -111,6 +156,8 @@ class KeptBaseline:
     ----------
     folder : Path or None
         Where files are kept; None where they are not.
+    ahead : ReadAhead
+        Of the tables in it.
 
     Parameters
     ----------
@@ -119,10 +166,18 @@ class KeptBaseline:
         Whole name of the node.
     sender : callable
         Returns what identifies the only sender of the references; empty where there is none.
+    ahead : ReadAhead, optional
     """
 
-    def __init__(self, folder: Path | None, node: str, sender: Callable[[], str]) -> None:
+    def __init__(
+        self,
+        folder: Path | None,
+        node: str,
+        sender: Callable[[], str],
+        ahead: ReadAhead | None = None,
+    ) -> None:
         self.folder, self._node, self._sender = folder, node, sender
+        self.ahead = ahead or ReadAhead(None, None)
         self._of: tuple[str, ...] = ()
         self._kept: Path | None = None
 
@@ -177,6 +232,11 @@ class KeptBaseline:
             return None
         key = fingerprint_of([self._node, sender, *self._of])
         return self.folder / f'baseline_{key}'
+
+
+def _tables_name(model: FieldModel) -> str:
+    """Return how the names of all files with tables of a model begin."""
+    return f'{TABLES}{model.fingerprint}_'
 
 
 def _code() -> list[Any]:

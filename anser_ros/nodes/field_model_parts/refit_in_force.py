@@ -79,10 +79,12 @@ class RefitInForce:
         self._kept.expect(setup, base)
         self._witnesses.expect(setup, base)
         if len(references):
-            bodies, folder = self._moving.bodies, self._kept.folder
-            self._start = RefitStart(setup, base, references, bodies, folder)
+            bodies, folder, ahead = self._moving.bodies, self._kept.folder, self._kept.ahead
+            self._start = RefitStart(setup, base, references, bodies, folder, ahead)
             if at_once:
                 self._start.prepare()
+        else:
+            self._kept.ahead.drop()
 
     def forget_baseline(self) -> None:
         """Drop the baseline: the readings are to be others."""

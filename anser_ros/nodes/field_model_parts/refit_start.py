@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from anser_ros.field.model import FieldModel
-from anser_ros.nodes.field_model_parts.kept_files import KeptTables
+from anser_ros.nodes.field_model_parts.kept_files import KeptTables, ReadAhead
 from anser_ros.nodes.field_model_parts.patches import Patches
 from anser_ros.physics.sensor import SensorTable
 from anser_ros.physics.tracks import loop_field
@@ -58,6 +58,8 @@ class RefitStart:
         Bodies whose coils are further references, while their poses are known.
     folder : Path or None
         Where tables are kept; None where they are not.
+    ahead : ReadAhead, optional
+        Of this folder.
 
     Attributes
     ----------
@@ -72,9 +74,10 @@ class RefitStart:
         references: SensorTable,
         bodies: tuple[str, ...],
         folder: Path | None = None,
+        ahead: ReadAhead | None = None,
     ) -> None:
         self._setup, self._model, self._fixed = setup, model, references
-        self._folder = folder
+        self._folder, self._ahead = folder, ahead
         moving = tuple(s for s in setup.tool_sensors if s.body in bodies)
         self._moving = sensor_table(moving) if moving else None
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=WORKER)
@@ -151,7 +154,7 @@ class RefitStart:
         return fixed if moving is None else fixed.joined(start_table(moving))
 
     def _file(self, folder: Path) -> KeptTables:
-        return KeptTables(folder, self._setup, self._model, self._references)
+        return KeptTables(folder, self._setup, self._model, self._references, self._ahead)
 
     def _work_tables_out(self) -> tables.RefitTables:
         kept = None if self._folder is None else self._file(self._folder).read()
