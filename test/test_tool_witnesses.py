@@ -96,3 +96,20 @@ def test_poses_of_another_frame_are_refused(witnesses):
     assert not refit.given
     ((counter, error),) = witnesses.refused
     assert counter == 'tool_poses_refused' and "'world'" in str(error)
+
+
+def test_a_body_whose_poses_have_two_publishers_witnesses_nothing(ros, witnesses):
+    from conftest import spin_until
+    from geometry_msgs.msg import PoseStamped
+
+    stranger, refit = ros.create_node('stranger'), Refit()
+    publishers = [stranger.create_publisher(PoseStamped, '/anser/tool_a/pose', 5) for _ in 'ab']
+    assert spin_until(stranger, lambda: stranger.count_publishers('/anser/tool_a/pose') == 2)
+    witnesses._on_flux(flux(100, 1e-9))
+    witnesses._pose_taker('tool_a')(pose(100, 0.01))
+    assert spin_until(stranger, lambda: not witnesses._has_one_source('tool_a'))
+    witnesses.tell(refit, 100)
+    assert not refit.given
+    for publisher in publishers:
+        stranger.destroy_publisher(publisher)
+    stranger.destroy_node()

@@ -93,10 +93,19 @@ class ToolWitnesses:
         correction = self._correction
         if points is None or poses is None or correction is None:
             return
+        poses = {body: pose for body, pose in poses.items() if self._has_one_source(body)}
         readings = tool_readings(correction, points.channel, points.flux, points.flags, poses)
         if readings:
             refit.witnessed(readings)
             self._node.count('witnessed_frames')
+
+    def _has_one_source(self, body: str) -> bool:
+        """Return whether one publisher gives a body's poses; whose is whose is not known else."""
+        count = self._node.count_publishers(self._subscriptions[body].topic_name)
+        if count > 1:
+            text = f'{count} publishers of the pose of {body}: it witnesses nothing'
+            self._node.warn('witnesses_of_two_sources', text)
+        return count <= 1
 
     def _on_flux(self, message: PointCloud2) -> None:
         try:
